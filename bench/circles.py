@@ -1,15 +1,17 @@
 """Circle of 20 cm in 8 s that arms draw under control "osc" with default gains, without collision shapes.
 
-    python bench/circles.py panda:panda_hand ur5.urdf z1.urdf:link06
+    python bench/circles.py panda:panda_hand ur5.urdf z1.urdf:link06 [--engine sapien mujoco]
 
-A robot without a LINK moves the one that the runner chooses. It begins at a pose from which the whole circle is in
-reach. Prints the largest distance of the tool from the circle where setpoints are poses alone, and from the setpoint
-where they have twist and acceleration, too, in the last 8 s of 10 [mm].
+A robot without a LINK moves the one that the runner chooses: name one where that is a moving jaw. It begins at a pose
+from which the whole circle is in reach. Prints, for each engine, the largest distance of the tool from the circle where
+setpoints are poses alone, and from the setpoint where they have twist and acceleration, too, in the last 8 s of 10
+[mm].
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 import batchpid.task_space as ts
 from batchpid.sim import OperationalSpace, Robot, Runner
 from batchpid.sim.options import RunnerOptions
+from batchpid.sim.runner_keywords import EngineName
 
 RADIUS, PERIOD, TICK = 0.1, 8.0, 1 / 100
 POSES = 200
@@ -55,7 +58,9 @@ def start_of(tree: ts.KinematicTree, link: str) -> NDArray[Any]:
     raise SystemExit(f"no pose of {link} has the circle in reach")
 
 
-def measure(robot: Robot, link: str, **parts: bool) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def measure(
+    robot: Robot, link: str, engine: EngineName, **parts: bool
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return the positions of the tool and of the circle (ticks, 3), and the center (3,)."""
     link = link or str(RunnerOptions(robot, 1, control="osc").tool)
     start = start_of(robot.kinematic_tree(), link)
@@ -63,7 +68,7 @@ def measure(robot: Robot, link: str, **parts: bool) -> tuple[NDArray[Any], NDArr
     pose, ticks = np.array(control.command.neutral)[:7], round(1.25 * PERIOD / TICK)
     phase = 2 * np.pi / PERIOD * TICK * np.arange(1, ticks + 1)
     held = circle(pose, phase - np.pi / PERIOD * TICK)  # a setpoint is held for a tick: its middle
-    with Runner(robot, 1, control=control, collisions=False, workers=0) as runner:
+    with Runner(robot, 1, control=control, engine=engine, collisions=False, workers=0) as runner:
         runner.reset(start)
         seen = runner.rollout(held[:, : control.command.size])
     last = slice(ticks // 5, None)
@@ -72,14 +77,18 @@ def measure(robot: Robot, link: str, **parts: bool) -> tuple[NDArray[Any], NDArr
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("robots", nargs="+")
+    parser.add_argument("robots", nargs="+", metavar="ROBOT[:LINK]")
+    installed = ["sapien", *(["mujoco"] if importlib.util.find_spec("mujoco") else [])]
+    parser.add_argument("--engine", nargs="+", choices=installed, default=installed)
     given = parser.parse_args()
     for name in given.robots:
         file, _, link = name.partition(":")
         arm = Robot.load(file)
-        tool, _, center = measure(arm, link)
-        away = tool - center
-        off = np.hypot(np.hypot(*away[:, :2].T) - RADIUS, away[:, 2]).max()
-        tool, wanted, _ = measure(arm, link, twist=True, acceleration=True)
-        late = np.linalg.norm(tool - wanted, axis=1).max()
-        print(f"{arm.name}: from the circle {1e3 * off:.2f} mm; with twist and acceleration {1e3 * late:.2f} mm")
+        for engine in given.engine:
+            tool, _, center = measure(arm, link, engine)
+            away = tool - center
+            off = np.hypot(np.hypot(*away[:, :2].T) - RADIUS, away[:, 2]).max()
+            tool, wanted, _ = measure(arm, link, engine, twist=True, acceleration=True)
+            late = np.linalg.norm(tool - wanted, axis=1).max()
+            found = f"from the circle {1e3 * off:.2f} mm; with twist and acceleration {1e3 * late:.2f} mm"
+            print(f"{arm.name}, {engine}: {found}", flush=True)

@@ -3,11 +3,14 @@
 "regular" rows are at a pose where the inverse of the mobility is Cholesky's, "bounded" rows near a straight arm, where
 each needs its eigenvalues. ``step`` is the law with the dynamics of a tree, in one call; its parts are timed as
 separate calls. Searches start 0.3 rad away from a solution.
+
+The closed loop under control "osc" is compared with that under joint PID in one process in turn, by processor time.
 """
 
 from __future__ import annotations
 
 import os
+import statistics
 import time
 from unittest import mock
 
@@ -16,7 +19,8 @@ import pytest
 
 import batchpid.task_space as ts
 from batchpid.native.availability import SWITCH
-from batchpid.sim import Robot
+from batchpid.sim import OperationalSpace, Robot, Runner
+from batchpid.sim.benchmark.workload import Workload
 from batchpid.task_space import native_rows
 
 LINK = "panda_hand"
@@ -97,3 +101,42 @@ def test_search(benchmark, compare, most, num_envs):
         benchmark.extra_info[f"{name} [us]"] = 1e6 * time_of_part / steps
     print("", *(f"{name} {us:.2f}" for name, us in benchmark.extra_info.items()), sep="\n")
     compare(f"{num_envs} targets", "native", "numpy", in_numpy / least, least=4)
+
+
+@pytest.mark.benchmark(group="closed loop under osc")
+@pytest.mark.parametrize("num_envs", [1, 16, 64])
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+def test_closed_loop(benchmark, report, compare, most, engine, num_envs):
+    """One env alone has no floor: the law computes four at once."""
+    if engine == "mujoco":
+        pytest.importorskip("mujoco")
+    robot, num_envs = Robot.load("panda"), int(min(num_envs, most.envs))
+    ticks, rounds = int(min(40 if num_envs == 1 else 20, most.ticks)), int(min(7, most.rounds))
+    work = Workload(robot, num_envs, workers=0, ticks=ticks)
+    goal = ts.link_poses(robot.kinematic_tree(), work.target[None], [LINK])[0, 0]
+    osc, options = OperationalSpace(robot, LINK, posture=work.target), {"engine": engine, "workers": 0}
+
+    def seconds_per_env_step(runner, setpoint):
+        runner.reset(work.start)
+        setpoints = np.broadcast_to(setpoint, (ticks, num_envs, len(setpoint)))
+        began = time.process_time()
+        qpos = runner.rollout(setpoints).qpos[-1]
+        seconds = time.process_time() - began
+        assert (np.abs(qpos - work.start)[:, work.moving].max(1) > 0.05).all(), "the robots did not move"
+        return seconds / (work.steps * num_envs)
+
+    def measure():
+        with (
+            Runner(robot, num_envs, control=osc, **options) as tool,
+            Runner(robot, num_envs, **options) as tuned,
+            Runner(robot, num_envs, params=robot.params(), **options) as tutorial,
+        ):
+            cases = (tool, goal), (tuned, work.target), (tutorial, work.target)
+            return [[seconds_per_env_step(*case) for case in cases] for _ in range(rounds + 1)][-rounds:]
+
+    rows = benchmark.pedantic(measure, rounds=1)
+    report([row[0] for row in rows])
+    least = None if num_envs == 1 else 0.95
+    for column, gains in ((1, "tuned"), (2, "tutorial")):
+        ratio = statistics.median(row[column] / row[0] for row in rows)
+        compare(f"{engine}, {num_envs} envs", "osc", f"joint PID, {gains} gains", ratio, least=least)

@@ -412,6 +412,11 @@ def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
     if tool is not None and name != "osc" and space == "joints" and tool != getattr(value, "link", None):
         problem, remedy = "is for control 'osc' or setpoint_space 'tool'", "leave it out"
         raise InvalidArgumentError("tool", problem, value=tool, remedy=remedy)
+    if not robot.fixed_base and (name == "osc" or space == "tool"):
+        argument, given = ("control", "'osc'") if name == "osc" else ("setpoint_space", "'tool'")
+        problem = f"{given} needs a fixed base, which {robot.name!r} does not have"
+        remedy = "load the robot with fixed_base=True, or control its joints"
+        raise InvalidArgumentError(argument, problem, remedy=remedy)
     if name == "osc":
         return OperationalSpace(robot, default_tool(robot) if tool is None else tool)
     return value

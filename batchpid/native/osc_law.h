@@ -80,7 +80,7 @@ inline Lanes along(Lanes const *row, Lanes const *vector, std::int64_t size) {
   return sum;
 }
 
-// Inputs of a law for WIDTH rows. A row that stands for all is loaded once.
+// Inputs of a law for WIDTH rows. Coefficients in one row are loaded once.
 class Given {
  public:
   explicit Given(Tables const &table) : table_(table) {
@@ -92,7 +92,7 @@ class Given {
       if (!table[i]) continue;
       at_[i] = next;
       next += table[i].columns;
-      if (table[i].rows == 1) {
+      if (i >= KP && table[i].rows == 1) {
         table[i].load(0, at_[i]);
       } else {
         each_.push_back(i);

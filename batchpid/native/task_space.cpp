@@ -209,18 +209,25 @@ struct Step : Call {
   }
 };
 
-FOR_EACH_PROCESSOR void write_step(Call const &call) {
-  auto const &step = static_cast<Step const &>(call);
-  bool const computes{step.tool[0]};
-  ToolDynamics dynamics(step.tree, step.body);
-  OSCLaw law(step.dof, step.decoupling, step.in_tool_axes, step.law, computes ? &dynamics : nullptr);
+// Room for the step of WIDTH robots. A bound step keeps it: to make it takes longer than to step four robots.
+struct StepRoom {
+  explicit StepRoom(Step const &step)
+      : dynamics(step.tree, step.body),
+        law(step.dof, step.decoupling, step.in_tool_axes, step.law, step.tool[0] ? &dynamics : nullptr),
+        friction(step.friction, step.dof) {
+    if (step.friction[1]) law.given().set(FEEDFORWARD, friction.out.data());
+  }
+  ToolDynamics dynamics;
+  OSCLaw law;
+  JointFriction friction;
+};
+
+FOR_EACH_PROCESSOR void write_step(Step const &step, StepRoom &room) {
+  auto &[dynamics, law, friction] = room;
   Lanes tool[FRAME];
-  JointFriction friction(step.friction, step.dof);
-  bool const rubs{step.friction[1]};
-  if (rubs) law.given().set(FEEDFORWARD, friction.out.data());
   for (std::int64_t first = 0; first < step.rows; first += WIDTH) {
     law.load(first);
-    if (computes) {
+    if (step.tool[0]) {
       step.tool[0].load(first, tool);
       dynamics.place(law.qpos(), law.qvel());
       dynamics.set_tool(tool, true, true, true);
@@ -228,9 +235,24 @@ FOR_EACH_PROCESSOR void write_step(Call const &call) {
       if (!step.law[TASK_BIAS]) dynamics.set_bias();
       dynamics.set_mass();
     }
-    if (rubs) friction.write(law, step.dof);
+    if (step.friction[1]) friction.write(law, step.dof);
     law.advance(first);
   }
+}
+
+void write_step(Step const &step) {
+  StepRoom room(step);
+  write_step(step, room);
+}
+
+// Step on arrays that stay, with its room.
+struct BoundStep : Step {
+  std::unique_ptr<StepRoom> room;
+};
+
+void write_bound_step(Call const &call) {
+  auto const &step = static_cast<BoundStep const &>(call);
+  write_step(step, *step.room);
 }
 
 // law(rows, dof, *arguments of Step::open)
@@ -281,12 +303,13 @@ char const *const BOUND = "batchpid.BoundStep";
 
 // bind(*arguments of Step::open_with_friction) -> (object, address of Call)
 PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  auto bound = std::make_unique<Step>();
-  bound->run = write_step;
+  auto bound = std::make_unique<BoundStep>();
+  bound->run = write_bound_step;
   if (!bound->open_with_friction(arguments)) return nullptr;
+  bound->room = std::make_unique<StepRoom>(*bound);
   PyObject *address = PyLong_FromVoidPtr(static_cast<Call *>(bound.get()));
   PyObject *capsule = PyCapsule_New(bound.release(), BOUND, [](PyObject *object) {
-    delete static_cast<Step *>(PyCapsule_GetPointer(object, BOUND));
+    delete static_cast<BoundStep *>(PyCapsule_GetPointer(object, BOUND));
   });
   return Py_BuildValue("NN", capsule, address);
 }

@@ -22,7 +22,7 @@ from __future__ import annotations
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -135,10 +135,12 @@ def tune(
     Raises
     ------
     InvalidArgumentError
-        An option out of range, or a history of another search.
+        An option out of range, ``params``, or a history of another search.
     MissingDependencyError
         The package ``cmaes`` is missing.
     """
+    remedy = "leave it out; bp.design_gains makes implicit gains"
+    refuse_searched(runner_options, ("params", "discretization"), remedy)
     seed, generations, population, seconds = checked_effort(seed, generations, population, seconds)
     weights = Weights() if weights is None else weights
     final = random_moves(robot, FINAL_MOVES, seed + _FINAL_SEED) if moves is None else None
@@ -233,6 +235,13 @@ def checked_effort(seed: int, generations: int, population: int, seconds: float)
         integer("population", population, 4, 1000),
         number("seconds", seconds, 0.05, 600.0, "seconds"),
     )
+
+
+def refuse_searched(runner_options: Mapping[str, Any], names: Sequence[str], remedy: str) -> None:
+    """Raise InvalidArgumentError for options that a search for explicit gains chooses itself."""
+    for name in names:
+        if name in runner_options:
+            raise InvalidArgumentError(name, "is chosen by the search, which is for explicit gains", remedy=remedy)
 
 
 def evolve(

@@ -25,7 +25,7 @@ from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tuning.candidates import HEADROOM
 from batchpid.sim.tuning.evaluation import SUBSTEPS
 from batchpid.sim.tuning.history import HistoryFile
-from batchpid.sim.tuning.search import FINALISTS, SEARCH_PHYSICS, checked_effort, evolve
+from batchpid.sim.tuning.search import FINALISTS, SEARCH_PHYSICS, checked_effort, evolve, refuse_searched
 from batchpid.sim.tuning.tool_candidates import GAINS, SearchedSpace, ToolCandidates, osc_options, tool_moves
 from batchpid.sim.tuning.weights import Weights
 from batchpid.sim.workers.contact_log import MissedContactWarning
@@ -72,12 +72,15 @@ def tune_tool(
     Raises
     ------
     InvalidArgumentError
-        An option is out of range, the history is of another search, or there are no moves within the joint limits.
+        An option is out of range or chosen by the search, the history is of another search, or there are no moves
+        within the joint limits.
     MissingDependencyError
         The package ``cmaes`` is missing.
     RobotError
         The robot has no kinematic tree, such as a floating base.
     """
+    remedy = "leave it out; discretization='implicit' may be added to the options found"
+    refuse_searched(runner_options, ("params", "control", "discretization"), remedy)
     seed, generations, population, seconds = checked_effort(seed, generations, population, seconds)
     weights, tool = Weights() if weights is None else weights, default_tool(robot) if tool is None else tool
     posture = robot.start if robot.settings is None else robot.settings.target

@@ -36,7 +36,7 @@ def test_circles(monkeypatch):
     circles = load_script("circles")
     monkeypatch.setattr(circles, "PERIOD", 0.4)
     panda = load_bundled("panda")
-    tool, wanted, center = circles.measure(panda, "panda_hand", twist=True, acceleration=True)
+    tool, wanted, center = circles.measure(panda, "panda_hand", "sapien", twist=True, acceleration=True)
     assert np.linalg.norm(tool - wanted, axis=1).max() < 0.05
     np.testing.assert_allclose(np.linalg.norm(wanted - center, axis=1), circles.RADIUS)
 

@@ -12,16 +12,21 @@ from tiny_urdf import joint, link, random_tree, robot, write
 
 from batchpid.sim import Robot, Runner, Snapshot, StabilityWarning
 from batchpid.trajectories import minimum_jerk
+from tests.sim.robot.test_design_on_robots import load
 
+PUBLISHED = [
+    f"{name}_description/urdf/{file}.urdf" for name, file in (("ur", "ur5_robot"), ("xarm", "xarm7"), ("z1", "z1"))
+]
 DURATION, HELD = 1.0, 0.3
 
 
 @pytest.fixture(
-    scope="module", params=["panda", *(pytest.param(name, marks=pytest.mark.slow) for name in ("jaco2", "tree"))]
+    scope="module",
+    params=["panda", *(pytest.param(name, marks=pytest.mark.slow) for name in ("jaco2", "tree", *PUBLISHED))],
 )
 def arm(request, tmp_path_factory):
     if request.param != "tree":
-        return load_bundled(request.param)
+        return load(request.param)
     path = write(tmp_path_factory.mktemp("tree"), robot(*random_tree(np.random.default_rng(5), 12)))
     return Robot.load(path, self_collision="none")
 

@@ -11,7 +11,7 @@ from tiny_urdf import joint, link, robot, write
 
 import batchpid as bp
 import batchpid.task_space as ts
-from batchpid.errors import InvalidArgumentError
+from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.native.availability import SWITCH
 from batchpid.sim import OperationalSpace, Robot, Runner
 from batchpid.sim.robot.loop_stability import StabilityWarning
@@ -272,6 +272,22 @@ def test_the_pose_of_the_tool_is_observed_recorded_and_drawn(panda, tmp_path):
 def test_a_wrong_tool_is_refused(panda, options, message):
     with pytest.raises(InvalidArgumentError, match=message):
         Runner(panda, 1, workers=0, **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"control": "osc"}, "control: 'osc' needs a fixed base, .*'panda' .*; load .*fixed_base=True, or control its"),
+        ({"setpoint_space": "tool"}, "setpoint_space: 'tool' needs a fixed base.*; load .*fixed_base=True"),
+    ],
+)
+def test_a_floating_base_is_refused(options, message):
+    floating = Robot.load("panda", fixed_base=False)
+    for tool in (None, HAND):
+        with pytest.raises(InvalidArgumentError, match=message):
+            Runner(floating, 1, workers=0, tool=tool, **options)
+    with pytest.raises(RobotError, match=r"fixed base; load the robot with fixed_base=True, or control its joints"):
+        OperationalSpace(floating, HAND)
 
 
 class Called(OperationalSpace):

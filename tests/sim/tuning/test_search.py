@@ -20,6 +20,7 @@ from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import random_moves
 from batchpid.sim.tuning.randomization_presets import ENCODER, load_randomization
 from batchpid.sim.tuning.search import tune
+from batchpid.sim.tuning.tool_search import tune_tool
 from batchpid.sim.tuning.weights import Weights
 
 pytest.importorskip("cmaes")
@@ -32,6 +33,19 @@ def few_moves(monkeypatch):
     """Search on two moves, with a final on one other."""
     monkeypatch.setattr("batchpid.sim.tuning.search.search_moves", lambda robot, seed: random_moves(robot, 2, seed))
     monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
+
+
+def test_gains_and_implicit_laws_are_refused(panda):
+    implicit = panda.params(kp=900.0, kd=60.0, ki=None, gain_units="mass_matrix", discretization="implicit")
+    for search, name, value, message in (
+        (tune, "params", implicit, r"explicit gains; .*bp\.design_gains makes implicit gains"),
+        (tune, "discretization", "implicit", r"explicit gains; .*bp\.design_gains"),
+        (tune_tool, "params", implicit, r"discretization='implicit' may be added to the options found"),
+        (tune_tool, "control", "pid", "is chosen by the search"),
+        (tune_tool, "discretization", "implicit", "explicit gains"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=f"{name}: .*{message}"):
+            search(panda, workers=0, **{name: value})
 
 
 def test_same_seed_gives_bit_identical_gains_for_any_number_of_workers(panda, few_moves):
