@@ -1,7 +1,7 @@
 # make demo    64 robots under one batch PID: a table, and a picture in out/demo.png
 # make test     all tests but the slow ones, and every benchmark on a tiny workload
 # make test-isa the tests with other instruction sets of NumPy, OpenBLAS and XLA (two runs)
-# make check    linter, formatter, types, floors and docs: what CI runs before the tests
+# make check    linter, formatter, types, layers of imports and docs: what CI runs before the tests
 # make docs     the API reference and the guides, as pages in out/site
 # make bench    benchmarks and their baselines, on an idle machine (10 minutes); the last lines compare them
 # make bench-check  ratios of speeds against their floors: 3 minutes, on an idle machine
@@ -23,7 +23,7 @@ ARGS :=
 # Sources of the native extensions. pip builds them with the rest; BUILD builds those that are older than their sources.
 NATIVE := setup.py batchpid/native/extensions.py batchpid/native/operations.py batchpid/native/task_space_extension.py \
 	batchpid/sim/engine/native/interface.py \
-	$(foreach room,batchpid/native batchpid/sim/engine/native,$(wildcard $(room)/*.cpp $(room)/*.h))
+	$(foreach folder,batchpid/native batchpid/sim/engine/native,$(wildcard $(folder)/*.cpp $(folder)/*.h))
 BUILD := $(RUN) -W ignore setup.py --quiet build_ext --inplace
 
 # Compiled modules are kept, whatever the caller's setting: the tests start hundreds of processes that import them.

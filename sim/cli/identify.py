@@ -47,7 +47,8 @@ class IdentifyCommand:
     no_payload: flags.Switch = False
     """The tool carries no payload."""
     evaluations: int = 25
-    """Largest number of evaluations of the fit; each simulates the robot and, for each unknown, a perturbed one."""
+    """Largest number of evaluations of the fit; each simulates the robot along the logs and, for each unknown,
+    a perturbed one, so that a minute of logs takes six times as long as ten seconds."""
     seed: int = 0
     """Seed of CMA-ES, which finds the start of the fit. The result does not depend on the number of workers."""
     workers: flags.Workers = None

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-AT_MOST = "{desc}: {n_fmt} of at most {total_fmt} evaluations, {elapsed}{postfix}"
-"""Format of a bar without remaining time, for work that usually ends long before the last step."""
+AT_MOST = "{desc}: {n_fmt} of at most {total_fmt} evaluations, {elapsed}, at most {remaining} more{postfix}"
+"""Format of a bar for work that usually ends long before the last step."""
 _bars: weakref.WeakSet[tqdm[Any]] = weakref.WeakSet()
 
 

@@ -41,7 +41,7 @@ _SHARPNESS = 4
 
 def excite(
     robot: Robot,
-    seconds: float = 10.0,
+    duration: float = 10.0,
     *,
     rate: float = 500.0,
     lowest: float = 0.15,
@@ -52,8 +52,8 @@ def excite(
 
     Parameters
     ----------
-    seconds
-        Duration [s].
+    duration
+        Duration of the motion [s].
     rate
         Rows per second [Hz].
     lowest, highest
@@ -66,11 +66,11 @@ def excite(
     InvalidArgumentError
         An argument is out of range, or the robot touches itself, or is too weak, near every pose.
     """
-    seconds, rate = number("seconds", seconds, 1.0, 3600.0, "s"), number("rate", rate, 20.0, 10_000.0, "Hz")
+    duration, rate = number("duration", duration, 1.0, 3600.0, "s"), number("rate", rate, 20.0, 10_000.0, "Hz")
     lowest = number("lowest", lowest, 0.01, 50.0, "Hz")
     highest = number("highest", highest, lowest, rate / 10, "Hz, at most a tenth of the rate")
     rng = np.random.default_rng(integer("seed", seed, 0, 2**31 - 1))
-    time = np.arange(1, round(seconds * rate) + 1) / rate
+    time = np.arange(1, round(duration * rate) + 1) / rate
     phase = rng.uniform(0, 2 * np.pi, robot.dof)
     best: tuple[float, Trajectory] | None = None
     for center in _centers(robot, rng):

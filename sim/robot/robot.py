@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike
 
 import batchpid as bp
@@ -308,6 +307,8 @@ def _file_actuators(mjcf: Mjcf, joints: tuple[Joint, ...]) -> bp.Actuators | Non
 
 
 def _read_settings(path: Path, joints: tuple[Joint, ...]) -> Settings:
+    import yaml  # here, so that `batchpid --help` does not load it
+
     data = yaml.safe_load(path.read_text())
     rows = [data["joints"][joint.name] for joint in joints]
     keys = ("start", "target", "kp", "ki", "kd")

@@ -45,6 +45,8 @@ class Parity(NamedTuple):
     """Largest difference of a position up to then, under equal efforts (ticks,); NaN if all envs began at limits."""
     chaos: Float64
     """The same between two runs in SAPIEN whose starts differ by one bit of a float32 (ticks,)."""
+    first_chaos: float
+    """``first_tick`` between these two runs."""
     moves: tuple[Evaluation, Evaluation]
     """Moves under the gains in each engine."""
     push: Float64 | None
@@ -130,7 +132,7 @@ def compare_engines(
     """
     drawn = random_moves(robot, moves, seed)
     mass_matrix, bias = _dynamics(robot, seed)
-    time, open_loop, chaos, first_tick = _open_loop(robot, random_moves(robot, ENVS, seed + 1).start, seed, workers)
+    time, open_loop, chaos, firsts = _open_loop(robot, random_moves(robot, ENVS, seed + 1).start, seed, workers)
     first, second = (
         evaluate_gains(
             robot, _params(robot, params), drawn, name=engine, seconds=seconds, engine=engine, workers=workers
@@ -138,7 +140,7 @@ def compare_engines(
         for engine in ENGINES
     )
     pushed = _push(robot, params, seed, workers)
-    return Parity(mass_matrix, bias, first_tick, time, open_loop, chaos, (first, second), pushed)
+    return Parity(mass_matrix, bias, firsts[0], time, open_loop, chaos, firsts[1], (first, second), pushed)
 
 
 def _params(robot: Robot, params: bp.PIDParams | None) -> bp.PIDParams:
@@ -166,8 +168,10 @@ def _relative(reference: NDArray[Any], other: NDArray[Any]) -> float:
     return float(np.abs(reference - other).max() / max(np.abs(reference).max(), 1e-300))
 
 
-def _open_loop(robot: Robot, start: Float64, seed: int, workers: int | None) -> tuple[Float64, Float64, Float64, float]:
-    """Return times, differences of the engines, and of two runs in SAPIEN; and the difference after one tick.
+def _open_loop(
+    robot: Robot, start: Float64, seed: int, workers: int | None
+) -> tuple[Float64, Float64, Float64, list[float]]:
+    """Return times, differences of the engines, and of two runs in SAPIEN; and both differences after one tick.
 
     The efforts give sinusoidal accelerations at the start poses. Once an env reaches a joint limit it is left out.
     """
@@ -193,7 +197,7 @@ def _open_loop(robot: Robot, start: Float64, seed: int, workers: int | None) -> 
     open_loop, chaos = (np.nan_to_num(each, nan=np.inf).astype(np.float64) for each in apart)
     if not free[0].any():
         open_loop = np.full_like(open_loop, np.nan)
-    return time, open_loop, chaos, _relative(runs[0].qvel[0], runs[1].qvel[0])
+    return time, open_loop, chaos, [_relative(runs[0].qvel[0], run.qvel[0]) for run in runs[1:]]
 
 
 def _next_float32(qpos: Float64) -> Float64:

@@ -68,7 +68,7 @@ class _Slot:
     lost_at: float = 0.0
     descriptor: int | None = None
     """Of the worker's results."""
-    poller: select.poll = field(default_factory=select.poll)
+    poller: select.poll = field(init=False)
     """Of the descriptor."""
 
 
@@ -101,12 +101,10 @@ class WorkerPool(SingleOwner):
             check_memory(options, num_envs, len(self._slices), self.is_local)
         self._replay: list[Request] = []
         self._slots: list[_Slot] = []
-        self._poller = select.poll()
         self._request: Request | None = None
-        self._next_check = 0.0
         self.closed = False
         """True if the running call is to end, and no other to begin."""
-        self.failure: Failure | None = None
+        self.failure: Failure | None
         """First failure of a loop in the last request."""
         self.recoveries = 0
         """Number of lost workers that were replaced."""
@@ -119,7 +117,7 @@ class WorkerPool(SingleOwner):
         """Input and output of each tick."""
         self.present = self.ticks[0]
         """The tick that holds the present observation."""
-        self.completed: list[Arrays] = []
+        self.completed: list[Arrays]
         """The ticks that all envs completed in the last request that observes."""
 
     def open(self) -> None:

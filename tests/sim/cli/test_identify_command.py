@@ -32,7 +32,7 @@ def make_log(folder, engine="sapien"):
     """Robot, a recording of it with a motor of 0.9 of its strength, and the params that drove it: files."""
     (folder / "pendulum.urdf").write_text(PENDULUM)
     robot = Robot.load(folder / "pendulum.urdf")
-    gains, motion = robot.designed("effort"), excite(robot, seconds=1.0, lowest=1.0, rate=200)
+    gains, motion = robot.designed("effort"), excite(robot, 1.0, lowest=1.0, rate=200)
     actuators = bp.make_actuators(robot.dof, strength=0.9)
     options = {"workers": 0, "substeps": 10, "compensate": "gravity+coriolis", "actuators": actuators, "engine": engine}
     with Runner(robot, 1, params=gains, **options) as runner:

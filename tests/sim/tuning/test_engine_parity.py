@@ -45,5 +45,6 @@ def test_a_joint_without_range_does_not_end_the_comparison(tmp_path):
     text = robot(*map(link, ("base", "arm", "tip")), joint("hinge", "base", "arm"), held)
     found = compare_engines(Robot.load(write(tmp_path, text)), moves=1, seconds=0.2, workers=0)
     assert found.open_loop[-1] > 0
+    assert 0 < found.first_chaos < 1e-3  # the scale of rounding, for first_tick
     at_limits = found._replace(open_loop=np.full_like(found.open_loop, np.nan))
     assert "NOTHING was compared" in " ".join(at_limits.verdict())

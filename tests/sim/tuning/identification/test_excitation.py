@@ -33,7 +33,7 @@ def test_the_file_reads_back_as_the_motion(panda):
     assert table[0, 0] == 0
 
 
-@pytest.mark.parametrize(("name", "value"), [("seconds", 0), ("rate", 1), ("highest", 0.01), ("seed", -1)])
+@pytest.mark.parametrize(("name", "value"), [("duration", 0), ("rate", 1), ("highest", 0.01), ("seed", -1)])
 def test_options_out_of_range_are_refused(panda, name, value):
     with pytest.raises(bp.InvalidArgumentError, match=name):
         excite(panda, **{name: value})

@@ -1,0 +1,301 @@
+"""The pool, with workers that answer, fail, die or are interrupted as a test says: no process and no physics."""
+
+from __future__ import annotations
+
+import gc
+import os
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from robots import load_bundled
+
+from batchpid.errors import ClosedError
+from batchpid.sim import RecoveryWarning, RunnerOptions
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.failure import Failure
+from batchpid.sim.workers.pool import WorkerPool
+from batchpid.sim.workers.requests import ReadPoses, Run, SetParams, Start
+from batchpid.sim.workers.worker import Worker, WorkerLost
+
+ROBOT = load_bundled("panda")
+PARAMS = ROBOT.params()
+N = 8
+
+
+def run(ticks=1):
+    return Run(ticks, 20, False, False, Command(None))
+
+
+def dies():
+    raise WorkerLost("worker 0 died")
+
+
+def interrupt():
+    raise KeyboardInterrupt
+
+
+class Stage:
+    """Calls of the workers (name, worker, ...), and acts for the next calls of a name by worker 0 of the pool."""
+
+    def __init__(self):
+        self.calls, self.acts, self.made = [], defaultdict(list), []
+
+    def next(self, name, *acts):
+        self.acts[name] += acts
+
+    def call(self, name, worker, *details):
+        self.calls.append((name, worker, *details))
+        return self.acts[name].pop(0)() if worker.index == 0 and self.acts[name] else None
+
+    def of(self, name, index=0):
+        """Return the details of the calls ``name`` of the workers with the number ``index``."""
+        return [
+            call[2] if len(call) == 3 else call[2:] for call in self.calls if call[0] == name and call[1].index == index
+        ]
+
+
+@pytest.fixture
+def stage(monkeypatch):
+    stage = Stage()
+
+    class Scripted(Worker):
+        def __init__(self, start, shared):
+            self.start, self.shared, self.index, self.ends = start, shared, start.index, os.pipe()
+            stage.made.append(self)
+
+        def open(self):
+            stage.call("open", self)
+            self._answer()
+
+        def send(self, request):
+            stage.call("send", self, request)
+            self._answer()
+
+        def _answer(self):
+            if stage.call("answer", self) is None:
+                os.write(self.ends[1], b".")
+
+        def receive(self):
+            result = stage.call("receive", self)
+            os.read(self.ends[0], 1)
+            return result or self.index
+
+        def close(self, patience):
+            stage.call("close", self, patience)
+
+        def successor(self):
+            return type(self)(self.start, self.shared)
+
+        def fileno(self):
+            return self.ends[0]
+
+        def check_alive(self, idle_limit, limit):
+            stage.call("check", self, idle_limit, limit)
+
+        def pin(self, core):
+            stage.call("pin", self, core)
+
+    monkeypatch.setattr("batchpid.sim.workers.pool.ProcessWorker", Scripted)
+    yield stage
+    for worker in stage.made:
+        for end in worker.ends:
+            os.close(end)
+
+
+def make_pool(workers=2, **options):
+    pool = WorkerPool(RunnerOptions(ROBOT, N, workers=workers, **options), PARAMS)
+    pool.open()
+    return pool
+
+
+def test_begin_sends_at_once_and_run_collects(stage):
+    pool, request = make_pool(), run()
+    pool.begin(request)
+    assert [stage.of("send", index) for index in (0, 1)] == [[request]] * 2
+    assert len(stage.of("receive")) == 1  # of the start
+    assert pool.run(request) == [0, 1]
+    assert [stage.of("send", index) for index in (0, 1)] == [[request]] * 2
+
+
+def test_the_last_tick_of_a_request_holds_the_present_observation(stage):
+    pool = make_pool()
+    pool.arrays.observation.qpos[:] = np.arange(len(pool.ticks))[:, None, None]
+    for ticks in (3, 1, 2):
+        pool.run(run(ticks))
+        assert len(pool.completed) == ticks
+        assert pool.present.observation.qpos[0, 0] == ticks - 1
+    pool.run(ReadPoses())  # observes nothing
+    assert pool.present.observation.qpos[0, 0] == 1
+
+
+def test_of_two_failures_the_earlier_counts_with_the_ticks_before_it(stage):
+    pool, failure = make_pool(), Failure(40, 0, 2, ValueError("late"))
+    stage.next("receive", lambda: failure)
+    results = pool.run(run(3))
+    assert results == [None, 1]
+    assert pool.failure is failure
+    assert len(pool.completed) == 2
+    stage.next("receive", lambda: failure)
+    pool.run(SetParams(PARAMS))  # of which no tick counts
+    assert pool.completed == []
+    pool.run(run())
+    assert pool.failure is None
+
+
+def test_a_failure_at_the_start_is_raised(stage):
+    stage.next("receive", lambda: Failure(0, 0, 0, ValueError("no such mesh")))
+    with pytest.raises(ValueError, match="no such mesh"):
+        make_pool()
+
+
+def test_a_lost_worker_is_given_what_the_others_have_done(stage):
+    pool, first, reading, second = make_pool(), run(), ReadPoses(), run(2)
+    for request in (first, reading):
+        pool.run(request)
+    stage.next("receive", dies)
+    assert pool.run(second) == [0, 1]
+    # Reading is not repeated.
+    assert stage.of("send") == [first, reading, second, first, second]
+    assert stage.of("send", 1) == [first, reading, second]
+    assert pool.recoveries == 1
+    assert "worker 0 died; replaced and replayed in 0." in pool.messages[RecoveryWarning]
+    assert stage.of("close") == [0.0]
+    pool.start_replay_from(third := SetParams(PARAMS))
+    stage.next("send", dies)
+    pool.run(fourth := run())
+    again = stage.of("send")[-2:]
+    assert isinstance(again[0], SetParams)
+    assert again[0] is not third  # which the caller may change
+    assert again[1] is fourth
+
+
+def test_a_worker_that_is_lost_again_and_again_is_given_up(stage):
+    pool = make_pool()
+    for times in (4, 4):  # fewer losses in each of two requests
+        stage.next("send", *[dies] * times)
+        pool.run(ReadPoses())
+    assert pool.recoveries == 2
+    stage.next("send", *[dies] * 5)
+    with pytest.raises(WorkerLost, match="lost 5 times"):
+        pool.run(ReadPoses())
+    assert len(stage.made) == 2 + 4 + 4 + 4
+
+
+def test_without_recovery_a_loss_is_an_error(stage):
+    pool = make_pool(recover=False)
+    stage.next("receive", dies)
+    with pytest.raises(WorkerLost, match=r"died.*recover=True"):
+        pool.run(run())
+    pool = make_pool(recover=False)
+    stage.next("receive", interrupt)
+    request = run()
+    with pytest.raises(KeyboardInterrupt):
+        pool.run(request)
+    with pytest.raises(WorkerLost, match=r"worker 0 was interrupted.*recover=True"):
+        pool.run(request)
+
+
+@pytest.mark.parametrize("moment", ["send", "receive"])
+def test_a_worker_with_half_a_message_is_replaced_by_the_next_call(stage, moment):
+    pool, request = make_pool(), run()
+    stage.next(moment, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        pool.run(request)
+    assert len(stage.made) == 2
+    assert pool.run(request) == [0, 1]
+    assert len(stage.made) == 3
+    assert pool.recoveries == 0  # it was not lost
+
+
+def test_a_worker_whose_replacement_was_interrupted_is_replaced_by_the_next_call(stage):
+    pool, request = make_pool(), run()
+    stage.next("answer", lambda: "none")
+    stage.next("check", dies)
+    stage.next("close", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        pool.run(request)
+    assert len(stage.made) == 2
+    assert pool.run(request) == [0, 1]
+    assert len(stage.made) == 3
+
+
+def test_a_silent_worker_is_checked_by_the_limits_of_its_request(stage):
+    pool, request = make_pool(timeout=5.0), Run(1, 20_000, False, False)
+    stage.next("answer", *[lambda: "none"] * 2)  # neither to the request, nor when its replacement starts
+    stage.next("check", lambda: None, dies, dies)
+    pool.run(request)
+    start = Start(0, slice(0, 4), RunnerOptions(ROBOT, N), PARAMS)
+    assert stage.of("check") == [(each.idle_limit, 5.0 + each.limit(N // 2)) for each in (request, request, start)]
+    assert pool.recoveries == 1
+
+
+def test_workers_are_pinned_and_so_are_their_successors(stage, monkeypatch):
+    monkeypatch.setattr(
+        "batchpid.sim.workers.pool.pinned_cores", lambda workers: [10 + core for core in range(workers)]
+    )
+    pool = make_pool()
+    stage.next("send", dies)
+    pool.run(run())
+    assert (stage.of("pin"), stage.of("pin", 1)) == ([10, 10], [11])
+
+
+def test_an_exception_of_a_signal_handler_is_raised(stage):
+    pool = make_pool()
+    stage.next("receive", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        pool.run(run())
+
+
+def test_idle_workers_are_waited_for_and_busy_ones_are_not(stage):
+    pool, request = make_pool(), run()
+    stage.next("receive", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        pool.run(request)
+    pool.close()
+    assert stage.of("close") == stage.of("close", 1) == [0.0]
+    pool = make_pool()
+    pool.close()
+    assert stage.of("close")[1:] == [5.0]
+    for call in (pool.begin, pool.run):
+        with pytest.raises(ClosedError):
+            call(run())
+    pool.close()
+    assert len(stage.of("close")) == 2
+
+
+def test_an_interrupt_while_workers_end_is_raised_when_they_have(stage):
+    pool = make_pool()
+    stage.next("close", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        pool.close()
+    assert (stage.of("close"), stage.of("close", 1)) == ([5.0, 0.0], [0.0])
+
+
+def test_the_shared_memory_ends_with_the_pool(stage):
+    pool = make_pool()
+    shared = stage.made[0].shared
+    pool.close()
+    with pytest.raises(OSError, match="Bad file"):
+        os.fstat(shared.fd)
+
+
+def test_a_pool_that_is_forgotten_ends_its_workers(stage):
+    make_pool()
+    gc.collect()
+    assert [stage.of("close", index) for index in (0, 1)] == [[5.0]] * 2
+
+
+@pytest.mark.parametrize("error", [None, OSError, WorkerLost])
+def test_a_call_during_which_another_thread_closes_the_pool_ends(stage, error):
+    pool = make_pool()
+
+    def close():
+        pool.close()
+        if error is not None:
+            raise error("the socket was closed")
+
+    stage.next("receive", close)
+    with pytest.raises(ClosedError) as info:
+        pool.run(run())
+    assert type(info.value.__cause__) is (type(None) if error is None else error)
