@@ -171,7 +171,7 @@ class GroupClearance:
         arrays: Arrays = {name: np.array(rows, np.uint64) for name, rows in addresses.items()}
         arrays |= tables | {name: np.zeros((robots, ways)) for name in ("moved", "rate")}
         arrays |= {"last": np.zeros((robots, dof + 7 * floats)), "open": np.zeros((robots, bodies), np.int8)}
-        arrays |= {"left": np.full((robots, pairs), -1.0, np.float32), "wait": np.ones(robots, np.int32)}
+        arrays |= {"left": np.zeros((robots, pairs), np.uint16), "wait": np.ones(robots, np.int32)}
         arrays |= {name: np.zeros(bodies, np.int32) for name in ("no_shapes", "some_types", "some_affinities")}
         arrays["age"] = np.full(robots, _NEVER, np.int32)
         self.arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
@@ -190,6 +190,11 @@ class GroupClearance:
             floats=floats,
             **{name: array.ctypes.data for name, array in self.arrays.items()},
         )
+
+    @property
+    def left(self) -> NDArray[np.float32]:
+        """Clearances that are proved (robots, pairs) [m]; 0 without a proof."""
+        return (self.arrays["left"].astype(np.uint32) << 16).view(np.float32)
 
     @property
     def address(self) -> int:

@@ -13,6 +13,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #include <limits>
 
 #pragma GCC visibility push(hidden)
@@ -42,7 +43,7 @@ struct Clearance {
   double const *travel;              // (2, dof): least and largest position at which the arms hold
   double *last;                      // (robots, dof), and 7 more for a floating base: positions after the last sim step
   double *moved;                     // (robots, ways): sum of |dq| since the last proof
-  float *left;                       // (robots, pairs): clearances [m], rounded down; -1 without a proof
+  std::uint16_t *left;               // (robots, pairs): clearances [m], as `shortened`; NOT_PROVED without a proof
   double *rate;                      // (robots, ways): largest arm over clearance [1/rad or 1/m]
   std::int32_t *wait;                // (robots,): 0 while all pairs are proved; otherwise sim steps to the next attempt
   std::int32_t *age;                 // (robots,): sim steps since the last proof
@@ -69,7 +70,24 @@ constexpr std::int32_t LEAST_STEPS = 16;  // that a proof lasts: pairs too near 
 // Shapes of which MuJoCo looks for contacts in a sim step.
 enum class Looked { NONE, SOME, ALL };
 
+constexpr std::uint16_t NOT_PROVED = 0;
+
 using Point = Vector<double>;
+
+// Return the first two bytes of a positive number in single precision, which is rounded down to three digits; of others
+// NOT_PROVED. There are many clearances to each robot.
+inline std::uint16_t shortened(double value) {
+  float const single = std::nextafter(static_cast<float>(value), -1.0f);
+  std::uint32_t bits = 0;
+  std::memcpy(&bits, &single, sizeof bits);
+  return single > 0.0f ? static_cast<std::uint16_t>(bits >> 16) : NOT_PROVED;
+}
+inline double widened(std::uint16_t value) {
+  std::uint32_t const bits = static_cast<std::uint32_t>(value) << 16;
+  float single = 0.0f;
+  std::memcpy(&single, &bits, sizeof bits);
+  return single;
+}
 
 // One shape of one robot.
 struct PlacedShape {
@@ -154,7 +172,7 @@ inline double distance_bound(PlacedShape const &a, PlacedShape const &b) {
 inline bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
   std::int64_t const ways = clearance.ways;
   double *moved = clearance.moved + row * ways, *rate = clearance.rate + row * ways;
-  float *left = clearance.left + row * clearance.number;
+  std::uint16_t *left = clearance.left + row * clearance.number;
   char *open = clearance.open + row * clearance.size;
   double const *places = clearance.places[row], *turns = clearance.turns[row];
   double const age = clearance.age[row];
@@ -165,11 +183,11 @@ inline bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
     std::int32_t const begin = clearance.begins[pair], end = clearance.begins[pair + 1];
     double const *arms = clearance.arms;
     std::int32_t const *arm_ways = clearance.arm_ways;
-    bool proved = left[pair] > 0.0f;
+    bool proved = left[pair] != NOT_PROVED;
     if (proved || retry) {
       double used = 0.0;
       for (std::int32_t k = begin; k < end; ++k) used += arms[k] * moved[arm_ways[k]];
-      double rest = left[pair] - used;
+      double rest = widened(left[pair]) - used;
       bool const anew = !proved || !(used < SHARE * rest);
       if (anew) {
         std::int64_t const a = clearance.pairs[2 * pair], b = clearance.pairs[2 * pair + 1];
@@ -177,17 +195,16 @@ inline bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
                               {clearance, b, places + 3 * b, turns + 9 * b}) - MARGIN;
       }
       bool const fades = anew && (!proved || age < LEAST_STEPS) && !(LEAST_STEPS * used < age * rest);
-      left[pair] = std::nextafter(static_cast<float>(rest), -1.0f);
-      proved = left[pair] > 0.0f && !fades;
+      left[pair] = fades ? NOT_PROVED : shortened(rest);
+      proved = left[pair] != NOT_PROVED;
     }
     if (proved) {
-      double const inverse = 1.0 / left[pair];
+      double const inverse = 1.0 / widened(left[pair]);
       for (std::int32_t k = begin; k < end; ++k) {
         double &most = rate[arm_ways[k]];
         most = std::max(most, arms[k] * inverse);
       }
     } else {
-      left[pair] = -1.0f;
       open[clearance.bodies[2 * pair]] = open[clearance.bodies[2 * pair + 1]] = 1;
       all = false;
     }
