@@ -25,6 +25,8 @@ _BEYOND = 0.01
 _NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _NEVER = 1 << 30
 """Age without a proof: NEVER in ``clearance.h``."""
+_MOST_NEAR = 16
+"""MOST_NEAR in ``clearance.h``."""
 _POINTERS = "body_geomnum", "body_contype", "body_conaffinity"
 _BEGINNING = 4096
 """Number of bytes at the start of ``mjModel`` that are searched for its options; ``mjModel`` is larger."""
@@ -173,6 +175,8 @@ class GroupClearance:
         arrays |= {"last": np.zeros((robots, dof + 7 * floats)), "open": np.zeros((robots, bodies), np.int8)}
         arrays |= {"left": np.zeros((robots, pairs), np.uint16), "wait": np.ones(robots, np.int32)}
         arrays |= {name: np.zeros(bodies, np.int32) for name in ("no_shapes", "some_types", "some_affinities")}
+        arrays["brief"] = np.zeros(robots, np.int8)
+        arrays["near"] = np.full((robots, _MOST_NEAR), -1, np.int32)
         arrays["age"] = np.full(robots, _NEVER, np.int32)
         self.arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         self._kept = models, data

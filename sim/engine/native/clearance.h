@@ -44,9 +44,11 @@ struct Clearance {
   double *last;                      // (robots, dof), and 7 more for a floating base: positions after the last sim step
   double *moved;                     // (robots, ways): sum of |dq| since the last proof
   std::uint16_t *left;               // (robots, pairs): clearances [m], as `shortened`; NOT_PROVED without a proof
-  double *rate;                      // (robots, ways): largest arm over clearance [1/rad or 1/m]
+  double *rate;                      // (robots, ways): largest arm over clearance of the other pairs [1/rad or 1/m]
   std::int32_t *wait;                // (robots,): 0 while all pairs are proved; otherwise sim steps to the next attempt
   std::int32_t *age;                 // (robots,): sim steps since the last proof
+  char *brief;                       // (robots,): whether the last proof did not last
+  std::int32_t *near;                // (robots, MOST_NEAR): pairs that are looked at one by one; -1 after the last
   char *open;                        // (robots, all bodies): whether a pair of the body is not proved
   std::int32_t const *const *shapes;  // (robots,): numbers of shapes of their bodies, body_geomnum in mjModel
   std::int32_t const *const *types, *const *affinities;  // (robots,): body_contype and body_conaffinity in mjModel
@@ -64,12 +66,14 @@ constexpr double TIGHT = 0.7;          // of the true distance, at which a bound
 constexpr int MOST_POINTS = 16;        // largest number of iterations of Gilbert's algorithm
 constexpr std::int32_t RETRY_STEPS = 50;  // between attempts to prove the pairs that are not
 constexpr std::int32_t NEVER = 1 << 30;   // age without a proof
-constexpr std::int32_t SPACING = 4;       // between proofs, each of which costs as much as collision detection
-constexpr std::int32_t LEAST_STEPS = 16;  // that a proof lasts: pairs too near for it are left to MuJoCo
+constexpr std::int32_t BRIEF = 1, PAUSE = 24; // after a proof that lasts for BRIEF steps there is no other for PAUSE
+constexpr std::int32_t LEAST_STEPS = 4;   // that a proof lasts: pairs too near for it are left to MuJoCo
 
 // Shapes of which MuJoCo looks for contacts in a sim step.
 enum class Looked { NONE, SOME, ALL };
 
+constexpr std::int32_t LONG_STEPS = 64;   // a proof that lasts as long needs no pairs looked at one by one
+constexpr int MOST_NEAR = 16;
 constexpr std::uint16_t NOT_PROVED = 0;
 
 using Point = Vector<double>;
@@ -167,26 +171,52 @@ inline double distance_bound(PlacedShape const &a, PlacedShape const &b) {
   return best;
 }
 
+// The pairs that use up their clearances first, by the share of it that the last proof has used.
+struct NearPairs {
+  double shares[MOST_NEAR];
+  std::int32_t pairs[MOST_NEAR];
+  int size = 0;
+
+  void add(std::int64_t pair, double share) {
+    if (size == MOST_NEAR && !(share > shares[MOST_NEAR - 1])) return;
+    int at = size < MOST_NEAR ? size++ : MOST_NEAR - 1;
+    for (; at > 0 && share > shares[at - 1]; --at) shares[at] = shares[at - 1], pairs[at] = pairs[at - 1];
+    shares[at] = share, pairs[at] = static_cast<std::int32_t>(pair);
+  }
+  // Write the pairs in order, and -1 after the last.
+  void write(std::int32_t *to) const {
+    std::copy(pairs, pairs + size, to);
+    std::sort(to, to + size);
+    std::fill(to + size, to + MOST_NEAR, -1);
+  }
+};
+
+// Return the part of the clearance of a pair that motions may have used.
+inline double used_by(Clearance const &clearance, std::int64_t pair, double const *moved) {
+  double used = 0.0;
+  for (std::int32_t k = clearance.begins[pair]; k < clearance.begins[pair + 1]; ++k) {
+    used += clearance.arms[k] * moved[clearance.arm_ways[k]];
+  }
+  return used;
+}
+
 // Recompute the clearances of one robot that are used up in part, and with `retry` those of the pairs that are not proved.
 // Return whether all pairs are.
 inline bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
   std::int64_t const ways = clearance.ways;
   double *moved = clearance.moved + row * ways, *rate = clearance.rate + row * ways;
   std::uint16_t *left = clearance.left + row * clearance.number;
+  std::int32_t *near = clearance.near + row * MOST_NEAR;
   char *open = clearance.open + row * clearance.size;
   double const *places = clearance.places[row], *turns = clearance.turns[row];
   double const age = clearance.age[row];
+  NearPairs first;
   bool all = true;
-  std::fill(rate, rate + ways, 0.0);
   std::fill(open, open + clearance.size, char{0});
   for (std::int64_t pair = 0; pair < clearance.number; ++pair) {
-    std::int32_t const begin = clearance.begins[pair], end = clearance.begins[pair + 1];
-    double const *arms = clearance.arms;
-    std::int32_t const *arm_ways = clearance.arm_ways;
     bool proved = left[pair] != NOT_PROVED;
     if (proved || retry) {
-      double used = 0.0;
-      for (std::int32_t k = begin; k < end; ++k) used += arms[k] * moved[arm_ways[k]];
+      double const used = used_by(clearance, pair, moved);
       double rest = widened(left[pair]) - used;
       bool const anew = !proved || !(used < SHARE * rest);
       if (anew) {
@@ -197,20 +227,41 @@ inline bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
       bool const fades = anew && (!proved || age < LEAST_STEPS) && !(LEAST_STEPS * used < age * rest);
       left[pair] = fades ? NOT_PROVED : shortened(rest);
       proved = left[pair] != NOT_PROVED;
+      if (proved && age < LONG_STEPS) first.add(pair, used / rest);
     }
-    if (proved) {
-      double const inverse = 1.0 / widened(left[pair]);
-      for (std::int32_t k = begin; k < end; ++k) {
-        double &most = rate[arm_ways[k]];
-        most = std::max(most, arms[k] * inverse);
-      }
-    } else {
+    if (!proved) {
       open[clearance.bodies[2 * pair]] = open[clearance.bodies[2 * pair + 1]] = 1;
       all = false;
     }
   }
+  first.write(near);
+  std::fill(rate, rate + ways, 0.0);
+  for (std::int64_t pair = 0, at = 0; pair < clearance.number; ++pair) {
+    if (at < first.size && near[at] == pair) {
+      ++at;
+    } else if (left[pair] != NOT_PROVED) {
+      double const inverse = 1.0 / widened(left[pair]);
+      for (std::int32_t k = clearance.begins[pair]; k < clearance.begins[pair + 1]; ++k) {
+        double &most = rate[clearance.arm_ways[k]];
+        most = std::max(most, clearance.arms[k] * inverse);
+      }
+    }
+  }
   std::fill(moved, moved + ways, 0.0);
   return all;
+}
+
+// Return whether the clearances of the proved pairs of one robot are not used up.
+inline bool is_proved(Clearance const &clearance, std::int64_t row) {
+  double const *moved = clearance.moved + row * clearance.ways, *rate = clearance.rate + row * clearance.ways;
+  double used = 0.0;
+  for (std::int64_t way = 0; way < clearance.ways; ++way) used += rate[way] * moved[way];
+  bool proved = used < 1.0;
+  std::int32_t const *near = clearance.near + row * MOST_NEAR;
+  for (int at = 0; proved && at < MOST_NEAR && near[at] >= 0; ++at) {
+    proved = used_by(clearance, near[at], moved) < widened(clearance.left[row * clearance.number + near[at]]);
+  }
+  return proved;
 }
 
 // Add the motion of a floating base to `moved`: its way, and an angle, from its position and quaternion (7,).
@@ -231,8 +282,7 @@ inline Looked looked_at(Clearance const &clearance, std::int64_t row, std::int64
                                   double const *qpos, std::int64_t const *qpos_at) {
   std::int64_t const ways = clearance.ways;
   double *last = clearance.last + row * (dof + (clearance.floats ? 7 : 0)), *moved = clearance.moved + row * ways;
-  double const *rate = clearance.rate + row * ways, *least = clearance.travel, *largest = least + dof;
-  double used = 0.0;
+  double const *least = clearance.travel, *largest = least + dof;
   bool inside = true;
   for (std::int64_t joint = 0; joint < dof; ++joint) {
     double const q = qpos[qpos_at[joint]];
@@ -242,12 +292,16 @@ inline Looked looked_at(Clearance const &clearance, std::int64_t row, std::int64
   }
   if (clearance.floats) add_base_motion(qpos, last + dof, moved + dof);
   if (!inside) return Looked::ALL;
-  for (std::int64_t way = 0; way < ways; ++way) used += rate[way] * moved[way];
   std::int32_t &wait = clearance.wait[row], &age = clearance.age[row];
   bool const retry = wait > 0 && --wait == 0;
   age = std::min(age + 1, NEVER);
-  if (!retry && age < SPACING && !(used < 1.0)) return Looked::ALL;
-  if (retry || !(used < 1.0)) {
+  if (!retry && age > BRIEF && age <= BRIEF + PAUSE && clearance.brief[row] != 0) return Looked::ALL;
+  if (retry || !is_proved(clearance, row)) {
+    if (!retry && age <= BRIEF) {
+      clearance.brief[row] = 1;
+      return Looked::ALL;
+    }
+    clearance.brief[row] = 0;
     clearance.kinematics(clearance.models[row], data);
     if (!prove(clearance, row, retry) && wait == 0) wait = RETRY_STEPS;
     age = 0;

@@ -60,7 +60,10 @@ class Clearance(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("kinematics", "models", "places", "turns")),
         *((name, ctypes.c_void_p) for name in ("kinds", "sizes", "radii", "hulls", "vertices")),
         *((name, ctypes.c_void_p) for name in ("pairs", "bodies", "arms", "arm_ways", "begins", "travel")),
-        *((name, ctypes.c_void_p) for name in ("last", "moved", "left", "rate", "wait", "age", "open")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("last", "moved", "left", "rate", "wait", "age", "brief", "near", "open")
+        ),
         *((name, ctypes.c_void_p) for name in ("shapes", "types", "affinities")),
         *((name, ctypes.c_void_p) for name in ("no_shapes", "some_types", "some_affinities")),
         *((name, ctypes.c_int64) for name in ("number", "ways", "size")),
