@@ -50,7 +50,7 @@ class RecoveryWarning(UserWarning):
     """A worker was lost and replaced."""
 
 
-@dataclass(eq=False)
+@dataclass
 class _Slot:
     """Worker, its env slice and its pending requests."""
 

@@ -163,6 +163,17 @@ def test_an_env_that_is_reset_after_a_fault_is_bit_identical_to_one_without():
     assert_identical(clean, again)
 
 
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_fault_is_not_reported_again_after_the_reset_of_its_env(workers):
+    with make(workers=workers) as runner, pytest.warns(FaultWarning, match="env 3"):  # of later ones there is none
+        for env in (3, 1):
+            bad = setpoints(1)[0]
+            bad[env, 4] = np.nan
+            runner.step(bad)
+            runner.reset(mask=np.arange(N) == env)
+        assert [fault.env for fault in runner.faults] == [3, 1]
+
+
 @pytest.mark.usefixtures("engine")
 def test_on_fault_reset_restarts_the_env_and_flags_one_tick():
     table = setpoints(10)
