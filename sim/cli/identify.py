@@ -86,6 +86,8 @@ class IdentifyCommand:
         picture = outputs.path("picture", self.picture or beside(out, "fit"), plots.FORMATS)
         history = outputs.history(out.with_suffix(".fit.json"), resume=self.resume)
         out.parent.mkdir(parents=True, exist_ok=True)
+        note = "first a search for the start of the fit, then the fit; both take longer the longer the logs are"
+        print(f"{robot.name}: {note}", flush=True)
         found = identify(
             robot,
             self.logs,

@@ -50,7 +50,7 @@ class RecoveryWarning(UserWarning):
     """A worker was lost and replaced."""
 
 
-@dataclass(eq=False)
+@dataclass
 class _Slot:
     """Worker, its env slice and its pending requests."""
 
@@ -59,13 +59,13 @@ class _Slot:
     queue: list[Request] = field(default_factory=list)
     phase: Literal["idle", "transfer", "waiting"] = "transfer"
     """Phase of the first request. An interrupt during a transfer leaves the worker unusable."""
-    limit: float = 0.0
+    limit: float = field(init=False)
     """Seconds that the first request may take, known after the first check."""
     result: Any = None
     failure: Failure | None = None
     losses: int = 0
     cause: str = ""
-    lost_at: float = 0.0
+    lost_at: float = field(init=False)
     descriptor: int | None = None
     """Of the worker's results."""
     poller: select.poll = field(init=False)
@@ -91,10 +91,8 @@ class WorkerPool(SingleOwner):
         self._slices = split_envs(num_envs, count, options.inseparable_envs)
         self._cores = pinned_cores(len(self._slices))
         widest, most_steps = max(envs.stop - envs.start for envs in self._slices), _MAX_STEPS
-        self.cluster: Cluster | None = None
-        """Machines whose pools execute the requests; None: this one's processes do."""
-        if options.cluster is not None:
-            self.cluster = cluster = Cluster(options, params, WorkerPool, self.messages)
+        if options.cluster is not None:  # the pools of its machines execute the requests
+            cluster = Cluster(options, params, WorkerPool, self.messages)
             self._slices, self._make_worker, self._cores = cluster.slices, partial(NodeWorker, cluster), []
             widest, most_steps = cluster.widest, NODE_STEPS
         else:
@@ -115,7 +113,7 @@ class WorkerPool(SingleOwner):
         """Input and output of a request (ticks, envs, ...)."""
         self.ticks = Ticks(self.arrays)
         """Input and output of each tick."""
-        self.present = self.ticks[0]
+        self.present: Arrays
         """The tick that holds the present observation."""
         self.completed: list[Arrays]
         """The ticks that all envs completed in the last request that observes."""

@@ -224,6 +224,15 @@ def test_errors_name_the_entry_of_the_command(arm):
         assert runner.rollout(np.ones((4, 3))).setpoint.shape == (4, N, 3)
 
 
+def test_a_fault_of_a_command_names_its_entry(arm):
+    bad = np.ones((N, 3))
+    bad[2, 1] = np.nan
+    with make(arm, Shapes(1), on_invalid_input="contain") as runner:
+        with pytest.warns(FaultWarning, match=r"env 2, entry 'number 1': the setpoint given for it is not finite"):
+            runner.step(bad)
+        assert [(fault.kind, fault.joint) for fault in runner.faults] == [("entry", "number 1")]
+
+
 @pytest.mark.parametrize(
     ("command", "problem"),
     [

@@ -48,7 +48,7 @@ def make_log(folder, engine="sapien"):
     [("sapien", 1), *(pytest.param(engine, 4, marks=pytest.mark.slow) for engine in ("sapien", "mujoco"))],
 )
 def test_motors_are_written_for_other_commands(batchpid, tmp_path, monkeypatch, engine, evaluations):
-    """From the motion in either engine, whose model the fit shares; the progress promises no remaining time, since a
+    """From the motion in either engine, whose model the fit shares; the progress gives the longest time to go, since a
     fit mostly ends long before its last evaluation. With one evaluation the search has few steps, too.
     """
     pytest.importorskip("mujoco.batch" if engine == "mujoco" else "sapien")
@@ -74,7 +74,7 @@ def test_motors_are_written_for_other_commands(batchpid, tmp_path, monkeypatch, 
     assert not out.with_suffix(".fit.json").exists()
     ((label, options),) = bars
     shown = tqdm.format_meter(8, 91, 63.0, prefix=label, postfix="error=0.1", **options)
-    assert shown == "identifying: 8 of at most 91 evaluations, 01:03, error=0.1"
+    assert shown == "identifying: 8 of at most 91 evaluations, 01:03, at most 10:53 more, error=0.1"
 
 
 def test_what_is_missing_is_named(batchpid, log, tmp_path):

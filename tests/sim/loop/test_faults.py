@@ -13,6 +13,8 @@ from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import FaultWarning, Runner
+from batchpid.sim.loop import faults
+from batchpid.sim.loop.control_step import Measured
 
 PANDA = load_bundled("panda")
 N = 6
@@ -163,6 +165,18 @@ def test_an_env_that_is_reset_after_a_fault_is_bit_identical_to_one_without():
     assert_identical(clean, again)
 
 
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_fault_is_not_reported_again_after_the_reset_of_its_env(workers):
+    with make(workers=workers) as runner:
+        for env in (3, 1):
+            bad = setpoints(1)[0]
+            bad[env, 4] = np.nan
+            runner.step(bad)
+            runner.reset(mask=np.arange(N) == env)
+        assert [fault.env for fault in runner.faults] == [3, 1]
+
+
 @pytest.mark.usefixtures("engine")
 def test_on_fault_reset_restarts_the_env_and_flags_one_tick():
     table = setpoints(10)
@@ -259,3 +273,19 @@ def test_a_state_that_is_finite_and_far_away_is_a_fault_at_the_same_step_for_eve
 def test_the_other_63_of_64_envs_are_bit_identical_in_many_cases():
     for case in range(6, CASES):
         check_random_fault(case)
+
+
+def test_quick_checks_pass_ordinary_states_and_no_failed_one():
+    beyond = [np.nextafter(faults.FARTHEST, np.inf), 1e8, 1e200, np.inf, -np.inf, np.nan]
+    assert faults.far(np.array([faults.FARTHEST, *beyond])).tolist() == [False] + [True] * len(beyond)
+    rest, limits = Measured(np.ones((2, 3)), np.ones((2, 3)), None), (None, 2.0)
+    assert faults.near(rest.qpos)
+    assert faults.finite(None, rest.qpos, rest.qvel)
+    assert all(faults.sound(rest, limit) for limit in limits)
+    for value in beyond:
+        bad = np.ones((2, 3))
+        bad[1, 2] = value
+        assert not faults.near(bad)
+        assert not any(faults.sound(rest._replace(qpos=bad), limit) for limit in limits)
+        assert not faults.sound(rest._replace(qvel=bad), 2.0)
+        assert faults.finite(rest.qpos, bad) == (value in beyond[:2])
