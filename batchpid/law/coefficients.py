@@ -1,4 +1,4 @@
-"""Coefficients of the law at one time step: with constant params, a loop computes them once."""
+"""Coefficients of the law at one time step. A loop with constant params computes them once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Coefficients(NamedTuple):
     kp: Any
     ki_dt: Any
     ki_dt2: Any
-    """ki dt^2 of the implicit law: weight of a setpoint rate that is given, in the integral."""
+    """ki dt^2 of the implicit law: weight in the integral of a given setpoint rate."""
     kd: Any
     per_dt: Any
     """1 / dt."""
@@ -34,10 +34,10 @@ class Coefficients(NamedTuple):
     b: Any
     c: Any
     c_given: Any
-    """c of a setpoint rate that is given, in the implicit law; off: c, or 1."""
+    """Weight c of a given setpoint rate in the implicit law; None: c, or 1."""
     deadband: Any
     tracking: Any
-    """dt / Tt, at most 1: a shorter Tt would correct by more than the whole excess, and oscillate."""
+    """dt / Tt, at most 1. Above 1, a step would correct more than the whole excess, and oscillate."""
     conditional: Any
     turns: Any
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
@@ -54,8 +54,8 @@ class Coefficients(NamedTuple):
 def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coefficients:
     """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.advance`.
 
-    With ``num_envs`` they are :func:`spread`. A dt that is not an array of JAX must be positive and finite, else
-    InvalidArgumentError is raised.
+    With ``num_envs`` they have the shape of :func:`spread`. Raises InvalidArgumentError unless dt is positive and
+    finite; an array of JAX is not checked.
     """
     dt = checked_dt(dt, params.dtype)
     c, c_given, implicit = params.setpoint_weight_derivative, None, params.discretization is not None
@@ -83,7 +83,7 @@ def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coeff
 
 
 def spread(k: Coefficients, num_envs: int) -> Coefficients:
-    """Return ``k`` with arrays (num_envs, joints), with which NumPy steps small batches twice as fast."""
+    """Return ``k`` with arrays of shape (num_envs, joints): NumPy then steps small batches twice as fast."""
     xp, dtype = namespace(*k), k.kp.dtype
     zeros, off = xp.zeros((num_envs, k.kp.shape[-1]), dtype), (type(None), tuple)
     return Coefficients(*(leaf if isinstance(leaf, off) else zeros + xp.asarray(leaf, dtype=dtype) for leaf in k))

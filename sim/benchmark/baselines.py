@@ -1,4 +1,4 @@
-"""Baselines of the benchmark that step an engine without a Runner, in worker processes."""
+"""Baselines of the benchmark, which step an engine in worker processes without a Runner."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from batchpid.sim.workers.placement import pinned_cores
 
 TUTORIALS = ("tutorial", "tutorial, a process a core")
 ENGINES = {
-    # case: (scenes to a PhysX system, whether all systems are stepped in turn, with collisions)
+    # case: (scenes per PhysX system, whether each sim step visits all systems in turn, with collisions)
     "drive, a scene a robot": (1, True, True),
     "bare engine, packs of 8": (8, True, True),
     "bare engine": (4, True, True),  # as in the Runner: the fastest of 1, 2, 4, 8 and 16
@@ -36,7 +36,7 @@ ENGINES = {
 
 
 def make_baselines(workload: Workload) -> dict[str, Case]:
-    """Return every baseline, by name. All run in one set of processes, each of which steps its share of the envs."""
+    """Return every baseline, by name. All use the same processes, each of which steps a share of the envs."""
     count = workload.processes
     bounds = [workload.num_envs * index // count for index in range(count + 1)]
     context, cores = multiprocessing.get_context("spawn"), pinned_cores(count)
@@ -83,8 +83,8 @@ def make_baselines(workload: Workload) -> dict[str, Case]:
 
 
 def _start(process: BaseProcess) -> None:
-    """Start a process that Ctrl-C does not reach; called in the background thread, where SIGINT is blocked."""
-    resource_tracker.ensure_running()  # the first start of a process does this, and unblocks SIGINT
+    """Start a process that ignores Ctrl-C; called in the background thread, where SIGINT is blocked."""
+    resource_tracker.ensure_running()  # otherwise the first start of a process does this, and unblocks SIGINT
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     process.start()
 
@@ -102,7 +102,7 @@ def single_threaded() -> Iterator[None]:
 
 
 def _serve(connection: Connection, workload: Workload, share: int) -> None:
-    """Reset to the start, and then run a round of, each case whose name comes; until the connection is closed."""
+    """Receive the names of cases: reset each case, then run a round of it, until the connection is closed."""
     cases: dict[str, TutorialLoop | _DriveLoop | _MujocoLoop] = {}
     drive_loop = _DriveLoop if workload.engine == "sapien" else _MujocoLoop
     gc.disable()
@@ -124,7 +124,7 @@ def _serve(connection: Connection, workload: Workload, share: int) -> None:
 
 
 class _DriveLoop:
-    """Scenes under PhysX's drive without control, and without gravity, so that the drive reaches the PID's place."""
+    """Scenes under PhysX's drive, without control. They have no gravity, so that it reaches the target, as the PID."""
 
     def __init__(self, name: str, workload: Workload, share: int) -> None:
         size, self._in_turn, collisions = ENGINES[name]
@@ -151,7 +151,7 @@ class _DriveLoop:
 
 
 class _MujocoLoop:
-    """The same robots in MuJoCo's ``mujoco.batch``, under its position actuators, all stepped by one call."""
+    """The same robots in ``mujoco.batch``, under MuJoCo's position actuators; one call steps all of them."""
 
     def __init__(self, name: str, workload: Workload, share: int) -> None:
         import mujoco.batch

@@ -1,8 +1,8 @@
-"""Speed of the runner and of its baselines in one run: ``batchpid bench`` and ``bench/`` are made of this.
+"""Speed of the runner and of its baselines in one run, for ``batchpid bench`` and ``bench/``.
 
-Every case moves the same robots from ``start`` to ``target`` with the tutorial's gains and, in SAPIEN, with its own
-friction and damping, so that the cases differ in the way of stepping and not in the motion. Baselines run in separate
-worker processes, as many as the runner has.
+Every case moves the same robots from ``start`` to ``target`` with the tutorial's gains and, in SAPIEN, with SAPIEN's
+friction and damping. So the cases differ in the way of stepping and not in the motion. Baselines run in separate worker
+processes, as many as the runner has.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from batchpid.sim.workers.shared_memory import SharedArrays
 CASES = {
     "tutorial": "the tutorial's loop as written: one robot, one process",
     "tutorial, a process a core": "the tutorial's loop, one robot in each of the processes",
-    "drive, a scene a robot": "internal drive, no control, one PhysX system to a robot, all stepped in turn",
-    "bare engine, packs of 8": "internal drive, no control, no gravity, 8 robots to a system, all stepped in turn",
-    "bare engine": "the same, 4 robots to a system, as the Runner packs them",
+    "drive, a scene a robot": "internal drive, no control, one PhysX system per robot, all stepped in turn",
+    "bare engine, packs of 8": "internal drive, no control, no gravity, 8 robots per system, all stepped in turn",
+    "bare engine": "the same, 4 robots per system, as the Runner packs them",
     "bare engine, pack by pack": "the same, each pack stepped for a tick while it is in the cache",
-    "bare engine, no shapes": "the same without collision shapes, 64 robots to a system, as the Runner packs those",
-    "closed loop, Python calls": "the closed loop without the native extension: the same as below, if there is none",
+    "bare engine, no shapes": "the same without collision shapes, 64 robots per system, as the Runner packs them then",
+    "closed loop, Python calls": "the closed loop without the native extension",
     "closed loop, tick by tick": "PID, gravity and Coriolis compensation at every sim step: Runner.step, tick by tick",
-    "closed loop": "the same by Runner.rollout: as all of the above, the workers never wait for each other",
-    "closed loop, policy network": "the same with a network of 64 x 64 units in the law, by NumPy: a Controller",
+    "closed loop": "the same by Runner.rollout: the workers never wait for each other",
+    "closed loop, policy network": "the same with a network of 64 x 64 units in the law, in NumPy: a Controller",
     "closed loop, no shapes": "the closed loop for free motion: Runner(collisions=False)",
     "closed loop, no shapes, free": "the same with physics 'free'",
 }
@@ -50,16 +50,16 @@ XLA_CASES = {
     "closed loop, policy network, XLA": "the same with a network of 64 x 64 units in the law",
     "closed loop, no shapes, free, XLA": "the closed loop in XLA without collision shapes, with physics 'free'",
 }
-"""Cases of the Runner that compile for some seconds first."""
+"""Cases of the Runner that first compile for some seconds."""
 IN_MUJOCO = {"closed loop, MuJoCo": "the closed loop in the other engine: Runner(engine='mujoco')"}
-"""Case of the Runner beside those in SAPIEN."""
+"""Case of the Runner in MuJoCo, in a benchmark of SAPIEN."""
 MUJOCO = {
     "bare engine": "mujoco.batch: its position actuators, no control, no gravity, all robots stepped in one call",
 }
-"""Baselines of the engine "mujoco", in addition to the tutorial's loop in SAPIEN."""
+"""Baselines of a benchmark of MuJoCo, besides the tutorial's loop in SAPIEN."""
 OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"
 PHASES = {
-    # phase of a sim step: the calls on the pack that it consists of
+    # phase of a sim step: methods of the pack that it calls
     "read": ("read_qpos", "read_qvel"),
     "passive": ("passive_force",),
     "write": ("write_qf",),
@@ -69,8 +69,8 @@ PHASES = {
 
 @dataclass(frozen=True)
 class Result:
-    """Figures of one case: env-steps per second of every round, the final positions of the first env (dof,), and the
-    number of processes that stepped.
+    """Figures of one case: env-steps per second of every round, final positions of the first env (dof,), and number of
+    stepping processes.
     """
 
     rates: tuple[float, ...]
@@ -83,12 +83,12 @@ class Result:
         return statistics.median(self.rates)
 
     def over(self, other: Result) -> float:
-        """Return the median over the rounds, which are paired, of our rate over the other's."""
+        """Return this rate divided by the other's: the median of the ratios within each round."""
         return statistics.median(ours / theirs for ours, theirs in zip(self.rates, other.rates, strict=True))
 
 
 def cases_in(engine: str = "sapien", xla: bool = False, mujoco: bool = False) -> dict[str, str]:
-    """Return the descriptions of the cases in ``engine``, by name, with those in XLA and in MuJoCo if asked."""
+    """Return the descriptions of the cases in ``engine``, by name; ``xla`` and ``mujoco`` add those cases."""
     named = CASES | (XLA_CASES if xla else {})
     if engine == "sapien":
         return named | (IN_MUJOCO if mujoco else {})
@@ -97,7 +97,7 @@ def cases_in(engine: str = "sapien", xla: bool = False, mujoco: bool = False) ->
 
 
 def make_closed_loops(workload: Workload, names: Collection[str] = tuple(CASES)) -> dict[str, Case]:
-    """Return those cases of the Runner that are among ``names``; a case by ticks shares the runner of the rollouts."""
+    """Return the cases of the Runner among ``names``. The case tick by tick uses the runner of the rollouts."""
     target, ticks, shared = workload.target, workload.ticks, dict[str, Runner]()
 
     def runner(name: str) -> Runner:
@@ -151,8 +151,8 @@ def measure_rates(
     """Measure the cases ``names`` and ``peers`` ``workload.rounds`` times in turn, so that their rounds are paired.
 
     ``names`` are among CASES, XLA_CASES and IN_MUJOCO. ``progress`` is called with the case's name before every round.
-    Raises BatchPIDError where the robots of a case did not move or ended elsewhere, and MissingDependencyError where
-    the package of a peer is not installed.
+    Raises BatchPIDError if the robots of a case did not move or ended far from the target, and MissingDependencyError
+    if the package of a peer is not installed.
     """
     with ExitStack() as stack:
         cases = make_peers(workload, peers) | make_baselines(workload) | make_closed_loops(workload, names)
@@ -179,10 +179,10 @@ def measure_rates(
 def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, float]:
     """Return the microseconds per env step that each phase of the closed loop takes in a worker.
 
-    Measured in this process with a worker's share of the envs, and in NumPy, with native calls into the engine if
-    available: in a native tick the phases cannot be separated. "control" is everything but calls on the engine, of
-    which a native tick takes a fraction. The time of the clock calls is included: about one percent. "waiting" is the
-    mean time of a tick of :meth:`Runner.step` beyond the work of a worker.
+    Measured in this process with a worker's share of the envs. The control step runs in NumPy, with native calls into
+    the engine if available, because the phases of a native tick cannot be separated. "control" is everything except
+    calls into the engine; it takes a fraction of that time in a native tick. The clock calls add about one percent.
+    "waiting" is the mean time of a tick of :meth:`Runner.step` beyond the work of a worker.
     """
     share = max(1, workload.num_envs // workload.processes)
     robot = workload.simulated_robot
@@ -207,7 +207,7 @@ def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, flo
 
 
 def _time_calls(pack: EnginePack, spent: dict[str, float]) -> None:
-    """Replace the calls of each phase on ``pack`` by ones that add their seconds to ``spent``."""
+    """Replace the methods of each phase of ``pack`` by ones that add their seconds to ``spent``."""
 
     def timed(phase: str, call: Callable[..., Any]) -> Callable[..., Any]:
         def run(*args: Any) -> Any:
@@ -224,7 +224,7 @@ def _time_calls(pack: EnginePack, spent: dict[str, float]) -> None:
 
 
 def _waiting(workload: Workload, collisions: bool) -> float:
-    """Return the mean seconds per env step between the end of a worker's work and the next tick."""
+    """Return the mean seconds per env step of a tick beyond the work of a worker."""
     with workload.runner(collisions=collisions) as runner:
         runner.step(workload.target)
         idle = 0.0

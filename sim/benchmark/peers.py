@@ -1,6 +1,6 @@
 """Third-party baselines of the benchmark: MuJoCo, Gymnasium.
 
-Each needs a package that nothing else here needs: the extra ``peers``.
+Their packages are in the extra ``peers``.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ class Peer(NamedTuple):
 
 
 def _async_vector(workload: Workload, count: int) -> Case:
-    """Return Gymnasium's AsyncVectorEnv around the tutorial's loop, with a process for each of ``count`` envs."""
+    """Return Gymnasium's AsyncVectorEnv around the tutorial's loop, with one process for each of ``count`` envs."""
     import gymnasium
 
-    # Processes are forked from one that has loaded all packages; otherwise many would take a minute to start.
+    # Fork the processes from one that has loaded all packages; otherwise many of them would take a minute to start.
     multiprocessing.set_forkserver_preload([__name__, "gymnasium", "sapien.wrapper.urdf_loader"])
     make_envs = [lambda: _tutorial_env(workload)] * count
     with single_threaded():
@@ -48,7 +48,7 @@ def _async_vector(workload: Workload, count: int) -> Case:
 
 
 def _tutorial_env(workload: Workload) -> Any:
-    """Return the tutorial's loop as an env: the action is the target, one step is ``workload.substeps`` sim steps."""
+    """Return the tutorial's loop as an env. The action is the target; a step is ``workload.substeps`` sim steps."""
     import gymnasium
 
     class TutorialEnv(gymnasium.Env):
@@ -71,11 +71,11 @@ def _tutorial_env(workload: Workload) -> Any:
 
 
 def _mujoco_batch(workload: Workload) -> Case:
-    """Return ``mujoco.batch`` on the same URDF, with a thread for each worker.
+    """Return ``mujoco.batch`` on the same URDF, with one thread for each worker.
 
-    Joints are driven by its actuator ``pid`` with the same kp, ki and kd. Gravity is compensated body by body, and the
-    sum of both stays within the URDF's effort limits. There is a ground. Solver and integrator are MuJoCo's: Newton,
-    and "implicitfast", which its documentation recommends.
+    MuJoCo's actuator ``pid`` drives the joints with the same kp, ki and kd. Gravity is compensated body by body. The
+    sum of both stays within the URDF's effort limits. The scene has a ground. The solver is Newton, and the integrator
+    "implicitfast", which MuJoCo's documentation recommends.
     """
     import mujoco
     import mujoco.batch
@@ -88,7 +88,7 @@ def _mujoco_batch(workload: Workload) -> Case:
     for body in spec.bodies:
         body.gravcomp = 1
     for joint in spec.joints:
-        joint.actgravcomp = True  # counts within the effort limits, which MuJoCo reads from the URDF
+        joint.actgravcomp = True  # the effort limits, which MuJoCo reads from the URDF, include it
     for name, kp, ki, kd in zip(robot.joint_names, settings.kp, settings.ki, settings.kd, strict=True):
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_pid(kp=kp, ki=ki, kv=kd, ctrlspec=mujoco.mjtCtrlInput.mjINPUT_POS)
@@ -112,17 +112,17 @@ def _mujoco_batch(workload: Workload) -> Case:
 
 PEERS = {
     "gymnasium, an env a core": Peer(
-        "AsyncVectorEnv around the tutorial's loop, one env for each core",
+        "AsyncVectorEnv around the tutorial's loop, one env per core",
         "gymnasium",
         lambda workload: _async_vector(workload, workload.processes),
     ),
     "gymnasium, all envs": Peer(
-        "the same, all envs at once, a process to each",
+        "the same with all envs, one process per env",
         "gymnasium",
         lambda workload: _async_vector(workload, workload.num_envs),
     ),
     "mujoco": Peer(
-        "mujoco.batch on the same URDF, a thread a core: its PID actuators, gravity compensation and solver",
+        "mujoco.batch on the same URDF, one thread per core: its PID actuators, gravity compensation and solver",
         "mujoco",
         _mujoco_batch,
     ),

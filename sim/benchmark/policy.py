@@ -1,4 +1,4 @@
-"""Controller of the caller's own for the benchmark: a policy network that is evaluated at every sim step."""
+"""User-defined controller for the benchmark: a policy network that is evaluated at every sim step."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ RESIDUAL = 0.01
 
 
 class ResidualPolicy:
-    """PD law with the tutorial's gains plus a residual by a network with two hidden layers of random weights.
+    """PD law from the tutorial's gains, plus the output of a network with two hidden layers of random weights.
 
-    It is for NumPy and JAX. The residual is small, so that the robots move as in the other cases: the network costs the
-    same as a trained one.
+    It works with NumPy and JAX. The output is small, so that the robots move as in the other cases. The network takes
+    the same time as a trained one.
     """
 
     def __init__(self, robot: Robot) -> None:
         settings, rng, dof = tutorial_settings(robot), np.random.default_rng(0), robot.dof
-        self._kp, self._kd = 2 * settings.kp, settings.kd  # it lacks the integral
+        self._kp, self._kd = 2 * settings.kp, settings.kd  # twice kp, because there is no integral
         self._scale = (RESIDUAL * robot.effort_limit).astype(np.float32)
         sizes = (3 * dof, HIDDEN, HIDDEN, dof)
         self._layers = [rng.normal(0, n**-0.5, (n, m)).astype(np.float32) for n, m in pairwise(sizes)]

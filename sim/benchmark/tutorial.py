@@ -1,7 +1,7 @@
-"""SAPIEN's tutorial "Drive Robot with PID Controller", as written: oracle of the tests, baseline of the benchmark.
+"""SAPIEN's tutorial "Drive Robot with PID Controller", as written: reference of tests, baseline of the benchmark.
 
-One robot in one scene, one Python object per joint, one call after another. Only the parts that need a display are left
-out. The objects are SAPIEN's, with its default settings; the Runner uses none of this.
+It has one robot in one scene, one Python object per joint, and one call after another. Only the parts that need a
+display are left out. The objects are SAPIEN's, with its default settings. The Runner does not use this module.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def tutorial_settings(robot: Robot) -> Settings:
 class TutorialLoop:
     """Scene and loop of the tutorial for one bundled robot, with SAPIEN's default friction and damping.
 
-    ``external_pid`` and ``internal_drive`` are the tutorial's two switches; ``target`` and ``start`` (dof,) [rad or m],
-    the start by default the robot's own.
+    ``external_pid`` and ``internal_drive`` are the tutorial's two switches. ``target`` and ``start`` are (dof,) [rad or
+    m]; by default the start is the one in the robot's settings.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class TutorialLoop:
                 joint.set_drive_target(position)
 
     def reset(self) -> None:
-        """Put the robot at the start, at rest, with new PID objects."""
+        """Put the robot at rest at the start, with new PID objects."""
         self.robot.set_qpos(self._start)
         self.robot.set_qvel(np.zeros_like(self._start))
         self.pids = [SimplePID(*gains) for gains in self._gains]

@@ -1,4 +1,4 @@
-"""Workload of the benchmark: the robots and the motion that every case steps, and the interface of a case."""
+"""Workload of the benchmark: robots and motion, the same in every case; and the interface of a case."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from batchpid.sim.runner import Runner
 from batchpid.sim.runner_keywords import EngineName, PhysicsPreset
 
 TIMESTEP = 1 / 2000
-"""Of simulation and control [s]."""
+"""Time step of simulation and control [s]."""
 DISTANCE = 0.3
 """Distance of the start from the target, per joint [rad]."""
 MOVED = 0.01
-"""Least motion of each of these joints in a round [rad]; SAPIEN's joint friction holds some of them back."""
+"""Least motion in a round of each joint that starts away from its target [rad]: SAPIEN's friction slows some."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Workload:
 
     @property
     def start(self) -> Float64:
-        """Start of every case (dof,) [rad or m]: ``DISTANCE`` below the target on the joints that have the room."""
+        """Start of every case (dof,) [rad or m]: ``DISTANCE`` below the target, on joints whose limits allow it."""
         away = self.target - DISTANCE
         roomy = (self.robot.upper - self.robot.lower > 1.0) & (away > self.robot.lower)
         return np.where(roomy, away, self.target)
@@ -70,7 +70,7 @@ class Workload:
 
     @property
     def processes(self) -> int:
-        """Number of processes that step: the workers, or this process."""
+        """Number of stepping processes: the workers, or this process."""
         return max(self.workers, 1)
 
     @property
@@ -79,7 +79,7 @@ class Workload:
         return Robot.load(self.robot.path, dissipation="sapien" if self.engine == "sapien" else "urdf")
 
     def scene(self, gravity: bool, collisions: bool = True) -> SceneSpec:
-        """Return the scene of every case; without gravity a drive needs no compensation to reach the same place."""
+        """Return the scene of every case. Without gravity a drive reaches the target without compensation."""
         robot, physics = self.simulated_robot, load_engine(self.engine).physics[self.physics]
         options: dict[str, Any] = {"dissipation": robot.dissipation, "collisions": collisions, "ground": collisions}
         options["engine"] = self.engine
@@ -113,9 +113,9 @@ class Case(NamedTuple):
     run: Callable[[], NDArray[Any]]
     """Steps one round; returns the final positions of the first env (dof,) [rad or m]."""
     close: Callable[[], None]
-    """Frees processes and scenes; may be called again."""
+    """Ends processes and frees scenes; may be called again."""
     processes: int
-    """Processes, or threads, that step."""
+    """Number of stepping processes, or threads."""
 
 
 def run_round(case: Case) -> tuple[float, Float64]:

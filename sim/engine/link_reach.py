@@ -1,4 +1,4 @@
-"""Bounds of the motion of a robot's links per unit of motion of its joints, which hold at every pose."""
+"""Upper bounds, at any pose, of the motion of a robot's links per unit of motion of its joints."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class LinkExtent(NamedTuple):
     """Size of a link, and how the joint above it moves it."""
 
     parent: int | None
-    """Number of the parent link; None for the root."""
+    """Index of the parent link; None for the root."""
     dof: int | None
-    """Number of the joint above it; None if that joint is fixed."""
+    """Index of the joint above it; None if that joint is fixed."""
     slides: bool
     """True if that joint is prismatic."""
     in_parent: Float64
@@ -29,14 +29,14 @@ class LinkExtent(NamedTuple):
     balls: Float64
     """Balls that cover its shapes (balls, 4): centers in its frame, and radii [m]."""
     free: bool = False
-    """True if that joint leaves it free to move: joint ``dof`` is its way, and ``dof`` + 1 its angle about any axis."""
+    """True for a floating base: column ``dof`` is its displacement, and ``dof`` + 1 its rotation about any axis."""
 
 
 def link_reach(links: Sequence[LinkExtent], dof: int) -> Float64:
     """Return upper bounds of the speeds of the links' shapes per unit of each joint's speed (links, dof).
 
-    That is the largest distance of the shapes from the joint's axis [m], 1 for a sliding joint, and 0 for a joint that
-    does not move the link. ``links`` has parents first.
+    The bound is the largest distance of the shapes from the joint's axis [m], 1 for a sliding joint, and 0 for a joint
+    that does not move the link. In ``links`` parents come before their children.
     """
     reach = np.zeros((len(links), dof))
     for row, link in zip(reach, links, strict=True):
@@ -45,9 +45,9 @@ def link_reach(links: Sequence[LinkExtent], dof: int) -> Float64:
 
 
 def closing_arms(first: Float64, second: Float64) -> NDArray[Any]:
-    """Return the largest closing speed of two links per unit of each joint's speed, from their reach (..., dof).
+    """Return upper bounds of the closing speed of two links per unit speed of each joint, from their reach (..., dof).
 
-    A joint above both links does not change their distance.
+    A joint above both links does not change their distance, so its bound is 0.
     """
     return np.where((first > 0) != (second > 0), first + second, 0.0)
 
@@ -55,8 +55,9 @@ def closing_arms(first: Float64, second: Float64) -> NDArray[Any]:
 def _add_reach(reach: Float64, link: LinkExtent, links: Sequence[LinkExtent]) -> None:
     """Write into ``reach`` (dof,) the largest distance of the shapes of ``link`` from the axis of each joint above it.
 
-    It holds at all positions of the joints between: a ball that turns about an axis stays within a larger ball, whose
-    center is on the axis. A second bound is the sum of the distances along the chain; the smaller one counts.
+    It is the largest for all positions of the joints between. One bound comes from balls: a ball that turns about an
+    axis stays within a larger ball with its center on the axis. Another bound is the sum of the distances along the
+    chain. The smaller one is used.
     """
     centers, radii, at = link.balls[:, :3], link.balls[:, 3], link
     farthest = (np.linalg.norm(centers, axis=1) + radii).max(initial=0.0)

@@ -1,4 +1,4 @@
-"""Way in which law and sim steps are run, by the options of a runner."""
+"""How law and sim steps run under the options of a runner: in native code, XLA or NumPy, and why."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 
 def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
-    """Return why the sim steps of a tick cannot be one program of XLA, under backend "jax"; or nothing."""
+    """Return why backend "jax" cannot run the sim steps of a tick as one program of XLA; "" if it can."""
     if options.robot.coupling is not None:
         return "coupled joints take constraint efforts of NumPy"
     if options.randomization is not None or actuators is not None or options.robot.actuators is not None:
@@ -29,12 +29,12 @@ def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
 
 
 def _engine_obstacle(engine: Engine) -> str:
-    """Return why the engine has no native steps, or nothing."""
+    """Return why the engine has no native sim steps; "" if it has."""
     return "" if "compiled_steps" in engine.capabilities else f"the sim steps of {engine.name!r} are calls of Python"
 
 
 def _force_obstacle(engine: Engine, options: RunnerOptions) -> str:
-    """Return why the engine's native steps do not read the passive force, or nothing."""
+    """Return why the engine's native sim steps do not read the passive force; "" if they do."""
     if "gravity" in options.compensate and "partial_force" not in engine.capabilities:
         if not options.robot.fixed_base:
             return f"{engine.title} needs NumPy for the passive force of a floating base"
@@ -44,7 +44,7 @@ def _force_obstacle(engine: Engine, options: RunnerOptions) -> str:
 
 
 def native_obstacle(options: RunnerOptions) -> str:
-    """Return why the sim steps of a tick cannot be one native call, without XLA; or nothing."""
+    """Return why the sim steps of a tick cannot be one native call, without XLA; "" if they can."""
     control = options.control
     if isinstance(control, OperationalSpace):
         if not control.is_native:
@@ -57,7 +57,7 @@ def native_obstacle(options: RunnerOptions) -> str:
 
 
 def describe(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
-    """Return the library of the law, and the kind of the calls into the engine, with reasons."""
+    """Describe the library of the law, and the calls into the engine, with reasons."""
     engine = options.load_engine().title
     calls = native.status().describe(engine)
     drives = options.control == "drive"

@@ -1,12 +1,11 @@
-"""Sim steps of a tick in native code: control step and engine in one call of the extension for all of them.
+"""Sim steps of a tick in native code: one call of the extension runs control step and engine for all of them.
 
 :func:`batchpid.sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on
-arrays that hold the state from step to step. Before and after it, native code updates the inertia of the friction model
-and the constraint of coupled joints, writes the targets of drives, and computes the passive force of the model where
-the engine's steps read another one. Sensors have another program; Python draws their noise in advance, for 64 sim steps
-at once. Operational-space control is a native call before the program, which takes its effort as an input. With a
-controller of Python, or more joints than a program sums, the control step runs in NumPy, and one native call applies
-the efforts, steps the engine and reads it.
+arrays that hold the state between steps. Before and after it, native code updates the inertia of the friction model and
+the constraint of coupled joints, and writes the targets of drives. It also computes the passive force, if the law needs
+another one than the engine's. Sensors have a separate program; Python draws their noise for 64 sim steps at once.
+Operational-space control is a native call before the program, which takes its effort as an input. With a controller in
+Python, or too many joints, the control step runs in NumPy, and one native call applies efforts, steps and reads.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from batchpid.sim.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 LOOK = 1 << STATUS.index("not_finite") | 1 << STATUS.index("too_fast")
-"""Bits of the status of a sim step after which an env may have failed."""
+"""Bits of a sim step's status that report a possible failure of an env."""
 
 
 class NativeExecutor(NumPyExecutor):
@@ -75,7 +74,7 @@ class NativeExecutor(NumPyExecutor):
         return Ran(program.state, program.outputs, measured, program.before, done, bool(status & LOOK))
 
     def quiet_ticks(self, state: StepState, command: Command, arrays: Arrays, shown: Shown) -> QuietTicks | None:
-        """Return the ticks under commands like ``command`` in one call; None where each tick needs Python."""
+        """Return ticks in one call, for commands with the entries of ``command``; None if each tick needs Python."""
         layout = self._layout
         is_whole = self._compiles and self._reads_qvel and not layout.measures
         if not (is_whole and layout.control in ("pid", "effort")):
@@ -85,7 +84,7 @@ class NativeExecutor(NumPyExecutor):
     def run_ticks(
         self, ticks: QuietTicks, state: StepState, measured: Measured, first: int, until: int, steps: int
     ) -> Stopped:
-        """Run ticks of ``steps`` sim steps from ``first`` to ``until``, or until something needs attention."""
+        """Run ticks of ``steps`` sim steps from ``first`` to ``until``, or until an event needs Python."""
         program = ticks.program
         program.load(state, measured, None)
         tick, done, status = ticks.run(self._prepared(), first, until, steps)
@@ -154,5 +153,5 @@ def _is_native(controller: Any) -> bool:
 
 
 def is_compiled(constants: Constants, dof: int) -> bool:
-    """Return whether the control step can be a program: in float64, of few joints."""
+    """Return whether the control step can be a program: in float64, with at most MOST_SUMMED joints."""
     return dof <= MOST_SUMMED and all(leaf.dtype != np.float32 for leaf in leaves(constants))

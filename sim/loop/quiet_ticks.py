@@ -1,4 +1,4 @@
-"""Ticks of a group of envs in one native call, as long as nothing happens that Python has to handle."""
+"""Ticks of a group of envs in one native call, as long as no event needs Python."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from batchpid.sim.loop.tick_program import TickProgram
 
 
 class Shown(NamedTuple):
-    """Further arrays of a group's observations, besides positions and velocities; always the same ones.
+    """Arrays of a group's observation besides positions and velocities, the same arrays in every tick.
 
     Effort, saturated and guarded joints of the last tick (envs, dof), and the last fault of each env (envs,).
     """
@@ -28,7 +28,7 @@ class Shown(NamedTuple):
 class QuietTicks:
     """Ticks of ``program`` with commands and observations in ``arrays`` (ticks, envs, ...), and in ``shown``.
 
-    They can be run under control "pid" or "effort", without sensors, while no env is suspended.
+    Possible under control "pid" or "effort", without sensors, while no env is suspended.
     """
 
     def __init__(self, program: TickProgram, arrays: Arrays, shown: Shown) -> None:

@@ -1,20 +1,20 @@
-r"""Black-box search for gains on the real scenes: CMA-ES from the designed gains, in log space.
+r"""Black-box search for gains by simulation: CMA-ES from the designed gains, in log space.
 
-Each env runs one move of one candidate, so a generation is one rollout. The moves touch nothing, so the robots have no
-collision shapes in the search. A share of the effort limits is reserved for moves that are harder than those searched;
+Each env runs one move of one candidate, so a generation is one rollout. The moves are free of contact, so the robots
+have no collision shapes in the search. A share of the effort limits is a reserve for harder moves.
 :mod:`batchpid.sim.tuning.candidates` defines the cost. The search itself is the package ``cmaes`` (N. Hansen, "The CMA
 evolution strategy: a tutorial", arXiv:1604.00772).
 
-Gains for robots that differ from the model, by actuators or a randomization, lie farther from the designed ones. For
-them the first generation consists of the designs of :mod:`batchpid.sim.tuning.first_candidates`, and CMA-ES starts from
-the best of them.
+Good gains for robots that differ from the model, by actuators or a randomization, are farther from the designed ones.
+For such robots the first generation consists of the designs of :mod:`batchpid.sim.tuning.first_candidates`, and CMA-ES
+starts from the best of them.
 
-The best candidates and the designed gains then run a final round on more moves, with collisions, under the caller's
-solver, at the full effort limits, because gains that are best on the few moves of the search need not be best on
-others. The gains with the lowest cost there are the result.
+Gains that are best on the few moves of the search need not be best on others. So the best candidates and the designed
+gains run a final round on more moves, with collisions, with the caller's solver, at the full effort limits. The gains
+with the lowest cost there are the result.
 
-A search is a function of its seed and does not depend on the number of workers. To resume, a fresh search of the same
-seed is given the costs in the history, and continues as if it had never stopped.
+The result of a search depends on its seed and not on the number of workers. To resume, a new search with the same seed
+takes the costs of known generations from the history, and continues as if it had never stopped.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ from batchpid.sim.workers.contact_log import MissedContactWarning
 INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
 VARIED_MOVES = 20
-"""Random moves of the search for robots that differ from the model."""
+"""Number of random moves in the search for robots that differ from the model."""
 FINALISTS, FINAL_MOVES = 3, 24
-"""Candidates of the final, besides the designed gains, and its moves."""
+"""Number of candidates in the final round, besides the designed gains, and of its moves."""
 SEARCH_PHYSICS = {"collisions": False, "physics": "free"}
-"""Options of the runner in the search, on moves of our own: these touch nothing."""
+"""Options of the runner in the search, unless moves are given: the default moves are free of contact."""
 _FINAL_SEED = 1_000_003
-"""Difference between the seed of these moves and the seed of the search."""
+"""Difference between the seed of the final round and the seed of the search."""
 
 
 class Tuning(NamedTuple):
@@ -116,8 +116,8 @@ def tune(
     moves
         Default: :func:`batchpid.sim.tuning.moves.search_moves`, and FINAL_MOVES random ones in the final round. For
         robots with actuators or a randomization, the search uses the tutorial's move and VARIED_MOVES random ones,
-        because the hardest moves that the effort limits allow for the model are too hard for them. Given moves are used
-        in the search and in the final round, both with the physics of the final round, since they may touch something.
+        because the hardest moves within the effort limits of the model are too hard for such robots. Given moves
+        replace them, with collisions, since they may touch something. There is then no final round.
     randomization
         The robot of each move is drawn from it, the same for all candidates. None: the robot as described.
     workers, cluster
@@ -129,13 +129,13 @@ def tune(
     progress
         Wraps the range of generations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
     runner_options
-        More options of :class:`batchpid.sim.Runner`, e.g. ``physics="fast"``. The search, too, uses this physics and
-        collisions if there is a ``build`` or a floating base, or if the solver computes drives or SAPIEN's friction.
+        More options of :class:`batchpid.sim.Runner`, e.g. ``physics="fast"``, for the final round. They also apply to
+        the search if there is a ``build`` or a floating base, or if the solver computes drives or SAPIEN's friction.
 
     Raises
     ------
     InvalidArgumentError
-        An option out of range, ``params``, or a history of another search.
+        An option is out of range or chosen by the search, such as ``params``, or the history is of another search.
     MissingDependencyError
         The package ``cmaes`` is missing.
     """
@@ -150,7 +150,7 @@ def tune(
         moves = search_moves(robot, seed) if sample is None else sample
     count = len(moves.start)
     own = final is not None and robot.fixed_base and runner_options.get("build") is None
-    # One iteration is enough if the loop computes friction, and not the solver.
+    # Physics "free", with one iteration, is enough if the loop computes friction, and not the solver.
     is_free = own and DISSIPATION[robot.dissipation].modelled and runner_options.get("control", "pid") != "drive"
     settings: dict[str, Any] = {
         **robot.describe(),
@@ -175,7 +175,7 @@ def tune(
     )
 
     start = search.params(np.zeros((1, search.dimension)))
-    firsts = [np.zeros(search.dimension)]  # the designed gains are a candidate too
+    firsts = [np.zeros(search.dimension)]  # the designed gains
     if is_varied:
         dt = float(runner_options.get("timestep", RunnerOptions.timestep))
         delay = loop_delay(robot, randomization, dt + float(np.max(start.derivative_filter_time)))
@@ -238,7 +238,7 @@ def checked_effort(seed: int, generations: int, population: int, seconds: float)
 
 
 def refuse_searched(runner_options: Mapping[str, Any], names: Sequence[str], remedy: str) -> None:
-    """Raise InvalidArgumentError for options that a search for explicit gains chooses itself."""
+    """Raise InvalidArgumentError for options ``names``, which a search for explicit gains chooses itself."""
     for name in names:
         if name in runner_options:
             raise InvalidArgumentError(name, "is chosen by the search, which is for explicit gains", remedy=remedy)
@@ -258,9 +258,9 @@ def evolve(
 ) -> tuple[Float64, tuple[tuple[float, ...], ...]]:
     """Search by CMA-ES from ``firsts[0]``; return all points (n, dimension) and the costs of each generation.
 
-    ``evaluate`` returns the costs of points (population, dimension). ``firsts`` are the first points of the first
-    generation; with ``restart`` the search starts again from the best point of that generation. Known generations come
-    from ``record``, which is written after each new one.
+    ``evaluate`` returns the costs of points (population, dimension). ``firsts`` replace the first points of the first
+    generation. With ``restart`` CMA-ES starts again from the best point of that generation. Costs of known generations
+    are read from ``record``, which is written after each new one.
     """
     from cmaes import CMA
 
@@ -272,7 +272,7 @@ def evolve(
     began = time.monotonic()
     bar = (progress or (lambda items: items))(range(generations))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MissedContactWarning)  # a bad candidate may leave its line
+        warnings.simplefilter("ignore", MissedContactWarning)  # a bad candidate may leave the line of its move
         for generation in bar:
             points += [optimizer.ask() for _ in range(population)]
             if generation == 0:
@@ -293,7 +293,7 @@ def evolve(
 
 
 def _plain(name: str, value: Any, resumes: bool) -> Any:
-    """Return an option of the runner as a plain value: itself, or its digest."""
+    """Return an option of the runner as a plain value: the option itself, its digest, or a function's name."""
     value = value.item() if isinstance(value, np.generic) else value
     if value is None or isinstance(value, bool | int | float | str):
         return value

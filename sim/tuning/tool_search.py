@@ -1,8 +1,8 @@
 """Search for gains of operational-space control on simulated moves of a tool, by CMA-ES from the default gains.
 
-The moves of the search touch nothing, so the robots have no collision shapes there, and candidates may use a share of
-the effort limits. The best candidates and the default gains then run a final round on other moves, with collisions, at
-the full limits; the gains with the lowest cost there are the result.
+The robots have no collision shapes in the search, and candidates may use only a share of the effort limits. The best
+candidates and the default gains then run a final round on other moves, with collisions, at the full limits. The gains
+with the lowest cost there are the result.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from batchpid.sim.tuning.weights import Weights
 from batchpid.sim.workers.contact_log import MissedContactWarning
 
 MOVES, FINAL_MOVES = 16, 16
-"""Moves of the search and of its final round."""
+"""Number of moves of the search and of its final round."""
 _FINAL_SEED = 1_000_003
 
 
@@ -67,17 +67,17 @@ def tune_tool(
 ) -> ToolTuning:
     """Search for gains of operational-space control of the link ``tool``, by default the robot's last link.
 
-    Arguments are those of :func:`batchpid.sim.tuning.search.tune`. ``runner_options`` are plain values.
+    The other arguments are as for :func:`batchpid.sim.tuning.search.tune`; ``runner_options`` must be plain values.
 
     Raises
     ------
     InvalidArgumentError
-        An option is out of range or chosen by the search, the history is of another search, or there are no moves
+        An option is out of range or chosen by the search, the history is of another search, or no moves were found
         within the joint limits.
     MissingDependencyError
         The package ``cmaes`` is missing.
     RobotError
-        The robot has no kinematic tree, such as a floating base.
+        The robot has no kinematic tree, for example because its base floats.
     """
     remedy = "leave it out; discretization='implicit' may be added to the options found"
     refuse_searched(runner_options, ("params", "control", "discretization"), remedy)

@@ -1,14 +1,14 @@
-"""Pool of workers, each with a slice of the envs. A lost worker is replaced, and its envs are replayed.
+"""Pool of workers, each with a slice of the envs. A lost worker is replaced, and the new one replays its requests.
 
 Every request that changes the loops is kept until the next checkpoint, a snapshot of all envs. A new worker gets the
-last checkpoint and the requests since. A checkpoint is a barrier for the other workers too
-(:mod:`batchpid.sim.loop.snapshot`), so that the replayed envs are bit-identical. Each worker has a queue of requests,
+last checkpoint and all later requests. At a checkpoint all workers rebuild their scenes
+(:mod:`batchpid.sim.loop.snapshot`), so the replayed envs are bit-identical. Each worker has its own queue of requests,
 so that one can catch up while the others continue.
 
-An exception of a signal handler (Ctrl-C) can end a call at any moment. The state of the pool says at every moment how
-far each worker is, and a worker with a partly sent or received message is replaced, so that the call can be repeated.
+An exception of a signal handler (Ctrl-C) can end a call at any moment. The state of the pool always shows the progress
+of each worker, and a worker with a partly sent or received message is replaced, so that the call can be repeated.
 
-Longer than 300 lines because all that can happen to a worker during a request is read in one place.
+Longer than 300 lines, to keep in one place everything that can happen to a worker during a request.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from batchpid.sim.workers.shared_memory import SharedArrays
 from batchpid.sim.workers.worker import LocalWorker, ProcessWorker, Worker, WorkerLost
 
 MAX_LOSSES = 5
-"""Losses of one worker during the same request after which the pool gives up."""
+"""Number of losses of one worker during the same request after which the pool gives up."""
 _POLL_INTERVAL = 0.1  # seconds between two checks of workers that do not answer
 _MAX_STEPS = 8000
-"""Sim steps times envs of one request to a worker, at most, unless a tick has more: a fifth of a second."""
+"""Largest number of sim steps times envs of one request to a worker, except for one tick: a fifth of a second."""
 
 _QUEUE, _RESULT, _FAILURE = map(attrgetter, ("queue", "result", "failure"))  # C functions, for the path of a tick
 
@@ -67,16 +67,16 @@ class _Slot:
     cause: str = ""
     lost_at: float = field(init=False)
     descriptor: int | None = None
-    """Of the worker's results."""
+    """File descriptor of the worker's results."""
     poller: select.poll = field(init=False)
-    """Of the descriptor."""
+    """Poll object of ``descriptor``."""
 
 
 class WorkerPool(SingleOwner):
     """Workers of a runner: processes, or with ``options.workers`` 0 the loop in this process.
 
-    ``params`` are those that the loops start with. The workers start with :meth:`open`. With ``options.cluster`` they
-    are nodes, whose pools have a ``share`` of the envs.
+    The loops start with ``params``, and the workers with :meth:`open`. With ``options.cluster`` the workers are nodes.
+    Each node has its own pool, for a ``share`` of the envs.
     """
 
     def __init__(self, options: RunnerOptions, params: bp.PIDParams, share: Share | None = None) -> None:
@@ -101,7 +101,7 @@ class WorkerPool(SingleOwner):
         self._slots: list[_Slot] = []
         self._request: Request | None = None
         self.closed = False
-        """True if the running call is to end, and no other to begin."""
+        """True if the running call must end, and no other may begin."""
         self.failure: Failure | None
         """First failure of a loop in the last request."""
         self.recoveries = 0
@@ -114,9 +114,9 @@ class WorkerPool(SingleOwner):
         self.ticks = Ticks(self.arrays)
         """Input and output of each tick."""
         self.present: Arrays
-        """The tick that holds the present observation."""
+        """Tick with the present observation."""
         self.completed: list[Arrays]
-        """The ticks that all envs completed in the last request that observes."""
+        """Ticks that all envs completed in the last request with observations."""
 
     def open(self) -> None:
         """Start the workers and wait until all are ready."""
@@ -142,19 +142,19 @@ class WorkerPool(SingleOwner):
     def begin(self, request: Request) -> None:
         """Send every worker its part of ``request``; :meth:`run` completes it.
 
-        A loop in this process executes it at once. Raises WorkerError if a worker was lost for good.
+        A loop in this process executes it at once. Raises WorkerError if a lost worker cannot be replaced.
         """
         self._serve(request, wait=False)
 
     def run(self, request: Request) -> list[Any]:
         """Execute ``request`` on all workers; return their results, unless there is a :attr:`failure`.
 
-        A call with a request that :meth:`begin` sent, or whose call was interrupted, continues it.
+        If :meth:`begin` has sent the request, or an earlier call with it was interrupted, this call completes it.
 
         Raises
         ------
         WorkerError
-            A worker was lost for good.
+            A lost worker cannot be replaced.
         ClosedError
             The pool was closed meanwhile.
         """
@@ -171,12 +171,12 @@ class WorkerPool(SingleOwner):
         return list(map(_RESULT, self._slots))
 
     def start_replay_from(self, request: Request) -> None:
-        """Drop the requests kept so far: ``request`` brings a new worker to the present state."""
+        """Drop the kept requests, because ``request`` brings a new worker to the present state."""
         if self._options.recover:
             self._replay = [request.copy()]
 
     def close(self) -> None:
-        """End all workers, those that have a request at once. May be called again after an interrupt."""
+        """End all workers, at once if they have a request. May be called again after an interrupt."""
         self.closed = True
         try:
             self._end_workers(patience=5.0)
@@ -197,14 +197,14 @@ class WorkerPool(SingleOwner):
     # -- one request, until every worker has executed it -----------------------------------------------------------
 
     def _serve(self, request: Request | None = None, wait: bool = True) -> None:
-        """Serve the queues until all are empty, first with ``request``, unless every worker is to execute it already.
+        """Queue ``request`` for every worker, unless that was done before, and serve the queues until all are empty.
 
         Without ``wait`` return when the first request of each queue is sent.
         """
         if request is not None and self._request is not request:
             for slot in self._slots:
                 slot.queue, slot.failure = [request], None
-            self._request = request  # nothing is sent before
+            self._request = request  # last, so that an interrupted call can begin again: nothing is sent before
         self._next_check = time.monotonic() + _POLL_INTERVAL
         while not self.closed and (busy := list(filter(_QUEUE, self._slots))):
             for slot in busy:
@@ -248,9 +248,9 @@ class WorkerPool(SingleOwner):
         slot.phase = "idle"
 
     def _wait(self, busy: list[_Slot]) -> list[_Slot]:
-        """Wait until workers have answered or died, or the pool is closed; return their slots.
+        """Wait until a worker has answered or died, or the pool is closed; return the slots of such workers.
 
-        The others are checked every 0.1 s; if one is lost, it is replaced, and there may be no answer.
+        Workers without an answer are checked every 0.1 s. If one is lost, it is replaced, and the list may be empty.
         """
         if self.is_local:
             return busy
@@ -258,10 +258,10 @@ class WorkerPool(SingleOwner):
         while not (answered or self.closed):
             left = 1e3 * _POLL_INTERVAL
             for slot in busy:
-                if len(slot.queue) > 1:  # it catches up: to be given its next request at once
+                if len(slot.queue) > 1:  # it is catching up: give it its next request at once
                     break
             else:
-                # For all, one after another: to wake up for the first takes the core of one that still runs.
+                # Wait for the workers in turn: waking up for the first would take the core of one that still runs.
                 end = time.monotonic() + _POLL_INTERVAL
                 for slot in busy:
                     if not slot.poller.poll(left):

@@ -1,4 +1,4 @@
-"""Tables of a robot's shapes in MuJoCo, from which native code proves that no shapes touch (``clearance.h``).
+"""Tables of a robot's shapes in MuJoCo, from which native code proves that shapes do not touch (``clearance.h``).
 
 Collision detection takes half of a sim step of a robot with meshes, and usually finds no contact.
 """
@@ -21,7 +21,7 @@ from batchpid.sim.engine.native.interface import Clearance
 Arrays = dict[str, NDArray[Any]]
 
 _BEYOND = 0.01
-"""Distance by which a sliding joint may pass its limits while clearances hold [m]: MuJoCo's limits are soft."""
+"""Distance beyond its limits up to which a sliding joint's arms are valid [m]: MuJoCo's limits are soft."""
 _NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _NEVER = 1 << 30
 """Age without a proof: NEVER in ``clearance.h``."""
@@ -39,10 +39,10 @@ _KINDS = {
 
 @lru_cache(maxsize=8)
 def shape_tables(robot: RobotMj) -> Arrays | None:
-    """Return the tables of shapes and pairs that ``Clearance`` in ``clearance.h`` lists, the same for every robot.
+    """Return the tables of shapes and pairs for ``Clearance`` in ``clearance.h``, the same for every robot.
 
-    None where MuJoCo always runs its collision detection: no pair of shapes may touch, a kind of shape is not
-    supported, or the fields to change are not found in this version of MuJoCo.
+    None if collision detection is never skipped: the model has no pair of shapes that may touch, or a kind of shape
+    that is not supported, or the fields to change are not found in this version of MuJoCo.
     """
     model = robot.model
     pairs = touching_pairs(model) if places() is not None else np.empty((0, 2))
@@ -73,9 +73,9 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
 def touching_pairs(model: Any) -> NDArray[np.int32]:
     """Return the pairs of shapes (pairs, 2), by number, that MuJoCo checks for contact; a plane comes first.
 
-    MuJoCo leaves out pairs of planes, of bodies that are welded together, of a body and its parent unless that is the
-    world, of excluded bodies, and of shapes whose ``contype`` and ``conaffinity`` do not match ("Collision detection"
-    in MuJoCo's documentation).
+    MuJoCo ignores two planes, bodies that are welded together, a body and its parent unless the parent is the world,
+    excluded bodies, and shapes whose ``contype`` and ``conaffinity`` do not match ("Collision detection" in MuJoCo's
+    documentation).
     """
     pairs = np.column_stack(np.triu_indices(model.ngeom, 1))
     planes = model.geom_type == int(_GEOM.mjGEOM_PLANE)
@@ -91,9 +91,9 @@ def touching_pairs(model: Any) -> NDArray[np.int32]:
 
 
 def _reach(robot: RobotMj) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the reach of the bodies (bodies, ways), and the range of joint positions in which it holds (2, dof).
+    """Return the reach of the bodies (bodies, ways), and the range of joint positions in which it is valid (2, dof).
 
-    A floating base adds two ways to those of the joints: its own, and its angle.
+    A way is a joint. A floating base adds two ways: its displacement and its rotation angle.
     """
     model, dof = robot.model, len(robot.qvel)
     places = {int(at): number for number, at in enumerate(robot.qvel)}
@@ -130,9 +130,9 @@ def _pose(position: NDArray[np.float64], wxyz: NDArray[np.float64]) -> NDArray[n
 
 @cache
 def places() -> tuple[int, ...] | None:
-    """Return the places of ``opt.disableflags``, and of the pointers :data:`_POINTERS`, in ``mjModel`` [bytes].
+    """Return the offsets of ``opt.disableflags`` and of the pointers :data:`_POINTERS` in ``mjModel`` [bytes].
 
-    They are found by flipping a flag, and by their addresses; None if one is ambiguous.
+    The flags are found by a change of one of them, the pointers by their values. None if one is ambiguous.
     """
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     before = ctypes.string_at(model._address, _BEGINNING)
@@ -149,8 +149,8 @@ class GroupClearance:
     """Clearances of robots in MuJoCo, for native code; ``kinematics`` is the address of ``mj_kinematics``.
 
     ``tables`` come from :func:`shape_tables`; ``models`` and ``data`` have one entry for each robot. Native code
-    disables the contacts of a model during part of a sim step, so groups with the same model take turns. A reset of a
-    robot needs no call: a jump of its positions counts as motion of its joints.
+    disables contacts in a model during a part of each sim step, so groups that share a model must take turns. A reset
+    of a robot needs no call, because a jump of its positions counts as motion of its joints.
 
     Attributes
     ----------
@@ -197,7 +197,7 @@ class GroupClearance:
 
     @property
     def left(self) -> NDArray[np.float32]:
-        """Clearances that are proved (robots, pairs) [m]; 0 without a proof."""
+        """Proved clearances (robots, pairs) [m]; 0 without a proof."""
         return (self.arrays["left"].astype(np.uint32) << 16).view(np.float32)
 
     @property

@@ -1,10 +1,11 @@
-// Proof that shapes of a robot do not touch, with which a sim step skips MuJoCo's collision detection of these shapes.
+// Proof that shapes of a robot do not touch. A sim step skips MuJoCo's collision detection for these shapes.
 //
-// Two shapes d apart stay apart while the joints move by less than sum_j arm_j |dq_j| = d, where arm_j bounds the speed at
-// which joint j closes them, at every pose. That is conservative advancement (B. Mirtich, Impulse-based Dynamic
-// Simulation of Rigid Body Systems, PhD thesis, University of California, Berkeley, 1996, section 2.3). A proof uses
-// the present state alone. MuJoCo runs its collision detection for the bodies of the other pairs, with the same result.
-// A floating base moves its shapes against the world: by its way, and by its angle times their largest distance from it.
+// Two shapes at a distance d do not touch while sum_j arm_j |dq_j| < d. Here dq_j is the motion of joint j since the
+// distance was computed, and arm_j bounds, at any pose, the closing speed of the shapes per unit speed of joint j. This
+// is conservative advancement (B. Mirtich, Impulse-based Dynamic Simulation of Rigid Body Systems, PhD thesis,
+// University of California, Berkeley, 1996, section 2.3). A new proof depends on the present state only. MuJoCo runs
+// its collision detection for the bodies of all pairs without a proof, and the contacts are the same. A floating base
+// counts as two more joints: its displacement with an arm of 1, and its rotation with the shapes' distance from it.
 
 #pragma once
 
@@ -23,63 +24,63 @@ namespace batchpid {
 // Kinds of shapes: mjtGeom.
 enum ShapeKind : std::int32_t { PLANE = 0, SPHERE = 2, CAPSULE = 3, CYLINDER = 5, BOX = 6, HULL = 7 };
 
-// Shapes of a robot, and what is proved of the robots of a group. Python fills in the fields (Clearance in interface.py)
-// and owns what they point to.
+// Shapes of a robot, and the proofs for the robots of a group. Python fills in the fields (Clearance in interface.py)
+// and owns the memory behind the pointers. A way is a joint, or the displacement or rotation angle of a floating base.
 struct Clearance {
   void (*kinematics)(void const *model, void *data);  // mj_kinematics
   void *const *models;               // (robots,): mjModel, not shared with another group
-  double *const *places, *const *turns;  // (robots,): places (shapes, 3) and rotations (shapes, 9), in mjData
+  double *const *places, *const *turns;  // (robots,): positions (shapes, 3) and rotations (shapes, 9), in mjData
   std::int32_t const *kinds;         // (shapes,)
   double const *sizes;               // (shapes, 3), as in mjModel
-  double const *radii;               // (shapes,): of the ball around a shape's place, or 0 for a plane
+  double const *radii;               // (shapes,): of the ball around a shape's position, or 0 for a plane
   std::int32_t const *hulls;         // (shapes, 2): first vertex and number of vertices
   double const *vertices;            // (vertices, 3)
   std::int32_t const *pairs;         // (pairs, 2): shapes that may touch; a plane comes first
   std::int32_t const *bodies;        // (pairs, 2): bodies of these shapes
-  // Arms that are not zero (entries,), and their ways: a joint's, or of a floating base its own and its angle. Those of
-  // a pair begin at its entry of `begins` (pairs + 1,).
+  // Arms that are not zero, and the way of each (entries,). The arms of a pair begin at `begins[pair]` (pairs + 1,).
   double const *arms;
   std::int32_t const *arm_ways, *begins;
-  double const *travel;              // (2, dof): least and largest position at which the arms hold
-  double *last;                      // (robots, dof), and 7 more for a floating base: positions after the last sim step
+  double const *travel;              // (2, dof): range of joint positions in which the arms are upper bounds
+  double *last;                      // (robots, dof, and 7 for a floating base): positions after the last sim step
   double *moved;                     // (robots, ways): sum of |dq| since the last proof
-  std::uint16_t *left;               // (robots, pairs): clearances [m], as `shortened`; NOT_PROVED without a proof
-  double *rate;                      // (robots, ways): largest arm over clearance of the other pairs [1/rad or 1/m]
-  std::int32_t *wait;                // (robots,): 0 while all pairs are proved; otherwise sim steps to the next attempt
+  std::uint16_t *left;               // (robots, pairs): clearances [m], as from `shortened`, or NOT_PROVED
+  double *rate;                      // (robots, ways): largest arm over clearance of the pairs not in `near` [1/rad, 1/m]
+  std::int32_t *wait;                // (robots,): sim steps to the next attempt to prove the open pairs; 0 without any
   std::int32_t *age;                 // (robots,): sim steps since the last proof
-  char *brief;                       // (robots,): whether the last proof did not last
-  std::int32_t *near;                // (robots, MOST_NEAR): pairs that are looked at one by one; -1 after the last
-  char *open;                        // (robots, all bodies): whether a pair of the body is not proved
-  std::int32_t const *const *shapes;  // (robots,): numbers of shapes of their bodies, body_geomnum in mjModel
+  char *brief;                       // (robots,): whether the last proof held for BRIEF sim steps or less
+  std::int32_t *near;                // (robots, MOST_NEAR): pairs that are checked one by one; -1 after the last
+  char *open;                        // (robots, all bodies): whether the body has a pair without a proof
+  std::int32_t const *const *shapes;  // (robots,): number of shapes of each body, body_geomnum in mjModel
   std::int32_t const *const *types, *const *affinities;  // (robots,): body_contype and body_conaffinity in mjModel
   std::int32_t const *no_shapes;     // (all bodies,): zeros
-  std::int32_t *some_types, *some_affinities;  // (all bodies,): of bodies in pairs that are not proved; work space
-  std::int64_t number, ways, size;   // of pairs, of ways, and of all bodies
-  std::int64_t flags, counts, types_at, affinities_at;  // places of opt.disableflags and of these pointers in mjModel
+  std::int32_t *some_types, *some_affinities;  // (all bodies,): for bodies in pairs without a proof; work space
+  std::int64_t number, ways, size;   // number of pairs, of ways, and of all bodies
+  // Offsets in mjModel [bytes]: of opt.disableflags, body_geomnum, body_contype and body_conaffinity.
+  std::int64_t flags, counts, types_at, affinities_at;
   std::int32_t contact;              // mjDSBL_CONTACT
   std::int32_t floats;               // the base moves freely
 };
 
-constexpr double MARGIN = 1e-4;        // [m], far above the rounding of places and of MuJoCo's own distances
-constexpr double SHARE = 0.25;         // of a clearance; when more of it is used, it is computed anew
-constexpr double TIGHT = 0.7;          // of the true distance, at which a bound is good enough to stop
+constexpr double MARGIN = 1e-4;        // [m], far above the rounding of positions and of MuJoCo's own distances
+constexpr double SHARE = 0.25;         // share of a clearance after whose use the clearance is computed again
+constexpr double TIGHT = 0.7;          // share of the true distance at which a lower bound is good enough
 constexpr int MOST_POINTS = 16;        // largest number of iterations of Gilbert's algorithm
-constexpr std::int32_t RETRY_STEPS = 50;  // between attempts to prove the pairs that are not
+constexpr std::int32_t RETRY_STEPS = 50;  // sim steps between attempts to prove the open pairs
 constexpr std::int32_t NEVER = 1 << 30;   // age without a proof
-constexpr std::int32_t BRIEF = 1, PAUSE = 24; // after a proof that lasts for BRIEF steps there is no other for PAUSE
-constexpr std::int32_t LEAST_STEPS = 4;   // that a proof lasts: pairs too near for it are left to MuJoCo
+constexpr std::int32_t BRIEF = 1, PAUSE = 24;  // after a proof that held for BRIEF sim steps, no proof for PAUSE
+constexpr std::int32_t LEAST_STEPS = 4;   // least sim steps that a proof must last; nearer pairs are left to MuJoCo
+constexpr std::int32_t LONG_STEPS = 64;   // after a proof that held as long no pairs are checked one by one
+constexpr int MOST_NEAR = 16;
 
-// Shapes of which MuJoCo looks for contacts in a sim step.
+// Shapes for which MuJoCo runs its collision detection in a sim step.
 enum class Looked { NONE, SOME, ALL };
 
-constexpr std::int32_t LONG_STEPS = 64;   // a proof that lasts as long needs no pairs looked at one by one
-constexpr int MOST_NEAR = 16;
 constexpr std::uint16_t NOT_PROVED = 0;
 
 using Point = Vector<double>;
 
-// Return the first two bytes of a positive number in single precision, which is rounded down to three digits; of others
-// NOT_PROVED. There are many clearances to each robot.
+// Return a positive number as the upper two bytes of its float32, rounded down to three digits; NOT_PROVED for others.
+// Two bytes, because a robot has many clearances.
 inline std::uint16_t shortened(double value) {
   float const single = std::nextafter(static_cast<float>(value), -1.0f);
   std::uint32_t bits = 0;
@@ -140,10 +141,10 @@ struct PlacedShape {
   }
 };
 
-// Return a lower bound of the distance of two convex shapes, at least TIGHT of it where it is above zero and MOST_POINTS
-// suffice: E. G. Gilbert, An iterative procedure for computing the minimum of a quadratic form on a convex set, SIAM
-// Journal on Control 4 (1966). v is a point of the difference of the shapes, w the one farthest against it, and every
-// point of the difference is at least v . w / |v| from the origin.
+// Return a lower bound of the distance of two convex shapes. It is at least TIGHT times a distance above zero, if
+// MOST_POINTS iterations suffice: E. G. Gilbert, An iterative procedure for computing the minimum of a quadratic form
+// on a convex set, SIAM Journal on Control 4 (1966). v is a point of the Minkowski difference of the shapes, and w its
+// farthest point in direction -v, so every point of the difference is at least v . w / |v| from the origin.
 inline double distance_bound(PlacedShape const &a, PlacedShape const &b) {
   if (a.clearance.kinds[a.number] == PLANE) {
     Point const normal = a.normal();
@@ -171,7 +172,7 @@ inline double distance_bound(PlacedShape const &a, PlacedShape const &b) {
   return best;
 }
 
-// The pairs that use up their clearances first, by the share of it that the last proof has used.
+// The pairs that will use up their clearances first: those with the largest share used since the last proof.
 struct NearPairs {
   double shares[MOST_NEAR];
   std::int32_t pairs[MOST_NEAR];
@@ -183,7 +184,7 @@ struct NearPairs {
     for (; at > 0 && share > shares[at - 1]; --at) shares[at] = shares[at - 1], pairs[at] = pairs[at - 1];
     shares[at] = share, pairs[at] = static_cast<std::int32_t>(pair);
   }
-  // Write the pairs in order, and -1 after the last.
+  // Write the numbers of the pairs in ascending order, and -1 after the last.
   void write(std::int32_t *to) const {
     std::copy(pairs, pairs + size, to);
     std::sort(to, to + size);
@@ -191,7 +192,7 @@ struct NearPairs {
   }
 };
 
-// Return the part of the clearance of a pair that motions may have used.
+// Return an upper bound of how much closer the shapes of a pair have come through the motions `moved` [m].
 inline double used_by(Clearance const &clearance, std::int64_t pair, double const *moved) {
   double used = 0.0;
   for (std::int32_t k = clearance.begins[pair]; k < clearance.begins[pair + 1]; ++k) {
@@ -200,8 +201,8 @@ inline double used_by(Clearance const &clearance, std::int64_t pair, double cons
   return used;
 }
 
-// Recompute the clearances of one robot that are used up in part, and with `retry` those of the pairs that are not proved.
-// Return whether all pairs are.
+// Recompute the clearances of one robot that are partly used up, and with `retry` also the clearances of open pairs.
+// Return whether all pairs are proved.
 inline bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
   std::int64_t const ways = clearance.ways;
   double *moved = clearance.moved + row * ways, *rate = clearance.rate + row * ways;
@@ -251,7 +252,7 @@ inline bool prove(Clearance const &clearance, std::int64_t row, bool retry) {
   return all;
 }
 
-// Return whether the clearances of the proved pairs of one robot are not used up.
+// Return whether the last proof of one robot still holds.
 inline bool is_proved(Clearance const &clearance, std::int64_t row) {
   double const *moved = clearance.moved + row * clearance.ways, *rate = clearance.rate + row * clearance.ways;
   double used = 0.0;
@@ -264,7 +265,7 @@ inline bool is_proved(Clearance const &clearance, std::int64_t row) {
   return proved;
 }
 
-// Add the motion of a floating base to `moved`: its way, and an angle, from its position and quaternion (7,).
+// Add the motion of a floating base to `moved`: its displacement and its rotation angle, from its pose (7,).
 inline void add_base_motion(double const *now, double *last, double *moved) {
   double way = 0.0, with = 0.0, against = 0.0;
   for (int k = 0; k < 3; ++k) way += (now[k] - last[k]) * (now[k] - last[k]);
@@ -277,7 +278,7 @@ inline void add_base_motion(double const *now, double *last, double *moved) {
   std::copy(now, now + 7, last);
 }
 
-// Return the shapes that may touch, as far as is proved, at the positions `qpos` of the joints at `qpos_at`.
+// Return the shapes that MuJoCo has to check at `qpos`, after a new proof if one is due; `qpos_at`: indices of joints.
 inline Looked looked_at(Clearance const &clearance, std::int64_t row, std::int64_t dof, void *data,
                                   double const *qpos, std::int64_t const *qpos_at) {
   std::int64_t const ways = clearance.ways;
@@ -309,10 +310,10 @@ inline Looked looked_at(Clearance const &clearance, std::int64_t row, std::int64
   return wait == 0 ? Looked::NONE : Looked::SOME;
 }
 
-// Let MuJoCo look for contacts of these shapes of one robot. For NONE no body has shapes either, so that MuJoCo does not
-// place them: nothing but collision detection and proofs reads their places, and a proof places them first. For SOME the
-// other bodies count as bodies that touch nothing; all shapes are placed, since their places choose the axes along which
-// MuJoCo sorts bodies.
+// Make MuJoCo's collision detection check these shapes of one robot. With NONE the bodies also have no shapes, so that
+// MuJoCo does not compute the shapes' positions: only collision detection and proofs read them, and a proof computes
+// them first. With SOME the other bodies collide with nothing, but the positions of all shapes are computed, because
+// MuJoCo derives from them the axes along which it sorts bodies.
 inline void switch_contacts(Clearance const &clearance, std::int64_t row, Looked which) {
   char *model = static_cast<char *>(clearance.models[row]);
   bool const none = which == Looked::NONE, some = which == Looked::SOME;

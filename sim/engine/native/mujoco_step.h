@@ -1,5 +1,5 @@
-// One sim step of robots in MuJoCo. Functions and pointers come from Python (sim/engine/mujoco/mujoco_step.py), so that
-// nothing of MuJoCo is needed to compile this file.
+// One sim step of robots in MuJoCo. Functions and pointers come from Python (sim/engine/mujoco/mujoco_step.py), so this
+// file compiles without MuJoCo.
 
 #pragma once
 
@@ -26,7 +26,7 @@ using LogHandler = void (*)(LogMessage const *);
 using MujocoStage = void (*)(void const *model, void *data);
 using Clock = double (*)();
 
-// Robots in MuJoCo; Python fills in the fields (Mujoco in interface.py) and owns what they point to.
+// Robots in MuJoCo. Python fills in the fields (Mujoco in interface.py) and owns the memory behind the pointers.
 struct Mujoco {
   MujocoStage step1, step2;                 // mj_step1, mj_step2
   LogHandler (*set_log_handler)(LogHandler);  // mju_setLogHandler
@@ -35,15 +35,16 @@ struct Mujoco {
   void *const *data;                        // (robots,)
   double *const *qpos, *const *qvel;        // (robots,): arrays of their mjData
   double *const *applied, *const *bias;
-  std::int64_t const *qpos_at, *qvel_at;    // (dof,): places of the joints in these arrays
+  std::int64_t const *qpos_at, *qvel_at;    // (dof,): indices of the joints in these arrays
   double *qf;                               // (robots, dof): efforts last applied
   double *const *ctrl;                      // (robots,): arrays of their mjData, (dof,) each with drives
-  double const *stiffness, *rate_gain;      // (robots, dof): of the drives, or null without targets that move
+  double const *stiffness, *rate_gain;      // (robots, dof): gains of the drives, or null if no target changes
   char const *continuous;                   // (dof,): joints whose targets may be whole turns away
-  Clearance const *clearance;               // or null: MuJoCo looks for contacts in every sim step
+  Clearance const *clearance;               // or null: collision detection of all shapes in every sim step
 };
 
-// Handler of MuJoCo's messages while this thread steps: an error, which would end the process, leaves the step.
+// Handler of MuJoCo's messages while this thread steps. After an error MuJoCo would end the process: the handler jumps
+// out of the step instead.
 struct Messages {
   static inline thread_local std::jmp_buf *frame = nullptr;
   static inline thread_local char *text = nullptr;  // (256,)
@@ -55,7 +56,7 @@ struct Messages {
       if (other != nullptr) other(message);
       return;
     }
-    if (message->level < LOG_ERROR) return;  // the loop finds states that are not finite
+    if (message->level < LOG_ERROR) return;  // warnings of bad states: the loop itself checks that states are finite
     std::size_t const size = strnlen(message->subject, 255);
     std::memcpy(text, message->subject, size);
     text[size] = '\0';
@@ -63,8 +64,8 @@ struct Messages {
   }
 };
 
-// Stop MuJoCo's clock while any thread steps: a step would read it forty times, a tenth of its cost, for the durations in
-// mjData, which nothing here uses. A constant takes the clock's place, since another thread may be about to call it.
+// Stop MuJoCo's clock while any thread steps. A step would read it forty times, a tenth of its time, for durations in
+// mjData that are not used here. A constant clock replaces it, and not null: another thread may be about to call it.
 class StoppedClock {
  public:
   explicit StoppedClock(Clock *clock) : clock_(clock) {
@@ -88,8 +89,8 @@ class StoppedClock {
   static inline Clock before_ = nullptr;
 };
 
-// Advance one robot: from velocities to the next velocities. The state of a robot that diverges stays as it is then.
-// Return false after an error of MuJoCo, with its message.
+// Advance one robot: mj_step2 of this sim step, then mj_step1 of the next one. A robot that has diverged keeps its
+// state, without mj_step1. Return false, with a message, after an error of MuJoCo.
 inline bool advance(Mujoco const &mujoco, std::int64_t row, std::int64_t dof, double farthest, char *message) {
   std::jmp_buf frame;
   Clearance const *clearance = mujoco.clearance;
