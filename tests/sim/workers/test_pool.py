@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gc
 import os
+import select
 from collections import defaultdict
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -299,3 +301,57 @@ def test_a_call_during_which_another_thread_closes_the_pool_ends(stage, error):
     with pytest.raises(ClosedError) as info:
         pool.run(run())
     assert type(info.value.__cause__) is (type(None) if error is None else error)
+
+
+@pytest.mark.parametrize(("substeps", "ticks"), [(20, 100), (3000, 1)])
+def test_a_request_has_so_many_ticks_that_it_lasts_a_fifth_of_a_second(stage, substeps, ticks):
+    assert len(make_pool(substeps=substeps).ticks) == ticks
+
+
+@pytest.fixture
+def waits(monkeypatch):
+    """Return the waits for answers, in ms; a clock goes on by 0.03 s in each, by the whole wait if none comes."""
+    found, now, poll = [], [0.0], select.poll
+
+    class Poll:
+        def __init__(self):
+            self.poller = poll()
+
+        def register(self, *arguments):
+            self.poller.register(*arguments)
+
+        def poll(self, wait):
+            found.append(round(wait))
+            answers = self.poller.poll(0)
+            now[0] += 0.03 if answers else 1.01e-3 * wait
+            return answers
+
+    monkeypatch.setattr("batchpid.sim.workers.pool.select", SimpleNamespace(poll=Poll, POLLIN=select.POLLIN))
+    monkeypatch.setattr("batchpid.sim.workers.pool.time", SimpleNamespace(monotonic=lambda: now[0]))
+    return found
+
+
+def test_a_tick_waits_for_its_workers_one_after_another(stage, waits):
+    pool = make_pool()
+    waits.clear()
+    pool.run(run())
+    assert waits == [100, 70, 0]
+    assert stage.of("check") == []
+
+
+def test_a_silent_worker_is_waited_for_a_tenth_of_a_second_between_checks(stage, waits):
+    pool = make_pool()
+    waits.clear()
+    stage.next("answer", lambda: "none")
+    stage.next("check", lambda: None, lambda: os.write(stage.made[0].ends[1], b".") and None)
+    pool.run(run())
+    assert waits == [100, 0, 100, 0, 100, 0]
+    assert len(stage.of("check")) == 2
+
+
+def test_a_worker_that_catches_up_gets_its_next_request_at_once(stage, waits):
+    pool = make_pool()
+    waits.clear()
+    stage.next("receive", dies)
+    pool.run(run())
+    assert waits == [100, 70, 0, 100, 100, 0]
