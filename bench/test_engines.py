@@ -106,7 +106,7 @@ def build_many(num_envs: int) -> tuple[float, float]:
 def test_thousands_of_envs(benchmark, report, most):
     """Build 8,192 pandas in one process, and step them once: time, and memory of each.
 
-    In a process of its own: this one has memory to give from earlier tests.
+    It is a new process, because this one may use memory again that earlier tests have freed.
     """
     benchmark.group = "MuJoCo, in one process"
     num_envs = min(8192, 100 * most.envs)

@@ -27,7 +27,7 @@ class ResidualPolicy:
 
     def __init__(self, robot: Robot) -> None:
         settings, rng, dof = tutorial_settings(robot), np.random.default_rng(0), robot.dof
-        self._kp, self._kd = 2 * settings.kp, settings.kd  # twice kp, because there is no integral
+        self._kp, self._kd = 2 * settings.kp, settings.kd  # kp is doubled to make up for the missing integral
         self._scale = (RESIDUAL * robot.effort_limit).astype(np.float32)
         sizes = (3 * dof, HIDDEN, HIDDEN, dof)
         self._layers = [rng.normal(0, n**-0.5, (n, m)).astype(np.float32) for n, m in pairwise(sizes)]
