@@ -10,9 +10,10 @@ import numpy as np
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
 from batchpid.backends import JAXBackend, NumPyBackend, declined
-from batchpid.checks.validate import choice, env_mask, instance, integer, names, positive, read_array
+from batchpid.checks.validate import choice, env_mask, instance, integer, names, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.law import bumpless, pid
+from batchpid.law.inputs import check_alone
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
 
@@ -65,7 +66,7 @@ class BatchPID:
         joint_names: Sequence[str] | None = None,
         threads: int | None = None,
     ) -> None:
-        self._backend, self._dt = choice("backend", backend, BACKENDS), positive("dt", dt, "s")
+        self._backend, self._dt = choice("backend", backend, BACKENDS), time_step("dt", dt)
         self._shape = (integer("num_envs", num_envs, 1, MOST_ENVS), _checked(params).num_joints)
         self._names = None if joint_names is None else names("joint_names", joint_names, self.num_joints)
         threads = None if threads is None else integer("threads", threads, 1, MOST_THREADS)
@@ -128,6 +129,7 @@ class BatchPID:
             problem = f"hold {params.num_joints} joints, not {self.num_joints}"
             raise InvalidArgumentError("params", problem, remedy="give one gain per joint")
         params.check(self.num_envs, self._names)
+        check_alone(params._replace(measurement_rate=None), None)
         if params.dtype != self._params.dtype:
             problem = f"are {params.dtype}, the controller's {self._params.dtype}"
             raise InvalidArgumentError("params", problem, remedy="build them with that dtype, or a new BatchPID")
@@ -165,6 +167,8 @@ class BatchPID:
         the law. It may be one of the inputs. Where a shape is wrong, InvalidArgumentError is raised and the state is
         unchanged.
         """
+        if measurement_rate is None:
+            check_alone(self._params, None)
         effort = self._fast(out, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
         if effort is not NotImplemented:
             return effort

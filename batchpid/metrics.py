@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.display import array_summary, html_table, span
 from batchpid.arrays.elementwise import TURN
-from batchpid.checks.validate import broadcast, number, positive, read_array
+from batchpid.checks.validate import broadcast, number, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 
 
@@ -148,7 +148,7 @@ def step_metrics(
     if start is not None:
         y = np.concatenate([broadcast("start", start, y.shape[1:])[None], y])
         r = np.concatenate([r[:1], r])
-    t = positive("dt", dt, "s") * np.arange(len(y), dtype=np.float64)
+    t = time_step("dt", dt) * np.arange(len(y), dtype=np.float64)
     finite = np.isfinite(y).all(0) & np.isfinite(r).all(0)
     y, r = np.where(finite, y, 0.0), np.where(finite, r, 0.0)
     if continuous is not None:

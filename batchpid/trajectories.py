@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.display import array_summary
-from batchpid.checks.validate import at_least, broadcast, entries, positive, read_array
+from batchpid.checks.validate import at_least, broadcast, entries, positive, read_array, time_step
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 
 _PEAK_VELOCITY = 15 / 8  # of the minimum-jerk s, times T
@@ -209,7 +209,7 @@ def jerk_limited(
     }
     joints = way.shape[-1]
     rows = {name: value.reshape(-1, joints) for name, value in asked.items()}
-    planner, plans = ruckig.Ruckig(joints, positive("dt", dt, "s")), []
+    planner, plans = ruckig.Ruckig(joints, time_step("dt", dt)), []
     for env in range(way.size // joints):
         inputs, plan = ruckig.InputParameter(joints), ruckig.Trajectory(joints)
         for name, table in rows.items():
@@ -261,7 +261,7 @@ def _limits(name: str, value: ArrayLike, way: Float64, finite: bool = True, low:
 
 def _ticks(dt: float, total: Float64) -> Float64:
     """Return the times of the ticks' ends up to the longest of the durations ``total``, at least one."""
-    return positive("dt", dt, "s") * np.arange(1, _count(float(total.max()), dt) + 1, dtype=np.float64)
+    return time_step("dt", dt) * np.arange(1, _count(float(total.max()), dt) + 1, dtype=np.float64)
 
 
 def _count(duration: float, dt: float) -> int:

@@ -271,7 +271,10 @@ class Rollout:
         """Return successive rollouts of the same envs as one, with the info of the first and the faults of the last."""
         seen = Observation.join([part.observation for part in parts])
         time, setpoint = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "setpoint"))
-        info = replace(parts[0].info, faults=parts[-1].info.faults)
+        info = parts[0].info
+        redraws = tuple(dict.fromkeys(each for part in parts for each in part.info.redraws))
+        complete = all(part.info.complete for part in parts)
+        info = replace(info, faults=parts[-1].info.faults, redraws=redraws, complete=complete)
         return Rollout(time, setpoint, seen, parts[0].tick, info)
 
     def __repr__(self) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.digest import digest
+from batchpid.arrays.digest import attributes_digest, digest
 from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
@@ -101,7 +101,7 @@ class RunnerOptions:
     control: ControlMode | Controller = field(
         default="pid", metadata=_in(snapshot="control_name", recording="control_name")
     )
-    tool: str | None = field(default=None, metadata=_in("recording"))
+    tool: str | None = field(default=None, metadata=_in("snapshot", "recording"))
     """Link that setpoints move; None where they are not poses."""
     setpoint_space: SetpointSpace = field(default="joints", metadata=_in("snapshot"))
     backend: Backend = field(default="numpy", metadata=_in("snapshot"))
@@ -137,7 +137,7 @@ class RunnerOptions:
         vars(self).update(given | {"robot": robot, "num_envs": integer("num_envs", num_envs, 1, 1_000_000)})
         own = vars(self)
         own |= {
-            "timestep": number("timestep", self.timestep, 1e-6, 0.1, "seconds; the tutorial's is 1/2000"),
+            "timestep": number("timestep", self.timestep, 1e-6, 0.1, "seconds, not a rate: 1/2000"),
             "substeps": integer("substeps", self.substeps, 1, 1_000_000),
             "setpoint_space": choice("setpoint_space", self.setpoint_space, get_args(SetpointSpace)),
             "control": _control(self.control, robot, given["tool"], self.setpoint_space),
@@ -363,6 +363,7 @@ class RunnerOptions:
             "joints": list(robot.joint_names),
             **self.values_for("snapshot"),
             "ignored_pairs": digest(robot.ignored_pairs),
+            "controller": None if isinstance(self.control, str) else attributes_digest(self.control),
             "command": None if own is None else list(own.names),
         }
 

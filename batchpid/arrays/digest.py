@@ -33,6 +33,20 @@ def digest(*values: Any) -> str:
     return _of_parts("values", [_digest(value, f"[{index}]") for index, value in enumerate(values)]).hex()
 
 
+def attributes_digest(value: object) -> str:
+    """Return the digest of an object's type and attributes, and of theirs; what has no digest counts by its type."""
+    kind = type(value)
+    parts = []
+    for name, each in sorted(getattr(value, "__dict__", {}).items()):
+        try:
+            parts.append((name, digest(each)))
+        except InvalidArgumentError:
+            nested = type(each).__module__.partition(".")[0] == "batchpid" and not isinstance(each, type)
+            own = attributes_digest(each) if nested else f"{type(each).__module__}.{type(each).__qualname__}"
+            parts.append((name, own))
+    return digest(kind.__module__, kind.__qualname__, parts)
+
+
 def _digest(value: Any, where: str) -> bytes:
     kind = type(value)
     if value is None or kind in (bool, int, complex):

@@ -53,6 +53,15 @@ def positive(argument: str, value: Any, unit: str) -> float:
     return value
 
 
+def time_step(argument: str, value: Any) -> float:
+    """Return ``value`` as a time step [s]; above :data:`LONGEST_STEP` it is taken for a rate."""
+    value = positive(argument, value, "s")
+    if value > LONGEST_STEP:
+        problem = f"is longer than {LONGEST_STEP:g} s, and looks like a rate in Hz"
+        raise InvalidArgumentError(argument, problem, value=value, remedy=f"give {argument} in seconds, 1/{value:g}")
+    return value
+
+
 def choice(argument: str, value: Any, known: Collection[S]) -> S:
     """Return ``value`` if it is one of ``known``."""
     chosen: S = value

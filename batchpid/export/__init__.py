@@ -2,9 +2,8 @@
 
 from batchpid.export.c_header import to_c
 from batchpid.export.c_project import to_c_project
-from batchpid.export.exported import Exported, Imported, ImportedMotors
+from batchpid.export.exported import Exported, Imported
 from batchpid.export.isaac_lab import to_isaac_lab
-from batchpid.export.isaac_lab_reader import from_isaac_lab
 from batchpid.export.maniskill import to_maniskill
 from batchpid.export.newton import to_newton
 from batchpid.export.ros2_control import to_ros2_control
@@ -13,8 +12,6 @@ from batchpid.export.ros2_control_reader import from_ros2_control
 __all__ = [
     "Exported",
     "Imported",
-    "ImportedMotors",
-    "from_isaac_lab",
     "from_ros2_control",
     "to_c",
     "to_c_project",

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.choices import MeasuredRate, PerInertia, PerMassMatrix
-from batchpid.checks.validate import choice, instance, names, positive
+from batchpid.checks.validate import choice, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.c_rigid_body import rigid_body
 from batchpid.export.c_step import Dialect, Value, helpers, statements
@@ -95,7 +95,7 @@ class Header:
         tree: KinematicTree | None,
     ) -> None:
         instance("params", params, PIDParams, "build them with make_params()")
-        positive("dt", dt, "s")
+        time_step("dt", dt)
         joints = params.num_joints
         if params.num_envs > 1:
             remedy = "choose one env: params.for_envs(slice(k, k + 1))"

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.choices import IntegrateFirst, MeasuredRate, PerMassMatrix
-from batchpid.checks.validate import at_least, instance, names, positive, read_array
+from batchpid.checks.validate import at_least, instance, names, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.implicit import as_explicit
@@ -50,7 +50,7 @@ class Differences(list[str]):
             remedy = "choose one env: params.for_envs(slice(k, k + 1))"
             raise InvalidArgumentError("params", f"are for {params.num_envs} envs", remedy=remedy)
         self.joints = names("joint_names", joint_names, params.num_joints)
-        self.dt = positive("dt", dt, "s")
+        self.dt = time_step("dt", dt)
         params.check(1, self.joints)
         check_gain_units(params)
         self.inertia = None if inertia is None else _inertia(inertia, self.joints)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from batchpid.law.params import PIDParams
-from batchpid.motors.actuators import Actuators
 
 
 class Exported(NamedTuple):
@@ -22,12 +21,3 @@ class Imported(NamedTuple):
     params: PIDParams
     joint_names: list[str]
     differences: tuple[str, ...] = ()
-
-
-class ImportedMotors(NamedTuple):
-    """Params with the motors of their joints, and the differences of both from the file."""
-
-    params: PIDParams
-    joint_names: list[str]
-    differences: tuple[str, ...]
-    actuators: Actuators

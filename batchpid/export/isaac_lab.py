@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.checks.validate import choice, identifier, positive
+from batchpid.checks.validate import choice, identifier, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.exported import Exported
 from batchpid.export.pd_drive import Drive
@@ -67,7 +67,7 @@ def to_isaac_lab(
     has_line = getattr(motors, "saturation_effort", None) is not None
     if model is None:
         delay = getattr(motors, "command_delay", None)
-        delayed = delay is not None and bool(np.rint(np.asarray(delay) / positive("dt", dt, "s")).any())
+        delayed = delay is not None and bool(np.rint(np.asarray(delay) / time_step("dt", dt)).any())
         model = "delayed_pd" if delayed else "dc_motor" if has_line else "implicit"
     choice("model", model, CLASSES)
     identifier("name", name)

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.choices import CHOICES
-from batchpid.checks.validate import choice, number, positive
+from batchpid.checks.validate import choice, number, positive, time_step
 from batchpid.gains.stability import stability_bound
 from batchpid.law.params import PIDParams
 
@@ -146,7 +146,7 @@ def design_gains(
     """
     bandwidth = positive("bandwidth_hz", bandwidth_hz, "Hz")
     positive("damping_ratio", damping_ratio, "zeta")
-    positive("dt", dt, "s")
+    time_step("dt", dt)
     number("margin", margin, 1e-3, 1 - 1e-3, "share of the stability range")
     integrates = integral_time is None or integral_time != math.inf
     if integral_time is not None and integrates:

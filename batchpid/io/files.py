@@ -22,11 +22,11 @@ def read_bytes(path: str) -> bytes:
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+def replacing(path: str | os.PathLike[str], overwrite: bool = True) -> Iterator[Path]:
     """Yield a path to write a file to, which then replaces the file at ``path``.
 
     It is in the same folder and has the same suffix. After an exception, a crash or a kill the older file is unchanged;
-    a link stays a link. The caller's file is on the disk before it takes its place. Raises OSError if the file cannot
+    a link stays a link. Without ``overwrite`` a file that exists by then stays. The caller's file is on the disk before it takes its place. Raises OSError if the file cannot
     be written.
     """
     path = Path(os.path.realpath(path))
@@ -35,7 +35,10 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield temporary
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
-        temporary.replace(path)
+        if overwrite:
+            temporary.replace(path)
+        else:
+            os.link(temporary, path)  # fails where a file exists by now
     except OSError as error:
         if error.errno is None or error.filename not in (None, str(temporary)):
             raise
@@ -44,7 +47,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_atomically(path: str | os.PathLike[str], content: str | bytes | Callable[[BinaryIO], object]) -> None:
+def write_atomically(
+    path: str | os.PathLike[str], content: str | bytes | Callable[[BinaryIO], object], overwrite: bool = True
+) -> None:
     """Write the file at ``path`` as a whole or not at all, as :func:`replacing` does.
 
     Parameters
@@ -56,9 +61,9 @@ def write_atomically(path: str | os.PathLike[str], content: str | bytes | Callab
     Raises
     ------
     OSError
-        The file cannot be written.
+        The file cannot be written, or exists and ``overwrite`` is False.
     """
-    with replacing(path) as temporary, temporary.open("x+b") as file:
+    with replacing(path, overwrite) as temporary, temporary.open("x+b") as file:
         if callable(content):
             content(file)
         else:

@@ -7,7 +7,7 @@ from typing import Any
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import discretise
-from batchpid.law.inputs import checked_inputs, checked_state, needs
+from batchpid.law.inputs import check_alone, checked_inputs, checked_state, needs
 from batchpid.law.params import PIDParams
 from batchpid.law.pid import proportional, turned_origin, weighted_rate, wrapped_error
 from batchpid.law.state import PIDState
@@ -48,6 +48,7 @@ def track(
         feedforward=feedforward,
     )
     checked_state(state, needs(params))
+    check_alone(params, measurement_rate)
     if params.ki is None:
         raise InvalidArgumentError(
             "params.ki", "is off, so no integral can carry the effort over", remedy="give ki; 0 is allowed"

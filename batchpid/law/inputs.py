@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.choices import HoldEffort
-from batchpid.checks.validate import instance, positive, read_array
+from batchpid.checks.validate import instance, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState
@@ -30,6 +30,22 @@ def checked_inputs(params: PIDParams, state: PIDState, measurement: Any, **input
     if whole[-1:] != (joints,) or not usual.issuperset(of_params.union(*known.values())):
         _check_shapes(np.broadcast_shapes(*of_params), joints, known)
     return list(arrays.values())
+
+
+def check_alone(params: PIDParams, measurement_rate: Any) -> None:
+    """Raise InvalidArgumentError for params that ask for more than the law itself is given."""
+    if params.gain_units is not None:
+        raise InvalidArgumentError(
+            "params.gain_units",
+            "give accelerations or ask for inertias, which the law does not know",
+            remedy="take gains of efforts, as robot.designed('effort'); a Runner turns these gains into efforts",
+        )
+    if params.measurement_rate is not None and params.kd is not None and measurement_rate is None:
+        raise InvalidArgumentError(
+            "measurement_rate",
+            "is missing, and these params differentiate the measured rate",
+            remedy="give it, or params with measurement_rate='difference'",
+        )
 
 
 def _check_shapes(shape: tuple[int, ...], joints: int, known: dict[str, list[tuple[int, ...]]]) -> None:
@@ -91,7 +107,7 @@ def checked_dt(dt: Any, dtype: Any) -> Any:
         return dt.astype(dtype, copy=False)
     if isinstance(dt, np.ndarray | np.generic):
         dt = dt.item()
-    return dt if hasattr(dt, "__array_namespace__") else positive("dt", dt, "s")
+    return dt if hasattr(dt, "__array_namespace__") else time_step("dt", dt)
 
 
 def _as_array(name: str, value: Any, kinds: str = "iuf") -> Any:

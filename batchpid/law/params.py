@@ -239,7 +239,7 @@ def make_params(
         command "zero" effort, or "hold" the last effort.
     measurement_rate
         Rate of the measurement that the derivative uses: "difference" of successive measurements, or "measured": the
-        velocity that :class:`batchpid.sim.Runner` reads from the simulator. A law that is given none differences.
+        velocity that :class:`batchpid.sim.Runner` reads from the simulator. The pure law refuses a call without it.
     gain_units
         "effort" per position, ...; or per unit of "inertia", or of the whole "mass_matrix": gains of an acceleration,
         which :class:`batchpid.sim.Runner` turns into an effort at the robot's pose (see

@@ -27,7 +27,7 @@ from typing import Any
 from batchpid.arrays.choices import Everywhere, HoldEffort
 from batchpid.arrays.elementwise import clip, flush, namespace, replace_envs, wrap
 from batchpid.law.coefficients import Coefficients, discretise
-from batchpid.law.inputs import checked_inputs, checked_mask, checked_state, needs
+from batchpid.law.inputs import check_alone, checked_inputs, checked_mask, checked_state, needs
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
 
@@ -90,7 +90,8 @@ def step(
     Raises
     ------
     InvalidArgumentError
-        If dt is not positive and finite, a shape does not fit, or the state lacks an array that the params need.
+        If dt is not positive and finite, a shape does not fit, the state lacks an array that the params need, the params
+        have gain_units other than "effort", or ask for a measured rate that is not given.
     """
     inputs = {"measurement_rate": measurement_rate, "setpoint_rate": setpoint_rate, "feedforward": feedforward}
     state, setpoint, measurement, rest = _checked(params, state, setpoint, measurement, **inputs)
@@ -110,6 +111,7 @@ def _checked(
 ) -> tuple[PIDState, Any, Any, list[Any]]:
     """Check the arguments of a step; return them as arrays, JAX arrays unchanged."""
     y, r, *rest = checked_inputs(params, state, measurement, setpoint=setpoint, **inputs)
+    check_alone(params, inputs.get("measurement_rate"))
     return checked_state(state, needs(params)), r, y, rest
 
 
@@ -276,6 +278,7 @@ def drive_target(
     the drive's, inside the same limit) are as in :func:`batchpid.step`. The idea is from the SAPIEN authors' answer
     in haosulab/SAPIEN#178.
     """
+    check_alone(params, inputs.get("measurement_rate"))
     state, terms = advance_terms(discretise(params, dt), state, setpoint, measurement, **inputs)
     xp = namespace(*params, terms.i, setpoint)
     driven = params.kp > 0

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import namespace
-from batchpid.checks.validate import positive
+from batchpid.checks.validate import time_step
 from batchpid.task_space.osc_params import OSCParams
 
 
@@ -70,7 +70,7 @@ def discretise(params: OSCParams, dt: Any) -> OSCCoefficients:
         dt is a Python number that is not positive and finite.
     """
     if isinstance(dt, int | float):
-        positive("dt", dt, "s")
+        time_step("dt", dt)
     xp = namespace(*params, dt)
     kp, kd, ki = params.stiffness, params.damping, params.integral_gain
     posture_kp, posture_kd = params.posture_stiffness, params.posture_damping

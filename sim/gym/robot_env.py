@@ -21,7 +21,7 @@ _FIXED = ("num_envs", "max_episode_steps", "autoreset_mode")
 class RobotEnv(SingleOwner, gymnasium.Env):
     """One robot of a task as a :class:`gymnasium.Env`, by default in this process. A subclass names its ``task``.
 
-    Episodes have no time limit, which :func:`gymnasium.make` adds. Other arguments are those of the task.
+    ``robot`` None is the task's own default. Episodes have no time limit, which :func:`gymnasium.make` adds. Other arguments are those of the task.
     """
 
     instead = RobotVectorEnv.instead
@@ -29,10 +29,11 @@ class RobotEnv(SingleOwner, gymnasium.Env):
     task: ClassVar[type[RobotVectorEnv]]
     """Class of the task."""
 
-    def __init__(self, robot: str | Robot = "panda", *, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(self, robot: str | Robot | None = None, *, render_mode: str | None = None, **options: Any) -> None:
         check_keywords(type(self).__name__, options, [name for name in arguments_of(self.task) if name not in _FIXED])
         options |= {"workers": options.get("workers", 0), "autoreset_mode": AutoresetMode.DISABLED}
-        self._envs = self.task(1, robot, max_episode_steps=None, render_mode=render_mode, **options)
+        given = {} if robot is None else {"robot": robot}
+        self._envs = self.task(1, **given, max_episode_steps=None, render_mode=render_mode, **options)
         self.runner, self.render_mode = self._envs.runner, render_mode
         self.metadata = self._envs.metadata  # type: ignore[misc]
         self.observation_space = self._envs.single_observation_space

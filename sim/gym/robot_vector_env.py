@@ -358,18 +358,22 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         for env in np.flatnonzero(mask).tolist():
             drawn = self.draw(env, self._generators[env])
             self._starts[env] = self._returned("draw", drawn, dof, np.float64)
-        first = np.broadcast_to(np.asarray(self.first_setpoint(self._starts)), self._setpoint.shape)
-        self._setpoint = np.where(mask[:, None], first, self._setpoint)
         self._steps[mask] = 0
         self._done = self._done & ~mask
-        seeds = np.zeros(self.num_envs, np.int64)
-        if streams and self.runner.options.randomization is not None:
+        seeds, rest = np.zeros(self.num_envs, np.int64), mask
+        randomization, observed = self.runner.options.randomization, None
+        if streams and randomization is not None:
             seeded = np.isin(np.arange(self.num_envs), list(streams))
             seeds[list(streams)] = list(streams.values())
-            self._observe(self.runner.reset(self._starts, mask=seeded, seed=seeds))
-            mask = mask & ~seeded
-        if mask.any():
-            self._observe(self.runner.reset(self._starts, mask=mask))
+            observed, rest = self.runner.reset(self._starts, mask=seeded, seed=seeds), mask & ~seeded
+        if rest.any():
+            observed = self.runner.reset(self._starts, mask=rest)
+        assert observed is not None
+        if randomization is not None and randomization.qpos is not None:  # the setpoint belongs to the drawn pose
+            self._starts = np.where(mask[:, None], observed.qpos, self._starts)
+        first = np.broadcast_to(np.asarray(self.first_setpoint(self._starts)), self._setpoint.shape)
+        self._setpoint = np.where(mask[:, None], first, self._setpoint)
+        self._observe(observed)
 
     def _observe(self, observed: Observation) -> None:
         """Update observation and success; an env that diverged keeps its last finite observation."""

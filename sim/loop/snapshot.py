@@ -35,7 +35,7 @@ CHANGED = "changed"
 """Name of the setpoints that the guard changed in the last sim step."""
 AGE = "age"
 """Name of the sim steps since the friction model of an env took its inertia (envs,)."""
-_FORMAT = 8
+_FORMAT = 9
 _ACTUATORS = "actuator_params"
 _CHOICES: dict[str, tuple[Any, ...]] = {name: tuple(named.values()) for name, named in CHOICES.items()}
 _CHOICES["conditional"] = (Everywhere(),)

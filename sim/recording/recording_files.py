@@ -87,7 +87,9 @@ def write_recording(
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, write)
+        write_atomically(path, write, overwrite)
+    except FileExistsError:
+        raise RecordingError(f"{path}: was made by another program meanwhile; give another name") from None
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error
     return path

@@ -10,8 +10,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.export.exported import Imported, ImportedMotors
-from batchpid.export.isaac_lab_reader import from_isaac_lab
+from batchpid.export.exported import Imported
 from batchpid.export.ros2_control_reader import from_ros2_control, is_ros2_control
 from batchpid.io import documents
 from batchpid.sim.robot.findings import summary
@@ -38,7 +37,7 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     "tuned" gains ship with the robot, "designed" is :meth:`batchpid.sim.Robot.designed`, "tutorial" are the gains in
     SAPIEN's tutorial, for a bundled robot, "mjcf" is :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or
     "drive:STIFFNESS,DAMPING" is the engine's internal drive. Other names are params files, or gains of other programs:
-    YAML of ros2_control, Python of Isaac Lab (parsed, not executed), MJCF (.xml); their differences are warnings.
+    YAML of ros2_control, MJCF (.xml); their differences are warnings.
 
     Raises
     ------
@@ -65,8 +64,9 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
         )
     own = [joint for joint, independent in zip(robot.joint_names, robot.independent, strict=True) if independent]
     if path.suffix.lower() == ".py":
-        found: Imported | ImportedMotors = from_isaac_lab(path.read_text(), own)
-    elif path.suffix.lower() == ".xml":
+        remedy = "give a params file (.yaml, .json), YAML of ros2_control, or MJCF (.xml)"
+        raise InvalidArgumentError("gains", "is Python, which is not read", value=name, remedy=remedy)
+    if path.suffix.lower() == ".xml":
         found = _of_mjcf(path, own)
     elif path.suffix.lower() != ".json" and is_ros2_control(documents.read(path)):
         found = from_ros2_control(path.read_text(), own, continuous=robot.continuous[robot.independent])

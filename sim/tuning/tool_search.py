@@ -91,6 +91,7 @@ def tune_tool(
     judge = ToolCandidates(robot, full, unseen, seconds, weights)
     settings: dict[str, Any] = {
         **robot.describe(),
+        "actuators": None if robot.actuators is None else digest(robot.actuators),
         "tool": tool,
         "seed": seed,
         "population": population,

@@ -10,7 +10,6 @@ import pytest
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.export import to_isaac_lab
 from batchpid.sim import Robot
 from batchpid.sim.tuning.gain_sets import gain_set
 
@@ -60,14 +59,9 @@ def test_tuned_gains_of_a_robot_without_are_refused(panda):
         gain_set(dataclasses.replace(panda, settings=None), "tuned")
 
 
-def test_gains_of_other_programs_are_read_from_their_files(panda, tmp_path):
-    params = bp.make_params(9, np.linspace(5, 80, 9), None, 2.0, effort_limit=20.0, measurement_rate="measured")
-    (path := tmp_path / "arm.py").write_text(to_isaac_lab(params, panda.joint_names, 0.005, model="ideal_pd").text)
-    found = gain_set(panda, str(path))
-    assert (found.name, found.control) == ("arm.py", "pid")
-    assert same(found.params, params)
-    path.write_text(to_isaac_lab(params, panda.joint_names, 0.005).text)
-    with pytest.warns(UserWarning, match=r"arm.py: law: stiffness and damping act implicitly"):
+def test_python_is_refused_with_what_is_read(panda, tmp_path):
+    (path := tmp_path / "arm.py").write_text("ARM = ImplicitActuatorCfg(stiffness=1.0)")
+    with pytest.raises(InvalidArgumentError, match=r"arm.py.*is not read.*ros2_control.*MJCF"):
         gain_set(panda, str(path))
 
 
