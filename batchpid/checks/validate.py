@@ -20,6 +20,8 @@ from batchpid.errors import InvalidArgumentError
 
 S = TypeVar("S", bound=str)
 T = TypeVar("T")
+LONGEST_STEP = 1.0
+"""Longest time step of a loop [s]; a larger number is taken for a rate."""
 AxisKind = Literal["joint", "entry"]
 
 

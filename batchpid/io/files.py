@@ -26,8 +26,8 @@ def replacing(path: str | os.PathLike[str], overwrite: bool = True) -> Iterator[
     """Yield a path to write a file to, which then replaces the file at ``path``.
 
     It is in the same folder and has the same suffix. After an exception, a crash or a kill the older file is unchanged;
-    a link stays a link. Without ``overwrite`` a file that exists by then stays. The caller's file is on the disk before it takes its place. Raises OSError if the file cannot
-    be written.
+    a link stays a link. The caller's file is on the disk before it takes its place. Without ``overwrite`` a file that
+    exists by then stays. Raises OSError if the file cannot be written, FileExistsError for a file that stays.
     """
     path = Path(os.path.realpath(path))
     temporary = _temporary(path)

@@ -90,8 +90,8 @@ def step(
     Raises
     ------
     InvalidArgumentError
-        If dt is not positive and finite, a shape does not fit, the state lacks an array that the params need, the params
-        have gain_units other than "effort", or ask for a measured rate that is not given.
+        If dt is not positive, or above 1 s, a shape does not fit, the state lacks an array that the params need, or the
+        params have gain_units other than "effort" or ask for a measured rate that is not given.
     """
     inputs = {"measurement_rate": measurement_rate, "setpoint_rate": setpoint_rate, "feedforward": feedforward}
     state, setpoint, measurement, rest = _checked(params, state, setpoint, measurement, **inputs)
