@@ -58,7 +58,7 @@ def test_it_solves_the_law_at_the_end_of_the_step(gains, dt, b, c, order, measur
         expected = solved(excess)
         known = {"measurement_rate": np.array([[v]])} if measures else {}
         known |= {"setpoint_rate": np.array([[slope]])} if rated else {}
-        state, a = bp.step(p, state, np.array([[r]]), np.array([[y]]), dt, **known)
+        state, a = bp.advance(bp.discretise(p, dt), state, np.array([[r]]), np.array([[y]]), **known)
         scale = abs(expected) + (abs(r) + abs(y) + dt * abs(v)) * (p_ + i_ * dt) + (abs(rate) + abs(v)) * d_
         assert abs(a.item() - expected) <= 1e-7 * (scale + abs(integral) + 1)
         v += dt * a.item()
@@ -72,7 +72,9 @@ def test_each_continuous_pole_s_becomes_1_over_1_minus_s_dt(kp, ki, kd, dt, orde
     columns = []
     for y, v, i in np.eye(3):
         state = bp.init(p, np.zeros((1, 1)))._replace(integral=np.array([[i]]))
-        new, a = bp.step(p, state, np.zeros((1, 1)), np.array([[y]]), dt, measurement_rate=np.array([[v]]))
+        new, a = bp.advance(
+            bp.discretise(p, dt), state, np.zeros((1, 1)), np.array([[y]]), measurement_rate=np.array([[v]])
+        )
         speed = v + dt * a.item()
         columns.append([y + dt * speed, speed, new.integral.item()])
     found = np.poly(np.linalg.eigvals(np.array(columns).T))
@@ -130,34 +132,13 @@ def test_an_inertia_that_the_model_overestimates_has_a_bound(wdt, largest):
         assert (radius < 1) == stable
 
 
-@pytest.mark.parametrize(("backend", "dtype"), [("numpy", np.float32), ("numpy", np.float64), ("jax", np.float32)])
-def test_the_controller_is_the_law_on_every_backend(backend, dtype):
+@pytest.mark.parametrize("backend", ["numpy", "jax"])
+def test_a_controller_without_a_mass_matrix_refuses_it(backend):
     if backend == "jax":
         pytest.importorskip("jax")
-    rng = np.random.default_rng(0)
-    p = bp.make_params(3, 4e3, 2e3, [90.0, 1.0, 0.0], setpoint_weight=0.3, integral_limit=2.0, dtype=dtype, **IMPLICIT)
-    pid = bp.BatchPID(p, 4, 0.01, backend=backend)
-    state = None
-    for _ in range(5):
-        r, y, v, rate = rng.normal(size=(4, 4, 3)).astype(dtype)
-        state = bp.init(p, y) if state is None else state
-        state, expected = bp.step(p, state, r, y, 0.01, measurement_rate=v, setpoint_rate=rate)
-        effort = np.asarray(pid(r, y, v, rate))
-        assert effort.dtype == expected.dtype == dtype
-        np.testing.assert_allclose(effort, expected, rtol=1e-4 if dtype == np.float32 else 1e-11)
-
-
-@pytest.mark.parametrize("order", ["output_first", "integrate_first"])
-def test_a_change_of_gains_is_bumpless_with_track(order):
-    p = bp.make_params(2, 400.0, 100.0, 40.0, setpoint_weight=0.5, integration=order, **IMPLICIT)
-    r, y, v, rate = np.random.default_rng(1).normal(size=(4, 3, 2))
-    rates = {"measurement_rate": v, "setpoint_rate": rate}
-    state, effort = bp.step(p, bp.init(p, y), r, y, 0.02, **rates)
-    stiffer = p.replace(kp=900.0, kd=60.0)
-    _, after = bp.step(stiffer, bp.track(stiffer, state, r, y, effort, dt=0.02, **rates), r, y, 0.02, **rates)
-    np.testing.assert_allclose(after, effort)
-    with pytest.raises(InvalidArgumentError, match="dt: is needed"):
-        bp.track(stiffer, state, r, y, effort)
+    p = bp.make_params(3, 4e3, 2e3, [90.0, 1.0, 0.0], **IMPLICIT)
+    with pytest.raises(InvalidArgumentError, match=r"gain_units.*designed\('effort'\)"):
+        bp.BatchPID(p, 4, 0.01, backend=backend)
 
 
 def test_options_that_it_does_not_have_are_refused():
