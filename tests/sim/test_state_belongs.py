@@ -50,7 +50,7 @@ def test_a_snapshot_of_another_controller_is_refused(panda, other):
         runner.reset(POSTURE)
         snapshot = runner.snapshot()
         runner.restore(snapshot)
-    with osc_runner(panda, **other) as runner, pytest.raises(InvalidArgumentError, match="controller|tool"):
+    with osc_runner(panda, **other) as runner, pytest.raises(InvalidArgumentError, match=r"controller|tool"):
         runner.restore(snapshot)
 
 

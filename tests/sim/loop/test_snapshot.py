@@ -174,7 +174,7 @@ def test_a_snapshot_with_other_content_is_refused(panda, builds):
 
 
 BROKEN = {
-    "an older format": (lambda head, tables: head.update(format=2), "cannot be read as a snapshot: format 2, not 8"),
+    "an older format": (lambda head, tables: head.update(format=2), "cannot be read as a snapshot: format 2, not 9"),
     "about": (lambda head, tables: head.update(about=[]), "cannot be read"),
     "steps": (lambda head, tables: head.update(steps=-1), "cannot be read"),
     "a marker": (lambda head, tables: head.update(markers={"anti_windup": "Evil"}), "cannot be read"),

@@ -61,7 +61,7 @@ def test_tuned_gains_of_a_robot_without_are_refused(panda):
 
 def test_python_is_refused_with_what_is_read(panda, tmp_path):
     (path := tmp_path / "arm.py").write_text("ARM = ImplicitActuatorCfg(stiffness=1.0)")
-    with pytest.raises(InvalidArgumentError, match=r"arm.py.*is not read.*ros2_control.*MJCF"):
+    with pytest.raises(InvalidArgumentError, match=r"is not read.*arm.py.*ros2_control.*MJCF"):
         gain_set(panda, str(path))
 
 
