@@ -36,8 +36,8 @@ SEARCH = ("goal", "tool", "lower", "upper", "tolerances", "qpos", "errors", "ste
 DECOUPLING = ("full", "partial", "none")
 """Kinds of decoupling, as Decoupling in task_space.cpp."""
 
-BUFFER, CALL, LANES, RIGID_BODY = (
-    f"batchpid/native/{name}" for name in ("buffer.h", "call.h", "lanes.h", "rigid_body.h")
+BUFFER, CALL, COUPLING, LANES, RIGID_BODY = (
+    f"batchpid/native/{name}.h" for name in ("buffer", "call", "coupling", "lanes", "rigid_body")
 )
 _HEADERS = tuple(
     f"batchpid/native/{name}.h"
@@ -51,7 +51,7 @@ def _tables() -> tuple[Any, ...]:
 
 TASK_SPACE = Extension(
     "batchpid.native._task_space",
-    ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, CALL, LANES, RIGID_BODY),
+    ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, CALL, COUPLING, LANES, RIGID_BODY),
     (*ROUNDED, "-Wno-psabi"),
     _tables,
 )

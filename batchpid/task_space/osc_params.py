@@ -155,7 +155,7 @@ def make_osc_params(
         Bools: axes, not among ``axes``, that the wrench controls, and on which the posture does not act.
     posture_stiffness, posture_damping_ratio
         Gains of the joints towards their posture: within the null space of the task for the joints of the chain to the
-        tool, fully for others, such as fingers [1/s^2].
+        tool, fully for others, such as fingers [1/s^2]. Followers have none.
     limit_margin, limit_stiffness
         Joints of the chain that come nearer to a position limit than the margin [rad or m], or a quarter of their
         range, are pushed away within the null space, by a critically damped spring [1/s^2]. None: no margin.
@@ -190,7 +190,7 @@ def make_osc_params(
         problem = "'implicit' needs gains of accelerations, which decoupling 'none' has not"
         raise InvalidArgumentError("discretization", problem, remedy="use 'explicit', or decoupling 'full'")
     kd = 2 * _rows("damping_ratio", damping_ratio, AXES) * np.sqrt(kp)
-    posture = _rows("posture_stiffness", posture_stiffness, joints)
+    posture = _rows("posture_stiffness", posture_stiffness, joints) * tree.independent
     motion, force = (_mask(name, value) for name, value in (("axes", axes), ("force_axes", force_axes)))
     if force is not None:
         both = force * (np.ones((1, 6)) if motion is None else motion)
@@ -208,7 +208,7 @@ def make_osc_params(
     if low is not None and high is not None:
         ends = np.broadcast_arrays(low, high)
         entries("effort_min", ends[0], ends[0] <= ends[1], "exceeds effort_max", joints)
-    limits = np.array([tree.lower, tree.upper])
+    limits, own = np.array([tree.lower, tree.upper]), tree.independent
     margin = None if limit_margin is None else _rows("limit_margin", limit_margin, joints)
     integral = None if integral_gain is None else _rows("integral_gain", integral_gain, AXES)
     params = OSCParams(
@@ -227,7 +227,7 @@ def make_osc_params(
         frame=TASK_CHOICES["frame"][choice("frame", frame, TASK_CHOICES["frame"])],
         integral_gain=integral,
         integral_limit=None if integral is None else _rows("integral_limit", integral_limit, AXES),
-        limit_stiffness=None if margin is None else _rows("limit_stiffness", limit_stiffness, joints),
+        limit_stiffness=None if margin is None else _rows("limit_stiffness", limit_stiffness, joints) * own,
         limit_margin=None if margin is None else np.minimum(margin, (limits[1:] - limits[:1]) / 4),
         lower=None if margin is None else limits[:1],
         upper=None if margin is None else limits[1:],

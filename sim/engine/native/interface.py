@@ -11,7 +11,7 @@ from typing import Any
 
 from batchpid.native.extensions import ROUNDED, Extension
 from batchpid.native.operations import HEADERS, PROGRAM
-from batchpid.native.task_space_extension import BODY, BUFFER, CALL, LANES, RIGID_BODY
+from batchpid.native.task_space_extension import BODY, BUFFER, CALL, COUPLING, LANES, RIGID_BODY
 
 SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation7getQposEv",
@@ -205,6 +205,7 @@ EXTENSIONS = {
             ),
             BUFFER,
             CALL,
+            COUPLING,
             LANES,
             RIGID_BODY,
             *HEADERS,
