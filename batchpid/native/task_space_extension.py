@@ -21,7 +21,7 @@ LAW = (
     *("kp", "kd", "c", "acceleration_share", "ki_dt", "ki_dt2", "posture_kp", "posture_kd"),
     *("limit_kp", "limit_kd", "limit_margin", "limit_low", "limit_high", "integral_limit"),
     *("position_error_limit", "rotation_error_limit", "smallest_eigenvalue", "axes", "force_axes"),
-    *("effort_min", "effort_max"),
+    *("effort_min", "effort_max", "turns"),
     *("effort", "next_integral", "limited", "error", "force", "task", "posture_effort", "unsaturated"),
     *("task_share", "posture_share", "near_singular"),
 )

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.choices import CHOICES, Choice
 from batchpid.arrays.display import array_summary
+from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field
 from batchpid.checks.keywords import known_keywords
 from batchpid.checks.validate import array, choice, entries, instance, read_array
@@ -105,6 +106,9 @@ class OSCParams(NamedTuple):
     lower: Any = None
     """Position limits of the tree (1, dof) [rad or m]; None without ``limit_margin``."""
     upper: Any = None
+    turns: Any = None
+    """1 / (2 pi) for joints of the tree that turn without limits, whose posture is the one next to qpos, else 0
+    (1, dof); None without such joints."""
     discretization: Any = None
     """ImplicitLaw(): the gains act on the predicted end of the step; None: on its beginning."""
 
@@ -209,6 +213,7 @@ def make_osc_params(
         ends = np.broadcast_arrays(low, high)
         entries("effort_min", ends[0], ends[0] <= ends[1], "exceeds effort_max", joints)
     limits, own = np.array([tree.lower, tree.upper]), tree.independent
+    endless = np.isinf(limits).all(0) & (tree.bodies.slides[:, 0] == 0)
     margin = None if limit_margin is None else _rows("limit_margin", limit_margin, joints)
     integral = None if integral_gain is None else _rows("integral_gain", integral_gain, AXES)
     params = OSCParams(
@@ -231,6 +236,7 @@ def make_osc_params(
         limit_margin=None if margin is None else np.minimum(margin, (limits[1:] - limits[:1]) / 4),
         lower=None if margin is None else limits[:1],
         upper=None if margin is None else limits[1:],
+        turns=(endless / TURN)[None] if endless.any() else None,
         discretization=TASK_CHOICES["discretization"][discretization],
     )
     _check_rows(params)
