@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import itertools
 import tempfile
-import warnings
 from pathlib import Path
 
 import numpy as np

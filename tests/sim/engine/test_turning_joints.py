@@ -18,7 +18,8 @@ def wheel(folder, kind: str = "", multiplier: float = 0.0) -> Robot:
     limit = '<limit lower="-90" upper="90" effort="20" velocity="20"/>'
     law = f'<mimic joint="wheel" multiplier="{multiplier}"/>'
     for name, type_, child, inner in (("wheel", "continuous", "rim", limit), ("follower", kind, "gear", limit + law)):
-        ends = f'<parent link="base"/><child link="{child}"/><axis xyz="0 0 1"/>{inner}'
+        axis = "1 0 0" if type_ == "prismatic" else "0 0 1"  # gravity acts on neither
+        ends = f'<parent link="base"/><child link="{child}"/><axis xyz="{axis}"/>{inner}'
         parts.append(f'<joint name="{name}" type="{type_}">{ends}</joint>' if type_ else "")
     return Robot.load(write(folder, f'<robot name="wheel">{"".join(parts)}</robot>'))
 
@@ -44,7 +45,7 @@ def test_a_follower_stays_with_its_leader_over_many_turns(kind, multiplier, nati
     np.testing.assert_array_equal(again.qpos[-1], second.qpos[-1])
     qvel = np.concatenate([first.qvel, second.qvel])[:, 0]
     assert second.ok.all()
-    np.testing.assert_allclose(qvel[:, 1], multiplier * qvel[:, 0], atol=0.01)
+    np.testing.assert_allclose(qvel[:, 1], multiplier * qvel[:, 0], rtol=2e-3, atol=0.01)
     np.testing.assert_allclose(qvel[-1, 0], 0.5 / inertia * ticks * 0.01, rtol=3e-3)
 
 
