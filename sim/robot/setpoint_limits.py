@@ -81,7 +81,7 @@ def _of_leaders(guard: bp.Guard, robot: GuardedRobot) -> bp.Guard:
         if robot.continuous[leader]:
             _check_turning(robot, index, leader, ends)
             continue
-        ends = np.maximum(low[:, leader], ends[0]), np.minimum(high[:, leader], ends[1])
+        ends = np.stack([np.maximum(low[:, leader], ends[0]), np.minimum(high[:, leader], ends[1])])
         narrower = ends[0] < ends[1]
         low[:, leader], high[:, leader] = np.where(narrower, ends, (low[:, leader], high[:, leader]))
     for limits, none in zip((low, high, rate, acceleration), free, strict=False):

@@ -54,9 +54,7 @@ class ToolSetpoints:
                 continue
             leader, multiplier = robot.joints[robot.coupling.leader[index]], robot.coupling.multiplier[index]
             if leader.continuous and (multiplier % 1 if joint.unit == "rad" else multiplier):
-                problem = (
-                    f"'tool': the pose of {self.link!r} depends on the turns of the continuous joint {leader.name!r}"
-                )
+                problem = f"'tool': the pose of {self.link!r} depends on the turns of {leader.name!r}"
                 remedy = "use control 'osc', or setpoint_space 'joints'"
                 raise InvalidArgumentError("setpoint_space", problem, joint=joint.name, remedy=remedy)
 
