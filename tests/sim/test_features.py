@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -141,3 +142,28 @@ def test_every_pair_of_features_reaches_its_goal_under_every_control_or_is_refus
 @pytest.fixture(params=["sapien", "mujoco"])
 def engine(request) -> str:
     return request.param
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
+@pytest.mark.parametrize("feature", [feature for feature, given in FEATURES.items() if "mimics" in given])
+def test_kinematics_and_dynamics_are_those_of_the_leaders(feature, native, monkeypatch):
+    monkeypatch.setenv("BATCHPID_NATIVE", native)
+    robot = robot_with(feature)
+    tree, g, own = robot.kinematic_tree(), robot.coupling.matrix, robot.independent
+    free = replace(tree, coupling=None)
+    rng = np.random.default_rng(0)
+    qpos = robot.coupled(rng.normal(size=(5, robot.dof)))
+    qvel, qacc = (robot.coupling.rates(rng.normal(size=(5, robot.dof))) for _ in range(2))
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
+    close(ts.jacobian(tree, qpos, "l8")[..., own], ts.jacobian(free, qpos, "l8") @ g)
+    close(ts.mass_matrix(tree, qpos)[:, own][..., own], g.T @ ts.mass_matrix(free, qpos) @ g)
+    close(ts.bias(tree, qpos, qvel)[:, own], ts.bias(free, qpos, qvel) @ g)
+    effort = ts.inverse_dynamics(tree, qpos, qvel, qacc)
+    close(effort[:, own], ts.inverse_dynamics(free, qpos, qvel, qacc) @ g)
+    close(ts.forward_dynamics(tree, qpos, qvel, effort), qacc)
+    for unused in (ts.jacobian(tree, qpos, "l8")[..., ~own], ts.bias(tree, qpos, qvel)[:, ~own], effort[:, ~own]):
+        assert not unused.any()
+    goal = ts.link_poses(tree, qpos, ["l8"])[:, 0]
+    found = ts.inverse_kinematics(tree, "l8", goal, robot.coupled(qpos + 0.1))
+    close(found.qpos, robot.coupled(found.qpos))
+    close(ts.link_poses(tree, found.qpos, ["l8"])[:, 0, :3], goal[:, :3], atol=2e-5)
