@@ -37,7 +37,14 @@ FEATURES: dict[str, dict] = {
     "floating base": {"fixed_base": False},
 }
 """Types of joints other than revolute, mimic joints (leader, multiplier, offset), links without mass, ..."""
-PAIRS = list(itertools.combinations(FEATURES, 2))
+
+
+def joints_of(feature: str) -> set[int]:
+    types, mimics = (FEATURES[feature].get(name, {}) for name in ("types", "mimics"))
+    return {*types, *mimics, *(leader for leader, *_ in mimics.values())}
+
+
+PAIRS = [pair for pair in itertools.combinations(FEATURES, 2) if not joints_of(pair[0]) & joints_of(pair[1])]
 CONTROLS = [("pid", "joints"), ("pid", "tool"), ("drive", "joints"), ("drive", "tool"), ("osc", "joints")]
 REFUSED = {
     "floating base": {("pid", "tool"), ("drive", "tool"), ("osc", "joints")},
@@ -55,15 +62,12 @@ def inertial(kg: float, moment: float, x: float = 0.0) -> str:
 
 @functools.cache
 def robot_with(*features: str) -> Robot:
-    """Return an arm of nine joints with these features; the first one has a joint that two want."""
-    types: dict = {}
-    mimics: dict = {}
-    for feature in map(FEATURES.__getitem__, features):
-        own, laws = feature.get("types", {}), feature.get("mimics", {})
-        wanted = {*own, *laws, *(leader for leader, *_ in laws.values())}
-        if not wanted & {*types, *mimics, *(leader for leader, *_ in mimics.values())}:
-            types, mimics = types | own, mimics | laws
+    """Return an arm of nine joints with these features."""
     chosen = [FEATURES[feature] for feature in features]
+    types, mimics = (
+        {joint: law for feature in chosen for joint, law in feature.get(name, {}).items()}
+        for name in ("types", "mimics")
+    )
     massless = {link for feature in chosen for link in feature.get("massless", ())}
     parts, above = [f'<link name="base">{inertial(40.0, 2.0)}</link>'], "base"
     for k, axis in enumerate(AXES):
