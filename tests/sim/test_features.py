@@ -111,7 +111,7 @@ def reach(robot: Robot, control: str, space: str, engine: str) -> None:
     else:
         left = last - goal
         left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
-        np.testing.assert_allclose(left[robot.independent], 0.0, atol=1e-2)
+        np.testing.assert_allclose(left[robot.independent], 0.0, atol=0.02)
     if robot.coupling is not None:
         followers = robot.coupling.followers
         rates = robot.coupling.rates(seen.qvel[-20:])[..., followers]
