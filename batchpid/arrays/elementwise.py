@@ -51,6 +51,13 @@ def wrap(angle: Any, turns_per_rad: Any, xp: Any) -> Any:
     return angle if turns_per_rad is None else angle - TURN * xp.rint(angle * turns_per_rad)
 
 
+def nearest_turn(angle: Any, near: Any, turns_per_rad: Any, xp: Any) -> Any:
+    """Return ``angle`` plus the whole turns that bring it within half a turn of ``near``; other arguments as in
+    :func:`wrap`.
+    """
+    return angle if turns_per_rad is None else angle - TURN * xp.rint((angle - near) * turns_per_rad)
+
+
 def flush(x: Any, tiny: Any) -> Any:
     """Return x rounded to a multiple of the last bit of ``tiny``, which leaves larger numbers unchanged.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from batchpid.export.c_step import Dialect
+from batchpid.motors.coupling import Coupling
 from batchpid.task_space.kinematic_tree import KinematicTree
 
 
@@ -105,7 +106,7 @@ static inline void {p}_mass_matrix(const {t} qpos[{n}], {t} matrix[{n} * {n}]) {
     }}
     matrix[{n} * j + j] += k_armature[j];
   }}
-}}
+{_folded_matrix(c, tree)}}}
 
 /* Efforts [N m or N] that cancel gravity and Coriolis and centrifugal forces, at qpos [rad or m] and qvel. */
 static inline void {p}_bias(const {t} qpos[{n}], const {t} qvel[{n}], {t} bias[{n}]) {{
@@ -149,7 +150,7 @@ static inline void {p}_bias(const {t} qpos[{n}], const {t} qvel[{n}], {t} bias[{
       torque[above[j]][i] += torque[j][i];
     }}
   }}
-}}
+{_folded_bias(c, tree)}}}
 
 /* Efforts [N m or N] that hold the robot at qpos [rad or m]. */
 static inline void {p}_gravity(const {t} qpos[{n}], {t} bias[{n}]) {{
@@ -158,6 +159,41 @@ static inline void {p}_gravity(const {t} qpos[{n}], {t} bias[{n}]) {{
 }}
 
 """
+
+
+def _folded_matrix(c: Dialect, tree: KinematicTree) -> str:
+    """Return the lines that reduce ``matrix`` to the leaders of coupled joints: :meth:`Coupling.mass_matrix`."""
+    if tree.coupling is None:
+        return ""
+    n = c.size
+    return f"""{_laws(c, tree.coupling)}  for (int j = 0; j < {n}; ++j) {{
+    for (int i = 0; i < {n} && leader[j] != j; ++i) matrix[{n} * leader[j] + i] += multiplier[j] * matrix[{n} * j + i];
+  }}
+  for (int j = 0; j < {n}; ++j) {{
+    for (int i = 0; i < {n} && leader[j] != j; ++i) matrix[{n} * i + leader[j]] += multiplier[j] * matrix[{n} * i + j];
+  }}
+  for (int j = 0; j < {n}; ++j) {{
+    if (leader[j] == j) continue;
+    for (int i = 0; i < {n}; ++i) matrix[{n} * j + i] = matrix[{n} * i + j] = {c.number(0.0)};
+    matrix[{n} * j + j] = {c.number(1.0)};
+  }}
+"""
+
+
+def _folded_bias(c: Dialect, tree: KinematicTree) -> str:
+    """Return the lines that reduce ``bias`` to the leaders of coupled joints: :meth:`Coupling.efforts`."""
+    if tree.coupling is None:
+        return ""
+    return f"""{_laws(c, tree.coupling)}  for (int j = 0; j < {c.size}; ++j) {{
+    if (leader[j] == j) continue;
+    bias[leader[j]] += multiplier[j] * bias[j];
+    bias[j] = {c.number(0.0)};
+  }}
+"""
+
+
+def _laws(c: Dialect, coupling: Coupling) -> str:
+    return _integers(c, "leader", coupling.leader) + c.table("multiplier", coupling.multiplier)
 
 
 def _integers(c: Dialect, name: str, values: object) -> str:

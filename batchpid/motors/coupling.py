@@ -73,19 +73,14 @@ class CouplingArrays(NamedTuple):
         """Return ``figures`` (..., joints) in which followers take the figures of their leaders."""
         return namespace(figures).take(figures, self.leader, axis=-1)
 
-    def mass_matrix(self, matrix: Float64) -> Float64:
+    def mass_matrix(self, matrix: Any) -> Any:
         """Return G^T M G for M (..., joints, joints) in the rows and columns of the independent joints.
 
-        Rows and columns of followers are the identity's. ``fold`` in tick.h is the same function.
+        Rows and columns of followers are the identity's. ``fold`` in coupling.h is the same function.
         """
-        folded, followers = np.array(matrix), np.flatnonzero(~self.independent)
-        for joint in followers:
-            folded[..., self.leader[joint], :] += self.multiplier[joint] * folded[..., joint, :]
-        for joint in followers:
-            folded[..., :, self.leader[joint]] += self.multiplier[joint] * folded[..., :, joint]
-        folded[..., followers, :] = folded[..., :, followers] = 0.0
-        folded[..., followers, followers] = 1.0
-        return folded
+        xp = namespace(matrix)
+        rows = xp.swapaxes(self.efforts(xp.swapaxes(matrix, -1, -2)), -1, -2)
+        return self.efforts(rows) + xp.diag(xp.where(self.independent, 0.0, 1.0).astype(matrix.dtype))
 
 
 class Coupling:
@@ -170,7 +165,8 @@ class Coupling:
 
     def mass_matrix(self, mass_matrix: ArrayLike) -> Float64:
         """Return M_r in the rows and columns of the independent joints (..., joints, joints), else the identity."""
-        return self.arrays.mass_matrix(np.asarray(mass_matrix, np.float64))
+        reduced: Float64 = self.arrays.mass_matrix(np.asarray(mass_matrix, np.float64))
+        return reduced
 
     def reduced_damping(self, damping: ArrayLike) -> Float64:
         """Return the diagonal of G^T B G (independent,) for viscous damping B = diag(damping) (joints,)."""

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <limits>
 #include <vector>
@@ -60,6 +61,7 @@ enum Law {
   FORCE_AXES,
   EFFORT_MIN,
   EFFORT_MAX,
+  TURNS,
   EFFORT,  // results
   NEXT_INTEGRAL,
   LIMITED,
@@ -171,6 +173,8 @@ class OSCLaw {
   }
 
  private:
+  static constexpr double TURN = 6.283185307179586;
+
   std::int64_t links() const { return static_cast<std::int64_t>(chain_.size()); }
 
   // Set error, a and a_n.
@@ -205,7 +209,11 @@ class OSCLaw {
       if (given_[INTEGRAL] != nullptr) a_[axis] += given_[INTEGRAL][axis];
     }
     for (std::int64_t j = 0; j < dof_; ++j) {
-      a_n_[j] = given_[POSTURE_KP][j] * (given_[POSTURE][j] - qpos[j]) - given_[POSTURE_KD][j] * qvel[j];
+      Lanes away = given_[POSTURE][j] - qpos[j];
+      for (int k = 0; k < WIDTH && given_[TURNS] != nullptr; ++k) {
+        away.of[k] -= TURN * std::nearbyint(away.of[k] * given_[TURNS][j].of[k]);
+      }
+      a_n_[j] = given_[POSTURE_KP][j] * away - given_[POSTURE_KD][j] * qvel[j];
       if (given_[LIMIT_KP] == nullptr) continue;
       Lanes const low = given_[LIMIT_LOW][j] - qpos[j], high = qpos[j] - given_[LIMIT_HIGH][j];
       Lanes const depth = at_least(low, 0.0) - at_least(high, 0.0), within = absolute(depth);

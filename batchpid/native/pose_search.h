@@ -30,31 +30,43 @@ class PoseSearch {
       chain_.push_back(static_cast<std::int32_t>(rows_.size()) - 1);
       chain_.push_back(tree.tree[2 * joint + 1]);
       rows_.push_back(tree.bodies()[joint]);
-      lower_.push_back(lower.data[joint]);
-      upper_.push_back(upper.data[joint]);
+      std::int64_t const leader = tree.leader[joint];
+      auto const found = std::find(leaders_.begin(), leaders_.end(), leader);
+      of_.push_back(found - leaders_.begin());
+      multiplier_.push_back(tree.multiplier[joint]);
+      offset_.push_back(tree.offset[joint]);
+      if (found != leaders_.end()) continue;
+      leaders_.push_back(leader);
+      lower_.push_back(lower.data[leader]);
+      upper_.push_back(upper.data[leader]);
     }
-    std::size_t const size = joints_.size();
-    for (auto *leaf : {&qpos_, &cosine_, &sine_, &free_, &move_, &change_}) leaf->resize(size);
-    for (auto *leaf : {&jacobian_, &part_}) leaf->resize(AXES * size);
+    std::size_t const size = joints_.size(), moving = leaders_.size();
+    for (auto *leaf : {&cosine_, &sine_, &angle_}) leaf->resize(size);
+    for (auto *leaf : {&qpos_, &free_, &move_, &change_}) leaf->resize(moving);
+    for (auto *leaf : {&jacobian_, &part_}) leaf->resize(AXES * moving);
     bodies_.resize(size);
     motions_.resize(size);
   }
 
   void set_qpos(int lane, double const *qpos) {
-    for (std::size_t j = 0; j < joints_.size(); ++j) qpos_[j].of[lane] = qpos[joints_[j]];
+    for (std::size_t j = 0; j < leaders_.size(); ++j) qpos_[j].of[lane] = qpos[leaders_[j]];
   }
   void write_qpos(int lane, double *qpos) const {
-    for (std::size_t j = 0; j < joints_.size(); ++j) qpos[joints_[j]] = qpos_[j].of[lane];
+    for (std::size_t j = 0; j < leaders_.size(); ++j) qpos[leaders_[j]] = qpos_[j].of[lane];
   }
 
   // Return the tool at present positions, and set the Jacobian of its place.
   Tool place(Lanes const *frame) {
-    std::int64_t const size = count();
-    write_cosines(size, qpos_.data(), cosine_.data(), sine_.data());
-    place_bodies(size, chain_.data(), rows_.data(), cosine_.data(), sine_.data(), qpos_.data(), bodies_.data());
+    auto const size = static_cast<std::int64_t>(joints_.size());
+    for (std::size_t j = 0; j < joints_.size(); ++j) angle_[j] = multiplier_[j] * qpos_[of_[j]] + offset_[j];
+    write_cosines(size, angle_.data(), cosine_.data(), sine_.data());
+    place_bodies(size, chain_.data(), rows_.data(), cosine_.data(), sine_.data(), angle_.data(), bodies_.data());
     Tool const tool(frame, size == 0 ? nullptr : &bodies_.back());
-    for (std::int64_t j = 0; j < size; ++j) {
-      write_column(bodies_[j], chain_[2 * j + 1], tool.place(), &jacobian_[j * AXES]);
+    std::fill(jacobian_.begin(), jacobian_.end(), Lanes{});
+    for (std::size_t j = 0; j < joints_.size(); ++j) {
+      Lanes column[AXES];
+      write_column(bodies_[j], chain_[2 * j + 1], tool.place(), column);
+      for (int axis = 0; axis < AXES; ++axis) jacobian_[of_[j] * AXES + axis] += multiplier_[j] * column[axis];
     }
     return tool;
   }
@@ -94,7 +106,7 @@ class PoseSearch {
   static constexpr double DAMPING = 1e-8, DAMPING_PER_ERROR = 0.1, LARGEST_ACCELERATION = 0.75;
   static constexpr int PASSES = 4;
 
-  std::int64_t count() const { return static_cast<std::int64_t>(joints_.size()); }
+  std::int64_t count() const { return static_cast<std::int64_t>(leaders_.size()); }
 
   // Set the columns of the free joints and the factor of their damped J J^T; take the moves of the others off `rest`.
   void set_factor(Lanes damping, Lanes *rest) {
@@ -128,7 +140,9 @@ class PoseSearch {
   void accelerate(Vector<Lanes> const &place) {
     double const still[3] = {0.0, 0.0, 0.0};
     Lanes rate[AXES], moved{}, changed{};
-    move_bodies(count(), chain_.data(), bodies_.data(), move_.data(), still, motions_.data());
+    for (std::size_t j = 0; j < joints_.size(); ++j) angle_[j] = multiplier_[j] * move_[of_[j]];
+    move_bodies(static_cast<std::int64_t>(joints_.size()), chain_.data(), bodies_.data(), angle_.data(), still,
+                motions_.data());
     write_rate(motions_.back(), place, rate);
     solve(rate);
     for (std::int64_t j = 0; j < count(); ++j) {
@@ -143,12 +157,13 @@ class PoseSearch {
     }
   }
 
-  std::vector<std::int64_t> joints_;
+  std::vector<std::int64_t> joints_, leaders_, of_;  // of_: place of each joint's leader in leaders_
   std::vector<std::int32_t> chain_;
   std::vector<BodyRow<double>> rows_;
-  std::vector<double> lower_, upper_;
-  std::vector<Lanes> qpos_, cosine_, sine_, free_, move_, change_;
-  std::vector<Lanes> jacobian_, part_;  // a row of AXES for each joint
+  std::vector<double> multiplier_, offset_, lower_, upper_;
+  std::vector<Lanes> angle_, cosine_, sine_;  // positions, or rates, of all joints
+  std::vector<Lanes> qpos_, free_, move_, change_;  // of the leaders
+  std::vector<Lanes> jacobian_, part_;  // a row of AXES for each leader
   std::vector<BodyState<Lanes>> bodies_;
   std::vector<BodyMotion<Lanes>> motions_;
   Lanes factor_[AXES * AXES];

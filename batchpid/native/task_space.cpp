@@ -33,19 +33,24 @@ bool copy(PyObject *array, Py_ssize_t count, std::vector<T> &to) {
   return true;
 }
 
-// tree(dof, tree, rows, armature, (gravity))
+// tree(dof, tree, rows, armature, (gravity), leader, multiplier, offset)
 PyObject *make_tree(PyObject *, PyObject *arguments) {
-  PyObject *tree, *rows, *armature;
+  PyObject *tree, *rows, *armature, *leader, *multiplier, *offset;
   auto made = std::make_unique<Tree>();
   Py_ssize_t dof;
   double x, y, z;
-  if (!PyArg_ParseTuple(arguments, "nOOO(ddd)", &dof, &tree, &rows, &armature, &x, &y, &z)) return nullptr;
+  if (!PyArg_ParseTuple(arguments, "nOOO(ddd)OOO", &dof, &tree, &rows, &armature, &x, &y, &z, &leader, &multiplier,
+                        &offset)) {
+    return nullptr;
+  }
   made->dof = dof;
   made->gravity = {x, y, z};
   if (!copy(tree, 2 * dof, made->tree) || !copy(rows, dof * COLUMNS, made->rows) ||
-      !copy(armature, dof, made->armature)) {
+      !copy(armature, dof, made->armature) || !copy(leader, dof, made->leader) ||
+      !copy(multiplier, dof, made->multiplier) || !copy(offset, dof, made->offset)) {
     return nullptr;
   }
+  for (Py_ssize_t j = 0; j < dof; ++j) made->coupled = made->coupled || made->leader[j] != j;
   return PyCapsule_New(made.release(), TREE, [](PyObject *capsule) { delete tree_of(capsule); });
 }
 

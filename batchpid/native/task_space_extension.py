@@ -21,7 +21,7 @@ LAW = (
     *("kp", "kd", "c", "acceleration_share", "ki_dt", "ki_dt2", "posture_kp", "posture_kd"),
     *("limit_kp", "limit_kd", "limit_margin", "limit_low", "limit_high", "integral_limit"),
     *("position_error_limit", "rotation_error_limit", "smallest_eigenvalue", "axes", "force_axes"),
-    *("effort_min", "effort_max"),
+    *("effort_min", "effort_max", "turns"),
     *("effort", "next_integral", "limited", "error", "force", "task", "posture_effort", "unsaturated"),
     *("task_share", "posture_share", "near_singular"),
 )
@@ -36,8 +36,8 @@ SEARCH = ("goal", "tool", "lower", "upper", "tolerances", "qpos", "errors", "ste
 DECOUPLING = ("full", "partial", "none")
 """Kinds of decoupling, as Decoupling in task_space.cpp."""
 
-BUFFER, CALL, LANES, RIGID_BODY = (
-    f"batchpid/native/{name}" for name in ("buffer.h", "call.h", "lanes.h", "rigid_body.h")
+BUFFER, CALL, COUPLING, LANES, RIGID_BODY = (
+    f"batchpid/native/{name}.h" for name in ("buffer", "call", "coupling", "lanes", "rigid_body")
 )
 _HEADERS = tuple(
     f"batchpid/native/{name}.h"
@@ -51,7 +51,7 @@ def _tables() -> tuple[Any, ...]:
 
 TASK_SPACE = Extension(
     "batchpid.native._task_space",
-    ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, CALL, LANES, RIGID_BODY),
+    ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, CALL, COUPLING, LANES, RIGID_BODY),
     (*ROUNDED, "-Wno-psabi"),
     _tables,
 )

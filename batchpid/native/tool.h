@@ -8,6 +8,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "batchpid/native/coupling.h"
 #include "batchpid/native/lanes.h"
 #include "batchpid/native/rigid_body.h"
 
@@ -25,6 +26,11 @@ struct Tree {
   std::vector<std::int32_t> tree;
   std::vector<double> rows, armature;
   Vector<Lanes> gravity;
+  std::vector<std::int32_t> leader;  // of each joint: itself, if it is independent
+  std::vector<double> multiplier, offset;
+  bool coupled;                      // some joint is not independent
+
+  Coupling coupling() const { return {coupled ? leader.data() : nullptr, multiplier.data()}; }
 };
 
 // Write cosines and sines of angles.

@@ -1,8 +1,9 @@
-// Kinematics and dynamics of WIDTH robots with a tool. The equations stand in batchpid/task_space: tree_kinematics.py and
+// Kinematics and dynamics of WIDTH robots with a tool, reduced to the leaders of coupled joints. The equations stand in batchpid/task_space: tree_kinematics.py and
 // tree_dynamics.py.
 
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <vector>
 
@@ -37,8 +38,13 @@ class ToolDynamics {
   void set_tool(Lanes const *frame, bool poses, bool columns, bool moves) {
     Tool const tool(frame, body_ < 0 ? nullptr : &bodies_[body_]);
     if (poses) tool.write_pose(pose);
+    if (columns && tree_.coupled) std::fill(jacobian.begin(), jacobian.end(), Lanes{});  // leaders are added to
     for (std::int64_t j = columns ? body_ : -1; j >= 0; j = above()[2 * j]) {
       write_column(bodies_[j], above()[2 * j + 1], tool.place(), &jacobian[j], tree_.dof);
+    }
+    for (int axis = 0; axis < AXES && columns && tree_.coupled; ++axis) {
+      Lanes *row = &jacobian[axis * tree_.dof];
+      tree_.coupling().fold_vector(size(), row);
     }
     if (moves) write_rate(body_ < 0 ? BodyMotion<Lanes>{} : motions_[body_], tool.place(), rate);
   }
@@ -47,18 +53,21 @@ class ToolDynamics {
   void set_bias() {
     for (std::int64_t i = 0; i < tree_.dof; ++i) motions_[i].accelerate(bodies_[i].inertia, tree_.gravity);
     efforts_of_wrenches(tree_.dof, above(), bodies_.data(), motions_.data(), bias.data());
+    tree_.coupling().fold_vector(size(), bias.data());
   }
   void set_mass() {
     composite_mass_matrix(tree_.dof, above(), bodies_.data(), mass.data());
     for (std::int64_t i = 0; i < tree_.dof; ++i) mass[i * tree_.dof + i] += tree_.armature[i];
+    tree_.coupling().fold(size(), mass.data());
   }
 
   Lanes pose[POSE], rate[AXES];
-  std::vector<Lanes> jacobian;  // 0 for joints that are not between base and tool
+  std::vector<Lanes> jacobian;  // J G: 0 for joints that do not move the tool, and for followers
   std::vector<Lanes> mass, bias;
 
  private:
   std::int32_t const *above() const { return tree_.tree.data(); }
+  std::size_t size() const { return static_cast<std::size_t>(tree_.dof); }
 
   Tree const &tree_;
   std::int64_t body_;

@@ -146,13 +146,14 @@ class _Search:
         self._chain = tree.chain(tree.links[index])
         self._limits: tuple[Float64, Float64] = np.asarray(tree.lower), np.asarray(tree.upper)
         turn = self._limits[1] - self._limits[0]
-        self._full = self._chain & (tree.bodies.slides[:, 0] == 0) & (turn > _FULL_TURN) & np.isfinite(turn)
+        turns = _wholly_turning(tree)
+        self._full = self._chain & turns & (turn > _FULL_TURN) & np.isfinite(turn)
 
     def drawn(self, rows: Float64, share: Float64) -> Float64:
         """Return starts at a ``share`` (dof,) of the range of each joint, half a turn about ``rows`` without limits."""
         low, high = self._limits
         low, high = np.where(np.isfinite(low), low, rows - np.pi), np.where(np.isfinite(high), high, rows + np.pi)
-        return np.where(self._chain, low + share * (high - low), rows)
+        return self._tree.positions(np.where(self._chain, low + share * (high - low), rows))
 
     def solve_past_limits(self, goal: Float64, qpos: Float64) -> IKResult:
         """Return the results of searches in which joints with a full turn between their limits pass these."""
@@ -198,7 +199,7 @@ class _Search:
             rows = going[better]
             nearest[rows], lengths[rows], steps[rows] = q[better], found[better], step
             stay = ~(found <= self._tolerance).all(1)
-            going, q = going[stay], _stepped(limits, at, q, error)[stay]
+            going, q = going[stay], self._tree.positions(_stepped(limits, at, q, error))[stay]
             if not len(going):
                 break
         return [nearest, lengths, steps]
@@ -216,7 +217,8 @@ class _At:
 
     def rate(self, qvel: Float64) -> Float64:
         """Return J' q' (n, 6)."""
-        return rate_at(self._tree, velocities_of(self._tree, self._motions, qvel, np), self._index, self._place)
+        velocities = velocities_of(self._tree, self._motions, self._tree.rates(qvel), np)
+        return rate_at(self._tree, velocities, self._index, self._place)
 
 
 def _stepped(limits: tuple[Float64, Float64], at: _At, qpos: Float64, error: Float64) -> Float64:
@@ -256,7 +258,17 @@ def _goals_and_starts(tree: KinematicTree, pose: ArrayLike, start: ArrayLike) ->
     unit = np.abs(length - 1) < 1e-3
     entries("pose", length, unit, "has a quaternion that is not of unit length", ["qw"], remedy="normalise w, x, y, z")
     goal[:, 3:] /= length
-    return goal, np.clip(rows, tree.lower, tree.upper)
+    return goal, tree.positions(np.clip(rows, tree.lower, tree.upper))
+
+
+def _wholly_turning(tree: KinematicTree) -> NDArray[np.bool_]:
+    """Return the joints (dof,) that a whole turn brings back to the same pose of all links."""
+    turning = tree.bodies.slides[:, 0] == 0
+    if tree.coupling is None:
+        return turning
+    pitch = np.where(turning, tree.coupling.multiplier % 1, tree.coupling.multiplier)  # 0 if the follower is back, too
+    back = np.bincount(tree.coupling.leader, pitch != 0, minlength=tree.dof) == 0
+    return turning & back & tree.independent
 
 
 def _lengths(found: IKResult, rows: Any) -> Float64:

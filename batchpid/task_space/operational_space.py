@@ -43,7 +43,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.elementwise import clip, namespace
+from batchpid.arrays.elementwise import clip, namespace, wrap
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_law
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
@@ -373,7 +373,7 @@ def _accelerations(kp: Any, kd: Any, c: Any, share: Any, e: Any, v: Any, twist: 
 def posture_acceleration(k: OSCCoefficients, d: TaskDynamics, posture: Any, q: Any, v: Any) -> Any:
     """Return a_n (envs, dof)."""
     xp = namespace(posture, q, v)
-    a = k.posture_kp * (posture - q) - k.posture_kd * v
+    a = k.posture_kp * wrap(posture - q, k.turns, xp) - k.posture_kd * v
     if k.limit_kp is None:
         return a
     depth = xp.maximum(k.limit_low - q, 0.0) - xp.maximum(q - k.limit_high, 0.0)

@@ -54,6 +54,7 @@ class OSCCoefficients(NamedTuple):
     force_axes: Any
     effort_min: Any
     effort_max: Any
+    turns: Any
     decoupling: Any
     frame: Any
 

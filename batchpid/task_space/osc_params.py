@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.choices import CHOICES, Choice
 from batchpid.arrays.display import array_summary
+from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field
 from batchpid.checks.keywords import known_keywords
 from batchpid.checks.validate import array, choice, entries, instance, read_array
@@ -105,6 +106,9 @@ class OSCParams(NamedTuple):
     lower: Any = None
     """Position limits of the tree (1, dof) [rad or m]; None without ``limit_margin``."""
     upper: Any = None
+    turns: Any = None
+    """1 / (2 pi) for joints of the tree that turn without limits, whose posture is the one next to qpos, else 0
+    (1, dof); None without such joints."""
     discretization: Any = None
     """ImplicitLaw(): the gains act on the predicted end of the step; None: on its beginning."""
 
@@ -155,7 +159,7 @@ def make_osc_params(
         Bools: axes, not among ``axes``, that the wrench controls, and on which the posture does not act.
     posture_stiffness, posture_damping_ratio
         Gains of the joints towards their posture: within the null space of the task for the joints of the chain to the
-        tool, fully for others, such as fingers [1/s^2].
+        tool, fully for others, such as fingers [1/s^2]. Followers have none.
     limit_margin, limit_stiffness
         Joints of the chain that come nearer to a position limit than the margin [rad or m], or a quarter of their
         range, are pushed away within the null space, by a critically damped spring [1/s^2]. None: no margin.
@@ -190,7 +194,7 @@ def make_osc_params(
         problem = "'implicit' needs gains of accelerations, which decoupling 'none' has not"
         raise InvalidArgumentError("discretization", problem, remedy="use 'explicit', or decoupling 'full'")
     kd = 2 * _rows("damping_ratio", damping_ratio, AXES) * np.sqrt(kp)
-    posture = _rows("posture_stiffness", posture_stiffness, joints)
+    posture = _rows("posture_stiffness", posture_stiffness, joints) * tree.independent
     motion, force = (_mask(name, value) for name, value in (("axes", axes), ("force_axes", force_axes)))
     if force is not None:
         both = force * (np.ones((1, 6)) if motion is None else motion)
@@ -208,7 +212,8 @@ def make_osc_params(
     if low is not None and high is not None:
         ends = np.broadcast_arrays(low, high)
         entries("effort_min", ends[0], ends[0] <= ends[1], "exceeds effort_max", joints)
-    limits = np.array([tree.lower, tree.upper])
+    limits, own = np.array([tree.lower, tree.upper]), tree.independent
+    endless = np.isinf(limits).all(0) & (tree.bodies.slides[:, 0] == 0)
     margin = None if limit_margin is None else _rows("limit_margin", limit_margin, joints)
     integral = None if integral_gain is None else _rows("integral_gain", integral_gain, AXES)
     params = OSCParams(
@@ -227,10 +232,11 @@ def make_osc_params(
         frame=TASK_CHOICES["frame"][choice("frame", frame, TASK_CHOICES["frame"])],
         integral_gain=integral,
         integral_limit=None if integral is None else _rows("integral_limit", integral_limit, AXES),
-        limit_stiffness=None if margin is None else _rows("limit_stiffness", limit_stiffness, joints),
+        limit_stiffness=None if margin is None else _rows("limit_stiffness", limit_stiffness, joints) * own,
         limit_margin=None if margin is None else np.minimum(margin, (limits[1:] - limits[:1]) / 4),
         lower=None if margin is None else limits[:1],
         upper=None if margin is None else limits[1:],
+        turns=(endless / TURN)[None] if endless.any() else None,
         discretization=TASK_CHOICES["discretization"][discretization],
     )
     _check_rows(params)

@@ -12,6 +12,8 @@ q'' = 0, less their weight (recursive Newton-Euler algorithm, section 5.3). With
 mass r of a body, its inertia tensor I about it, its angular velocity w and its angular acceleration w'::
 
     f = m (a - g)      n = I w' + w x I w + r x f      h_j = s_j . (sum of (f, n) of all that joint j moves)
+
+The results for coupled joints are reduced to their leaders, G^T M G and G^T h (:mod:`batchpid.motors.coupling`).
 """
 
 from __future__ import annotations
@@ -81,7 +83,8 @@ def inverse_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, qacc: Any) -> An
     (q, v, a), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel, qacc=qacc)
     if (found := native_rows.kinematics(tree, ("mass_matrix", "bias"), q, v)) is not None:
         with quiet():
-            return product(found[0], a) + found[1]
+            return product(found[0], tree.independent * a) + found[1]
+    a = tree.rates(a)
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         still = velocities_of(tree, motions, v, xp)
@@ -89,7 +92,7 @@ def inverse_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, qacc: Any) -> An
             linear_rate=still.linear_rate + from_base(tree, motions.linear * a[..., None], xp),
             angular_rate=still.angular_rate + from_base(tree, motions.angular * a[..., None], xp),
         )
-        return effort_of(tree, bodies, motions, moving, xp) + bodies.armature * a
+        return tree.efforts(effort_of(tree, bodies, motions, moving, xp) + bodies.armature * a)
 
 
 def forward_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, effort: Any) -> Any:
@@ -102,18 +105,21 @@ def forward_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, effort: Any) -> 
     """
     check_masses(tree)
     (q, v, u), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel, effort=effort)
+    u = tree.efforts(u)
     if (found := native_rows.kinematics(tree, ("mass_matrix", "bias"), q, v)) is not None:
         with quiet():
-            return solve(found[0], (u - found[1])[..., None])[..., 0]
+            return tree.rates(solve(found[0], (u - found[1])[..., None])[..., 0])
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         force = effort_of(tree, bodies, motions, velocities_of(tree, motions, v, xp), xp)
-        return solve(mass_matrix_of(tree, bodies, motions, xp), (u - force)[..., None])[..., 0]
+        return tree.rates(solve(mass_matrix_of(tree, bodies, motions, xp), (u - force)[..., None])[..., 0])
 
 
 def check_masses(tree: KinematicTree) -> None:
     """Raise InvalidArgumentError for a joint that moves no mass and has no armature: its mass matrix is singular."""
     moved = tree.bodies.moves.T @ tree.bodies.mass[:, 0] + tree.bodies.armature
+    if tree.coupling is not None:
+        moved = tree.coupling.of_all(tree.coupling.reduced_damping(moved))
     for joint, kg in zip(tree.joint_names, moved, strict=True):
         if not kg > 0:
             problem = "has a joint that moves no mass and has no armature"
@@ -139,7 +145,8 @@ def mass_matrix_of(tree: KinematicTree, bodies: Bodies, motions: Motions, xp: An
     above = xp.swapaxes(bodies.moves, 0, 1) > 0
     rest = xp.where(bodies.moves > 0, xp.swapaxes(table, -1, -2), xp.zeros_like(table))
     matrix = xp.where(above, table, rest)
-    return matrix + bodies.armature * xp.eye(tree.dof, dtype=matrix.dtype)
+    matrix = matrix + bodies.armature * xp.eye(tree.dof, dtype=matrix.dtype)
+    return matrix if tree.coupling is None else tree.coupling.arrays.mass_matrix(matrix).astype(matrix.dtype)
 
 
 def effort_of(tree: KinematicTree, bodies: Bodies, motions: Motions, rates: Velocities, xp: Any) -> Any:
@@ -152,7 +159,7 @@ def effort_of(tree: KinematicTree, bodies: Bodies, motions: Motions, rates: Velo
     force = bodies.mass * (acceleration - bodies.gravity)
     spin = rotate(tensor, rates.angular_rate) + cross(w, rotate(tensor, w))
     wrench = from_tips(tree, xp.concatenate([force, spin + cross(center, force)], axis=-1), xp)
-    return (xp.concatenate([motions.linear, motions.angular], axis=-1) * wrench).sum(-1)
+    return tree.efforts((xp.concatenate([motions.linear, motions.angular], axis=-1) * wrench).sum(-1))
 
 
 def _in_world(turn: Any, tensor: Any, xp: Any) -> Any:

@@ -225,12 +225,12 @@ def read_point(like: Any, point: Any) -> Any:
 
 
 def jacobian_at(tree: KinematicTree, bodies: Bodies, motions: Motions, index: int, place: Any) -> Any:
-    """Return the Jacobian (..., 6, dof) of a link's point at ``place`` (..., 3) in the world."""
+    """Return the Jacobian (..., 6, dof) of a link's point at ``place`` (..., 3) in the world, J G of coupled joints."""
     xp, body = namespace(place), tree.link_bodies[index]
     linear = motions.linear + cross(motions.angular, place[..., None, :])
     columns = xp.concatenate([linear, motions.angular], axis=-1)
     moved = bodies.moves[body][:, None] > 0 if body >= 0 else xp.asarray(False)
-    return xp.moveaxis(xp.where(moved, columns, xp.zeros_like(columns)), -1, -2)
+    return tree.efforts(xp.moveaxis(xp.where(moved, columns, xp.zeros_like(columns)), -1, -2))
 
 
 def rate_at(tree: KinematicTree, velocities: Velocities, index: int, place: Any) -> Any:

@@ -11,6 +11,9 @@ constraints and integrals of motion in dynamical systems", Computer Methods in A
 1972): their poles are at |z| = 0.71, and stay stable up to three times these gains, when M is that much off. A force F
 on the follower alone, as of an object, displaces it by 4 F dt^2 (J M^-1 J^T).
 
+SAPIEN's positions of continuous joints jump from one end of [-2 pi, 2 pi] to the other, which would move a follower by
+4 pi m. So the constraint counts the jumps: it takes the position nearest to the one in the sim step before.
+
 PhysX's fixed tendons, which SAPIEN takes for this, hold one follower, but several followers of one leader shake a whole
 arm, or make it diverge. See docs/joints.md.
 """
@@ -33,17 +36,23 @@ from batchpid.sim.engine.native_model import NativeModel
 
 RATE_GAIN, POSITION_GAIN = 0.5, 0.25
 """Gains of c' dt and c in units of 1 / dt^2."""
+WRAP = 2 * TURN
+"""Size of a jump in SAPIEN's positions of continuous joints [rad]."""
 
 
 class ConstraintEfforts:
-    """Constraint efforts of robots with the coupling ``coupling``; ``continuous`` (dof,) positions wrap.
+    """Constraint efforts of robots with the coupling ``coupling``; positions of the joints ``wraps`` (dof,) jump.
 
     Arrays are (robots, dof). :meth:`update` comes before the first :meth:`apply`. Native code applies and updates the
     efforts by the structure at :attr:`address`; it writes the efforts without the constraint's into ``asked``, if
-    given.
+    given. Where positions jump, :meth:`place` comes after every change of positions that is no motion.
 
     Attributes
     ----------
+    wraps
+        Mask of the joints whose positions jump (dof,).
+    unwrapped
+        Positions in the last sim step, without jumps (robots, dof); not used for other joints.
     implicit
         Inertia on the diagonal of the mass matrix besides the model's: armature of the motors, and damping times dt.
     """
@@ -52,12 +61,12 @@ class ConstraintEfforts:
         self,
         robots: int,
         coupling: Coupling,
-        continuous: NDArray[np.bool_],
+        wraps: NDArray[np.bool_],
         timestep: float,
         asked: NDArray[np.float32] | None = None,
     ) -> None:
         joints, followers = len(coupling.leader), coupling.followers
-        self._coupling, self._wraps = coupling, continuous[followers]
+        self._coupling, self.wraps, self.unwrapped = coupling, wraps, np.zeros((robots, joints))
         self._rate_gain, self._position_gain = RATE_GAIN / timestep, POSITION_GAIN / timestep**2
         self._response = np.zeros((robots, len(followers), joints))
         self._push, self._passive = np.zeros((robots, joints, len(followers))), np.zeros((robots, joints))
@@ -72,7 +81,8 @@ class ConstraintEfforts:
             "leaders": coupling.leader[followers].astype(np.int64),
             "multiplier": coupling.multiplier[followers],
             "offset": coupling.offset[followers],
-            "wraps": self._wraps,
+            "wraps": wraps,
+            "unwrapped": self.unwrapped,
             "wrong": np.zeros(len(followers)),
             "free": np.zeros(joints),
         } | ({} if asked is None else {"asked": asked})
@@ -119,11 +129,15 @@ class ConstraintEfforts:
         self._response[rows], self._passive[rows] = response, np.where(sound[:, 0], passive[rows], 0.0)
         self._push[rows] = jacobian.T @ np.linalg.inv(response @ jacobian.T)
 
+    def place(self, rows: Sequence[int], qpos: NDArray[Any]) -> None:
+        """Put robots ``rows`` at positions ``qpos`` (len(rows), dof)."""
+        self.unwrapped[rows] = qpos
+
     def apply(self, effort: NDArray[np.floating], qpos: Float64, qvel: Float64) -> Float64:
         """Return ``effort`` with the constraint efforts added."""
         coupling, followers = self._coupling, self._coupling.followers
-        error = (qpos - coupling.positions(qpos))[:, followers]
-        error = np.where(self._wraps, error - TURN * np.rint(error / TURN), error)
+        self.unwrapped[...] = np.where(self.wraps, qpos + WRAP * np.rint((self.unwrapped - qpos) / WRAP), qpos)
+        error = (self.unwrapped - coupling.positions(self.unwrapped))[:, followers]
         rate = (qvel - coupling.rates(qvel))[:, followers]
         wrong = multiply(self._response, effort - self._passive)
         wrong += self._rate_gain * rate + self._position_gain * error

@@ -107,7 +107,7 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
                 remedy = "give joint positions in which the tool is where it works, such as robot.settings.target"
                 raise InvalidArgumentError("posture", f"is needed for the robot {robot.name!r}", remedy=remedy)
             posture = self.panda_posture
-        self.posture = array("posture", posture, (1, robot.dof), robot.joint_names)[0]
+        self.posture = robot.coupled(array("posture", posture, (1, robot.dof), robot.joint_names)[0])
         kinematics = Kinematics(robot)
         self.tool = kinematics.links[kinematics.tool]
         if self._tool is not None:
@@ -138,7 +138,7 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
         """Draw a start around the posture; joints outside the chain to the tool start in it."""
         moves = self.robot.kinematic_tree().chain(self.tool) & self.robot.independent
         drawn = self.posture + self.spread * moves * random.uniform(-1.0, 1.0, self.robot.dof)
-        return np.clip(drawn, self.robot.lower, self.robot.upper)
+        return self.robot.coupled(np.clip(drawn, self.robot.lower, self.robot.upper))
 
     def first_setpoint(self, qpos: Float64) -> Float64:
         """Return the poses of the tool."""

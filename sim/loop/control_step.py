@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.elementwise import clip, namespace, replace_envs, wrap
+from batchpid.arrays.elementwise import clip, namespace, nearest_turn, replace_envs, wrap
 from batchpid.law.coefficients import Coefficients
 from batchpid.motors import STAGES, ActuatorState, Stages, advance_effort, advance_measurement
 from batchpid.motors import friction as friction_model
@@ -137,6 +137,8 @@ class Constants(NamedTuple):
     """:class:`batchpid.motors.Coefficients` of motors and sensors."""
     driven: bp.PIDParams | None = None
     """Params of the integral that moves the targets of drives."""
+    turns: Any = None
+    """1 / (2 pi) on continuous joints with drives, 0 elsewhere; None without such joints."""
     coupling: CouplingArrays | None = None
 
 
@@ -282,10 +284,12 @@ def _drive(layout: Layout, constants: Constants, state: StepState, given: Inputs
     """PhysX's internal drive with stiffness kp and damping kd; qf = feedforward.
 
     With ki the drive's target moves by the integral over kp (:func:`batchpid.drive_target`), so that the drive acts as
-    a PID whose P and D the engine integrates implicitly.
+    a PID whose P and D the engine integrates implicitly. The engine's drives do not know whole turns, so the target of
+    a continuous joint is the one next to qpos, which may jump at every sim step.
     """
     (target, rate, _), seen, *_ = given
     xp = namespace(seen.qpos)
+    target = nearest_turn(target, seen.qpos, constants.turns, xp)
     if constants.driven is not None:
         rates = {"setpoint_rate": rate, "feedforward": seen.passive}
         law, target = bp.drive_target(constants.driven, state.law, target, seen.qpos, constants.timestep, **rates)

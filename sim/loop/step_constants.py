@@ -67,9 +67,8 @@ def make_constants(
     if options.control == "drive":
         kd = np.zeros_like(acting.kp) if acting.kd is None else acting.kd
         integrates = params.ki is not None and bool(np.any(params.ki > 0))
-        return constants._replace(
-            drive=(kd, acting.kp), driven=acting._replace(measurement_rate=None) if integrates else None
-        )
+        driven = acting._replace(measurement_rate=None) if integrates else None
+        return constants._replace(drive=(kd, acting.kp), driven=driven, turns=_turns(pack))
     return constants
 
 
@@ -88,8 +87,13 @@ def _known_friction(options: RunnerOptions, pack: EnginePack) -> KnownFriction |
     friction = np.array([joint.friction * modelled for joint in joints]) + known_joints(options.robot).coulomb
     if not (friction.any() and "friction" in options.compensate.split("+") and options.sets_positions):
         return None
-    turns = np.array([joint.continuous / TURN for joint in joints])
-    return KnownFriction(friction, np.array([BAND[joint.unit] for joint in joints]), turns if turns.any() else None)
+    return KnownFriction(friction, np.array([BAND[joint.unit] for joint in joints]), _turns(pack))
+
+
+def _turns(pack: EnginePack) -> Any:
+    """Return 1 / (2 pi) for continuous joints and 0 for others (dof,); None without continuous joints."""
+    turns = np.array([joint.continuous / TURN for joint in pack.spec.joints])
+    return turns if turns.any() else None
 
 
 def needs_qvel(layout: Layout, constants: Constants, speed_limit: Any) -> bool:

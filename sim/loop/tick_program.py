@@ -206,7 +206,8 @@ class TickProgram:
 
 def moves_drives(layout: Layout, constants: Constants) -> bool:
     """Return whether the targets of the engine's drives move within a tick."""
-    return layout.control == "drive" and (constants.driven is not None or constants.guard is not None)
+    moving = constants.driven, constants.guard, constants.turns
+    return layout.control == "drive" and any(each is not None for each in moving)
 
 
 @lru_cache(maxsize=64)

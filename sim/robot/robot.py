@@ -208,8 +208,8 @@ class Robot(RobotDescription):
 
         No engine is needed, unless a link has collision shapes and no ``<inertial>``: SAPIEN computes its inertia.
 
-        It knows every link of the URDF by name, merged ones included. Its joints move independently: it ignores mimic
-        couplings, friction and damping.
+        It knows every link of the URDF by name, merged ones included. Followers move with their leaders
+        (:attr:`coupling`). It has no friction and damping.
 
         Parameters
         ----------

@@ -47,6 +47,7 @@ def kinematic_tree(robot: RobotDescription, **options: Any) -> KinematicTree:
         inertia=np.array([inertia.tensor for inertia in of_links]),
         lower=np.where(robot.continuous, -np.inf, robot.lower),
         upper=np.where(robot.continuous, np.inf, robot.upper),
+        coupling=robot.coupling,
         **options,
     )
 

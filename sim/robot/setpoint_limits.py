@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +11,7 @@ import batchpid as bp
 from batchpid.arrays.leaves import frozen
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
+from batchpid.motors.coupling import Coupling
 from batchpid.motors.guard import check_guard
 from batchpid.sim.robot.parts import Joint
 
@@ -31,34 +32,78 @@ class GuardedRobot(Protocol):
         """Joints whose positions wrap."""
 
     @property
-    def independent(self) -> NDArray[np.bool_]:
-        """Joints that are not followers."""
+    def coupling(self) -> Coupling | None:
+        """Coupling of the joints; None without followers."""
 
 
 def setpoint_guard(robot: GuardedRobot, rate: ArrayLike | None, acceleration: ArrayLike | None) -> bp.Guard:
-    """Return the limits of setpoints, of the URDF where they are not given; followers have none."""
-    own, joints, dof = robot.independent, robot.joints, len(robot.joints)
+    """Return the limits of setpoints, of the URDF where they are not given.
 
-    def of_leaders(name: str, value: Any) -> Any:
-        checked = getattr(bp.make_guard(dof, joint_names=robot.joint_names, **{name: value}), name)
-        return None if checked is None else np.where(own, checked, np.inf)
+    Followers have none: their limits narrow those of their leaders.
 
+    Raises InvalidArgumentError if a follower of a continuous joint has position limits.
+    """
+    joints = robot.joints
     fastest = [joint.velocity_limit if joint.velocity_limit > 0 else np.inf for joint in joints]
-    return bp.make_guard(
-        dof,
-        lower=np.where(own, [max(joint.lower, joint.soft_lower) for joint in joints], -np.inf),
-        upper=np.where(own, [min(joint.upper, joint.soft_upper) for joint in joints], np.inf),
-        rate=of_leaders("rate", fastest if rate is None else rate),
-        acceleration=of_leaders("acceleration", acceleration),
+    limits = bp.make_guard(
+        len(joints),
+        lower=[max(joint.lower, joint.soft_lower) for joint in joints],
+        upper=[min(joint.upper, joint.soft_upper) for joint in joints],
+        rate=fastest if rate is None else rate,
+        acceleration=acceleration,
         continuous=robot.continuous,
         joint_names=robot.joint_names,
     )
+    return _of_leaders(limits, robot)
+
+
+def _of_leaders(guard: bp.Guard, robot: GuardedRobot) -> bp.Guard:
+    """Return ``guard`` with limits of the leaders that hold for their followers, too, and none of the followers.
+
+    Position limits of a follower that leave its leader no range are left out, as in a robot's own limits.
+    """
+    coupling = robot.coupling
+    if coupling is None:
+        return guard
+    shape = max((np.shape(leaf) for leaf in guard if leaf is not None), default=(1, len(robot.joints)))
+    free = guard._replace(lower=-np.inf, upper=np.inf, rate=np.inf, acceleration=np.inf)
+    low, high, rate, acceleration = (
+        np.broadcast_to(none if leaf is None else leaf, shape).astype(np.float64)
+        for leaf, none in zip(guard[:4], free[:4], strict=True)
+    )
+    for index in coupling.followers.tolist():
+        leader, multiplier = int(coupling.leader[index]), float(coupling.multiplier[index])
+        if multiplier == 0:
+            continue
+        for fastest in (rate, acceleration):
+            fastest[:, leader] = np.minimum(fastest[:, leader], fastest[:, index] / abs(multiplier))
+        ends = np.sort([(end[:, index] - coupling.offset[index]) / multiplier for end in (low, high)], axis=0)
+        if robot.continuous[leader]:
+            _check_turning(robot, index, leader, ends)
+            continue
+        ends = np.stack([np.maximum(low[:, leader], ends[0]), np.minimum(high[:, leader], ends[1])])
+        narrower = ends[0] < ends[1]
+        low[:, leader], high[:, leader] = np.where(narrower, ends, (low[:, leader], high[:, leader]))
+    for limits, none in zip((low, high, rate, acceleration), free, strict=False):
+        limits[:, coupling.followers] = none
+    found = dict(zip(guard._fields, (low, high, rate, acceleration), strict=False))
+    return guard._replace(**{name: None if np.isinf(limits).all() else limits for name, limits in found.items()})
+
+
+def _check_turning(robot: GuardedRobot, index: int, leader: int, ends: NDArray[np.float64]) -> None:
+    """Raise InvalidArgumentError for position limits ``ends`` of a follower of a continuous joint."""
+    if np.isfinite(ends).any():
+        names = robot.joint_names
+        problem = f"cannot hold the position limits of {names[index]!r}, which follows the continuous joint"
+        remedy = "make the leader revolute with limits, or pass batchpid.make_guard(...) without lower and upper"
+        raise InvalidArgumentError("guard", problem, joint=names[leader], remedy=remedy)
 
 
 def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, sets_positions: bool) -> bp.Guard | None:
     """Return the guard for a runner's option ``guard``; None means no guard.
 
-    Raises InvalidArgumentError if it does not fit the robot or the control.
+    Raises InvalidArgumentError if it does not fit the robot or the control, or limits the positions of a follower of a
+    continuous joint.
     """
     if guard is False or guard is None:
         return None
@@ -68,4 +113,4 @@ def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, s
     limits = setpoint_guard(robot, None, None) if guard is True else guard
     limits = instance("guard", limits, bp.Guard, "pass True, or robot.guard(...)")
     check_guard(limits, num_envs, robot.joint_names)
-    return frozen(limits)
+    return frozen(_of_leaders(limits, robot))

@@ -114,7 +114,9 @@ class OperationalSpace:
         """Link that carries the tool."""
         self.point = None if point is None else array("point", point, (1, 3), "xyz", kind="entry")[0]
         """Tool in the link's frame (3,) [m]; None for its origin."""
-        self._posture = array("posture", robot.start if posture is None else posture, (1, tree.dof), tree.joint_names)
+        _check_coupling(tree, robot)
+        given = array("posture", robot.start if posture is None else posture, (1, tree.dof), tree.joint_names)
+        self._posture = robot.coupled(given)
         if params is None:
             if not {"effort_limit", "effort_min", "effort_max"} & set(options):
                 options["effort_limit"] = robot.effort_limit
@@ -123,6 +125,9 @@ class OperationalSpace:
             problem, remedy = "are given together with params", "give them to the function that makes the params"
             raise InvalidArgumentError(next(iter(options)), problem, remedy=remedy)
         params = _of_one_row(instance("params", params, ts.OSCParams, "make them with make_osc_params()"))
+        if (params.posture_stiffness * ~tree.independent).any():
+            problem = "are for a tree without the coupling of the joints: followers have a posture stiffness"
+            raise InvalidArgumentError("params", problem, remedy="make them with robot.kinematic_tree()")
         self._params = params
         self._k, self._timestep = ts.discretise(params, 1 / 2000), 1 / 2000
         self._friction: Friction | None = None
@@ -146,6 +151,8 @@ class OperationalSpace:
             if chain[joint]:
                 remedy = "name joints outside the chain, such as fingers"
                 raise InvalidArgumentError("joints", f"the pose of {link!r} controls it", joint=name, remedy=remedy)
+            if not tree.independent[joint]:
+                raise InvalidArgumentError("joints", "follows another joint", joint=name, remedy="name its leader")
             self._columns[joint] = column
         units = dict(zip(robot.joint_names, robot.units, strict=True)) if joints else {}
         entries |= {name: units[name] for name in joints}
@@ -278,6 +285,13 @@ def default_tool(robot: Robot) -> str:
 def tool_pose(tree: ts.KinematicTree, link: str, point: Any, qpos: Any) -> NDArray[np.float32]:
     """Return the poses of a tool (..., 7) at ``qpos`` (..., dof), as they are observed."""
     return ts.link_poses(tree, qpos, [link], point=point)[..., 0, :].astype(np.float32)
+
+
+def _check_coupling(tree: ts.KinematicTree, robot: Robot) -> None:
+    """Raise InvalidArgumentError if ``tree`` has another coupling of the joints than ``robot``."""
+    if repr(tree.coupling) != repr(robot.coupling):
+        problem = f"has {tree.coupling or 'no coupling'}, but the robot {robot.coupling or 'none'}"
+        raise InvalidArgumentError("tree", problem, remedy="pass robot.kinematic_tree(...)")
 
 
 def _of_one_row(params: ts.OSCParams) -> ts.OSCParams:

@@ -28,18 +28,35 @@ class ToolSetpoints:
     Raises
     ------
     InvalidArgumentError
-        The link is unknown.
+        The link is unknown, or a joint in the chain to it follows a continuous joint, so that a whole turn of that
+        changes the pose of the tool.
     RobotError
         The robot has no kinematic tree: see :meth:`Robot.kinematic_tree`.
     """
 
     def __init__(self, robot: Robot, link: str) -> None:
         self._tree, self.link = robot.kinematic_tree(), link
+        self._check_turns(robot)
         self._others = np.flatnonzero(~self._tree.chain(link))
         names, units = ([of[joint] for joint in self._others] for of in (robot.joint_names, robot.units))
         self.command = CommandSpec((*POSE_UNITS, *names), (*POSE_UNITS.values(), *units))
         """Names and units of a setpoint: the pose, and the positions of joints outside the chain to the link."""
         self._has_warned = False
+
+    def _check_turns(self, robot: Robot) -> None:
+        """Raise InvalidArgumentError for followers that have another position after a whole turn of their leader.
+
+        The law takes setpoints of continuous joints modulo whole turns.
+        """
+        moving = self._tree.chains[self._tree.link_bodies[self._tree.index(self.link)]] > 0
+        for index, joint in enumerate(robot.joints):
+            if robot.coupling is None or not moving[index] or robot.independent[index]:
+                continue
+            leader, multiplier = robot.joints[robot.coupling.leader[index]], robot.coupling.multiplier[index]
+            if leader.continuous and (multiplier % 1 if joint.unit == "rad" else multiplier):
+                problem = f"'tool': the pose of {self.link!r} depends on the turns of {leader.name!r}"
+                remedy = "use control 'osc', or setpoint_space 'joints'"
+                raise InvalidArgumentError("setpoint_space", problem, joint=joint.name, remedy=remedy)
 
     def tool_pose(self, qpos: Any) -> NDArray[np.float32]:
         """Return the poses of the link (..., 7) at ``qpos`` (..., dof)."""

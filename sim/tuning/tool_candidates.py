@@ -76,7 +76,7 @@ class SearchedSpace(OperationalSpace):
         position, rotation, posture, *ratios = (setpoint[:, 7 + k : 8 + k] for k in range(len(GAINS)))
         bandwidth = xp.concatenate([position] * 3 + [rotation] * 3, axis=1)
         ratio = xp.concatenate([ratios[0]] * 3 + [ratios[1]] * 3, axis=1)
-        joint = posture + xp.zeros_like(self.params.posture_stiffness)
+        joint = posture * self.tree.independent.astype(posture.dtype)
         gains = {"stiffness": bandwidth**2, "damping": 2 * ratio * bandwidth}
         gains |= {"posture_stiffness": joint**2, "posture_damping": 2 * joint}
         return ts.discretise(self.params._replace(**gains), self._timestep)

@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.elementwise import TURN
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine import native
@@ -75,9 +74,8 @@ class MujocoPack(SingleOwner):
         self._implicit = spec.timestep * np.array([[joint.damping for joint in spec.joints]])
         self._actuators: Actuators | None = None
         coupling, self._constraint = coupling_of(spec.joints), None
-        self._continuous = np.array([joint.continuous for joint in spec.joints])
         if coupling is not None:
-            self._constraint = ConstraintEfforts(size, coupling, self._continuous, spec.timestep)
+            self._constraint = ConstraintEfforts(size, coupling, np.zeros(self.dof, bool), spec.timestep)
             self._constraint.implicit[...] = self._implicit
             if self.steps_natively:
                 self._constraint.use(
@@ -253,7 +251,7 @@ class MujocoPack(SingleOwner):
         self, reads_force: bool, speed_limit: NDArray[np.float64] | None, drives: bool = False
     ) -> MujocoStep:
         constraint, arrays = None if self._constraint is None else self._constraint.address, (self.qf, self._suspended)
-        moving = (self._stiffness, self._rate_gain, self._continuous) if drives else None
+        moving = (self._stiffness, self._rate_gain) if drives else None
         return MujocoStep(
             self._robot, self.models, lambda: self._data, *arrays, reads_force, speed_limit, constraint, moving
         )
@@ -373,8 +371,6 @@ class MujocoPack(SingleOwner):
 
     def write_drive_target(self, position: NDArray[Any], velocity: NDArray[Any] | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
-        error = position - self.read_qpos()
-        position = np.where(self._continuous, position - TURN * np.rint(error / TURN), position)
         if velocity is not None:
             self._target_rate = velocity
         values = self._stiffness * position + self._rate_gain * self._target_rate

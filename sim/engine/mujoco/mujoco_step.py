@@ -74,8 +74,7 @@ class MujocoStep:
     constraint
         Address of the constraint of coupled joints, or None.
     drives
-        Stiffness and rate gain of the drives (robots, dof), and the joints that are continuous (dof,), if the targets
-        move within a tick.
+        Stiffness and rate gain of the drives (robots, dof), if the targets move within a tick.
     """
 
     def __init__(
@@ -104,7 +103,7 @@ class MujocoStep:
         arrays: dict[str, NDArray[Any]] = {name: np.array(rows, np.uint64) for name, rows in tables.items()}
         arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64), "qf": qf}
         if drives is not None:
-            arrays |= zip(("stiffness", "rate_gain", "continuous"), drives, strict=True)
+            arrays |= zip(("stiffness", "rate_gain"), drives, strict=True)
         robots = Mujoco(**addresses, **{name: array.ctypes.data for name, array in arrays.items()})
         robots.clearance = None if clearance is None else clearance.address
         limit = None if speed_limit is None else np.broadcast_to(speed_limit, qf.shape[1:]).astype(np.float64)

@@ -19,7 +19,8 @@ struct Constraint {
   double *passive;                         // (robots, dof)
   std::int64_t const *followers, *leaders;  // (followers,)
   double const *multiplier, *offset;       // (followers,)
-  char const *wraps;                       // (followers,): differences of positions lose their whole turns
+  char const *wraps;                       // (dof,): joints whose positions jump by WRAP
+  double *unwrapped;                       // (robots, dof): positions of the last step, without jumps
   float *asked;                            // (robots, dof): efforts without the constraint's, or null
   double *wrong, *free;                    // (followers,), (dof,): work space
   Model const *model;                      // of the joints' mass matrices
@@ -84,15 +85,20 @@ FOR_EACH_PROCESSOR static void update_constraint(Constraint const &of, std::int6
   }
 }
 
-// Add the constraint efforts of a robot to `effort` (dof); q(j) and v(j) are position and velocity of joint j.
+// Add the constraint efforts of a robot to `effort` (dof); read(j) and v(j) are position and velocity of joint j.
 template <class Position, class Velocity>
-void constrain(Constraint const &of, std::int64_t row, std::int64_t dof, double *effort, Position q, Velocity v) {
-  constexpr double TURN = 6.283185307179586;
+void constrain(Constraint const &of, std::int64_t row, std::int64_t dof, double *effort, Position read, Velocity v) {
+  constexpr double WRAP = 12.566370614359172;
+  auto const q = [&](std::int64_t j) {
+    double const position = read(j);
+    if (!of.wraps[j]) return position;
+    double &last = of.unwrapped[row * dof + j];
+    return last = position + WRAP * std::nearbyint((last - position) / WRAP);
+  };
   for (std::int64_t j = 0; j < dof; ++j) of.free[j] = effort[j] - of.passive[row * dof + j];
   for (std::int64_t i = 0; i < of.size; ++i) {
     std::int64_t const joint = of.followers[i], leader = of.leaders[i];
-    double error = q(joint) - (of.multiplier[i] * q(leader) + of.offset[i]);
-    if (of.wraps[i]) error -= TURN * std::nearbyint(error / TURN);
+    double const error = q(joint) - (of.multiplier[i] * q(leader) + of.offset[i]);
     double const rate = v(joint) - of.multiplier[i] * v(leader);
     of.wrong[i] = detail::sum_of_products(of.response + (row * of.size + i) * dof, of.free, dof);
     of.wrong[i] += of.rate_gain * rate + of.position_gain * error;

@@ -11,7 +11,7 @@ from typing import Any
 
 from batchpid.native.extensions import ROUNDED, Extension
 from batchpid.native.operations import HEADERS, PROGRAM
-from batchpid.native.task_space_extension import BODY, BUFFER, CALL, LANES, RIGID_BODY
+from batchpid.native.task_space_extension import BODY, BUFFER, CALL, COUPLING, LANES, RIGID_BODY
 
 SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation7getQposEv",
@@ -79,7 +79,7 @@ class Mujoco(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("step1", "step2", "set_log_handler", "clock")),
         *((name, ctypes.c_void_p) for name in ("models", "data")),
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")),
-        *((name, ctypes.c_void_p) for name in ("ctrl", "stiffness", "rate_gain", "continuous")),
+        *((name, ctypes.c_void_p) for name in ("ctrl", "stiffness", "rate_gain")),
         ("clearance", ctypes.c_void_p),
     ]
 
@@ -89,7 +89,7 @@ class Constraint(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("response", "push", "passive", "followers", "leaders")),
-        *((name, ctypes.c_void_p) for name in ("multiplier", "offset", "wraps", "asked", "wrong", "free")),
+        *((name, ctypes.c_void_p) for name in ("multiplier", "offset", "wraps", "unwrapped", "asked", "wrong", "free")),
         *((name, ctypes.c_void_p) for name in ("model", "implicit", "force")),
         ("rate_gain", ctypes.c_double),
         ("position_gain", ctypes.c_double),
@@ -205,6 +205,7 @@ EXTENSIONS = {
             ),
             BUFFER,
             CALL,
+            COUPLING,
             LANES,
             RIGID_BODY,
             *HEADERS,

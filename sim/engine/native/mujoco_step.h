@@ -39,7 +39,6 @@ struct Mujoco {
   double *qf;                               // (robots, dof): efforts last applied
   double *const *ctrl;                      // (robots,): arrays of their mjData, (dof,) each with drives
   double const *stiffness, *rate_gain;      // (robots, dof): gains of the drives, or null if no target changes
-  char const *continuous;                   // (dof,): joints whose targets may be whole turns away
   Clearance const *clearance;               // or null: collision detection of all shapes in every sim step
 };
 

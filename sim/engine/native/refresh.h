@@ -2,37 +2,12 @@
 
 #pragma once
 
+#include "batchpid/native/coupling.h"
 #include "model.h"
 
 #pragma GCC visibility push(hidden)
 
 namespace batchpid {
-
-// Coupling of joints, as in batchpid/motors/coupling.py, or null for none.
-struct Coupling {
-  std::int32_t const *leader;  // (dof,)
-  double const *multiplier;    // (dof,)
-
-  // Write G^T M G of coupled joints in place of M (n, n): CouplingArrays.mass_matrix.
-  template <class N>
-  void fold(std::size_t n, N *matrix) const {
-    auto const above = [&](std::size_t i) { return static_cast<std::size_t>(leader[i]); };
-    if (leader == nullptr) return;
-    for (std::size_t i = 0; i < n; ++i) {
-      if (above(i) == i) continue;
-      for (std::size_t j = 0; j < n; ++j) matrix[above(i) * n + j] += multiplier[i] * matrix[i * n + j];
-    }
-    for (std::size_t i = 0; i < n; ++i) {
-      if (above(i) == i) continue;
-      for (std::size_t j = 0; j < n; ++j) matrix[j * n + above(i)] += multiplier[i] * matrix[j * n + i];
-    }
-    for (std::size_t i = 0; i < n; ++i) {
-      if (above(i) == i) continue;
-      for (std::size_t j = 0; j < n; ++j) matrix[i * n + j] = matrix[j * n + i] = 0.0;
-      matrix[i * n + i] = 1.0;
-    }
-  }
-};
 
 // Constants of the friction model; Python fills in the fields (Refresh in interface.py).
 struct Refresh {

@@ -228,15 +228,8 @@ inline void write_targets(Group const &group, double const *target, double const
       call.set_drive_velocity(group.joints[at], static_cast<float>(rate[at]));
       continue;
     }
-    constexpr double TURN = 6.283185307179586;
     Mujoco const &mujoco = *group.mujoco;
-    std::int64_t const row = at / dof, joint = at % dof;
-    double position = target[at];
-    if (mujoco.continuous[joint]) {
-      double const error = position - mujoco.qpos[row][mujoco.qpos_at[joint]];
-      position -= TURN * std::nearbyint(error / TURN);
-    }
-    mujoco.ctrl[row][joint] = mujoco.stiffness[at] * position + mujoco.rate_gain[at] * rate[at];
+    mujoco.ctrl[at / dof][at % dof] = mujoco.stiffness[at] * target[at] + mujoco.rate_gain[at] * rate[at];
   }
 }
 

@@ -102,9 +102,11 @@ class Pack(SingleOwner):
         self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
         coupling = coupling_of(spec.joints)
         self._constraint, self._joint_qf = None, self.qf
+        self._turning = np.array([], np.intp)
         if coupling is not None:
             self._joint_qf = np.zeros_like(self.qf)
             continuous = np.array([joint.continuous for joint in spec.joints])
+            self._turning = np.flatnonzero(continuous)
             self._constraint = ConstraintEfforts(size, coupling, continuous, spec.timestep, self.qf)
             self._constraint.implicit[...] = self._implicit
             if self.steps_natively:
@@ -280,6 +282,8 @@ class Pack(SingleOwner):
             robot.set_qf(self.qf[row])
             if self._contents:
                 self._contents[row].reset()
+        if self._constraint is not None:
+            self._constraint.place(rows, qpos)
         if self._isolates:
             self._assign_systems(rows, qpos, qvel)
 
@@ -289,23 +293,28 @@ class Pack(SingleOwner):
 
     def state_sizes(self) -> list[int]:
         """Return the number of values in the state of each scene: of the robot, and of its content."""
-        robot = 2 * self.dof + ROOT_SIZE + 1
+        robot = 2 * self.dof + ROOT_SIZE + 1 + self._turning.size
         return [robot + content.size for content in self._contents] or [robot] * self.size
 
     def read_state(self) -> NDArray[np.float64]:
-        """Return the state of each scene (M, values): qpos, qvel, root, whether it is isolated, content, then NaN."""
+        """Return the state of each scene (M, values): qpos, qvel, root, whether it is isolated, positions without jumps
+        of coupled continuous joints, content, then NaN.
+        """
         sizes = self.state_sizes()
         states = np.full((self.size, max(sizes)), np.nan)
         for row, (robot, isolated) in enumerate(zip(self.robots, self.isolated, strict=True)):
             content = [scene.read() for scene in self._contents[row : row + 1]]
-            parts = robot.get_qpos(), robot.get_qvel(), read_root(robot), [isolated], *content
+            turned = [] if self._constraint is None else self._constraint.unwrapped[row, self._turning]
+            parts = robot.get_qpos(), robot.get_qvel(), read_root(robot), [isolated], turned, *content
             states[row, : sizes[row]] = np.concatenate(parts)
         return states
 
     def write_state_rows(self, states: NDArray[np.float64]) -> None:
-        ends = np.cumsum([self.dof, self.dof, ROOT_SIZE, 1])
-        qpos, qvel, roots, isolated, contents = np.split(states.astype(np.float32), ends, axis=1)
+        ends = np.cumsum([self.dof, self.dof, ROOT_SIZE, 1, self._turning.size])
+        qpos, qvel, roots, isolated, turned, contents = np.split(states.astype(np.float32), ends, axis=1)
         self._place(range(self.size), qpos, qvel, roots)
+        if self._constraint is not None:
+            self._constraint.unwrapped[:, self._turning] = turned
         for content, row in zip(self._contents, contents, strict=False):
             content.write(row)
         self.isolate(np.flatnonzero(isolated).tolist())

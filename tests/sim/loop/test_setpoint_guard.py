@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from identical import assert_identical
+from tiny_urdf import joint, link, write
+from tiny_urdf import robot as urdf
 
+import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner, Snapshot
 
@@ -83,3 +86,19 @@ def test_a_guard_that_does_not_fit_is_refused(panda, tmp_path):
             Runner(panda, 1, workers=0, guard=guard, control=control)
     with pytest.raises(InvalidArgumentError, match="rate, joint 'panda_joint1'"):
         panda.guard(rate=-1.0)
+
+
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+@pytest.mark.parametrize(("multiplier", "offset"), [(2.82, 0.0), (-3.0, 0.2), (0.5, -0.1)])
+def test_limits_of_a_follower_hold_under_the_guard(multiplier, offset, engine, tmp_path):
+    fast, slow = (f'<limit lower="-2" upper="2" effort="50" velocity="{rate}"/>' for rate in (20, 2))
+    law = f'<mimic joint="a" multiplier="{multiplier}" offset="{offset}"/>'
+    soft = '<safety_controller k_velocity="1" soft_lower_limit="-1" soft_upper_limit="1.5"/>'
+    parts = [link("base"), link("one"), link("two"), joint("a", "base", "one", inner=fast)]
+    robot = Robot.load(write(tmp_path, urdf(*parts, joint("b", "base", "two", inner=slow + law + soft))))
+    for guard in (robot.guard(), bp.make_guard(2, lower=[-2, -1], upper=[2, 1.5], rate=[np.inf, 2.0])):
+        with Runner(robot, 1, workers=0, guard=guard, ground=False, engine=engine) as runner:
+            runner.reset([0.0, 0.0])
+            seen = runner.rollout(np.tile([2.0 * np.sign(multiplier), 0.0], (250, 1)))
+        assert np.abs(seen.qvel[..., 1]).max() < 2.0
+        np.testing.assert_allclose(seen.qpos[-1, 0, 1], min(1.5, 2.0 * abs(multiplier) + offset), atol=5e-3)

@@ -1,0 +1,65 @@
+"""Continuous joints, whose positions jump in SAPIEN, against hand calculation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from batchpid.sim import Robot, Runner
+from tests.sim.tiny_urdf import write
+
+
+def wheel(folder, kind: str = "", multiplier: float = 0.0) -> Robot:
+    """Return a wheel of 0.02 kg m^2, with a body of 0.2 kg or 0.002 kg m^2 that follows it."""
+    moments = '<inertia ixx="{0}" iyy="{0}" izz="{0}" ixy="0" ixz="0" iyz="0"/>'
+    parts = ['<link name="base"/>']
+    for name, mass, moment in (("rim", 1.0, 0.02), ("gear", 0.2, 0.002))[: 2 if kind else 1]:
+        parts.append(f'<link name="{name}"><inertial><mass value="{mass}"/>{moments.format(moment)}</inertial></link>')
+    limit = '<limit lower="-90" upper="90" effort="20" velocity="20"/>'
+    law = f'<mimic joint="wheel" multiplier="{multiplier}"/>'
+    for name, type_, child, inner in (("wheel", "continuous", "rim", limit), ("follower", kind, "gear", limit + law)):
+        axis = "1 0 0" if type_ == "prismatic" else "0 0 1"  # gravity acts on neither
+        ends = f'<parent link="base"/><child link="{child}"/><axis xyz="{axis}"/>{inner}'
+        parts.append(f'<joint name="{name}" type="{type_}">{ends}</joint>' if type_ else "")
+    return Robot.load(write(folder, f'<robot name="wheel">{"".join(parts)}</robot>'))
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
+@pytest.mark.parametrize(
+    ("kind", "multiplier"), [("continuous", 0.25), ("revolute", -1.0), ("prismatic", 0.01), ("continuous", np.sqrt(2))]
+)
+def test_a_follower_stays_with_its_leader_over_many_turns(kind, multiplier, native, tmp_path, monkeypatch):
+    """q = tau t^2 / (2 J), with J = J_leader + m^2 J_follower; half way the robot is saved and restored."""
+    monkeypatch.setenv("BATCHPID_NATIVE", native)
+    robot, effort, ticks = wheel(tmp_path, kind, multiplier), np.tile([0.5, 0.0], (60, 1)), 120
+    inertia = 0.02 + multiplier**2 * (0.2 if kind == "prismatic" else 0.002)
+    options = {"control": "effort", "workers": 0, "ground": False, "compensate": "none", "engine": "sapien"}
+    with Runner(robot, 1, **options) as runner:
+        runner.reset([2.0, 0.0])
+        first = runner.rollout(effort)
+        kept = runner.snapshot()
+        second = runner.rollout(effort)
+    with Runner(robot, 1, **options) as runner:
+        runner.restore(kept)
+        again = runner.rollout(effort)
+    np.testing.assert_array_equal(again.qpos[-1], second.qpos[-1])
+    qvel = np.concatenate([first.qvel, second.qvel])[:, 0]
+    assert second.ok.all()
+    np.testing.assert_allclose(qvel[:, 1], multiplier * qvel[:, 0], rtol=2e-3, atol=0.01)
+    np.testing.assert_allclose(qvel[-1, 0], 0.5 / inertia * ticks * 0.01, rtol=3e-3)
+
+
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+@pytest.mark.parametrize("options", [{}, {"guard": True}, {"params": "designed"}], ids=["plain", "guard", "integral"])
+@pytest.mark.parametrize(("start", "goal"), [(3.0, -3.0), (6.2, 6.6), (-5.9, -26.0), (0.3, 7.0)])
+def test_a_drive_goes_the_short_way_round(start, goal, options, engine, tmp_path):
+    robot = wheel(tmp_path)
+    if "params" in options:
+        options = {"params": robot.designed("effort")}
+    with Runner(robot, 1, control="drive", workers=0, ground=False, engine=engine, **options) as runner:
+        runner.reset([start])
+        seen = runner.rollout(np.full((300, 1), goal))
+    left = np.remainder(seen.qpos[-1, 0, 0] - goal + np.pi, 2 * np.pi) - np.pi
+    short = np.abs(np.remainder(start - goal + np.pi, 2 * np.pi) - np.pi)
+    assert abs(left) < 2e-2
+    assert np.abs(seen.qvel).sum() * 0.01 < 1.8 * short + 0.05

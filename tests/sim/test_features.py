@@ -1,0 +1,173 @@
+"""Each feature of a robot with each control, command space and engine: it reaches its goal, or is refused by name."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import batchpid as bp
+import batchpid.task_space as ts
+from batchpid.errors import BatchPIDError
+from batchpid.sim import OperationalSpace, Robot, Runner
+from batchpid.task_space.frames import pose_error
+from tests.sim.tiny_urdf import write
+
+AXES = ("0 0 1", "0 1 0", "1 0 0", "0 1 0", "0 0 1", "1 0 0", "0 1 0", "0 0 1", "0 1 0")
+WIDE = '<limit lower="-9" upper="9" effort="80" velocity="9"/>'
+TURNED = 6.1
+"""Start of continuous joints: a move of 0.3 rad passes the end of SAPIEN's positions, 2 pi."""
+
+FEATURES: dict[str, dict] = {
+    "mimic": {"mimics": {3: (1, -0.5, 0.1)}},
+    "chain of mimics": {"mimics": {3: (1, 2.0, 0.0), 5: (3, -0.25, 0.2)}},
+    "sliding mimic": {"types": {3: "prismatic"}, "mimics": {3: (1, 0.2, -0.05)}},
+    "continuous": {"types": {0: "continuous", 4: "continuous"}},
+    "continuous mimic": {"types": {3: "continuous"}, "mimics": {3: (1, -1.5, 0.0)}},
+    "mimic of a continuous joint": {"types": {1: "continuous"}, "mimics": {3: (1, 0.25, -1.3)}},
+    "sliding mimic of a continuous joint": {"types": {1: "continuous", 3: "prismatic"}, "mimics": {3: (1, 0.02, -0.1)}},
+    "whole turns of a continuous joint": {"types": {1: "continuous"}, "mimics": {3: (1, -1.0, 6.3)}},
+    "massless links": {"massless": (2, 5)},
+    "armature": {"armature": 0.02},
+    "floating base": {"fixed_base": False},
+}
+"""Types of joints other than revolute, mimic joints (leader, multiplier, offset), links without mass, ..."""
+
+
+def joints_of(feature: str) -> set[int]:
+    types, mimics = (FEATURES[feature].get(name, {}) for name in ("types", "mimics"))
+    return {*types, *mimics, *(leader for leader, *_ in mimics.values())}
+
+
+PAIRS = [pair for pair in itertools.combinations(FEATURES, 2) if not joints_of(pair[0]) & joints_of(pair[1])]
+CONTROLS = [("pid", "joints"), ("pid", "tool"), ("drive", "joints"), ("drive", "tool"), ("osc", "joints")]
+REFUSED = {
+    "floating base": {("pid", "tool"), ("drive", "tool"), ("osc", "joints")},
+    "mimic of a continuous joint": {("pid", "tool"), ("drive", "tool")},
+    "sliding mimic of a continuous joint": {("pid", "tool"), ("drive", "tool")},
+}
+"""Controls that refuse a feature; all others have to reach their goal."""
+
+
+def inertial(kg: float, moment: float, x: float = 0.0) -> str:
+    moments = " ".join(f'{key}="{moment}"' for key in ("ixx", "iyy", "izz"))
+    tensor = f'<inertia {moments} ixy="0" ixz="0" iyz="0"/>'
+    return f'<inertial><mass value="{kg}"/><origin xyz="{x} 0 0"/>{tensor}</inertial>'
+
+
+@functools.cache
+def robot_with(*features: str) -> Robot:
+    """Return an arm of nine joints with these features."""
+    chosen = [FEATURES[feature] for feature in features]
+    types, mimics = (
+        {joint: law for feature in chosen for joint, law in feature.get(name, {}).items()}
+        for name in ("types", "mimics")
+    )
+    massless = {link for feature in chosen for link in feature.get("massless", ())}
+    parts, above = [f'<link name="base">{inertial(40.0, 2.0)}</link>'], "base"
+    for k, axis in enumerate(AXES):
+        law = '<mimic joint="j{}" multiplier="{}" offset="{}"/>'.format(*mimics[k]) if k in mimics else ""
+        place = f'<origin xyz="{0.0 if k in massless else 0.2} 0 0.05"/><axis xyz="{axis}"/>'
+        ends = f'<parent link="{above}"/><child link="l{k}"/>{place}{WIDE}{law}'
+        parts.append(f'<link name="l{k}">{"" if k in massless else inertial(0.8, 0.006, 0.1)}</link>')
+        parts.append(f'<joint name="j{k}" type="{types.get(k, "revolute")}">{ends}</joint>')
+        above = f"l{k}"
+    armature = max(feature.get("armature", 0.0) for feature in chosen)
+    options: dict = {"fixed_base": all(feature.get("fixed_base", True) for feature in chosen)}
+    if armature:
+        options["actuators"] = bp.make_actuators(len(AXES), armature=armature)
+    with tempfile.TemporaryDirectory() as folder:
+        return Robot.load(write(Path(folder), f'<robot name="featured">{"".join(parts)}</robot>'), **options)
+
+
+def poses(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Return the joint positions of a start and a goal (dof,)."""
+    bent = np.where(robot.continuous, TURNED, [0.2, 0.7, 0.6, 0.9, -0.8, 0.6, 1.1, 0.7, 0.6])
+    return robot.coupled(bent), robot.coupled(bent + 0.3 * np.array([1, 1, -1, 1, 1, -1, 1, 1, -1]))
+
+
+def reach(robot: Robot, control: str, space: str, engine: str) -> None:
+    """Assert that the robot reaches its goal, within a turn of each continuous joint."""
+    start, goal = poses(robot)
+    options: dict = {"control": control}
+    if control == "osc":
+        options = {"control": OperationalSpace(robot, "l8", posture=goal)}
+    elif space == "tool":
+        options |= {"setpoint_space": "tool", "tool": "l8"}
+    with_pose = control == "osc" or space == "tool"
+    setpoint = ts.link_poses(robot.kinematic_tree(), goal, ["l8"])[0] if with_pose else goal
+    with Runner(robot, 1, workers=0, engine=engine, ground=False, **options) as runner:
+        runner.reset(start)
+        seen = runner.rollout(np.tile(setpoint, (250, 1)))
+    assert seen.ok.all()
+    last = seen.qpos[-1, 0].astype(float)
+    if with_pose:
+        assert np.abs(pose_error(setpoint, seen.tool_pose[-1, 0].astype(float))).max() < 2e-3
+    else:
+        left = last - goal
+        left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
+        np.testing.assert_allclose(left[robot.independent], 0.0, atol=0.02)
+    if robot.coupling is not None:
+        followers = robot.coupling.followers
+        rates = robot.coupling.rates(seen.qvel[-20:])[..., followers]
+        np.testing.assert_allclose(seen.qvel[-20:, :, followers], rates, atol=0.02)
+        turning = robot.continuous[robot.coupling.leader] | robot.continuous
+        still = [joint for joint in followers if not turning[joint]]
+        np.testing.assert_allclose(last[still], robot.coupling.positions(last)[still], atol=1e-4)
+
+
+def check(features: tuple[str, ...], command: tuple[str, str], engine: str) -> None:
+    refuses = any(command in REFUSED.get(feature, ()) for feature in features)
+    try:
+        reach(robot_with(*features), *command, engine)
+    except BatchPIDError:
+        if not refuses:
+            raise
+    else:
+        assert not refuses
+
+
+@pytest.mark.parametrize(("feature", "command"), list(itertools.product(FEATURES, CONTROLS)), ids=str)
+def test_every_feature_reaches_its_goal_under_every_control_or_is_refused(feature, command, engine):
+    check((feature,), command, engine)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("features", "command"), list(itertools.product(PAIRS, CONTROLS)), ids=str)
+def test_every_pair_of_features_reaches_its_goal_under_every_control_or_is_refused(features, command, engine):
+    check(features, command, engine)
+
+
+@pytest.fixture(params=["sapien", "mujoco"])
+def engine(request) -> str:
+    return request.param
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
+@pytest.mark.parametrize("feature", [feature for feature, given in FEATURES.items() if "mimics" in given])
+def test_kinematics_and_dynamics_are_those_of_the_leaders(feature, native, monkeypatch):
+    monkeypatch.setenv("BATCHPID_NATIVE", native)
+    robot = robot_with(feature)
+    tree, g, own = robot.kinematic_tree(), robot.coupling.matrix, robot.independent
+    free = replace(tree, coupling=None)
+    rng = np.random.default_rng(0)
+    qpos = robot.coupled(rng.normal(size=(5, robot.dof)))
+    qvel, qacc = (robot.coupling.rates(rng.normal(size=(5, robot.dof))) for _ in range(2))
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
+    close(ts.jacobian(tree, qpos, "l8")[..., own], ts.jacobian(free, qpos, "l8") @ g)
+    close(ts.mass_matrix(tree, qpos)[:, own][..., own], g.T @ ts.mass_matrix(free, qpos) @ g)
+    close(ts.bias(tree, qpos, qvel)[:, own], ts.bias(free, qpos, qvel) @ g)
+    effort = ts.inverse_dynamics(tree, qpos, qvel, qacc)
+    close(effort[:, own], ts.inverse_dynamics(free, qpos, qvel, qacc) @ g)
+    close(ts.forward_dynamics(tree, qpos, qvel, effort), qacc)
+    for unused in (ts.jacobian(tree, qpos, "l8")[..., ~own], ts.bias(tree, qpos, qvel)[:, ~own], effort[:, ~own]):
+        assert not unused.any()
+    goal = ts.link_poses(tree, qpos, ["l8"])[:, 0]
+    found = ts.inverse_kinematics(tree, "l8", goal, robot.coupled(qpos + 0.1))
+    close(found.qpos, robot.coupled(found.qpos))
+    close(ts.link_poses(tree, found.qpos, ["l8"])[:, 0, :3], goal[:, :3], atol=2e-5)
