@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from lxml import etree
 
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.mjcf.mjcf_laws import plugin_name
 from batchpid.sim.robot.mjcf.mjcf_motors import Motors, read_couplings, read_motors
 from batchpid.sim.robot.mjcf.mjcf_names import Names
 from batchpid.sim.robot.mjcf.mjcf_shapes import excluded_pairs
@@ -48,10 +50,10 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> M
     findings: list[Finding] = []
     model = _compile(path, missing_meshes, findings)
     names = Names(model)
+    tree = Tree(model, names, path, fixed_base, findings)
     mimics = read_couplings(model, names, findings)
     motors = read_motors(model, names, mimics, findings)
-    tree = Tree(model, names, path, findings)
-    tree.write(fixed_base, motors, mimics)
+    tree.write(motors, mimics)
     tree.root.set("name", name)
     findings += [*_in_radians(model, names), *_unused(model, names)]
     key = next((key for key in range(model.nkey) if model.key(key).name == _KEYFRAME), None)
@@ -81,11 +83,22 @@ def _compile(path: Path, missing_meshes: str, findings: list[Finding]) -> Any:
         remedy = "restore the files, or pass missing_meshes='skip' to simulate without"
         raise RobotError(f"{path}: collision mesh not found: {names}; {remedy}")
     if not names or stripped.model is None:
-        problem = stripped.problem if names else whole.problem
-        raise RobotError(f"{path}: MuJoCo cannot compile the file: {problem}; correct it")
+        raise RobotError(_refused(path, stripped.problem if names else whole.problem))
     text = f"collision meshes not found, simulated without: {names}"
     findings.append(Finding("warning", "missing-mesh", text, "put the files where the MJCF names them"))
     return stripped.model
+
+
+def _refused(path: Path, problem: str) -> str:
+    """Return the message for a file that MuJoCo refuses."""
+    plugin = re.search(r"plugin '?([\w.-]+)'? not found|unrecognized plugin '([^']*)'", problem)
+    if plugin is not None and plugin[1]:
+        remedy = "load its library with mujoco.mj_loadPluginLibrary, or remove <extension> and the elements that use it"
+        return f"{path}: uses the plugin {plugin[1]!r}, which MuJoCo {mujoco.__version__} has not loaded; {remedy}"
+    if plugin is not None:
+        remedy = f'add <extension><plugin plugin="{plugin[2]}"/></extension>, or remove the elements that use it'
+        return f"{path}: uses the plugin {plugin[2]!r} without <extension>; {remedy}"
+    return f"{path}: MuJoCo cannot compile the file: {problem}; correct it"
 
 
 def _attempt(path: Path, strip: bool) -> _Attempt:
@@ -161,6 +174,10 @@ def _unused(model: Any, names: Names) -> list[Finding]:
         text = "gravity compensation of this body (gravcomp) is not simulated"
         remedy = "keep the compensation of the controller on"
         found.append(Finding("note", "gravcomp", text, remedy, link=names.bodies[int(body)]))
+    for body in np.flatnonzero(model.body_plugin >= 0):
+        text = f"the plugin {plugin_name(model, model.body_plugin[body])!r} acts on the body: it is not simulated"
+        remedy = "expect the body to be rigid and to move freely"
+        found.append(Finding("warning", "unknown-element", text, remedy, link=names.bodies[int(body)]))
     if model.nflex or model.nskin:
         found.append(Finding("warning", "unknown-element", "flexible bodies are left out", "expect rigid links alone"))
     return found

@@ -420,7 +420,14 @@ def test_a_dc_motor_has_a_line_a_lag_and_gains(load):
         ('<general joint="j" gainprm="5" biastype="affine" biasprm="0 5 -1"/>', "has a negative gain"),
         ('<damper joint="j" kv="2" ctrlrange="0 1"/>', "not proportional to its input"),
         ('<pid joint="j" kp="5" input="vel ff"/>', "is a spring"),
-        ('<dcmotor joint="j" nominal="24 6 3" cogging="1 4 0" lugre="9 1 1 1 1"/>', "cogging, friction (lugre)"),
+        (
+            '<dcmotor joint="j" nominal="24 6 3" ctrlrange="-9 9" cogging="1 4 0" lugre="9 1 1 1 1"/>',
+            "cogging, friction (lugre)",
+        ),
+        ('<dcmotor joint="j" nominal="24 6 3"/>', "no torque-speed line"),
+        ('<general joint="j" gainprm="0" biastype="affine" biasprm="0 -5 0"/>', "is a spring"),
+        ('<velocity joint="j" kv="2"/>', "is a velocity servo"),
+        ('<general joint="j" biastype="user"/>', "adds a force that depends on its length and speed"),
         (
             '<motor joint="j" group="2"/></actuator><option actuatorgroupdisable="2"/><actuator>',
             "is disabled in the file",
@@ -523,6 +530,23 @@ def test_what_has_no_equivalent_is_told(load, name):
     assert all(each.remedy for each in found)
     with pytest.raises(RobotError, match="needs"):
         load(text, strict=True)
+
+
+def test_all_that_is_left_out_is_named(load):
+    """A floating robot is not fixed to the world, whose shapes are not its links'."""
+    floor = '<geom {} type="plane" size="1 1 .1"/>'
+    named = floor.format("name='floor'")
+    world = f'{named}<geom name="wall" size=".1"/><geom type="box" size=".1 .1 .1"/>'
+    rest = """<tendon><fixed name="idle"><joint joint="hip1" coef="1"/></fixed></tendon><equality>
+      <weld name="hold" body1="leg1"/><connect name="off" body1="leg2" anchor="0 0 0" active="false"/></equality>"""
+    told = "\n".join(map(str, load(WALKER.replace("<worldbody>", f"{rest}<worldbody>{world}")).repairs))
+    for name in ("'floor'", "'wall', 'number 2'", "'idle'", "weld 'hold'", "'off'", "'ball'", "'goal'"):
+        assert name in told
+    for place, said in (('pos="0 0 -1"', "at height -1 m"), ('euler="30 0 0"', "which is not level")):
+        (found,) = load(two_links().replace("<worldbody>", f"<worldbody>{floor.format(place)}")).repairs
+        assert (found.severity, found.code) == ("warning", "collision")
+        assert "plane 'number 0'" in found.text
+        assert said in found.text
 
 
 def test_a_plain_file_needs_no_repair(load):
