@@ -111,6 +111,8 @@ class Robot(RobotDescription):
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
         root, repairs, mjcf = read_source(path, fixed_base, missing_meshes)
         urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
+        if mjcf is not None:
+            urdf = replace(urdf, missing_meshes=(*mjcf.missing_meshes, *urdf.missing_meshes))
         if not any(joint.moves for joint in urdf.all_joints):
             raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
         bodies = place_links(urdf.urdf, merge_fixed)

@@ -576,17 +576,64 @@ def test_what_cannot_be_simulated_is_refused(load, name):
         load(text)
 
 
-def test_missing_meshes(load):
-    asset = '<asset><mesh name="gone" file="gone.stl"/></asset>'
-    shown = f'{BOX}<geom type="mesh" mesh="gone" contype="0" conaffinity="0"/>'
-    inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
-    assert load(two_links(rest=asset, geom=inertial + shown), missing_meshes="error").repairs == ()
-    text = two_links(rest=asset, geom=f'{BOX}<geom type="mesh" mesh="gone"/>')
-    (finding,) = load(text).repairs
-    assert finding.code == "missing-mesh"
-    assert "gone.stl" in finding.text
-    with pytest.raises(RobotError, match=r"gone\.stl.*missing_meshes"):
-        load(text, missing_meshes="error")
+INERTIAL = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"
+UNREADABLE = {"not found": None, "git lfs pull": POINTER, "empty": b"", "damaged": b"solid wedge" + 99 * b" "}
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj"])
+@pytest.mark.parametrize("reason", UNREADABLE)
+def test_missing_meshes(load, tmp_path, reason, suffix):
+    """A mesh may be missing if the mass of its body is known, and is named."""
+    (tmp_path / "parts").mkdir()
+    if UNREADABLE[reason] is not None:
+        (tmp_path / "parts" / f"gone.{suffix}").write_bytes(UNREADABLE[reason])
+    asset = f'<compiler meshdir="parts"/><asset><mesh name="m" file="gone.{suffix}"/></asset>'
+    shown = '<geom name="{}" type="mesh" mesh="m" contype="0" conaffinity="0"/>'
+    assert load(two_links(rest=asset, geom=INERTIAL + BOX + shown.format("")), missing_meshes="error").repairs == ()
+    for shape in ('<geom type="mesh" mesh="m"/>', '<geom type="box" mesh="m"/>'):
+        for body in (f"{INERTIAL}{BOX}{shape}", f"{INERTIAL}{shape}", BOX + shape.replace("/>", ' mass="0"/>')):
+            text = two_links(rest=asset, geom=body)
+            robot = load(text)
+            (finding,) = robot.repairs
+            assert finding.code == "missing-mesh"
+            assert f"gone.{suffix}" in finding.text
+            assert reason in finding.text
+            assert finding.text.endswith(robot.missing_meshes[0])
+            with pytest.raises(RobotError, match=rf"gone\.{suffix}.*{reason}.*missing_meshes"):
+                load(text, missing_meshes="error")
+    seen = '<sensor><framepos objtype="geom" objname="seen"/></sensor>'
+    assert load(two_links(geom=INERTIAL + BOX, rest=asset + seen).replace(BOX, BOX + shown.format("seen"), 1)).dof == 1
+
+
+@pytest.mark.parametrize("mode", ["skip", "error"])
+@pytest.mark.parametrize("drawn", ["", 'contype="0" conaffinity="0"'])
+@pytest.mark.parametrize("inferred", [False, True])
+def test_a_missing_mesh_without_which_the_mass_is_unknown_is_refused(load, mode, drawn, inferred):
+    asset = f'<compiler inertiafromgeom="{str(inferred).lower() if inferred else "auto"}"/>'
+    asset += '<asset><mesh name="m" file="gone.stl"/></asset>'
+    shape = f'<geom type="mesh" mesh="m" {drawn}/>'
+    for geom in (shape, BOX + shape, BOX + shape.replace("/>", ' mass="2"/>')):
+        text = two_links(geom=INERTIAL * inferred + geom, rest=asset)
+        with pytest.raises(
+            RobotError, match=r"mesh gone\.stl \(not found\) of body 'b'; restore the file, or give the"
+        ):
+            load(text, missing_meshes=mode)
+    base = two_links(rest=asset).replace(BOX, BOX + shape, 1)
+    if not (mode == "error" and not drawn):
+        assert load(base, missing_meshes=mode).dof == 1  # the mass of a fixed base has no effect
+    with pytest.raises(RobotError, match=r"of body 'a'; restore the file"):
+        load(base, missing_meshes=mode, fixed_base=False)
+
+
+@pytest.mark.parametrize(
+    "asset", ['<include file="part.xml"/>', '<asset><hfield name="h" file="part.png" size="1 1 1 1"/></asset>']
+)
+def test_a_git_lfs_pointer_in_place_of_another_file_is_named(load, tmp_path, asset):
+    for suffix in ("png", "xml"):
+        (tmp_path / f"part.{suffix}").write_bytes(POINTER)
+    with pytest.raises(RobotError, match=r"part\.(png|xml) is a git-lfs pointer instead of the file; run git lfs pull"):
+        load(two_links(rest=asset))
 
 
 def test_a_geom_that_is_referred_to_stays(load):
