@@ -11,7 +11,7 @@ mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.batch")
 
 from batchpid.errors import RobotError  # noqa: E402
-from batchpid.sim import Robot, Runner  # noqa: E402
+from batchpid.sim import Robot, Runner, StabilityWarning  # noqa: E402
 
 PID = '<extension><plugin plugin="mujoco.pid"/></extension>'
 FILE = """<mujoco>{extension}<compiler angle="radian"/><option timestep="1e-9"/>
@@ -181,6 +181,31 @@ def test_the_pid_plugin_moves_as_in_mujoco(load, extras, imax):
 
 
 WITHOUT_CONTACT = '<option><flag contact="disable"/></option><worldbody>'
+
+
+SERVO = '<position joint="{}" kp="{}" kv="{}" forcerange="-90 90"/>'
+
+
+@pytest.mark.parametrize(("kp", "kv"), [(2000, 200), (500, 900), (9000, 400)])
+def test_stiff_servos_diverge_as_pid_and_not_as_drives(load, kp, kv):
+    """MuJoCo integrates the gain kv implicitly."""
+    robot = load(SERVO.format("j", kp, kv) + SERVO.format("k", kp, kv), extension="")
+    text = robot.path.read_text().replace("1e-9", "5e-4").replace("<worldbody>", WITHOUT_CONTACT)
+    model = mujoco.MjModel.from_xml_string(text)
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    data, goal = mujoco.MjData(model), np.array([0.02, 0.03])
+    data.ctrl[:] = goal
+    mujoco.mj_step(model, data, 400)
+    options = {"engine": "mujoco", "compensate": "none", "ground": False, "workers": 0, "substeps": 400}
+    (unstable,) = [
+        each for each in robot.check(params=robot.mjcf_gains()) if each.joint is None and each.code == "unstable"
+    ]
+    with pytest.warns(StabilityWarning, match="control='drive', which integrates these gains implicitly, as MuJoCo"):
+        Runner(robot, 1, params=robot.mjcf_gains(), **options).close()
+    assert "control='drive'" in unstable.remedy
+    with Runner(robot, 1, params=robot.mjcf_gains(), control="drive", **options) as runner:
+        runner.reset([0, 0])
+        np.testing.assert_allclose(runner.step(goal).qpos[0], data.qpos, atol=1e-3)
 
 
 def test_the_plugin_has_ranges(load):
