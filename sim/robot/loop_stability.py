@@ -139,7 +139,8 @@ class StabilityWarning(UserWarning):
 
     The bound holds for ideal motors at the start pose, with the armature of actuators. Actuators that delay or limit
     efforts, or measure with errors, have other bounds, and ``dissipation="sapien"`` adds friction that is not in the
-    formula: in these cases there is no warning.
+    formula: in these cases there is no warning. Under control "drive" in MuJoCo the warning names the first joint that
+    sticks, see :mod:`batchpid.sim.robot.drive_chatter`.
     """
 
 
