@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
-from batchpid.sim.robot.xml import LARGEST
+from batchpid.sim.robot.xml import LARGEST, LFS_POINTER
 
 SIZE_LIMIT = 2**27  # bytes of a mesh file
-LFS_POINTER, LFS_PROBLEM = b"version https://git-lfs", "a git-lfs pointer instead of the mesh: run git lfs pull"
+LFS_PROBLEM = "a git-lfs pointer instead of the mesh: run git lfs pull"
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 
 

@@ -17,8 +17,8 @@ import mujoco
 
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.meshes import LFS_POINTER, LFS_PROBLEM, mesh_problem
-from batchpid.sim.robot.xml import parse_xml
+from batchpid.sim.robot.meshes import LFS_PROBLEM, mesh_problem
+from batchpid.sim.robot.xml import LFS_POINTER, parse_xml
 
 _ERRORS = (ValueError, mujoco.FatalError)
 """Errors of MuJoCo's parser and compiler."""
@@ -58,6 +58,7 @@ def compile_file(
     if best.weighing:
         listed = ", ".join(f"mesh {mesh} of body {body!r}" for mesh, body in best.weighing)
         remedy = "restore the file, or give the body an <inertial>, with which the mesh may be missing"
+        remedy += ' (unless inertiafromgeom is "true")'
         raise RobotError(f"{path}: the mass of a body is unknown without its mesh: {listed}; {remedy}")
     names = ", ".join(best.missing)
     if names and missing_meshes == "error":
@@ -102,7 +103,8 @@ def _strip(
     absent = {}
     for mesh in spec.meshes:
         folder = path.parent / (getattr(mesh, "compiler", spec).meshdir or "")
-        if mesh.file and (problem := problem_of(folder / mesh.file)):
+        file = Path(mesh.file).name if spec.strippath else mesh.file
+        if mesh.file and (problem := problem_of(folder / file)):
             absent[mesh.name] = f"{mesh.file} ({problem})"
     missing: dict[str, None] = {}
     weighing: dict[tuple[str, str], None] = {}

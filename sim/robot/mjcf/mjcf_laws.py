@@ -73,16 +73,28 @@ def plugin_name(model: Any, instance: int) -> str | None:
 
 
 def _plugin_servo(model: Any, actuator: int) -> Servo:
-    """Return the gains of the plugin "mujoco.pid", which reads a number from the beginning of each text, as C does."""
-    config: dict[str, float | None] = dict.fromkeys(("kp", "ki", "kd", "imax", "slewmax"))
-    for key in config:
+    """Return the gains of the plugin "mujoco.pid"."""
+    given = {key: value for key, (_, value) in _plugin_config(model, actuator).items()}
+    ki = given.get("ki", 0.0)
+    imax = given["imax"] / ki if ki and "imax" in given else math.inf
+    return Servo(given.get("kp", 0.0), given.get("kd", 0.0), ki, imax, given.get("slewmax", math.inf))
+
+
+def _plugin_config(model: Any, actuator: int) -> dict[str, tuple[str, float]]:
+    """Return the texts that the plugin "mujoco.pid" is given, with the number that it reads from each by strtod."""
+    config = {}
+    for key in ("kp", "ki", "kd", "imax", "slewmax"):
         text = _library().mj_getPluginConfig(model._address, int(model.actuator_plugin[actuator]), key.encode())
-        with suppress(ValueError):
-            config[key] = float((text or b"").decode())
-    ki = config["ki"] or 0.0
-    imax = math.inf if not ki or config["imax"] is None else config["imax"] / ki
-    rate = math.inf if config["slewmax"] is None else config["slewmax"]
-    return Servo(config["kp"] or 0.0, config["kd"] or 0.0, ki, imax, rate)
+        if text:
+            config[key] = text.decode(errors="replace"), float(_library().strtod(text, None))
+    return config
+
+
+def _is_number(text: str, value: float) -> bool:
+    """Return whether the whole text is the finite number ``value``."""
+    with suppress(ValueError):
+        return text.isascii() and "_" not in text and math.isfinite(value) and float(text) == value
+    return False
 
 
 @cache
@@ -92,6 +104,7 @@ def _library() -> Any:
     library.mjp_getPluginAtSlot.restype = ctypes.c_void_p
     library.mj_getPluginConfig.restype = ctypes.c_char_p
     library.mj_getPluginConfig.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p
+    library.strtod.restype, library.strtod.argtypes = ctypes.c_double, (ctypes.c_char_p, ctypes.c_void_p)
     return library
 
 
@@ -198,6 +211,10 @@ def unread(model: Any, actuator: int, servo: Servo | None) -> Iterator[tuple[str
     if servo is not None and plugin is None and _velocity_scale(model, actuator, *servo[:2]) and not servo.kp:
         text = "is a velocity servo, and a setpoint is a position here: its gain kv is the gain kd, which damps"
         yield text, 'add a <position> servo to the file, give the joint a kp, or use control="effort"', ""
+    if plugin == PID_PLUGIN:
+        for key, (text, value) in _plugin_config(model, actuator).items():
+            if not _is_number(text, value):
+                yield f"has {key}={text!r}, of which MuJoCo reads {value:g}", "write one finite number", ""
     if plugin == PID_PLUGIN and servo is not None and not any(servo[:3]):
         yield f"has no gains in the configuration of its plugin {plugin!r}", "add kp, ki or kd to its <config>", ""
     if servo is not None and servo.rate == 0:

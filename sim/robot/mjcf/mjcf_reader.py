@@ -54,8 +54,8 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> M
     motors = read_motors(model, names, mimics, findings)
     tree.write(motors, mimics)
     tree.root.set("name", name)
-    findings += [*_in_radians(model, names), *_unused(model, names)]
     key = next((key for key in range(model.nkey) if model.key(key).name == _KEYFRAME), None)
+    findings += [*_in_radians(model, names), *_unused(model, names, key)]
     pose = model.qpos0 if key is None else model.key_qpos[key]
     start = {name: float(pose[model.jnt_qposadr[joint]]) for joint, name in names.joints.items()}
     return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, missing, tuple(findings))
@@ -70,10 +70,11 @@ def _in_radians(model: Any, names: Names) -> list[Finding]:
     return [Finding("warning", "limits", text, 'add <compiler angle="radian"/> if the file is in radians')]
 
 
-def _unused(model: Any, names: Names) -> list[Finding]:
-    """Return findings for content that is not simulated, apart from motors, couplings and shapes."""
+def _unused(model: Any, names: Names, key: int | None) -> list[Finding]:
+    """Return findings for content that is not simulated, apart from motors, couplings, shapes and keyframe ``key``."""
     found = []
     counts = {"site": model.nsite, "sensor": model.nsensor, "camera": model.ncam}
+    counts["keyframe"] = model.nkey - (key is not None)
     if listed := [f"{count} {kind}{'s' * (count > 1)}" for kind, count in counts.items() if count]:
         text = f"elements that the simulation does not use are left out: {', '.join(listed)}"
         found.append(Finding("note", "unknown-element", text, "expect no effect"))

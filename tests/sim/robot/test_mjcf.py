@@ -636,6 +636,48 @@ def test_a_git_lfs_pointer_in_place_of_another_file_is_named(load, tmp_path, ass
         load(two_links(rest=asset))
 
 
+@pytest.mark.parametrize("name", ["robot.xml", "robot.urdf"])
+def test_a_git_lfs_pointer_in_place_of_the_robot_is_named(tmp_path, name):
+    (tmp_path / name).write_bytes(POINTER)
+    with pytest.raises(RobotError, match=r"robot\.\w+: a git-lfs pointer instead of the file; run git lfs pull"):
+        Robot.load(tmp_path / name)
+
+
+def test_a_mesh_beside_a_missing_one_keeps_its_shape(load, tmp_path):
+    """MuJoCo looks up meshes in meshdir or assetdir, with strippath without their folders."""
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "here.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    geom = f'{INERTIAL}<geom type="mesh" mesh="here"/><geom type="mesh" mesh="gone"/>'
+    absolute = tmp_path / "parts" / "here.obj"
+    for compiler, file in (
+        ('meshdir="parts"', "here.obj"),
+        ('assetdir="parts"', "here.obj"),
+        ('meshdir="parts" strippath="true"', "x/y/here.obj"),
+        ('meshdir="elsewhere"', absolute),
+    ):
+        asset = f'<asset><mesh name="here" file="{file}"/><mesh name="gone" file="x/gone.obj"/></asset>'
+        (missing,) = load(two_links(geom=geom, rest=f"<compiler {compiler}/>{asset}")).missing_meshes
+        assert missing.startswith("x/gone.obj")
+
+
+def test_a_default_namespace_changes_nothing(load, tmp_path):
+    pytest.importorskip("trimesh")
+    (tmp_path / "part.xml").write_text(f'<mujocoinclude xmlns="urn:m"><body name="c">{BOX}</body></mujocoinclude>')
+    text = ARM.replace("</worldbody>", '<include file="part.xml"/></worldbody>')
+    plain, named = load(text), load(text.replace("<mujoco ", '<mujoco xmlns="http://mujoco.org/mjcf" '))
+    assert (named.urdf, named.repairs) == (plain.urdf, plain.repairs)
+    assert [each.link for each in surfaces(named)] == [each.link for each in surfaces(plain)]
+
+
+def test_keyframes_other_than_the_start_are_named(load):
+    keys = '<keyframe><key name="home" qpos=".1"/><key name="stand"/><key/></keyframe>'
+    (finding,) = load(two_links(rest=keys)).repairs
+    assert "2 keyframes" in finding.text
+    assert load(two_links(rest='<keyframe><key name="home" qpos=".1"/></keyframe>')).repairs == ()
+
+
 def test_a_geom_that_is_referred_to_stays(load):
     """Without the geoms that are only drawn the file would not compile."""
     inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'

@@ -218,6 +218,17 @@ def test_the_plugin_has_ranges(load):
     assert any("setpoint is not limited" in str(each) and "-0.5 to 0.5" in str(each) for each in robot.repairs)
 
 
+@pytest.mark.parametrize(
+    "text", ["40", " 4e1", "+.5", "40 3", "4abc", "0x10", "1e1x", "1,5", ".5.5", "1_0", "abc", "\u0663"]
+)
+def test_numbers_of_a_plugin_are_those_that_mujoco_reads(load, text):
+    robot = load(configured(kp=text, kd=1).format('joint="j" name="motor"'))
+    model = mujoco.MjModel.from_xml_path(str(robot.path))
+    assert robot.mjcf_gains().kp[0, 0] == efforts(model, [[1.0]], [[0.0, 0.0]])[0]
+    told = [each for each in robot.repairs if f"'motor' has kp={text!r}" in each.text]
+    assert len(told) == (text not in ("40", " 4e1", "+.5"))
+
+
 def test_targets_of_velocity_have_a_range(load):
     slow = load('<velocity joint="j" kv="2" gear="2" ctrlrange="-3 1"/>')
     assert slow.velocity_limit[0] == 1.5
