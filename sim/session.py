@@ -29,6 +29,7 @@ from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
 from batchpid.sim.observation import OBSERVED, Observation, Rollout, RunInfo, empty_observation
 from batchpid.sim.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.draws import NOTHING
+from batchpid.sim.robot.drive_chatter import DriveChatterCheck
 from batchpid.sim.robot.loop_stability import StabilityCheck
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContactLog, MissedContactWarning
@@ -76,6 +77,8 @@ class Session:
         """Recorder of every tick."""
         self._arguments = Arguments(options)
         self._stability = StabilityCheck(robot, options.timestep) if options.control == "pid" else None
+        is_checked = options.control == "drive" and options.engine == "mujoco"
+        self._chatter = DriveChatterCheck(robot, options.timestep) if is_checked else None
         self._tool_pose, self._tool_setpoints = options.tool_pose, options.tool_setpoints
         self._has_warned = self._has_warned_of_contact = False
         entry_names = None if own is None else own.names
@@ -98,6 +101,8 @@ class Session:
         self.reset(seed=None if self.options.randomization is None else 0)
         if self._stability is not None:
             self._stability.check(self.state.params, self.options.actuators, stacklevel=4)
+        if self._chatter is not None:
+            self._chatter.set_gains(self.state.params, self.options.actuators)
         if isinstance(self.options.control, OperationalSpace):
             self.options.control.check_stability(stacklevel=3)
 
@@ -253,12 +258,16 @@ class Session:
         self._execute(SetParams(checked), lambda state, _: (state._replace(params=checked), None))
         if self._stability is not None:
             self._stability.check(checked, self.state.actuators, stacklevel=4)
+        if self._chatter is not None:
+            self._chatter.set_gains(checked, self.state.actuators)
 
     def set_actuators(self, actuators: bp.Actuators | None) -> None:
         """Change the actuators in flight."""
         self._transactions.ready()
         checked = self.options.check_actuators(actuators)
         self._execute(SetActuators(checked), lambda state, _: (state._replace(actuators=checked), None))
+        if self._chatter is not None:
+            self._chatter.set_gains(self.state.params, checked)
 
     def snapshot(self) -> Snapshot:
         """Return the state of all envs, from which the workers go on."""
@@ -314,6 +323,8 @@ class Session:
             return state, self._observation()
 
         observation: Observation = self._execute(request, commit)
+        if self._chatter is not None:
+            self._chatter.set_gains(params, actuators)
         return observation
 
     def info(self) -> RunInfo:
@@ -365,6 +376,9 @@ class Session:
                     time = (state.steps + done * substeps) * timestep
                     observation = self._seen(arrays.observation)
                     unrecorded += ((time, arrays.command.setpoint.copy(), observation),)
+            if self._chatter is not None:
+                seen = pool.arrays.observation.map(lambda rows: rows[:count])
+                self._chatter.see(seen, substeps * timestep)
             steps = count * substeps
             state = state._replace(
                 faults=faults,
@@ -424,6 +438,8 @@ class Session:
         while messages:
             category, message = messages.popitem()
             warnings.warn(message, category, stacklevel=stacklevel)
+        if self._chatter is not None:
+            self._chatter.warn(stacklevel + 1)
         faults, contacts = state.faults.faults, state.contacts
         if faults and not self._has_warned:
             self._has_warned = True

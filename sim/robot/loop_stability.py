@@ -127,12 +127,20 @@ def slow_oscillation(
     return found
 
 
+def implicit_remedy(params: bp.PIDParams) -> str:
+    """Return the way to act with the gains of ``params`` implicitly, as part of a list of remedies; "" without one."""
+    if params.gain_units is None:
+        return "control='drive', which integrates these gains implicitly, as MuJoCo does with a servo's kv, "
+    return "discretization='implicit', " if isinstance(params.gain_units, PerMassMatrix) else ""
+
+
 class StabilityWarning(UserWarning):
     """The gains pass the stability bound of the sampled PID loop, see :mod:`batchpid.sim.robot.loop_stability`.
 
     The bound holds for ideal motors at the start pose, with the armature of actuators. Actuators that delay or limit
     efforts, or measure with errors, have other bounds, and ``dissipation="sapien"`` adds friction that is not in the
-    formula: in these cases there is no warning.
+    formula: in these cases there is no warning. Under control "drive" in MuJoCo the warning names the first joint that
+    sticks, see :mod:`batchpid.sim.robot.drive_chatter`.
     """
 
 
@@ -159,7 +167,8 @@ class StabilityCheck:
                 f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the sampled PID loop, "
                 f"mostly of joint {joint!r}{env}, at the start pose with a time step of {self._timestep:g} s: efforts "
                 f"alternate from step to step, and the joint chatters or diverges; use at most "
-                f"{0.5 / report.robot_ratio:.1g} times these gains, a derivative_filter_time, or robot.designed()",
+                f"{0.5 / report.robot_ratio:.1g} times these gains, a derivative_filter_time, "
+                f"{implicit_remedy(params)}or robot.designed()",
                 StabilityWarning,
                 stacklevel=stacklevel,
             )

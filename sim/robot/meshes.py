@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
-from batchpid.sim.robot.xml import LARGEST
+from batchpid.sim.robot.xml import LARGEST, LFS_POINTER
 
 SIZE_LIMIT = 2**27  # bytes of a mesh file
+LFS_PROBLEM = "a git-lfs pointer instead of the mesh: run git lfs pull"
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 
 
@@ -92,8 +93,8 @@ def mesh_problem(path: Path) -> str | None:
             data = file.read(SIZE_LIMIT + 1)
     except OSError as error:
         return f"cannot be read: {error.strerror}"
-    if data.startswith(b"version https://git-lfs"):
-        return "a git-lfs pointer instead of the mesh: run git lfs pull"
+    if data.startswith(LFS_POINTER):
+        return LFS_PROBLEM
     if not data or len(data) > SIZE_LIMIT:
         return f"larger than {SIZE_LIMIT >> 20} MiB" if data else "empty"
     try:

@@ -21,7 +21,7 @@ from batchpid.sim.robot.effort import POSES
 from batchpid.sim.robot.findings import SEVERITIES, Finding, Findings
 from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.joint_repair import GIVE_RANGE
-from batchpid.sim.robot.loop_stability import slow_oscillation, stability_report
+from batchpid.sim.robot.loop_stability import implicit_remedy, slow_oscillation, stability_report
 from batchpid.sim.robot.parts import Joint
 from batchpid.sim.robot.plausibility import implausible_figures
 
@@ -196,8 +196,11 @@ def _stability(
     severity, code = ("warning", "unstable") if unstable else ("note", "near-unstable")
     effect = "it diverges, alternating from step to step" if unstable else "it may diverge in other poses"
     text = f"the sampled PID loop is at {report.robot_ratio:.3g} times its stability bound at the start pose: {effect}"
+    other = implicit_remedy(params)
     times = f"use at most {0.5 / report.robot_ratio:.1g} times"
-    yield Finding(severity, code, text, f"{times} these gains, a derivative_filter_time, or gain_units='inertia'")
+    yield Finding(
+        severity, code, text, f"{times} these gains, a derivative_filter_time, {other}or gain_units='inertia'"
+    )
     for index in np.flatnonzero(robot.independent & (report.joint_ratio >= NEAR_BOUND)):
         joint, ratio = robot.joints[index], report.joint_ratio[index]
         unit = "kg" if joint.type == "prismatic" else "kg m^2"

@@ -111,6 +111,8 @@ class Robot(RobotDescription):
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
         root, repairs, mjcf = read_source(path, fixed_base, missing_meshes)
         urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
+        if mjcf is not None:
+            urdf = replace(urdf, missing_meshes=(*mjcf.missing_meshes, *urdf.missing_meshes))
         if not any(joint.moves for joint in urdf.all_joints):
             raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
         bodies = place_links(urdf.urdf, merge_fixed)
@@ -250,8 +252,8 @@ class Robot(RobotDescription):
     def mjcf_gains(self) -> bp.PIDParams:
         """Return params with the gains of the servos of an MJCF file: kp and, on the measurement alone, kd.
 
-        Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of the servo's control.
-        For <pid> and <dcmotor> ki and its limit are included.
+        Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of the servo's control;
+        a velocity servo has kd alone. For <pid>, its plugin and <dcmotor> ki and its limit are included.
 
         Raises
         ------
@@ -260,7 +262,9 @@ class Robot(RobotDescription):
         """
         defaults = self.defaults
         if defaults is None or defaults.kp is None or defaults.kv is None:
-            problem = f"{self.name!r} has no servos of an MJCF file (<position>, or <general> with an affine bias)"
+            problem = (
+                f"{self.name!r} has no servos of an MJCF file (<position>, <pid>, or <general> with an affine bias)"
+            )
             raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
         options: dict[str, Any] = {"ki": 0.0}
         if defaults.ki is not None and defaults.imax is not None and defaults.ki.any():
@@ -286,9 +290,9 @@ def _find(name_or_path: str | Path) -> Path:
 def _file_defaults(mjcf: Mjcf, joints: tuple[Joint, ...]) -> FileDefaults:
     names = [joint.name for joint in joints]
     start = read_only(np.array([mjcf.start[name] for name in names]))
-    if not any(mjcf.motors.kp.values()):
-        return FileDefaults(start)
     motors = mjcf.motors
+    if not any((*motors.kp.values(), *motors.kv.values(), *motors.ki.values())):
+        return FileDefaults(start)
     columns = (motors.kp, 0.0), (motors.kv, 0.0), (motors.ki, 0.0), (motors.imax, np.inf)
     kp, kv, ki, imax = (read_only(np.array([gains.get(name, off) for name in names])) for gains, off in columns)
     return FileDefaults(start, kp, kv, ki, imax)

@@ -21,6 +21,7 @@ from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.meshes import find_mesh, mesh_problem
 from batchpid.sim.robot.rotations import from_rpy, rotate
+from batchpid.sim.robot.source import is_mjcf
 from batchpid.sim.robot.xml import numbers, parse_xml
 
 Rgba = tuple[float, ...]
@@ -61,7 +62,7 @@ def surfaces(
     except ImportError:
         raise MissingDependencyError("trimesh", "drawing a robot", "view") from None
     original, sanitised = parse_xml(robot.path), etree.fromstring(robot.urdf.encode())
-    if original.tag == "mujoco":  # drawn by its collision shapes
+    if is_mjcf(original):  # drawn by its collision shapes
         original = sanitised
     colours = {
         material.get("name"): _rgba(material.find("color"), f"{robot.path}: material")

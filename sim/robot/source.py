@@ -15,6 +15,11 @@ if TYPE_CHECKING:
     from batchpid.sim.robot.mjcf.mjcf_reader import Mjcf
 
 
+def is_mjcf(root: etree._Element) -> bool:
+    """Return whether a root element is an MJCF file's; MuJoCo ignores a default namespace."""
+    return root.prefix is None and etree.QName(root).localname == "mujoco"
+
+
 def read_source(path: Path, fixed_base: bool, missing_meshes: str) -> tuple[etree._Element, list[Finding], Mjcf | None]:
     """Return the root of the URDF at ``path``, or of one that is equivalent to the MJCF there, and the findings.
 
@@ -29,7 +34,7 @@ def read_source(path: Path, fixed_base: bool, missing_meshes: str) -> tuple[etre
     """
     findings: list[Finding] = []
     root = parse_xml(path, findings)
-    if root.tag != "mujoco":
+    if not is_mjcf(root):
         return root, findings, None
     try:
         import mujoco  # noqa: F401

@@ -16,6 +16,7 @@ from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 
 SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
+LFS_POINTER = b"version https://git-lfs"  # beginning of the file that git-lfs puts in place of another
 MOST_PREFIXES = 100  # of namespaces that nobody declared
 LARGEST = 1e18  # magnitude of a number whose square fits in PhysX's single precision
 LARGEST_LIMIT = 3.4e38  # magnitude of a finite joint limit, which is compared and not multiplied
@@ -32,6 +33,8 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
             data = file.read(SIZE_LIMIT + 1)
         if len(data) > SIZE_LIMIT:
             raise RobotError(f"{path}: larger than {SIZE_LIMIT >> 20} MiB; remove what the robot does not need")
+        if data.startswith(LFS_POINTER):
+            raise RobotError(f"{path}: a git-lfs pointer instead of the file; run git lfs pull")
         root = _parse(data)
     except etree.XMLSyntaxError as error:
         try:

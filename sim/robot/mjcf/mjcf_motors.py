@@ -16,12 +16,12 @@ import mujoco
 import numpy as np
 
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.mjcf.mjcf_laws import Line, line_of, servo_of, setpoint_range, unread
-from batchpid.sim.robot.mjcf.mjcf_names import Names
+from batchpid.sim.robot.mjcf.mjcf_laws import Line, input_range, is_motor, line_of, servo_of, setpoint_range, unread
+from batchpid.sim.robot.mjcf.mjcf_names import Names, label
 
 Couplings = dict[str, tuple[str, float, float]]
 """Leader, multiplier and offset of each follower, as in ``<mimic>``."""
-_TRN, _BIAS, _EQ = mujoco.mjtTrn, mujoco.mjtBias, mujoco.mjtEq
+_TRN, _EQ = mujoco.mjtTrn, mujoco.mjtEq
 
 
 class Motors(NamedTuple):
@@ -50,16 +50,20 @@ class Motors(NamedTuple):
 def read_couplings(model: Any, names: Names, findings: list[Finding]) -> Couplings:
     """Return the joints that linear equalities couple: y - y0 = c0 + c1 (x - x0), with y0, x0 the reference pose."""
     couplings: Couplings = {}
-    others: dict[str, int] = defaultdict(int)
-    for equality in np.flatnonzero(model.eq_active0):
-        if model.eq_type[equality] != _EQ.mjEQ_JOINT:
-            others[_EQ(model.eq_type[equality]).name.removeprefix("mjEQ_").lower()] += 1
+    others: list[str] = []
+    for equality in map(int, np.flatnonzero(model.eq_active0)):
+        kind = _EQ(model.eq_type[equality]).name.removeprefix("mjEQ_").lower()
+        named = f"{kind} {label(model.equality(equality))}"
+        if model.eq_type[equality] != _EQ.mjEQ_JOINT or int(model.eq_obj1id[equality]) not in names.joints:
+            others.append(named)
             continue
         follower, leader = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])
-        name = names.joints.get(follower, "")
+        name = names.joints[follower]
         offset, multiplier, *higher = model.eq_data[equality, :5].tolist()
         problem = None
-        if leader not in names.joints:
+        if leader >= 0 and leader not in names.joints:
+            problem = f"an equality that couples the joint to {label(model.joint(leader))} is not simulated"
+        elif leader < 0:
             problem = "an equality that holds the joint at a position is not simulated"
         elif any(higher) or multiplier == 0:
             problem = f"an equality that couples the joint to {names.joints[leader]!r} nonlinearly is not simulated"
@@ -71,9 +75,14 @@ def read_couplings(model: Any, names: Names, findings: list[Finding]) -> Couplin
         rest, rest_of_leader = (float(model.qpos0[model.jnt_qposadr[joint]]) for joint in (follower, leader))
         couplings[name] = names.joints[leader], multiplier, rest + offset - multiplier * rest_of_leader
     if others:
-        listed = ", ".join(f"{count} {kind}" for kind, count in others.items())
-        text = f"equality constraints other than of joints are not simulated: {listed}; links move as a tree"
+        listed = ", ".join(others)
+        text = (
+            f"equality constraints other than of the robot's joints are not simulated: {listed}; links move as a tree"
+        )
         findings.append(Finding("warning", "equality", text, "expect closed loops to be open"))
+    if inactive := [label(model.equality(int(equality))) for equality in np.flatnonzero(model.eq_active0 == 0)]:
+        text = f"equality constraints that the file has switched off are left out: {', '.join(inactive)}"
+        findings.append(Finding("note", "equality", text, "expect no effect"))
     return couplings
 
 
@@ -87,19 +96,19 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
     ki: dict[str, float] = defaultdict(float)
     most: dict[str, float] = defaultdict(float)  # limits of the integrals as efforts
     rate: dict[str, float] = {}
+    speed_of_target: dict[str, float] = {}  # limits of velocity servos, which count without a position servo
     lines: dict[str, Line] = {}
     driven: dict[str, int] = defaultdict(int)
     pull: dict[int, float] = {}  # what limited tendons leave to their further actuators
     for actuator in range(len(model.actuator_trntype)):  # nu counts inputs, of which <pid> has up to three
         arms = _arms(model, actuator, names)
-        label = model.actuator(actuator).name or f"number {actuator}"
-        if not arms:
-            text = f"actuator {label!r} acts on no joint, or by a spatial tendon: left out"
-            findings.append(Finding("warning", "actuator", text, "expect every joint to have a motor of its own"))
-            continue
-        leading = _leading(arms, couplings)
+        name_of = f"actuator {label(model.actuator(actuator))}"
+        leading = _leading(arms or {}, couplings)
         if not leading:
-            continue  # a gear of 0
+            text = "acts on no joint of the robot, or by a spatial tendon" if arms is None else "has moment arms of 0"
+            remedy = "expect every joint to have a motor of its own"
+            findings.append(Finding("warning", "actuator", f"{name_of} {text}: left out", remedy))
+            continue
         for name, arm in leading.items():
             armature[name] += arm**2 * _field(model, "actuator_armature", actuator)
             damping[name] += arm**2 * _field(model, "actuator_damping", actuator)
@@ -107,11 +116,11 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
             driven[name] += 1
         first, single = next(iter(leading)), len(leading) == 1
         if not single:
-            text = f"actuator {label!r} pulls several joints: each has a motor of its own here, as strong as all"
+            text = f"{name_of} pulls several joints: each has a motor of its own here, as strong as all"
             findings += [Finding("warning", "actuator", text, "control them together", name) for name in leading]
         servo = servo_of(model, actuator)
         findings += [
-            Finding("warning", "actuator", f"actuator {label!r} {text}", remedy, first, detail=detail)
+            Finding("warning", "actuator", f"{name_of} {text}", remedy, first, detail=detail)
             for text, remedy, detail in unread(model, actuator, servo)
         ]
         if line := line_of(model, actuator):
@@ -121,7 +130,7 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
                 arm = abs(leading[first])
                 lines[first] = line._replace(stall=arm * line.stall, speed=line.speed / arm)
         if (delay := _field(model, "actuator_delay", actuator)) > 0:
-            text = f"actuator {label!r} has a delay, which is not simulated"
+            text = f"{name_of} has a delay, which is not simulated"
             remedy = "give command_delay= to make_actuators"
             findings.append(Finding("warning", "actuator", text, remedy, first, detail=f"{delay:g} s"))
         force = _force_limit(model, actuator, first, findings)
@@ -136,11 +145,13 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
             if servo is not None and single:
                 kp[name] += max(arm**2 * servo.kp, 0.0)
                 kv[name] += max(arm**2 * servo.kv, 0.0)
-                ki[name] += arm**2 * servo.ki
-                most[name] += abs(arm) * servo.ki * servo.imax if servo.ki else 0.0
+                ki[name] += max(arm**2 * servo.ki, 0.0)
+                most[name] += abs(arm) * servo.ki * servo.imax if servo.ki > 0 else 0.0
                 findings += _narrower(model, names, name, setpoint_range(model, actuator, servo), arm)
-                if servo.rate:
-                    rate[name] = min(rate.get(name, math.inf), servo.rate / abs(arm))
+                if 0 < servo.rate < math.inf:
+                    slowest = rate if servo.kp > 0 else speed_of_target
+                    slowest[name] = min(slowest.get(name, math.inf), servo.rate / abs(arm))
+    rate |= {name: value for name, value in speed_of_target.items() if kp[name] == 0}
     for name in [name for name in lines if driven[name] > 1]:
         del lines[name]
         text = "a DC motor is one of several actuators of the joint: its torque-speed line and lag are not simulated"
@@ -196,6 +207,8 @@ def _arms(model: Any, actuator: int, names: Names) -> dict[str, float] | None:
     wraps = range(int(model.tendon_adr[target]), int(model.tendon_adr[target] + model.tendon_num[target]))
     if any(model.wrap_type[wrap] != mujoco.mjtWrap.mjWRAP_JOINT for wrap in wraps):
         return None
+    if any(int(model.wrap_objid[wrap]) not in names.joints for wrap in wraps):
+        return None
     arms: dict[str, float] = defaultdict(float)
     for wrap in wraps:
         arms[names.joints[int(model.wrap_objid[wrap])]] += gear * float(model.wrap_prm[wrap])
@@ -215,15 +228,13 @@ def _leading(arms: dict[str, float], couplings: Couplings) -> dict[str, float]:
 
 def _force_limit(model: Any, actuator: int, name: str, findings: list[Finding]) -> float:
     """Return the largest magnitude of an actuator's force that both its signs reach."""
+    low, high = -math.inf, math.inf
     if model.actuator_forcelimited[actuator]:
-        return _magnitude(model.actuator_forcerange[actuator], name, findings)
-    fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
-    inputs = getattr(model, "actuator_ctrladr", None)  # older versions have one input for each actuator
-    first = actuator if inputs is None else int(inputs[actuator])
-    if fixed and model.actuator_biastype[actuator] == _BIAS.mjBIAS_NONE and model.actuator_ctrllimited[first]:
-        ends = model.actuator_gainprm[actuator, 0] * model.actuator_ctrlrange[first]
-        return _magnitude(ends, name, findings)
-    return math.inf
+        low, high = model.actuator_forcerange[actuator].tolist()
+    if is_motor(model, actuator) and (ends := input_range(model, actuator)) is not None:
+        least, most = sorted((model.actuator_gainprm[actuator, 0] * ends).tolist())
+        low, high = max(low, least), min(high, most)
+    return _magnitude((low, high), name, findings)
 
 
 def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
@@ -238,12 +249,18 @@ def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
 
 
 def _tendons(model: Any) -> list[Finding]:
-    """Return a finding of tendons that act on the joints by themselves."""
-    effects = ("stiffness", "damping", "frictionloss", "armature", "limited")
-    passive = [getattr(model, f"tendon_{name}") for name in effects]
-    acting = [model.tendon(tendon).name for tendon in range(model.ntendon) if any(field[tendon] for field in passive)]
-    if not acting:
-        return []
-    names = ", ".join(map(repr, acting))
-    text = f"springs, damping, friction, armature and limits of tendons are not simulated: {names}"
-    return [Finding("warning", "tendon", text, "expect their joints to move freely")]
+    """Return findings of tendons that act on the joints by themselves, and of tendons that do not act."""
+    effects = ("stiffness", "stiffnesspoly", "damping", "dampingpoly", "frictionloss", "armature", "limited")
+    passive = [getattr(model, f"tendon_{name}", np.zeros(model.ntendon)) for name in effects]  # by version
+    acting = [tendon for tendon in range(model.ntendon) if any(np.any(field[tendon]) for field in passive)]
+    pulled = {*model.actuator_trnid[model.actuator_trntype == _TRN.mjTRN_TENDON, 0].tolist()}
+    idle = [tendon for tendon in range(model.ntendon) if tendon not in pulled and tendon not in acting]
+    found = []
+    if acting:
+        text = "springs, damping, friction, armature and limits of tendons are not simulated: "
+        text += ", ".join(label(model.tendon(tendon)) for tendon in acting)
+        found.append(Finding("warning", "tendon", text, "expect their joints to move freely"))
+    if idle:
+        text = f"tendons without an effect are left out: {', '.join(label(model.tendon(tendon)) for tendon in idle)}"
+        found.append(Finding("note", "tendon", text, "expect no effect"))
+    return found

@@ -10,14 +10,19 @@ MOVING = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 """Types of joints with one degree of freedom."""
 
 
+def label(element: Any) -> str:
+    """Return the quoted name of an element of a model, or its number if it has none."""
+    return repr(element.name or f"number {element.id}")
+
+
 class Names:
     """Names of the ``bodies`` and of the hinges and slides among the ``joints``, by their numbers in the model.
 
-    A body or joint without a name gets one of its number.
+    A body or joint without a name gets one of its number. :meth:`leave_out` removes the joints of other objects.
     """
 
     def __init__(self, model: Any) -> None:
-        self._types = model.jnt_type
+        self._types, self._roots = model.jnt_type, model.body_rootid[model.jnt_bodyid]
         given = [model.body(body).name for body in range(1, model.nbody)]
         self._links, self._joints = {"world", *given}, {model.joint(joint).name for joint in range(model.njnt)}
         self.bodies = {0: "world"}
@@ -31,6 +36,10 @@ class Names:
     def is_slide(self, joint: int) -> bool:
         """Return whether a joint is a slide, not a hinge."""
         return bool(self._types[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
+
+    def leave_out(self, bodies: set[int]) -> None:
+        """Remove the joints of ``bodies``, children of the world, and of the bodies below them."""
+        self.joints = {joint: name for joint, name in self.joints.items() if int(self._roots[joint]) not in bodies}
 
     def new_link(self, name: str) -> str:
         """Return ``name``, with a number if a link has it."""

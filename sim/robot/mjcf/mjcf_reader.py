@@ -9,8 +9,9 @@ import mujoco
 import numpy as np
 from lxml import etree
 
-from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.mjcf.mjcf_compiler import compile_file
+from batchpid.sim.robot.mjcf.mjcf_laws import plugin_name
 from batchpid.sim.robot.mjcf.mjcf_motors import Motors, read_couplings, read_motors
 from batchpid.sim.robot.mjcf.mjcf_names import Names
 from batchpid.sim.robot.mjcf.mjcf_shapes import excluded_pairs
@@ -22,8 +23,6 @@ _KEYFRAME = "home"
 """Keyframe with the start pose."""
 _FLAGS = ("GRAVITY", "CONTACT", "LIMIT", "EQUALITY", "FRICTIONLOSS", "DAMPER", "CONSTRAINT", "ACTUATION", "CLAMPCTRL")
 """Parts of MuJoCo's physics that a file can disable, and that this package simulates nevertheless."""
-_ERRORS = (ValueError, mujoco.FatalError)
-"""Errors of MuJoCo's parser and compiler."""
 
 
 class Mjcf(NamedTuple):
@@ -36,6 +35,8 @@ class Mjcf(NamedTuple):
     motors: Motors
     start: dict[str, float]
     """Start pose by joint [rad or m]: the keyframe "home", else the reference pose."""
+    missing_meshes: tuple[str, ...]
+    """Collision meshes that the robot is simulated without."""
     findings: tuple[Finding, ...]
 
 
@@ -43,84 +44,21 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> M
     """Return the content of the MJCF file at ``path`` as the robot ``name``.
 
     For the other arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError if MuJoCo refuses the file, it has a
-    ball joint or several robots, or, if refused, a missing mesh.
+    ball joint or several robots, a missing mesh has an unknown mass, or missing meshes are refused.
     """
     findings: list[Finding] = []
-    model = _compile(path, missing_meshes, findings)
+    model, missing = compile_file(path, fixed_base, missing_meshes, findings)
     names = Names(model)
+    tree = Tree(model, names, path, fixed_base, findings)
     mimics = read_couplings(model, names, findings)
     motors = read_motors(model, names, mimics, findings)
-    tree = Tree(model, names, path, findings)
-    tree.write(fixed_base, motors, mimics)
+    tree.write(motors, mimics)
     tree.root.set("name", name)
-    findings += [*_in_radians(model, names), *_unused(model, names)]
     key = next((key for key in range(model.nkey) if model.key(key).name == _KEYFRAME), None)
+    findings += [*_in_radians(model, names), *_unused(model, names, key)]
     pose = model.qpos0 if key is None else model.key_qpos[key]
     start = {name: float(pose[model.jnt_qposadr[joint]]) for joint, name in names.joints.items()}
-    return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, tuple(findings))
-
-
-class _Attempt(NamedTuple):
-    """Model of a file, or None with MuJoCo's reason; missing files of collision meshes, whose geoms are left out."""
-
-    model: Any | None
-    missing: list[str]
-    problem: str
-
-
-def _compile(path: Path, missing_meshes: str, findings: list[Finding]) -> Any:
-    """Return the compiled model, if possible without geoms that are only drawn, whose meshes take time to read."""
-    stripped = _attempt(path, strip=True)
-    if stripped.model is not None and not stripped.missing:
-        return stripped.model
-    whole = _attempt(path, strip=False)  # something may refer to a removed geom, and a missing file be elsewhere
-    if whole.model is not None:
-        return whole.model
-    names = ", ".join(stripped.missing)
-    if names and missing_meshes == "error":
-        remedy = "restore the files, or pass missing_meshes='skip' to simulate without"
-        raise RobotError(f"{path}: collision mesh not found: {names}; {remedy}")
-    if not names or stripped.model is None:
-        problem = stripped.problem if names else whole.problem
-        raise RobotError(f"{path}: MuJoCo cannot compile the file: {problem}; correct it")
-    text = f"collision meshes not found, simulated without: {names}"
-    findings.append(Finding("warning", "missing-mesh", text, "put the files where the MJCF names them"))
-    return stripped.model
-
-
-def _attempt(path: Path, strip: bool) -> _Attempt:
-    missing: list[str] = []
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        missing = _strip(spec, path) if strip else []
-        return _Attempt(spec.compile(), missing, "")
-    except _ERRORS as error:
-        return _Attempt(None, missing, " ".join(str(error).split()))
-
-
-def _strip(spec: Any, path: Path) -> list[str]:
-    """Remove textures, and geoms that add neither shape nor mass; return the missing files of collision meshes."""
-    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
-    folder = path.parent / (spec.meshdir or "")
-    absent = {mesh.name: mesh.file for mesh in spec.meshes if mesh.file and not (folder / mesh.file).is_file()}
-    inferred = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    missing: dict[str, None] = {}
-    used: set[str] = set()
-    for geom in list(spec.geoms):
-        geom.material = ""
-        drawn_only = not (geom.contype | geom.conaffinity) and geom.name not in paired
-        unused = drawn_only and not inferred and bool(geom.parent.explicitinertial)
-        if not unused and geom.meshname in absent:
-            missing[absent[geom.meshname]] = None
-        if unused or geom.meshname in absent:
-            spec.delete(geom)
-        elif geom.meshname:
-            used.add(geom.meshname)
-    for site in spec.sites:
-        site.material = ""
-    for each in [*spec.materials, *spec.textures, *(mesh for mesh in spec.meshes if mesh.name not in used)]:
-        spec.delete(each)
-    return list(missing)
+    return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, missing, tuple(findings))
 
 
 def _in_radians(model: Any, names: Names) -> list[Finding]:
@@ -132,10 +70,11 @@ def _in_radians(model: Any, names: Names) -> list[Finding]:
     return [Finding("warning", "limits", text, 'add <compiler angle="radian"/> if the file is in radians')]
 
 
-def _unused(model: Any, names: Names) -> list[Finding]:
-    """Return findings for content that is not simulated, apart from motors, couplings and shapes."""
+def _unused(model: Any, names: Names, key: int | None) -> list[Finding]:
+    """Return findings for content that is not simulated, apart from motors, couplings, shapes and keyframe ``key``."""
     found = []
     counts = {"site": model.nsite, "sensor": model.nsensor, "camera": model.ncam}
+    counts["keyframe"] = model.nkey - (key is not None)
     if listed := [f"{count} {kind}{'s' * (count > 1)}" for kind, count in counts.items() if count]:
         text = f"elements that the simulation does not use are left out: {', '.join(listed)}"
         found.append(Finding("note", "unknown-element", text, "expect no effect"))
@@ -161,6 +100,10 @@ def _unused(model: Any, names: Names) -> list[Finding]:
         text = "gravity compensation of this body (gravcomp) is not simulated"
         remedy = "keep the compensation of the controller on"
         found.append(Finding("note", "gravcomp", text, remedy, link=names.bodies[int(body)]))
+    for body in np.flatnonzero(model.body_plugin >= 0):
+        text = f"the plugin {plugin_name(model, model.body_plugin[body])!r} acts on the body: it is not simulated"
+        remedy = "expect the body to be rigid and to move freely"
+        found.append(Finding("warning", "unknown-element", text, remedy, link=names.bodies[int(body)]))
     if model.nflex or model.nskin:
         found.append(Finding("warning", "unknown-element", "flexible bodies are left out", "expect rigid links alone"))
     return found

@@ -21,7 +21,7 @@ from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.mjcf.mjcf_names import Names
+from batchpid.sim.robot.mjcf.mjcf_names import Names, label
 from batchpid.sim.robot.rotations import to_rpy
 from batchpid.sim.robot.self_collision import DisabledPair
 
@@ -98,6 +98,33 @@ class ShapeWriter:
             written = True
         return written
 
+    def leave_out(self, body: int) -> None:
+        """Report the shapes of a body that is not part of the robot."""
+        first = int(self._model.body_geomadr[body])
+        solid = [
+            geom for geom in range(first, first + int(self._model.body_geomnum[body])) if can_collide(self._model, geom)
+        ]
+        others = [geom for geom in solid if int(self._model.geom_type[geom]) != PLANE]
+        for geom in sorted({*solid} - {*others}):
+            self._plane(geom)
+        if others:
+            listed = ", ".join(label(self._model.geom(geom)) for geom in others)
+            text = f"shapes of the world beside a robot on a free joint are left out: {listed}"
+            self._found("warning", None, text, "add them with build= of Runner")
+
+    def _plane(self, geom: int) -> None:
+        """Report a plane of the world, in place of which scenes have a ground."""
+        text = f"the plane {label(self._model.geom(geom))} of the file is left out"
+        height, (_, x, y, _) = float(self._model.geom_pos[geom, 2]), self._model.geom_quat[geom]
+        if height == 0 and x == y == 0:
+            self._found("note", None, text, "scenes have a ground at height 0")
+        else:
+            remedy = (
+                "scenes have a ground at height 0 instead: add the plane with build= of Runner, or pass ground=False"
+            )
+            where = f"{text}, at height {height:g} m" if x == y == 0 else f"{text}, which is not level"
+            self._found("warning", None, where, remedy)
+
     def _geometry(self, geom: int, body: int) -> etree._Element | None:
         """Return the shape of a geom; None, with a finding, if a URDF has no such shape."""
         kind, size = int(self._model.geom_type[geom]), self._model.geom_size[geom]
@@ -118,9 +145,9 @@ class ShapeWriter:
             self._found("note", body, text, "expect its surface up to 3 % of the radii farther inside")
             return etree.Element("mesh", filename=str(_write_mesh(*_ellipsoid(size))))
         if body == 0 and kind == PLANE:
-            self._found("note", None, "the plane of the file is left out", "scenes have a ground at height 0")
+            self._plane(geom)
         else:
-            name = "a plane" if kind == PLANE else "a height field"
+            name = f"{'a plane' if kind == PLANE else 'a height field'} ({label(self._model.geom(geom))})"
             self._found("warning", body, f"{name} is not a shape of a robot: left out", "add it with build= of Runner")
         return None
 

@@ -420,7 +420,14 @@ def test_a_dc_motor_has_a_line_a_lag_and_gains(load):
         ('<general joint="j" gainprm="5" biastype="affine" biasprm="0 5 -1"/>', "has a negative gain"),
         ('<damper joint="j" kv="2" ctrlrange="0 1"/>', "not proportional to its input"),
         ('<pid joint="j" kp="5" input="vel ff"/>', "is a spring"),
-        ('<dcmotor joint="j" nominal="24 6 3" cogging="1 4 0" lugre="9 1 1 1 1"/>', "cogging, friction (lugre)"),
+        (
+            '<dcmotor joint="j" nominal="24 6 3" ctrlrange="-9 9" cogging="1 4 0" lugre="9 1 1 1 1"/>',
+            "cogging, friction (lugre)",
+        ),
+        ('<dcmotor joint="j" nominal="24 6 3"/>', "no torque-speed line"),
+        ('<general joint="j" gainprm="0" biastype="affine" biasprm="0 -5 0"/>', "is a spring"),
+        ('<velocity joint="j" kv="2"/>', "is a velocity servo"),
+        ('<general joint="j" biastype="user"/>', "adds a force that depends on its length and speed"),
         (
             '<motor joint="j" group="2"/></actuator><option actuatorgroupdisable="2"/><actuator>',
             "is disabled in the file",
@@ -525,6 +532,23 @@ def test_what_has_no_equivalent_is_told(load, name):
         load(text, strict=True)
 
 
+def test_all_that_is_left_out_is_named(load):
+    """A floating robot is not fixed to the world, whose shapes are not its links'."""
+    floor = '<geom {} type="plane" size="1 1 .1"/>'
+    named = floor.format("name='floor'")
+    world = f'{named}<geom name="wall" size=".1"/><geom type="box" size=".1 .1 .1"/>'
+    rest = """<tendon><fixed name="idle"><joint joint="hip1" coef="1"/></fixed></tendon><equality>
+      <weld name="hold" body1="leg1"/><connect name="off" body1="leg2" anchor="0 0 0" active="false"/></equality>"""
+    told = "\n".join(map(str, load(WALKER.replace("<worldbody>", f"{rest}<worldbody>{world}")).repairs))
+    for name in ("'floor'", "'wall', 'number 2'", "'idle'", "weld 'hold'", "'off'", "'ball'", "'goal'"):
+        assert name in told
+    for place, said in (('pos="0 0 -1"', "at height -1 m"), ('euler="30 0 0"', "which is not level")):
+        (found,) = load(two_links().replace("<worldbody>", f"<worldbody>{floor.format(place)}")).repairs
+        assert (found.severity, found.code) == ("warning", "collision")
+        assert "plane 'number 0'" in found.text
+        assert said in found.text
+
+
 def test_a_plain_file_needs_no_repair(load):
     assert load(two_links(), strict=True).repairs == ()
 
@@ -552,17 +576,106 @@ def test_what_cannot_be_simulated_is_refused(load, name):
         load(text)
 
 
-def test_missing_meshes(load):
-    asset = '<asset><mesh name="gone" file="gone.stl"/></asset>'
-    shown = f'{BOX}<geom type="mesh" mesh="gone" contype="0" conaffinity="0"/>'
-    inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
-    assert load(two_links(rest=asset, geom=inertial + shown), missing_meshes="error").repairs == ()
-    text = two_links(rest=asset, geom=f'{BOX}<geom type="mesh" mesh="gone"/>')
-    (finding,) = load(text).repairs
-    assert finding.code == "missing-mesh"
-    assert "gone.stl" in finding.text
-    with pytest.raises(RobotError, match=r"gone\.stl.*missing_meshes"):
-        load(text, missing_meshes="error")
+INERTIAL = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"
+UNREADABLE = {"not found": None, "git lfs pull": POINTER, "empty": b"", "damaged": b"solid wedge" + 99 * b" "}
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj"])
+@pytest.mark.parametrize("reason", UNREADABLE)
+def test_missing_meshes(load, tmp_path, reason, suffix):
+    """A mesh may be missing if the mass of its body is known, and is named."""
+    (tmp_path / "parts").mkdir()
+    if UNREADABLE[reason] is not None:
+        (tmp_path / "parts" / f"gone.{suffix}").write_bytes(UNREADABLE[reason])
+    asset = f'<compiler meshdir="parts"/><asset><mesh name="m" file="gone.{suffix}"/></asset>'
+    shown = '<geom name="{}" type="mesh" mesh="m" contype="0" conaffinity="0"/>'
+    assert load(two_links(rest=asset, geom=INERTIAL + BOX + shown.format("")), missing_meshes="error").repairs == ()
+    for shape in ('<geom type="mesh" mesh="m"/>', '<geom type="box" mesh="m"/>'):
+        for body in (f"{INERTIAL}{BOX}{shape}", f"{INERTIAL}{shape}", BOX + shape.replace("/>", ' mass="0"/>')):
+            text = two_links(rest=asset, geom=body)
+            robot = load(text)
+            (finding,) = robot.repairs
+            assert finding.code == "missing-mesh"
+            assert f"gone.{suffix}" in finding.text
+            assert reason in finding.text
+            assert finding.text.endswith(robot.missing_meshes[0])
+            with pytest.raises(RobotError, match=rf"gone\.{suffix}.*{reason}.*missing_meshes"):
+                load(text, missing_meshes="error")
+    seen = '<sensor><framepos objtype="geom" objname="seen"/></sensor>'
+    assert load(two_links(geom=INERTIAL + BOX, rest=asset + seen).replace(BOX, BOX + shown.format("seen"), 1)).dof == 1
+
+
+@pytest.mark.parametrize("mode", ["skip", "error"])
+@pytest.mark.parametrize("drawn", ["", 'contype="0" conaffinity="0"'])
+@pytest.mark.parametrize("inferred", [False, True])
+def test_a_missing_mesh_without_which_the_mass_is_unknown_is_refused(load, mode, drawn, inferred):
+    asset = f'<compiler inertiafromgeom="{str(inferred).lower() if inferred else "auto"}"/>'
+    asset += '<asset><mesh name="m" file="gone.stl"/></asset>'
+    shape = f'<geom type="mesh" mesh="m" {drawn}/>'
+    for geom in (shape, BOX + shape, BOX + shape.replace("/>", ' mass="2"/>')):
+        text = two_links(geom=INERTIAL * inferred + geom, rest=asset)
+        with pytest.raises(
+            RobotError, match=r"mesh gone\.stl \(not found\) of body 'b'; restore the file, or give the"
+        ):
+            load(text, missing_meshes=mode)
+    base = two_links(rest=asset).replace(BOX, BOX + shape, 1)
+    if not (mode == "error" and not drawn):
+        assert load(base, missing_meshes=mode).dof == 1  # the mass of a fixed base has no effect
+    with pytest.raises(RobotError, match=r"of body 'a'; restore the file"):
+        load(base, missing_meshes=mode, fixed_base=False)
+
+
+@pytest.mark.parametrize(
+    "asset", ['<include file="part.xml"/>', '<asset><hfield name="h" file="part.png" size="1 1 1 1"/></asset>']
+)
+def test_a_git_lfs_pointer_in_place_of_another_file_is_named(load, tmp_path, asset):
+    for suffix in ("png", "xml"):
+        (tmp_path / f"part.{suffix}").write_bytes(POINTER)
+    with pytest.raises(RobotError, match=r"part\.(png|xml) is a git-lfs pointer instead of the file; run git lfs pull"):
+        load(two_links(rest=asset))
+
+
+@pytest.mark.parametrize("name", ["robot.xml", "robot.urdf"])
+def test_a_git_lfs_pointer_in_place_of_the_robot_is_named(tmp_path, name):
+    (tmp_path / name).write_bytes(POINTER)
+    with pytest.raises(RobotError, match=r"robot\.\w+: a git-lfs pointer instead of the file; run git lfs pull"):
+        Robot.load(tmp_path / name)
+
+
+def test_a_mesh_beside_a_missing_one_keeps_its_shape(load, tmp_path):
+    """MuJoCo looks up meshes in meshdir or assetdir, with strippath without their folders."""
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "here.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    geom = f'{INERTIAL}<geom type="mesh" mesh="here"/><geom type="mesh" mesh="gone"/>'
+    absolute = tmp_path / "parts" / "here.obj"
+    for compiler, file in (
+        ('meshdir="parts"', "here.obj"),
+        ('assetdir="parts"', "here.obj"),
+        ('meshdir="parts" strippath="true"', "x/y/here.obj"),
+        ('meshdir="elsewhere"', absolute),
+    ):
+        asset = f'<asset><mesh name="here" file="{file}"/><mesh name="gone" file="x/gone.obj"/></asset>'
+        (missing,) = load(two_links(geom=geom, rest=f"<compiler {compiler}/>{asset}")).missing_meshes
+        assert missing.startswith("x/gone.obj")
+
+
+def test_a_default_namespace_changes_nothing(load, tmp_path):
+    pytest.importorskip("trimesh")
+    (tmp_path / "part.xml").write_text(f'<mujocoinclude xmlns="urn:m"><body name="c">{BOX}</body></mujocoinclude>')
+    text = ARM.replace("</worldbody>", '<include file="part.xml"/></worldbody>')
+    plain, named = load(text), load(text.replace("<mujoco ", '<mujoco xmlns="http://mujoco.org/mjcf" '))
+    assert (named.urdf, named.repairs) == (plain.urdf, plain.repairs)
+    assert [each.link for each in surfaces(named)] == [each.link for each in surfaces(plain)]
+
+
+def test_keyframes_other_than_the_start_are_named(load):
+    keys = '<keyframe><key name="home" qpos=".1"/><key name="stand"/><key/></keyframe>'
+    (finding,) = load(two_links(rest=keys)).repairs
+    assert "2 keyframes" in finding.text
+    assert load(two_links(rest='<keyframe><key name="home" qpos=".1"/></keyframe>')).repairs == ()
 
 
 def test_a_geom_that_is_referred_to_stays(load):

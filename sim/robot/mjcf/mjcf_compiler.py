@@ -1,0 +1,180 @@
+"""Compilation of an MJCF file by MuJoCo, without the geoms that add neither shape nor mass, and without missing meshes.
+
+MuJoCo refuses a file that names a mesh that is missing or cannot be read. A geom of that mesh can be left out only if
+the mass of its body does not depend on it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+
+from batchpid.errors import RobotError
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.meshes import LFS_PROBLEM, mesh_problem
+from batchpid.sim.robot.xml import LFS_POINTER, parse_xml
+
+_ERRORS = (ValueError, mujoco.FatalError)
+"""Errors of MuJoCo's parser and compiler."""
+_CHECKED = (".stl", ".obj")
+"""Formats of meshes that :func:`mesh_problem` and MuJoCo both read."""
+
+
+class _Attempt(NamedTuple):
+    """Model of a file, or None with MuJoCo's reason; collision meshes whose geoms are left out, with the reason.
+
+    ``weighing`` are the bodies whose mass depends on a geom that is left out, each with the mesh.
+    """
+
+    model: Any | None
+    missing: tuple[str, ...] = ()
+    weighing: tuple[tuple[str, str], ...] = ()
+    problem: str = ""
+
+
+def compile_file(
+    path: Path, fixed_base: bool, missing_meshes: str, findings: list[Finding]
+) -> tuple[Any, tuple[str, ...]]:
+    """Return the compiled model of a file, and the collision meshes that it is without.
+
+    Raises RobotError if MuJoCo refuses the file, a missing mesh has an unknown mass, or missing meshes are refused.
+    """
+    first = _attempt(path, fixed_base, _unreadable)  # without geoms that are only drawn: their meshes take time to read
+    if first.model is not None and not first.missing and not first.weighing:
+        return first.model, ()
+    whole = _attempt(path, fixed_base)  # something may refer to a removed geom, and a missing file be elsewhere
+    if whole.model is not None:
+        return whole.model, ()
+    best = next(
+        (each for each in _attempts(path, fixed_base, first, whole.problem) if each.model is not None or each.weighing),
+        whole,
+    )
+    if best.weighing:
+        listed = ", ".join(f"mesh {mesh} of body {body!r}" for mesh, body in best.weighing)
+        remedy = "restore the file, or give the body an <inertial>, with which the mesh may be missing"
+        remedy += ' (unless inertiafromgeom is "true")'
+        raise RobotError(f"{path}: the mass of a body is unknown without its mesh: {listed}; {remedy}")
+    names = ", ".join(best.missing)
+    if names and missing_meshes == "error":
+        remedy = "restore the files, or pass missing_meshes='skip' to simulate without"
+        raise RobotError(f"{path}: collision mesh not found or not readable: {names}; {remedy}")
+    if best.model is None:
+        raise RobotError(_refusal(path, best.problem))
+    if names:
+        text = f"collision meshes not found or not readable, simulated without: {names}"
+        findings.append(Finding("warning", "missing-mesh", text, "put the files where the MJCF names them"))
+    return best.model, best.missing
+
+
+def _attempts(path: Path, fixed_base: bool, first: _Attempt, problem: str) -> Iterator[_Attempt]:
+    """Yield compilations without missing meshes, then, if MuJoCo's problem is a mesh, without damaged ones."""
+    yield first
+    yield _attempt(path, fixed_base, _unreadable, keeps_drawn=True)
+    if re.search("stl|obj|mesh|vert|face", problem, re.IGNORECASE):
+        yield _attempt(path, fixed_base, _damaged)
+        yield _attempt(path, fixed_base, _damaged, keeps_drawn=True)
+
+
+def _attempt(
+    path: Path, fixed_base: bool, problem_of: Callable[[Path], str | None] | None = None, keeps_drawn: bool = False
+) -> _Attempt:
+    """Return a compilation without the geoms of meshes that have a problem; of the whole file by default."""
+    left_out: tuple[Any, Any] = (), ()
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        if problem_of is not None:
+            left_out = _strip(spec, path, fixed_base, problem_of, keeps_drawn)
+        return _Attempt(spec.compile(), *left_out)
+    except _ERRORS as error:
+        return _Attempt(None, *left_out, " ".join(str(error).split()))
+
+
+def _strip(
+    spec: Any, path: Path, fixed_base: bool, problem_of: Callable[[Path], str | None], keeps_drawn: bool
+) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
+    """Remove textures, geoms that add neither shape nor mass, and those of missing meshes; return the latter."""
+    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    absent = {}
+    for mesh in spec.meshes:
+        folder = path.parent / (getattr(mesh, "compiler", spec).meshdir or "")
+        file = Path(mesh.file).name if spec.strippath else mesh.file
+        if mesh.file and (problem := problem_of(folder / file)):
+            absent[mesh.name] = f"{mesh.file} ({problem})"
+    missing: dict[str, None] = {}
+    weighing: dict[tuple[str, str], None] = {}
+    used: set[str] = set()
+    for geom in list(spec.geoms):
+        geom.material = ""
+        drawn_only = not (geom.contype | geom.conaffinity) and geom.name not in paired
+        weighs = _weighs(spec, geom)
+        if geom.meshname in absent and weighs and (not fixed_base or _moves(geom.parent)):
+            weighing[absent[geom.meshname], geom.parent.name] = None
+        elif geom.meshname in absent and not drawn_only:
+            missing[absent[geom.meshname]] = None
+        if drawn_only and not weighs and not keeps_drawn:
+            spec.delete(geom)
+        elif geom.meshname in absent:  # something may refer to it
+            geom.type, geom.size, geom.meshname = mujoco.mjtGeom.mjGEOM_SPHERE, [1e-3, 0, 0], ""
+            geom.contype, geom.conaffinity, geom.mass = 0, 0, 0.0
+            for pair in [each for each in spec.pairs if geom.name in (each.geomname1, each.geomname2) and geom.name]:
+                spec.delete(pair)
+        elif geom.meshname:
+            used.add(geom.meshname)
+    for site in spec.sites:
+        site.material = ""
+    for each in [*spec.materials, *spec.textures, *(mesh for mesh in spec.meshes if mesh.name not in used)]:
+        spec.delete(each)
+    return tuple(missing), tuple(weighing)
+
+
+def _weighs(spec: Any, geom: Any) -> bool:
+    """Return whether the mass of a geom's body depends on the geom."""
+    inferred = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    low, high = spec.compiler.inertiagrouprange
+    weightless = geom.mass == 0 or (math.isnan(geom.mass) and geom.density == 0) or not low <= geom.group <= high
+    return (inferred or not geom.parent.explicitinertial) and not weightless and geom.parent.parent is not None
+
+
+def _moves(body: Any) -> bool:
+    """Return whether a joint moves the body."""
+    while body is not None and not len(body.joints):
+        body = body.parent
+    return body is not None
+
+
+def _unreadable(path: Path) -> str | None:
+    """Return the reason for which no program can read a mesh; None for other meshes."""
+    try:
+        with open(path, "rb") as file:
+            return LFS_PROBLEM if file.read(len(LFS_POINTER)) == LFS_POINTER else None
+    except OSError as error:
+        return "not found" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+
+
+def _damaged(path: Path) -> str | None:
+    """Return the reason for which a mesh cannot be read, after a check of its format; None for other meshes."""
+    return _unreadable(path) or (mesh_problem(path) if path.suffix.lower() in _CHECKED else None)
+
+
+def _refusal(path: Path, problem: str) -> str:
+    """Return the message for a file that MuJoCo refuses."""
+    plugin = re.search(r"plugin '?([\w.-]+)'? not found|unrecognized plugin '([^']*)'", problem)
+    if plugin is not None and plugin[1]:
+        remedy = "load its library with mujoco.mj_loadPluginLibrary, or remove <extension> and the elements that use it"
+        return f"{path}: uses the plugin {plugin[1]!r}, which MuJoCo {mujoco.__version__} has not loaded; {remedy}"
+    if plugin is not None:
+        remedy = f'add <extension><plugin plugin="{plugin[2]}"/></extension>, or remove the elements that use it'
+        return f"{path}: uses the plugin {plugin[2]!r} without <extension>; {remedy}"
+    included = [each.get("file", "") for each in parse_xml(path).iter("{*}include")]
+    for name in (*re.findall(r"'([^']+)'", problem), *included):
+        with suppress(OSError, ValueError):
+            if _unreadable(path.parent / name) == LFS_PROBLEM:
+                return f"{path}: {name} is a git-lfs pointer instead of the file; run git lfs pull"
+    remedy = "restore the file" if "opening file" in problem else "correct it"
+    return f"{path}: MuJoCo cannot compile the file: {problem}; {remedy}"
