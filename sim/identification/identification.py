@@ -21,6 +21,7 @@ from batchpid.arrays.digest import digest
 from batchpid.checks.validate import choice, flag, instance, integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.versions import package_versions
+from batchpid.motors.actuator_files import dumps_actuators, loads_actuators
 from batchpid.sim.engine import native
 from batchpid.sim.identification.fit import Step
 from batchpid.sim.identification.fit_history import History, State
@@ -30,7 +31,7 @@ from batchpid.sim.identification.logs import Log, LogWarning, at_limits, checked
 from batchpid.sim.identification.plant import Motors, Plant
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import Motion, best_drive, smooth
-from batchpid.sim.identification.result import Fit, Identification
+from batchpid.sim.identification.result import Fit, Identification, actuators_at
 from batchpid.sim.identification.start import begin
 from batchpid.sim.identification.statistics import uncertainty
 from batchpid.sim.identification.unknowns import Unknowns
@@ -154,8 +155,9 @@ def identify(
         problem, best = search(problems, state, evaluations, record, bar)
         before, after = problem.residuals(unknowns.point(ideal)[None]), [window.residual for window in best.windows]
         sure = uncertainty(problem, best)
+        saved = problem.residuals(_saved(robot, joints, unknowns, best.theta)[None])
     before = [residual[0] for residual in before]
-    errors = tuple(_held_out(problem, residuals) for residuals in (before, after))
+    errors = _held_out(problem, before), _held_out(problem, [residual[0] for residual in saved])
     if not errors[1] < errors[0]:  # the fit failed: nothing is known
         sure = sure._replace(identified=np.zeros_like(sure.identified))
     fits = tuple(
@@ -239,6 +241,27 @@ def _ideal(robot: Robot, joints: tuple[int, ...]) -> Motors:
     zero, own = np.zeros((1, len(joints))), list(joints)
     damping, friction, none = robot.damping[None, own], robot.friction[None, own], np.zeros((1, 1))
     return Motors(zero, damping, friction, zero + 1, zero, none, none, none)
+
+
+def _saved(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Float64) -> Float64:
+    """Return the point ``theta`` as its actuators file describes it, with the stopping time and payload of ``theta``."""
+    text = dumps_actuators(actuators_at(robot, joints, unknowns, theta), robot.joint_names)
+    read = loads_actuators(text, robot.joint_names)[0]
+    own, found = list(joints), unknowns.motors(theta[None])
+    columns = {
+        "armature": read.armature,
+        "damping": robot.damping + (0.0 if read.viscous is None else read.viscous),
+        "friction": robot.friction + (0.0 if read.coulomb is None else read.coulomb),
+        "strength": read.strength,
+        "bias": read.bias,
+    }
+    ideal = {"strength": 1.0}
+    per_joint = {
+        kind: np.full((1, len(own)), ideal.get(kind, 0.0)) if leaf is None else np.atleast_2d(leaf)[:, own]
+        for kind, leaf in columns.items()
+    }
+    delay = np.zeros((1, 1)) if read.command_delay is None else np.asarray(read.command_delay, float)[:1, :1]
+    return unknowns.point(found._replace(**per_joint, delay=delay))
 
 
 def _held_out(problem: Problem, residuals: list[Float64]) -> float:
