@@ -37,9 +37,11 @@ class IdentifyCommand:
     params: flags.OptionalName = None
     """Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file as for --gains of
     other commands. Without it the logs' efforts are used."""
-    compensate: flags.Compensate = "gravity+coriolis+friction"
-    timestep: float = 1 / 2000
-    """Time step of the control that drove the robot [s]."""
+    compensate: Annotated[flags.Compensate | None, tyro.conf.arg(metavar="FORCES")] = None
+    """Forces that the robot compensates: gravity+coriolis+friction, gravity+coriolis, gravity or none. Default: as the
+    recordings say, else gravity+coriolis+friction."""
+    timestep: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """Time step of the control that drove the robot [s]. Default: as the recordings say, else 1/2000."""
     sim_steps: int = 1
     """Sim steps in each control step: about 4 for a robot under control at 500 Hz, or its hold counts as delay."""
     hold: flags.Switch = False

@@ -45,8 +45,8 @@ def identify(
     logs: Iterable[str | os.PathLike[str] | Log],
     *,
     params: bp.PIDParams | None = None,
-    compensate: Compensation = "gravity+coriolis+friction",
-    timestep: float = 1 / 2000,
+    compensate: Compensation | None = None,
+    timestep: float | None = None,
     sim_steps: int = 1,
     payload: bool = True,
     hold: bool = False,
@@ -68,9 +68,9 @@ def identify(
     compensate
         Forces that the robot compensates by itself, or "none". The fit determines whether the compensation passes
         through the motors. For a log of the complete efforts, compensation included, use "none"; where the log shows
-        it, the fit determines this, too.
+        it, the fit determines this, too. Default: as the recordings say, else "gravity+coriolis+friction".
     timestep
-        Time step of the control that drove the robot [s].
+        Time step of the control that drove the robot [s]. Default: as the recordings say, else 1/2000.
     sim_steps
         Number of sim steps in each. Use more than one if the robot, or its simulator, moved in smaller steps than its
         control, as a real robot under control at 500 Hz or less. Otherwise half the difference of the steps counts as
@@ -94,7 +94,7 @@ def identify(
     Raises
     ------
     InvalidArgumentError
-        An option is out of range, a file holds no log of this robot, or a history is of another fit.
+        An option is out of range or contradicts a recording, a file holds no log of this robot, or a history is of another fit.
     MissingDependencyError
         A package is missing.
 
@@ -107,16 +107,16 @@ def identify(
         if find_spec(package) is None:
             raise MissingDependencyError(package, "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
-    choice("compensate", compensate, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"))
-    timestep = number("timestep", timestep, 1e-5, 0.01, "seconds")
     sim_steps = integer("sim_steps", sim_steps, 1, 100)
-    control, timestep = timestep, timestep / sim_steps
     evaluations, seed = integer("evaluations", evaluations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
     if workers is not None:
         integer("workers", workers, 0, 1024)
     payload, kind = flag("payload", payload), "effort" if params is None else "setpoint"
     found = _logs(robot, logs, kind, flag("hold", hold))
-    joints = found[0].joints
+    control = number("timestep", _recorded("timestep", timestep, found, 1 / 2000), 1e-5, 0.01, "seconds")
+    compensate = _recorded("compensate", compensate, found, "gravity+coriolis+friction")
+    choice("compensate", compensate, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"))
+    timestep, joints = control / sim_steps, found[0].joints
     if params is not None:
         params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, joints)
     measured = params is not None and params.measurement_rate is not None
@@ -204,6 +204,25 @@ def _logs(robot: Robot, logs: Iterable[Any], kind: Any, hold: bool) -> list[Log]
             message = "; ".join(stopped) + ": stops are not part of the model; record between the limits"
             warnings.warn(message, LogWarning, stacklevel=4)
     return found
+
+
+def _recorded(name: str, given: Any, logs: list[Log], default: Any) -> Any:
+    """Return the option ``name`` as given or as the recordings say, or the default."""
+    for log in logs:
+        known = getattr(log, name)
+        if known is None:
+            continue
+        if given is None:
+            given = known
+        same = np.isclose(known, given) if name == "timestep" else _forces(known) == _forces(given)
+        if not same:
+            problem, remedy = f"contradicts {log.source}, which was made with {known!r}", "leave the option out"
+            raise InvalidArgumentError(name, problem, value=given, remedy=f"{remedy}, and fit such recordings alone")
+    return default if given is None else given
+
+
+def _forces(compensate: Any) -> str:
+    return str(compensate).removesuffix("+friction")
 
 
 def _of_joints(params: bp.PIDParams, robot: Robot, joints: tuple[int, ...]) -> bp.PIDParams:

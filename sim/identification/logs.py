@@ -21,6 +21,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,9 @@ def logs_of_rollout(
     if info.own_command is not None:
         problem = f"was made with setpoints of {', '.join(info.own_command.names)}, not of joints"
         raise InvalidArgumentError(source, problem, remedy="record a run under control 'pid' or 'effort'")
+    if info.control not in (None, "pid", "effort"):
+        problem = f"was made under control {info.control!r}, which the model does not have"
+        raise InvalidArgumentError(source, problem, remedy="record a run under control 'pid' or 'effort'")
     found: CommandKind = "effort" if info.control == "effort" else "setpoint"
     if kind is not None and kind != found:
         problem = f"was made under control {info.control!r} and holds {found}s"
@@ -123,6 +127,7 @@ def logs_of_rollout(
         }
         name = source if rollout.num_envs == 1 else f"{source}, env {env}"
         log = Log(name, joints, found, rollout.time, tables["qpos"], begin, tables["setpoint"], True, tables["qvel"])
+        log = replace(log, timestep=info.timestep, compensate=info.compensate)
         logs += checked(robot, log)
     return logs
 

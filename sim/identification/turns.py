@@ -36,7 +36,7 @@ def unwrapped(robot: Robot, log: Log, row: Callable[[int], str]) -> tuple[Log, l
             _check(log, name, steps, turns, row)
             qpos[1:, number] -= TURN * np.cumsum(turns)
             wrapped.append(name)
-        if log.kind == "setpoint":
+        if log.kind == "setpoint" and (turns.any() or robot.continuous[joint]):
             measured = np.interp(log.command_time, log.time, qpos[:, number])
             command[:, number] = _closest(command[:, number], measured)
             far = np.abs(command[:, number] - measured) > np.pi
