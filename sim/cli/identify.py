@@ -37,9 +37,11 @@ class IdentifyCommand:
     params: flags.OptionalName = None
     """Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file as for --gains of
     other commands. Without it the logs' efforts are used."""
-    compensate: flags.Compensate = "gravity+coriolis+friction"
-    timestep: float = 1 / 2000
-    """Time step of the control that drove the robot [s]."""
+    compensate: Annotated[flags.Compensate | None, tyro.conf.arg(metavar="FORCES")] = None
+    """Forces that the robot compensates: gravity+coriolis+friction, gravity+coriolis, gravity or none. Default: as the
+    recordings say, else gravity+coriolis+friction."""
+    timestep: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    """Time step of the control that drove the robot [s]. Default: as the recordings say, else 1/2000."""
     sim_steps: int = 1
     """Sim steps in each control step: about 4 for a robot under control at 500 Hz, or its hold counts as delay."""
     hold: flags.Switch = False
@@ -98,6 +100,10 @@ class IdentifyCommand:
             progress=bar("identifying", bar_format=AT_MOST),
         )
         print(report(found))
+        if not found.explains:
+            problem = "are not explained: the error on the held-out part did not fall, and no file is written"
+            remedy = "check --params, --timestep and --compensate, or leave out the joint that did not move"
+            raise InvalidArgumentError("logs", problem, remedy=remedy)
         found.save(out)
         print(f"\nwritten: {out}")
         if details is not None:
@@ -138,26 +144,26 @@ def report(found: Identification) -> str:
     from batchpid.sim.identification.unknowns import PER_JOINT
 
     def cell(kind: str, joint: int | None = None, factor: float = 1.0) -> str:
-        interval = found.interval(kind, joint)
-        if interval is None:
-            return "-"
-        value, low, high = (factor * each for each in interval)
-        return f"{value:.4g} ± {max(high - value, value - low):.1g}"
+        row = document[kind] if joint is None else document["joints"][names[joint]][kind]
+        value, low, high = (factor * each for each in row)
+        mark = "" if found.interval(kind, joint) else " ?"
+        return f"{value:.4g} ± {max(high - value, value - low):.1g}{mark}"
 
-    names = [found.robot.joint_names[joint] for joint in found.joints]
+    document, names = found.document(), [found.robot.joint_names[joint] for joint in found.joints]
     rows = [[name, *(cell(kind, joint) for kind in PER_JOINT)] for joint, name in enumerate(names)]
     text = [table(rows, ["95 % intervals, SI units", *PER_JOINT], "lrrrrr"), ""]
     text.append(f"delay of the commands: {cell('delay', None, 1e3)} ms")
     if ("payload", None) in found.unknowns.names:
         payload = cell("payload")
-        text.append(f"payload at the tool: {'none that shows' if payload == '-' else f'{payload} kg'}")
+        shows = found.interval("payload") is not None
+        text.append(f"payload at the tool: {f'{payload} kg' if shows else 'none that shows'}")
     if found.drive.params is None and found.drive.compensate == "none":
         text.append("gravity: within the logged efforts")
     elif found.drive.compensate != "none":
         way = "through its motors" if found.drive.through else "apart from its motors"
         text.append(f"the robot compensates {found.drive.compensate} {way}")
     before, after = found.held_out_error
-    text.append(f"position error on the part that was kept: {before:.3g} as described, {after:.3g} as identified")
+    text.append(f"position error on the part that was kept: {before:.3g} as described, {after:.3g} by the values of the file")
     return "\n".join(text + _not_identified(found))
 
 
@@ -168,7 +174,7 @@ def _not_identified(found: Identification) -> list[str]:
     of_joints, others = found.missing()
     if not of_joints and not others:
         return []
-    lines = ["NOT IDENTIFIABLE from these logs, and ideal in the actuators file:"]
+    lines = ["NOT WELL DETERMINED by these logs (marked ?), but part of the optimum, and in the actuators file:"]
     before, after = found.held_out_error
     if not found.uncertainty.identified.any() and after < before and ("payload", None) in found.unknowns.names:
         remedy = "pass --no-payload if the tool carries none, or record a longer motion without compensation"
@@ -178,7 +184,7 @@ def _not_identified(found: Identification) -> list[str]:
         return [*lines, f"  everything: the fit does not explain the motion; {remedy}"]
     for joint, kinds in of_joints.items():
         if {*kinds} == {*PER_JOINT}:
-            remedy = "it hardly moves; move it more (batchpid excite)"
+            remedy = "no value is certain; move it more or faster (batchpid excite)"
         elif "strength" in kinds:
             remedy = "only ratios to the strength are identifiable; record without compensation, or with more load"
         else:

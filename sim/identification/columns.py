@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,10 @@ from batchpid.sim.recording.recording_files import RecordingError, load_h5py
 
 MAX_BYTES = 1 << 30
 """Most that the columns of an HDF5 file may take."""
+_QUOTED = re.compile(r'"[^"]*"')
+_NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
+_DECIMAL_COMMA = re.compile(r"[+-]?[\d.]*,\d+([eE][+-]?\d+)?")
+_WITH_UNIT = re.compile(rf"{_NUMBER}\s*[^\W\d].*")
 
 
 def error(source: str, problem: str, remedy: str, value: Any = None) -> InvalidArgumentError:
@@ -39,10 +44,13 @@ def read_csv(path: Path) -> tuple[dict[str, Float64], list[int]]:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         if header is None:
-            delimiter = max(",;\t", key=line.count)
-            header = [name.strip() for name in next(csv.reader([line], delimiter=delimiter))]
-            continue
+            delimiter = max(",;\t", key=_QUOTED.sub("", line).count)
         cells = line.rstrip("\n").split(delimiter)
+        if '"' in line or "'" in line:
+            cells = _unquoted(path, number, line, delimiter)
+        if header is None:
+            header = [name.strip() for name in cells]
+            continue
         if len(cells) != len(header):
             problem = f"line {number} has {len(cells)} cells, the header {len(header)}"
             raise error(str(path), problem, "complete or remove the line")
@@ -60,18 +68,41 @@ def read_csv(path: Path) -> tuple[dict[str, Float64], list[int]]:
     return {name: table[:, index] for index, name in enumerate(header)}, lines
 
 
+def _unquoted(path: Path, number: int, line: str, delimiter: str) -> list[str]:
+    """Return the cells of line ``number``, without the quotes around them, double or single."""
+    quote = '"' if '"' in line else "'"
+    try:
+        (cells,) = csv.reader(
+            [line.rstrip("\n")], delimiter=delimiter, quotechar=quote, skipinitialspace=True, strict=True
+        )
+    except csv.Error:
+        problem = f"line {number} has a quote that does not enclose a whole cell"
+        raise error(str(path), problem, f"put {quote} at both ends of a cell, or at none") from None
+    return cells
+
+
 def _read_row(path: Path, number: int, header: list[str], cells: list[str]) -> list[float]:
     """Return the numbers of line ``number``; NaN for empty cells, and for text in columns of other quantities."""
     row = []
     for column, cell in zip(header, cells, strict=True):
+        text = cell.strip()
         try:
-            row.append(float(cell) if cell.strip() else math.nan)
+            row.append(float(text) if text else math.nan)
         except ValueError:
             if column.partition(":")[0].strip() in (*QUANTITIES, "time"):
                 problem = f"line {number}, column {column!r} is not a number"
-                raise error(str(path), problem, "write numbers with a decimal point", cell.strip()) from None
+                raise error(str(path), problem, _remedy(text), text) from None
             row.append(math.nan)
     return row
+
+
+def _remedy(text: str) -> str:
+    """Return the remedy for a cell whose ``text`` is not a number."""
+    if _DECIMAL_COMMA.fullmatch(text):
+        return "write numbers with a decimal point"
+    if _WITH_UNIT.fullmatch(text):
+        return "write the number alone, without its unit: rad, m, N m, N and seconds are meant"
+    return "remove the row, or give the number"
 
 
 def read_hdf5_columns(path: Path) -> dict[str, Float64] | None:

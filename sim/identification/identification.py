@@ -21,6 +21,7 @@ from batchpid.arrays.digest import digest
 from batchpid.checks.validate import choice, flag, instance, integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.versions import package_versions
+from batchpid.motors.actuator_files import dumps_actuators, loads_actuators
 from batchpid.sim.engine import native
 from batchpid.sim.identification.fit import Step
 from batchpid.sim.identification.fit_history import History, State
@@ -30,7 +31,7 @@ from batchpid.sim.identification.logs import Log, LogWarning, at_limits, checked
 from batchpid.sim.identification.plant import Motors, Plant
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import Motion, best_drive, smooth
-from batchpid.sim.identification.result import Fit, Identification
+from batchpid.sim.identification.result import Fit, Identification, actuators_at
 from batchpid.sim.identification.start import begin
 from batchpid.sim.identification.statistics import uncertainty
 from batchpid.sim.identification.unknowns import Unknowns
@@ -44,8 +45,8 @@ def identify(
     logs: Iterable[str | os.PathLike[str] | Log],
     *,
     params: bp.PIDParams | None = None,
-    compensate: Compensation = "gravity+coriolis+friction",
-    timestep: float = 1 / 2000,
+    compensate: Compensation | None = None,
+    timestep: float | None = None,
     sim_steps: int = 1,
     payload: bool = True,
     hold: bool = False,
@@ -67,9 +68,9 @@ def identify(
     compensate
         Forces that the robot compensates by itself, or "none". The fit determines whether the compensation passes
         through the motors. For a log of the complete efforts, compensation included, use "none"; where the log shows
-        it, the fit determines this, too.
+        it, the fit determines this, too. Default: as the recordings say, else "gravity+coriolis+friction".
     timestep
-        Time step of the control that drove the robot [s].
+        Time step of the control that drove the robot [s]. Default: as the recordings say, else 1/2000.
     sim_steps
         Number of sim steps in each. Use more than one if the robot, or its simulator, moved in smaller steps than its
         control, as a real robot under control at 500 Hz or less. Otherwise half the difference of the steps counts as
@@ -93,7 +94,7 @@ def identify(
     Raises
     ------
     InvalidArgumentError
-        An option is out of range, a file holds no log of this robot, or a history is of another fit.
+        An option is out of range or contradicts a recording, a file holds no log of this robot, or a history is of another fit.
     MissingDependencyError
         A package is missing.
 
@@ -106,16 +107,16 @@ def identify(
         if find_spec(package) is None:
             raise MissingDependencyError(package, "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
-    choice("compensate", compensate, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"))
-    timestep = number("timestep", timestep, 1e-5, 0.01, "seconds")
     sim_steps = integer("sim_steps", sim_steps, 1, 100)
-    control, timestep = timestep, timestep / sim_steps
     evaluations, seed = integer("evaluations", evaluations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
     if workers is not None:
         integer("workers", workers, 0, 1024)
     payload, kind = flag("payload", payload), "effort" if params is None else "setpoint"
     found = _logs(robot, logs, kind, flag("hold", hold))
-    joints = found[0].joints
+    control = number("timestep", _recorded("timestep", timestep, found, 1 / 2000), 1e-5, 0.01, "seconds")
+    compensate = _recorded("compensate", compensate, found, "gravity+coriolis+friction")
+    choice("compensate", compensate, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"))
+    timestep, joints = control / sim_steps, found[0].joints
     if params is not None:
         params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, joints)
     measured = params is not None and params.measurement_rate is not None
@@ -154,8 +155,9 @@ def identify(
         problem, best = search(problems, state, evaluations, record, bar)
         before, after = problem.residuals(unknowns.point(ideal)[None]), [window.residual for window in best.windows]
         sure = uncertainty(problem, best)
+        saved = problem.residuals(_saved(robot, joints, unknowns, best.theta)[None])
     before = [residual[0] for residual in before]
-    errors = tuple(_held_out(problem, residuals) for residuals in (before, after))
+    errors = _held_out(problem, before), _held_out(problem, [residual[0] for residual in saved])
     if not errors[1] < errors[0]:  # the fit failed: nothing is known
         sure = sure._replace(identified=np.zeros_like(sure.identified))
     fits = tuple(
@@ -204,6 +206,25 @@ def _logs(robot: Robot, logs: Iterable[Any], kind: Any, hold: bool) -> list[Log]
     return found
 
 
+def _recorded(name: str, given: Any, logs: list[Log], default: Any) -> Any:
+    """Return the option ``name`` as given or as the recordings say, or the default."""
+    for log in logs:
+        known = getattr(log, name)
+        if known is None:
+            continue
+        if given is None:
+            given = known
+        same = np.isclose(known, given) if name == "timestep" else _forces(known) == _forces(given)
+        if not same:
+            problem, remedy = f"contradicts {log.source}, which was made with {known!r}", "leave the option out"
+            raise InvalidArgumentError(name, problem, value=given, remedy=f"{remedy}, and fit such recordings alone")
+    return default if given is None else given
+
+
+def _forces(compensate: Any) -> str:
+    return str(compensate).removesuffix("+friction")
+
+
 def _of_joints(params: bp.PIDParams, robot: Robot, joints: tuple[int, ...]) -> bp.PIDParams:
     """Return the params of ``joints``, one row."""
     if params.num_envs != 1:
@@ -239,6 +260,27 @@ def _ideal(robot: Robot, joints: tuple[int, ...]) -> Motors:
     zero, own = np.zeros((1, len(joints))), list(joints)
     damping, friction, none = robot.damping[None, own], robot.friction[None, own], np.zeros((1, 1))
     return Motors(zero, damping, friction, zero + 1, zero, none, none, none)
+
+
+def _saved(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Float64) -> Float64:
+    """Return the point ``theta`` as its actuators file describes it, with the stopping time and payload of ``theta``."""
+    text = dumps_actuators(actuators_at(robot, joints, unknowns, theta), robot.joint_names)
+    read = loads_actuators(text, robot.joint_names)[0]
+    own, found = list(joints), unknowns.motors(theta[None])
+    columns = {
+        "armature": read.armature,
+        "damping": robot.damping + (0.0 if read.viscous is None else read.viscous),
+        "friction": robot.friction + (0.0 if read.coulomb is None else read.coulomb),
+        "strength": read.strength,
+        "bias": read.bias,
+    }
+    ideal = {"strength": 1.0}
+    per_joint = {
+        kind: np.full((1, len(own)), ideal.get(kind, 0.0)) if leaf is None else np.atleast_2d(leaf)[:, own]
+        for kind, leaf in columns.items()
+    }
+    delay = np.zeros((1, 1)) if read.command_delay is None else np.asarray(read.command_delay, float)[:1, :1]
+    return unknowns.point(found._replace(**per_joint, delay=delay))
 
 
 def _held_out(problem: Problem, residuals: list[Float64]) -> float:

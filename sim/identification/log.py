@@ -37,6 +37,10 @@ class Log:
     """True if a command holds until the next one; False to interpolate between them."""
     qvel: Float64 | None = None
     """Measured velocities (rows, joints), if there are any."""
+    timestep: float | None = None
+    """Time step of the control [s], where the log says it."""
+    compensate: str | None = None
+    """Forces that the robot compensated, where the log says it."""
 
     @property
     def seconds(self) -> float:

@@ -9,7 +9,8 @@ command computed from it, which acts from then on. Columns may have any order, j
 be equidistant. Columns of other quantities are ignored.
 
 Where the times have a gap, such as between two recordings, each stretch without gap is a log
-(:mod:`batchpid.sim.identification.gaps`).
+(:mod:`batchpid.sim.identification.gaps`). Positions and setpoints that wrap at +-pi or at 0 and 2 pi are unwrapped
+(:mod:`batchpid.sim.identification.turns`).
 
 In a recording (:func:`batchpid.sim.write_recording`) the command of a row acted in the tick that ends at its time, and
 each env is a log.
@@ -18,7 +19,9 @@ each env is a log.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +32,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.columns import QUANTITIES, error, read_csv, read_hdf5_columns
 from batchpid.sim.identification.gaps import MIN_ROWS, MIN_SECONDS, divided
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning
+from batchpid.sim.identification.turns import unwrapped
 from batchpid.sim.observation import Rollout
 from batchpid.sim.recording.recording_files import HDF5, read_recording
 from batchpid.sim.robot.robot import Robot
@@ -104,6 +108,9 @@ def logs_of_rollout(
     if info.own_command is not None:
         problem = f"was made with setpoints of {', '.join(info.own_command.names)}, not of joints"
         raise InvalidArgumentError(source, problem, remedy="record a run under control 'pid' or 'effort'")
+    if info.control not in (None, "pid", "effort"):
+        problem = f"was made under control {info.control!r}, which the model does not have"
+        raise InvalidArgumentError(source, problem, remedy="record a run under control 'pid' or 'effort'")
     found: CommandKind = "effort" if info.control == "effort" else "setpoint"
     if kind is not None and kind != found:
         problem = f"was made under control {info.control!r} and holds {found}s"
@@ -120,6 +127,7 @@ def logs_of_rollout(
         }
         name = source if rollout.num_envs == 1 else f"{source}, env {env}"
         log = Log(name, joints, found, rollout.time, tables["qpos"], begin, tables["setpoint"], True, tables["qvel"])
+        log = replace(log, timestep=info.timestep, compensate=info.compensate)
         logs += checked(robot, log)
     return logs
 
@@ -212,8 +220,19 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
         index, joint = (int(n) for n in np.argwhere(beyond)[0])
         problem = f"{row(index)}, column 'qpos:{names[joint]}' is far beyond the joint's limits"
         remedy = f"positions are in {robot.units[log.joints[joint]]}; the limits are {low[joint]:g} to {high[joint]:g}"
+        if np.isclose(high[joint] - low[joint], 2 * np.pi, rtol=0.01):
+            remedy += "; a joint that turns freely is of type continuous"
         raise error(log.source, problem, remedy, float(log.qpos[index, joint]))
-    return divided(log, row)
+    parts, wrapped = [], dict[str, None]()
+    for part in divided(log, row):
+        first = int(np.searchsorted(log.time, part.time[0]))
+        whole, found = unwrapped(robot, part, lambda index, first=first: row(first + index))
+        parts.append(whole)
+        wrapped |= dict.fromkeys(found)
+    if stopped := [name for name in wrapped if not robot.continuous[robot.joint_names.index(name)]]:
+        problem = f"{log.source}: the positions of {', '.join(stopped)} jump by whole turns, and were unwrapped"
+        warnings.warn(f"{problem}; in the robot's file the type is not continuous: correct it", LogWarning, stacklevel=3)
+    return parts
 
 
 def at_limits(robot: Robot, log: Log) -> list[str]:
@@ -223,6 +242,8 @@ def at_limits(robot: Robot, log: Log) -> list[str]:
         low, high = robot.lower[joint], robot.upper[joint]
         if robot.continuous[joint] or not np.isfinite(high - low):
             continue
+        if (column < low - BEYOND["rad"]).any() or (column > high + BEYOND["rad"]).any():
+            continue  # unwrapped: it turns freely
         touching = (column < low + AT_LIMIT * (high - low)) | (column > high - AT_LIMIT * (high - low))
         if touching.any():
             limits = f"limits {low:g} to {high:g} {robot.units[joint]}"

@@ -64,6 +64,8 @@ class Evaluation(NamedTuple):
     """Change of the simulated positions with the unknowns, also without wander (rows, joints, unknowns)."""
     determinant: Float64
     """Half the logarithm of the determinant of the wander's covariance, per row (stretches, joints)."""
+    expected: Float64
+    """Standard deviations of the residuals by sensor noise and wander alone (rows, joints) [rad or m]."""
 
 
 @dataclass
@@ -171,8 +173,10 @@ class Problem:
                 residual, jacobian = project(effect, residual, jacobian)
             else:
                 wander = np.concatenate([wander, effect * window.speed_error], axis=2)
-            wander /= (self.noise / NOISES)[:, None]
-            found.append(Evaluation(residual, *whiten(wander, stretches, residual, jacobian)))
+            noise = self.noise / NOISES
+            wander /= noise[:, None]
+            expected = noise * np.sqrt(1 + (wander**2).sum(2))
+            found.append(Evaluation(residual, *whiten(wander, stretches, residual, jacobian), expected))
         return found
 
     def lags(self, seconds: float) -> list[int]:

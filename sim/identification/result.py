@@ -73,8 +73,10 @@ class Identification(NamedTuple):
         if joint is not None:
             joint = integer("joint", joint, 0, len(self.joints) - 1)
         index = self.unknowns.names.index((kind, joint))
-        if not self.uncertainty.identified[index]:
-            return None
+        return self._row(index) if self.uncertainty.identified[index] else None
+
+    def _row(self, index: int) -> tuple[float, float, float]:
+        """Return estimate, lower and upper end of the 95 % interval of an unknown, however wide."""
         value, half = self.estimate[index], INTERVAL * self.uncertainty.deviation[index]
         low, high = self.unknowns.low[index], self.unknowns.high[index]
         return float(value), float(max(value - half, low)), float(min(value + half, high))
@@ -97,23 +99,31 @@ class Identification(NamedTuple):
         return of_joints, others
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write :meth:`actuators` to a .yaml or .json file, with the names of the logs and of unidentified values."""
+        """Write :meth:`actuators` to a .yaml or .json file: all values, with their intervals and the names of the logs.
+
+        The values are a joint optimum, and correlated: all are kept, also those whose interval is wide.
+        """
         of_joints, others = self.missing()
+        document = self.document()
         logged = {self.robot.joint_names[number] for number in self.joints}
         own = zip(self.robot.joint_names, self.robot.independent, strict=True)
         about = {
             "identified_from": self.settings["logs"],
-            "held_out_error": self.document()["held_out_error"],
-            "not_identified_hence_ideal": of_joints | ({"all joints": others} if others else {}),
+            "held_out_error": document["held_out_error"],
+            "intervals": document["joints"] | {kind: document[kind] for kind in ("delay", "payload") if kind in document},
+            "not_well_determined": of_joints | ({"all joints": others} if others else {}),
             "not_in_the_logs_hence_ideal": [name for name, free in own if free and name not in logged],
         }
         bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
 
     def document(self) -> dict[str, Any]:
-        """Return the result as plain values; an unidentified value is [None, None, None]."""
+        """Return the result as plain values: for each unknown the estimate and its 95 % interval, however wide.
 
-        def row(kind: str, joint: int | None = None) -> list[float | None]:
-            return list(self.interval(kind, joint) or (None, None, None))
+        "not_identified" names the unknowns that are not well determined.
+        """
+
+        def row(kind: str, joint: int | None = None) -> list[float]:
+            return list(self._row(self.unknowns.names.index((kind, joint))))
 
         document: dict[str, Any] = {
             "joints": {
@@ -133,27 +143,34 @@ class Identification(NamedTuple):
             "about": self.settings,
         }
 
+    @property
+    def explains(self) -> bool:
+        """True if the error on the held-out part fell."""
+        return self.held_out_error[1] < self.held_out_error[0]
+
     def actuators(self) -> bp.Actuators:
-        """Return the identified actuators of all joints; unidentified values and unlogged joints are ideal.
+        """Return the actuators at the point that was found; joints that are not in the logs are ideal.
 
         Friction is the excess over the friction in the robot's description, at least 0.
         """
-        robot = self.robot
-        columns = {kind: np.zeros(robot.dof) for kind in PER_JOINT}
-        columns["strength"][:] = 1.0
-        columns["damping"][:], columns["friction"][:] = robot.damping, robot.friction
-        for joint, index in enumerate(self.joints):
-            for kind in PER_JOINT:
-                if (found := self.interval(kind, joint)) is not None:
-                    columns[kind][index] = found[0]
-        delay = self.interval("delay")
-        return bp.make_actuators(
-            robot.dof,
-            command_delay=0.0 if delay is None else delay[0],
-            strength=columns["strength"],
-            bias=columns["bias"],
-            coulomb=np.maximum(columns["friction"] - robot.friction, 0.0),
-            viscous=np.maximum(columns["damping"] - robot.damping, 0.0),
-            armature=columns["armature"],
-            joint_names=robot.joint_names,
-        )
+        return actuators_at(self.robot, self.joints, self.unknowns, self.estimate)
+
+
+def actuators_at(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Float64) -> bp.Actuators:
+    """Return the actuators of ``robot`` at a point (unknowns,); joints that are not in ``joints`` are ideal."""
+    found = unknowns.motors(theta[None])
+    columns = {kind: np.zeros(robot.dof) for kind in PER_JOINT}
+    columns["strength"][:] = 1.0
+    columns["damping"][:], columns["friction"][:] = robot.damping, robot.friction
+    for kind in PER_JOINT:
+        columns[kind][list(joints)] = getattr(found, kind)[0]
+    return bp.make_actuators(
+        robot.dof,
+        command_delay=float(found.delay[0, 0]),
+        strength=columns["strength"],
+        bias=columns["bias"],
+        coulomb=np.maximum(columns["friction"] - robot.friction, 0.0),
+        viscous=np.maximum(columns["damping"] - robot.damping, 0.0),
+        armature=columns["armature"],
+        joint_names=robot.joint_names,
+    )

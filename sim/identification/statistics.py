@@ -36,8 +36,6 @@ RESOLVED, DELAY_RESOLVED = 0.05, 0.1
 
 LEAST_MOTION = 30.0
 """Least standard deviation of a joint's positions, over their noise, of a joint that is moved and not only shaken."""
-UNFINISHED = 3e-3
-"""Largest remaining decrease of the cost; a fit with more has not found an optimum, and identifies nothing."""
 
 
 class Uncertainty(NamedTuple):
@@ -82,7 +80,7 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(normal)[::-1], 0.0))
     resolved = np.array([DELAY_RESOLVED if kind == "delay" else RESOLVED for kind, _ in unknowns.names])
     moves = _motion(problem) > LEAST_MOTION * problem.noise / NOISES
-    known = np.array([joint is None or moves[joint] for _, joint in unknowns.names]) & (point.promised < UNFINISHED)
+    known = np.array([joint is None or moves[joint] for _, joint in unknowns.names])
     identified = known & (INTERVAL * deviation <= resolved * np.abs(point.theta))
     return Uncertainty(deviation, identified, values / max(values[0], 1e-300))
 

@@ -17,7 +17,7 @@ LIMITS = {
     "strength": (0.05, 5.0),
     "bias": (-np.inf, np.inf),
     "delay": (0.0, 0.09),
-    "stopping": (2e-3, 0.1),
+    "stopping": (5e-4, 0.1),
     "payload": (0.0, np.inf),
 }
 """Bounds of each kind of unknown, SI units."""

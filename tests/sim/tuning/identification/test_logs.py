@@ -314,3 +314,81 @@ def test_whatever_a_file_holds_the_error_is_one_of_ours(panda, tmp_path, content
     head = "time,setpoint:panda_joint2,qpos:panda_joint2\n" if with_header else ""
     with pytest.raises(bp.InvalidArgumentError):
         read(panda, tmp_path, head + content)
+
+
+PENDULUM = """<robot name="pendulum"><link name="base"/>
+<link name="bob"><inertial><origin xyz="0 0 -0.3"/><mass value="2"/>
+<inertia ixx="0.03" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.005"/></inertial></link>
+<joint name="hinge" type="TYPE"><parent link="base"/><child link="bob"/>
+<axis xyz="0 1 0"/><limit lower="-3.14159" upper="3.14159" effort="40" velocity="60"/></joint></robot>"""
+
+
+def pendulum(folder, kind: str) -> Robot:
+    (folder / f"{kind}.urdf").write_text(PENDULUM.replace("TYPE", kind))
+    return Robot.load(folder / f"{kind}.urdf")
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.floats(-8, 8), st.floats(0, 20), st.sampled_from([-np.pi, 0.0]), st.sampled_from(["both", "qpos", "setpoint"]))
+def test_wrapped_columns_are_unwrapped_with_the_turns_of_each_other(tmp_path, start, speed, low, wrapped):
+    robot, time = pendulum(tmp_path, "continuous"), np.r_[0:1:0.005, 1.5:2.5:0.005]
+    qpos = start + speed * np.sin(3 * time)
+    setpoint = qpos + 0.2
+
+    def wrap(values):
+        return (values - low) % (2 * np.pi) + low
+
+    table = {
+        "time": time,
+        "setpoint:hinge": setpoint if wrapped == "qpos" else wrap(setpoint),
+        "qpos:hinge": qpos if wrapped == "setpoint" else wrap(qpos),
+    }
+    (tmp_path / "turns.csv").write_text(text(table))
+    logs = read_logs(robot, [tmp_path / "turns.csv"])
+    assert len(logs) == 2
+    for log in logs:
+        np.testing.assert_allclose(log.command - log.qpos, 0.2, atol=1e-9)
+        assert np.abs(np.diff(log.qpos[:, 0])).max() < 1.0
+
+
+def test_wraps_of_other_joints_and_uncertain_turns_are_told(tmp_path):
+    time = np.arange(0, 1, 0.01)
+    wrapped = (6 * time + np.pi) % (2 * np.pi) - np.pi
+    path = tmp_path / "turns.csv"
+    path.write_text(text({"time": time, "effort:hinge": 0 * time, "qpos:hinge": wrapped}))
+    with pytest.warns(LogWarning, match="of hinge jump by whole turns, and were unwrapped; .*not continuous"):
+        (log,) = read_logs(pendulum(tmp_path, "revolute"), [path])
+    np.testing.assert_allclose(np.diff(log.qpos[:, 0]), 0.06)
+    path.write_text(text({"time": time, "effort:hinge": 0 * time, "qpos:hinge": np.where(time < 0.5, 0.0, 4.0)}))
+    with pytest.raises(bp.InvalidArgumentError, match=r"line 52: joint 'hinge' jumps by 4 rad .*turns is not certain"):
+        read_logs(pendulum(tmp_path, "continuous"), [path])
+
+
+@pytest.mark.parametrize("quote", ['"', "'"])
+def test_cells_in_quotes_are_read(panda, tmp_path, columns, quote):
+    plain = read(panda, tmp_path, text(columns))
+    header, *rows = text(columns).splitlines()
+    quoted = "\n".join([header, *(",".join(f"{quote}{cell}{quote}" for cell in row.split(",")) for row in rows)])
+    assert np.array_equal(read(panda, tmp_path, quoted).qpos, plain.qpos)
+    for cell, remedy in (('"1,5"', "decimal point"), ('"1.5 deg"', "without its unit"), ('"off"', "give the number")):
+        broken = {**columns, "qpos:panda_joint2": [cell, *columns["qpos:panda_joint2"][1:]]}
+        with pytest.raises(bp.InvalidArgumentError, match=remedy):
+            read(panda, tmp_path, text(broken))
+
+
+def test_a_recording_says_its_time_step_compensation_and_control(tmp_path):
+    robot, setpoints = pendulum(tmp_path, "continuous"), 0.3 * np.sin(np.arange(200) / 20)[:, None, None]
+    gains = robot.designed("effort")
+    paths = {}
+    for control in ("pid", "drive"):
+        options = {"params": gains} if control == "pid" else {}
+        with Runner(robot, 1, workers=0, timestep=1 / 500, substeps=1, control=control, **options) as runner:
+            runner.reset(setpoints[0])
+            paths[control] = write_recording(runner.rollout(setpoints), tmp_path / f"{control}.npz")
+    (log,) = read_logs(robot, [paths["pid"]])
+    assert (log.timestep, log.compensate) == (1 / 500, "gravity+coriolis+friction")
+    with pytest.raises(bp.InvalidArgumentError, match="made under control 'drive'"):
+        read_logs(robot, [paths["drive"]])
+    for option in ({"timestep": 1 / 2000}, {"compensate": "none"}):
+        with pytest.raises(bp.InvalidArgumentError, match=f"{next(iter(option))}: contradicts .*pid.npz"):
+            identify(robot, [paths["pid"]], params=gains, workers=0, **option)
