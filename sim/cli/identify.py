@@ -163,7 +163,9 @@ def report(found: Identification) -> str:
         way = "through its motors" if found.drive.through else "apart from its motors"
         text.append(f"the robot compensates {found.drive.compensate} {way}")
     before, after = found.held_out_error
-    text.append(f"position error on the part that was kept: {before:.3g} as described, {after:.3g} by the values of the file")
+    text.append(
+        f"position error on the part that was kept: {before:.3g} as described, {after:.3g} by the values of the file"
+    )
     return "\n".join(text + _not_identified(found))
 
 

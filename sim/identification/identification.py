@@ -94,7 +94,8 @@ def identify(
     Raises
     ------
     InvalidArgumentError
-        An option is out of range or contradicts a recording, a file holds no log of this robot, or a history is of another fit.
+        An option is out of range or contradicts a recording, a file holds no log of this robot, or a history is of
+        another fit.
     MissingDependencyError
         A package is missing.
 
@@ -263,7 +264,7 @@ def _ideal(robot: Robot, joints: tuple[int, ...]) -> Motors:
 
 
 def _saved(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Float64) -> Float64:
-    """Return the point ``theta`` as its actuators file describes it, with the stopping time and payload of ``theta``."""
+    """Return ``theta`` as its actuators file describes it, with the stopping time and payload of ``theta``."""
     text = dumps_actuators(actuators_at(robot, joints, unknowns, theta), robot.joint_names)
     read = loads_actuators(text, robot.joint_names)[0]
     own, found = list(joints), unknowns.motors(theta[None])

@@ -231,7 +231,9 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
         wrapped |= dict.fromkeys(found)
     if stopped := [name for name in wrapped if not robot.continuous[robot.joint_names.index(name)]]:
         problem = f"{log.source}: the positions of {', '.join(stopped)} jump by whole turns, and were unwrapped"
-        warnings.warn(f"{problem}; in the robot's file the type is not continuous: correct it", LogWarning, stacklevel=3)
+        warnings.warn(
+            f"{problem}; in the robot's file the type is not continuous: correct it", LogWarning, stacklevel=3
+        )
     return parts
 
 

@@ -110,7 +110,8 @@ class Identification(NamedTuple):
         about = {
             "identified_from": self.settings["logs"],
             "held_out_error": document["held_out_error"],
-            "intervals": document["joints"] | {kind: document[kind] for kind in ("delay", "payload") if kind in document},
+            "intervals": document["joints"]
+            | {kind: document[kind] for kind in ("delay", "payload") if kind in document},
             "not_well_determined": of_joints | ({"all joints": others} if others else {}),
             "not_in_the_logs_hence_ideal": [name for name, free in own if free and name not in logged],
         }

@@ -42,7 +42,9 @@ def unwrapped(robot: Robot, log: Log, row: Callable[[int], str]) -> tuple[Log, l
             far = np.abs(command[:, number] - measured) > np.pi
             if turns.any() and far.any():
                 at = int(np.clip(np.searchsorted(log.time, log.command_time[np.argmax(far)]), 0, len(log.time) - 1))
-                problem = f"{row(at)}: the setpoint of joint {name!r} is more than half a turn from its wrapped position"
+                problem = (
+                    f"{row(at)}: the setpoint of joint {name!r} is more than half a turn from its wrapped position"
+                )
                 raise error(log.source, problem, "unwrap the columns of the joint before they are logged")
     if np.array_equal(qpos, log.qpos) and np.array_equal(command, log.command):
         return log, []
@@ -55,7 +57,9 @@ def _check(log: Log, name: str, steps: Float64, turns: Float64, row: Callable[[i
     if not len(unclear):
         return
     at = int(unclear[0])
-    problem = f"{row(at + 1)}: joint {name!r} jumps by {steps[at]:.3g} rad within {log.time[at + 1] - log.time[at]:.3g} s"
+    problem = (
+        f"{row(at + 1)}: joint {name!r} jumps by {steps[at]:.3g} rad within {log.time[at + 1] - log.time[at]:.3g} s"
+    )
     if abs(turns[at]) > MOST_TURNS:
         raise error(log.source, problem, "give positions in rad")
     remedy = "the number of turns is not certain: log more rows per second, unwrap the column, or remove wrong rows"

@@ -329,7 +329,9 @@ def pendulum(folder, kind: str) -> Robot:
 
 
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.floats(-8, 8), st.floats(0, 20), st.sampled_from([-np.pi, 0.0]), st.sampled_from(["both", "qpos", "setpoint"]))
+@given(
+    st.floats(-8, 8), st.floats(0, 20), st.sampled_from([-np.pi, 0.0]), st.sampled_from(["both", "qpos", "setpoint"])
+)
 def test_wrapped_columns_are_unwrapped_with_the_turns_of_each_other(tmp_path, start, speed, low, wrapped):
     robot, time = pendulum(tmp_path, "continuous"), np.r_[0:1:0.005, 1.5:2.5:0.005]
     qpos = start + speed * np.sin(3 * time)
