@@ -37,6 +37,18 @@ def test_every_package_is_shipped():
     assert set(find_packages(str(ROOT), include=include)) == packages
 
 
+def test_the_package_is_found_from_the_folder_above_the_checkout_too(tmp_path):
+    """There Python's path offers the checkout itself, if it is named batchpid, as a namespace package."""
+    if Path(batchpid.__file__).parents[1] != ROOT:
+        pytest.skip("the package is not that of the checkout")
+    (tmp_path / "batchpid").symlink_to(ROOT)
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    code = "import batchpid; from batchpid.sim import Robot; print(batchpid.__file__, batchpid.make_params)"
+    for folder in (tmp_path, Path("/"), ROOT):
+        shown = subprocess.run([sys.executable, "-c", code], cwd=folder, env=clean, capture_output=True, text=True)
+        assert str(Path("batchpid", "__init__.py")) in shown.stdout, (folder, shown.stderr)
+
+
 def test_every_data_file_is_shipped():
     data = PROJECT["tool"]["setuptools"]["package-data"]
     for package, patterns in data.items():

@@ -20,8 +20,9 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -226,7 +227,7 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
     parts, wrapped = [], dict[str, None]()
     for part in divided(log, row):
         first = int(np.searchsorted(log.time, part.time[0]))
-        whole, found = unwrapped(robot, part, lambda index, first=first: row(first + index))
+        whole, found = unwrapped(robot, part, partial(_row_from, row, first))
         parts.append(whole)
         wrapped |= dict.fromkeys(found)
     if stopped := [name for name in wrapped if not robot.continuous[robot.joint_names.index(name)]]:
@@ -235,6 +236,11 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
             f"{problem}; in the robot's file the type is not continuous: correct it", LogWarning, stacklevel=3
         )
     return parts
+
+
+def _row_from(row: Callable[[int], str], first: int, index: int) -> str:
+    """Return the name of the row ``index`` of a part that begins at the row ``first``."""
+    return row(first + index)
 
 
 def at_limits(robot: Robot, log: Log) -> list[str]:
