@@ -10,7 +10,7 @@ import re
 import numpy as np
 import pytest
 from export_cases import DT, JOINTS, motion, random_params, run, values
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
@@ -101,6 +101,7 @@ def test_a_dc_motor_is_the_law_within_the_motors_envelope(limit):
 
 
 @given(random_params())
+@example(bp.make_params(3, 0.0, 0.0, 0.0, integral_min=0.5, integral_max=0.5, **PD))
 @settings(max_examples=25)
 def test_params_without_a_listed_difference_have_the_targets_efforts(params):
     params = params.replace(gain_units="effort", dtype=np.float64)
