@@ -190,7 +190,7 @@ def unread(model: Any, actuator: int, servo: Servo | None) -> Iterator[tuple[str
             yield f"has effects of a DC motor that are not simulated: {', '.join(on)}", "give make_actuators others", ""
         if kinds[1] != _BIAS.mjBIAS_DCMOTOR or min(model.actuator_gainprm[actuator, :2]) <= 0:
             yield "lacks a part of the law of a DC motor: a motor is simulated", "use <dcmotor> in the file", ""
-        elif not _inputs(model, actuator) & _NO_INPUT and math.isinf(_line(model, actuator).stall):
+        elif _inputs(model, actuator) == _VOLTAGE and math.isinf(_line(model, actuator).stall):
             text = "has no limit of its voltage, and so no torque-speed line: its back-EMF is not simulated"
             yield text, "add ctrlrange= [V] to the file, or damping to the joint", ""
     else:
