@@ -92,6 +92,7 @@ def simulate(
     order = [int(model.joint(name).qposadr[0]) for name in names]
     data.qpos[order] = motion.position[0, :count]
     gains = bp.PIDParams(*(leaf[:, :count] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
+    gains = gains._replace(measurement_rate=None)  # the law gets positions alone
     controller = bp.BatchPID(gains, 1, dt=timestep, joint_names=names)
     time = timestep * np.arange(round(motion.time[-1] / timestep))
     setpoints = np.stack([np.interp(time, motion.time - motion.time[0], q) for q in motion.position.T[:count]], axis=1)

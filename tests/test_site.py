@@ -89,7 +89,7 @@ def test_the_tables_of_fields_are_those_of_the_code():
     assert old == [], "run python docs/tables.py"
 
 
-LONGER = {"tutorial.md": 200}
+LONGER = {"tutorial.md": 200, "task-space.md": 160, "reliability.md": 160}
 """Pages that may have more than 150 lines."""
 
 

@@ -134,7 +134,9 @@ class Drive(Differences):
         ends = self.value("integral_min", -math.inf), self.value("integral_max", math.inf)
         if params.ki is not None and (least := np.clip(0.0, *ends)).any():
             size = self.listed(least, least != 0)
-            self.append(f"integral_limit: an integral within limits that exclude 0 begins at {size} N m or N, here at 0")
+            self.append(
+                f"integral_limit: an integral within limits that exclude 0 begins at {size} N m or N, here at 0"
+            )
         low, high = self.value("effort_min", -math.inf), self.value("effort_max", math.inf)
         if not two_sided and (uneven := -low != high).any():
             limit = self.listed(self.effort_limit, uneven)

@@ -91,7 +91,6 @@ def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
         "workers",
         "physics",
         "collisions",
-        "compensate",
         "missing_meshes",
         "seed",
         "seconds",

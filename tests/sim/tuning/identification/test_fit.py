@@ -7,7 +7,6 @@ import pytest
 
 from batchpid.sim.identification.fit import Step, fit
 from batchpid.sim.identification.problem import Evaluation
-from batchpid.sim.identification.statistics import UNFINISHED
 
 TIME = np.linspace(0, 1, 8)
 JACOBIAN = np.stack([np.ones(8), TIME], axis=-1)[:, None]
@@ -21,7 +20,7 @@ class Line:
 
     def evaluate(self, theta):
         rows = (5 + TIME - JACOBIAN[:, 0] @ theta)[:, None]
-        return [Evaluation(rows, rows, JACOBIAN, np.zeros((1, 1)))]
+        return [Evaluation(rows, rows, JACOBIAN, np.zeros((1, 1)), np.ones_like(rows))]
 
     def sizes(self, white):
         return np.sqrt(np.mean(np.square(white), axis=1))
@@ -44,7 +43,7 @@ def test_a_fit_at_a_bound_leaves_no_less_than_no_evaluation(evaluations):
 def test_what_a_bound_closes_promises_nothing():
     """A fit whose best point is at a bound has arrived: its unknowns count as found."""
     begun = fit(Line(), Step.first(np.zeros(2), 0))
-    assert begun.promised > 10 * UNFINISHED
+    assert begun.promised > 0.03
     arrived = fit(Line(), Step.first(np.zeros(2), 40))
     assert arrived.theta == pytest.approx([1.0, 1.0], abs=1e-3)
-    assert arrived.promised < UNFINISHED
+    assert arrived.promised < 0.003
