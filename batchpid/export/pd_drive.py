@@ -131,8 +131,8 @@ class Drive(Differences):
             soft = np.divide(1.0, kp, out=np.full(len(kp), math.inf), where=kp > 0)
             left = self.listed(soft, ki > 0)
             self.append(f"ki: no integral: a load of 1 N m or N leaves an error of {left} rad or m")
-        ends = self.value("integral_min", -math.inf), self.value("integral_max", math.inf)
-        if params.ki is not None and (least := np.clip(0.0, *ends)).any():
+        lowest, highest = self.value("integral_min", -math.inf), self.value("integral_max", math.inf)
+        if params.ki is not None and (least := np.clip(0.0, lowest, highest)).any():
             size = self.listed(least, least != 0)
             self.append(
                 f"integral_limit: an integral within limits that exclude 0 begins at {size} N m or N, here at 0"
