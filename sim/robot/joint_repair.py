@@ -25,6 +25,7 @@ def repair(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
         return
     yield from _axis(joint)
     yield from _limits(joint)
+    yield from _soft_limits(joint)
     yield from _dynamics(joint)
 
 
@@ -82,7 +83,7 @@ def _limits(joint: etree._Element) -> Iterator[Finding]:
         if values is None:
             problem = f"<limit {key}={text!r}> is not a number: no {key} limit"
             yield finding_of(joint, "warning", "limits", problem, f"give <limit {key}=> of the motor")
-        elif values[0] < 0:
+        elif values[0] < 0 and values[0] != -1:  # -1 is what exporters write for "not set"
             limit.set(key, repr(-values[0]))
             problem = f"{key} limit is negative: its magnitude is used"
             yield finding_of(joint, "warning", "limits", problem, "make it positive", text)
@@ -118,6 +119,15 @@ def _range(joint: etree._Element, limit: etree._Element) -> Iterator[Finding]:
         lower, upper = upper, lower
     limit.set("lower", repr(lower))
     limit.set("upper", repr(upper))
+
+
+def _soft_limits(joint: etree._Element) -> Iterator[Finding]:
+    """Report soft limits without a range, which have no effect."""
+    safety = joint.find("safety_controller")
+    low, high = (readable(safety, f"soft_{key}_limit", "0") for key in ("lower", "upper"))
+    if safety is not None and low is not None and high is not None and low >= high and (low, high) != ((0,), (0,)):
+        text = "soft limits without a range have no effect"
+        yield finding_of(joint, "warning", "limits", text, "correct <safety_controller>", f"{low[0]:g}, {high[0]:g}")
 
 
 def _dynamics(joint: etree._Element) -> Iterator[Finding]:

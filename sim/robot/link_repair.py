@@ -9,7 +9,7 @@ from lxml import etree
 
 from batchpid.sim.robot.findings import Finding, finding_of
 from batchpid.sim.robot.inertia import DENSITY, ball, from_entries, nearest_physical
-from batchpid.sim.robot.xml import readable
+from batchpid.sim.robot.xml import fault, readable
 
 SMALLEST = 1e-30  # mass [kg] and principal moment [kg m^2] with a reciprocal that single precision can hold
 SMALLEST_RATIO = 1e-9  # of principal moments that SAPIEN's eigenvalues and single precision resolve
@@ -35,18 +35,22 @@ def _inertial(link: etree._Element) -> Iterator[Finding]:
     if (inertial := link.find("inertial")) is None:
         return
     origin, mass, inertia = map(inertial.find, ("origin", "mass", "inertia"))
-    if origin is not None and None in (readable(origin, key, "0 0 0") for key in ("xyz", "rpy")):
-        text = "the centre of mass is not a position: the origin of the link is used"
-        yield finding_of(link, "warning", "inertia", text, "correct <inertial><origin>", str(dict(origin.attrib)))
+    if problem := _misplaced(origin):
+        text = f"{problem}: the centre of mass is taken at the origin of the link"
+        yield finding_of(link, "warning", "inertia", text, "correct <inertial><origin>")
         inertial.remove(origin)
     value = readable(mass, "value", "0")
     if value is None or value[0] < 0 or 0 < value[0] < SMALLEST:
-        text = f"<mass value={mass.get('value')!r}> is a mass that PhysX cannot hold: it counts as not given"
+        problem = fault(mass, "value", "0") or f"<mass value={mass.get('value')!r}> is a mass that PhysX cannot hold"
+        text = f"{problem}: it counts as not given"
         yield finding_of(link, "warning", "inertia", text, "give a mass > 0 [kg]")
         value = None
     if not value or not value[0]:
         link.remove(inertial)  # SAPIEN does not use it
         return
+    for problem in filter(None, (fault(inertia, key, "0") for key in MOMENTS)):
+        text = f"{problem}: the inertia tensor counts as not given"
+        yield finding_of(link, "warning", "inertia", text, "correct <inertia>")
     parts = [readable(inertia, key, "0") for key in MOMENTS]
     tensor = np.zeros((3, 3)) if None in parts else from_entries([part[0] for part in parts if part])
     moments = np.linalg.eigvalsh(tensor)
@@ -75,9 +79,7 @@ def _collisions(link: etree._Element) -> Iterator[Finding]:
     for collision in link.findall("collision"):
         shapes = collision.findall("geometry/*")
         problem = f"it has none of {', '.join(SHAPES)}" if not shapes else None
-        origin = collision.find("origin")
-        if origin is not None and None in (readable(origin, key, "0 0 0") for key in ("xyz", "rpy")):
-            problem = f"<origin> {dict(origin.attrib)} is not a position"
+        problem = _misplaced(collision.find("origin")) or problem
         for shape in shapes:
             for key, default in SHAPES[shape.tag].items():
                 text = shape.get(key, default)
@@ -94,3 +96,8 @@ def _collisions(link: etree._Element) -> Iterator[Finding]:
             text = f"a collision shape is left out: {problem}"
             yield finding_of(link, "warning", "collision", text, "correct <collision>")
             link.remove(collision)
+
+
+def _misplaced(origin: etree._Element | None) -> str | None:
+    """Return the reason for which an ``<origin>`` is no place, or None."""
+    return fault(origin, "xyz", "0 0 0") or fault(origin, "rpy", "0 0 0")

@@ -6,8 +6,9 @@ for the reader (:mod:`batchpid.sim.robot.urdf`), or has a fault without repair, 
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from lxml import etree
@@ -16,7 +17,7 @@ from batchpid.errors import RobotError
 from batchpid.sim.robot import joint_repair, link_repair
 from batchpid.sim.robot.findings import Finding, finding_of
 from batchpid.sim.robot.joint_repair import ends_of
-from batchpid.sim.robot.link_repair import SHAPES
+from batchpid.sim.robot.link_repair import MOMENTS, SHAPES
 
 _READ = {  # elements to keep, by parent: SAPIEN may fail to parse elements that it does not use
     "robot": {"link", "joint"},
@@ -29,7 +30,11 @@ _READ = {  # elements to keep, by parent: SAPIEN may fail to parse elements that
 _MANY = {"link", "joint", "collision", *SHAPES}  # elements that a parent may have several of
 UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
 """Elements of a URDF that have no effect here."""
-_VECTORS = ("xyz", "rpy", "size", "scale")
+_SCALARS = "value lower upper effort velocity damping friction multiplier offset soft_lower_limit soft_upper_limit"
+_NUMBERS = dict.fromkeys([*_SCALARS.split(), *MOMENTS, "radius", "length"], (1,))
+_NUMBERS |= {"xyz": (3,), "rpy": (3,), "size": (3,), "scale": (3, 1)}
+"""Attributes that hold numbers, and how many."""
+_DECIMAL_COMMA = re.compile(r"[+-]?(\d+,?\d*|,\d+)([eE][+-]?\d+)?")
 
 
 def repair(root: etree._Element, path: Path) -> list[Finding]:
@@ -39,6 +44,10 @@ def repair(root: etree._Element, path: Path) -> list[Finding]:
     """
     found = [*_elements(root), *_attributes(root)]
     _refuse_xacro(root, path)
+    if root.get("name") is None:
+        root.set("name", path.stem)
+        text = f"<robot> has no name: called {path.stem!r}, after the file"
+        found.append(Finding("note", "repeated-name", text, "give <robot name=>"))
     found += [*_links(root), *_joints(root), *_tree(root)]
     for joint in root.findall("joint"):
         found += joint_repair.repair(joint, root)
@@ -83,7 +92,7 @@ def _list(tags: Counter[str]) -> str:
 
 
 def _attributes(root: etree._Element) -> Iterator[Finding]:
-    """Strip the attributes, remove empty ones, and separate numbers by blanks."""
+    """Strip the attributes, remove empty ones, and read commas between and in numbers."""
     for element in root.iter():
         for key, value in element.items():
             if not (text := value.strip()):
@@ -91,18 +100,30 @@ def _attributes(root: etree._Element) -> Iterator[Finding]:
                 if key != "name":
                     problem = f"<{element.tag} {key}=''> is empty and counts as not given"
                     yield finding_of(element, "note", "empty-attribute", problem, "give a value, or remove it")
-            elif key in _VECTORS and "," in text:
-                element.set(key, text.replace(",", " "))
-                problem = f"<{element.tag} {key}={text!r}> is read with blanks in place of the commas"
-                yield finding_of(element, "warning", "number", problem, "separate the numbers by blanks")
+            elif "," in text and (read := _without_commas(text, _NUMBERS.get(key, ()))) is not None:
+                element.set(key, read)
+                done, remedy = "points in place of decimal commas", "write decimal points"
+                if read == text.replace(",", " "):
+                    done, remedy = "blanks in place of the commas", "separate the numbers by blanks"
+                problem = f"<{element.tag} {key}={text!r}> is read with {done}"
+                yield finding_of(element, "warning", "number", problem, remedy)
             elif text != value:
                 element.set(key, text)
+
+
+def _without_commas(text: str, counts: Sequence[int]) -> str | None:
+    """Return one of ``counts`` numbers with blanks between them and decimal points; None if the commas are neither."""
+    if len((separated := text.replace(",", " ")).split()) in counts:
+        return separated
+    words = text.split()
+    decimal = len(words) in counts and all("," not in each or _DECIMAL_COMMA.fullmatch(each) for each in words)
+    return text.replace(",", ".") if decimal else None
 
 
 def _refuse_xacro(root: etree._Element, path: Path) -> None:
     for element in root.iter():
         for key, value in element.items():
-            if "${" in value:
+            if "${" in value or ("$(" in value and key != "filename"):  # of which find_mesh reads $(find PACKAGE)
                 problem = f"<{element.tag} {key}={value!r}> is an expression of xacro, so this is no URDF yet"
                 raise RobotError(f"{path}: {problem}; expand it first: xacro FILE.xacro > FILE.urdf")
 
@@ -122,6 +143,7 @@ def _links(root: etree._Element) -> Iterator[Finding]:
 def _joints(root: etree._Element) -> Iterator[Finding]:
     """Name joints that have no name or a repeated one; remove copies of joints."""
     seen: dict[str, tuple[str | None, str | None]] = {}
+    given = {joint.get("name") for joint in root.findall("joint")}
     for joint in root.findall("joint"):
         name, ends = joint.get("name"), ends_of(joint)
         if name is not None and seen.get(name) == ends:
@@ -130,7 +152,7 @@ def _joints(root: etree._Element) -> Iterator[Finding]:
             continue
         base = new = name or "{}_to_{}".format(*ends)
         number = 2
-        while new in seen:
+        while new in seen or (new != name and new in given):
             new, number = f"{base}_{number}", number + 1
         if new != name:
             joint.set("name", new)

@@ -48,7 +48,17 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
         raise RobotError(f"{path}: cannot be read: {error}; check that it is a readable text file") from error
     if root.getroottree().docinfo.internalDTD is not None:
         raise RobotError(f"{path}: a DTD or entity declaration is refused for safety; remove the <!DOCTYPE> lines")
+    _drop_default_namespace(root)
     return root
+
+
+def _drop_default_namespace(root: etree._Element) -> None:
+    """Take elements out of a default namespace, which readers of robots ignore."""
+    found = [each for each in root.iter("{*}*") if each.prefix is None and each.tag.startswith("{")]
+    for element in found:
+        element.tag = etree.QName(element).localname
+    if found:
+        etree.cleanup_namespaces(root)
 
 
 def _parse(data: bytes) -> etree._Element:
@@ -74,7 +84,7 @@ def _lenient(data: bytes) -> etree._Element:
     prefixes = sorted(set(re.findall(r"[<\s]([A-Za-z_]\w{0,40}):", text)) - {"xml", "xmlns"})[:MOST_PREFIXES]
     declared = " ".join(f'xmlns:{prefix}="urn:{prefix}"' for prefix in prefixes)
     wrapper = _parse(f"<file {declared}>{text}</file>".encode(errors="replace"))
-    root = wrapper.find("robot")
+    root = wrapper.find("{*}robot")
     root = wrapper[0] if root is None and len(wrapper) else root
     if root is None:
         raise etree.XMLSyntaxError("no element", 0, 0, 0)
@@ -91,18 +101,9 @@ def numbers(
     Raises a RobotError, whose message begins with ``where``, unless they are finite and at most LARGEST in magnitude;
     numbers of a joint ``limit`` may be up to LARGEST_LIMIT or infinite.
     """
-    given = default if element is None else element.get(key, default)
-    text, count = given if given.strip() else default, len(default.split())
-    largest = LARGEST_LIMIT if limit else LARGEST
-    try:
-        values = tuple(float(word) for word in text.split() if word.isascii() and "_" not in word)
-    except ValueError:
-        values = ()
-    fits = all(abs(value) <= largest or (limit and math.isinf(value)) for value in values)
-    if element is not None and (len(values) != count or len(text.split()) != count or not fits):
-        need = "one finite number" if count == 1 else f"{count} finite numbers"
-        problem = f"needs {need} within +-{largest:g}, which PhysX can hold"
-        raise RobotError(f"{where}: <{element.tag} {key}={text!r}> {problem}; correct the URDF")
+    values = readable(element, key, default, limit)
+    if values is None:
+        raise RobotError(f"{where}: {fault(element, key, default, limit)}; correct the URDF")
     return values
 
 
@@ -113,7 +114,24 @@ def number(element: etree._Element | None, key: str, default: str, where: str, l
 
 def readable(element: etree._Element | None, key: str, default: str, limit: bool = False) -> tuple[float, ...] | None:
     """Return the numbers in an attribute, or None where :func:`numbers` raises."""
+    given = default if element is None else element.get(key, default)
+    words = (given if given.strip() else default).split()
+    largest = LARGEST_LIMIT if limit else LARGEST
     try:
-        return numbers(element, key, default, "", limit)
-    except RobotError:
+        values = tuple(float(word) for word in words if word.isascii() and "_" not in word)
+    except ValueError:
         return None
+    if element is None:
+        return values
+    fits = all(abs(value) <= largest or (limit and math.isinf(value)) for value in values)
+    return values if fits and len(values) == len(words) == len(default.split()) else None
+
+
+def fault(element: etree._Element | None, key: str, default: str, limit: bool = False) -> str | None:
+    """Return the reason for which :func:`numbers` raises, which quotes the attribute, or None where it does not."""
+    if element is None or readable(element, key, default, limit) is not None:
+        return None
+    count = len(default.split())
+    need = "one finite number" if count == 1 else f"{count} finite numbers"
+    within = f"within +-{LARGEST_LIMIT if limit else LARGEST:g}, which PhysX can hold"
+    return f"<{element.tag} {key}={element.get(key)!r}> needs {need} {within}"

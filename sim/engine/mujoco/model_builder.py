@@ -11,9 +11,10 @@ engine, with the damping's share dt d in the armature, which makes it implicit (
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations, product
+from itertools import combinations, count, product
 from typing import Any
 
 import mujoco
@@ -76,7 +77,7 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     try:
         model = scene.compile()
     except ValueError as error:
-        raise RobotError(f"MuJoCo cannot build the robot: {error}; correct the URDF") from error
+        raise _refusal(error) from error
     bodies = {link: model.body(name).id for link, name in names.items()}
     for link, body in bodies.items():  # the compiler refuses some inertias that both engines simulate
         model.body_inertia[body] = np.linalg.eigh(inertias[link].tensor)[0]
@@ -90,13 +91,28 @@ def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[An
     """Return the ``mujoco.MjSpec`` of ``spec``, and the name of the body of each simulated link.
 
     The bodies have the links' mass and center from ``inertias``; their inertia tensors are placeholders.
+
+    Raises RobotError if MuJoCo refuses a part of the robot.
     """
     scene = mujoco.MjSpec()
     _set_options(scene, spec)
-    names = _add_links(scene, spec, inertias)
-    if spec.collisions:
-        _add_shapes(scene, spec, names)
+    try:
+        names = _add_links(scene, spec, inertias)
+        if spec.collisions:
+            _add_shapes(scene, spec, names)
+    except ValueError as error:
+        raise _refusal(error) from error
     return scene, names
+
+
+def _refusal(error: ValueError) -> RobotError:
+    return RobotError(f"MuJoCo cannot build the robot: {' '.join(str(error).split())}; correct the URDF")
+
+
+def _unused(name: str, taken: Collection[str]) -> str:
+    """Return ``name``, or that with the first number after it that makes a name outside ``taken``."""
+    numbered = (f"{name}_{number}" for number in count(2))
+    return name if name not in taken else next(each for each in numbered if each not in taken)
 
 
 def principal_inertia(inertia: SpatialInertia) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -123,7 +139,7 @@ def _add_links(scene: Any, spec: SceneSpec, inertias: dict[str, SpatialInertia])
     """Add the simulated links of ``spec`` as bodies; return the name of the body of each."""
     root = etree.fromstring((merged(spec).urdf if spec.merge_fixed else spec.urdf).encode())
     above = {joint.find("child").get("link"): joint for joint in root.findall("joint")}
-    names = {link: "world_link" if link == "world" else link for link in inertias}
+    names = {link: _unused("world_link", inertias) if link == "world" else link for link in inertias}
     limits = {joint.name: (joint.lower, joint.upper) for joint in spec.joints}
     damping = {joint.name: joint.damping for joint in spec.joints}
     continuous = {joint.name for joint in spec.joints if joint.continuous}
@@ -183,9 +199,11 @@ def _add_shapes(scene: Any, spec: SceneSpec, names: dict[str, str]) -> None:
         if any(pairs) and not all(pairs):
             split |= {first, second}
     bodies = {owner: names[link] for link in solid for owner in owners[link]}
+    taken = {"world", *names.values()}
     for link in split:
         for owner in owners[link]:
-            bodies[owner] = f"{owner} (shapes)"
+            bodies[owner] = _unused(f"{owner} (shapes)", taken)
+            taken.add(bodies[owner])
             scene.body(names[link]).add_body(name=bodies[owner])
     pairs_of_bodies = {frozenset(bodies[owner] for owner in pair) for pair in ignored if pair <= set(bodies)}
     for first, second in sorted(sorted(pair) for pair in pairs_of_bodies if len(pair) == 2):

@@ -134,7 +134,7 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
     "centre of mass": (
         one_joint(arm=INERTIAL.replace("<mass", '<origin xyz="1e300 0 0"/><mass')),
         "inertia",
-        "link 'arm' .*: the centre of mass",
+        "link 'arm': <origin xyz='1e300 0 0'> needs 3 finite numbers.*: the centre of mass",
     ),
     "no inertia": (one_joint(arm='<inertial><mass value="2"/></inertial>'), "inertia", "'arm' .*ball of its mass"),
     "zero inertia": (one_joint(arm=TENSOR.format(*"000000")), "inertia", "'arm' .*0 0 0 .*ball of its mass"),
@@ -153,7 +153,7 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
     "shape nowhere": (
         one_joint(arm=INERTIAL + SHAPE.format('<box size="1 1 1"/>').replace("<geo", '<origin xyz="x"/><geo')),
         "collision",
-        "'arm': a collision shape is left out: <origin>.* is not a position",
+        "'arm': a collision shape is left out: <origin xyz='x'> needs 3",
     ),
     "missing mesh": (shaped('<mesh filename="package://ghost/no.stl"/>'), "missing-mesh", "package://ghost/no.stl"),
 }
