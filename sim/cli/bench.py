@@ -45,7 +45,7 @@ class BenchCommand:
     xla: flags.Switch = False
     """Measure the closed loop in XLA, too."""
     workers: flags.Workers = None
-    missing_meshes: flags.MissingMeshes = "skip"
+    meshes: flags.Meshes = flags.MeshOptions()
     out: flags.OptionalPath = None
     """Figures to write, with the machine and the versions: .json."""
     force: flags.Force = False
@@ -65,7 +65,7 @@ class BenchCommand:
         workers = len(os.sched_getaffinity(0)) if self.workers is None else self.workers
         load_engine(self.engine)
         workload = Workload(
-            Robot.load(self.robot, missing_meshes=self.missing_meshes),
+            Robot.load(self.robot, **vars(self.meshes)),
             num_envs=integer("num_envs", self.num_envs, 1, 1_000_000),
             workers=integer("workers", workers, 0, 1024),
             physics=self.physics,

@@ -34,7 +34,7 @@ class CompareCommand:
     collisions: flags.Collisions = True
     workers: flags.Workers = None
     actuators: flags.Actuators = None
-    missing_meshes: flags.MissingMeshes = "skip"
+    meshes: flags.Meshes = flags.MeshOptions()
     picture: flags.OptionalPath = None
     """First two rows of the table on the first move, to draw: .png or .svg."""
     force: flags.Force = False
@@ -48,7 +48,7 @@ class CompareCommand:
         from batchpid.sim.cli.run import evaluate_sets, read_variation
 
         picture = Outputs(force=self.force).path("picture", self.picture, plots.FORMATS)
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
+        robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         default = ("tuned", "tutorial", "drive") if robot.settings else ("designed", "drive")
         sets = [gain_set(robot, name) for name in self.gains or default]
         if not self.engine:

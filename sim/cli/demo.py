@@ -31,7 +31,7 @@ class DemoCommand:
     workers: flags.Workers = None
     engine: flags.Engine = "sapien"
     backend: flags.Backend = "numpy"
-    missing_meshes: flags.MissingMeshes = "skip"
+    meshes: flags.Meshes = flags.MeshOptions()
     picture: flags.OptionalPath = None
     """Step responses to draw: .png or .svg. Default: out/ROBOT-demo.png."""
     force: flags.Force = False
@@ -50,7 +50,7 @@ class DemoCommand:
             from batchpid.sim.view.renderer import check_renderer
 
             check_renderer()
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
+        robot = Robot.load(self.robot, **vars(self.meshes))
         settings = robot.settings
         if settings is None:
             raise InvalidArgumentError(

@@ -30,7 +30,7 @@ class ExciteCommand:
     """Highest frequency [Hz]."""
     seed: int = 0
     """Seed of the phases."""
-    missing_meshes: flags.MissingMeshes = "skip"
+    meshes: flags.Meshes = flags.MeshOptions()
     out: flags.OptionalPath = None
     """File to write: .csv. Default: out/ROBOT.excite.csv."""
     force: flags.Force = False
@@ -44,7 +44,7 @@ class ExciteCommand:
         from batchpid.sim.identification.excitation import excite
         from batchpid.sim.identification.logs import setpoint_csv
 
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
+        robot = Robot.load(self.robot, **vars(self.meshes))
         out = self.out or Path(f"out/{robot.path.stem}.excite.csv")
         out = Outputs(force=self.force).path("out", out, (".csv",))
         motion = excite(robot, self.duration, rate=self.rate, lowest=self.lowest, highest=self.highest, seed=self.seed)

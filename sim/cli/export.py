@@ -76,7 +76,7 @@ class ExportCommand:
     """In C, write a CMakeLists.txt and an example loop next to the header."""
     strict: flags.Switch = False
     """End with an error if the target's law differs."""
-    missing_meshes: flags.MissingMeshes = "skip"
+    meshes: flags.Meshes = flags.MeshOptions()
     out: flags.OptionalPath = None
     """File to write. Default: out/ROBOT-pid.h, or another ending."""
     force: flags.Force = False
@@ -96,7 +96,7 @@ class ExportCommand:
             if unused and (value := getattr(self, field.name)) != field.default:
                 problem = f"has no effect with --to {self.to}"
                 raise InvalidArgumentError(field.name, problem, value=value, remedy="leave it out")
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
+        robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
         outputs = Outputs(force=self.force)
         out = outputs.path("out", out, (Path(FILES[self.to]).suffix,))

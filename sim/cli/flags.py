@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -36,7 +37,24 @@ RecordedRobot = Annotated[
     tyro.conf.Positional,
     _flag("Bundled robot, or path of a URDF or MJCF file. Default: that of the recording, or panda."),
 ]
-MissingMeshes = Annotated[Literal["error", "skip"], _flag("Skip collision shapes whose mesh is missing, or raise.")]
+
+
+@dataclass(frozen=True)
+class MeshOptions:
+    """Flags of every command that loads a robot, as arguments of ``Robot.load``."""
+
+    missing_meshes: Annotated[
+        Literal["error", "skip"], _flag("Skip collision shapes whose mesh is missing, or raise.")
+    ] = "skip"
+    package_dirs: Annotated[
+        tuple[Path, ...],
+        _flag(
+            "Folders that hold the packages of package:// mesh paths, looked up first.", metavar="FOLDER [FOLDER ...]"
+        ),
+    ] = ()
+
+
+Meshes = Annotated[MeshOptions, tyro.conf.arg(name="")]
 NumEnvs = Annotated[int, _flag("Number of robots, one in each scene.")]
 Workers = Annotated[int | None, _flag("Processes that step the scenes; 0: this one. Default: one per available core.")]
 Cluster = Annotated[

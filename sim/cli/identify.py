@@ -54,7 +54,7 @@ class IdentifyCommand:
     seed: int = 0
     """Seed of CMA-ES, which finds the start of the fit. The result does not depend on the number of workers."""
     workers: flags.Workers = None
-    missing_meshes: flags.MissingMeshes = "skip"
+    meshes: flags.Meshes = flags.MeshOptions()
     resume: flags.Switch = False
     """Continue a fit with the same options that was stopped."""
     out: flags.OptionalPath = None
@@ -78,7 +78,7 @@ class IdentifyCommand:
         from batchpid.sim import plots
         from batchpid.sim.identification.identification import identify
 
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
+        robot = Robot.load(self.robot, **vars(self.meshes))
         if not self.logs:
             raise InvalidArgumentError("logs", "are missing", remedy="name one file or more after the robot")
         out = self.out or Path(f"out/{robot.path.stem}.actuators.yaml")

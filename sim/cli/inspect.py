@@ -37,7 +37,7 @@ class InspectCommand:
     """List fixed joints, light links, and pairs of links that do not collide, too."""
     strict: flags.Switch = False
     """Exit with status 1 if a finding is worse than a note."""
-    missing_meshes: flags.MissingMeshes = "skip"
+    meshes: flags.Meshes = flags.MeshOptions()
     engine: flags.Switch = False
     """Print the kind of the calls into the engine too, and the reason if they are not native."""
 
@@ -45,7 +45,7 @@ class InspectCommand:
 
     def run(self) -> int:
         """Run the command and return its exit status."""
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes)
+        robot = Robot.load(self.robot, **vars(self.meshes))
         mass = sum(link.mass for link in robot.link_masses.values())
         size = f"{robot.dof} degrees of freedom, {len(robot.links)} links, {mass:.4g} kg"
         print(f"{robot.name}: {size}, {robot.path}\n")

@@ -27,7 +27,7 @@ class ParityCommand:
     seconds: flags.Seconds = 2.0
     workers: flags.Workers = None
     actuators: flags.Actuators = None
-    missing_meshes: flags.MissingMeshes = "skip"
+    meshes: flags.Meshes = flags.MeshOptions()
     picture: flags.OptionalPath = None
     """Differences over time, to draw: .png or .svg."""
     json: flags.OptionalPath = None
@@ -46,7 +46,7 @@ class ParityCommand:
         outputs = Outputs(force=self.force)
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         json_path = outputs.path("json", self.json, (".json",))
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
+        robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         gains = gain_set(robot, self.gains)
         found = compare_engines(
             robot, gains.params, moves=self.moves, seconds=self.seconds, seed=self.seed, workers=self.workers

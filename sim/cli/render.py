@@ -31,7 +31,7 @@ class RenderCommand:
     """Width of the film [pixels]."""
     height: int = 540
     """Height of the film [pixels]."""
-    missing_meshes: flags.MissingMeshes = "skip"
+    meshes: flags.Meshes = flags.MeshOptions()
     out: flags.OptionalPath = None
     """Film to write: .mp4 or .gif. Default: next to the recording NAME.npz, NAME-film.mp4."""
     force: flags.Force = False
@@ -47,7 +47,7 @@ class RenderCommand:
         outputs = Outputs(force=self.force, inputs=(self.recording,))
         out = outputs.path("out", self.out or beside(self.recording, "film", ".mp4"), FORMATS)
         usage = f"batchpid render {shlex.quote(str(self.recording))} PATH/TO/ROBOT.urdf"
-        rollout, robot = read_run(self.recording, self.robot, self.missing_meshes, usage)
+        rollout, robot = read_run(self.recording, self.robot, self.meshes, usage)
         rollout = rollout.for_envs(slice(0, integer("num_envs", self.num_envs, 1, MAX_ROBOTS)))
         progress = bar("filming", unit="frame")
         path = write_film(

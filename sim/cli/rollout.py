@@ -59,7 +59,7 @@ class RolloutCommand:
     workers: flags.Workers = None
     cluster: flags.Cluster = None
     actuators: flags.Actuators = None
-    missing_meshes: flags.MissingMeshes = "skip"
+    meshes: flags.Meshes = flags.MeshOptions()
     out: flags.OptionalPath = None
     """Recording to write: .npz at the end, or .h5 tick by tick (extra `record`). For plot, view and render."""
     picture: flags.OptionalPath = None
@@ -77,7 +77,7 @@ class RolloutCommand:
         out = outputs.path("out", self.out, (".npz", ".h5", ".hdf5"))
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         robot = Robot.load(
-            self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators, dissipation=self.dissipation
+            self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes)
         )
         robot, randomization = read_variation(robot, self.randomize)
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, Runner, read_recording
+from batchpid.sim.cli.flags import MeshOptions
 from batchpid.sim.cli.progress import bar
 from batchpid.sim.cli.report import run_report, tool_report
 from batchpid.sim.engine.engines import load_engine
@@ -105,7 +106,7 @@ def read_variation(
     return replace(robot, actuators=actuators), randomization
 
 
-def read_run(path: Path, robot: str | None, missing_meshes: str, usage: str) -> tuple[Rollout, Robot]:
+def read_run(path: Path, robot: str | None, meshes: MeshOptions, usage: str) -> tuple[Rollout, Robot]:
     """Return the run in a file and its robot: that name or URDF, or the bundled robot that was recorded.
 
     ``usage`` is a command that names the robot, for the error message. A recording is untrusted input, so no path in it
@@ -115,8 +116,8 @@ def read_run(path: Path, robot: str | None, missing_meshes: str, usage: str) -> 
     rollout = read_recording(path)
     name, description = rollout.info.robot, rollout.info.urdf
     if robot is not None:
-        return rollout, Robot.load(robot, missing_meshes=missing_meshes)
-    found = Robot.load(name, missing_meshes=missing_meshes) if name in Robot.bundled() else None
+        return rollout, Robot.load(robot, **vars(meshes))
+    found = Robot.load(name, **vars(meshes)) if name in Robot.bundled() else None
     if found is None or description not in (None, found.urdf):
         problem = "is not bundled" if found is None else "is another one than the bundled robot of that name"
         raise InvalidArgumentError("robot", f"{name!r} of the recording {problem}", remedy=f"name its URDF: {usage}")

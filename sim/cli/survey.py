@@ -1,4 +1,4 @@
-"""``batchpid survey``: many URDFs, each loaded, built and moved, in a table."""
+"""``batchpid survey``: many robots, each loaded, built and moved, in a table."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ class SurveyCommand:
         tyro.conf.Positional,
         tyro.conf.arg(metavar="PATHS [PATHS ...]", help_behavior_hint="(required)"),
     ]
-    """URDF and MJCF files, and folders that are searched for files *.urdf."""
+    """URDF and MJCF files, and folders that are searched for both: *.urdf, and *.xml or *.mjcf with a <mujoco> that no
+    other file includes."""
     moves: int = 8
     """Number of moves of each robot."""
     seed: int = 0
@@ -45,6 +46,7 @@ class SurveyCommand:
     time_limit: float = 300.0
     """Wall-clock time for each robot [s]."""
     workers: flags.Workers = None
+    meshes: flags.Meshes = flags.MeshOptions()
     json: flags.OptionalPath = None
     """Reports to write: a list of objects, .json."""
     out: flags.OptionalPath = None
@@ -56,18 +58,19 @@ class SurveyCommand:
     def run(self) -> int:
         """Run the command; the exit status is 1 if a robot crashed its process."""
         from batchpid.sim.cli.progress import bar
-        from batchpid.sim.tuning.robot_survey import find_urdfs, survey
+        from batchpid.sim.tuning.robot_survey import find_robots, survey
 
         outputs = Outputs(force=self.force)
         json_path = outputs.path("json", self.json, (".json",))
         out = outputs.path("out", self.out, (".md",))
-        urdfs = find_urdfs(self.paths)
+        urdfs = find_robots(self.paths)
         cores = len(os.sched_getaffinity(0))
         reports = survey(
             urdfs,
             bandwidth_hz=self.bandwidth,
             processes=max(1, cores if self.workers is None else self.workers),
             **flags.chosen(self, "moves seed seconds engine physics time_limit"),
+            **vars(self.meshes),
         )
         done = list(bar("surveying", unit="robot", total=len(urdfs))(reports))
         if json_path is not None:
@@ -97,7 +100,7 @@ def survey_table(reports: Sequence[RobotReport], style: str) -> str:
         ]
         for report in reports
     ]
-    headers = ["URDF", "joints", "settled", "worst error", "overshoot", "findings, or what went wrong"]
+    headers = ["file", "joints", "settled", "worst error", "overshoot", "findings, or what went wrong"]
     sides = ("left", "right", "right", "right", "right", "left")
     return tabulate(rows, headers, tablefmt=style, disable_numparse=True, colalign=sides)
 

@@ -60,7 +60,7 @@ class TuneCommand:
     cluster: flags.Cluster = None
     time_limit: flags.TimeLimit = None
     actuators: flags.Actuators = None
-    missing_meshes: flags.MissingMeshes = "skip"
+    meshes: flags.Meshes = flags.MeshOptions()
     resume: flags.Switch = False
     """Continue a search with the same options that was stopped."""
     out: flags.OptionalPath = None
@@ -79,7 +79,7 @@ class TuneCommand:
         from batchpid.sim.tuning.evaluation import arm_joints
         from batchpid.sim.tuning.search import tune
 
-        robot = Robot.load(self.robot, missing_meshes=self.missing_meshes, actuators=self.actuators)
+        robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         read = [Path(path) for path in (self.actuators, self.randomize) if path is not None]
         outputs = Outputs(force=self.force, inputs=read)
         named = self.out or Path("out") / robot.path.name
@@ -173,8 +173,11 @@ class TuneCommand:
         if self.control == "osc":
             words += ["--control", "osc", *([] if self.tool is None else ["--tool", self.tool])]
         defaults = {each.name: each.default for each in fields(self)}
-        for name in ("randomize", "engine", "physics", "collisions", "cluster", "actuators", "missing_meshes"):
-            value, flag = getattr(self, name), name.replace("_", "-")
-            if value != defaults[name]:
-                words += [f"--no-{flag}"] if value is False else [f"--{flag}", str(value)]
+        for name in ("randomize", "engine", "physics", "collisions", "cluster", "actuators"):
+            if (value := getattr(self, name)) != defaults[name]:
+                words += [f"--no-{name}"] if value is False else [f"--{name}", str(value)]
+        if self.meshes.missing_meshes != "skip":
+            words += ["--missing-meshes", self.meshes.missing_meshes]
+        if self.meshes.package_dirs:
+            words += ["--package-dirs", *map(str, self.meshes.package_dirs)]
         return shlex.join(words)

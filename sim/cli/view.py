@@ -42,7 +42,7 @@ class ViewCommand:
     physics: flags.Physics = "accurate"
     workers: flags.Workers = None
     actuators: flags.Actuators = None
-    missing_meshes: flags.MissingMeshes = "skip"
+    meshes: flags.Meshes = flags.MeshOptions()
     play: flags.OptionalPath = None
     """Recorded run to show: .npz or .h5."""
     fps: flags.Fps = 30.0
@@ -80,7 +80,7 @@ class ViewCommand:
         """Return the running robots."""
         from batchpid.sim.view import LiveSimulation
 
-        robot = Robot.load(self.robot or "panda", missing_meshes=self.missing_meshes, actuators=self.actuators)
+        robot = Robot.load(self.robot or "panda", actuators=self.actuators, **vars(self.meshes))
         gains = None if self.gains is None else gain_set(robot, self.gains)
         if gains and "osc" in self.control:
             raise InvalidArgumentError("gains", "are not for control 'osc'", value=self.gains, remedy="leave it out")
@@ -106,7 +106,7 @@ class ViewCommand:
         from batchpid.sim.view.layout import MAX_ROBOTS
 
         usage = f"batchpid view PATH/TO/ROBOT.urdf --play {shlex.quote(str(path))}"
-        rollout, robot = read_run(path, self.robot, self.missing_meshes, usage)
+        rollout, robot = read_run(path, self.robot, self.meshes, usage)
         if rollout.num_envs > MAX_ROBOTS:
             print(f"showing the first {MAX_ROBOTS} of {rollout.num_envs} envs")
         return Playback(rollout.for_envs(slice(0, MAX_ROBOTS)), robot, period=1 / self.fps)

@@ -10,9 +10,10 @@ import json
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 from lxml import etree
@@ -30,20 +31,55 @@ _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attrib
 def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | None:
     """Return the mesh file that the URDF at ``path`` refers to as ``name``, or None if it does not exist.
 
-    ``package://`` and ``model://`` paths are looked up in ``package_dirs`` and in the folders above the URDF, with the
-    name of the package and, in a folder that is the package under another name, without it. Other paths are relative to
-    the URDF's folder, or to one of these.
+    ``package://`` and ``model://`` paths are looked up in ``package_dirs``, in the folders above the URDF, and in those
+    of AMENT_PREFIX_PATH and ROS_PACKAGE_PATH, with the name of the package and, in a folder that is the package under
+    another name, without it. Other paths are relative to the URDF's folder, or to one of these. The suffix may be in
+    the other case, and the name percent-encoded.
     """
-    name = re.sub(r"^\$\(find ([^)]+)\)", r"package://\1", name.replace("\\", "/"))  # xacro, and Windows
+    name = re.sub(r"^(file:/*)?\$\(find ([^)]+)\)", r"package://\2", name.strip().replace("\\", "/"))  # xacro, Windows
+    for change in (str, str.lower, str.upper, str.title):
+        for spelling in dict.fromkeys([name, unquote(name)]):
+            for each in _candidates(spelling, path, package_dirs):
+                stem, suffix = os.path.splitext(each)
+                if os.path.isfile(found := stem + change(suffix)):
+                    return Path(found).absolute()
+    return None
+
+
+def _candidates(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Iterator[Path]:
+    """Yield the files that ``name`` may mean, the likeliest first."""
     scheme, _, relative = name.rpartition("://")
     above = path.absolute().parents
     if scheme in ("package", "model"):
         relative = relative.lstrip("/")
-        within = relative.partition("/")[2]
-        candidates = [folder / each for each in (relative, within) if each for folder in (*package_dirs, *above)]
-    else:
-        candidates = [folder / relative for folder in (above[0], *package_dirs, *above[1:]) if relative]
-    return next((each.absolute() for each in candidates if os.path.isfile(each)), None)
+        package, _, within = relative.partition("/")
+        if within:
+            yield from (folder / relative for folder in (*package_dirs, *above))
+            yield from (folder / within for folder in (*package_dirs, *above))
+            yield from (folder / within for folder in _ros_packages(package))
+        return
+    if not scheme and name.startswith("file:"):
+        relative = name.removeprefix("file:")
+    elif scheme == "file":
+        relative = relative.removeprefix("localhost")
+    if relative.strip("/"):
+        yield from (folder / relative for folder in (above[0], *package_dirs, *above[1:]))
+
+
+def _ros_packages(package: str) -> Iterator[Path]:
+    """Yield the folders of a ROS package that the environment names: ROS 2 installs, then ROS 1 workspaces."""
+    if not re.fullmatch(r"\w[\w.-]*", package):
+        return
+    prefixes, roots = (
+        [Path(each) for each in os.environ.get(variable, "").split(os.pathsep) if each]
+        for variable in ("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH")
+    )
+    yield from (prefix / "share" / package for prefix in prefixes)
+    for root in roots:
+        if root.name == package:
+            yield root
+        for pattern in (package, f"*/{package}", f"*/*/{package}"):  # rospack searches any depth
+            yield from sorted(root.glob(pattern))
 
 
 _in_use: dict[str, str] = {}

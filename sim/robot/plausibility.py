@@ -8,7 +8,11 @@ brackets are the most extreme figures of the 66 robots of example-robot-data 6.0
 - the mass of a link, if given by ``<inertial>``, over its cubed size is below 0.1 (2.6) or above 30,000 (1030) kg/m^3;
   the size is the diagonal of its shapes, or the distance to the next joint if that is longer;
 - its radius of gyration exceeds twice L and twice its size (0.6);
-- a joint bears more than a mass of 1000 L^3 kg at the distance L (10 L^3), by gravity or by inertia.
+- a joint bears more than a mass of 1000 L^3 kg at the distance L (10 L^3), by gravity or by inertia;
+- a limit or mimic offset of a hinge is from 4 pi to 1000 rad (10 rad), or an angle of an <origin> is beyond 2 pi (4.7
+  rad), as if degrees were read as radians;
+- the velocity limit of a hinge with limits is a multiple of 5 rad/s from 60 to 1000 rad/s, but neither 100 nor 1000
+  (others have up to 60 rad/s), and it has no effort limit, or a power of at least 1 kW.
 
 Mass and inertia are not checked for a fixed base and for links with less than a hundredth of the total mass: sensors,
 frames and stands often have arbitrary figures.
@@ -20,10 +24,13 @@ from collections import defaultdict
 from collections.abc import Iterator
 
 import numpy as np
+from lxml import etree
 
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.effort import POSES
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.findings import Finding, finding_of
+from batchpid.sim.robot.parts import Joint
+from batchpid.sim.robot.xml import numbers
 
 GRAVITY = 9.81
 LARGEST, SMALLEST = 20.0, 1 / 200
@@ -39,11 +46,18 @@ SHORT = 0.3
 JUDGED = 0.01
 """Share of the total mass from which the mass and inertia of a link are checked."""
 
+FARTHEST, PLACEHOLDER = 4 * np.pi, 1000.0
+"""Bounds between which limits of a hinge are taken for degrees [rad]; larger ones stand for no limit."""
+TURN = 2 * np.pi + 0.01
+"""Bound of an angle of an origin [rad]."""
+FASTEST, POWER = 60.0, 1000.0
+"""Velocity [rad/s] and power [W] from which a round velocity limit is taken for degrees per second."""
+
 _UNITS = "give sizes in metres, meshes in millimetres with <mesh scale='0.001 0.001 0.001'>"
 
 
 def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
-    """Yield a finding for each implausible size, mass, inertia and load."""
+    """Yield a finding for each implausible size, mass, inertia, load and angle."""
     masses, (reach, next_joint, fixed) = robot.link_masses, _distances(robot)
     length = max(reach, SHORT)
     sizes = {name: mass.size for name, mass in masses.items() if mass.size > 0}
@@ -71,6 +85,9 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
             remedy, detail = "give <inertia> in kg m^2, about the centre of mass", f"{mass.gyration:.3g} m"
             yield Finding("warning", "inertia", text, remedy, link=name, detail=detail)
     yield from _loads(robot, max(reach, 1.0), bool(by_shapes))
+    for joint in robot.all_joints:
+        yield from _degrees(joint)
+    yield from _turned(robot)
 
 
 def _loads(robot: RobotDescription, length: float, by_shapes: bool) -> Iterator[Finding]:
@@ -90,6 +107,35 @@ def _loads(robot: RobotDescription, length: float, by_shapes: bool) -> Iterator[
             remedy = f"add <inertial> to links without, or {_UNITS}"
         detail = f"gravity {force:.3g} {joint.effort_unit}, inertia {moved:.3g} {unit}"
         yield Finding("warning", "load", text, remedy, joint.name, detail=detail)
+
+
+def _degrees(joint: Joint) -> Iterator[Finding]:
+    """Yield a finding for limits, a mimic offset or a velocity that look like degrees."""
+    if joint.type not in ("revolute", "continuous"):
+        return
+    angles = {"lower": joint.lower, "upper": joint.upper, "soft_lower": joint.soft_lower, "soft_upper": joint.soft_upper}
+    angles["mimic offset"] = 0.0 if joint.mimic is None else joint.mimic.offset
+    found = [f"{name} {angle:g} rad" for name, angle in angles.items() if FARTHEST < abs(angle) <= PLACEHOLDER]
+    speed = joint.velocity_limit
+    if found:
+        text, remedy = "angles of many turns, as if degrees were read as radians", "give radians, and velocities in rad/s"
+        found += [f"velocity {speed:g} rad/s"] if np.isfinite(speed) else []
+        yield Finding("warning", "degrees", text, remedy, joint.name, detail=", ".join(found))
+        return
+    is_round = speed % 5 == 0 and speed not in (100.0, 1000.0)
+    if joint.type == "revolute" and FASTEST <= speed <= 1000 and is_round and speed * joint.effort_limit >= POWER:
+        text = "such a velocity limit is usually one in degrees per second"
+        yield Finding("note", "degrees", text, "give <limit velocity=> in rad/s", joint.name, detail=f"{speed:g} rad/s")
+
+
+def _turned(robot: RobotDescription) -> Iterator[Finding]:
+    """Yield a finding for each origin with an angle of more than a turn."""
+    for origin in etree.fromstring(robot.urdf.encode()).iter("origin"):
+        angles = numbers(origin, "rpy", "0 0 0", robot.name)
+        if max(map(abs, angles)) > TURN:
+            text = "roll, pitch or yaw of more than a turn, as if degrees were read as radians"
+            detail = f"<{origin.getparent().tag}> rpy {' '.join(f'{angle:g}' for angle in angles)}"
+            yield finding_of(origin, "warning", "degrees", text, "give <origin rpy=> in radians", detail)
 
 
 def _distances(robot: RobotDescription) -> tuple[float, dict[str, float], set[str]]:

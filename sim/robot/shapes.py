@@ -128,7 +128,7 @@ def _read_mesh(name: str, robot: RobotDescription) -> Any:
 
     path = find_mesh(name, robot.path, robot.package_dirs)
     if path is None:
-        remedy = "put the file next to the URDF, or pass package_dirs=[...] to Robot.load"
+        remedy = "put the file next to the URDF, or pass package_dirs=[...] to Robot.load (--package-dirs)"
         raise _UnreadableMesh(name, "not found", remedy)
     problem = "no triangles"
     try:

@@ -1,4 +1,4 @@
-"""Survey of robots: each URDF is loaded, built and moved under designed gains, in a separate process.
+"""Survey of robots: each file is loaded, built and moved under designed gains, in a separate process.
 
 A robot that crashes the engine ends only its process, and the survey reports the stage. The moves come from
 :func:`batchpid.sim.tuning.moves.random_moves`, the gains from :func:`batchpid.design_gains` per mass matrix.
@@ -16,6 +16,7 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,10 +25,11 @@ import numpy as np
 from lxml import etree
 
 from batchpid.checks.validate import integer, number
-from batchpid.errors import BatchPIDError, InvalidArgumentError
+from batchpid.errors import BatchPIDError, InvalidArgumentError, RobotError
 from batchpid.sim.processes.fork_server import ONE_THREAD
 from batchpid.sim.robot.parts import MOVING_TYPES
-from batchpid.sim.robot.xml import SIZE_LIMIT
+from batchpid.sim.robot.source import is_mjcf
+from batchpid.sim.robot.xml import SIZE_LIMIT, parse_xml
 
 STAGES = ("reading the URDF", "building it in the engine", "checking it", "drawing moves", "moving it")
 """Stages of a survey of one robot, named in :attr:`RobotReport.error`."""
@@ -38,14 +40,14 @@ _PROGRAM = (
 
 @dataclass(frozen=True)
 class RobotReport:
-    """Outcome of a survey for one URDF; None where a stage was not reached.
+    """Outcome of a survey for one robot; None where a stage was not reached.
 
     Attributes
     ----------
     urdf
         Path of the file.
     dof
-        Number of joints that move, as far as the file tells if it does not load.
+        Number of joints that move, as far as a URDF tells if it does not load.
     loads
         Whether the engine built the robot.
     findings
@@ -79,22 +81,55 @@ class RobotReport:
         return asdict(self) | {"findings": list(self.findings)}
 
 
-def find_urdfs(paths: Sequence[Path]) -> list[Path]:
-    """Return the files among ``paths``, and the files ``*.urdf`` in the folders among them and below, each once.
+def find_robots(paths: Sequence[Path]) -> list[Path]:
+    """Return the files among ``paths``, and the URDF and MJCF files in the folders among them and below, each once.
 
-    Raises InvalidArgumentError if a path does not exist, or there is no URDF at all.
+    A URDF is a file ``*.urdf``, an MJCF file one ``*.xml`` or ``*.mjcf`` with the root ``<mujoco>`` that no other
+    includes.
+
+    Raises InvalidArgumentError if a path does not exist, or there is no such file at all.
     """
     found: dict[Path, None] = {}
     for path in paths:
         if path.is_dir():
-            found |= dict.fromkeys(sorted(path.rglob("*.urdf")))
+            found |= dict.fromkeys(_robots_in(path))
         elif path.is_file():
             found[path] = None
         else:
             raise InvalidArgumentError("paths", "must be files or folders", value=str(path), remedy="check the path")
     if not found:
-        raise InvalidArgumentError("paths", "hold no file *.urdf", value=", ".join(map(str, paths)), remedy="add one")
+        problem = "hold no file *.urdf and no MJCF file"
+        raise InvalidArgumentError("paths", problem, value=", ".join(map(str, paths)), remedy="add one")
     return list(found)
+
+
+def _robots_in(folder: Path) -> list[Path]:
+    """Return the robots' files in a folder and below."""
+    files = {each: each.suffix.lower() for each in sorted(folder.rglob("*")) if each.is_file()}
+    included = {each: _included(each) for each, suffix in files.items() if suffix in (".xml", ".mjcf")}
+    parts = {part for of_file in included.values() for part in of_file or ()}
+    is_robot = {each: included.get(each) is not None and each.resolve() not in parts for each in included}
+    return [each for each, suffix in files.items() if suffix == ".urdf" or is_robot.get(each, False)]
+
+
+def _included(path: Path) -> set[Path] | None:
+    """Return the files that an MJCF file includes, directly or not; None if the file is no MJCF."""
+    try:
+        root = parse_xml(path)
+    except RobotError:
+        return None
+    if not is_mjcf(root):
+        return None
+    files: set[Path] = set()
+    pending = [(path, root)]
+    for file, element in pending:
+        names = [each.get("file", "") for each in element.iter("include")]
+        for part in [(folder / name).resolve() for name in names for folder in (path.parent, file.parent)]:
+            if part not in files and part.is_file():
+                files.add(part)
+                with suppress(RobotError):
+                    pending.append((part, parse_xml(part)))
+    return files
 
 
 def survey(
@@ -107,6 +142,8 @@ def survey(
     engine: str = "sapien",
     physics: str = "accurate",
     dissipation: str = "urdf",
+    package_dirs: Sequence[Path] = (),
+    missing_meshes: str = "skip",
     time_limit: float = 300.0,
     processes: int = 1,
 ) -> Iterator[RobotReport]:
@@ -120,7 +157,7 @@ def survey(
         Simulated time of a move [s].
     bandwidth_hz
         Of the designed gains [Hz].
-    engine, physics, dissipation
+    engine, physics, dissipation, package_dirs, missing_meshes
         Options of :class:`batchpid.sim.Runner` and :meth:`batchpid.sim.Robot.load`.
     time_limit
         Seconds after which the process of a robot is ended [s].
@@ -138,7 +175,11 @@ def survey(
         "bandwidth_hz": number("bandwidth_hz", bandwidth_hz, 1e-3, 100.0, "Hz"),
         "engine": engine,
         "physics": physics,
-        "dissipation": dissipation,
+        "loading": {
+            "dissipation": dissipation,
+            "package_dirs": [str(each) for each in package_dirs],
+            "missing_meshes": missing_meshes,
+        },
     }
     running: set[subprocess.Popen[str]] = set()
     stop = threading.Event()
@@ -229,7 +270,7 @@ def _stages(
     bandwidth_hz: float,
     engine: str,
     physics: str,
-    dissipation: str,
+    loading: dict[str, Any],
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield each stage of the survey as it begins, with the fields of the report that the one before found."""
     import batchpid as bp
@@ -238,7 +279,7 @@ def _stages(
     from batchpid.sim.tuning.moves import random_moves
 
     yield STAGES[0], {"dof": _count_joints(urdf)}
-    robot = Robot.load(urdf, dissipation=dissipation)
+    robot = Robot.load(urdf, **loading)
     yield STAGES[1], {"dof": robot.dof}
     robot.dynamics()
     yield STAGES[2], {"loads": True}
@@ -264,9 +305,9 @@ def _stages(
 
 
 def _count_joints(urdf: Path) -> int | None:
-    """Return the number of moving joints that a file names, readable as a URDF or not; None if it is no XML."""
+    """Return the number of moving joints that a URDF names, readable or not; None if it is no XML, or MJCF."""
     root = etree.fromstring(urdf.read_bytes()[:SIZE_LIMIT], etree.XMLParser(recover=True, resolve_entities=False))
-    if root is None:
+    if root is None or is_mjcf(root):
         return None
     return sum(joint.get("type") in MOVING_TYPES and joint.find("child") is not None for joint in root.iter("joint"))
 

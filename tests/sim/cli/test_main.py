@@ -74,15 +74,16 @@ def test_every_command_is_a_frozen_dataclass_with_help(name, batchpid):
     status, out, _ = batchpid(name, "--help")
     assert status == 0
     assert " ".join(command.__doc__.split()) in " ".join(out.split())
-    flags = fields_of(name).keys() - {"weights"}  # its fields are flags
+    flags = fields_of(name).keys() - {"weights", "meshes"}  # their fields are flags
     assert all(f"-{flag}".replace("_", "-") in out or flag.upper() in out for flag in flags)  # --flag or --no-flag
 
 
 @pytest.mark.parametrize("name", [name for name in cli.COMMANDS if "robot" in fields_of(name)])
 def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
     recording = ["run.npz"] if "recording" in fields_of(name) else []
-    parsed = cli.parse([name, *recording, "jaco2", "--missing-meshes", "skip"])
-    assert (parsed.robot, parsed.missing_meshes) == ("jaco2", "skip")
+    parsed = cli.parse([name, *recording, "jaco2", "--missing-meshes", "error", "--package-dirs", "a", "b"])
+    assert parsed.robot == "jaco2"
+    assert vars(parsed.meshes) == {"missing_meshes": "error", "package_dirs": (Path("a"), Path("b"))}
 
 
 @pytest.mark.parametrize(
@@ -91,7 +92,7 @@ def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
         "workers",
         "physics",
         "collisions",
-        "missing_meshes",
+        "meshes",
         "seed",
         "seconds",
         "substeps",

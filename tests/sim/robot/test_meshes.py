@@ -135,6 +135,12 @@ def test_a_sound_mesh_is_simulated(name, tmp_path):
         "..\\meshes\\arm.stl",
         "meshes/arm.stl",
         "file://{folder}/meshes/arm.stl",
+        "file://localhost{folder}/meshes/arm.stl",
+        "file:{folder}/meshes/arm.stl",
+        "file://$(find arm_description)/meshes/arm.stl",
+        "package://arm_description/meshes/%61rm.stl",
+        "package://arm_description/meshes/arm.STL",
+        "meshes/arm.Stl",
         "{folder}/meshes/arm.stl",
     ],
 )
@@ -145,6 +151,27 @@ def test_a_mesh_is_found_by_the_ways_that_urdfs_name_it(name, tmp_path):
     (folder / "meshes" / "arm.stl").write_bytes(stl())
     loaded = Robot.load(write(folder / "urdf", arm(name.format(folder=folder))), strict=True)
     assert str(folder / "meshes" / "arm.stl") in loaded.urdf.replace("urdf/../", "")
+
+
+@pytest.mark.parametrize(
+    ("variable", "path", "package"),
+    [
+        ("AMENT_PREFIX_PATH", "{0}/none:{0}/install", "install/share/arm_description"),
+        ("ROS_PACKAGE_PATH", "{0}/none:{0}/ws/src", "ws/src/arm_description"),
+        ("ROS_PACKAGE_PATH", "{0}/ws/src", "ws/src/repository/arm_description"),
+        ("ROS_PACKAGE_PATH", "{0}/ws/src/arm_description", "ws/src/arm_description"),
+    ],
+)
+def test_packages_of_a_ros_environment_are_found(variable, path, package, tmp_path, monkeypatch):
+    file, elsewhere = tmp_path / package / "meshes" / "my arm.STL", tmp_path / "elsewhere"
+    file.parent.mkdir(parents=True)
+    elsewhere.mkdir()
+    file.write_bytes(stl())
+    urdf = write(elsewhere, arm("package://arm_description/meshes/my%20arm.stl"))
+    with pytest.raises(RobotError, match=r"package_dirs=\[...\] \(--package-dirs"):
+        Robot.load(urdf, missing_meshes="error")
+    monkeypatch.setenv(variable, path.format(tmp_path))
+    assert str(file) in Robot.load(urdf, strict=True).urdf
 
 
 @pytest.mark.parametrize("case", BAD)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import re
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 from batchpid.errors import BatchPIDError, RobotError, RobotNotFoundError
 from batchpid.sim import Robot, Runner
+from batchpid.sim.robot.urdf_export import to_urdf
 
 BASE, ARM, TIP = link("base"), link("arm"), link("tip")
 HINGE = joint("hinge", "base", "arm")
@@ -244,3 +246,49 @@ def test_missing_meshes_can_be_skipped(tmp_path):
 def test_invalid_options_of_load_raise(options):
     with pytest.raises(BatchPIDError):
         Robot.load(**options)
+
+
+@pytest.mark.parametrize("head", ['<?xml version="1.0"?>', "\n<!-- made by hand --><?xml version='1.0'?>"])
+def test_a_default_namespace_is_ignored(head, tmp_path):
+    plain = one_joint(arm=INERTIAL + '<visual><geometry><box size="1 1 1"/></geometry></visual>')
+    named = plain.replace('<?xml version="1.0"?>', head).replace("<robot", '<robot xmlns="http://www.ros.org"')
+    robots = [Robot.load(write(tmp_path, text, f"{at}.urdf")) for at, text in enumerate((plain, named))]
+    assert robots[0].urdf == robots[1].urdf
+    assert to_urdf(robots[0]).text == to_urdf(robots[1]).text
+
+
+def test_a_robot_without_a_name_is_called_after_its_file(tmp_path):
+    loaded = Robot.load(write(tmp_path, one_joint().replace(' name="test"', ""), "arm.urdf"))
+    assert loaded.name == "arm"
+    assert "<robot> has no name: called 'arm'" in str(loaded.repairs[0])
+    assert '<robot name="arm">' in to_urdf(loaded).text
+    assert any("<robot> has no name" in each for each in to_urdf(loaded).differences)
+    with Runner(loaded, 1, workers=0, params=loaded.params(kp=1.0)) as runner:
+        assert runner.step([0.0]).ok.all()
+
+
+def test_a_joint_gets_a_name_that_no_other_has(tmp_path):
+    unnamed = HINGE.replace('name="hinge"', "")
+    loaded = Robot.load(write(tmp_path, robot(BASE, ARM, TIP, unnamed, joint("base_to_arm", "arm", "tip"))))
+    assert loaded.joint_names == ("base_to_arm_2", "base_to_arm")
+
+
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+def test_links_may_have_the_names_of_added_bodies(engine, tmp_path):
+    """MuJoCo's root is called world; where links of a body collide in part, each gets a body "LINK (shapes)"."""
+    if engine == "mujoco":
+        pytest.importorskip("mujoco")
+    box = INERTIAL + '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
+    names = ["world", "world_link", "world_link_2", "a", "b", "a (shapes)", "a (shapes)_2"]
+    joints = [joint(f"to {b}", a, b, "fixed" if b == "b" else "revolute") for a, b in pairwise(names)]
+    path = write(tmp_path, robot(*(link(name, box) for name in names), *joints))
+    write(tmp_path, '<robot><disable_collisions link1="a" link2="world" reason="x"/></robot>', "test.srdf")
+    loaded = Robot.load(path)
+    with Runner(loaded, 1, workers=0, engine=engine, params=loaded.params(kp=1.0)) as runner:
+        assert runner.step(loaded.start).ok.all()
+    if engine == "mujoco":
+        from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+
+        text = to_mjcf(loaded, loaded.designed("effort"), 1e-3).text
+        assert 'name="world_link_3"' in text
+        assert 'name="a (shapes)_3"' in text

@@ -10,7 +10,7 @@ import pytest
 from tiny_urdf import one_joint
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.tuning.robot_survey import find_urdfs, survey
+from batchpid.sim.tuning.robot_survey import find_robots, survey
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def folder(tmp_path_factory):
 
 @pytest.mark.slow
 def test_reports_come_in_order_with_all_that_is_known(folder):
-    good, scenery, truncated = survey(find_urdfs([folder]), moves=2, seconds=2.5, processes=2)
+    good, scenery, truncated = survey(find_robots([folder]), moves=2, seconds=2.5, processes=2)
     assert good.urdf.endswith("arm.urdf")
     assert good.error is None
     assert good.loads
@@ -53,9 +53,29 @@ def test_a_process_that_ends_at_once_is_an_error_of_its_robot(folder, monkeypatc
 
 def test_files_and_folders_are_found_once(folder):
     arm = folder / "deep" / "arm.urdf"
-    assert find_urdfs([arm, folder]) == [arm, folder / "scenery.urdf", folder / "truncated.urdf"]
+    assert find_robots([arm, folder]) == [arm, folder / "scenery.urdf", folder / "truncated.urdf"]
     with pytest.raises(InvalidArgumentError, match="must be files or folders"):
-        find_urdfs([folder / "nothing"])
+        find_robots([folder / "nothing"])
     (folder / "empty").mkdir()
-    with pytest.raises(InvalidArgumentError, match=r"hold no file \*.urdf"):
-        find_urdfs([folder / "empty"])
+    with pytest.raises(InvalidArgumentError, match=r"hold no file \*.urdf and no MJCF"):
+        find_robots([folder / "empty"])
+
+
+def test_folders_are_searched_for_urdf_and_mjcf_files(tmp_path):
+    """Suffixes in capitals and MJCF count; parts that others include, and other XML, do not."""
+    deep = tmp_path / "deep"
+    (deep / "parts").mkdir(parents=True)
+    include = '<mujoco><include file="{}"/></mujoco>'
+    files = {
+        tmp_path / "ARM.URDF": one_joint(),
+        tmp_path / "other.xml": "<package/>",
+        tmp_path / "broken.xml": "<mujoco",
+        tmp_path / "hand.MJCF": "<mujoco/>",
+        tmp_path / "scene.xml": include.format("deep/arm.xml"),
+        deep / "arm.xml": include.format("parts/motors.xml"),
+        deep / "parts" / "motors.xml": '<mujoco xmlns="urn:mujoco"/>',
+        deep / "leg.xml": '<mujoco xmlns="urn:mujoco"/>',
+    }
+    for path, text in files.items():
+        path.write_text(text)
+    assert {path.name for path in find_robots([tmp_path])} == {"ARM.URDF", "hand.MJCF", "scene.xml", "leg.xml"}
