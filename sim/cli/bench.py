@@ -45,7 +45,7 @@ class BenchCommand:
     xla: flags.Switch = False
     """Measure the closed loop in XLA, too."""
     workers: flags.Workers = None
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
     """Figures to write, with the machine and the versions: .json."""
     force: flags.Force = False

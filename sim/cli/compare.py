@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
@@ -34,7 +34,7 @@ class CompareCommand:
     collisions: flags.Collisions = True
     workers: flags.Workers = None
     actuators: flags.Actuators = None
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     picture: flags.OptionalPath = None
     """First two rows of the table on the first move, to draw: .png or .svg."""
     force: flags.Force = False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ class DemoCommand:
     workers: flags.Workers = None
     engine: flags.Engine = "sapien"
     backend: flags.Backend = "numpy"
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     picture: flags.OptionalPath = None
     """Step responses to draw: .png or .svg. Default: out/ROBOT-demo.png."""
     force: flags.Force = False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from batchpid.sim import Robot
@@ -30,7 +30,7 @@ class ExciteCommand:
     """Highest frequency [Hz]."""
     seed: int = 0
     """Seed of the phases."""
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
     """File to write: .csv. Default: out/ROBOT.excite.csv."""
     force: flags.Force = False

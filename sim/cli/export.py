@@ -76,7 +76,7 @@ class ExportCommand:
     """In C, write a CMakeLists.txt and an example loop next to the header."""
     strict: flags.Switch = False
     """End with an error if the target's law differs."""
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
     """File to write. Default: out/ROBOT-pid.h, or another ending."""
     force: flags.Force = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json as json_text
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -54,7 +54,7 @@ class IdentifyCommand:
     seed: int = 0
     """Seed of CMA-ES, which finds the start of the fit. The result does not depend on the number of workers."""
     workers: flags.Workers = None
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     resume: flags.Switch = False
     """Continue a fit with the same options that was stopped."""
     out: flags.OptionalPath = None

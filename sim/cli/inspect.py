@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from batchpid.io.versions import package_versions
 from batchpid.sim import Finding, Robot
@@ -37,7 +37,7 @@ class InspectCommand:
     """List fixed joints, light links, and pairs of links that do not collide, too."""
     strict: flags.Switch = False
     """Exit with status 1 if a finding is worse than a note."""
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     engine: flags.Switch = False
     """Print the kind of the calls into the engine too, and the reason if they are not native."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json as json_text
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -27,7 +27,7 @@ class ParityCommand:
     seconds: flags.Seconds = 2.0
     workers: flags.Workers = None
     actuators: flags.Actuators = None
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     picture: flags.OptionalPath = None
     """Differences over time, to draw: .png or .svg."""
     json: flags.OptionalPath = None

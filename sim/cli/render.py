@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import tyro
@@ -31,7 +31,7 @@ class RenderCommand:
     """Width of the film [pixels]."""
     height: int = 540
     """Height of the film [pixels]."""
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
     """Film to write: .mp4 or .gif. Default: next to the recording NAME.npz, NAME-film.mp4."""
     force: flags.Force = False

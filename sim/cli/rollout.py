@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -59,7 +59,7 @@ class RolloutCommand:
     workers: flags.Workers = None
     cluster: flags.Cluster = None
     actuators: flags.Actuators = None
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
     """Recording to write: .npz at the end, or .h5 tick by tick (extra `record`). For plot, view and render."""
     picture: flags.OptionalPath = None
@@ -76,9 +76,7 @@ class RolloutCommand:
         outputs = Outputs(force=self.force)
         out = outputs.path("out", self.out, (".npz", ".h5", ".hdf5"))
         picture = outputs.path("picture", self.picture, plots.FORMATS)
-        robot = Robot.load(
-            self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes)
-        )
+        robot = Robot.load(self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes))
         robot, randomization = read_variation(robot, self.randomize)
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
         target = robot.start if robot.settings is None else robot.settings.target

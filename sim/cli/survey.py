@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -46,7 +46,7 @@ class SurveyCommand:
     time_limit: float = 300.0
     """Wall-clock time for each robot [s]."""
     workers: flags.Workers = None
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     json: flags.OptionalPath = None
     """Reports to write: a list of objects, .json."""
     out: flags.OptionalPath = None

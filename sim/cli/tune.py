@@ -60,7 +60,7 @@ class TuneCommand:
     cluster: flags.Cluster = None
     time_limit: flags.TimeLimit = None
     actuators: flags.Actuators = None
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     resume: flags.Switch = False
     """Continue a search with the same options that was stopped."""
     out: flags.OptionalPath = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -42,7 +42,7 @@ class ViewCommand:
     physics: flags.Physics = "accurate"
     workers: flags.Workers = None
     actuators: flags.Actuators = None
-    meshes: flags.Meshes = flags.MeshOptions()
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     play: flags.OptionalPath = None
     """Recorded run to show: .npz or .h5."""
     fps: flags.Fps = 30.0

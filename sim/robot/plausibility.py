@@ -113,12 +113,13 @@ def _degrees(joint: Joint) -> Iterator[Finding]:
     """Yield a finding for limits, a mimic offset or a velocity that look like degrees."""
     if joint.type not in ("revolute", "continuous"):
         return
-    angles = {"lower": joint.lower, "upper": joint.upper, "soft_lower": joint.soft_lower, "soft_upper": joint.soft_upper}
+    angles = {name: getattr(joint, name) for name in ("lower", "upper", "soft_lower", "soft_upper")}
     angles["mimic offset"] = 0.0 if joint.mimic is None else joint.mimic.offset
     found = [f"{name} {angle:g} rad" for name, angle in angles.items() if FARTHEST < abs(angle) <= PLACEHOLDER]
     speed = joint.velocity_limit
     if found:
-        text, remedy = "angles of many turns, as if degrees were read as radians", "give radians, and velocities in rad/s"
+        text = "angles of many turns, as if degrees were read as radians"
+        remedy = "give radians, and velocities in rad/s"
         found += [f"velocity {speed:g} rad/s"] if np.isfinite(speed) else []
         yield Finding("warning", "degrees", text, remedy, joint.name, detail=", ".join(found))
         return

@@ -23,7 +23,7 @@ def test_prints_a_table_and_writes_the_reports(batchpid, tmp_path):
     assert set(arm) == set(nothing) == KEYS
     assert (arm["dof"], arm["settled"], arm["error"]) == (1, 1, None)
     assert nothing["error"] in out
-    assert page.read_text().startswith("| URDF ")
+    assert page.read_text().startswith("| file ")
     assert "| arm.urdf " in page.read_text()
 
 
