@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -91,11 +91,11 @@ class ExportCommand:
         from batchpid.sim.robot.urdf_export import to_urdf
         from batchpid.sim.tuning.gain_sets import gain_set
 
-        for field in fields(self):
-            unused = any(field.name in names for names in USED.values()) and field.name not in USED[self.to]
-            if unused and (value := getattr(self, field.name)) != field.default:
+        for each in fields(self):
+            unused = any(each.name in names for names in USED.values()) and each.name not in USED[self.to]
+            if unused and (value := getattr(self, each.name)) != each.default:
                 problem = f"has no effect with --to {self.to}"
-                raise InvalidArgumentError(field.name, problem, value=value, remedy="leave it out")
+                raise InvalidArgumentError(each.name, problem, value=value, remedy="leave it out")
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
         outputs = Outputs(force=self.force)

@@ -31,7 +31,7 @@ _MANY = {"link", "joint", "collision", *SHAPES}  # elements that a parent may ha
 UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
 """Elements of a URDF that have no effect here."""
 _SCALARS = "value lower upper effort velocity damping friction multiplier offset soft_lower_limit soft_upper_limit"
-_NUMBERS = dict.fromkeys([*_SCALARS.split(), *MOMENTS, "radius", "length"], (1,))
+_NUMBERS: dict[str, tuple[int, ...]] = dict.fromkeys([*_SCALARS.split(), *MOMENTS, "radius", "length"], (1,))
 _NUMBERS |= {"xyz": (3,), "rpy": (3,), "size": (3,), "scale": (3, 1)}
 """Attributes that hold numbers, and how many."""
 _DECIMAL_COMMA = re.compile(r"[+-]?(\d+,?\d*|,\d+)([eE][+-]?\d+)?")
