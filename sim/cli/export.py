@@ -91,11 +91,11 @@ class ExportCommand:
         from batchpid.sim.robot.urdf_export import to_urdf
         from batchpid.sim.tuning.gain_sets import gain_set
 
-        for each in fields(self):
-            unused = any(each.name in names for names in USED.values()) and each.name not in USED[self.to]
-            if unused and (value := getattr(self, each.name)) != each.default:
+        for option in fields(self):
+            unused = any(option.name in names for names in USED.values()) and option.name not in USED[self.to]
+            if unused and (value := getattr(self, option.name)) != option.default:
                 problem = f"has no effect with --to {self.to}"
-                raise InvalidArgumentError(each.name, problem, value=value, remedy="leave it out")
+                raise InvalidArgumentError(option.name, problem, value=value, remedy="leave it out")
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
         outputs = Outputs(force=self.force)
