@@ -89,7 +89,7 @@ def test_a_mesh_that_cannot_be_read_is_named_on_the_page_and_in_the_terminal(bat
     assert status == 0
     assert err.splitlines() == [
         "batchpid: warning: link 'base' ('no.stl'): mesh not found: nothing is drawn; put the file next to the URDF, "
-        "or pass package_dirs=[...] to Robot.load",
+        "or pass package_dirs=[...] to Robot.load (--package-dirs)",
         "batchpid: warning: link 'arm' ('<b>.stl'): mesh cannot be read (a git-lfs pointer instead of the mesh: run "
         "git lfs pull): collision shapes are drawn instead; repair the file",
     ]
