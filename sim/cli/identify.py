@@ -184,9 +184,13 @@ def _not_identified(found: Identification) -> list[str]:
     if not found.uncertainty.identified.any():
         remedy = "check --params, --timestep and --compensate, or give more --evaluations"
         return [*lines, f"  everything: the fit does not explain the motion; {remedy}"]
+    names = [found.robot.joint_names[number] for number in found.joints]
+    moves = dict(zip(names, found.uncertainty.moves, strict=True))
     for joint, kinds in of_joints.items():
-        if {*kinds} == {*PER_JOINT}:
-            remedy = "no value is certain; move it more or faster (batchpid excite)"
+        if not moves[joint]:
+            remedy = "it hardly moves; move it more (batchpid excite)"
+        elif {*kinds} == {*PER_JOINT}:
+            remedy = "no value is certain, perhaps their ratios are; record with more load, or faster motion"
         elif "strength" in kinds:
             remedy = "only ratios to the strength are identifiable; record without compensation, or with more load"
         else:

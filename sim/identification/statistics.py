@@ -44,6 +44,8 @@ class Uncertainty(NamedTuple):
     deviation: Float64
     """Standard deviations."""
     identified: NDArray[np.bool_]
+    moves: NDArray[np.bool_]
+    """Joints (joints,) that the motion moves, and not only the noise of their sensor."""
     singular_values: Float64
     """Singular values of the Jacobian in units of typical sizes, over the largest, descending."""
 
@@ -82,7 +84,7 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     moves = _motion(problem) > LEAST_MOTION * problem.noise / NOISES
     known = np.array([joint is None or moves[joint] for _, joint in unknowns.names])
     identified = known & (INTERVAL * deviation <= resolved * np.abs(point.theta))
-    return Uncertainty(deviation, identified, values / max(values[0], 1e-300))
+    return Uncertainty(deviation, identified, moves, values / max(values[0], 1e-300))
 
 
 def _motion(problem: Problem) -> Float64:

@@ -87,7 +87,7 @@ def error_of_the_export(found, log: Log, params: bp.PIDParams, dt: float) -> flo
 
     robot, moving = found.robot, list(log.joints)
     model = mujoco.MjModel.from_xml_string(to_mjcf(robot, None, dt, actuators=found.actuators()).text)
-    data, pid = mujoco.MjData(model), bp.BatchPID(params, 1, dt=dt)
+    data, pid = mujoco.MjData(model), bp.BatchPID(params.replace(measurement_rate="difference"), 1, dt=dt)
     order = [int(model.joint(name).qposadr[0]) for name in robot.joint_names]
     time = np.arange(round(log.time[-1] / dt) + 1) * dt
     wanted = np.zeros((len(time), robot.dof))  # the other joints are locked at 0 in the log
@@ -240,14 +240,15 @@ def test_what_a_log_does_not_show_is_told(mujoco_log, tmp_path):
     document = found.document()
     assert {f"shoulder: {kind}" for kind in PER_JOINT} <= set(found.not_identified)
     assert "elbow: friction" not in found.not_identified
-    assert document["joints"]["shoulder"]["damping"] == [None, None, None]
-    assert found.actuators().strength[0, 0] == 1.0
+    assert np.isfinite(document["joints"]["shoulder"]["damping"]).all()
     found.save(tmp_path / "motors.yaml")
     saved = yaml.safe_load((tmp_path / "motors.yaml").read_text())["about"]
     of_joints, others = found.missing()
-    assert saved["not_identified_hence_ideal"] == of_joints | ({"all joints": others} if others else {})
-    assert saved["not_identified_hence_ideal"]["shoulder"] == list(PER_JOINT)
-    assert Robot.load(turret.path, actuators=tmp_path / "motors.yaml").actuators.armature[0, 0] == 0.0
+    assert saved["not_well_determined"] == of_joints | ({"all joints": others} if others else {})
+    assert saved["not_well_determined"]["shoulder"] == list(PER_JOINT)
+    loaded = Robot.load(turret.path, actuators=tmp_path / "motors.yaml").actuators
+    for name, leaf in found.actuators()._asdict().items():  # every value, however uncertain
+        assert leaf is None or np.array_equal(leaf, getattr(loaded, name)), name
     lines = [line for line in report(found).splitlines() if line.startswith("  shoulder: ")]
     assert lines == [f"  shoulder: {', '.join(PER_JOINT)}: it hardly moves; move it more (batchpid excite)"]
     unknown = [("strength", 2, "0 to 1"), ("strength", -1, "0 to 1"), ("strength", None, "0 to 1")]
@@ -259,7 +260,7 @@ def test_what_a_log_does_not_show_is_told(mujoco_log, tmp_path):
 
 
 @pytest.mark.slow
-def test_joints_that_noise_alone_shakes_and_fits_that_did_not_arrive_tell_nothing(arm, runs):
+def test_joints_that_noise_alone_shakes_tell_nothing(arm, runs):
     truth, _, efforts = runs
     unknowns = Unknowns.of(*(np.ones(2) for _ in range(4)), payload=False)
     drive, motion = Drive(DT, None, "gravity+coriolis"), smooth(efforts, DT)
@@ -270,7 +271,6 @@ def test_joints_that_noise_alone_shakes_and_fits_that_did_not_arrive_tell_nothin
     of_elbow = np.array([joint == 1 for _, joint in unknowns.names])
     known = uncertainty(problem, found).identified
     assert known[of_elbow].sum() >= 4
-    assert not uncertainty(problem, found._replace(promised=0.1)).identified.any()
     problem.noise[1] = 0.1 * np.std(efforts.qpos[:, 1])
     shaken = uncertainty(problem, found).identified
     assert not shaken[of_elbow].any()
