@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.choices import HoldEffort
+from batchpid.arrays.choices import CHOICES, HoldEffort
 from batchpid.checks.validate import instance, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
@@ -32,19 +32,21 @@ def checked_inputs(params: PIDParams, state: PIDState, measurement: Any, **input
     return list(arrays.values())
 
 
-def check_alone(params: PIDParams, measurement_rate: Any) -> None:
-    """Raise InvalidArgumentError for params that ask for more than the law itself is given."""
-    if params.gain_units is not None:
+def check_alone(law: Any, measurement_rate: Any) -> None:
+    """Raise InvalidArgumentError if params or coefficients need a mass matrix, or a measured rate that is not given."""
+    if law.gain_units is not None:
+        unit = next(name for name, each in CHOICES["gain_units"].items() if type(each) is type(law.gain_units))
         raise InvalidArgumentError(
             "params.gain_units",
-            "give accelerations or ask for inertias, which the law does not know",
-            remedy="take gains of efforts, as robot.designed('effort'); a Runner turns these gains into efforts",
+            "are accelerations: without the robot's mass matrix the law cannot turn them into efforts",
+            value=unit,
+            remedy="use gains in efforts, such as robot.designed('effort'), or a batchpid.sim.Runner",
         )
-    if params.measurement_rate is not None and params.kd is not None and measurement_rate is None:
+    if law.measurement_rate is not None and law.kd is not None and measurement_rate is None:
         raise InvalidArgumentError(
             "measurement_rate",
-            "is missing, and these params differentiate the measured rate",
-            remedy="give it, or params with measurement_rate='difference'",
+            "is missing: the params have measurement_rate='measured'",
+            remedy="pass the measured velocity, or use params.replace(measurement_rate='difference')",
         )
 
 
@@ -104,6 +106,7 @@ def checked_dt(dt: Any, dtype: Any) -> Any:
     if isinstance(dt, np.ndarray) and dt.ndim:
         if dt.dtype.kind not in "iuf" or not ((dt > 0) & (dt < np.inf)).all():
             raise InvalidArgumentError("dt", "must be positive and finite", value=dt, remedy="use numbers > 0 (s)")
+        time_step("dt", float(dt.max(initial=0)))
         return dt.astype(dtype, copy=False)
     if isinstance(dt, np.ndarray | np.generic):
         dt = dt.item()

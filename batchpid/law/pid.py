@@ -111,7 +111,6 @@ def _checked(
 ) -> tuple[PIDState, Any, Any, list[Any]]:
     """Check the arguments of a step; return them as arrays, JAX arrays unchanged."""
     y, r, *rest = checked_inputs(params, state, measurement, setpoint=setpoint, **inputs)
-    check_alone(params, inputs.get("measurement_rate"))
     return checked_state(state, needs(params)), r, y, rest
 
 
@@ -124,7 +123,11 @@ def advance(
     setpoint_rate: Any = None,
     feedforward: Any = None,
 ) -> tuple[PIDState, Any]:
-    """Advance the law with given coefficients, for loops with constant params; otherwise as :func:`step`."""
+    """Advance the law with given coefficients, for loops with constant params; otherwise as :func:`step`.
+
+    Raises InvalidArgumentError if the coefficients are of gain_units other than "effort", or need a measured rate that
+    is not given. Gains per inertia: :mod:`batchpid.law.computed_torque`.
+    """
     new, effort, *_ = _advance(k, state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
     return new, effort
 
@@ -156,6 +159,7 @@ def _advance(
     feedforward: Any = None,
 ) -> tuple[PIDState, Any, Any, tuple[Any, ...], Any]:
     """Return state, effort, unsaturated effort, its four parts, and the mask of finite inputs; None is off."""
+    check_alone(k, measurement_rate)
     xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
     r, y, r_rate, y_rate, ff = setpoint, measurement, setpoint_rate, measurement_rate, feedforward
     finite = None
@@ -278,7 +282,6 @@ def drive_target(
     the drive's, inside the same limit) are as in :func:`batchpid.step`. The idea is from the SAPIEN authors' answer
     in haosulab/SAPIEN#178.
     """
-    check_alone(params, inputs.get("measurement_rate"))
     state, terms = advance_terms(discretise(params, dt), state, setpoint, measurement, **inputs)
     xp = namespace(*params, terms.i, setpoint)
     driven = params.kp > 0
