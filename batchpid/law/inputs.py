@@ -15,6 +15,16 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState
 
+DRIVE_LACKS = {
+    "effort_rate_limit": None,
+    "derivative_filter_time": None,
+    "setpoint_weight": None,
+    "setpoint_weight_derivative": None,
+    "deadband": None,
+    "non_finite": "propagate",
+}
+"""Options that change P, D or the effort in a way that no target of a drive can, and their values for off."""
+
 
 def checked_inputs(params: PIDParams, state: PIDState, measurement: Any, **inputs: Any) -> list[Any]:
     """Return ``measurement`` and ``inputs`` as arrays that broadcast with the params and the state; None stays None."""
@@ -47,6 +57,18 @@ def check_alone(law: Any, measurement_rate: Any) -> None:
             "measurement_rate",
             "is missing: the params have measurement_rate='measured'",
             remedy="pass the measured velocity, or use params.replace(measurement_rate='difference')",
+        )
+
+
+def check_drive(params: PIDParams) -> None:
+    """Raise InvalidArgumentError for options of the law that a drive of stiffness kp and damping kd does not have."""
+    lacking = {name: off for name, off in DRIVE_LACKS.items() if getattr(params, name) is not None}
+    if lacking:
+        others = ", ".join(f"{name}={off!r}" for name, off in lacking.items())
+        raise InvalidArgumentError(
+            f"params.{next(iter(lacking))}",
+            "is not available in a drive, whose effort is kp (target - y) - kd dy/dt within the effort limits",
+            remedy=f"use params.replace({others}), or the law itself, as control 'pid' does",
         )
 
 

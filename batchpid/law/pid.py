@@ -25,9 +25,9 @@ from __future__ import annotations
 from typing import Any
 
 from batchpid.arrays.choices import Everywhere, HoldEffort
-from batchpid.arrays.elementwise import clip, flush, namespace, replace_envs, wrap
+from batchpid.arrays.elementwise import clip, flush, namespace, nearest_turn, replace_envs, wrap
 from batchpid.law.coefficients import Coefficients, discretise
-from batchpid.law.inputs import check_alone, checked_inputs, checked_mask, checked_state, needs
+from batchpid.law.inputs import check_alone, check_drive, checked_inputs, checked_mask, checked_state, needs
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
 
@@ -281,8 +281,13 @@ def drive_target(
     Arrays and the optional ``inputs`` measurement_rate, setpoint_rate and feedforward (an effort added to
     the drive's, inside the same limit) are as in :func:`batchpid.step`. The idea is from the SAPIEN authors' answer
     in haosulab/SAPIEN#178.
+
+    Raises InvalidArgumentError as :func:`batchpid.step`, and for options that a drive does not have: setpoint weights,
+    a filter of the derivative, a dead zone, a limit of the effort's rate, and a policy for non-finite inputs.
     """
-    state, terms = advance_terms(discretise(params, dt), state, setpoint, measurement, **inputs)
+    check_drive(params)
+    k = discretise(params, dt)
+    state, terms = advance_terms(k, state, setpoint, measurement, **inputs)
     xp = namespace(*params, terms.i, setpoint)
-    driven = params.kp > 0
-    return state, setpoint + xp.where(driven, terms.i, 0) / xp.where(driven, params.kp, 1)
+    driven, target = params.kp > 0, nearest_turn(setpoint, measurement, k.turns, xp)
+    return state, target + xp.where(driven, terms.i, 0) / xp.where(driven, params.kp, 1)
