@@ -20,13 +20,13 @@ Y, TREE = np.zeros((1, 2)), planar()
 PARAMS = bp.make_params(2, 4.0, 1.0, 1.0, integration="integrate_first")
 OSC = ts.make_osc_params(TREE, integral_gain=1.0)
 POSE = ts.link_poses(TREE, Y, ["tip"])[:, 0]
-MOTORS = bp.make_actuators(2, lag=0.1)
+MOTORS, GUARD = bp.make_actuators(2, lag=0.1), bp.make_guard(2, rate=1.0)
 RUBBING = friction.Friction(np.ones((1, 2)), np.ones((1, 2)))
 VALUES = {
     "num_envs": 1, "joints": 2, "joint_names": ["a", "b"], "measurement": Y, "setpoint": Y, "effort": Y, "qpos": Y,
     "qvel": Y, "tree": TREE, "link": "tip", "mass_matrix": np.eye(2), "inertia": np.ones((1, 2)), "kp": 1.0, "ki": 1.0,
-    "kd": 1.0, "params": PARAMS, "actuators": MOTORS, "min_delay": 0, "max_delay": 1, "guard": bp.make_guard(2, rate=1.0),
-    "friction": RUBBING, "velocity": Y, "load": Y, "start": Y, "target": Y + 1, "end": Y + 1, "max_velocity": 1.0,
+    "kd": 1.0, "params": PARAMS, "actuators": MOTORS, "min_delay": 0, "max_delay": 1, "load": Y,
+    "guard": GUARD, "friction": RUBBING, "velocity": Y, "start": Y, "target": Y + 1, "end": Y + 1, "max_velocity": 1.0,
     "max_acceleration": 1.0, "max_jerk": 1.0, "robot": robot_of("panda"),
 }  # fmt: skip
 """Values of required arguments, by their names."""
@@ -37,7 +37,7 @@ OWN = {
     "batchpid.trajectories": {"duration": 1.0},
     "batchpid.metrics": {"setpoint": np.ones((9, 1, 2)), "measurement": np.zeros((9, 1, 2))},
     "batchpid.motors": {"state": motors.init(MOTORS, Y, 0.01)},
-    "batchpid.motors.guard": {"state": guard.init(VALUES["guard"], Y)},
+    "batchpid.motors.guard": {"state": guard.init(GUARD, Y)},
     "batchpid.motors.friction": {
         "mass_matrix": np.eye(2)[None],
         "state": friction.init(RUBBING, Y, Y, np.eye(2)[None], 0.01),

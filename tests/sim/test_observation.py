@@ -7,7 +7,7 @@ import pytest
 from identical import assert_identical
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Rollout, Runner, RunInfo
+from batchpid.sim import Rollout, RunInfo, Runner
 from batchpid.sim.observation import Redraw
 
 
@@ -104,5 +104,5 @@ def test_parts_with_other_ticks_or_envs_are_refused(rollout):
     for other in (dataclasses.replace(rollout, tick=2 * rollout.tick), rollout.for_envs([0])):
         with pytest.raises(InvalidArgumentError, match="parts"):
             Rollout.join([rollout, other])
-    with pytest.raises(InvalidArgumentError, match="parts: .*empty"):
+    with pytest.raises(InvalidArgumentError, match=r"parts: .*empty"):
         Rollout.join([])
