@@ -276,9 +276,9 @@ class Rollout:
     def join(parts: Sequence[Rollout]) -> Rollout:
         """Return successive rollouts of one run as one.
 
-        ``info`` is that of the first, with the faults of the last, and the redraws of all. It is complete if all are.
+        The info is the first part's, with the faults of the last and the redraws of all. It is complete if all are.
 
-        Raises InvalidArgumentError if there are no parts, or they differ in the robot, an option, the tick or the
+        Raises InvalidArgumentError if ``parts`` are empty, or differ in the robot, an option, the tick or the
         number of envs.
         """
         if not parts:
