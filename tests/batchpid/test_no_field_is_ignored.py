@@ -7,6 +7,7 @@ import itertools
 
 import numpy as np
 import pytest
+from tiny_urdf import one_joint, write
 from trees import planar
 
 import batchpid as bp
@@ -18,6 +19,7 @@ from batchpid.law.computed_torque import advance_with_mass_matrix, per_inertia
 from batchpid.law.inputs import DRIVE_LACKS
 from batchpid.motors import guard as guards
 from batchpid.motors.actuator_fields import FIELDS
+from batchpid.sim import Robot
 
 DT, JOINTS = 0.01, ["a", "b", "c"]
 MIXED = ["back_calculation", "conditional", "none"]
@@ -159,6 +161,8 @@ def test_every_field_of_params_is_exported_or_a_difference(target):
 
 
 MOTORS = dict.fromkeys(FIELDS, 0.25) | {"no_load_speed": 9.0, "position_limit": ([0.0, 1.0], [5.0, 6.0])}
+PART_OF_MOTORS = {"no_load_speed": "saturation_effort", "limit_positions": "position_limit"}
+PART_OF_MOTORS["limit_efforts"] = "position_limit"
 
 
 @pytest.mark.parametrize("target", sorted(TARGETS.keys() - {"C", "trajectory", "pid_controller"}))
@@ -167,13 +171,30 @@ def test_every_field_of_motors_is_exported_or_a_difference(target):
     base = bp.make_actuators(3, **MOTORS)
     plain = TARGETS[target](params, base)
     listed = {each.partition(":")[0] for each in plain.differences}
-    part_of = {"no_load_speed": "saturation_effort"} | dict.fromkeys(
-        ("limit_positions", "limit_efforts"), "position_limit"
-    )
     for label, name, motors in changes(
         base._replace(seed=None, max_delay=None), {}
     ):  # noise is listed without its seed
-        assert TARGETS[target](params, motors) != plain or part_of.get(name, name) in listed, label
+        assert TARGETS[target](params, motors) != plain or PART_OF_MOTORS.get(name, name) in listed, label
+
+
+@pytest.mark.parametrize("line", [{}, {"saturation_effort": 9.0, "no_load_speed": 5.0, "lag": 0.01}], ids=["pid", "dc"])
+def test_every_field_is_in_an_mjcf_or_a_difference(line, tmp_path):
+    pytest.importorskip("mujoco")
+    from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+
+    hinge, part_of = Robot.load(write(tmp_path, one_joint())), PART_OF | PART_OF_MOTORS
+
+    def exported(params, motors):
+        return to_mjcf(hinge, params, DT, actuators=motors, inertia=[1.0])
+
+    params, motors = bp.make_params(3, **FULL).for_joints([1]), bp.make_actuators(1, **line) if line else None
+    full = bp.make_actuators(1, **MOTORS)._replace(seed=None, max_delay=None)
+    tried = [(name, (params, motors), (other, motors)) for _, name, other in changes(params, CHOICES)]
+    tried += [(name, (params, full), (params, other)) for _, name, other in changes(full, {})]
+    for name, base, other in tried:
+        plain = exported(*base)
+        listed = {each.partition(":")[0] for each in plain.differences}
+        assert outcome(exported, *other) != plain or {LABELS.get(name, name), part_of.get(name)} & listed, name
 
 
 def delivered(actuators):
