@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Bool, Float32, Float64
 from batchpid.arrays.display import html_table, span
+from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
 from batchpid.sim.command import POSE_UNITS, CommandSpec, joint_command
@@ -220,6 +221,11 @@ class RunInfo:
         return f"RunInfo({self.robot}, {len(self.joint_names)} joints{control})"
 
 
+OWN_OF_PARTS = {"params", "actuators", "start", "seed", "versions", "begun", "draws", "episodes"}
+OWN_OF_PARTS |= {"complete", "faults", "redraws"}
+"""Fields of :class:`RunInfo` in which parts of a run may differ: state and origin at their start, and events."""
+
+
 @dataclass(frozen=True, eq=False)
 class Rollout:
     """Record of a run. Row k is the state at the end of tick k, at ``time[k]``.
@@ -268,14 +274,27 @@ class Rollout:
 
     @staticmethod
     def join(parts: Sequence[Rollout]) -> Rollout:
-        """Return successive rollouts of the same envs as one, with the info of the first and the faults of the last."""
+        """Return successive rollouts of one run as one.
+
+        The info is the first part's, with the faults of the last and the redraws of all. It is complete if all are.
+
+        Raises InvalidArgumentError if ``parts`` are empty, or differ in the robot, an option, the tick or the
+        number of envs.
+        """
+        if not parts:
+            raise InvalidArgumentError("parts", "are empty", remedy="give one rollout or more")
+        first = parts[0]
+        for part in parts[1:]:
+            here, there = ({"tick": each.tick, "num_envs": each.num_envs, **vars(each.info)} for each in (first, part))
+            odd = [name for name in here if name not in OWN_OF_PARTS and not _is_equal(here[name], there[name])]
+            if odd:
+                raise InvalidArgumentError("parts", f"differ in {', '.join(odd)}", remedy="join parts of one run")
         seen = Observation.join([part.observation for part in parts])
         time, setpoint = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "setpoint"))
-        info = parts[0].info
         redraws = tuple(dict.fromkeys(each for part in parts for each in part.info.redraws))
         complete = all(part.info.complete for part in parts)
-        info = replace(info, faults=parts[-1].info.faults, redraws=redraws, complete=complete)
-        return Rollout(time, setpoint, seen, parts[0].tick, info)
+        info = replace(first.info, faults=parts[-1].info.faults, redraws=redraws, complete=complete)
+        return Rollout(time, setpoint, seen, first.tick, info)
 
     def __repr__(self) -> str:
         ticks, envs, dof = self.qpos.shape
@@ -311,6 +330,10 @@ class Rollout:
         ``options`` are arguments of :func:`batchpid.sim.plots.step_responses`: joints, band, mark, title.
         """
         return _load_plot[0]()(self, **options)
+
+
+def _is_equal(first: Any, second: Any) -> bool:
+    return first is second or bool(np.array_equal(first, second) if isinstance(first, np.ndarray) else first == second)
 
 
 def _failed_envs(ok: Bool) -> str:

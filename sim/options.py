@@ -25,6 +25,7 @@ from batchpid.checks.keywords import check_keywords
 from batchpid.checks.validate import choice, flag, instance, integer, joint_speeds, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
+from batchpid.law.inputs import check_drive
 from batchpid.sim.command import CommandSpec, joint_command, own_command
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.protocol import Capability, Engine, require
@@ -303,6 +304,8 @@ class RunnerOptions:
                 remedy="use control 'pid', or params with gain_units 'effort'",
             )
         check_gain_units(params)
+        if self.control == "drive":
+            check_drive(params)
         if params.num_joints != self.robot.dof:
             raise InvalidArgumentError(
                 "params",
@@ -439,7 +442,7 @@ def default_params(robot: Robot, control: ControlMode | Controller = "pid") -> b
 
     - ``"pid"``: ``robot.tuned()`` where the robot ships them, else ``robot.designed()``;
     - ``"drive"``: the drive gains of a bundled robot's settings, else the gains of ``robot.designed("effort")`` without
-      ki: a drive has no setpoint weight, so that the integral would overshoot;
+      ki, setpoint weight and filter, which a drive does not have: the integral would overshoot;
     - ``"effort"``, and a :class:`Controller`: zero gains and the robot's effort limits.
 
     Raises
@@ -452,6 +455,6 @@ def default_params(robot: Robot, control: ControlMode | Controller = "pid") -> b
     settings = robot.settings
     if control == "drive":
         if settings is None:
-            return robot.designed("effort").replace(ki=0.0)
+            return robot.designed("effort").replace(ki=0.0, setpoint_weight=None, derivative_filter_time=None)
         return robot.params(kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None)
     return robot.designed() if settings is None else robot.tuned()

@@ -64,6 +64,12 @@ def time_step(argument: str, value: Any) -> float:
     return value
 
 
+def check_time_step(argument: str, value: Any) -> None:
+    """Check a time step that is a plain number; the values of arrays are not read."""
+    if isinstance(value, int | float | np.number):
+        time_step(argument, value)
+
+
 def choice(argument: str, value: Any, known: Collection[S]) -> S:
     """Return ``value`` if it is one of ``known``."""
     chosen: S = value

@@ -28,11 +28,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64
-from batchpid.checks.validate import at_least, broadcast, number, positive, read_array
+from batchpid.checks.validate import at_least, broadcast, positive, read_array, time_step
 from batchpid.errors import InvalidArgumentError
-
-LONGEST_STEP = 1e6
-"""Longest time step [s]; the square of a longer one could overflow."""
 
 
 class StabilityBound(NamedTuple):
@@ -82,7 +79,7 @@ def stability_bound(
     Raises
     ------
     InvalidArgumentError
-        A shape that does not fit, a mass matrix that is not positive definite, or a dt above LONGEST_STEP.
+        A shape that does not fit, a mass matrix that is not positive definite, or a dt above 1 s.
     """
     m, p, c, tau, b = _columns(mass_matrix, dt, kp=kp, kd=kd, filter_time=filter_time, damping=damping)
     passed = dt / (dt + 2 * tau)
@@ -172,7 +169,7 @@ def _one_step(mass_matrix: ArrayLike, dt: float, *gains: ArrayLike) -> Float64:
 
 def _columns(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> tuple[Float64, ...]:
     """Return the mass matrix and the columns as (..., joints, joints) and (..., joints), checked."""
-    positive("dt", number("dt", dt, 0.0, LONGEST_STEP, "s"), "s")
+    time_step("dt", dt)
     m = read_array("mass_matrix", mass_matrix).astype(np.float64)
     if m.ndim < 2 or m.shape[-1] != m.shape[-2]:
         remedy = "pass (joints, joints), or a stack of such"

@@ -46,6 +46,9 @@ class Coefficients(NamedTuple):
     integration: Any
     weight_origin: Any
     non_finite: Any
+    measurement_rate: Any
+    gain_units: Any
+    """Unit of gains that :mod:`batchpid.law.computed_torque` turns into efforts; the law alone refuses them."""
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")

@@ -43,6 +43,7 @@ from batchpid.law.state import PIDState, Terms
 def per_inertia(k: Coefficients, inertia: Any) -> Coefficients:
     """Return the coefficients ``k`` of an acceleration law times ``inertia`` (envs, joints), for an effort law."""
     return k._replace(
+        gain_units=None,
         kp=k.kp * inertia,
         ki_dt=None if k.ki_dt is None else k.ki_dt * inertia,
         kd=None if k.kd is None else k.kd * inertia,
@@ -130,7 +131,7 @@ def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matri
 
 
 def _unlimited(k: Coefficients) -> Coefficients:
-    return k._replace(effort_min=None, effort_max=None, effort_step=None)
+    return k._replace(effort_min=None, effort_max=None, effort_step=None, gain_units=None)
 
 
 def _to_effort(

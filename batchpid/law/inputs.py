@@ -9,11 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.choices import HoldEffort
+from batchpid.arrays.choices import CHOICES, HoldEffort
 from batchpid.checks.validate import instance, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState
+
+DRIVE_LACKS = {
+    "effort_rate_limit": None,
+    "derivative_filter_time": None,
+    "setpoint_weight": None,
+    "setpoint_weight_derivative": None,
+    "deadband": None,
+    "non_finite": "propagate",
+}
+"""Options that change P, D or the effort in a way that no target of a drive can, and their values for off."""
 
 
 def checked_inputs(params: PIDParams, state: PIDState, measurement: Any, **inputs: Any) -> list[Any]:
@@ -32,19 +42,33 @@ def checked_inputs(params: PIDParams, state: PIDState, measurement: Any, **input
     return list(arrays.values())
 
 
-def check_alone(params: PIDParams, measurement_rate: Any) -> None:
-    """Raise InvalidArgumentError for params that ask for more than the law itself is given."""
-    if params.gain_units is not None:
+def check_alone(law: Any, measurement_rate: Any) -> None:
+    """Raise InvalidArgumentError if params or coefficients need a mass matrix, or a measured rate that is not given."""
+    if law.gain_units is not None:
+        unit = next(name for name, each in CHOICES["gain_units"].items() if type(each) is type(law.gain_units))
         raise InvalidArgumentError(
             "params.gain_units",
-            "give accelerations or ask for inertias, which the law does not know",
-            remedy="take gains of efforts, as robot.designed('effort'); a Runner turns these gains into efforts",
+            "are accelerations: without the robot's mass matrix the law cannot turn them into efforts",
+            value=unit,
+            remedy="use gains in efforts, such as robot.designed('effort'), or a batchpid.sim.Runner",
         )
-    if params.measurement_rate is not None and params.kd is not None and measurement_rate is None:
+    if law.measurement_rate is not None and law.kd is not None and measurement_rate is None:
         raise InvalidArgumentError(
             "measurement_rate",
-            "is missing, and these params differentiate the measured rate",
-            remedy="give it, or params with measurement_rate='difference'",
+            "is missing: the params have measurement_rate='measured'",
+            remedy="pass the measured velocity, or use params.replace(measurement_rate='difference')",
+        )
+
+
+def check_drive(params: PIDParams) -> None:
+    """Raise InvalidArgumentError for options of the law that a drive of stiffness kp and damping kd does not have."""
+    lacking = {name: off for name, off in DRIVE_LACKS.items() if getattr(params, name) is not None}
+    if lacking:
+        others = ", ".join(f"{name}={off!r}" for name, off in lacking.items())
+        raise InvalidArgumentError(
+            f"params.{next(iter(lacking))}",
+            "is not available in a drive, whose effort is kp (target - y) - kd dy/dt within the effort limits",
+            remedy=f"use params.replace({others}), or the law itself, as control 'pid' does",
         )
 
 
@@ -104,6 +128,7 @@ def checked_dt(dt: Any, dtype: Any) -> Any:
     if isinstance(dt, np.ndarray) and dt.ndim:
         if dt.dtype.kind not in "iuf" or not ((dt > 0) & (dt < np.inf)).all():
             raise InvalidArgumentError("dt", "must be positive and finite", value=dt, remedy="use numbers > 0 (s)")
+        time_step("dt", float(dt.max(initial=0)))
         return dt.astype(dtype, copy=False)
     if isinstance(dt, np.ndarray | np.generic):
         dt = dt.item()

@@ -25,9 +25,9 @@ from __future__ import annotations
 from typing import Any
 
 from batchpid.arrays.choices import Everywhere, HoldEffort
-from batchpid.arrays.elementwise import clip, flush, namespace, replace_envs, wrap
+from batchpid.arrays.elementwise import clip, flush, namespace, nearest_turn, replace_envs, wrap
 from batchpid.law.coefficients import Coefficients, discretise
-from batchpid.law.inputs import check_alone, checked_inputs, checked_mask, checked_state, needs
+from batchpid.law.inputs import check_alone, check_drive, checked_inputs, checked_mask, checked_state, needs
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
 
@@ -111,7 +111,6 @@ def _checked(
 ) -> tuple[PIDState, Any, Any, list[Any]]:
     """Check the arguments of a step; return them as arrays, JAX arrays unchanged."""
     y, r, *rest = checked_inputs(params, state, measurement, setpoint=setpoint, **inputs)
-    check_alone(params, inputs.get("measurement_rate"))
     return checked_state(state, needs(params)), r, y, rest
 
 
@@ -124,7 +123,11 @@ def advance(
     setpoint_rate: Any = None,
     feedforward: Any = None,
 ) -> tuple[PIDState, Any]:
-    """Advance the law with given coefficients, for loops with constant params; otherwise as :func:`step`."""
+    """Advance the law with given coefficients, for loops with constant params; otherwise as :func:`step`.
+
+    Raises InvalidArgumentError if the coefficients are of gain_units other than "effort", or need a measured rate that
+    is not given. Gains per inertia: :mod:`batchpid.law.computed_torque`.
+    """
     new, effort, *_ = _advance(k, state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
     return new, effort
 
@@ -156,6 +159,7 @@ def _advance(
     feedforward: Any = None,
 ) -> tuple[PIDState, Any, Any, tuple[Any, ...], Any]:
     """Return state, effort, unsaturated effort, its four parts, and the mask of finite inputs; None is off."""
+    check_alone(k, measurement_rate)
     xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
     r, y, r_rate, y_rate, ff = setpoint, measurement, setpoint_rate, measurement_rate, feedforward
     finite = None
@@ -277,9 +281,13 @@ def drive_target(
     Arrays and the optional ``inputs`` measurement_rate, setpoint_rate and feedforward (an effort added to
     the drive's, inside the same limit) are as in :func:`batchpid.step`. The idea is from the SAPIEN authors' answer
     in haosulab/SAPIEN#178.
+
+    Raises InvalidArgumentError as :func:`batchpid.step`, and for options that a drive does not have: setpoint weights,
+    a filter of the derivative, a dead zone, a limit of the effort's rate, and a policy for non-finite inputs.
     """
-    check_alone(params, inputs.get("measurement_rate"))
-    state, terms = advance_terms(discretise(params, dt), state, setpoint, measurement, **inputs)
+    check_drive(params)
+    k = discretise(params, dt)
+    state, terms = advance_terms(k, state, setpoint, measurement, **inputs)
     xp = namespace(*params, terms.i, setpoint)
-    driven = params.kp > 0
-    return state, setpoint + xp.where(driven, terms.i, 0) / xp.where(driven, params.kp, 1)
+    driven, target = params.kp > 0, nearest_turn(setpoint, measurement, k.turns, xp)
+    return state, target + xp.where(driven, terms.i, 0) / xp.where(driven, params.kp, 1)

@@ -29,6 +29,7 @@ import numpy as np
 
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, clip, namespace, wrap
+from batchpid.checks.validate import check_time_step
 from batchpid.motors import delay
 from batchpid.motors import sensor_noise as noise
 from batchpid.motors.actuator_state import ActuatorState
@@ -93,8 +94,9 @@ def init(
     Raises
     ------
     InvalidArgumentError
-        ``max_delay`` is traced and ``samples`` is missing, or it needs too many samples.
+        dt is not positive, or above 1 s; ``max_delay`` is traced and ``samples`` is missing, or it needs too many.
     """
+    check_time_step("dt", dt)
     xp = namespace(*actuators, qpos)
     zeros = xp.zeros_like(qpos)
     position, velocity = zeros + qpos, zeros if qvel is None else zeros + qvel
@@ -123,8 +125,10 @@ def init(
 def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: int | None = None) -> Coefficients:
     """Return the coefficients at ``dt`` [s], for :func:`advance_effort` and :func:`advance_measurement`.
 
-    With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches faster.
+    With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches faster. Raises
+    InvalidArgumentError if dt is a number that is not positive, or above 1 s.
     """
+    check_time_step("dt", dt)
     a, xp = actuators, namespace(*actuators)
     position = velocity = None
     if a.sensor_delay is not None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.checks.validate import integer
+from batchpid.checks.validate import integer, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.actuators import Actuators, make_actuators
 
@@ -38,6 +38,7 @@ def delayed_pd(
     is ``min_delay`` steps of ``timestep`` [s], with histories for ``max_delay``. The steps to add to it are drawn by a
     runner's randomization of ``command_delay`` (docs/randomization.md).
     """
+    time_step("timestep", timestep)
     low, high = integer("min_delay", min_delay, 0, 10**6), integer("max_delay", max_delay, min_delay, 10**6)
     delay: dict[str, Any] = {"command_delay": low * timestep, "max_delay": high * timestep}
     return make_actuators(joints, **delay, effort_limit=effort_limit, **options)
@@ -96,7 +97,8 @@ def newton(
     """
     if delay_steps is not None and timestep is None:
         raise InvalidArgumentError("timestep", "is missing", remedy="give the time step of the delay_steps [s]")
-    delay = None if timestep is None or delay_steps is None else np.multiply(delay_steps, timestep)
+    step = None if timestep is None else time_step("timestep", timestep)
+    delay = None if step is None or delay_steps is None else np.multiply(delay_steps, step)
     limit = np.minimum(max_effort, max_motor_effort)
     line = {"saturation_effort": saturation_effort, "no_load_speed": velocity_limit, "effort_limit": limit}
     table = None if lookup_positions is None else (lookup_positions, lookup_efforts)

@@ -36,6 +36,7 @@ from typing import Any, NamedTuple
 
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import clip, namespace
+from batchpid.checks.validate import check_time_step
 
 SHARE = 0.7
 """Share of the deadbeat gain K that is used."""
@@ -84,6 +85,7 @@ def init(
     mass_matrix, dt, damping, stiffness
         As in :func:`refresh`.
     """
+    check_time_step("dt", dt)
     if friction.coulomb is None:
         return FrictionState()
     return refresh(friction, started(velocity, load), mass_matrix, dt, damping, stiffness)
@@ -103,6 +105,7 @@ def refresh(
     ``damping`` and ``stiffness`` (envs, joints) or (1, joints) belong to a drive that the simulator integrates
     implicitly [N m s/rad, N m/rad].
     """
+    check_time_step("dt", dt)
     if friction.coulomb is None:
         return state
     xp = namespace(mass_matrix, *friction)

@@ -26,6 +26,7 @@ from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, clip, namespace, wrap
 from batchpid.arrays.field_tables import Field, check_leaves
 from batchpid.arrays.leaves import LeafBuilder
+from batchpid.checks.validate import check_time_step
 
 FIELDS = {
     "lower": Field("rad or m", -math.inf, low=-math.inf),
@@ -118,7 +119,9 @@ def advance(guard: Guard, state: GuardState, setpoint: Any, dt: float) -> tuple[
     """Advance the guard by ``dt`` [s]; return the state, with the guarded ``setpoint``, and a mask of the changes.
 
     ``setpoint`` (envs, joints) [rad or m] is the requested setpoint; it is not modified. The mask has the same shape.
+    Raises InvalidArgumentError if dt is a number that is not positive, or above 1 s.
     """
+    check_time_step("dt", dt)
     xp = namespace(*guard, setpoint, *state)
     target = clip(setpoint, guard.lower, guard.upper, xp)
     error = wrap(target - state.setpoint, guard.turns, xp)

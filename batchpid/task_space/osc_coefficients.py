@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import namespace
-from batchpid.checks.validate import time_step
+from batchpid.checks.validate import check_time_step
 from batchpid.task_space.osc_params import OSCParams
 
 
@@ -68,10 +68,9 @@ def discretise(params: OSCParams, dt: Any) -> OSCCoefficients:
     Raises
     ------
     InvalidArgumentError
-        dt is a Python number that is not positive and finite.
+        dt is a number that is not positive, or above 1 s.
     """
-    if isinstance(dt, int | float):
-        time_step("dt", dt)
+    check_time_step("dt", dt)
     xp = namespace(*params, dt)
     kp, kd, ki = params.stiffness, params.damping, params.integral_gain
     posture_kp, posture_kd = params.posture_stiffness, params.posture_damping

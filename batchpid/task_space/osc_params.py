@@ -186,6 +186,9 @@ def make_osc_params(
     """
     check_masses(instance("tree", tree, KinematicTree, "pass robot.kinematic_tree()"))
     joints = tree.joint_names
+    _check_unused("damping_ratio", damping_ratio, 1.0, damping is not None, "damping is given, too")
+    _check_unused("integral_limit", integral_limit, math.inf, integral_gain is None, "integral_gain is not given")
+    _check_unused("limit_stiffness", limit_stiffness, 400.0, limit_margin is None, "limit_margin is not given")
     kp = _rows("stiffness", stiffness, AXES)
     if choice("decoupling", decoupling, TASK_CHOICES["decoupling"]) == "none" and damping is None:
         problem = "is missing: with decoupling 'none' no mass relates it to the stiffness"
@@ -254,6 +257,12 @@ def _rows(name: str, value: ArrayLike, columns: tuple[str, ...]) -> NDArray[np.f
     FIELDS[name].checked(name, rows, columns)
     rows.setflags(write=False)
     return rows
+
+
+def _check_unused(name: str, value: ArrayLike, default: float, unused: bool, reason: str) -> None:
+    """Raise InvalidArgumentError for an option that is given, and has no effect."""
+    if unused and (read_array(name, value) != default).any():
+        raise InvalidArgumentError(name, f"has no effect: {reason}", remedy="leave it out, or correct the other option")
 
 
 def _mask(name: str, value: ArrayLike | None) -> NDArray[np.float64] | None:

@@ -40,6 +40,7 @@ class Law:
         params = drive.params
         assert params is not None
         self._law = PIDLaw.of(params)._replace(measures_rate=drive.measured_rate)
+        params = params._replace(measurement_rate=None)  # the log's loop decides, not the params
         self._k = bp.discretise(params, drive.timestep * drive.substeps, len(qpos))
         self._state = bp.init(params, qpos)
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.checks.validate import at_least, broadcast, choice, integer
 from batchpid.errors import InvalidArgumentError
+from batchpid.law.inputs import DRIVE_LACKS
 from batchpid.sim.options import RunnerOptions, default_params
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import ControlMode
@@ -36,9 +37,9 @@ _MAX_EFFORT = 1e3
 class GroupGains:
     """Gains of one group. ``sets`` are params of one row by name; the group starts with the first."""
 
-    def __init__(self, robot: Robot, sets: dict[str, bp.PIDParams]) -> None:
-        self._robot = robot
-        self.sets = {name: _adjustable(params) for name, params in sets.items()}
+    def __init__(self, robot: Robot, sets: dict[str, bp.PIDParams], control: ControlMode = "pid") -> None:
+        self._robot, self._lacks = robot, frozenset(DRIVE_LACKS if control == "drive" else ())
+        self.sets = {name: self._adjustable(params) for name, params in sets.items()}
         """Params by name, with every option on that a slider sets."""
         self.params = next(iter(self.sets.values()))
         """Params in force."""
@@ -53,14 +54,16 @@ class GroupGains:
         self.params = self.sets[choice("name", name, self.sets)]
 
     def set(self, gain: str, joint: int, value: ArrayLike) -> None:
-        """Set one of :data:`GAINS` of a joint, a number >= 0."""
+        """Set one of :data:`GAINS` of a joint, a number >= 0; a drive has no filter and no setpoint weight."""
+        if gain in self._lacks:
+            raise InvalidArgumentError("gain", "is not available in a drive", value=gain, remedy="set kp, ki or kd")
         values, joint = self.values, integer("joint", joint, 0, self._robot.dof - 1)
         value = at_least(gain, broadcast(gain, value, (), "give one number"), 0.0, infinite=True)
         if choice("gain", gain, GAINS) == "effort_limit":
             values["effort_min"][joint], values["effort_max"][joint] = -value, value
         else:
             values[gain][joint] = np.clip(value, *_ends(self.params, gain))
-        self.params = self.params.replace(**values)
+        self.params = self._replaced(self.params, values)
 
     def slider_range(self, gain: str, joint: int) -> tuple[float, float]:
         """Return a gain of a joint, and the upper end of the range worth trying."""
@@ -81,6 +84,15 @@ class GroupGains:
         values = self.values
         return self.params.replace(**{end: disturbance + values[end] for end in ("effort_min", "effort_max")})
 
+    def _adjustable(self, params: bp.PIDParams) -> bp.PIDParams:
+        """Return ``params`` with every option on that a slider sets."""
+        weightless = params.setpoint_weight is None  # then the origin has no effect until the weight is changed
+        params = self._replaced(params, _values(params))
+        return params.replace(weight_origin="start") if weightless else params
+
+    def _replaced(self, params: bp.PIDParams, values: dict[str, Float64]) -> bp.PIDParams:
+        return params.replace(**{name: value for name, value in values.items() if name not in self._lacks})
+
 
 def offered_gains(robot: Robot, control: ControlMode, params: bp.PIDParams | None) -> dict[str, bp.PIDParams]:
     """Return the gain sets that the page offers for a control, by name; the first is in force at the start.
@@ -99,12 +111,6 @@ def offered_gains(robot: Robot, control: ControlMode, params: bp.PIDParams | Non
         with suppress(InvalidArgumentError):  # not every robot has them
             sets[name] = make()
     return sets or {"designed": default_params(robot, control)}
-
-
-def _adjustable(params: bp.PIDParams) -> bp.PIDParams:
-    """Return ``params`` with every option on that a slider sets."""
-    weightless = params.setpoint_weight is None  # then the origin has no effect until the weight is changed
-    return params.replace(**_values(params), **{"weight_origin": "start"} if weightless else {})
 
 
 def _values(params: bp.PIDParams) -> dict[str, Float64]:

@@ -98,7 +98,7 @@ class LiveSimulation(SingleOwner):
         self.gains = {}
         """Gains of each group, by control; none of control "osc"."""
         if osc is None:
-            self.gains = {each: GroupGains(robot, offered_gains(robot, each, params)) for each in self.groups}
+            self.gains = {each: GroupGains(robot, offered_gains(robot, each, params), each) for each in self.groups}
         self.command = None if osc is None else osc.command
         """Entries of a setpoint, if these are not joints: a pose of the tool."""
         self.neutral = robot.start if osc is None else np.array(osc.command.neutral)

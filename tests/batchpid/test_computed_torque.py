@@ -41,7 +41,7 @@ def test_the_effort_is_within_limits_and_keeps_the_direction_of_the_acceleration
     state = bp.init(p, y)
     new, terms = advance_terms_with_mass_matrix(k, state, r, y, matrix, feedforward=passive)
     effort = terms.effort
-    free = k._replace(effort_min=None, effort_max=None)
+    free = k._replace(effort_min=None, effort_max=None, gain_units=None)
     _, acceleration = bp.advance(free, state, r, y)
     np.testing.assert_allclose(terms.unsaturated, np.einsum("eij,ej->ei", matrix, acceleration) + passive)
     np.testing.assert_allclose(terms.p + terms.i + terms.d + terms.feedforward, terms.unsaturated)

@@ -58,7 +58,9 @@ def test_it_solves_the_law_at_the_end_of_the_step(gains, dt, b, c, order, measur
         expected = solved(excess)
         known = {"measurement_rate": np.array([[v]])} if measures else {}
         known |= {"setpoint_rate": np.array([[slope]])} if rated else {}
-        state, a = bp.advance(bp.discretise(p, dt), state, np.array([[r]]), np.array([[y]]), **known)
+        state, a = bp.advance(
+            bp.discretise(p, dt)._replace(gain_units=None), state, np.array([[r]]), np.array([[y]]), **known
+        )
         scale = abs(expected) + (abs(r) + abs(y) + dt * abs(v)) * (p_ + i_ * dt) + (abs(rate) + abs(v)) * d_
         assert abs(a.item() - expected) <= 1e-7 * (scale + abs(integral) + 1)
         v += dt * a.item()
@@ -73,7 +75,11 @@ def test_each_continuous_pole_s_becomes_1_over_1_minus_s_dt(kp, ki, kd, dt, orde
     for y, v, i in np.eye(3):
         state = bp.init(p, np.zeros((1, 1)))._replace(integral=np.array([[i]]))
         new, a = bp.advance(
-            bp.discretise(p, dt), state, np.zeros((1, 1)), np.array([[y]]), measurement_rate=np.array([[v]])
+            bp.discretise(p, dt)._replace(gain_units=None),
+            state,
+            np.zeros((1, 1)),
+            np.array([[y]]),
+            measurement_rate=np.array([[v]]),
         )
         speed = v + dt * a.item()
         columns.append([y + dt * speed, speed, new.integral.item()])

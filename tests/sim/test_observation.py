@@ -1,10 +1,14 @@
 """Parts of a rollout have the same rows as the whole."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from identical import assert_identical
 
-from batchpid.sim import Rollout, Runner
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim import Rollout, RunInfo, Runner
+from batchpid.sim.observation import Redraw
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +51,58 @@ def test_representations_are_one_line(rollout):
 def test_unknown_fields_are_named(rollout):
     with pytest.raises(AttributeError, match="'speed'; it has time, setpoint, tick, info, qpos"):
         _ = rollout.speed
+
+
+GATHERED = {"faults", "redraws", "complete"}
+"""Fields of RunInfo that all parts of a run contribute to."""
+OF_THE_START = {"params", "actuators", "start", "seed", "versions", "begun", "draws", "episodes"}
+"""Fields that the joined rollout has from its first part. All others are the same in all parts."""
+
+
+def another(value):
+    """Return a value of the same kind that is different."""
+    if isinstance(value, bool) or value is None:
+        return not value
+    if isinstance(value, np.ndarray):
+        return value + 1
+    if isinstance(value, dict):
+        return value | {"another": "1"}
+    if isinstance(value, tuple) and hasattr(value, "_replace"):
+        return value._replace(**{value._fields[0]: another(value[0])})
+    if isinstance(value, tuple):
+        return (*value, "another")
+    return f"{value}+" if isinstance(value, str) else value + 1
+
+
+@pytest.mark.parametrize("name", [each.name for each in dataclasses.fields(RunInfo)])
+def test_every_field_of_a_rollout_is_joined_or_has_to_be_the_same(name, rollout):
+    """The start, its draws and the origin are the first part's."""
+    parts = [rollout.for_ticks(slice(0, 2)), rollout.for_ticks(slice(2, None))]
+    changed = dataclasses.replace(parts[1].info, **{name: another(getattr(parts[1].info, name))})
+    parts[1] = dataclasses.replace(parts[1], info=changed)
+    if name not in GATHERED | OF_THE_START:
+        with pytest.raises(InvalidArgumentError, match=f"parts: .*{name}"):
+            Rollout.join(parts)
+        return
+    joined = getattr(Rollout.join(parts).info, name)
+    kept = getattr(changed if name in GATHERED else parts[0].info, name)
+    assert joined is kept or np.array_equal(joined, kept)
+
+
+def test_redraws_and_faults_of_all_parts_are_joined(rollout):
+    redraws = [Redraw(0.1, 0, 0, 1), Redraw(0.2, 1, 1, 1), Redraw(0.3, 2, 2, 1)]
+    known = [(redraws[:1], ("a",)), (redraws[:2], ("a",)), (redraws[2:], ("a", "b"))]
+    parts = [
+        dataclasses.replace(rollout, info=dataclasses.replace(rollout.info, redraws=tuple(seen), faults=faults))
+        for seen, faults in known
+    ]
+    info = Rollout.join(parts).info
+    assert (info.redraws, info.faults, info.complete) == (tuple(redraws), ("a", "b"), True)
+
+
+def test_parts_with_other_ticks_or_envs_are_refused(rollout):
+    for other in (dataclasses.replace(rollout, tick=2 * rollout.tick), rollout.for_envs([0])):
+        with pytest.raises(InvalidArgumentError, match="parts"):
+            Rollout.join([rollout, other])
+    with pytest.raises(InvalidArgumentError, match=r"parts: .*empty"):
+        Rollout.join([])

@@ -64,6 +64,19 @@ class SwingEnv(RobotEnv):
     task = Swing
 
 
+class Jaco(Swing):
+    def __init__(self, num_envs, robot="jaco2", **options):
+        super().__init__(num_envs, robot, **options)
+
+
+def test_one_robot_of_a_task_is_by_default_the_tasks_own(hinge):
+    single = type("JacoEnv", (RobotEnv,), {"task": Jaco})
+    for given, name in (((), "jaco2"), (("jaco2",), "jaco2"), ((hinge,), hinge.name)):
+        env = single(*given)
+        assert env.runner.robot.name == name
+        env.close()
+
+
 @pytest.fixture(scope="module")
 def hinge(tmp_path_factory):
     return Robot.load(write(tmp_path_factory.mktemp("hinge"), one_joint()))

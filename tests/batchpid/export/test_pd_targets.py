@@ -199,6 +199,7 @@ def test_maniskill_has_lists_in_the_order_of_the_joints():
 
 
 @given(random_params(), st.sampled_from(["implicit", "ideal_pd", "maniskill"]))
+@example(bp.make_params(3, 0.0, 0.0, integral_min=1e-10), "implicit")
 @settings(max_examples=30, deadline=None)
 def test_nothing_is_lost_that_is_not_listed(params, target):
     inertia = np.array([2.0, 1.0, 0.5])
@@ -221,9 +222,10 @@ def test_nothing_is_lost_that_is_not_listed(params, target):
     if not listed & {"effort_limit"} or target == "implicit":
         low, high = (np.array(values(params, name)) for name in ("effort_min", "effort_max"))
         np.testing.assert_allclose(limit, np.clip(np.minimum(-low, high), 0, None), rtol=1e-12)
-    damps = params.kd is not None
+    damps, integral_ends = params.kd is not None, [values(params, f"integral_{end}") for end in ("min", "max")]
     needed = {
         "ki": any(values(params, "ki")),
+        "integral_limit": params.ki is not None and any(np.clip(0.0, *integral_ends)),
         "effort_rate_limit": params.effort_rate_limit is not None,
         "setpoint_weight": params.setpoint_weight is not None,
         "setpoint_weight_derivative": damps and params.setpoint_weight_derivative is not None,

@@ -232,6 +232,9 @@ def test_options_are_checked():
         ({"integral_gain": 1.0, "integral_limit": np.nan}, "integral_limit"),
         ({"limit_margin": -0.1}, "limit_margin"),
         ({"discretization": "tustin"}, "discretization: unknown option"),
+        ({"damping": 9.0, "damping_ratio": 0.7}, "damping_ratio: has no effect: damping is given"),
+        ({"integral_limit": 1.0}, "integral_limit: has no effect: integral_gain is not given"),
+        ({"limit_stiffness": [10.0, 20.0]}, "limit_stiffness: has no effect: limit_margin is not given"),
         ({"discretization": "implicit", "decoupling": "none", "damping": 1.0}, "discretization: 'implicit' needs"),
     ):
         with pytest.raises(InvalidArgumentError, match=message):

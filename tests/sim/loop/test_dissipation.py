@@ -209,7 +209,8 @@ def test_known_friction_is_compensated_without_chatter(control, physics, tmp_pat
 def test_light_joints_neither_chatter_nor_diverge(control, tmp_path):
     robot = wheel(tmp_path, 1e-5, friction=0.1, damping=1e-4)
     gains = {} if control == "effort" else {"kp": 0.02, "ki": 0.0, "kd": 1e-3}
-    params = robot.params(**({"kp": 0.0} | gains), derivative_filter_time=0.002)
+    filters = {} if control == "drive" else {"derivative_filter_time": 0.002}
+    params = robot.params(**({"kp": 0.0} | gains | filters))
     with Runner(robot, 1, params=params, control=control, substeps=1, workers=0) as runner:
         runner.reset(np.zeros(1), qvel=np.full(1, 20.0))
         rollout = runner.rollout(np.zeros((800, 1, 1)) + (0.0 if control == "effort" else 0.3))

@@ -188,3 +188,11 @@ def test_bad_arguments_are_named(panda):
     ):
         with pytest.raises(InvalidArgumentError, match=named):
             LiveSimulation(panda, workers=0, **options)
+
+
+def test_a_drive_has_no_sliders_of_options_that_it_lacks(jaco2):
+    live = LiveSimulation(jaco2, 1, controls=("drive",), workers=0, physics="fast")
+    for gain in ("setpoint_weight", "derivative_filter_time"):
+        with pytest.raises(InvalidArgumentError, match=gain):
+            live.gains["drive"].set(gain, 0, 0.5)
+    live.close()

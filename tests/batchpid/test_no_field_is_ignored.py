@@ -1,0 +1,274 @@
+"""Every field of params, motors, guards and OSC params changes the result, is refused, or is a listed difference."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+
+import numpy as np
+import pytest
+from tiny_urdf import one_joint, write
+from trees import planar
+
+import batchpid as bp
+import batchpid.task_space as ts
+from batchpid.arrays.choices import CHOICES
+from batchpid.errors import InvalidArgumentError
+from batchpid.export import to_c, to_isaac_lab, to_maniskill, to_newton, to_ros2_control
+from batchpid.law.computed_torque import advance_with_mass_matrix, per_inertia
+from batchpid.law.inputs import DRIVE_LACKS
+from batchpid.motors import guard as guards
+from batchpid.motors.actuator_fields import FIELDS
+from batchpid.sim import Robot
+
+DT, JOINTS = 0.01, ["a", "b", "c"]
+MIXED = ["back_calculation", "conditional", "none"]
+LIMITS = {"effort_min": [-30.0, -3.0, -2.0], "effort_max": [29.0, 3.5, 2.5], "integral_min": [-20.0, -1.5, -1.5]}
+LIMITS["integral_max"] = [18.0, 1.2, 1.2]
+DRIVE = {"kp": [9.0, 5.0, 3.0], "ki": [9.0, 9.0, 5.0], "kd": [2.0, 0.6, 0.3], "anti_windup": MIXED, **LIMITS}
+DRIVE |= {"tracking_time": 0.05, "continuous": [True, False, True]}
+FULL = DRIVE | {
+    "effort_rate_limit": [300.0, 100.0, 60.0],
+    "derivative_filter_time": 0.02,
+    "setpoint_weight": 0.7,
+    "setpoint_weight_derivative": 0.2,
+    "deadband": 0.1,
+}
+rng = np.random.default_rng(0)
+SETPOINT = 4 * np.sin(np.arange(40)[:, None, None] * DT * np.array([9.0, 15.0, 21.0]) + rng.normal(size=(2, 3)))
+MEASURED = -0.5 * SETPOINT + 0.1 * rng.normal(size=SETPOINT.shape)
+SETPOINT[20, 1, 0] = np.nan
+TURNED = MEASURED + 2 * np.pi * (np.arange(40)[:, None, None] > 7) * [1, 0, 0]
+
+
+def changes(params, choices):
+    """Yield a label, the field and the params for every field with another value: every other name of a choice."""
+    for name, leaf in params._asdict().items():
+        for other, chosen in choices.get(name, {}).items():
+            if type(chosen) is not type(leaf):
+                yield f"{name}={other}", name, params._replace(**{name: chosen})
+        if isinstance(leaf, np.ndarray):
+            is_mask = name in ("continuous", "conditional", "axes", "force_axes")
+            yield name, name, params._replace(**{name: 1 - leaf if is_mask else (leaf * 1.25).astype(leaf.dtype)})
+
+
+def outcome(function, *arguments):
+    """Return the result as bytes, so that NaN equals itself; or the message of a refusal."""
+    try:
+        found = function(*arguments)
+    except InvalidArgumentError as error:
+        return str(error)
+    return found if isinstance(found, tuple) else np.asarray(found).tobytes()
+
+
+def stepped(step, params):
+    state, results = bp.init(params, MEASURED[0]), []
+    for r, y in zip(SETPOINT, MEASURED, strict=True):
+        state, result = step(params, state, r, y)
+        results.append(result)
+    return results
+
+
+def effort_of_terms(params, state, setpoint, measurement):
+    state, terms = bp.step_terms(params, state, setpoint, measurement, DT)
+    return state, terms.effort
+
+
+def by_controller(params):
+    pid = bp.BatchPID(params, 2, DT)
+    return [pid(r, y) for r, y in zip(SETPOINT, MEASURED, strict=True)]
+
+
+LAWS = {
+    "step": functools.partial(stepped, lambda p, s, r, y: bp.step(p, s, r, y, DT)),
+    "terms": functools.partial(stepped, effort_of_terms),
+    "advance": functools.partial(stepped, lambda p, s, r, y: bp.advance(bp.discretise(p, DT), s, r, y)),
+    "controller": by_controller,
+    "drive": functools.partial(stepped, lambda p, s, r, y: bp.drive_target(p, s, r, y, DT)),
+}
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+@pytest.mark.parametrize("law", LAWS)
+def test_every_field_of_params_changes_the_efforts_or_is_refused(law):
+    """A choice without effect on the efforts of ``step``, such as an origin of no weight, may have none elsewhere."""
+    base = bp.make_params(3, **(DRIVE if law == "drive" else FULL))
+    bases = {name: outcome(LAWS[name], base) for name in ("step", law)}
+    tried = set()
+    for label, name, params in changes(base, CHOICES):
+        if outcome(LAWS["step"], params) != bases["step"]:
+            assert outcome(LAWS[law], params) != bases[law], label
+            tried.add(name)
+    without_effect = {"first_derivative", "weight_origin"} if law == "drive" else set()
+    lacking = DRIVE_LACKS.keys() - {"non_finite"} if law == "drive" else set()
+    assert tried == set(bp.PIDParams._fields) - without_effect - lacking
+
+
+@pytest.mark.parametrize("name", DRIVE_LACKS)
+def test_a_drive_refuses_options_that_it_does_not_have(name):
+    value = "hold" if name == "non_finite" else 0.3
+    params, y = bp.make_params(1, 4.0, 1.0, 1.0, **{name: value}), np.zeros((1, 1))
+    with pytest.raises(InvalidArgumentError, match=rf"params.{name}: .*replace\({name}="):
+        bp.drive_target(params, bp.init(params, y), y, y, DT)
+
+
+def test_a_drives_target_is_next_to_the_measurement_on_continuous_joints():
+    params, y = bp.make_params(1, 4.0, 1.0, continuous=True), np.full((1, 1), -3.0)
+    _, target = bp.drive_target(params, bp.init(params, y), np.full((1, 1), 3.0), y, DT)
+    np.testing.assert_allclose(target, 3.0 - 2 * np.pi)
+
+
+@pytest.mark.parametrize("terms", [False, True])
+@pytest.mark.parametrize("units", ["inertia", "mass_matrix"])
+def test_coefficients_of_accelerations_need_the_robots_inertia(units, terms):
+    params, y = bp.make_params(2, 4.0, 1.0, 1.0, gain_units=units), np.zeros((1, 2))
+    k, state = bp.discretise(params, DT), bp.init(params, y)
+    advance = bp.advance_terms if terms else bp.advance
+    with pytest.raises(InvalidArgumentError, match=rf"gain_units.*{units}.*designed\('effort'\)"):
+        advance(k, state, y, y)
+    if units == "inertia":
+        advance(per_inertia(k, np.ones((1, 2))), state, y, y)
+    else:
+        advance_with_mass_matrix(k, state, y, y, np.eye(2)[None])
+
+
+INERTIA = [1.0, 0.5, 0.2]
+TARGETS = {
+    "C": lambda p, m: to_c(p, DT),
+    "trajectory": lambda p, m: to_ros2_control(p, JOINTS, DT, inertia=INERTIA),
+    "pid_controller": lambda p, m: to_ros2_control(p, JOINTS, DT, controller="pid_controller", inertia=INERTIA),
+    "isaac_lab": lambda p, m: to_isaac_lab(p, JOINTS, DT, actuators=m, inertia=INERTIA, model="ideal_pd"),
+    "implicit": lambda p, m: to_isaac_lab(p, JOINTS, DT, actuators=m, inertia=INERTIA, model="implicit"),
+    "maniskill": lambda p, m: to_maniskill(p, JOINTS, DT, actuators=m, inertia=INERTIA),
+    "newton": lambda p, m: to_newton(p, JOINTS, DT, actuators=m, inertia=INERTIA),
+}
+PART_OF = {name: "ki" for name in ("integral_min", "integral_max", "tracking_time", "conditional", "integration")}
+PART_OF |= {"first_derivative": "setpoint_weight_derivative", "weight_origin": "setpoint_weight"}
+"""Fields of a term or weight, which its own difference contains."""
+LABELS = {"tracking_time": "anti_windup", "conditional": "anti_windup"}
+LABELS |= {f"{of}_{end}": f"{of}_limit" for of in ("effort", "integral") for end in ("min", "max")}
+"""Options by which differences name the fields."""
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_every_field_of_params_is_exported_or_a_difference(target):
+    base = bp.make_params(3, **FULL)
+    plain = TARGETS[target](base, None)
+    listed = {each.partition(":")[0] for each in plain.differences}
+    for label, name, params in changes(base, CHOICES):
+        same = outcome(TARGETS[target], params, None) == plain
+        assert not same or {LABELS.get(name, name), PART_OF.get(name)} & listed, label
+
+
+MOTORS = dict.fromkeys(FIELDS, 0.25) | {"no_load_speed": 9.0, "position_limit": ([0.0, 1.0], [5.0, 6.0])}
+PART_OF_MOTORS = {"no_load_speed": "saturation_effort", "limit_positions": "position_limit"}
+PART_OF_MOTORS["limit_efforts"] = "position_limit"
+
+
+@pytest.mark.parametrize("target", sorted(TARGETS.keys() - {"C", "trajectory", "pid_controller"}))
+def test_every_field_of_motors_is_exported_or_a_difference(target):
+    params = bp.make_params(3, 4.0, None, 1.0, effort_limit=9.0, measurement_rate="measured")
+    base = bp.make_actuators(3, **MOTORS)
+    plain = TARGETS[target](params, base)
+    listed = {each.partition(":")[0] for each in plain.differences}
+    for label, name, motors in changes(
+        base._replace(seed=None, max_delay=None), {}
+    ):  # noise is listed without its seed
+        assert TARGETS[target](params, motors) != plain or PART_OF_MOTORS.get(name, name) in listed, label
+
+
+@pytest.mark.parametrize("line", [{}, {"saturation_effort": 9.0, "no_load_speed": 5.0, "lag": 0.01}], ids=["pid", "dc"])
+def test_every_field_is_in_an_mjcf_or_a_difference(line, tmp_path):
+    pytest.importorskip("mujoco")
+    from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+
+    hinge, part_of = Robot.load(write(tmp_path, one_joint())), PART_OF | PART_OF_MOTORS
+
+    def exported(params, motors):
+        return to_mjcf(hinge, params, DT, actuators=motors, inertia=[1.0])
+
+    params, motors = bp.make_params(3, **FULL).for_joints([1]), bp.make_actuators(1, **line) if line else None
+    full = bp.make_actuators(1, **MOTORS)._replace(seed=None, max_delay=None)
+    tried = [(name, (params, motors), (other, motors)) for _, name, other in changes(params, CHOICES)]
+    tried += [(name, (params, full), (params, other)) for _, name, other in changes(full, {})]
+    for name, base, other in tried:
+        plain = exported(*base)
+        listed = {each.partition(":")[0] for each in plain.differences}
+        assert outcome(exported, *other) != plain or {LABELS.get(name, name), part_of.get(name)} & listed, name
+
+
+def delivered(actuators):
+    state, results = bp.motors.init(actuators, MEASURED[0], DT), []
+    for effort, q in itertools.islice(zip(SETPOINT, TURNED, strict=True), 15):
+        state, y, v = bp.motors.measure(actuators, state, q, 2 * q, DT)
+        state, out = bp.motors.deliver(actuators, state, effort, q, 2 * q, DT)
+        results += [y, v, out]
+    return results
+
+
+def test_every_field_of_motors_and_sensors_changes_a_signal():
+    """Friction and armature are the simulator's; the length of the histories has no effect beyond the longest delay."""
+    own = {
+        "command_delay": 0.013,
+        "sensor_delay": 0.017,
+        "effort_limit": 0.2,
+        "continuous": [True, False, True],
+        "seed": 5,
+    }
+    base = bp.make_actuators(3, **MOTORS | own | {"position_limit": ([0.0, 1.0], [0.05, 0.4])})
+    plain, without = outcome(delivered, base), {*bp.motors.JOINT_SIDE, "max_delay"}
+    for label, name, actuators in changes(base, {}):
+        assert name in without or outcome(delivered, actuators) != plain, label
+
+
+def test_every_field_of_a_guard_changes_the_setpoint():
+    def guarded(guard):
+        state, results = guards.init(guard, MEASURED[0]), []
+        for r in SETPOINT:
+            state, _ = guards.advance(guard, state, r, DT)
+            results.append(state.setpoint)
+        return results
+
+    base = bp.make_guard(
+        3, lower=-1.0, upper=[1.2, 1.5, 0.9], rate=20.0, acceleration=300.0, continuous=[True, False, False]
+    )
+    plain = outcome(guarded, base)
+    assert [label for label, _, guard in changes(base, {}) if outcome(guarded, guard) == plain] == []
+
+
+AXES = {"axes": ("x", "rz"), "force_axes": ("y",)}
+
+
+def test_every_field_of_osc_params_changes_the_efforts_or_is_refused():
+    tree = planar((1.0, 0.8, 0.5, 0.4))
+    options = {"integral_gain": 300.0, "integral_limit": 0.2, "limit_margin": 0.5}
+    options |= {name: [axis in chosen for axis in ts.osc_params.AXES] for name, chosen in AXES.items()}
+    tree = ts.KinematicTree(
+        **{**tree_fields(tree), "lower": [-3.0, -3.0, -3.0, -np.inf], "upper": [3.0] * 3 + [np.inf]}
+    )
+    q = np.array([[2.9, -2.8, 0.7, 9.0], [0.3, 0.4, 2.8, -9.0], [0.3, 0.4, 0.8, 9.0]])
+    pose = ts.link_poses(tree, np.add(q, [[0.02], [0.3], [-0.3]]), ["tip"])[:, 0]
+    base = ts.make_osc_params(
+        tree, smallest_eigenvalue=0.5, position_error_limit=0.2, rotation_error_limit=0.1, **options
+    )
+    room = np.array([[900.0], [6.0], [5.0]]) * np.ones((3, 4))
+    base = base._replace(effort_min=-room, effort_max=0.9 * room)
+
+    def run(params):
+        state, results = ts.init(params, 0.7 * q), []
+        for at in range(4):
+            inputs = pose, q + 0.01 * at, 0.3 * q
+            wrench, twist = np.full((3, 6), 0.3), np.full((3, 6), 0.1)
+            state, effort = ts.step(params, state, *inputs, DT, tree=tree, link="tip", wrench=wrench, twist=twist)
+            results += [effort, state.integral]
+        return np.concatenate([each.ravel() for each in results])
+
+    plain, ignored = outcome(run, base), []
+    for label, _, params in changes(base, ts.osc_params.TASK_CHOICES):
+        if outcome(run, params) == plain:
+            ignored.append(label)
+    assert ignored == []
+
+
+def tree_fields(tree):
+    return {name: getattr(tree, name) for name in tree.__dataclass_fields__ if name != "_"}
