@@ -141,6 +141,7 @@ def _params(robot: Robot, name: str) -> Any:
 def report(found: Identification) -> str:
     """Return a table of the joints, and the delay, the payload and the errors in lines."""
     from batchpid.sim.cli.report import table
+    from batchpid.sim.identification.statistics import EXPLAINED
     from batchpid.sim.identification.unknowns import PER_JOINT
 
     def cell(kind: str, joint: int | None = None, factor: float = 1.0) -> str:
@@ -166,6 +167,11 @@ def report(found: Identification) -> str:
     text.append(
         f"position error on the part that was kept: {before:.3g} as described, {after:.3g} by the values of the file"
     )
+    if found.misfit > EXPLAINED:
+        text.append(
+            f"the error there is {found.misfit:.2g} times the noise of the sensors: the model does not explain all of "
+            "the motion, and the intervals hold for this motion only"
+        )
     return "\n".join(text + _not_identified(found))
 
 

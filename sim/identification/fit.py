@@ -175,7 +175,8 @@ class _Factors:
 
     def _evaluate(self, theta: Float64) -> tuple[Float64, Float64, list[Evaluation]]:
         problem, scale = self._problem, self._problem.unknowns.scale
-        windows = problem.evaluate(theta)
+        with np.errstate(invalid="ignore", over="ignore"):  # simulations that diverge end at inf
+            windows = problem.evaluate(theta)
         sizes = problem.sizes([window.white for window in windows])
         count = len(theta) + 1
         factors = np.zeros((*sizes.shape, count, count))

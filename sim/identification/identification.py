@@ -23,21 +23,26 @@ from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.versions import package_versions
 from batchpid.motors.actuator_files import dumps_actuators, loads_actuators
 from batchpid.sim.engine import native
-from batchpid.sim.identification.fit import Step
+from batchpid.sim.identification.fit import Solution, Step
 from batchpid.sim.identification.fit_history import History, State
 from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, search
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log, LogWarning, at_limits, checked, read_logs
 from batchpid.sim.identification.plant import Motors, Plant
 from batchpid.sim.identification.problem import Problem
-from batchpid.sim.identification.regression import Motion, best_drive, smooth
+from batchpid.sim.identification.regression import Motion, Regression, best_drive, hypotheses, smooth
 from batchpid.sim.identification.result import Fit, Identification, actuators_at
 from batchpid.sim.identification.start import begin
-from batchpid.sim.identification.statistics import uncertainty
+from batchpid.sim.identification.statistics import EXPLAINED, misfit, uncertainty
 from batchpid.sim.identification.unknowns import Unknowns
 from batchpid.sim.identification.windows import rows_of
+from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Compensation
+
+STILL, SHARE, SHAKEN = {"rad": 1e-3, "m": 1e-4}, 0.01, 1.5
+"""Standard deviation of the positions up to which a joint did not move: absolute, or as a share of the joint with the
+largest one, whichever is less; or over the noise from row to row."""
 
 
 def identify(
@@ -117,12 +122,17 @@ def identify(
     control = number("timestep", _recorded("timestep", timestep, found, 1 / 2000), 1e-5, 0.01, "seconds")
     compensate = _recorded("compensate", compensate, found, "gravity+coriolis+friction")
     choice("compensate", compensate, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"))
-    timestep, joints = control / sim_steps, found[0].joints
+    timestep = control / sim_steps
+    logged = found[0].joints
+    found, resting, still = _without_still(robot, found)
+    joints = found[0].joints
     if params is not None:
-        params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, joints)
+        params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, logged)
+        params = params.for_joints([logged.index(joint) for joint in joints])
     measured = params is not None and params.measurement_rate is not None
     settings = {
-        **robot.describe(),
+        **resting.describe(),
+        "still": still,
         "logs": [log.source for log in found],
         "data": digest([replace(log, source="") for log in found]),
         "command": kind,
@@ -137,23 +147,34 @@ def identify(
         "versions": package_versions(("batchpid", "sapien", "numpy", "scipy", "cmaes")),
     }
     record = History(history, settings)
-    drive = Drive(timestep, params, compensate.removesuffix("+friction"), substeps=sim_steps, measured_rate=measured)
+    assumed = Drive(timestep, params, compensate.removesuffix("+friction"), substeps=sim_steps, measured_rate=measured)
     motions = [smooth(log, timestep) for log in found]
-    drive, regression = best_drive(robot, joints, drive, found, motions, payload)
-    unknowns = _unknowns(robot, joints, drive, regression.best.motors, motions, payload)
-    variants = _variants(drive, motions)
-    known = record.state(len(unknowns.names), max(evaluations, NEIGHBOUR_EVALUATIONS), len(variants))
+    drive, regression = best_drive(resting, joints, assumed, found, motions, payload)
+    unknowns = _unknowns(resting, joints, drive, regression.best.motors, motions, payload)
+    ideal = _ideal(robot, joints)
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
     pool: Any = nullcontext()
     if processes > 1:
         verdict: Any = {"initializer": native.take_verdict, "initargs": (native.environment(),)}
         pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), **verdict)
     with pool as executor:
-        problems = [Problem(robot, joints, each, found, motions, unknowns, executor) for each in variants]
-        ideal = _ideal(robot, joints)
-        state = known or State(Step.first(begin(problems[0], regression, ideal, seed), evaluations))
-        bar = Progress(len(problems), evaluations, progress)
-        problem, best = search(problems, state, evaluations, record, bar)
+
+        def fit_under(drive: Drive, regression: Regression, record: History) -> tuple[Problem, Solution]:
+            """Return the likeliest fit under ``drive``."""
+            problems = [
+                Problem(resting, joints, each, found, motions, unknowns, executor) for each in _variants(drive, motions)
+            ]
+            known = record.state(len(unknowns.names), max(evaluations, NEIGHBOUR_EVALUATIONS), len(problems))
+            state = known or State(Step.first(begin(problems[0], regression, ideal, seed), evaluations))
+            return search(problems, state, evaluations, record, Progress(len(problems), evaluations, progress))
+
+        fits_of_ways = [fit_under(drive, regression, record)]
+        if misfit(*fits_of_ways[0]) > EXPLAINED:  # then the regression may have chosen the wrong compensation
+            for way in hypotheses(assumed, payload):
+                if way.compensation != drive.compensation:
+                    other = Regression(Plant(resting, joints, way), found, motions, payload)
+                    fits_of_ways.append(fit_under(way, other, History(None, settings)))
+        problem, best = min(fits_of_ways, key=lambda each: each[1].cost)
         before, after = problem.residuals(unknowns.point(ideal)[None]), [window.residual for window in best.windows]
         sure = uncertainty(problem, best)
         saved = problem.residuals(_saved(robot, joints, unknowns, best.theta)[None])
@@ -168,7 +189,17 @@ def identify(
     fitted = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
     noise = np.sqrt((fitted**2).mean(0))
     return Identification(
-        robot, joints, unknowns, best.theta, sure, (errors[0], errors[1]), noise, problem.drive, settings, fits
+        robot,
+        joints,
+        unknowns,
+        best.theta,
+        sure,
+        (errors[0], errors[1]),
+        misfit(problem, best),
+        noise,
+        problem.drive,
+        settings,
+        fits,
     )
 
 
@@ -205,6 +236,41 @@ def _logs(robot: Robot, logs: Iterable[Any], kind: Any, hold: bool) -> list[Log]
             message = "; ".join(stopped) + ": stops are not part of the model; record between the limits"
             warnings.warn(message, LogWarning, stacklevel=4)
     return found
+
+
+def _without_still(robot: Robot, logs: list[Log]) -> tuple[list[Log], Robot, list[str]]:
+    """Return the logs without joints that do not move, the robot that rests where they are, and their names.
+
+    Such a joint is jammed, braked or not driven: the model of a motor does not describe it.
+    """
+    joints, qpos = logs[0].joints, np.concatenate([log.qpos for log in logs])
+    noise = np.sqrt(np.mean(np.concatenate([np.diff(log.qpos, axis=0) for log in logs]) ** 2, axis=0) / 2)
+    moved = qpos.std(0)
+    least = np.clip(SHARE * moved.max(), 1e-9, [STILL[robot.units[joint]] for joint in joints])
+    moves = moved > np.maximum(least, SHAKEN * noise)
+    if moves.all():
+        return logs, robot, []
+    names = [robot.joint_names[joint] for joint, each in zip(joints, moves, strict=True) if not each]
+    listed = ", ".join(map(repr, names))
+    if not moves.any():
+        problem = f"show no motion of any joint ({listed})"
+        raise InvalidArgumentError("logs", problem, remedy="record a motion, such as one of batchpid excite")
+    start = robot.start
+    start[[joint for joint, each in zip(joints, moves, strict=True) if not each]] = qpos.mean(0)[~moves]
+    message = f"{listed} did not move: left out, and held where the logs have it; its motor cannot be identified"
+    warnings.warn(message, LogWarning, stacklevel=3)
+    kept = tuple(joint for joint, each in zip(joints, moves, strict=True) if each)
+    found = [
+        replace(
+            log,
+            joints=kept,
+            qpos=log.qpos[:, moves],
+            qvel=None if log.qvel is None else log.qvel[:, moves],
+            command=log.command[:, moves],
+        )
+        for log in logs
+    ]
+    return found, replace(robot, settings=None, defaults=FileDefaults(start)), names
 
 
 def _recorded(name: str, given: Any, logs: list[Log], default: Any) -> Any:

@@ -32,6 +32,11 @@ class Drive:
     measured_rate: bool = False
     """True if the law is given the joint velocity, False if it takes differences of positions."""
 
+    @property
+    def compensation(self) -> tuple[str, bool, bool]:
+        """Hypothesis about the compensation."""
+        return self.compensate, self.through, self.knows_payload
+
 
 class Law:
     """PID law of many candidates."""

@@ -46,6 +46,8 @@ class Identification(NamedTuple):
     held_out_error: tuple[float, float]
     """Root mean square of the position error [rad or m] on the held-out part of the logs, of the robot as described and
     as identified; inf if the simulation diverges."""
+    misfit: float
+    """Held-out residuals over the noise of the sensors, worst joint: about 1 if the model explains the motion."""
     noise: Float64
     """Root mean square of the residuals (joints,) [rad or m]."""
     drive: Drive
@@ -110,10 +112,14 @@ class Identification(NamedTuple):
         about = {
             "identified_from": self.settings["logs"],
             "held_out_error": document["held_out_error"],
+            "misfit": document["misfit"],
             "intervals": document["joints"]
             | {kind: document[kind] for kind in ("delay", "payload") if kind in document},
             "not_well_determined": of_joints | ({"all joints": others} if others else {}),
-            "not_in_the_logs_hence_ideal": [name for name, free in own if free and name not in logged],
+            "did_not_move_hence_ideal": self.settings["still"],
+            "not_in_the_logs_hence_ideal": [
+                name for name, free in own if free and name not in logged and name not in self.settings["still"]
+            ],
         }
         bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
 
@@ -137,6 +143,7 @@ class Identification(NamedTuple):
             document["payload"] = row("payload")
         return document | {
             "held_out_error": [value if np.isfinite(value) else None for value in self.held_out_error],
+            "misfit": self.misfit if np.isfinite(self.misfit) else None,
             "not_identified": self.not_identified,
             "singular_values": self.uncertainty.singular_values.tolist(),
             "noise": self.noise.tolist(),
