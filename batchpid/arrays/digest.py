@@ -34,7 +34,10 @@ def digest(*values: Any) -> str:
 
 
 def attributes_digest(value: object) -> str:
-    """Return the digest of an object's type and attributes, and of theirs; what has no digest counts by its type."""
+    """Return the digest of an object: of its type and its attributes.
+
+    An attribute without a digest counts by its type; an object of this package by its attributes, too.
+    """
     kind = type(value)
     parts = []
     for name, each in sorted(getattr(value, "__dict__", {}).items()):

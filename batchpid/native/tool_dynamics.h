@@ -1,5 +1,5 @@
-// Kinematics and dynamics of WIDTH robots with a tool, reduced to the leaders of coupled joints. The equations stand in batchpid/task_space: tree_kinematics.py and
-// tree_dynamics.py.
+// Kinematics and dynamics of WIDTH robots with a tool, reduced to the leaders of coupled joints. The equations stand in
+// batchpid/task_space: tree_kinematics.py and tree_dynamics.py.
 
 #pragma once
 

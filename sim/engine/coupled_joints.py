@@ -45,7 +45,7 @@ class ConstraintEfforts:
 
     Arrays are (robots, dof). :meth:`update` comes before the first :meth:`apply`. Native code applies and updates the
     efforts by the structure at :attr:`address`; it writes the efforts without the constraint's into ``asked``, if
-    given. Where positions jump, :meth:`place` comes after every change of positions that is no motion.
+    given. Where positions jump, call :meth:`place` after every reset of positions.
 
     Attributes
     ----------

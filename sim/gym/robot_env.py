@@ -21,8 +21,8 @@ _FIXED = ("num_envs", "max_episode_steps", "autoreset_mode")
 class RobotEnv(SingleOwner, gymnasium.Env):
     """One robot of a task as a :class:`gymnasium.Env`, by default in this process. A subclass names its ``task``.
 
-    ``robot`` None is the task's own default. Episodes have no time limit, which :func:`gymnasium.make` adds. Other
-    arguments are those of the task.
+    ``robot`` None is the task's own default. Episodes have no time limit, which :func:`gymnasium.make` adds. The
+    other arguments belong to the task.
     """
 
     instead = RobotVectorEnv.instead

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
+from batchpid.arrays.elementwise import TURN
 from batchpid.sim.identification.columns import error
 from batchpid.sim.identification.log import Log
 from batchpid.sim.robot.robot import Robot
 
-TURN = 2 * np.pi
 MOST_TURNS = 2
 """Most turns of a jump; positions that jump by more are not in rad."""
 CLEAR = np.pi / 2

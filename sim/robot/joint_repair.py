@@ -83,7 +83,7 @@ def _limits(joint: etree._Element) -> Iterator[Finding]:
         if values is None:
             problem = f"<limit {key}={text!r}> is not a number: no {key} limit"
             yield finding_of(joint, "warning", "limits", problem, f"give <limit {key}=> of the motor")
-        elif values[0] < 0 and values[0] != -1:  # -1 is what exporters write for "not set"
+        elif values[0] < 0 and values[0] != -1:  # exporters write -1 for "not set"
             limit.set(key, repr(-values[0]))
             problem = f"{key} limit is negative: its magnitude is used"
             yield finding_of(joint, "warning", "limits", problem, "make it positive", text)

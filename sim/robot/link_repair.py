@@ -99,5 +99,5 @@ def _collisions(link: etree._Element) -> Iterator[Finding]:
 
 
 def _misplaced(origin: etree._Element | None) -> str | None:
-    """Return the reason for which an ``<origin>`` is no place, or None."""
+    """Return the fault of an ``<origin>`` that cannot be read, or None."""
     return fault(origin, "xyz", "0 0 0") or fault(origin, "rpy", "0 0 0")

@@ -37,12 +37,16 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
     the other case, and the name percent-encoded.
     """
     name = re.sub(r"^(file:/*)?\$\(find ([^)]+)\)", r"package://\2", name.strip().replace("\\", "/"))  # xacro, Windows
-    for change in (str, str.lower, str.upper, str.title):
-        for spelling in dict.fromkeys([name, unquote(name)]):
-            for each in _candidates(spelling, path, package_dirs):
-                stem, suffix = os.path.splitext(each)
-                if os.path.isfile(found := stem + change(suffix)):
-                    return Path(found).absolute()
+    tried = []
+    for spelling in dict.fromkeys([name, unquote(name)]):
+        for each in _candidates(spelling, path, package_dirs):
+            if os.path.isfile(each):
+                return each.absolute()
+            tried.append(os.path.splitext(each))
+    for change in (str.lower, str.upper, str.title):
+        for stem, suffix in tried:
+            if os.path.isfile(found := stem + change(suffix)):
+                return Path(found).absolute()
     return None
 
 

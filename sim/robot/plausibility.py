@@ -47,7 +47,7 @@ JUDGED = 0.01
 """Share of the total mass from which the mass and inertia of a link are checked."""
 
 FARTHEST, PLACEHOLDER = 4 * np.pi, 1000.0
-"""Bounds between which limits of a hinge are taken for degrees [rad]; larger ones stand for no limit."""
+"""Bounds between which limits of a hinge are taken for degrees [rad]; larger ones mean "no limit"."""
 TURN = 2 * np.pi + 0.01
 """Bound of an angle of an origin [rad]."""
 FASTEST, POWER = 60.0, 1000.0

@@ -39,7 +39,7 @@ class GuardedRobot(Protocol):
 def setpoint_guard(robot: GuardedRobot, rate: ArrayLike | None, acceleration: ArrayLike | None) -> bp.Guard:
     """Return the limits of setpoints, of the URDF where they are not given.
 
-    Followers have none: their limits narrow those of their leaders.
+    Followers have none: their limits narrow the limits of their leaders.
 
     Raises InvalidArgumentError if a follower of a continuous joint has position limits.
     """

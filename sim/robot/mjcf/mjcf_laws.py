@@ -109,7 +109,7 @@ def _library() -> Any:
 
 
 def _velocity_scale(model: Any, actuator: int, kp: float, kv: float) -> float | None:
-    """Return the target velocity of a servo per unit of its input; None if that is no velocity."""
+    """Return the target velocity of a servo per unit of its input; None if its target is not a velocity."""
     gain = abs(float(model.actuator_gainprm[actuator, 0]))
     if kp > 0:
         return gain / kp if model.actuator_dyntype[actuator] == _DYN.mjDYN_INTEGRATOR else None
