@@ -188,6 +188,8 @@ class WorkerPool(SingleOwner):
         for slot in list(self._slots):
             slot.worker.close(0.0 if slot.queue else patience)
         self._slots = []
+        for name in ("arrays", "ticks", "present", "completed"):  # views that would keep the memory and its descriptor
+            vars(self).pop(name, None)
         self._shared.close()
 
     def __del__(self) -> None:

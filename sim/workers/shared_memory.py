@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.checks.single_owner import SingleOwner
+from batchpid.errors import WorkerError
 from batchpid.sim.loop.arrays import Layout
 from batchpid.sim.processes.descriptors import standard_streams_occupied
 
@@ -34,7 +35,12 @@ class SharedArrays(SingleOwner):
         if fd is None:
             self._file: MemoryFile | None = MemoryFile("batchpid")
             fd = self._file.fileno()
-            os.ftruncate(fd, max(size, 1))
+            try:
+                os.ftruncate(fd, max(size, 1))
+            except OSError as error:
+                self._file.close()
+                remedy = "raise the limit of file sizes (ulimit -f), or use fewer envs"
+                raise WorkerError(f"{size} bytes of shared memory cannot be had: {error.strerror}; {remedy}") from error
         else:
             self._file = None
         self.fd = fd

@@ -161,8 +161,14 @@ def rigid_bodies(builder: ArticulationBuilder) -> dict[str, str]:
 def _in_memory(text: str) -> Iterator[str]:
     """Provide ``text`` under a path, which SAPIEN's loader requires: an in-memory file, gone after the block."""
     with open(os.memfd_create("batchpid-text"), "w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
+        try:
+            file.write(text)
+            file.flush()
+        except OSError as error:
+            size, remedy = len(text), "raise the limit of file sizes (ulimit -f)"
+            raise RobotError(
+                f"the URDF of {size} bytes cannot be kept in memory: {error.strerror}; {remedy}"
+            ) from error
         yield f"/proc/self/fd/{file.fileno()}"
 
 
