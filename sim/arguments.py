@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+import batchpid as bp
 from batchpid.checks.validate import AxisKind, array, env_mask, integer, read_array, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.loop.arrays import Command
@@ -26,7 +27,7 @@ class Arguments:
         self._options, self._robot = options, robot
         self._finite = options.on_invalid_input == "raise"
         entries: _Axis = ("joint" if own is None else "entry", options.command.names)
-        self._axes: tuple[_Axis, ...] = (entries, entries, ("joint", robot.joint_names))
+        self._axes: tuple[_Axis, ...] = (entries, entries, entries, ("joint", robot.joint_names))
         """Last axis of each array of a command: its kind, and the names of its columns."""
         self._coupling = robot.coupling if options.sets_positions else None
         self._limits = SetpointCheck(robot)
@@ -36,16 +37,17 @@ class Arguments:
         """Return the sim steps of a tick, by default the runner's."""
         return self._options.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
 
-    def tick(self, setpoint: ArrayLike, setpoint_rate: ArrayLike | None, feedforward: ArrayLike | None) -> Command:
-        """Return the command (1, envs, ...) of one tick."""
-        given = {"setpoint": setpoint, "setpoint_rate": setpoint_rate, "feedforward": feedforward}
-        command = self._read(given)
+    def tick(self, params: bp.PIDParams, *command: ArrayLike | None) -> Command:
+        """Return the command (1, envs, ...) of one tick, from its arrays in the order of :class:`Command`."""
+        given = dict(zip(Command._fields, command, strict=True))
+        self._check_acceleration(params, given)
+        read = self._read(given)
         if self._checks_setpoints:
-            self._limits.check("setpoint", command.setpoint, stacklevel=5)
-        return command
+            self._limits.check("setpoint", read.setpoint, stacklevel=5)
+        return read
 
-    def ticks(self, setpoints: ArrayLike, setpoint_rates: ArrayLike | None, feedforwards: ArrayLike | None) -> Command:
-        """Return the command (ticks, envs, ...) of a rollout."""
+    def ticks(self, params: bp.PIDParams, setpoints: ArrayLike, *others: ArrayLike | None) -> Command:
+        """Return the command (ticks, envs, ...) of a rollout, from its arrays in the order of :class:`Command`."""
         shape, num_envs, size = read_array("setpoints", setpoints).shape, self._options.num_envs, len(self._axes[0][1])
         if len(shape) not in (2, 3) or shape[0] == 0:
             raise InvalidArgumentError(
@@ -59,7 +61,8 @@ class Arguments:
             rows = None if value is None else read_array(name, value)
             return rows if rows is None or rows.ndim != 2 else rows[:, None]
 
-        given = {"setpoints": setpoints, "setpoint_rates": setpoint_rates, "feedforwards": feedforwards}
+        given = {f"{name}s": rows for name, rows in zip(Command._fields, (setpoints, *others), strict=True)}
+        self._check_acceleration(params, given)
         command = self._read({name: of_ticks(name, value) for name, value in given.items()}, shape[0])
         if self._checks_setpoints:
             self._limits.check("setpoint", command.setpoint, stacklevel=5)
@@ -75,6 +78,17 @@ class Arguments:
         chosen = np.ones(num_envs, bool) if mask is None else env_mask("mask", mask, num_envs)
         self._limits.check("qpos", self._robot.coupled(position), chosen, stacklevel=5)
         return position, velocity, chosen
+
+    def _check_acceleration(self, params: bp.PIDParams, given: Mapping[str, Any]) -> None:
+        """Raise InvalidArgumentError for an acceleration that the law does not take."""
+        _, (rate, given_rate), (name, value), _ = given.items()
+        if value is None:
+            return
+        if self._options.control != "pid" or params.gain_units is None:
+            remedy = "give M(q) times it as feedforward, or use gains in accelerations, such as robot.designed()"
+            raise InvalidArgumentError(name, "is for gains in accelerations, and these are efforts", remedy=remedy)
+        if given_rate is None:
+            raise InvalidArgumentError(name, f"has no {rate} beside it", remedy=f"give {rate}, too")
 
     def _pose(self, name: str, value: ArrayLike) -> NDArray[np.float64]:
         shape = (self._options.num_envs, self._robot.dof)
@@ -98,5 +112,5 @@ class Arguments:
             rows.append(own[None] if ticks is None else own)
         if self._coupling is not None:
             rows[0] = self._coupling.positions(rows[0])
-            rows[1] = None if rows[1] is None else self._coupling.rates(rows[1])
+            rows[1:3] = [None if each is None else self._coupling.rates(each) for each in rows[1:3]]
         return Command._make(rows)

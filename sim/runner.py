@@ -117,6 +117,7 @@ class Runner(SingleOwner):
         setpoint: ArrayLike,
         *,
         setpoint_rate: ArrayLike | None = None,
+        setpoint_acceleration: ArrayLike | None = None,
         feedforward: ArrayLike | None = None,
         substeps: int | None = None,
     ) -> Observation:
@@ -131,20 +132,26 @@ class Runner(SingleOwner):
             (envs, size): :attr:`command`. With ``setpoint_space="tool"`` it is a pose (7,) or (envs, 7), or
             :attr:`command`.
         setpoint_rate
-            Rate of the setpoint [rad/s or m/s], same shapes: damps the velocity error instead of the velocity. Not for
-            a :class:`batchpid.sim.Controller`, which ignores it.
+            Rate of the setpoint [rad/s or m/s], same shapes, with which the setpoint moves within the tick. Both hold
+            at the tick's end: the setpoint of a sim step that begins t before it is ``setpoint - t setpoint_rate``. The
+            law damps the velocity error instead of the velocity, and follows this motion with full weight. Controls
+            other than "pid" and "drive" ignore it.
+        setpoint_acceleration
+            Acceleration of the setpoint in the tick [rad/s^2 or m/s^2], same shapes, besides its rate: a law with gains
+            per unit of inertia adds it to the acceleration that it commands. Other gains take ``feedforward``.
         feedforward
             Joint effort (dof,) or (envs, dof) [N m or N] added to the passive force before saturation.
         substeps
             Sim steps of this tick; default the runner's.
         """
-        return self._session.step(setpoint, setpoint_rate, feedforward, substeps)
+        return self._session.step(setpoint, setpoint_rate, setpoint_acceleration, feedforward, substeps)
 
     def send(
         self,
         setpoint: ArrayLike,
         *,
         setpoint_rate: ArrayLike | None = None,
+        setpoint_acceleration: ArrayLike | None = None,
         feedforward: ArrayLike | None = None,
         substeps: int | None = None,
     ) -> None:
@@ -159,7 +166,7 @@ class Runner(SingleOwner):
         CallOrderError
             The observation of the last tick that was sent has not been received.
         """
-        self._session.send(setpoint, setpoint_rate, feedforward, substeps)
+        self._session.send(setpoint, setpoint_rate, setpoint_acceleration, feedforward, substeps)
 
     def recv(self) -> Observation:
         """Wait for the end of the tick that :meth:`send` began; return its observation.
@@ -176,6 +183,7 @@ class Runner(SingleOwner):
         setpoints: ArrayLike,
         *,
         setpoint_rates: ArrayLike | None = None,
+        setpoint_accelerations: ArrayLike | None = None,
         feedforwards: ArrayLike | None = None,
         progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
     ) -> Rollout:
@@ -185,12 +193,12 @@ class Runner(SingleOwner):
         ----------
         setpoints
             (ticks, envs, dof), or (ticks, dof) for all envs [rad or m]; for another command (ticks, envs, size).
-        setpoint_rates, feedforwards
+        setpoint_rates, setpoint_accelerations, feedforwards
             Also with the ticks first: see :meth:`step`.
         progress
             Wraps the range of ticks, e.g. ``tqdm.tqdm``.
         """
-        return self._session.rollout(setpoints, setpoint_rates, feedforwards, progress)
+        return self._session.rollout(setpoints, setpoint_rates, setpoint_accelerations, feedforwards, progress)
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""

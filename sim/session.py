@@ -157,6 +157,7 @@ class Session:
         self,
         setpoint: ArrayLike,
         setpoint_rate: ArrayLike | None,
+        setpoint_acceleration: ArrayLike | None,
         feedforward: ArrayLike | None,
         substeps: int | None,
     ) -> Observation:
@@ -165,7 +166,8 @@ class Session:
         count = self.options.substeps if substeps is None else self._arguments.substeps(substeps)
         if self._tool_setpoints is not None:
             setpoint = self._joints("setpoint", setpoint, setpoint_rate, None)
-        command = self._arguments.tick(setpoint, setpoint_rate, feedforward)
+        given = setpoint, setpoint_rate, setpoint_acceleration, feedforward
+        command = self._arguments.tick(self._transactions.state.params, *given)
         self._transactions.run(*self._ticks(command, count))
         self._warn(stacklevel=4)
         return self._observation()
@@ -174,6 +176,7 @@ class Session:
         self,
         setpoint: ArrayLike,
         setpoint_rate: ArrayLike | None,
+        setpoint_acceleration: ArrayLike | None,
         feedforward: ArrayLike | None,
         substeps: int | None,
     ) -> None:
@@ -182,7 +185,9 @@ class Session:
         count = self._arguments.substeps(substeps)
         if self._tool_setpoints is not None:
             setpoint = self._joints("setpoint", setpoint, setpoint_rate, None)
-        request, commit = self._ticks(self._arguments.tick(setpoint, setpoint_rate, feedforward), count)
+        given = setpoint, setpoint_rate, setpoint_acceleration, feedforward
+        command = self._arguments.tick(self._transactions.state.params, *given)
+        request, commit = self._ticks(command, count)
 
         def commit_sent(state: RunnerState, seconds: list[Any]) -> tuple[RunnerState, None]:
             state, _ = commit(state, seconds)
@@ -203,6 +208,7 @@ class Session:
         self,
         setpoints: ArrayLike,
         setpoint_rates: ArrayLike | None,
+        setpoint_accelerations: ArrayLike | None,
         feedforwards: ArrayLike | None,
         progress: Callable[[Iterable[int]], Iterable[int]] | None,
     ) -> Rollout:
@@ -210,7 +216,9 @@ class Session:
         steps, options = self._transactions.ready("rollout").steps, self.options
         if self._tool_setpoints is not None:
             setpoints = self._joints("setpoints", setpoints, setpoint_rates, len(np.atleast_1d(setpoints)))
-        command = self._arguments.ticks(setpoints, setpoint_rates, feedforwards)
+        command = self._arguments.ticks(
+            self._transactions.state.params, setpoints, setpoint_rates, setpoint_accelerations, feedforwards
+        )
         ticks = len(command.setpoint)
         seen = empty_observation(ticks, options.num_envs, options.robot.dof)
         times = (steps + options.substeps * np.arange(1.0, ticks + 1)) * options.timestep
@@ -361,7 +369,7 @@ class Session:
         every, pool = self.options.checkpoint_steps, self.pool
         if every is not None and self._transactions.state.steps_since_checkpoint >= every:
             self.snapshot()
-        setpoint, rate, feedforward = command
+        setpoint = command.setpoint
         ticks, timestep = len(setpoint), self.options.timestep
 
         def commit(state: RunnerState, seconds: list[Any]) -> tuple[RunnerState, None]:
@@ -391,7 +399,7 @@ class Session:
             )
             return state, None
 
-        return Run(ticks, substeps, rate is not None, feedforward is not None, command), commit
+        return Run(ticks, substeps, command.given, command), commit
 
     def _joints(self, name: str, setpoint: ArrayLike, rate: ArrayLike | None, ticks: int | None) -> NDArray[np.float64]:
         """Return joint setpoints for poses of the tool."""

@@ -9,7 +9,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import discretise
 from batchpid.law.inputs import check_alone, checked_inputs, checked_state, needs
 from batchpid.law.params import PIDParams
-from batchpid.law.pid import proportional, turned_origin, weighted_rate, wrapped_error
+from batchpid.law.pid import origins, proportional, weighted_rate, wrapped_error
 from batchpid.law.state import PIDState
 
 
@@ -60,7 +60,7 @@ def track(
     k = discretise(params, 1.0 if dt is None else dt)
     zero = xp.zeros_like(measurement)
     error = wrapped_error(k, setpoint, measurement, xp)
-    origin = turned_origin(k, state, measurement, xp)
+    (origin, _), (kept, _) = (origins(k, state, measurement, rate, xp) for rate in (setpoint_rate, None))
     rate = zero if measurement_rate is None else -measurement_rate
     if setpoint_rate is not None:
         rate = rate + weighted_rate(k, setpoint_rate)
@@ -78,5 +78,5 @@ def track(
         setpoint=None if state.setpoint is None else zero + setpoint,
         setpoint_seen=None if state.setpoint_seen is None else xp.ones_like(measurement),
         effort=None if state.effort is None else zero + effort,
-        origin=origin,
+        origin=kept,
     )

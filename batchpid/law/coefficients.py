@@ -35,6 +35,10 @@ class Coefficients(NamedTuple):
     c: Any
     c_given: Any
     """Weight c of a given setpoint rate in the implicit law; None: c, or 1."""
+    origin_dt: Any
+    """dt, where a given setpoint rate moves the origin of setpoint weighting."""
+    acceleration_share: Any
+    """Weight of a given setpoint acceleration in the implicit law; None: 1."""
     deadband: Any
     tracking: Any
     """dt / Tt, at most 1. Above 1, a step would correct more than the whole excess, and oscillate."""
@@ -61,9 +65,9 @@ def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coeff
     finite; an array of JAX is not checked.
     """
     dt = checked_dt(dt, params.dtype)
-    c, c_given, implicit = params.setpoint_weight_derivative, None, params.discretization is not None
+    c, c_given, share, implicit = params.setpoint_weight_derivative, None, None, params.discretization is not None
     if implicit:
-        c, c_given = implicit_gains(params, dt)[-2:]
+        c, c_given, share = implicit_gains(params, dt)[-3:]
         params = as_explicit(params, dt)
     tau, tracking = params.derivative_filter_time, params.tracking_time
     same = {name: leaf for name, leaf in params._asdict().items() if name in Coefficients._fields}
@@ -78,6 +82,8 @@ def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coeff
         b=params.setpoint_weight,
         c=c,
         c_given=c_given,
+        origin_dt=None if params.setpoint_weight is None else dt,
+        acceleration_share=share,
         tracking=None if tracking is None else dt / namespace(tracking, dt).maximum(tracking, dt),
         turns=None if params.continuous is None else params.continuous / TURN,
         tiny=None if tau is None and tracking is None else tiny_of(params.dtype),

@@ -24,6 +24,8 @@ A limit of the effort's rate scales the change of the effort as a whole, for the
 with the last effort u'. Both efforts are within the limits, and so is each on the line between them. While z < 1,
 conditional integration does not integrate further into the direction of u - effort.
 
+A setpoint's acceleration r'' is added to the law's: u = M (a + r'') + passive force, and with "inertia" M_jj r''.
+
 The time step limits the gains per mass matrix, unless the law is implicit (:mod:`batchpid.law.implicit`).
 """
 
@@ -47,6 +49,7 @@ def per_inertia(k: Coefficients, inertia: Any) -> Coefficients:
         kp=k.kp * inertia,
         ki_dt=None if k.ki_dt is None else k.ki_dt * inertia,
         kd=None if k.kd is None else k.kd * inertia,
+        acceleration_share=inertia if k.acceleration_share is None else k.acceleration_share * inertia,
     )
 
 
@@ -58,6 +61,7 @@ def advance_with_mass_matrix(
     mass_matrix: Any,
     measurement_rate: Any = None,
     setpoint_rate: Any = None,
+    setpoint_acceleration: Any = None,
     feedforward: Any = None,
 ) -> tuple[PIDState, Any]:
     """Advance the law in accelerations and return efforts; otherwise as :func:`batchpid.advance`.
@@ -66,10 +70,13 @@ def advance_with_mass_matrix(
     ----------
     mass_matrix
         (envs, joints, joints) at about the present positions [kg m^2 or kg].
+    setpoint_acceleration
+        r'' (envs, joints), added to the acceleration of the law [rad/s^2 or m/s^2].
     feedforward
         Effort added to the effort of the law [N m or N]: passive force and more.
     """
-    new, a = advance(_unlimited(k), state, setpoint, measurement, measurement_rate, setpoint_rate)
+    rates = measurement_rate, setpoint_rate, given_acceleration(k, setpoint_acceleration)
+    new, a = advance(_unlimited(k), state, setpoint, measurement, *rates)
     new, effort, _ = _to_effort(k, state, new, a, mass_matrix, feedforward)
     return new, effort
 
@@ -80,15 +87,25 @@ def advance_terms_with_mass_matrix(
     setpoint: Any,
     measurement: Any,
     mass_matrix: Any,
-    *rates: Any,
+    measurement_rate: Any = None,
+    setpoint_rate: Any = None,
+    setpoint_acceleration: Any = None,
     feedforward: Any = None,
 ) -> tuple[PIDState, Terms]:
     """Advance the law as :func:`advance_with_mass_matrix`; return the state and all terms, effort included."""
+    rates = measurement_rate, setpoint_rate, given_acceleration(k, setpoint_acceleration)
     new, terms = advance_terms(_unlimited(k), state, setpoint, measurement, *rates)
     new, effort, unsaturated = _to_effort(k, state, new, terms.effort, mass_matrix, feedforward)
-    p, i, d = (multiply(mass_matrix, term) for term in terms[:3])
-    given = namespace(effort).zeros_like(effort) + (0.0 if feedforward is None else feedforward)
+    p, i, d, given = (multiply(mass_matrix, term) for term in terms[:4])
+    given = given + (0.0 if feedforward is None else feedforward)
     return new, Terms(p, i, d, given, unsaturated, effort, effort != unsaturated, terms.finite)
+
+
+def given_acceleration(k: Coefficients, setpoint_acceleration: Any) -> Any:
+    """Return what a given acceleration of the setpoint adds to the law's output; None for nothing."""
+    if setpoint_acceleration is None or k.acceleration_share is None:
+        return setpoint_acceleration
+    return k.acceleration_share * setpoint_acceleration
 
 
 def check_gain_units(params: PIDParams) -> None:

@@ -3,15 +3,16 @@ r"""Implicit law: P, I and D at the end of the time step, for gains of an accele
 With u = M a + passive force, each joint moves as v+ = v + dt a, y+ = y + dt v+ (semi-implicit Euler). The law takes
 its error, rate and integral there, as backward Euler does, with the setpoint r and its rate r' at the end of the step::
 
-    a = kp (b r - y+) + kd (c r' - v+) + I+        I+ = I + ki dt (r - y+)        I <- I + ki dt (r - dt r' - y)
+    a = kp (b r - y+) + kd (c r' - v+) + I+ + r''   I+ = I + ki dt (r - y+)       I <- I + ki dt (r - dt r' - y)
 
 The last is the same at the beginning of the step, with the error that was measured. y+ and v+ contain a. Solved for
 it, with D = 1 + dt kd + dt^2 kp + dt^3 ki and e = r - y::
 
-    D a = kp (b r - y - dt v) + kd (c r' - v) + I + ki dt (e - dt v)
+    D a = kp (b r - y - dt v) + kd (c r' - v) + I + ki dt (e - dt v) + r''
 
-That is the explicit law with other gains, so a step costs no more (n = 1 where the present error is integrated first,
-2 where the output is first)::
+with the setpoint's acceleration r'', 0 unless given. (b r stands for o + b (r - o); a given rate moves the origin o to
+the end of the step, too.) That is the explicit law with other gains, so a step costs no more (n = 1 where the present
+error is integrated first, 2 where the output is first)::
 
     kp* = (kp + n dt ki) / D            b* = (b kp + n dt ki) / (kp + n dt ki)
     kd* = (kd + dt kp + dt^2 ki) / D    c* = (c kd - (n - 1) dt^2 ki) / (kd + dt kp + dt^2 ki)
@@ -55,10 +56,12 @@ class ImplicitGains(NamedTuple):
     """c* of the setpoint's difference quotient, which no integral takes: c kd / (kd + dt kp + dt^2 ki)."""
     c_given: Any
     """c* of a setpoint rate that is given."""
+    acceleration_share: Any
+    """1 / D: the weight of a setpoint acceleration that is given."""
 
 
 def implicit_gains(params: PIDParams, dt: Any) -> ImplicitGains:
-    """Return the gains kp*, ki*, kd*, b* and c* of implicit ``params`` at ``dt`` [s]."""
+    """Return the gains kp*, ki*, kd*, b* and c*, and 1 / D, of implicit ``params`` at ``dt`` [s]."""
     kp, ki, kd, b, c = params.kp, params.ki, params.kd, params.setpoint_weight, params.setpoint_weight_derivative
     xp = namespace(kp, ki, kd, b, c, dt)
     ki_dt = 0.0 if ki is None else ki * dt
@@ -78,6 +81,7 @@ def implicit_gains(params: PIDParams, dt: Any) -> ImplicitGains:
         b=None if b is None else share(b * kp + ki_dt + again, stiffness, b),
         c=None if c is None else share(on_rate, damping, 0),
         c_given=share(on_rate - dt * again, damping, 0),
+        acceleration_share=per_step,
     )
 
 
@@ -88,5 +92,5 @@ def as_explicit(params: PIDParams, dt: Any) -> PIDParams:
     """
     if params.discretization is None:
         return params
-    kp, ki, kd, b, _, c = implicit_gains(params, dt)
+    kp, ki, kd, b, _, c, _ = implicit_gains(params, dt)
     return params._replace(kp=kp, ki=ki, kd=kd, setpoint_weight=b, setpoint_weight_derivative=c, discretization=None)

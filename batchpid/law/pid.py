@@ -3,7 +3,8 @@ r"""The control law: pure functions on (envs, joints) arrays, one definition for
 With setpoint r, measurement y and step dt, per env and joint::
 
     e      = dead(wrap(r - y))                                  error
-    P      = kp (b e - (1 - b) (y - o))                         = kp (b r - y), off: b = 1
+    P      = kp (b e - (1 - b) (y - o))                         = kp (b r - y) with o = 0; off: b = 1
+    o     <- o + dt dr/dt                                       where a rate of the setpoint is given
     v      = c dr/dt - dy/dt                                    measured rates, else wrapped differences / dt
     d      = (tau d' + dt v) / (tau + dt)                       low-pass, backward Euler: stable for any dt
     D      = kd d
@@ -18,6 +19,10 @@ whether the effort is computed before I takes in the present error or after. Sat
 the motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13;
 conditional integration and the order of the two stages as in ros-controls/control_toolbox, src/pid.cpp. With
 discretization "implicit" the law is this one with other coefficients: :mod:`batchpid.law.implicit`.
+
+The moving origin is our own. With r = o + s, P = kp (o + b s - y): the motion that a rate describes is followed with
+full weight, and the rest s, a step, is approached with weight b. Without a rate every setpoint is all step, and a
+moving one is followed with a lag of kp (1 - b) / ki.
 """
 
 from __future__ import annotations
@@ -82,8 +87,8 @@ def step(
     measurement_rate
         dy/dt, if measured [rad/s or m/s]; None: the difference quotient of the measurement.
     setpoint_rate
-        dr/dt, if known; it enters with weight c, or 1 without one. None: the difference quotient of the setpoint
-        with a weight c, else 0.
+        dr/dt, if known, at the moment of the setpoint. It moves the origin o, and enters the derivative with weight c,
+        or 1 without one. None: the difference quotient of the setpoint with a weight c, else 0.
     feedforward
         Effort added before saturation [N m or N]: passive force, acceleration feedforward, ...
 
@@ -170,7 +175,7 @@ def _advance(
         r, y, r_rate, y_rate, ff = (None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff))
 
     error = wrapped_error(k, r, y, xp)
-    origin = turned_origin(k, state, y, xp)
+    origin, moved_origin = origins(k, state, y, r_rate, xp)
     p = proportional(k, error, y, origin)
     u = p
 
@@ -219,7 +224,7 @@ def _advance(
         setpoint=None if state.setpoint is None else r + xp.zeros_like(y),
         setpoint_seen=None if state.setpoint_seen is None else xp.ones_like(y),
         effort=None if state.effort is None else effort.copy(),
-        origin=origin,
+        origin=moved_origin,
     )
     if finite is not None:
         new = PIDState(*(None if n is None else xp.where(finite, n, o) for n, o in zip(new, state, strict=True)))
@@ -253,12 +258,19 @@ def weighted_rate(k: Coefficients, r_rate: Any) -> Any:
     return r_rate if weight is None else weight * r_rate
 
 
-def turned_origin(k: Coefficients, state: PIDState, y: Any, xp: Any) -> Any:
-    """Return the origin of setpoint weighting, moved by the whole turns that y jumped."""
-    if state.origin is None or k.turns is None:
-        return state.origin
-    moved = y - state.measurement
-    return state.origin + (moved - wrap(moved, k.turns, xp))
+def origins(k: Coefficients, state: PIDState, y: Any, r_rate: Any, xp: Any) -> tuple[Any, Any]:
+    """Return the origin of setpoint weighting, moved by the whole turns that y jumped: for this step and for the next.
+
+    A given rate moves it. The implicit law takes the setpoint, and so its origin, at the end of the step.
+    """
+    origin = state.origin
+    if origin is not None and k.turns is not None:
+        moved = y - state.measurement
+        origin = origin + (moved - wrap(moved, k.turns, xp))
+    if origin is None or r_rate is None:
+        return origin, origin
+    moved = origin + k.origin_dt * r_rate
+    return (origin if k.acceleration_share is None else moved), moved
 
 
 def proportional(k: Coefficients, error: Any, y: Any, origin: Any) -> Any:

@@ -22,6 +22,8 @@ class Command(NamedTuple):
     """(envs, size), as :attr:`batchpid.sim.RunnerOptions.command` describes it: for joints (envs, dof) [rad or m]."""
     setpoint_rate: Any = None
     """Rate of the setpoint, per second (envs, size)."""
+    setpoint_acceleration: Any = None
+    """Acceleration of the setpoint, per second squared (envs, size)."""
     feedforward: Any = None
     """Joint effort added before saturation (envs, dof) [N m or N]."""
 
@@ -29,9 +31,14 @@ class Command(NamedTuple):
         """Return a command with ``function`` applied to each array that is given."""
         return Command(*[None if rows is None else function(rows) for rows in self])
 
-    def with_only(self, rate: bool, feedforward: bool) -> Command:
-        """Return the command without rate or feedforward, where they are not used."""
-        return Command(self.setpoint, self.setpoint_rate if rate else None, self.feedforward if feedforward else None)
+    @property
+    def given(self) -> tuple[bool, ...]:
+        """Which arrays are given."""
+        return tuple([rows is not None for rows in self])
+
+    def with_only(self, given: tuple[bool, ...]) -> Command:
+        """Return the command with only the arrays that are ``given``."""
+        return Command(*[rows if is_given else None for rows, is_given in zip(self, given, strict=True)])
 
 
 class FaultArrays(NamedTuple):
@@ -64,7 +71,7 @@ class Arrays(NamedTuple):
         """Return the layout of all fields, for :meth:`from_fields`; a setpoint has ``command_size`` (dof) numbers."""
         row, table = (ticks, num_envs), (ticks, num_envs, dof)
         setpoint = table if command_size is None else (*row, command_size)
-        sizes = Command(setpoint, setpoint, table)
+        sizes = Command(setpoint, setpoint, setpoint, table)
         layout: Layout = {f"command.{name}": (shape, np.float64) for name, shape in sizes._asdict().items()}
         for name, quantity in OBSERVED.items():
             layout[f"observation.{name}"] = (table if quantity.per_joint else row, quantity.dtype)

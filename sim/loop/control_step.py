@@ -2,10 +2,11 @@ r"""One sim step of the control of many robots: a pure function of arrays, for N
 
 In this order, with setpoint r, joint positions q and velocities v, and passive force p::
 
+    setpoint    r    = r at this moment of the tick   where its rate is given: :func:`carried`
     guard       r    = guard(r)                       limits of position, rate and acceleration
     sensors     y    = sensors(q), y' = sensors(v)
     forward     f    = p + feedforward + known friction
-    law         u    = saturated(law(r, r', y, y', f))
+    law         u    = saturated(law(r, r', r'', y, y', f))
     motors      m    = motors(u)
     friction    qf   = m - friction(m, v)             applied in the next sim step
 
@@ -71,6 +72,8 @@ class Step(NamedTuple):
     """Sim steps of the tick."""
     observed: bool = True
     """Whether :attr:`Outputs.saturated` is wanted."""
+    left: Any = 0.0
+    """:meth:`Layout.left`: time from the moment of the law's setpoint to the end of the tick [s]."""
 
 
 class Inputs(NamedTuple):
@@ -183,6 +186,18 @@ class Layout(NamedTuple):
     """Whether the law takes the joints' state from sensors."""
     model: Model = Model()
 
+    def left(self, index: Any, end: Any, timestep: Any) -> Any:
+        """Return the time from the law's setpoint in sim step ``index`` to the end of a tick of ``end`` steps [s].
+
+        The explicit law takes its setpoint at the beginning of the step, the implicit law and drives at the end.
+        """
+        return (end - index - self.late) * timestep
+
+    @property
+    def late(self) -> int:
+        """1 if the law takes its setpoint at the end of a sim step, else 0."""
+        return int(self.control == "drive" or (self.law is not None and self.law.implicit))
+
 
 def control_step(
     layout: Layout, constants: Constants, state: StepState, command: Command, measured: Measured, step: Step
@@ -190,6 +205,8 @@ def control_step(
     """Advance the control by one sim step; return its state and the efforts to apply. Inputs are not modified."""
     qpos, qvel, passive = measured
     guard, motors, guarded, seen, seen_rate = state.guard, state.motors, None, qpos, qvel
+    if layout.control in ("pid", "drive"):
+        command = carried(command, step.left)
     limits: tuple[Any, Any] = (None, None)
     if guard is not None:
         guard, command, guarded = _guarded(constants, guard, command)
@@ -231,20 +248,40 @@ def refreshed(layout: Layout, constants: Constants, friction: FrictionState, qpo
     return friction_model.refresh(constants.friction, friction, matrix, constants.timestep, *constants.drive)
 
 
+def carried(command: Command, left: Any) -> Command:
+    """Return ``command`` at the time ``left`` before the end of its tick, where its rate is given::
+
+        r <- r - left (r' - left r'' / 2)        r' <- r' - left r''
+
+    A setpoint and its rate hold at the end of their tick, as in :class:`batchpid.trajectories.Trajectory`; an
+    acceleration is the same in the whole tick.
+    """
+    setpoint, rate, acceleration, _ = command
+    if rate is None:
+        return command
+    if acceleration is None:
+        return command._replace(setpoint=setpoint - left * rate)
+    change = left * acceleration
+    return command._replace(setpoint=setpoint - left * (rate - 0.5 * change), setpoint_rate=rate - change)
+
+
 def _guarded(constants: Constants, state: GuardState, command: Command) -> tuple[Any, Command, Any]:
     """Return the guard's state, ``command`` with guarded setpoints and rates (if given), and the mask of changes.
 
-    Followers move with their leaders.
+    A given acceleration is 0 where the guard changes the setpoint. Followers move with their leaders.
     """
     xp = namespace(command.setpoint)
     state, changed = guard_model.advance(constants.guard, state, command.setpoint, constants.timestep)
-    setpoint, rate = state.setpoint, command.setpoint_rate
+    setpoint, rate, acceleration = state.setpoint, command.setpoint_rate, command.setpoint_acceleration
     if rate is not None:
         rate = xp.where(changed, state.rate, rate)
+    if acceleration is not None:
+        acceleration = xp.where(changed, 0.0, acceleration)
     if (coupling := constants.coupling) is not None:
         setpoint, changed = coupling.positions(setpoint), coupling.of_leaders(changed)
-        rate = None if rate is None else coupling.rates(rate)
-    return state, command._replace(setpoint=setpoint, setpoint_rate=rate), changed
+        rate, acceleration = (None if each is None else coupling.rates(each) for each in (rate, acceleration))
+    moved = {"setpoint": setpoint, "setpoint_rate": rate, "setpoint_acceleration": acceleration}
+    return state, command._replace(**moved), changed
 
 
 def feedforward(constants: Constants, command: Command, qpos: Any, passive: Any) -> Any:
@@ -275,7 +312,7 @@ def _pid(layout: Layout, constants: Constants, state: StepState, given: Inputs) 
     viscous = None if constants.damping is None else constants.damping * qvel
     if viscous is not None and constants.coupling is not None:
         viscous = constants.coupling.efforts(viscous)
-    inputs = ((command.setpoint, command.setpoint_rate), seen.qpos, qvel, seen.passive, matrix, viscous, *limits)
+    inputs = (command[:3], seen.qpos, qvel, seen.passive, matrix, viscous, *limits)
     new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs, observed=step.observed)
     return state._replace(law=new, matrix=matrix), Outputs(effort, effort, saturated)
 
@@ -287,7 +324,7 @@ def _drive(layout: Layout, constants: Constants, state: StepState, given: Inputs
     a PID whose P and D the engine integrates implicitly. The engine's drives do not know whole turns, so the target of
     a continuous joint is the one next to qpos, which may jump at every sim step.
     """
-    (target, rate, _), seen, *_ = given
+    (target, rate, *_), seen, *_ = given
     xp = namespace(seen.qpos)
     target = nearest_turn(target, seen.qpos, constants.turns, xp)
     if constants.driven is not None:

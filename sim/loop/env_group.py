@@ -84,7 +84,7 @@ class EnvGroup:
         else:
             self._executor = NativeExecutor(options, pack, layout, constants)
         self._measured = self._executor.measure()
-        self._quiet: dict[tuple[bool, bool], QuietTicks | None] = {}
+        self._quiet: dict[tuple[bool, ...], QuietTicks | None] = {}
 
     def execute_in_numpy(self) -> None:
         """Run sim steps call by call in NumPy until the next change, so that the phases of a step can be timed."""
@@ -155,21 +155,21 @@ class EnvGroup:
             containment.fail(entries, cause, steps, containment.start_qpos)
         self._place_failed()
 
-    def run_quietly(self, arrays: Arrays, used: tuple[bool, bool], first: int, until: int, steps: int) -> Stopped:
+    def run_quietly(self, arrays: Arrays, given: tuple[bool, ...], first: int, until: int, steps: int) -> Stopped:
         """Run ticks of ``steps`` sim steps from ``first`` to ``until``, and observe them, while nothing happens.
 
-        ``arrays`` (ticks, envs, ...) are always the same; ``used`` says whether rates and feedforwards are. Next
+        ``arrays`` (ticks, envs, ...) are always the same; ``given`` says which commands are used. Next
         :meth:`run` runs the first tick that is not complete.
         """
         executor, containment = self._executor, self._containment
         if not isinstance(executor, NativeExecutor) or self._contacts is not None or containment.suspended.any():
             return Stopped(first)
-        if used not in self._quiet:
-            command = arrays.command.with_only(*used)
+        if given not in self._quiet:
+            command = arrays.command.with_only(given)
             fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
             shown = Shown(self._motor, self._saturated, self._guarded, fault)
-            self._quiet[used] = executor.quiet_ticks(self._state, command, arrays, shown)
-        if (ticks := self._quiet[used]) is None:
+            self._quiet[given] = executor.quiet_ticks(self._state, command, arrays, shown)
+        if (ticks := self._quiet[given]) is None:
             return Stopped(first)
         containment.failed[:] = False
         stopped = executor.run_ticks(ticks, self._state, self._measured, first, until, steps)
@@ -307,7 +307,7 @@ class EnvGroup:
                 containment.fail(~np.isfinite(rows), cause, self._steps + 1, self._qpos)
         self._place_failed()
         neutral, failed = (
-            (self._qpos if self._options.sets_positions else self._options.command.neutral, 0.0, 0.0),
+            (self._qpos if self._options.sets_positions else self._options.command.neutral, 0.0, 0.0, 0.0),
             containment.failed[:, None],
         )
         both = zip(command, neutral, strict=True)

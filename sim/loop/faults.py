@@ -20,14 +20,17 @@ from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.control_step import Measured
 from batchpid.sim.runner_keywords import FaultAction
 
-CAUSES = ("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort")
+CAUSES = (
+    *("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort"),
+    "setpoint_acceleration",
+)
 """Causes of faults: the state is not finite or a position beyond :data:`FARTHEST`, a joint is too fast, or the array of
 that name was not finite.
 
 "effort" is the effort that the caller's own controller returned. Snapshots hold indices of causes, so new causes are
 appended at the end.
 """
-COMMAND_CAUSES = ("setpoint", "setpoint_rate")
+COMMAND_CAUSES = ("setpoint", "setpoint_rate", "setpoint_acceleration")
 """Causes in an entry of the command, which need not be a joint."""
 
 LONGEST = 10_000

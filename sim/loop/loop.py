@@ -96,23 +96,23 @@ class Loop:
         for group in self.groups:
             group.set_actuators(None if actuators is None else actuators.for_envs(group.envs))
 
-    def run(self, ticks: int, substeps: int, use_rate: bool, use_feedforward: bool) -> float:
+    def run(self, ticks: int, substeps: int, given: tuple[bool, ...]) -> float:
         """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the seconds it took.
 
+        ``given`` says which arrays of the commands are used (:attr:`batchpid.sim.loop.arrays.Command.given`).
         Raises RunError if a group failed. The other groups complete the run, so that the first failure does not depend
         on grouping.
         """
         began = time.perf_counter()
         failures = []
-        used = use_rate, use_feedforward
         for group, group_ticks in zip(self.groups, self._group_ticks, strict=True):
             done = 0
             try:
                 while done < ticks:
-                    done, finish = group.run_quietly(group_ticks.arrays, used, done, ticks, substeps)
+                    done, finish = group.run_quietly(group_ticks.arrays, given, done, ticks, substeps)
                     if done < ticks:
                         rows = group_ticks[done]
-                        group.run(self._steps + done * substeps, substeps, rows.command.with_only(*used), finish)
+                        group.run(self._steps + done * substeps, substeps, rows.command.with_only(given), finish)
                         group.observe(rows)
                         done += 1
             except Exception as error:

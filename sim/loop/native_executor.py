@@ -25,7 +25,7 @@ from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.control_step import Constants, Layout, Measured, StepState
 from batchpid.sim.loop.numpy_executor import COUPLING_STEPS, NumPyExecutor, Ran, Stopped
 from batchpid.sim.loop.quiet_ticks import QuietTicks, Shown
-from batchpid.sim.loop.tick_program import TickProgram, moves_drives
+from batchpid.sim.loop.tick_program import TickProgram
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
@@ -42,7 +42,7 @@ class NativeExecutor(NumPyExecutor):
         super().__init__(options, pack, layout, constants)
         self._step: CompiledStep | None = None
         self._bound: object = None
-        self._ticks: dict[tuple[bool, bool], TickProgram] = {}
+        self._ticks: dict[tuple[bool, ...], TickProgram] = {}
         self._steps_read_force = pack.steps_read_force(self._gravity, self._coriolis)
         self._force: CompiledModel | None = None
         if layout.measures and self._gravity:
@@ -123,13 +123,13 @@ class NativeExecutor(NumPyExecutor):
             limit = None if self._speed_limit is None else np.asarray(self._speed_limit)
             reads_force = self._reads_force and self._steps_read_force
             force = (self._gravity, self._coriolis) if reads_force else (False, False)
-            moves = moves_drives(self._layout, self._constants)
-            self._bound, self._step = pack.calls, pack.compiled_step(*force, self._reads_qvel, limit, moves)
+            drives = self._layout.control == "drive" and isinstance(pack, DrivenPack)
+            self._bound, self._step = pack.calls, pack.compiled_step(*force, self._reads_qvel, limit, drives)
         return self._step
 
     def _program(self, state: StepState, command: Command) -> TickProgram:
-        """Return the program for commands with or without rate and feedforward."""
-        key = command.setpoint_rate is None, command.feedforward is None
+        """Return the program for commands with these arrays."""
+        key = command.given
         if key not in self._ticks:
             self._ticks[key] = TickProgram(
                 self._pack,

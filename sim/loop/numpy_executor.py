@@ -98,7 +98,8 @@ class NumPyExecutor:
         """Run the sim steps of a tick from ``begin`` to ``end``, or until an env may have failed."""
         pack, target, rate = self._pack, None, ()
         for index in range(begin, end):
-            step = Step(index, end, index + 1 == end)
+            left = self._layout.left(index, end, self._constants.timestep)
+            step = Step(index, end, index + 1 == end, left)
             with controller_errors(self._controller, index + 1):
                 state, outputs = control_step(self._layout, self._spread, state, command, measured, step)
             # Writing the drives' targets costs a call for each joint.

@@ -8,7 +8,12 @@ import batchpid as bp
 from batchpid.arrays.choices import PerInertia, PerMassMatrix
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.law.coefficients import Coefficients
-from batchpid.law.computed_torque import advance_terms_with_mass_matrix, advance_with_mass_matrix, per_inertia
+from batchpid.law.computed_torque import (
+    advance_terms_with_mass_matrix,
+    advance_with_mass_matrix,
+    given_acceleration,
+    per_inertia,
+)
 
 MASS_MATRIX_STEPS = 4
 """Sim steps for which a mass matrix is kept within a tick.
@@ -50,7 +55,7 @@ class PIDLaw(NamedTuple):
         self,
         k: Coefficients,
         state: bp.PIDState,
-        command: tuple[Any, Any],
+        command: tuple[Any, Any, Any],
         qpos: Any,
         qvel: Any,
         feedforward: Any,
@@ -65,7 +70,7 @@ class PIDLaw(NamedTuple):
         Parameters
         ----------
         command
-            Setpoint and its rate, which may be None.
+            Setpoint, and its rate and acceleration, which may be None.
         matrix
             M + dt B (envs, dof, dof) for gains per mass matrix; its diagonal (envs, dof) for gains per inertia.
         viscous
@@ -83,9 +88,14 @@ class PIDLaw(NamedTuple):
             k = k._replace(effort_min=low, effort_max=high)
         if viscous is not None:
             feedforward = viscous if feedforward is None else feedforward + viscous
-        setpoint, setpoint_rate = command
-        rates = (qvel if self.measures_rate else None, setpoint_rate)
-        inputs = (setpoint, qpos, matrix, *rates) if self.whole else (setpoint, qpos, *rates)
+        setpoint, setpoint_rate, acceleration = command
+        inputs: tuple[Any, ...] = (qvel if self.measures_rate else None, setpoint_rate)
+        if self.whole:
+            inputs = (setpoint, qpos, matrix, *inputs, acceleration)
+        else:
+            inputs = (setpoint, qpos, *inputs)
+            given = given_acceleration(k, acceleration)
+            feedforward = feedforward if given is None else given if feedforward is None else feedforward + given
         advance: Any = advance_with_mass_matrix if self.whole else bp.advance
         if not observed:
             return *advance(k, state, *inputs, feedforward=feedforward), None

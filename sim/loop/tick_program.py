@@ -85,7 +85,8 @@ class TickProgram:
         saturated = None if layout.control == "drive" else np.zeros(shape, bool)
         self.outputs = Outputs(np.zeros(shape), np.zeros(shape), saturated, guarded)
         arrays = {**self.reading._asdict(), "before": self.before, "qf": self.outputs.qf}
-        if moves_drives(layout, constants):
+        left = None if command.setpoint_rate is None else np.zeros(())
+        if moves_drives(layout, constants, command):
             target, rate = np.zeros((2, *shape))
             arrays |= {"target": target, "target_rate": rate}
             known = None if command.setpoint_rate is None else rate
@@ -96,7 +97,7 @@ class TickProgram:
         if self._control is not None:
             fixed = fixed._replace(law=None)
         limited = None if self._control is None else self._control.limited
-        inputs = (fixed, self.command, self.measured, self._seen, self.outputs.returned, limited)
+        inputs = (fixed, self.command, self.measured, self._seen, self.outputs.returned, limited, left)
         traced = _trace(layout._replace(model=Model()), *map(structure, (self._constants, *inputs)))
         given = leaves(inputs)
         program = ArrayProgram(traced, leaves(self._constants), len(given), shape)
@@ -128,6 +129,8 @@ class TickProgram:
             forward=forward,
             measured_force=force.address if force is not None and layout.measures else None,
             read_force=None if force is None or layout.measures else force.address,
+            late=layout.late,
+            left=left,
             **arrays,
         )
 
@@ -204,9 +207,9 @@ class TickProgram:
             self.state = self.state._replace(motors=self.state.motors._replace(key=state.motors.key))
 
 
-def moves_drives(layout: Layout, constants: Constants) -> bool:
+def moves_drives(layout: Layout, constants: Constants, command: Command) -> bool:
     """Return whether the targets of the engine's drives move within a tick."""
-    moving = constants.driven, constants.guard, constants.turns
+    moving = constants.driven, constants.guard, constants.turns, command.setpoint_rate
     return layout.control == "drive" and any(each is not None for each in moving)
 
 
@@ -220,7 +223,7 @@ def _trace(layout: Layout, *structures: Any) -> Trace:
 
     def function(*symbols: Symbol) -> list[Any]:
         given = iter(symbols)
-        k, before, command, measured, seen, effort, limited = (filled(each, given) for each in structures)
+        k, before, command, measured, seen, effort, limited, left = (filled(each, given) for each in structures)
         model = Model(when=lambda due, function, otherwise: otherwise)
         if limited is not None:
             model = model._replace(controller=lambda law, *_: (law, effort, limited > 0))
@@ -228,13 +231,14 @@ def _trace(layout: Layout, *structures: Any) -> Trace:
             model = model._replace(measure=lambda k, motors, *_: (motors, *seen))
         rubs = k.friction.coulomb is not None
         start = before._replace(age=symbols[0] if rubs else None)
-        new, outputs = control_step(layout._replace(model=model), k, start, command, measured, Step(0, 1))
+        step = Step(0, 1, left=left)
+        new, outputs = control_step(layout._replace(model=model), k, start, command, measured, step)
         results = leaves(_returned(new._replace(age=None)))
         assert len(results) == len(leaves(_returned(before)))
         outputs = outputs._replace(returned=None)
         return [
             *results,
-            *leaves(outputs if moves_drives(layout, k) else outputs._replace(target=None, target_rate=None)),
+            *leaves(outputs if moves_drives(layout, k, command) else outputs._replace(target=None, target_rate=None)),
         ]
 
     first = len(leaves(structures[0]))

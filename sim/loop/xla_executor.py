@@ -191,7 +191,8 @@ def tick(
     whole = layout._replace(model=model)
 
     def body(carry: Carry) -> Carry:
-        step = Step(carry.progress[0], end)
+        index = carry.progress[0]
+        step = Step(index, end, left=layout.left(index, end, constants.timestep))
         state, outputs = control_step(whole, constants, carry.state, command, carry.measured, step)
         qpos, qvel, passive, status = xla.sim_step(address, carry.progress[0], outputs.qf)
         new = Measured(qpos, qvel, passive if gravity else None)

@@ -9,7 +9,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.io.versions import package_versions
-from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.observation import OBSERVED
 from batchpid.sim.options import RunnerOptions
@@ -34,7 +34,7 @@ def canonical_digest(options: RunnerOptions, params: bp.PIDParams) -> str:
     loop = Loop(options, params, slice(0, 1), arrays)
     try:
         loop.reset(np.ones(1, bool), start, np.zeros_like(start))
-        loop.run(_TICKS, _SUBSTEPS, use_rate=False, use_feedforward=False)
+        loop.run(_TICKS, _SUBSTEPS, Command(arrays.command.setpoint).given)
     finally:
         loop.close()
     digest = hashlib.sha256(str(package_versions(("batchpid",)).get("batchpid")).encode())

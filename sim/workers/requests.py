@@ -21,7 +21,7 @@ from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.draws import NOTHING, Draws
 from batchpid.sim.workers.canonical import canonical_digest
 
-_RUN = struct.Struct("<cII??")  # b"R", ticks, substeps, use_rate, use_feedforward
+_RUN = struct.Struct(f"<cII{len(Command._fields)}?")  # b"R", ticks, substeps, Command.given
 
 
 class Request(ABC):
@@ -71,7 +71,8 @@ class Request(ABC):
 def decode(message: bytes) -> Request:
     """Return the request of a message from :meth:`Request.encode`."""
     if message[:1] == b"R":
-        return Run(*_RUN.unpack(message)[1:])
+        _, ticks, substeps, *given = _RUN.unpack(message)
+        return Run(ticks, substeps, tuple(given))
     request: Request = pickle.loads(message)
     return request
 
@@ -125,8 +126,8 @@ class Run(Request):
 
     ticks: int
     substeps: int
-    use_rate: bool
-    use_feedforward: bool
+    given: tuple[bool, ...]
+    """Which arrays of the command are used."""
     command: Command = Command(None)  # noqa: RUF009  (immutable)
     counts_ticks = True
     idle_limit = 0.7  # it only computes
@@ -147,10 +148,10 @@ class Run(Request):
                 table[: self.ticks, envs] = rows[:, envs]
 
     def encode(self, envs: slice) -> bytes:
-        return _RUN.pack(b"R", self.ticks, self.substeps, self.use_rate, self.use_feedforward)
+        return _RUN.pack(b"R", self.ticks, self.substeps, *self.given)
 
     def apply(self, loop: Loop) -> float:
-        return loop.run(self.ticks, self.substeps, self.use_rate, self.use_feedforward)
+        return loop.run(self.ticks, self.substeps, self.given)
 
     def join(self, results: list[float]) -> float:
         return max(results)

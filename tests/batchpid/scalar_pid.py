@@ -66,6 +66,7 @@ class ScalarPID:
         self.origin += (measurement - self.measurement) - moved
         weight = self.setpoint_weight
         proportional = self.kp * (weight * error - (1 - weight) * (measurement - self.origin))
+        self.origin += dt * (setpoint_rate or 0.0)
 
         rate = -(moved / dt) if measurement_rate is None else -measurement_rate
         if setpoint_rate is not None:

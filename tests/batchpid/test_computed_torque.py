@@ -103,6 +103,7 @@ def test_per_inertia_scales_every_gain_and_nothing_else():
     inertia = np.array([[0.5, 2.0], [1.0, 4.0]])
     scaled = per_inertia(k, inertia)
     by_hand = bp.discretise(p.replace(kp=10.0 * inertia, ki=5.0 * inertia, kd=2.0 * inertia), DT)
+    by_hand = by_hand._replace(acceleration_share=inertia)  # of a setpoint's acceleration
     for name in k._fields:
         np.testing.assert_array_equal(getattr(scaled, name), getattr(by_hand, name), err_msg=name)
 

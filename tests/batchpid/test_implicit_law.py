@@ -34,33 +34,36 @@ def solved(f):
     order=st.sampled_from(["output_first", "integrate_first"]),
     measures=st.booleans(),
     rated=st.booleans(),
+    accelerated=st.booleans(),
     seed=st.integers(0, 999),
 )
-def test_it_solves_the_law_at_the_end_of_the_step(gains, dt, b, c, order, measures, rated, seed):
+def test_it_solves_the_law_at_the_end_of_the_step(gains, dt, b, c, order, measures, rated, accelerated, seed):
     p = bp.make_params(1, *gains, setpoint_weight=b, setpoint_weight_derivative=c, integration=order, **IMPLICIT)
     p_, i_, d_ = (0.0 if x is None else x for x in gains)
     b_, on_rate = 1.0 if b is None else b, (1.0 if rated else 0.0) if c is None else c
     rng = np.random.default_rng(seed)
-    setpoints, rates = rng.normal(size=(2, 8))
-    y, v, integral, last = 0.3, 0.0, 0.0, None
+    setpoints, rates, accelerations = rng.normal(size=(3, 8))
+    y, v, integral, last, origin = 0.3, 0.0, 0.0, None, 0.0
     state = bp.init(p, np.array([[y]]))
-    for r, slope in zip(setpoints, rates, strict=True):
+    for r, slope, more in zip(setpoints, rates, accelerations * accelerated, strict=True):
+        origin += dt * slope if rated else 0.0
         rate = slope if rated else 0.0 if last is None else (r - last) / dt
         last = r
         integral += i_ * dt * (r - (dt * slope if rated else 0.0) - y)
 
-        def excess(a, r=r, rate=rate, y=y, v=v, integral=integral):
+        def excess(a, r=r, rate=rate, y=y, v=v, integral=integral, origin=origin, more=more):
             v_end = v + dt * a
             y_end = y + dt * v_end
             i_end = integral + i_ * dt * (r - y_end)
-            return p_ * (b_ * r - y_end) + d_ * (on_rate * rate - v_end) + i_end - a
+            weighted = b_ * (r - y_end) - (1 - b_) * (y_end - origin)
+            return p_ * weighted + d_ * (on_rate * rate - v_end) + i_end + more - a
 
         expected = solved(excess)
         known = {"measurement_rate": np.array([[v]])} if measures else {}
         known |= {"setpoint_rate": np.array([[slope]])} if rated else {}
-        state, a = bp.advance(
-            bp.discretise(p, dt)._replace(gain_units=None), state, np.array([[r]]), np.array([[y]]), **known
-        )
+        known |= {"setpoint_acceleration": np.array([[more]])} if accelerated else {}
+        k = bp.discretise(p, dt)
+        state, a = advance_with_mass_matrix(k, state, np.array([[r]]), np.array([[y]]), np.ones((1, 1, 1)), **known)
         scale = abs(expected) + (abs(r) + abs(y) + dt * abs(v)) * (p_ + i_ * dt) + (abs(rate) + abs(v)) * d_
         assert abs(a.item() - expected) <= 1e-7 * (scale + abs(integral) + 1)
         v += dt * a.item()

@@ -162,7 +162,7 @@ PyObject *step_group(PyObject *, PyObject *const *arguments, Py_ssize_t) {
 constexpr char BOUND[] = "batchpid.bound_program";
 
 // bind(arguments of make_program, inputs, outputs): pairs of an array (contiguous, kept alive by the caller) and the
-// numbers in each row of a table (0: it is (rows, columns)), and arrays.
+// numbers in each row of a table (0: it is (rows, columns), -1: one number), and arrays.
 PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto bound = std::make_unique<BoundProgram>();
   bound->program = make_program(arguments[0]);
@@ -175,11 +175,13 @@ PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   }
   for (Py_ssize_t i = 0; i < program.inputs; ++i) {
     PyObject *pair = PyTuple_GetItem(arguments[1], i);
-    Index const size = PyLong_AsSsize_t(PyTuple_GetItem(pair, 1)), count = size ? program.rows * size : numbers;
+    Index const size = PyLong_AsSsize_t(PyTuple_GetItem(pair, 1));
+    Index const count = size < 0 ? 1 : size ? program.rows * size : numbers;
+    Shape const shape = size < 0 ? Shape::NUMBER : size ? Shape::TABLE : Shape::FULL;
     Buffer array;
     int const flags = PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE;
     if (!array.open(PyTuple_GetItem(pair, 0), count, sizeof(double), flags)) return nullptr;
-    bound->inputs.push_back({array.as<void>(), size ? Shape::TABLE : Shape::FULL, size, true});
+    bound->inputs.push_back({array.as<void>(), shape, std::max<Index>(size, 0), true});
   }
   for (Py_ssize_t i = 0; i < PyTuple_Size(arguments[2]); ++i) {
     Buffer array;

@@ -129,12 +129,12 @@ class Tick(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping")),
         *((name, ctypes.c_void_p) for name in ("leader", "multiplier", "matrix", "control")),
         *((name, ctypes.c_void_p) for name in ("measured_force", "read_force", "refresh")),
-        *((name, ctypes.c_void_p) for name in ("gain", "memory", "age", "target", "target_rate")),
+        *((name, ctypes.c_void_p) for name in ("gain", "memory", "age", "target", "target_rate", "left")),
         ("noise", 2 * ctypes.c_void_p),
         ("timestep", ctypes.c_double),
         ("dof", ctypes.c_int64),
         *((name, ctypes.c_int32) for name in ("whole", "matrix_steps", "coupling_steps")),
-        *((name, ctypes.c_int32) for name in ("gravity", "coriolis", "unused")),
+        *((name, ctypes.c_int32) for name in ("gravity", "coriolis", "late")),
     ]
 
 

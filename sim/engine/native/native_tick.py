@@ -25,7 +25,8 @@ class NativeTick:
     program
         Program of the control step for the pack's envs.
     inputs, outputs
-        Arrays that it reads and writes, (envs, dof), or (envs, ...) for the matrices and histories among its inputs.
+        Arrays that it reads and writes, (envs, dof), or among its inputs (envs, ...) for matrices and histories and ()
+        for a number.
     timestep
         [s]
     matrix_steps
@@ -45,6 +46,9 @@ class NativeTick:
         Sim steps for which the constraint efforts of coupled joints keep their mass matrix.
     sensors
         Program of the sensors, its inputs and its outputs. Its last inputs are the noise (:meth:`run`).
+    late, left
+        Whether the law takes its setpoint at the end of a sim step, and the number () to which the time from there to
+        the end of the tick is written [s].
     forward
         Program that runs before the controller, its inputs and its outputs: of the feedforward that it takes.
     arrays
@@ -71,6 +75,7 @@ class NativeTick:
         read_force: int | None = None,
         refresh: int | None = None,
         coupling_steps: int = 1,
+        late: int = 0,
         sensors: tuple[ArrayProgram, Sequence[NDArray[Any]], Sequence[NDArray[Any]]] | None = None,
         forward: tuple[ArrayProgram, Sequence[NDArray[Any]], Sequence[NDArray[Any]]] | None = None,
         **arrays: NDArray[Any] | None,
@@ -86,7 +91,7 @@ class NativeTick:
         self._others = [None if each is None else self._bind(*each) for each in (sensors, forward)]
         addresses = {name: array.ctypes.data for name, array in given.items()}
         calls = {"control": control, "refresh": refresh, "measured_force": measured_force, "read_force": read_force}
-        steps = {"matrix_steps": matrix_steps, "coupling_steps": coupling_steps, "dof": program.shape[1]}
+        steps = {"matrix_steps": matrix_steps, "coupling_steps": coupling_steps, "dof": program.shape[1], "late": late}
         parts = dict(zip(("gravity", "coriolis"), compensated, strict=True))
         self._tick = Tick(timestep=timestep, whole=whole, **steps, **parts, **calls, **addresses)
         self._address = ctypes.addressof(self._tick)
@@ -94,7 +99,7 @@ class NativeTick:
 
     def _bind(self, program: ArrayProgram, inputs: Sequence[NDArray[Any]], outputs: Sequence[NDArray[Any]]) -> Any:
         """Return a program with its arrays."""
-        pairs = tuple([(array, 0 if array.ndim == 2 else array[0].size) for array in inputs])
+        pairs = tuple([(array, 0 if array.ndim == 2 else array[0].size if array.ndim else -1) for array in inputs])
         return self._native.bind(program.arguments, pairs, tuple(outputs))
 
     def run(self, group: int, begin: int, until: int, end: int, *noise: NDArray[np.float64]) -> tuple[int, int]:

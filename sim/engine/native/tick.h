@@ -33,6 +33,7 @@ struct Tick {
   double *gain, *memory;          // of the friction model
   std::int64_t *age;              // (robots,)
   double const *target, *target_rate;  // outputs of the program: targets of drives, or null
+  double *left;                   // time from the moment of the law's setpoint to the end of the tick [s], or null
   double const *noise[2];         // (steps, robots, dof): last inputs of the sensors in the next steps, or null
   double timestep;
   std::int64_t dof;
@@ -40,7 +41,7 @@ struct Tick {
   std::int32_t matrix_steps;
   std::int32_t coupling_steps;    // sim steps for which constraint efforts keep their mass matrix
   std::int32_t gravity, coriolis;  // parts of the passive force
-  std::int32_t unused;
+  std::int32_t late;              // the law takes its setpoint at the end of a sim step
 };
 
 // A program with its arrays.
@@ -103,6 +104,7 @@ inline std::int32_t run_tick(Programs const &programs, Tick const &tick, Group &
     if (tick.matrix != nullptr && step % tick.matrix_steps == 0) {
       write_matrices(tick, robots, std::min<std::int64_t>(tick.matrix_steps, end - step));
     }
+    if (tick.left != nullptr) *tick.left = static_cast<double>(end - step - tick.late) * tick.timestep;
     if (programs.forward != nullptr) run_bound(*programs.forward);
     if (tick.control != nullptr) tick.control->run(*tick.control);
     run_bound(*programs.step);

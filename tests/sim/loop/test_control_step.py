@@ -43,7 +43,7 @@ def table(rng, scale=1.0):
     return scale * rng.normal(size=(ENVS, JOINTS))
 
 
-EFFECTS = ("guard", "motors", "friction", "known", "feedforward", "rate")
+EFFECTS = ("guard", "motors", "friction", "known", "feedforward", "rate", "acceleration")
 
 
 def a_step(control, units, effects, seed, coupled=False):
@@ -81,6 +81,7 @@ def a_step(control, units, effects, seed, coupled=False):
     command = Command(
         qpos + table(rng, 0.1),
         table(rng, 0.1) if "rate" in effects else None,
+        table(rng, 0.1) if {"rate", "acceleration"} <= effects else None,
         table(rng) if "feedforward" in effects else None,
     )
     return layout, constants, state, command, Measured(qpos, qvel, passive)

@@ -26,7 +26,7 @@ N = 8
 
 
 def run(ticks=1):
-    return Run(ticks, 20, False, False, Command(None))
+    return Run(ticks, 20, Command(0).given, Command(None))
 
 
 def dies():

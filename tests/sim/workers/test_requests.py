@@ -32,7 +32,7 @@ def test_the_part_of_a_reset_has_the_rows_of_its_envs():
 def test_a_run_writes_the_commands_of_some_envs_and_no_others():
     layout = Arrays.layout(4, N, DOF)
     arrays = Arrays.from_fields({name: np.full(shape, 7, dtype) for name, (shape, dtype) in layout.items()})
-    run = Run(3, 20, False, False, command(ticks=3))
+    run = Run(3, 20, command().given, command(ticks=3))
     run.write(arrays, ENVS)
     expected = np.full((4, N, DOF), 7.0)
     expected[:3, ENVS] = command().setpoint[:, ENVS]
@@ -49,11 +49,12 @@ def test_the_part_of_params_has_the_rows_of_its_envs(panda):
 
 @pytest.mark.parametrize("rate", [None, command().setpoint])
 def test_the_message_of_a_run_is_short_and_holds_all_but_the_commands(rate):
-    request = Run(3, 7, rate is not None, False, command()._replace(setpoint_rate=rate))
+    given = command()._replace(setpoint_rate=rate)
+    request = Run(3, 7, given.given, given)
     message = request.encode(ENVS)
     assert len(message) < 20
     received = decode(message)
-    for name in ("ticks", "substeps", "use_rate", "use_feedforward"):
+    for name in ("ticks", "substeps", "given"):
         assert getattr(received, name) == getattr(request, name)
 
 
