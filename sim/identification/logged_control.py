@@ -55,6 +55,6 @@ class Law:
         """Advance the law by a step and return the efforts (n, joints)."""
         given = matrix if self._law.whole else np.diagonal(matrix, axis1=1, axis2=2)
         self._state, effort, _ = self._law.advance(
-            self._k, self._state, (setpoint, None), qpos, qvel, feedforward, given
+            self._k, self._state, (setpoint, None, None), qpos, qvel, feedforward, given
         )
         return np.asarray(effort)

@@ -62,16 +62,17 @@ def test_the_traced_law_is_bit_identical_to_numpy(options, joints, envs, odd, se
     state = bp.PIDState(
         *(None if leaf is None else numbers(rng, shape, odd, float) for leaf in bp.init(params, np.zeros(shape)))
     )
-    rate, qvel, feedforward = (
-        numbers(rng, shape, odd, float) if given else None for given in data.draw(st.tuples(*[st.booleans()] * 3))
+    rate, acceleration, qvel, feedforward = (
+        numbers(rng, shape, odd, float) if given else None for given in data.draw(st.tuples(*[st.booleans()] * 4))
     )
+    acceleration = None if params.gain_units is None else acceleration
     qvel = numbers(rng, shape, odd, float) if law.measures_rate else qvel
     matrix, viscous = (
         (numbers(rng, (*shape, joints), odd, float), numbers(rng, shape, odd, float)) if law.whole else (None, None)
     )
     matrix = numbers(rng, shape, odd, float) if law.per_inertia else matrix
     ends = np.sort(numbers(rng, (2, *shape), odd, float), axis=0) if data.draw(st.booleans()) else (None, None)
-    signals = (numbers(rng, shape, odd, float), rate), numbers(rng, shape, odd, float), qvel, feedforward
+    signals = (numbers(rng, shape, odd, float), rate, acceleration), numbers(rng, shape, odd, float), qvel, feedforward
     arguments = (state, *signals, matrix, viscous, *ends)
     with np.errstate(all="ignore"):
         expected = law.advance(k, *arguments, observed=True)
@@ -87,5 +88,5 @@ def test_sums_are_in_the_order_of_numpys(joints):
     params = bp.make_params(joints, 1.0, gain_units="mass_matrix")
     law, k = PIDLaw.of(params), bp.discretise(params, DT, 3)
     state, zero = bp.init(params, np.zeros_like(vector)), np.zeros_like(vector)
-    arguments = (state, (vector, None), zero, None, None, matrix)
+    arguments = (state, (vector, None, None), zero, None, None, matrix)
     assert bits(run_traced(law, k, *arguments)[-2]) == bits(law.advance(k, *arguments)[1])
