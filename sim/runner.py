@@ -135,7 +135,8 @@ class Runner(SingleOwner):
             Rate of the setpoint [rad/s or m/s], same shapes, with which the setpoint moves within the tick. Both hold
             at the tick's end: the setpoint of a sim step that begins t before it is ``setpoint - t setpoint_rate``. The
             law damps the velocity error instead of the velocity, and follows this motion with full weight. Controls
-            other than "pid" and "drive" ignore it.
+            other than "pid" and "drive" ignore it. With ``setpoint_space="tool"`` it is the twist of the tool in the
+            world (6,) or (envs, 6) [m/s, rad/s].
         setpoint_acceleration
             Acceleration of the setpoint in the tick [rad/s^2 or m/s^2], same shapes, besides its rate: a law with gains
             per unit of inertia adds it to the acceleration that it commands. Other gains take ``feedforward``.

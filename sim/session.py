@@ -165,7 +165,7 @@ class Session:
         self._transactions.ready("step")
         count = self.options.substeps if substeps is None else self._arguments.substeps(substeps)
         if self._tool_setpoints is not None:
-            setpoint = self._joints("setpoint", setpoint, setpoint_rate, None)
+            setpoint, setpoint_rate = self._joints("setpoint", setpoint, setpoint_rate, setpoint_acceleration, None)
         given = setpoint, setpoint_rate, setpoint_acceleration, feedforward
         command = self._arguments.tick(self._transactions.state.params, *given)
         self._transactions.run(*self._ticks(command, count))
@@ -184,7 +184,7 @@ class Session:
         self._transactions.ready("send")
         count = self._arguments.substeps(substeps)
         if self._tool_setpoints is not None:
-            setpoint = self._joints("setpoint", setpoint, setpoint_rate, None)
+            setpoint, setpoint_rate = self._joints("setpoint", setpoint, setpoint_rate, setpoint_acceleration, None)
         given = setpoint, setpoint_rate, setpoint_acceleration, feedforward
         command = self._arguments.tick(self._transactions.state.params, *given)
         request, commit = self._ticks(command, count)
@@ -215,7 +215,8 @@ class Session:
         """Run one tick for each row of ``setpoints``."""
         steps, options = self._transactions.ready("rollout").steps, self.options
         if self._tool_setpoints is not None:
-            setpoints = self._joints("setpoints", setpoints, setpoint_rates, len(np.atleast_1d(setpoints)))
+            poses = setpoints, setpoint_rates, setpoint_accelerations
+            setpoints, setpoint_rates = self._joints("setpoints", *poses, len(np.atleast_1d(setpoints)))
         command = self._arguments.ticks(
             self._transactions.state.params, setpoints, setpoint_rates, setpoint_accelerations, feedforwards
         )
@@ -401,15 +402,19 @@ class Session:
 
         return Run(ticks, substeps, command.given, command), commit
 
-    def _joints(self, name: str, setpoint: ArrayLike, rate: ArrayLike | None, ticks: int | None) -> NDArray[np.float64]:
-        """Return joint setpoints for poses of the tool."""
-        if rate is not None:
-            problem = "is the rate of joint setpoints, and setpoints are poses"
-            raise InvalidArgumentError("setpoint_rate", problem, remedy="leave it out")
+    def _joints(
+        self, name: str, setpoint: ArrayLike, twist: ArrayLike | None, acceleration: ArrayLike | None, ticks: int | None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """Return joint setpoints and their rates for poses of the tool and its twists."""
+        if acceleration is not None:
+            problem = "is for joint setpoints, and setpoints are poses"
+            raise InvalidArgumentError(name.replace("point", "point_acceleration"), problem, remedy="leave it out")
         last, finite = self._transactions.ready().targets, self.options.on_invalid_input == "raise"
-        assert self._tool_setpoints is not None
+        tool = self._tool_setpoints
+        assert tool is not None
         assert last is not None
-        return self._tool_setpoints.joints(name, setpoint, last, finite, ticks, stacklevel=4)
+        qpos = tool.joints(name, setpoint, last, finite, ticks, stacklevel=4)
+        return qpos, None if twist is None else tool.rates(name.replace("point", "point_rate"), twist, qpos, finite)
 
     def _max_ticks(self) -> int:
         """Return the number of ticks that one request may have: none beyond the next checkpoint."""

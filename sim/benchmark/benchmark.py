@@ -24,7 +24,7 @@ from batchpid.sim.benchmark.policy import ResidualPolicy
 from batchpid.sim.benchmark.workload import Case, Workload, run_round
 from batchpid.sim.engine.native import python_calls
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.loop.arrays import Arrays
+from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.runner import Runner
@@ -197,7 +197,8 @@ def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, flo
     for group in loop.groups:
         group.execute_in_numpy()
         _time_calls(group.pack, spent)
-    total = sum(loop.run(1, workload.substeps, False, False) for _ in range(workload.ticks))
+    given = Command(workload.target).given
+    total = sum(loop.run(1, workload.substeps, given) for _ in range(workload.ticks))
     loop.close()
     shared.close()
     env_steps = workload.steps * share

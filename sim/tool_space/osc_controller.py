@@ -29,7 +29,7 @@ from batchpid.task_space.frames import pose_error
 from batchpid.task_space.osc_params import AXES, NoDecoupling
 from batchpid.task_space.symmetric import gram, solve
 
-_OPTIONAL = {
+OPTIONAL = {
     "twist": ("vx vy vz wx wy wz", "m/s", "rad/s"),
     "acceleration": ("ax ay az alphax alphay alphaz", "m/s^2", "rad/s^2"),
     "wrench": ("fx fy fz mx my mz", "N", "N m"),
@@ -142,7 +142,7 @@ class OperationalSpace:
         entries, self._parts = dict(POSE_UNITS), dict[str, slice]()
         for name, wanted in {"twist": twist, "acceleration": acceleration, "wrench": wrench}.items():
             if flag(name, wanted):
-                (words, linear, angular), first = _OPTIONAL[name], len(entries)
+                (words, linear, angular), first = OPTIONAL[name], len(entries)
                 entries |= zip(words.split(), [linear] * 3 + [angular] * 3, strict=True)
                 self._parts[name] = slice(first, first + 6)
         size = len(entries)

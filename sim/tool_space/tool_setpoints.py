@@ -15,7 +15,10 @@ from batchpid.checks.validate import array, entries, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.command import POSE_UNITS, CommandSpec
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.tool_space.osc_controller import tool_pose
+from batchpid.sim.tool_space.osc_controller import OPTIONAL, tool_pose
+
+DAMPING = 1e-4
+"""Damping of the inverse Jacobian of a tool's twist."""
 
 
 class ToolSetpoints:
@@ -101,6 +104,28 @@ class ToolSetpoints:
                 self._warn(name, np.flatnonzero(good)[~solved.success], solved, stacklevel + 1)
             last = np.where(good[:, None], found[tick], last)
         return read_only(found.reshape(*lead, -1))
+
+    def rates(self, name: str, twist: Any, qpos: Float64, finite: bool) -> Float64:
+        """Return the joint rates (..., envs, dof) at setpoints ``qpos`` (..., envs, dof) for twists of the tool.
+
+        A twist has 6 entries, in the world [m/s, rad/s], and may go on with the rates of the joints outside the chain.
+        The joint rates are J^T (J J^T + 1e-4)^-1 twist, with the Jacobian J: bounded where the tool cannot move.
+
+        Raises
+        ------
+        InvalidArgumentError
+            A shape is wrong, or a number is not finite unless invalid numbers are allowed (not ``finite``).
+        """
+        given = read_array(name, twist)
+        names = (*OPTIONAL["twist"][0].split(), *self.command.names[7:])[: 6 if given.shape[-1:] == (6,) else None]
+        if qpos.ndim == 3 and given.ndim == 2:
+            given = given[:, None]
+        rows = array(name, given, (*qpos.shape[:-1], len(names)), names, finite=finite, kind="entry")
+        j = ts.jacobian(self._tree, qpos, self.link)
+        across = j @ j.swapaxes(-1, -2) + DAMPING * np.eye(6)
+        found = (j.swapaxes(-1, -2) @ np.linalg.solve(across, rows[..., :6, None]))[..., 0]
+        found[..., self._others[: len(names) - 6]] = rows[..., 6:]
+        return read_only(found)
 
     def _warn(self, name: str, failed: Any, found: ts.IKResult, stacklevel: int) -> None:
         """Warn of the first env whose pose was not reached, once."""

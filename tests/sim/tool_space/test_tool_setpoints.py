@@ -107,5 +107,28 @@ def test_setpoints_are_checked(panda):
         ):
             with pytest.raises(InvalidArgumentError, match=message):
                 runner.step(setpoint)
-        with pytest.raises(InvalidArgumentError, match="setpoint_rate: is the rate of joint setpoints"):
+        runner.reset(START)
+        with pytest.raises(InvalidArgumentError, match=r"setpoint_rate: has shape \(2, 7\), not \(2, 8\)"):
             runner.step(goals, setpoint_rate=goals)
+        with pytest.raises(InvalidArgumentError, match="setpoint_rate, entry 'wx', env 1"):
+            runner.step(goals, setpoint_rate=[[0.0] * 6, [0.0, 0.0, 0.0, np.inf, 0.0, 0.0]])
+        with pytest.raises(InvalidArgumentError, match="setpoint_acceleration: is for joint setpoints"):
+            runner.step(goals, setpoint_acceleration=goals)
+
+
+def test_a_tool_that_moves_follows_its_poses_with_its_twist(panda):
+    """The joints' rates are those whose tool has the twist; without them the tool stays behind."""
+    ticks, dt = 100, 0.01
+    time = dt * np.arange(1, ticks + 1)
+    goals = np.tile(ts.link_poses(panda.kinematic_tree(), START, [HAND])[0], (ticks, 2, 1))
+    twist = np.zeros((ticks, 2, 6))
+    goals[..., 1] += 0.1 * (1 - np.cos(np.pi * time))[:, None]
+    twist[..., 1] = 0.1 * np.pi * np.sin(np.pi * time)[:, None]
+    behind = {}
+    for rates in (None, twist):
+        with Runner(panda, 2, **OPTIONS) as runner:
+            runner.reset(START)
+            rollout = runner.rollout(goals, setpoint_rates=rates)
+            behind[rates is None] = np.linalg.norm(rollout.tool_pose[..., :3] - goals[..., :3], axis=-1).max()
+    assert behind[True] > 0.03
+    assert behind[False] < 0.01
