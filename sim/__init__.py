@@ -38,7 +38,7 @@ from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
 from batchpid.sim.robot.description import RobotFunctions, register_engine
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.limits import SetpointWarning
+from batchpid.sim.robot.limits import MovingSetpointWarning, SetpointWarning
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Controller, RunnerKeywords
@@ -62,6 +62,7 @@ __all__ = [
     "LogUniform",
     "MissedContact",
     "MissedContactWarning",
+    "MovingSetpointWarning",
     "MujocoSolver",
     "Normal",
     "Observation",

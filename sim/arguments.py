@@ -40,7 +40,8 @@ class Arguments:
     def tick(self, params: bp.PIDParams, *command: ArrayLike | None) -> Command:
         """Return the command (1, envs, ...) of one tick, from its arrays in the order of :class:`Command`."""
         given = dict(zip(Command._fields, command, strict=True))
-        self._check_acceleration(params, given)
+        if command[2] is not None:
+            self._check_acceleration(params, given)
         read = self._read(given)
         if self._checks_setpoints:
             self._limits.check("setpoint", read.setpoint, stacklevel=5)
@@ -62,7 +63,8 @@ class Arguments:
             return rows if rows is None or rows.ndim != 2 else rows[:, None]
 
         given = {f"{name}s": rows for name, rows in zip(Command._fields, (setpoints, *others), strict=True)}
-        self._check_acceleration(params, given)
+        if others[1] is not None:
+            self._check_acceleration(params, given)
         command = self._read({name: of_ticks(name, value) for name, value in given.items()}, shape[0])
         if self._checks_setpoints:
             self._limits.check("setpoint", command.setpoint, stacklevel=5)
@@ -81,9 +83,7 @@ class Arguments:
 
     def _check_acceleration(self, params: bp.PIDParams, given: Mapping[str, Any]) -> None:
         """Raise InvalidArgumentError for an acceleration that the law does not take."""
-        _, (rate, given_rate), (name, value), _ = given.items()
-        if value is None:
-            return
+        _, (rate, given_rate), (name, _), _ = given.items()
         if self._options.control != "pid" or params.gain_units is None:
             remedy = "give M(q) times it as feedforward, or use gains in accelerations, such as robot.designed()"
             raise InvalidArgumentError(name, "is for gains in accelerations, and these are efforts", remedy=remedy)

@@ -138,8 +138,10 @@ class Runner(SingleOwner):
             other than "pid" and "drive" ignore it. With ``setpoint_space="tool"`` it is the twist of the tool in the
             world (6,) or (envs, 6) [m/s, rad/s].
         setpoint_acceleration
-            Acceleration of the setpoint in the tick [rad/s^2 or m/s^2], same shapes, besides its rate: a law with gains
-            per unit of inertia adds it to the acceleration that it commands. Other gains take ``feedforward``.
+            Acceleration of the setpoint [rad/s^2 or m/s^2], same shapes, besides its rate: a law with gains per unit of
+            inertia adds it to the acceleration that it commands. Other gains take ``feedforward``. Default 0. Where the
+            setpoints confirm that the rate is the one at the tick's end, as in a smooth trajectory, its change over the
+            tick is taken instead, which is the mean acceleration.
         feedforward
             Joint effort (dof,) or (envs, dof) [N m or N] added to the passive force before saturation.
         substeps

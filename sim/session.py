@@ -30,6 +30,7 @@ from batchpid.sim.observation import OBSERVED, Observation, Rollout, RunInfo, em
 from batchpid.sim.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.draws import NOTHING
 from batchpid.sim.robot.drive_chatter import DriveChatterCheck
+from batchpid.sim.robot.limits import MovingSetpointCheck
 from batchpid.sim.robot.loop_stability import StabilityCheck
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContactLog, MissedContactWarning
@@ -79,8 +80,9 @@ class Session:
         self._stability = StabilityCheck(robot, options.timestep) if options.control == "pid" else None
         is_checked = options.control == "drive" and options.engine == "mujoco"
         self._chatter = DriveChatterCheck(robot, options.timestep) if is_checked else None
+        self._moving = MovingSetpointCheck(robot) if options.control == "pid" else None
         self._tool_pose, self._tool_setpoints = options.tool_pose, options.tool_setpoints
-        self._has_warned = self._has_warned_of_contact = False
+        self._has_warned = self._has_warned_of_contact = self._has_warned_of_motion = False
         entry_names = None if own is None else own.names
         faults = FaultLog(options.num_envs, robot.joint_names, options.timestep, options.on_fault, entry_names)
         contacts = None
@@ -101,6 +103,8 @@ class Session:
         self.reset(seed=None if self.options.randomization is None else 0)
         if self._stability is not None:
             self._stability.check(self.state.params, self.options.actuators, stacklevel=4)
+        if self._moving is not None:
+            self._moving.set_params(self.state.params)
         if self._chatter is not None:
             self._chatter.set_gains(self.state.params, self.options.actuators)
         if isinstance(self.options.control, OperationalSpace):
@@ -133,7 +137,7 @@ class Session:
     ) -> Observation:
         """Place robots, with a fresh state of the controller."""
         draws = self._transactions.ready("reset").draws
-        robot, randomization = self.options.robot, self.options.randomization
+        options, robot, randomization = self.options, self.options.robot, self.options.randomization
         position, velocity, chosen = self._arguments.start(qpos, qvel, mask)
         if randomization is not None:
             draws = randomization.redraw(robot, draws, chosen, seed)
@@ -148,7 +152,11 @@ class Session:
             if self._tool_setpoints is not None:
                 last = position if state.targets is None else state.targets
                 targets = np.where(chosen[:, None] & np.isfinite(position), position, last)
-            return state._replace(faults=faults, draws=draws, targets=targets), self._observation()
+            motion: Any = (position, velocity) if options.sets_positions else None
+            if state.motion is not None:
+                kept = [0.0 if rows is None else rows for rows in state.motion]
+                motion = tuple(np.where(chosen[:, None], *rows) for rows in zip(motion, kept, strict=True))
+            return state._replace(faults=faults, draws=draws, targets=targets, motion=motion), self._observation()
 
         observation: Observation = self._execute(Reset(chosen, position, velocity, draws), commit)
         return observation
@@ -267,6 +275,8 @@ class Session:
         self._execute(SetParams(checked), lambda state, _: (state._replace(params=checked), None))
         if self._stability is not None:
             self._stability.check(checked, self.state.actuators, stacklevel=4)
+        if self._moving is not None:
+            self._moving.set_params(checked)
         if self._chatter is not None:
             self._chatter.set_gains(checked, self.state.actuators)
 
@@ -286,7 +296,11 @@ class Session:
             episodes = None if self.options.randomization is None else state.draws.episodes.copy()
             targets = None if state.targets is None else state.targets.copy()
             about, states = self.options.describe(), EnvStates.join(results)
-            snapshot = Snapshot(about, state.steps, state.params, states, state.actuators, episodes, targets)
+            motion = None
+            if state.motion is not None:
+                last, rate = state.motion
+                motion = np.stack([last, np.zeros_like(last) if rate is None else rate])
+            snapshot = Snapshot(about, state.steps, state.params, states, state.actuators, episodes, targets, motion)
             self.pool.start_replay_from(Restore(snapshot, state.draws))
             return state._replace(steps_since_checkpoint=0), snapshot
 
@@ -326,12 +340,15 @@ class Session:
                 actuators=actuators,
                 steps=snapshot.steps,
                 targets=request.snapshot.targets,
+                motion=None if (motion := request.snapshot.motion) is None else (motion[0], motion[1]),
                 steps_since_checkpoint=0,
                 faults=state.faults.restored(request.snapshot.states.containment["step"]),
             )
             return state, self._observation()
 
         observation: Observation = self._execute(request, commit)
+        if self._moving is not None:
+            self._moving.set_params(params)
         if self._chatter is not None:
             self._chatter.set_gains(params, actuators)
         return observation
@@ -370,7 +387,9 @@ class Session:
         every, pool = self.options.checkpoint_steps, self.pool
         if every is not None and self._transactions.state.steps_since_checkpoint >= every:
             self.snapshot()
-        setpoint = command.setpoint
+        setpoint, rate, *_ = command
+        if rate is not None:
+            command = self._accelerated(command, substeps * self.options.timestep)
         ticks, timestep = len(setpoint), self.options.timestep
 
         def commit(state: RunnerState, seconds: list[Any]) -> tuple[RunnerState, None]:
@@ -385,22 +404,47 @@ class Session:
                     time = (state.steps + done * substeps) * timestep
                     observation = self._seen(arrays.observation)
                     unrecorded += ((time, arrays.command.setpoint.copy(), observation),)
+            if self._moving is not None:
+                self._moving.see(setpoint[:count], rate is not None, substeps * timestep)
             if self._chatter is not None:
                 seen = pool.arrays.observation.map(lambda rows: rows[:count])
                 self._chatter.see(seen, substeps * timestep)
             steps = count * substeps
+            motion = state.motion
+            if motion is not None and count:
+                motion = (setpoint[count - 1], None if rate is None else rate[count - 1])
             state = state._replace(
                 faults=faults,
                 contacts=contacts,
                 unrecorded=unrecorded,
                 steps=state.steps + steps,
-                targets=_followed(state.targets, setpoint[:count]),
+                targets=None if state.targets is None else _followed(state.targets, setpoint[:count]),
+                motion=motion,
                 steps_since_checkpoint=state.steps_since_checkpoint + steps,
                 work=state.work if pool.failure else (tuple(seconds), ticks),
             )
             return state, None
 
         return Run(ticks, substeps, command.given, command), commit
+
+    def _accelerated(self, command: Command, seconds: float) -> Command:
+        """Return ``command`` (ticks, envs, ...) with the mean accelerations in ticks of ``seconds`` with rates.
+
+        The mean is the change of the rate over the tick. It is taken where the setpoints confirm that the rate is the
+        one at the tick's end: where they change by the mean of the old and the new rate rather than by the new one, as
+        increments do. Elsewhere the given acceleration is kept, or 0.
+        """
+        setpoint, rate, given, _ = command
+        state = self._transactions.state
+        if state.motion is None or self.options.control != "pid" or state.params.gain_units is None:
+            return command
+        before = [0.0 * rate[0] if rows is None else rows for rows in state.motion]
+        both = zip((setpoint, rate), before, strict=True)
+        with np.errstate(invalid="ignore"):  # non-finite rates become faults
+            moved, change = (np.diff(rows, axis=0, prepend=first[None]) for rows, first in both)
+            ahead = moved - seconds * rate  # of increments 0, else minus half the change
+            fits = np.abs(ahead + 0.5 * seconds * change) < 4 * np.abs(ahead)
+        return command._replace(setpoint_acceleration=np.where(fits, change / seconds, 0.0 if given is None else given))
 
     def _joints(
         self, name: str, setpoint: ArrayLike, twist: ArrayLike | None, acceleration: ArrayLike | None, ticks: int | None
@@ -453,6 +497,9 @@ class Session:
             warnings.warn(message, category, stacklevel=stacklevel)
         if self._chatter is not None:
             self._chatter.warn(stacklevel + 1)
+        if self._moving is not None and self._moving.found is not None and not self._has_warned_of_motion:
+            self._has_warned_of_motion = True
+            self._moving.warn(stacklevel + 1)
         faults, contacts = state.faults.faults, state.contacts
         if faults and not self._has_warned:
             self._has_warned = True
@@ -466,9 +513,8 @@ class Session:
             warnings.warn(contacts.message(), MissedContactWarning, stacklevel=stacklevel)
 
 
-def _followed(targets: NDArray[Any] | None, setpoints: NDArray[Any]) -> NDArray[Any] | None:
+def _followed(targets: NDArray[Any], setpoints: NDArray[Any]) -> NDArray[Any]:
     """Return the last finite joint setpoints (envs, dof) after ``setpoints`` (ticks, envs, dof)."""
-    if targets is not None:
-        for rows in setpoints:
-            targets = np.where(np.isfinite(rows).all(1, keepdims=True), rows, targets)
+    for rows in setpoints:
+        targets = np.where(np.isfinite(rows).all(1, keepdims=True), rows, targets)
     return targets

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from operator import itemgetter
+from itertools import repeat
+from operator import is_not, itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,7 +35,7 @@ class Command(NamedTuple):
     @property
     def given(self) -> tuple[bool, ...]:
         """Which arrays are given."""
-        return tuple([rows is not None for rows in self])
+        return tuple(map(is_not, self, repeat(None)))
 
     def with_only(self, given: tuple[bool, ...]) -> Command:
         """Return the command with only the arrays that are ``given``."""

@@ -155,6 +155,8 @@ class Snapshot:
     """Stream and episode of each env (envs, 2), from which everything is drawn again; None without randomization."""
     targets: NDArray[np.float64] | None = None
     """Last joint setpoints (envs, dof) of a runner whose setpoints are poses; else None."""
+    motion: NDArray[np.float64] | None = None
+    """Last joint setpoints and their rates (2, envs, dof); None where setpoints are not those of joints."""
 
     def check(self, about: Mapping[str, Any]) -> None:
         """Check that a runner with options ``about`` can restore it.
@@ -195,7 +197,7 @@ class Snapshot:
             "head": np.array(json.dumps(head)),
             **flatten({"params": arrays, _ACTUATORS: _options(self.actuators), **vars(self.states)}),
         }
-        for name in ("episodes", "targets"):
+        for name in ("episodes", "targets", "motion"):
             if (rows := getattr(self, name)) is not None:
                 tables[name] = rows
         write_atomically(file_path("path", path), lambda file: np.savez(file, **tables))
@@ -243,6 +245,9 @@ class Snapshot:
             raise ValueError("its targets do not fit its setpoint_space")
         if targets is not None and (targets.shape != (num_envs, dof) or not np.isfinite(targets).all()):
             raise ValueError(f"its targets are not positions of {num_envs} envs of {dof} joints")
+        motion = tables.pop("motion", None)
+        if motion is not None and (motion.shape != (2, num_envs, dof) or motion.dtype != np.float64):
+            raise ValueError(f"its motion is not a setpoint and a rate of {num_envs} envs of {dof} joints")
         groups = nest(tables)
         motors = groups.pop(_ACTUATORS, None)
         motors = {name: leaf if leaf.ndim else leaf.item() for name, leaf in (motors or {}).items()}
@@ -265,7 +270,7 @@ class Snapshot:
             motors = states.actuators  # the runner that restores it checks them
         size = dof if about.get("command") is None else len(names("command", about["command"]))
         states.check(num_envs, dof, controller, bool(states.friction), motors, bool(states.guard), (), size)
-        return cls(about, steps, params, states, actuators, episodes, targets)
+        return cls(about, steps, params, states, actuators, episodes, targets, motion)
 
     def __repr__(self) -> str:
         about = self.about

@@ -1,4 +1,4 @@
-"""Warnings of setpoints and start poses outside the joint limits."""
+"""Warnings of setpoints: outside the joint limits, or moving without rates under gains that lag."""
 
 from __future__ import annotations
 
@@ -8,14 +8,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import batchpid as bp
 from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 
 LISTED = 4
 """Envs that a warning lists for each joint."""
+LAG, MOVING = 0.05, 0.5
+"""Lag above which a moving setpoint needs its rate, and how long it moves until a warning [s]."""
 
 
 class SetpointWarning(UserWarning):
     """A setpoint or start pose lies outside a joint's limits."""
+
+
+class MovingSetpointWarning(UserWarning):
+    """Setpoints move in every tick, without rates, under gains that follow such a motion with a lag."""
 
 
 class SetpointCheck:
@@ -63,3 +70,62 @@ class SetpointCheck:
         listed = ", ".join(map(str, envs[:LISTED])) + (f" and {len(envs) - LISTED} more" if len(envs) > LISTED else "")
         of_envs = "" if outside.shape[-1] == 1 else f" (env{'s' * (len(envs) > 1)} {listed})"
         return f"joint {joint.name!r} at {worst:g} {joint.unit}, not in [{joint.lower:g}, {joint.upper:g}]{of_envs}"
+
+
+class MovingSetpointCheck:
+    """Check for setpoints that move without rates under gains with a large lag. It warns once.
+
+    A joint's lag is kp (1 - b) / ki: with setpoint weight b, the integral alone follows a ramp. Setpoints move in a
+    tick if they change by no more than the velocity limits allow; larger changes are steps.
+    """
+
+    def __init__(self, robot: RobotDescription) -> None:
+        self._robot, self._fastest = robot, robot.velocity_limit
+        self._lag: NDArray[np.float64] | None = None
+        self._last: NDArray[np.float64] | None = None
+        self._moved: Any = 0.0  # seconds, of each env
+        self.found: int | None = None
+        """Joint with such a setpoint, once there is one; no other is looked for."""
+
+    def set_params(self, params: bp.PIDParams) -> None:
+        """Find the lags of these gains."""
+        self._lag, b, ki = None, params.setpoint_weight, params.ki
+        if b is None or ki is None or self.found is not None:
+            return
+        lag = np.max(params.kp * (1 - b) / np.where(ki > 0, ki, np.inf), axis=0)
+        self._lags = lag > LAG
+        if self._lags.any():
+            self._lag = np.broadcast_to(lag, (self._robot.dof,))
+
+    def see(self, setpoints: NDArray[np.float64], rated: bool, seconds: float) -> None:
+        """Look at the setpoints of ticks (ticks, envs, dof) of ``seconds`` each, which are ``rated`` or not."""
+        if self._lag is None or self.found is not None:
+            return
+        if rated:
+            self._last, self._moved = None, 0.0
+            return
+        for rows in setpoints:
+            last, self._last = self._last, rows
+            if last is None:
+                continue
+            change, reduce = np.abs(rows - last), np.logical_or.reduce  # methods of arrays take calls of Python
+            moves = reduce((change > 0) & self._lags, axis=1)
+            moves &= ~reduce(change > self._fastest * seconds, axis=1)
+            self._moved = (self._moved + seconds) * moves
+            long = self._moved >= MOVING
+            if reduce(long):
+                self.found = int(np.where(change[long][0] > 0, self._lag, 0.0).argmax())
+                return
+
+    def warn(self, stacklevel: int) -> None:
+        """Warn, once, of the setpoints that were found."""
+        assert self._lag is not None
+        assert self.found is not None
+        joint, lag = self._robot.joint_names[self.found], self._lag[self.found]
+        warnings.warn(
+            f"setpoint moves in every tick without its rate: under these gains joint {joint!r} follows {1e3 * lag:.0f} "
+            "ms behind (kp (1 - b) / ki); pass setpoint_rate, such as the change over a tick by the tick, or use gains "
+            "with setpoint_weight=1",
+            MovingSetpointWarning,
+            stacklevel=stacklevel,
+        )

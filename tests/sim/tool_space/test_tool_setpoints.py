@@ -116,6 +116,7 @@ def test_setpoints_are_checked(panda):
             runner.step(goals, setpoint_acceleration=goals)
 
 
+@pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
 def test_a_tool_that_moves_follows_its_poses_with_its_twist(panda):
     """The joints' rates are those whose tool has the twist; without them the tool stays behind."""
     ticks, dt = 100, 0.01
