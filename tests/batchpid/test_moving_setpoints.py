@@ -1,0 +1,93 @@
+"""Setpoints whose rate is given: followed with full weight, without a bump, through the turns of continuous joints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import batchpid as bp
+
+DT = 1 / 2000
+IMPLICIT = {"gain_units": "mass_matrix", "discretization": "implicit"}
+GAINS = {"kp": 170.0, "ki": 500.0, "kd": 26.0}
+WEIGHTS = st.floats(0.0, 1.0)
+
+
+def follow(b, rates=True, steps=2000, **options):
+    """Return the errors of a joint of inertia 1 on the way of a sine, under the law with setpoint weight b."""
+    params = bp.make_params(1, **GAINS, setpoint_weight=b, weight_origin="start", **options)
+    late = params.discretization is not None
+    k = bp.discretise(params, DT)._replace(gain_units=None)
+    y, v, errors = np.zeros((1, 1)), np.zeros((1, 1)), []
+    state = bp.init(params, y)
+    for step in range(steps):
+        t = DT * (step + late)
+        r, rate = np.full((1, 1), 0.3 * (1 - np.cos(3 * t))), np.full((1, 1), 0.9 * np.sin(3 * t))
+        state, u = bp.advance(k, state, r, y, v, rate if rates else None)
+        v = v + DT * u
+        y = y + DT * v
+        errors.append(0.3 * (1 - np.cos(3 * DT * (step + 1))) - y.item())
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("options", [{}, IMPLICIT])
+@settings(max_examples=10)
+@given(b=WEIGHTS)
+def test_the_following_error_does_not_depend_on_the_setpoint_weight(options, b):
+    ours, full = follow(b, **options), follow(1.0, **options)
+    assert np.abs(full).max() > 5e-3  # the acceleration is not given
+    assert np.abs(ours - full).max() < 0.02 * np.abs(full).max()
+    assert np.abs(follow(0.1, rates=False, **options)).max() > 10 * np.abs(full).max()
+
+
+@settings(max_examples=25)
+@given(b=WEIGHTS, seed=st.integers(0, 999), implicit=st.booleans(), turns=st.booleans())
+def test_to_begin_and_to_end_with_rates_makes_no_bump(b, seed, implicit, turns):
+    """P and I go on from step to step; a rate of 0 is no rate."""
+    options = IMPLICIT if implicit else {}
+    params = bp.make_params(3, **GAINS, setpoint_weight=b, continuous=turns, **options)
+    k, rng = bp.discretise(params, DT)._replace(gain_units=None), np.random.default_rng(seed)
+    y, r, rate = rng.normal(size=(3, 2, 3))
+    state, _ = bp.advance_terms(k, bp.init(params, y), r, y, setpoint_rate=rate)
+    (with_rate, given), (without, none) = (bp.advance_terms(k, state, r, y, setpoint_rate=x) for x in (0 * rate, None))
+    for one, other in zip((*with_rate, *given), (*without, *none), strict=True):
+        np.testing.assert_array_equal(one, other)
+    _, rated = bp.advance_terms(k, state, r, y, setpoint_rate=rate)
+    moved = (1 - b) * np.asarray(k.kp) * DT * np.abs(rate) if implicit else 0.0
+    assert (np.abs(rated.p - none.p) <= 1.001 * moved + 1e-12 * np.abs(none.p)).all()
+    np.testing.assert_array_equal(rated.i, none.i)
+
+
+@settings(max_examples=25)
+@given(b=WEIGHTS, seed=st.integers(0, 999), implicit=st.booleans())
+def test_a_continuous_joint_follows_through_its_turns(b, seed, implicit):
+    """Positions in [-pi, pi] give the efforts of those that go on."""
+    options, rng = IMPLICIT if implicit else {}, np.random.default_rng(seed)
+    wound, wrapped = (
+        bp.make_params(2, **GAINS, setpoint_weight=b, weight_origin="start", continuous=turns, **options)
+        for turns in (False, True)
+    )
+    speed, start = rng.uniform(-40, 40, (1, 2)), rng.uniform(-3, 3, (1, 2))
+    behind = rng.normal(scale=0.05, size=(300, 1, 2))
+    states = [bp.init(wound, start), bp.init(wrapped, (start + np.pi) % (2 * np.pi) - np.pi)]
+    for step in range(300):
+        r = start + speed * 0.01 * step
+        rows = []
+        for at, params in enumerate((wound, wrapped)):
+            k = bp.discretise(params, 0.01)._replace(gain_units=None)
+            turn = (lambda x: x) if at == 0 else (lambda x: (x + np.pi) % (2 * np.pi) - np.pi)
+            states[at], u = bp.advance(k, states[at], turn(r), turn(r - behind[step]), setpoint_rate=speed)
+            rows.append(u)
+        np.testing.assert_allclose(rows[1], rows[0], rtol=1e-9, atol=1e-6)
+
+
+@pytest.mark.parametrize("order", ["output_first", "integrate_first"])
+def test_manual_control_hands_over_to_a_moving_setpoint(order):
+    """The next step after ``track`` on these inputs gives the effort, also with a rate."""
+    params = bp.make_params(2, **GAINS, setpoint_weight=0.2, integration=order)
+    y, r, rate, effort = np.random.default_rng(0).normal(size=(4, 3, 2))
+    state = bp.track(params, bp.init(params, y), r, y, effort, dt=DT, setpoint_rate=rate)
+    _, got = bp.step(params, state, r, y, DT, setpoint_rate=rate, measurement_rate=0 * y)
+    np.testing.assert_allclose(got, effort, atol=1e-9)
