@@ -376,7 +376,7 @@ class Session:
                     time = (state.steps + done * substeps) * timestep
                     observation = self._seen(arrays.observation)
                     unrecorded += ((time, arrays.command.setpoint.copy(), observation),)
-            if self._chatter is not None:
+            if self._chatter is not None and self._chatter.is_watching:
                 seen = pool.arrays.observation.map(lambda rows: rows[:count])
                 self._chatter.see(seen, substeps * timestep)
             steps = count * substeps
