@@ -32,7 +32,7 @@ from batchpid.sim.engine.protocol import Capability, Engine, require
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
-from batchpid.sim.robot.actuator_checks import fit_actuators
+from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 from batchpid.sim.runner_keywords import (
@@ -56,12 +56,13 @@ if TYPE_CHECKING:
     from batchpid.sim.engine.sapien.physics import Physics
 
 Place = Literal["snapshot", "recording", "scene"]
-Role = Literal["restored", "speed", "next commands"]
+Role = Literal["restored", "processes", "last bits", "next commands"]
 """Reason for which a snapshot may be restored in a runner with another value of an option.
 
 - "restored": the snapshot holds the value, and the runner takes it over;
-- "speed": results are the same for any value, up to the last bits after contacts for ``checkpoint_steps``;
-- "next commands": the value says how the commands after the restoration are read, as their own arguments do.
+- "processes": the value says where and how fast the envs run, and results are bit-identical for any;
+- "last bits": so, but the last bits of results differ;
+- "next commands": the value is a default of the commands to come (``substeps``), or says which of them are refused.
 """
 IDEAL = bp.Actuators()
 """Actuators without any effect."""
@@ -107,7 +108,7 @@ class RunnerOptions:
 
     robot: Robot = field(metadata=_in(snapshot="robot_name"))
     num_envs: int = field(metadata=_in("snapshot"))
-    workers: int | None = field(default=None, metadata=_apart("speed"))
+    workers: int | None = field(default=None, metadata=_apart("processes"))
     """None on a cluster."""
     timestep: float = field(default=1 / 2000, metadata=_in("snapshot", "recording", "scene"))
     substeps: int = field(default=20, metadata=_apart("next commands", "recording"))
@@ -128,7 +129,7 @@ class RunnerOptions:
     collisions: bool = field(default=True, metadata=_in("snapshot", "recording", "scene"))
     ground: bool = field(default=_DERIVED, metadata=_in("snapshot", "recording", "scene"))
     build: Callable[[Any, int], Any] | None = field(default=None, metadata=_in("scene", snapshot="build_digest"))
-    pack_size: int = field(default=_DERIVED, metadata=_apart("speed"))
+    pack_size: int = field(default=_DERIVED, metadata=_apart("processes"))
     on_fault: FaultAction = field(default="hold", metadata=_in("snapshot"))
     speed_limit: NDArray[np.float64] | None = field(default=None, metadata=_in(snapshot="speed_limits"))
     actuators: bp.Actuators | None = field(default=None, metadata=_apart("restored"))
@@ -138,10 +139,10 @@ class RunnerOptions:
     )
     guard: bp.Guard | None = field(default=None, metadata=_in(snapshot="guard_digest"))
     on_invalid_input: InvalidInputAction = field(default="raise", metadata=_apart("next commands"))
-    recover: bool = field(default=True, metadata=_apart("speed"))
-    checkpoint_steps: int | None = field(default=8000, metadata=_apart("speed"))
-    timeout: float = field(default=60.0, metadata=_apart("speed"))
-    cluster: Ray | None = field(default=None, metadata=_apart("speed"))
+    recover: bool = field(default=True, metadata=_apart("processes"))
+    checkpoint_steps: int | None = field(default=8000, metadata=_apart("last bits"))
+    timeout: float = field(default=60.0, metadata=_apart("processes"))
+    cluster: Ray | None = field(default=None, metadata=_apart("processes"))
 
     def __init__(self, robot: Robot, num_envs: int, **options: Unpack[RunnerKeywords]) -> None:
         check_keywords("Runner", options, [*RunnerKeywords.__annotations__, "params"])
@@ -380,6 +381,7 @@ class RunnerOptions:
             "joints": list(robot.joint_names),
             **self.values_for("snapshot"),
             "ignored_pairs": digest(robot.ignored_pairs),
+            "robot_actuators": digest(known_joints(robot)),
             "controller": self.controller_digest,
             "command": None if own is None else list(own.names),
         }

@@ -1,14 +1,34 @@
 """State of one runner is refused in another, or gives the same result there: for every option."""
 
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from identical import assert_identical
+from tiny_urdf import INERTIAL, joint, link, robot, write
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import OperationalSpace, Randomization, Robot, Runner, RunnerOptions, Uniform
+from batchpid.sim import (
+    MujocoSolver,
+    OperationalSpace,
+    Physics,
+    Randomization,
+    Robot,
+    Runner,
+    RunnerKeywords,
+    RunnerOptions,
+    Uniform,
+)  # fmt: skip
 from batchpid.sim.gym import ReachVectorEnv, ToolReachVectorEnv
+from batchpid.sim.options import Role
 
 pytest.importorskip("mujoco")
 POSTURE = np.array([0, -0.5, 0, -2.2, 0, 1.8, 0.8, 0.02, 0.02])
@@ -19,13 +39,168 @@ OTHER = {
     "point": {"point": [0, 0, 0.3]},
     "posture": {"posture": POSTURE + 0.01},
 }
-CHOSEN_ANEW = {
-    "workers", "cluster", "timeout", "recover", "checkpoint_steps", "pack_size", "substeps", "on_fault",
-    "on_invalid_input", "speed_limit",
+
+
+def arm(mass):
+    """Arm of two joints, with shapes."""
+    inertial = INERTIAL.replace('mass value="1"', f'mass value="{mass}"')
+    ends = joint("shoulder", "base", "arm"), joint("elbow", "arm", "hand")
+    with TemporaryDirectory() as folder:
+        parts = link("base"), link("arm", inertial + SHAPE), link("hand", INERTIAL + SHAPE), *ends
+        return Robot.load(write(Path(folder), robot(*parts)))
+
+
+SHAPE = '<collision><geometry><box size="0.05 0.05 0.4"/></geometry></collision>'
+ARM, HEAVY = arm(1), arm(2)
+MOTORS = bp.make_actuators(2, coulomb=0.3, armature=0.05)
+
+
+@dataclass
+class Law:
+    """Controller of the caller's own, with attributes of several kinds."""
+
+    kp: float = 20.0
+    gains: tuple = (5.0, {"shoulder": np.ones(2)})
+    shape: Any = np.tanh
+
+    def init(self, robot, num_envs):
+        return None
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        kd, scale = self.gains
+        return None, self.kp * self.shape(setpoint - qpos) * scale["shoulder"] - kd * qvel + passive
+
+
+def box(size, scene, env):
+    import sapien
+
+    builder = scene.create_actor_builder()
+    builder.add_box_collision(half_size=[size, size, size])
+    entity = builder.build(name="box")
+    entity.set_pose(sapien.Pose([2, env, 0.15]))
+    return [entity]
+
+
+def box_of(size):
+    return lambda scene, env: box(size, scene, env)
+
+
+VALUES = {
+    "robot": [ARM, HEAVY, replace(ARM, actuators=MOTORS)],
+    "num_envs": [2, 3],
+    "params": [ARM.params(kp=9.0, ki=None, kd=2.0), ARM.params(kp=90.0, ki=1.0, kd=9.0)],
+    "workers": [0, 1],
+    "timestep": [1 / 2000, 1 / 1000],
+    "substeps": [20, 7],
+    "control": [Law(), Law(30.0), Law(gains=(5.0, {"shoulder": np.full(2, 0.5)})), Law(shape=lambda x: 2 * x),
+                Law(shape=lambda x: 3 * x), Law(shape=partial(np.multiply, 2.0)), Law(shape=partial(np.multiply, 3.0))],
+    "tool": ["arm", "hand"],
+    "physics": [MujocoSolver(iterations=3), Physics("PGS", 3)],
+    "build": [box_of(0.05), box_of(0.1), partial(box, 0.05), partial(box, 0.1)],
+    "pack_size": [1, 2],
+    "speed_limit": [0.3, 0.6, [0.3, 9.0]],
+    "actuators": [bp.Actuators(), MOTORS, bp.make_actuators(2, command_delay=2e-3)],
+    "randomization": [Randomization(payload=Uniform(0, 1)), Randomization(payload=Uniform(0, 2))],
+    "guard": [bp.make_guard(2, rate=0.5), bp.make_guard(2, rate=0.2)],
+    "checkpoint_steps": [100],
+    "timeout": [60.0, 30.0],
 }  # fmt: skip
-"""Options of how a run goes on, not of the state."""
-CARRIED = {"robot", "actuators", "build"}
-"""Parts that are in the snapshot itself, or in the sizes of its arrays."""
+"""Values of options to try, besides those that their types list."""
+BASE = {"robot": ARM, "num_envs": 2, "workers": 0, "substeps": 20, "speed_limit": 0.6, "build": VALUES["build"][0]}
+"""In the run, env 1 becomes faster than the limit after the snapshot, and a box falls."""
+CONTEXTS = [{}, {"build": None}, {"control": "osc"}, {"backend": "jax"}, {"build": None, "engine": "mujoco"}]
+"""Further options that a value may need."""
+NAMES = [each.name for each in fields(RunnerOptions)] + ["params"]
+DEFAULT = object()
+TYPES = get_type_hints(RunnerKeywords, localns={"Physics": Physics, "MujocoSolver": MujocoSolver})
+
+
+def values(name):
+    """Return the values of an option to try: those that its type lists, and those of the table."""
+    return [*listed(TYPES.get(name)), *VALUES.get(name, [])]
+
+
+def listed(kind):
+    if kind in (bool, type(None)):
+        return [True, False] if kind is bool else [None]
+    if get_origin(kind) is Literal:
+        return [each for each in get_args(kind) if each != "ray"]  # test_cluster.py
+    return [each for part in get_args(kind) for each in listed(part)] if get_origin(kind) in (Union, UnionType) else []
+
+
+def quick(name):
+    """Return the values that need neither a compilation nor a process of its own."""
+    return [
+        each for each in values(name) if (name, each) not in (("backend", "jax"), ("workers", 1), ("workers", None))
+    ]
+
+
+def go_on(runner):
+    """Return what follows: every observation, and where the boxes end."""
+    pose = runner.options.command.size > 2 or runner.options.setpoint_space == "tool"
+    start = runner.observe()
+    seen = []
+    for _ in range(6):
+        setpoint = start.tool_pose + 0.0 if pose else start.qpos + 0.0
+        setpoint[1:, 0] += 0.6
+        seen.append(runner.step(setpoint, substeps=10))
+    return seen, runner.poses() if runner.options.build is not None else None
+
+
+def is_possible(chosen):
+    options = {name: value for name, value in {**BASE, **chosen}.items() if name != "params"}
+    try:
+        found = RunnerOptions(**options)
+    except InvalidArgumentError:
+        return False
+    return found.collisions or found.build is None  # which has shapes
+
+
+@cache
+def in_context(number):
+    """Return a snapshot under one of CONTEXTS, and what followed."""
+    return went_on(CONTEXTS[number])
+
+
+def made(chosen):
+    return Runner(**{**BASE, **chosen})
+
+
+def went_on(chosen):
+    with made(chosen) as runner:
+        goal = runner.observe()
+        for _ in range(2):
+            runner.step(goal.qpos if goal.tool_pose is None else goal.tool_pose, substeps=10)
+        return runner.snapshot(), go_on(runner)
+
+
+def changed(ours, theirs):
+    """Return the names of options with other values."""
+    given, other = (BASE | each for each in (ours, theirs))
+    return [name for name in given.keys() | other if given.get(name, DEFAULT) is not other.get(name, DEFAULT)]
+
+
+def check(ours, theirs, before=None):
+    """Check that a snapshot made under ``ours`` is refused, or gives the same, under ``theirs``."""
+    snapshot, (expected, ends) = before or went_on(ours)
+    roles = {each.name: each.metadata.get("role") for each in fields(RunnerOptions)} | {"params": "restored"}
+    with made(theirs) as other:
+        try:
+            other.restore(snapshot)
+        except InvalidArgumentError as error:
+            refusal = error
+        else:
+            refusal, (found, places) = None, go_on(other)
+    if refusal is not None:
+        assert refusal.argument == "snapshot"
+        assert any(roles[name] is None for name in changed(ours, theirs)), "these belong to no snapshot"
+        return
+    for one, two in zip(expected, found, strict=True):
+        if "checkpoint_steps" in theirs:
+            np.testing.assert_allclose(two.qpos, one.qpos, atol=1e-5)
+        else:
+            assert_identical(one, two)
+    np.testing.assert_array_equal(places, ends)
 
 
 def osc_runner(robot, link="panda_hand", **options):
@@ -38,10 +213,45 @@ def panda():
     return Robot.load("panda")
 
 
-def test_every_option_is_in_the_snapshot_or_has_a_reason_not_to_be():
-    marked = {each.name for each in fields(RunnerOptions) if "snapshot" in each.metadata}
-    assert {each.name for each in fields(RunnerOptions)} == marked | CHOSEN_ANEW | CARRIED
-    assert not marked & (CHOSEN_ANEW | CARRIED)
+def test_every_option_is_kept_or_has_a_role_apart():
+    for each in fields(RunnerOptions):
+        assert ("snapshot" in each.metadata) != (each.metadata.get("role") in get_args(Role)), each.name
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("name", "index"), [(name, index) for name in NAMES for index in range(len(values(name)))])
+def test_a_snapshot_is_refused_or_goes_on_as_before_under_each_value_of_each_option(name, index):
+    value = values(name)[index]
+    number = next(number for number, each in enumerate(CONTEXTS) if is_possible({**each, name: value}))
+    check(CONTEXTS[number], {**CONTEXTS[number], name: value}, in_context(number))
+
+
+def test_each_option_has_two_values_to_try():
+    """A new option needs a line in VALUES, unless its type lists its values."""
+    few = [name for name in NAMES if len({repr(each) for each in (BASE.get(name, DEFAULT), *values(name))}) < 2]
+    assert not few
+
+
+PAIRS = st.lists(st.sampled_from(NAMES), min_size=1, max_size=2, unique=True).flatmap(
+    lambda names: st.tuples(*[st.fixed_dictionaries({name: st.sampled_from(quick(name)) for name in names})] * 2)
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(PAIRS)
+@pytest.mark.filterwarnings("ignore")
+def test_a_snapshot_under_two_options_is_refused_or_goes_on_as_before(pair):
+    assume(all(map(is_possible, pair)))
+    check(*pair)
+
+
+@pytest.mark.slow
+@settings(max_examples=1500, deadline=None)
+@given(PAIRS)
+@pytest.mark.filterwarnings("ignore")
+def test_a_snapshot_under_any_two_options_is_refused_or_goes_on_as_before(pair):
+    assume(all(map(is_possible, pair)))
+    check(*pair)
 
 
 @pytest.mark.parametrize("other", OTHER.values(), ids=OTHER)
