@@ -1,32 +1,19 @@
 """State of one runner is refused in another, or gives the same result there: for every option."""
 
-from dataclasses import dataclass, fields, replace
-from functools import cache, partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from dataclasses import fields
+from functools import cache
+from typing import get_args
 
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from identical import assert_identical
-from tiny_urdf import INERTIAL, joint, link, robot, write
+from option_values import ARM, VALUES, option_values
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import (
-    MujocoSolver,
-    OperationalSpace,
-    Physics,
-    Randomization,
-    Robot,
-    Runner,
-    RunnerKeywords,
-    RunnerOptions,
-    Uniform,
-)  # fmt: skip
+from batchpid.sim import OperationalSpace, Randomization, Robot, Runner, RunnerOptions, Uniform
 from batchpid.sim.gym import ReachVectorEnv, ToolReachVectorEnv
 from batchpid.sim.options import Role
 
@@ -41,71 +28,6 @@ OTHER = {
 }
 
 
-def arm(mass):
-    """Arm of two joints, with shapes."""
-    inertial = INERTIAL.replace('mass value="1"', f'mass value="{mass}"')
-    ends = joint("shoulder", "base", "arm"), joint("elbow", "arm", "hand")
-    with TemporaryDirectory() as folder:
-        parts = link("base"), link("arm", inertial + SHAPE), link("hand", INERTIAL + SHAPE), *ends
-        return Robot.load(write(Path(folder), robot(*parts)))
-
-
-SHAPE = '<collision><geometry><box size="0.05 0.05 0.4"/></geometry></collision>'
-ARM, HEAVY = arm(1), arm(2)
-MOTORS = bp.make_actuators(2, coulomb=0.3, armature=0.05)
-
-
-@dataclass
-class Law:
-    """Controller of the caller's own, with attributes of several kinds."""
-
-    kp: float = 20.0
-    gains: tuple = (5.0, {"shoulder": np.ones(2)})
-    shape: Any = np.tanh
-
-    def init(self, robot, num_envs):
-        return None
-
-    def __call__(self, state, setpoint, qpos, qvel, passive):
-        kd, scale = self.gains
-        return None, self.kp * self.shape(setpoint - qpos) * scale["shoulder"] - kd * qvel + passive
-
-
-def box(size, scene, env):
-    import sapien
-
-    builder = scene.create_actor_builder()
-    builder.add_box_collision(half_size=[size, size, size])
-    entity = builder.build(name="box")
-    entity.set_pose(sapien.Pose([2, env, 0.15]))
-    return [entity]
-
-
-def box_of(size):
-    return lambda scene, env: box(size, scene, env)
-
-
-VALUES = {
-    "robot": [ARM, HEAVY, replace(ARM, actuators=MOTORS)],
-    "num_envs": [2, 3],
-    "params": [ARM.params(kp=9.0, ki=None, kd=2.0), ARM.params(kp=90.0, ki=1.0, kd=9.0)],
-    "workers": [0, 1],
-    "timestep": [1 / 2000, 1 / 1000],
-    "substeps": [20, 7],
-    "control": [Law(), Law(30.0), Law(gains=(5.0, {"shoulder": np.full(2, 0.5)})), Law(shape=lambda x: 2 * x),
-                Law(shape=lambda x: 3 * x), Law(shape=partial(np.multiply, 2.0)), Law(shape=partial(np.multiply, 3.0))],
-    "tool": ["arm", "hand"],
-    "physics": [MujocoSolver(iterations=3), Physics("PGS", 3)],
-    "build": [box_of(0.05), box_of(0.1), partial(box, 0.05), partial(box, 0.1)],
-    "pack_size": [1, 2],
-    "speed_limit": [0.3, 0.6, [0.3, 9.0]],
-    "actuators": [bp.Actuators(), MOTORS, bp.make_actuators(2, command_delay=2e-3)],
-    "randomization": [Randomization(payload=Uniform(0, 1)), Randomization(payload=Uniform(0, 2))],
-    "guard": [bp.make_guard(2, rate=0.5), bp.make_guard(2, rate=0.2)],
-    "checkpoint_steps": [100],
-    "timeout": [60.0, 30.0],
-}  # fmt: skip
-"""Values of options to try, besides those that their types list."""
 BASE = {
     "robot": ARM,
     "num_envs": 2,
@@ -126,20 +48,6 @@ CONTEXTS = [
 ]
 """Further options that a value may need."""
 NAMES = [each.name for each in fields(RunnerOptions)] + ["params"]
-TYPES = get_type_hints(RunnerKeywords, localns={"Physics": Physics, "MujocoSolver": MujocoSolver})
-
-
-def values(name):
-    """Return the values of an option to try: those that its type lists, and those of the table."""
-    return [*listed(TYPES.get(name)), *VALUES.get(name, [])]
-
-
-def listed(kind):
-    if kind in (bool, type(None)):
-        return [True, False] if kind is bool else [None]
-    if get_origin(kind) is Literal:
-        return [*get_args(kind)]
-    return [each for part in get_args(kind) for each in listed(part)] if get_origin(kind) in (Union, UnionType) else []
 
 
 def is_slow(name, value):
@@ -149,7 +57,7 @@ def is_slow(name, value):
 
 def quick(name):
     """Return the values for random pairs."""
-    return [each for each in values(name) if name != "workers" and not is_slow(name, each)] or [BASE[name]]
+    return [each for each in option_values(name) if name != "workers" and not is_slow(name, each)] or [BASE[name]]
 
 
 def go_on(runner):
@@ -241,12 +149,12 @@ def test_every_option_is_kept_or_has_a_role_apart():
     [
         pytest.param(name, index, marks=pytest.mark.slow if name == "cluster" else [])
         for name in NAMES
-        for index in range(len(values(name)))
+        for index in range(len(option_values(name)))
     ],
 )
 def test_a_snapshot_is_refused_or_goes_on_as_before_under_each_value_of_each_option(name, index):
     """The snapshot is made under the value before it, the last one for the first."""
-    before, value = values(name)[index - 1], values(name)[index]
+    before, value = option_values(name)[index - 1], option_values(name)[index]
     number, context = next(each for each in enumerate(CONTEXTS) if is_possible({**each[1], name: value}))
     if is_possible({**context, name: before}):
         check({**context, name: before}, {**context, name: value})
@@ -257,7 +165,7 @@ def test_a_snapshot_is_refused_or_goes_on_as_before_under_each_value_of_each_opt
 def test_each_option_has_a_value_to_try_besides_its_default():
     """A new option needs a line in VALUES, unless its type lists its values."""
     default = {each.name: each.default for each in fields(RunnerOptions)} | {"params": None}
-    assert not [name for name in NAMES if {repr(each) for each in values(name)} <= {repr(default[name])}]
+    assert not [name for name in NAMES if {repr(each) for each in option_values(name)} <= {repr(default[name])}]
 
 
 PAIRS = st.lists(st.sampled_from(NAMES), min_size=1, max_size=2, unique=True).flatmap(
