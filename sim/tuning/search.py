@@ -156,7 +156,7 @@ def tune(
         **robot.describe(),
         "seed": seed,
         "population": population,
-        "actuators": None if robot.actuators is None else digest(robot.actuators),
+        "robot_actuators": None if robot.actuators is None else digest(robot.actuators),
         "gain_units": gain_units,
         "per_joint": per_joint,
         "moves": list(moves.names),
@@ -165,9 +165,8 @@ def tune(
         "weights": dataclasses.asdict(weights),
         "headroom": HEADROOM,
         "randomization": None if randomization is None else randomization.to_dict(),
-        **{name: _plain(name, value, history is not None) for name, value in runner_options.items()},
+        **plain_options(runner_options, history is not None),
         "search_physics": SEARCH_PHYSICS if is_free else None,
-        "versions": package_versions(("batchpid", runner_options.get("engine", "sapien"), "numpy", "cmaes")),
     }
     record = HistoryFile(history, "search", settings)
     search = Candidates(
@@ -290,6 +289,16 @@ def evolve(
             if time_limit is not None and time.monotonic() - began > time_limit:
                 break
     return np.array(points), tuple(costs)
+
+
+def plain_options(options: Mapping[str, Any], resumes: bool) -> dict[str, Any]:
+    """Return options of the runner as plain values, and the versions of the packages that they use.
+
+    Raises InvalidArgumentError for a function if the search ``resumes`` from a history.
+    """
+    libraries = options.get("engine", "sapien"), *(("jax",) if options.get("backend") == "jax" else ())
+    versions = package_versions(("batchpid", *libraries, "numpy", "cmaes"))
+    return {name: _plain(name, value, resumes) for name, value in options.items()} | {"versions": versions}
 
 
 def _plain(name: str, value: Any, resumes: bool) -> Any:

@@ -95,3 +95,8 @@ def listed(kind):
     if get_origin(kind) is Literal:
         return [*get_args(kind)]
     return [each for part in get_args(kind) for each in listed(part)] if get_origin(kind) in (Union, UnionType) else []
+
+
+def is_slow(name, value):
+    """Return whether a value needs compilations or processes."""
+    return value == "jax" if name == "backend" else name in ("workers", "cluster") and value not in (0, None)

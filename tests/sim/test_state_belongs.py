@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from identical import assert_identical
-from option_values import ARM, VALUES, option_values
+from option_values import ARM, VALUES, is_slow, option_values
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
@@ -48,11 +48,6 @@ CONTEXTS = [
 ]
 """Further options that a value may need."""
 NAMES = [each.name for each in fields(RunnerOptions)] + ["params"]
-
-
-def is_slow(name, value):
-    """Return whether a value needs compilations or processes."""
-    return value == "jax" if name == "backend" else name in ("workers", "cluster") and value not in (0, None)
 
 
 def quick(name):
