@@ -20,6 +20,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import RunnerKeywords
 from batchpid.sim.identification.fit import Step
 from batchpid.sim.identification.fit_history import History, State
+from batchpid.sim.tuning import tool_candidates
 from batchpid.sim.tuning.history import HistoryFile
 from batchpid.sim.tuning.moves import random_moves
 from batchpid.sim.tuning.search import tune
@@ -149,10 +150,20 @@ def cheap(search):
 
 @pytest.fixture(autouse=True, scope="module")
 def few_moves():
+    """The searches have one move; the moves of a tool, which take seconds to find, are found once."""
+    found = {}
+
+    def tool_moves(robot, space, count, seed):
+        key = str(robot.describe()), space.link, count, seed
+        if key not in found:
+            found[key] = tool_candidates.tool_moves(robot, space, count, seed)
+        return found[key]
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("batchpid.sim.tuning.search.search_moves", lambda robot, seed: random_moves(robot, 1, seed))
         for name in ("search.FINAL_MOVES", "search.VARIED_MOVES", "tool_search.MOVES", "tool_search.FINAL_MOVES"):
             patch.setattr(f"batchpid.sim.tuning.{name}", 1)
+        patch.setattr("batchpid.sim.tuning.tool_search.tool_moves", tool_moves)
         yield
 
 
@@ -190,7 +201,14 @@ def test_every_input_of_a_search_has_values_to_try(search):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(("search", "name"), [(search, name) for search in SEARCHES for name in inputs(search)])
+@pytest.mark.parametrize(
+    ("search", "name"),
+    [
+        pytest.param(search, name, marks=pytest.mark.slow if (search, name) == (tune_tool, "robot") else [])
+        for search in SEARCHES
+        for name in inputs(search)
+    ],
+)
 def test_a_history_is_refused_or_has_no_effect_under_another_value_of_each_input(search, name):
     check_histories(search, *({name: each} for each in input_values(name) if not is_slow(name, each)))
 
