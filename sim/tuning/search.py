@@ -33,7 +33,6 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.io.versions import package_versions
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
@@ -43,7 +42,7 @@ from batchpid.sim.runner import Runner
 from batchpid.sim.tuning.candidates import HEADROOM, Candidates
 from batchpid.sim.tuning.evaluation import SUBSTEPS
 from batchpid.sim.tuning.first_candidates import first_gains, loop_delay
-from batchpid.sim.tuning.history import HistoryFile
+from batchpid.sim.tuning.history import HistoryFile, plain_options
 from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
 from batchpid.sim.tuning.randomization_presets import reseeded
 from batchpid.sim.tuning.weights import Weights
@@ -289,29 +288,6 @@ def evolve(
             if time_limit is not None and time.monotonic() - began > time_limit:
                 break
     return np.array(points), tuple(costs)
-
-
-def plain_options(options: Mapping[str, Any], resumes: bool) -> dict[str, Any]:
-    """Return options of the runner as plain values, and the versions of the packages that they use.
-
-    Raises InvalidArgumentError for a function if the search ``resumes`` from a history.
-    """
-    libraries = options.get("engine", "sapien"), *(("jax",) if options.get("backend") == "jax" else ())
-    versions = package_versions(("batchpid", *libraries, "numpy", "cmaes"))
-    return {name: _plain(name, value, resumes) for name, value in options.items()} | {"versions": versions}
-
-
-def _plain(name: str, value: Any, resumes: bool) -> Any:
-    """Return an option of the runner as a plain value: the option itself, its digest, or a function's name."""
-    value = value.item() if isinstance(value, np.generic) else value
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if not callable(value):
-        return digest(value)
-    if resumes:
-        problem = f"cannot tell whether {name} is the same function when the search resumes"
-        raise InvalidArgumentError("history", problem, remedy="leave history out")
-    return getattr(value, "__qualname__", type(value).__qualname__)
 
 
 def _known_costs(record: HistoryFile, population: int) -> list[tuple[float, ...]]:

@@ -23,8 +23,8 @@ from batchpid.sim.runner import Runner
 from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tuning.candidates import HEADROOM
 from batchpid.sim.tuning.evaluation import SUBSTEPS
-from batchpid.sim.tuning.history import HistoryFile
-from batchpid.sim.tuning.search import FINALISTS, SEARCH_PHYSICS, checked_effort, evolve, plain_options, refuse_searched
+from batchpid.sim.tuning.history import HistoryFile, plain_options
+from batchpid.sim.tuning.search import FINALISTS, SEARCH_PHYSICS, checked_effort, evolve, refuse_searched
 from batchpid.sim.tuning.tool_candidates import GAINS, SearchedSpace, ToolCandidates, osc_options, tool_moves
 from batchpid.sim.tuning.weights import Weights
 from batchpid.sim.workers.contact_log import MissedContactWarning

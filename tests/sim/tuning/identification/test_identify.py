@@ -528,7 +528,7 @@ def heavier(path: Path) -> Robot:
     return Robot.load(path)
 
 
-@pytest.mark.quick_rows(3)
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_search")
 @pytest.mark.parametrize("name", [name for name in inspect.signature(identify).parameters if name != "history"])
 def test_a_history_is_refused_or_has_no_effect_under_another_value_of_each_input(arm, runs, tmp_path, name):
@@ -539,7 +539,7 @@ def test_a_history_is_refused_or_has_no_effect_under_another_value_of_each_input
     if name == "hold":
         rows = np.column_stack([time, qpos, command])
         log = tmp_path / "log.csv"
-        columns = [f"{kind}.{joint}" for kind in ("qpos", "setpoint") for joint in arm.joint_names]
+        columns = [f"{kind}:{joint}" for kind in ("qpos", "setpoint") for joint in arm.joint_names]
         np.savetxt(log, rows, delimiter=",", header=",".join(["time", *columns]), comments="")
     base = {"robot": arm, "logs": log, "params": arm.designed("effort"), "timestep": DT, "workers": 0}
     base |= {"payload": False, "evaluations": 1}
