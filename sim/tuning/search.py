@@ -138,16 +138,14 @@ def tune(
     MissingDependencyError
         The package ``cmaes`` is missing.
     """
-    remedy = "leave it out; bp.design_gains makes implicit gains"
-    refuse_searched(runner_options, ("params", "discretization"), remedy)
+    refuse_searched(runner_options, ("params", "discretization"), "leave it out; bp.design_gains makes implicit gains")
     seed, generations, population, seconds = checked_effort(seed, generations, population, seconds)
     weights = Weights() if weights is None else weights
     final = random_moves(robot, FINAL_MOVES, seed + _FINAL_SEED) if moves is None else None
     is_varied = randomization is not None or robot.actuators is not None
-    if moves is None:
-        sample = tutorial_move(robot) + random_moves(robot, VARIED_MOVES, seed) if is_varied else None
-        moves = search_moves(robot, seed) if sample is None else sample
-    count = len(moves.start)
+    if moves is None and is_varied:
+        moves = tutorial_move(robot) + random_moves(robot, VARIED_MOVES, seed)
+    moves = search_moves(robot, seed) if moves is None else moves
     own = final is not None and robot.fixed_base and runner_options.get("build") is None
     # Physics "free", with one iteration, is enough if the loop computes friction, and not the solver.
     is_free = own and DISSIPATION[robot.dissipation].modelled and runner_options.get("control", "pid") != "drive"
@@ -181,7 +179,7 @@ def tune(
     where = {"workers": workers, "cluster": cluster, "randomization": reseeded(randomization, seed)}
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, **where} | runner_options
     search_options = options | {"ground": None, **SEARCH_PHYSICS} if is_free else options
-    with Runner(robot, population * count, **search_options) as runner:
+    with Runner(robot, population * len(moves.start), **search_options) as runner:
         points, costs = evolve(
             lambda points: search.costs(runner, points),
             firsts,
