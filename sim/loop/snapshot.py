@@ -166,12 +166,15 @@ class Snapshot:
         InvalidArgumentError
             It cannot.
         """
-        for key, ours in about.items():
-            if (theirs := self.about.get(key)) != ours:
-                is_digest = any(isinstance(each, str) and len(each) == _DIGITS for each in (ours, theirs))
-                problem = f"another {key}" if is_digest else f"{key} {reprlib.repr(theirs)}, not {ours!r}"
-                remedy = "restore it in a runner made with the same options"
-                raise InvalidArgumentError("snapshot", f"is of a runner with {problem}", remedy=remedy)
+        different = [key for key, ours in about.items() if self.about.get(key) != ours]
+        if different:
+            key, *others = different
+            ours, theirs = about[key], self.about.get(key)
+            is_digest = any(isinstance(each, str) and len(each) == _DIGITS for each in (ours, theirs))
+            problem = f"another {key}" if is_digest else f"{key} {reprlib.repr(theirs)}, not {ours!r}"
+            problem += "".join(f", and another {other}" for other in others)
+            remedy = "restore it in a runner made with the same options"
+            raise InvalidArgumentError("snapshot", f"is of a runner with {problem}", remedy=remedy)
 
     def for_envs(self, envs: slice) -> Snapshot:
         """Return the snapshot of some envs."""
