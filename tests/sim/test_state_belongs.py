@@ -182,7 +182,7 @@ def test_a_snapshot_under_two_options_is_refused_or_goes_on_as_before(pair):
 
 
 @pytest.mark.slow
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=800, deadline=None)
 @given(PAIRS)
 @pytest.mark.filterwarnings("ignore")
 def test_a_snapshot_under_any_two_options_is_refused_or_goes_on_as_before(pair):
