@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.digest import attributes_digest, digest
+from batchpid.arrays.digest import digest, object_digest
 from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
@@ -32,7 +32,7 @@ from batchpid.sim.engine.protocol import Capability, Engine, require
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
-from batchpid.sim.robot.actuator_checks import fit_actuators
+from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 from batchpid.sim.runner_keywords import (
@@ -56,6 +56,14 @@ if TYPE_CHECKING:
     from batchpid.sim.engine.sapien.physics import Physics
 
 Place = Literal["snapshot", "recording", "scene"]
+Role = Literal["restored", "processes", "last bits", "next commands"]
+"""Reason for which a snapshot may be restored in a runner with another value of an option.
+
+- "restored": the snapshot holds the value, and the runner takes it over;
+- "processes": the value says where and how fast the envs run, and results are bit-identical for any;
+- "last bits": so, but the last bits of results differ;
+- "next commands": the value is a default of the commands to come (``substeps``), or says which of them are refused.
+"""
 IDEAL = bp.Actuators()
 """Actuators without any effect."""
 PACK_SIZE = {True: 4, False: 64}
@@ -72,6 +80,11 @@ def _in(*places: Place, **sources: str) -> dict[str, str | None]:
     Where a place keeps another value than the option itself, ``sources`` names the attribute that holds it.
     """
     return {**dict.fromkeys(places), **sources}
+
+
+def _apart(role: Role, *places: Place) -> dict[str, str | None]:
+    """Return the metadata of an option that a snapshot leaves out, with its ``role`` for a runner that restores it."""
+    return {**_in(*places), "role": role}
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -93,12 +106,12 @@ class RunnerOptions:
         An option is out of range, or no option has this name.
     """
 
-    robot: Robot
+    robot: Robot = field(metadata=_in(snapshot="robot_name"))
     num_envs: int = field(metadata=_in("snapshot"))
-    workers: int | None = None
+    workers: int | None = field(default=None, metadata=_apart("processes"))
     """None on a cluster."""
     timestep: float = field(default=1 / 2000, metadata=_in("snapshot", "recording", "scene"))
-    substeps: int = field(default=20, metadata=_in("recording"))
+    substeps: int = field(default=20, metadata=_apart("next commands", "recording"))
     control: ControlMode | Controller = field(
         default="pid", metadata=_in(snapshot="control_name", recording="control_name")
     )
@@ -115,21 +128,21 @@ class RunnerOptions:
     )
     collisions: bool = field(default=True, metadata=_in("snapshot", "recording", "scene"))
     ground: bool = field(default=_DERIVED, metadata=_in("snapshot", "recording", "scene"))
-    build: Callable[[Any, int], Any] | None = field(default=None, metadata=_in("scene"))
-    pack_size: int = _DERIVED
-    on_fault: FaultAction = "hold"
-    speed_limit: NDArray[np.float64] | None = None
-    actuators: bp.Actuators | None = None
+    build: Callable[[Any, int], Any] | None = field(default=None, metadata=_in("scene", snapshot="build_digest"))
+    pack_size: int = field(default=_DERIVED, metadata=_apart("processes"))
+    on_fault: FaultAction = field(default="hold", metadata=_in("snapshot"))
+    speed_limit: NDArray[np.float64] | None = field(default=None, metadata=_in(snapshot="speed_limits"))
+    actuators: bp.Actuators | None = field(default=None, metadata=_apart("restored"))
     """None if every effect is off."""
     randomization: Randomization | None = field(
         default=None, metadata=_in(snapshot="distributions", recording="distributions")
     )
     guard: bp.Guard | None = field(default=None, metadata=_in(snapshot="guard_digest"))
-    on_invalid_input: InvalidInputAction = "raise"
-    recover: bool = True
-    checkpoint_steps: int | None = 8000
-    timeout: float = 60.0
-    cluster: Ray | None = None
+    on_invalid_input: InvalidInputAction = field(default="raise", metadata=_apart("next commands"))
+    recover: bool = field(default=True, metadata=_apart("processes"))
+    checkpoint_steps: int | None = field(default=8000, metadata=_apart("last bits"))
+    timeout: float = field(default=60.0, metadata=_apart("processes"))
+    cluster: Ray | None = field(default=None, metadata=_apart("processes"))
 
     def __init__(self, robot: Robot, num_envs: int, **options: Unpack[RunnerKeywords]) -> None:
         check_keywords("Runner", options, [*RunnerKeywords.__annotations__, "params"])
@@ -180,6 +193,8 @@ class RunnerOptions:
         own["guard"] = fit_guard(given["guard"], robot, self.num_envs, self.control_name, self.sets_positions)
         own["actuators"] = self.check_actuators(given["actuators"])
         self._check_collisions()
+        for name in ("controller_digest", "build_digest"):  # of the objects as they are now
+            getattr(self, name)
 
     def _checked_pack_size(self, given: Any) -> int:
         """Return the number of scenes that may share a system, by default the engine's; 1 where none is shared."""
@@ -366,7 +381,8 @@ class RunnerOptions:
             "joints": list(robot.joint_names),
             **self.values_for("snapshot"),
             "ignored_pairs": digest(robot.ignored_pairs),
-            "controller": None if isinstance(self.control, str) else attributes_digest(self.control),
+            "robot_actuators": digest(known_joints(robot)),
+            "controller": self.controller_digest,
             "command": None if own is None else list(own.names),
         }
 
@@ -384,6 +400,26 @@ class RunnerOptions:
     def solver_settings(self) -> list[Any]:
         """Values of :attr:`solver`."""
         return list(astuple(self.solver))
+
+    @property
+    def robot_name(self) -> str:
+        """Name of the robot."""
+        return self.robot.name
+
+    @cached_property
+    def controller_digest(self) -> str | None:
+        """Digest of a :class:`Controller`, which may change itself later; None for the name of a control."""
+        return _code_digest(self.control)
+
+    @cached_property
+    def build_digest(self) -> str | None:
+        """Digest of ``build``, which may change itself later; None without one."""
+        return _code_digest(self.build)
+
+    @property
+    def speed_limits(self) -> list[float] | None:
+        """The option ``speed_limit`` as plain values."""
+        return None if self.speed_limit is None else self.speed_limit.tolist()
 
     @property
     def guard_digest(self) -> str:
@@ -424,6 +460,11 @@ def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
     if name == "osc":
         return OperationalSpace(robot, default_tool(robot) if tool is None else tool)
     return value
+
+
+def _code_digest(value: object) -> str | None:
+    """Return the digest of a controller or function of the caller's; None for a name, or without a value."""
+    return None if value is None or isinstance(value, str) else object_digest(value)
 
 
 def _places(workers: Any, cluster: Any) -> tuple[int | None, Ray | None]:

@@ -246,12 +246,22 @@ class Runner(SingleOwner):
         return self._session.snapshot()
 
     def restore(self, snapshot: Snapshot) -> Observation:
-        """Put all envs into the state of ``snapshot``, with its params, from this runner or one with its options.
+        """Put all envs into the state of ``snapshot``, with its params and actuators.
+
+        The snapshot is from this runner, or from one with the same options, except for:
+
+        - ``workers``, ``cluster``, ``pack_size``, ``recover`` and ``timeout``, which change no result, and
+          ``checkpoint_steps``, which changes the last bits;
+        - ``substeps`` and ``on_invalid_input``, which apply to the commands that follow.
+
+        A controller or ``build`` of the caller's own counts by its code, constants, closure and attributes, and by the
+        globals that it names, as they are when the runner is made. So snapshots of an edited function are refused, and
+        of another version of Python. Make a new controller for each runner if calls change its attributes.
 
         Raises
         ------
         InvalidArgumentError
-            It is of another robot, number of envs, timestep, control, ...
+            It is of another robot, number of envs, timestep, control, ...; the message names the options.
         """
         return self._session.restore(snapshot)
 

@@ -406,7 +406,7 @@ class Session:
                     unrecorded += ((time, arrays.command.setpoint.copy(), observation),)
             if self._moving is not None:
                 self._moving.see(setpoint[:count], rate is not None, substeps * timestep)
-            if self._chatter is not None:
+            if self._chatter is not None and self._chatter.is_watching:
                 seen = pool.arrays.observation.map(lambda rows: rows[:count])
                 self._chatter.see(seen, substeps * timestep)
             steps = count * substeps

@@ -35,7 +35,9 @@ CHANGED = "changed"
 """Name of the setpoints that the guard changed in the last sim step."""
 AGE = "age"
 """Name of the sim steps since the friction model of an env took its inertia (envs,)."""
-_FORMAT = 9
+_FORMAT = 10
+_DIGITS = 64
+"""Length of a digest."""
 _ACTUATORS = "actuator_params"
 _CHOICES: dict[str, tuple[Any, ...]] = {name: tuple(named.values()) for name, named in CHOICES.items()}
 _CHOICES["conditional"] = (Everywhere(),)
@@ -166,13 +168,15 @@ class Snapshot:
         InvalidArgumentError
             It cannot.
         """
-        for key, ours in about.items():
-            if self.about.get(key) != ours:
-                raise InvalidArgumentError(
-                    "snapshot",
-                    f"is of a runner with {key} {reprlib.repr(self.about.get(key))}, not {ours!r}",
-                    remedy="restore it in a runner made with the same options",
-                )
+        different = [key for key, ours in about.items() if self.about.get(key) != ours]
+        if different:
+            key, *others = different
+            ours, theirs = about[key], self.about.get(key)
+            is_digest = any(isinstance(each, str) and len(each) == _DIGITS for each in (ours, theirs))
+            problem = f"another {key}" if is_digest else f"{key} {reprlib.repr(theirs)}, not {ours!r}"
+            problem += "".join(f", and another {other}" for other in others)
+            remedy = "restore it in a runner made with the same options"
+            raise InvalidArgumentError("snapshot", f"is of a runner with {problem}", remedy=remedy)
 
     def for_envs(self, envs: slice) -> Snapshot:
         """Return the snapshot of some envs."""

@@ -77,6 +77,11 @@ class DriveChatterCheck:
         speed = np.where(chatters & np.isfinite(speed) & self._robot.independent, speed, np.inf)
         self._speed = speed if np.isfinite(speed).any() else None
 
+    @property
+    def is_watching(self) -> bool:
+        """False where no joint can chatter, and after the warning: :meth:`see` then has nothing to find."""
+        return self._speed is not None and not self._has_warned
+
     def see(self, observation: Observation, seconds: float) -> None:
         """Look at the ticks (ticks, envs, ...) of ``observation``, each of which lasted ``seconds``."""
         if self._speed is None or self._has_warned:

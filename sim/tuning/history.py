@@ -7,10 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from batchpid.arrays.digest import digest
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
+from batchpid.io.versions import package_versions
 
 
 class HistoryFile:
@@ -58,3 +61,26 @@ class HistoryFile:
     def _error(self, problem: str) -> InvalidArgumentError:
         remedy = "use the same inputs, remove it, or name another file"
         return InvalidArgumentError("history", problem, value=str(self._path), remedy=remedy)
+
+
+def plain_options(options: Mapping[str, Any], resumes: bool) -> dict[str, Any]:
+    """Return options of the runner as plain values, and the versions of the packages that they use.
+
+    Raises InvalidArgumentError for a function if the search ``resumes`` from a history.
+    """
+    libraries = options.get("engine", "sapien"), *(("jax",) if options.get("backend") == "jax" else ())
+    versions = package_versions(("batchpid", *libraries, "numpy", "cmaes"))
+    return {name: _plain(name, value, resumes) for name, value in options.items()} | {"versions": versions}
+
+
+def _plain(name: str, value: Any, resumes: bool) -> Any:
+    """Return an option of the runner as a plain value: the option itself, its digest, or a function's name."""
+    value = value.item() if isinstance(value, np.generic) else value
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if not callable(value):
+        return digest(value)
+    if resumes:
+        problem = f"cannot tell whether {name} is the same function when the search resumes"
+        raise InvalidArgumentError("history", problem, remedy="leave history out")
+    return getattr(value, "__qualname__", type(value).__qualname__)

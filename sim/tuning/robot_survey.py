@@ -31,7 +31,7 @@ from batchpid.sim.robot.parts import MOVING_TYPES
 from batchpid.sim.robot.source import is_mjcf
 from batchpid.sim.robot.xml import SIZE_LIMIT, parse_xml
 
-STAGES = ("reading the URDF", "building it in the engine", "checking it", "drawing moves", "moving it")
+STAGES = ("reading the description", "building it in the engine", "checking it", "drawing moves", "moving it")
 """Stages of a survey of one robot, named in :attr:`RobotReport.error`."""
 _PROGRAM = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from batchpid.sim.tuning.robot_survey import main; main()"

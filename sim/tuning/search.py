@@ -33,7 +33,6 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.io.versions import package_versions
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
@@ -43,7 +42,7 @@ from batchpid.sim.runner import Runner
 from batchpid.sim.tuning.candidates import HEADROOM, Candidates
 from batchpid.sim.tuning.evaluation import SUBSTEPS
 from batchpid.sim.tuning.first_candidates import first_gains, loop_delay
-from batchpid.sim.tuning.history import HistoryFile
+from batchpid.sim.tuning.history import HistoryFile, plain_options
 from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
 from batchpid.sim.tuning.randomization_presets import reseeded
 from batchpid.sim.tuning.weights import Weights
@@ -139,16 +138,14 @@ def tune(
     MissingDependencyError
         The package ``cmaes`` is missing.
     """
-    remedy = "leave it out; bp.design_gains makes implicit gains"
-    refuse_searched(runner_options, ("params", "discretization"), remedy)
+    refuse_searched(runner_options, ("params", "discretization"), "leave it out; bp.design_gains makes implicit gains")
     seed, generations, population, seconds = checked_effort(seed, generations, population, seconds)
     weights = Weights() if weights is None else weights
     final = random_moves(robot, FINAL_MOVES, seed + _FINAL_SEED) if moves is None else None
     is_varied = randomization is not None or robot.actuators is not None
-    if moves is None:
-        sample = tutorial_move(robot) + random_moves(robot, VARIED_MOVES, seed) if is_varied else None
-        moves = search_moves(robot, seed) if sample is None else sample
-    count = len(moves.start)
+    if moves is None and is_varied:
+        moves = tutorial_move(robot) + random_moves(robot, VARIED_MOVES, seed)
+    moves = search_moves(robot, seed) if moves is None else moves
     own = final is not None and robot.fixed_base and runner_options.get("build") is None
     # Physics "free", with one iteration, is enough if the loop computes friction, and not the solver.
     is_free = own and DISSIPATION[robot.dissipation].modelled and runner_options.get("control", "pid") != "drive"
@@ -156,7 +153,7 @@ def tune(
         **robot.describe(),
         "seed": seed,
         "population": population,
-        "actuators": None if robot.actuators is None else digest(robot.actuators),
+        "robot_actuators": None if robot.actuators is None else digest(robot.actuators),
         "gain_units": gain_units,
         "per_joint": per_joint,
         "moves": list(moves.names),
@@ -165,9 +162,8 @@ def tune(
         "weights": dataclasses.asdict(weights),
         "headroom": HEADROOM,
         "randomization": None if randomization is None else randomization.to_dict(),
-        **{name: _plain(name, value, history is not None) for name, value in runner_options.items()},
+        **plain_options(runner_options, history is not None),
         "search_physics": SEARCH_PHYSICS if is_free else None,
-        "versions": package_versions(("batchpid", runner_options.get("engine", "sapien"), "numpy", "cmaes")),
     }
     record = HistoryFile(history, "search", settings)
     search = Candidates(
@@ -183,7 +179,7 @@ def tune(
     where = {"workers": workers, "cluster": cluster, "randomization": reseeded(randomization, seed)}
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, **where} | runner_options
     search_options = options | {"ground": None, **SEARCH_PHYSICS} if is_free else options
-    with Runner(robot, population * count, **search_options) as runner:
+    with Runner(robot, population * len(moves.start), **search_options) as runner:
         points, costs = evolve(
             lambda points: search.costs(runner, points),
             firsts,
@@ -290,19 +286,6 @@ def evolve(
             if time_limit is not None and time.monotonic() - began > time_limit:
                 break
     return np.array(points), tuple(costs)
-
-
-def _plain(name: str, value: Any, resumes: bool) -> Any:
-    """Return an option of the runner as a plain value: the option itself, its digest, or a function's name."""
-    value = value.item() if isinstance(value, np.generic) else value
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if not callable(value):
-        return digest(value)
-    if resumes:
-        problem = f"cannot tell whether {name} is the same function when the search resumes"
-        raise InvalidArgumentError("history", problem, remedy="leave history out")
-    return getattr(value, "__qualname__", type(value).__qualname__)
 
 
 def _known_costs(record: HistoryFile, population: int) -> list[tuple[float, ...]]:

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.digest import digest
-from batchpid.io.versions import package_versions
 from batchpid.metrics import StepMetrics
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
@@ -24,7 +23,7 @@ from batchpid.sim.runner import Runner
 from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tuning.candidates import HEADROOM
 from batchpid.sim.tuning.evaluation import SUBSTEPS
-from batchpid.sim.tuning.history import HistoryFile
+from batchpid.sim.tuning.history import HistoryFile, plain_options
 from batchpid.sim.tuning.search import FINALISTS, SEARCH_PHYSICS, checked_effort, evolve, refuse_searched
 from batchpid.sim.tuning.tool_candidates import GAINS, SearchedSpace, ToolCandidates, osc_options, tool_moves
 from batchpid.sim.tuning.weights import Weights
@@ -67,7 +66,7 @@ def tune_tool(
 ) -> ToolTuning:
     """Search for gains of operational-space control of the link ``tool``, by default the robot's last link.
 
-    The other arguments are as for :func:`batchpid.sim.tuning.search.tune`; ``runner_options`` must be plain values.
+    The other arguments are as for :func:`batchpid.sim.tuning.search.tune`.
 
     Raises
     ------
@@ -91,7 +90,7 @@ def tune_tool(
     judge = ToolCandidates(robot, full, unseen, seconds, weights)
     settings: dict[str, Any] = {
         **robot.describe(),
-        "actuators": None if robot.actuators is None else digest(robot.actuators),
+        "robot_actuators": None if robot.actuators is None else digest(robot.actuators),
         "tool": tool,
         "seed": seed,
         "population": population,
@@ -99,8 +98,7 @@ def tune_tool(
         "seconds": seconds,
         "weights": dataclasses.asdict(weights),
         "headroom": HEADROOM,
-        **runner_options,
-        "versions": package_versions(("batchpid", runner_options.get("engine", "sapien"), "numpy", "cmaes")),
+        **plain_options(runner_options, history is not None),
     }
     options: dict[str, Any] = {"substeps": SUBSTEPS, "workers": workers, **runner_options}
     with warnings.catch_warnings():

@@ -9,6 +9,7 @@ import pytest
 
 import batchpid as bp
 from batchpid.sim import Robot, Runner, StabilityWarning
+from batchpid.sim.robot.drive_chatter import DriveChatterCheck
 from batchpid.sim.tuning.candidates import Candidates
 from tests.sim.tiny_urdf import joint, link, one_joint, robot, write
 
@@ -182,3 +183,11 @@ def test_drives_of_bundled_robots_do_not_warn(panda, jaco2, engine):
         with make(each, **DRIVEN | {"engine": engine}) as runner:
             goal = np.clip(each.start + 1.0, each.lower, each.upper)
             assert warned(lambda runner=runner, goal=goal: runner.rollout(np.tile(goal, (30, 1))))[1] == []
+
+
+def test_only_drives_that_can_stick_are_watched(arm):
+    check = DriveChatterCheck(arm, 1 / 2000)
+    assert not check.is_watching
+    for gains, watches in ((BAD, True), (GOOD, False)):
+        check.set_gains(arm.params(**gains), None)
+        assert check.is_watching == watches

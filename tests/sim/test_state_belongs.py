@@ -1,14 +1,21 @@
 """State of one runner is refused in another, or gives the same result there: for every option."""
 
 from dataclasses import fields
+from functools import cache
+from typing import get_args
 
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from identical import assert_identical
+from option_values import ARM, VALUES, is_slow, option_values
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Randomization, Robot, Runner, RunnerOptions, Uniform
 from batchpid.sim.gym import ReachVectorEnv, ToolReachVectorEnv
+from batchpid.sim.options import Role
 
 pytest.importorskip("mujoco")
 POSTURE = np.array([0, -0.5, 0, -2.2, 0, 1.8, 0.8, 0.02, 0.02])
@@ -19,13 +26,106 @@ OTHER = {
     "point": {"point": [0, 0, 0.3]},
     "posture": {"posture": POSTURE + 0.01},
 }
-CHOSEN_ANEW = {
-    "workers", "cluster", "timeout", "recover", "checkpoint_steps", "pack_size", "substeps", "on_fault",
-    "on_invalid_input", "speed_limit",
-}  # fmt: skip
-"""Options of how a run goes on, not of the state."""
-CARRIED = {"robot", "actuators", "build"}
-"""Parts that are in the snapshot itself, or in the sizes of its arrays."""
+
+
+BASE = {
+    "robot": ARM,
+    "num_envs": 2,
+    "workers": 0,
+    "substeps": 20,
+    "speed_limit": 0.6,
+    "ground": True,
+    "build": VALUES["build"][0],
+}
+"""In the run, env 1 becomes faster than the limit after the snapshot, and a box falls."""
+CONTEXTS = [
+    {},
+    {"build": None, "ground": None},
+    {"control": "osc"},
+    {"backend": "jax"},
+    {"build": None, "ground": None, "engine": "mujoco"},
+    {"workers": None, "build": None, "ground": None},
+]
+"""Further options that a value may need."""
+NAMES = [each.name for each in fields(RunnerOptions)] + ["params"]
+
+
+def quick(name):
+    """Return the values for random pairs."""
+    return [each for each in option_values(name) if name != "workers" and not is_slow(name, each)] or [BASE[name]]
+
+
+def go_on(runner):
+    """Return what follows: every observation, and where the boxes end."""
+    pose = runner.options.command.size > 2 or runner.options.setpoint_space == "tool"
+    start = runner.observe()
+    seen = []
+    for _ in range(8):
+        setpoint = start.tool_pose + 0.0 if pose else start.qpos + 0.0
+        setpoint[1:, 0] += 0.6
+        seen.append(runner.step(setpoint, substeps=40))
+    return seen, runner.poses() if runner.options.build is not None else None
+
+
+def is_possible(chosen):
+    options = {name: value for name, value in {**BASE, **chosen}.items() if name != "params"}
+    try:
+        found = RunnerOptions(**options)
+    except InvalidArgumentError:
+        return False
+    return found.collisions or found.build is None  # which has shapes
+
+
+@cache
+def in_context(number):
+    """Return a snapshot under one of CONTEXTS, and what followed."""
+    return went_on(CONTEXTS[number])
+
+
+def made(chosen):
+    return Runner(**{**BASE, **chosen})
+
+
+def went_on(chosen):
+    with made(chosen) as runner:
+        goal = runner.observe()
+        for _ in range(2):
+            runner.step(goal.qpos if goal.tool_pose is None else goal.tool_pose, substeps=10)
+        return runner.snapshot(), go_on(runner)
+
+
+def changed(ours, theirs):
+    """Return the names of options with other values."""
+    given, other = (BASE | each for each in (ours, theirs))
+    return [name for name in given.keys() | other if given.get(name, ...) is not other.get(name, ...)]
+
+
+def check(ours, theirs, before=None):
+    """Check that a snapshot made under ``ours`` is refused, or gives the same, under ``theirs``."""
+    snapshot, (expected, ends) = before or went_on(ours)
+    roles = {each.name: each.metadata.get("role") for each in fields(RunnerOptions)} | {"params": "restored"}
+    with made(theirs) as other:
+        try:
+            other.restore(snapshot)
+        except InvalidArgumentError as error:
+            refusal = error
+        else:
+            refusal, (found, places) = None, go_on(other)
+    if refusal is not None:
+        assert refusal.argument == "snapshot"
+        kept = [name for name in changed(ours, theirs) if roles[name] is None]
+        assert kept, "these options belong to no snapshot"
+        assert "robot" in kept or any(name in str(refusal) for name in kept), "the option is named"
+        return
+    if any(roles[name] == "last bits" for name in changed(ours, theirs)):
+        for one, two in zip(expected, found, strict=True):
+            np.testing.assert_allclose(two.qpos, one.qpos, atol=1e-5)
+        if ends is not None:
+            np.testing.assert_allclose(places, ends, atol=1e-5)
+    else:
+        for one, two in zip(expected, found, strict=True):
+            assert_identical(one, two)
+        np.testing.assert_array_equal(places, ends)
 
 
 def osc_runner(robot, link="panda_hand", **options):
@@ -38,10 +138,56 @@ def panda():
     return Robot.load("panda")
 
 
-def test_every_option_is_in_the_snapshot_or_has_a_reason_not_to_be():
-    marked = {each.name for each in fields(RunnerOptions) if "snapshot" in each.metadata}
-    assert {each.name for each in fields(RunnerOptions)} == marked | CHOSEN_ANEW | CARRIED
-    assert not marked & (CHOSEN_ANEW | CARRIED)
+def test_every_option_is_kept_or_has_a_role_apart():
+    for each in fields(RunnerOptions):
+        assert ("snapshot" in each.metadata) != (each.metadata.get("role") in get_args(Role)), each.name
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    ("name", "index"),
+    [
+        pytest.param(name, index, marks=pytest.mark.slow if name == "cluster" else [])
+        for name in NAMES
+        for index in range(len(option_values(name)))
+    ],
+)
+def test_a_snapshot_is_refused_or_goes_on_as_before_under_each_value_of_each_option(name, index):
+    """The snapshot is made under the value before it, the last one for the first."""
+    before, value = option_values(name)[index - 1], option_values(name)[index]
+    number, context = next(each for each in enumerate(CONTEXTS) if is_possible({**each[1], name: value}))
+    if is_possible({**context, name: before}):
+        check({**context, name: before}, {**context, name: value})
+    else:
+        check(context, {**context, name: value}, in_context(number))
+
+
+def test_each_option_has_a_value_to_try_besides_its_default():
+    """A new option needs a line in VALUES, unless its type lists its values."""
+    default = {each.name: each.default for each in fields(RunnerOptions)} | {"params": None}
+    assert not [name for name in NAMES if {repr(each) for each in option_values(name)} <= {repr(default[name])}]
+
+
+PAIRS = st.lists(st.sampled_from(NAMES), min_size=1, max_size=2, unique=True).flatmap(
+    lambda names: st.tuples(*[st.fixed_dictionaries({name: st.sampled_from(quick(name)) for name in names})] * 2)
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(PAIRS)
+@pytest.mark.filterwarnings("ignore")
+def test_a_snapshot_under_two_options_is_refused_or_goes_on_as_before(pair):
+    assume(all(map(is_possible, pair)))
+    check(*pair)
+
+
+@pytest.mark.slow
+@settings(max_examples=800, deadline=None)
+@given(PAIRS)
+@pytest.mark.filterwarnings("ignore")
+def test_a_snapshot_under_any_two_options_is_refused_or_goes_on_as_before(pair):
+    assume(all(map(is_possible, pair)))
+    check(*pair)
 
 
 @pytest.mark.parametrize("other", OTHER.values(), ids=OTHER)

@@ -105,7 +105,7 @@ def test_a_history_of_other_inputs_is_refused_by_their_names(panda, tmp_path):
     permuted = actuators._replace(strength=actuators.strength[:, ::-1])
     assert repr(permuted) == repr(actuators)
     refused("actuators", actuators=permuted)
-    refused("actuators", dataclasses.replace(panda, actuators=permuted), actuators=None)
+    refused("actuators, robot_actuators", dataclasses.replace(panda, actuators=permuted), actuators=None)
     refused("moves_digest", moves=moves._replace(target=moves.target + 1e-9))
     heavier = panda.urdf.replace('mass value="', 'mass value="1')
     refused("urdf", dataclasses.replace(panda, urdf=heavier))

@@ -34,9 +34,9 @@ def test_reports_come_in_order_with_all_that_is_known(folder):
     assert 0 <= good.worst_error < 1e-3
     assert json.loads(json.dumps(good.asdict()))["findings"] == list(good.findings)
     assert (scenery.dof, scenery.loads, scenery.moves) == (0, False, 0)
-    assert scenery.error.startswith("reading the URDF: a robot without moving joints")
+    assert scenery.error.startswith("reading the description: a robot without moving joints")
     assert not truncated.loads
-    assert truncated.error.startswith("reading the URDF: ")
+    assert truncated.error.startswith("reading the description: ")
 
 
 @pytest.mark.slow
@@ -48,7 +48,7 @@ def test_a_robot_that_takes_too_long_is_ended(folder):
 def test_a_process_that_ends_at_once_is_an_error_of_its_robot(folder, monkeypatch):
     monkeypatch.setattr(sys, "executable", shutil.which("false"))
     (report,) = survey([folder / "deep" / "arm.urdf"])
-    assert report.error == "reading the URDF: exit status 1"
+    assert report.error == "reading the description: exit status 1"
 
 
 def test_files_and_folders_are_found_once(folder):

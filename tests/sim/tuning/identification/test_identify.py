@@ -1,9 +1,11 @@
+import inspect
 import json
 import os
 import runpy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -502,3 +504,56 @@ def test_motors_that_move_a_mimic_joint_are_found(tmp_path):
             wanted = float(getattr(truth, name)[0, joint])
             assert found.interval(kind, joint)[0] == pytest.approx(wanted, rel=0.03), (kind, joint)
     assert found.interval("delay")[0] == pytest.approx(0.004, abs=1e-4)
+
+
+INPUTS = {
+    "robot": lambda arm, log, path: [arm, replace(arm, actuators=bp.make_actuators(2, coulomb=1.0)), heavier(path)],
+    "logs": lambda arm, log, path: [log, replace(log, qpos=log.qpos * 1.01), replace(log, held=True), [log, log]],
+    "params": lambda arm, log, path: [arm.designed("effort"), arm.designed("effort").replace(ki=None)],
+    "compensate": lambda *_: ["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"],
+    "timestep": lambda *_: [DT, DT / 2],
+    "sim_steps": lambda *_: [1, 2],
+    "payload": lambda *_: [False, True],
+    "hold": lambda *_: [False, True],
+    "evaluations": lambda *_: [1, 2],
+    "seed": lambda *_: [0, 1],
+    "workers": lambda *_: [0, 1],
+    "progress": lambda *_: [None, list],
+}
+"""Values of the inputs of a fit to try."""
+
+
+def heavier(path: Path) -> Robot:
+    path.write_text(ARM.replace('mass value="1"', 'mass value="1.5"'))
+    return Robot.load(path)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short_search")
+@pytest.mark.parametrize("name", [name for name in inspect.signature(identify).parameters if name != "history"])
+def test_a_history_is_refused_or_has_no_effect_under_another_value_of_each_input(arm, runs, tmp_path, name):
+    """A new input needs a line in INPUTS. The log is a file for ``hold``, which says how files are read."""
+    _, setpoints, _ = runs
+    time, qpos, command = (table[1000:1210] for table in (setpoints.time, setpoints.qpos, setpoints.command))
+    log: Any = Log("part", (0, 1), "setpoint", time, qpos, time, command, False)
+    if name == "hold":
+        rows = np.column_stack([time, qpos, command])
+        log = tmp_path / "log.csv"
+        columns = [f"{kind}:{joint}" for kind in ("qpos", "setpoint") for joint in arm.joint_names]
+        np.savetxt(log, rows, delimiter=",", header=",".join(["time", *columns]), comments="")
+    base = {"robot": arm, "logs": log, "params": arm.designed("effort"), "timestep": DT, "workers": 0}
+    base |= {"payload": False, "evaluations": 1}
+    values, results = INPUTS[name](arm, log, tmp_path / "heavier.urdf"), []
+    for number, value in enumerate(values):
+        found = identify(**{**base, name: value}, history=tmp_path / f"{number}.json")
+        results.append((found.estimate, found.uncertainty.deviation))
+    for number, value in enumerate(values):
+        try:
+            found = identify(**{**base, name: value}, history=tmp_path / f"{(number - 1) % len(values)}.json")
+        except bp.InvalidArgumentError as error:
+            refusal = error
+        else:
+            refusal = None
+            np.testing.assert_array_equal(found.estimate, results[number][0])
+            np.testing.assert_array_equal(found.uncertainty.deviation, results[number][1])
+        assert refusal is None or refusal.argument == "history"

@@ -1,0 +1,102 @@
+"""Values of every option of a Runner, to try the promises that hold for all of them."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from tiny_urdf import INERTIAL, joint, link, robot, write
+
+import batchpid as bp
+from batchpid.sim import MujocoSolver, Physics, Randomization, Robot, RunnerKeywords, Uniform
+
+
+def arm(mass, **options):
+    """Arm of two joints, with shapes."""
+    inertial = INERTIAL.replace('mass value="1"', f'mass value="{mass}"')
+    ends = joint("shoulder", "base", "arm"), joint("elbow", "arm", "hand")
+    with TemporaryDirectory() as folder:
+        parts = link("base"), link("arm", inertial + SHAPE), link("hand", INERTIAL + SHAPE), *ends
+        return Robot.load(write(Path(folder), robot(*parts)), **options)
+
+
+SHAPE = '<collision><geometry><box size="0.05 0.05 0.4"/></geometry></collision>'
+ARM, HEAVY = arm(1), arm(2)
+MOTORS = bp.make_actuators(2, coulomb=0.3, armature=0.05)
+
+
+@dataclass
+class Law:
+    """Controller of the caller's own, with attributes of several kinds."""
+
+    kp: float = 20.0
+    gains: tuple = (5.0, {"shoulder": np.ones(2)})
+    shape: Any = np.tanh
+
+    def init(self, robot, num_envs):
+        return None
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        kd, scale = self.gains
+        return None, self.kp * self.shape(setpoint - qpos) * scale["shoulder"] - kd * qvel + passive
+
+
+def box(size, scene, env):
+    import sapien
+
+    builder = scene.create_actor_builder()
+    builder.add_box_collision(half_size=[size, size, size])
+    entity = builder.build(name="box")
+    entity.set_pose(sapien.Pose([2, env, 0.15]))
+    return [entity]
+
+
+def box_of(size):
+    return lambda scene, env: box(size, scene, env)
+
+
+VALUES = {
+    "robot": [ARM, HEAVY, replace(ARM, actuators=MOTORS), arm(1, dissipation="sapien"), arm(1, self_collision="none")],
+    "num_envs": [2, 3],
+    "params": [ARM.params(kp=9.0, ki=None, kd=2.0), ARM.params(kp=90.0, ki=1.0, kd=9.0)],
+    "workers": [0, 1],
+    "timestep": [1 / 2000, 1 / 1000],
+    "substeps": [20, 7],
+    "control": [Law(), Law(30.0), Law(gains=(5.0, {"shoulder": np.full(2, 0.5)})), Law(shape=lambda x: 2 * x),
+                Law(shape=lambda x: 3 * x), Law(shape=partial(np.multiply, 2.0)), Law(shape=partial(np.multiply, 3.0))],
+    "tool": ["arm", "hand"],
+    "physics": [MujocoSolver(iterations=3), Physics("PGS", 3)],
+    "build": [box_of(0.05), box_of(0.1), partial(box, 0.05), partial(box, 0.1)],
+    "pack_size": [1, 2],
+    "speed_limit": [0.3, 0.6, [0.3, 9.0]],
+    "actuators": [bp.Actuators(), MOTORS, bp.make_actuators(2, command_delay=2e-3)],
+    "randomization": [Randomization(payload=Uniform(0, 1)), Randomization(payload=Uniform(0, 2))],
+    "guard": [bp.make_guard(2, rate=0.5), bp.make_guard(2, rate=0.2)],
+    "checkpoint_steps": [100],
+    "timeout": [60.0, 30.0],
+}  # fmt: skip
+"""Values of options to try, besides those that their types list."""
+
+TYPES = get_type_hints(RunnerKeywords, localns={"Physics": Physics, "MujocoSolver": MujocoSolver})
+
+
+def option_values(name):
+    """Return the values of an option to try: those that its type lists, and those of the table."""
+    return [*listed(TYPES.get(name)), *VALUES.get(name, [])]
+
+
+def listed(kind):
+    """Return the values that a type lists: of a Literal, of bool, and None."""
+    if kind in (bool, type(None)):
+        return [True, False] if kind is bool else [None]
+    if get_origin(kind) is Literal:
+        return [*get_args(kind)]
+    return [each for part in get_args(kind) for each in listed(part)] if get_origin(kind) in (Union, UnionType) else []
+
+
+def is_slow(name, value):
+    """Return whether a value needs compilations or processes."""
+    return value == "jax" if name == "backend" else name in ("workers", "cluster") and value not in (0, None)
