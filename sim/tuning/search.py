@@ -1,7 +1,7 @@
 r"""Black-box search for gains by simulation: CMA-ES from the designed gains, in log space.
 
-Each env runs one move of one candidate, so a generation is one rollout. The moves are free of contact, so the robots
-have no collision shapes in the search. A share of the effort limits is a reserve for harder moves.
+Each env runs one move of one candidate, as a step or as a smooth motion of the setpoint, so a generation is one rollout
+and gains are found that are good at both. The moves are free of contact, so the robots have no collision shapes in the search. A share of the effort limits is a reserve for harder moves.
 :mod:`batchpid.sim.tuning.candidates` defines the cost. The search itself is the package ``cmaes`` (N. Hansen, "The CMA
 evolution strategy: a tutorial", arXiv:1604.00772).
 
@@ -148,7 +148,6 @@ def tune(
     if moves is None:
         sample = tutorial_move(robot) + random_moves(robot, VARIED_MOVES, seed) if is_varied else None
         moves = search_moves(robot, seed) if sample is None else sample
-    count = len(moves.start)
     own = final is not None and robot.fixed_base and runner_options.get("build") is None
     # Physics "free", with one iteration, is enough if the loop computes friction, and not the solver.
     is_free = own and DISSIPATION[robot.dissipation].modelled and runner_options.get("control", "pid") != "drive"
@@ -183,7 +182,7 @@ def tune(
     where = {"workers": workers, "cluster": cluster, "randomization": reseeded(randomization, seed)}
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, **where} | runner_options
     search_options = options | {"ground": None, **SEARCH_PHYSICS} if is_free else options
-    with Runner(robot, population * count, **search_options) as runner:
+    with Runner(robot, population * search.envs, **search_options) as runner:
         points, costs = evolve(
             lambda points: search.costs(runner, points),
             firsts,
@@ -204,7 +203,7 @@ def tune(
         finalists = [*dict.fromkeys([*ranking, 0])]  # 0: the designed gains
         judge = Candidates(robot, gain_units, per_joint, final, seconds, weights, headroom=1.0, varied=is_varied)
         options["randomization"] = reseeded(randomization, seed + _FINAL_SEED)
-        with Runner(robot, FINAL_MOVES * len(finalists), **options) as runner:
+        with Runner(robot, judge.envs * len(finalists), **options) as runner:
             finals = judge.costs(runner, points[finalists])
         best = finalists[int(np.argmin(finals))]
         if not best:
