@@ -158,24 +158,16 @@ def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
                 str(diverged or "-"),
             ]
         )
-    headers = [
-        "median / worst",
-        "settling",
-        "following error",
-        "overshoot",
-        "final error",
-        "chatter",
-        "settled / in time",
-    ]
+    headers = ["gains", "settling", "following error", "overshoot", "final error", "chatter", "settled /\nin time"]
     if all(row[-1] == "-" for row in rows):
         rows = [row[:-1] for row in rows]
     else:
         headers.append("diverged")
     return table(rows, headers, "l" + "r" * (len(headers) - 1)) + (
-        "\nOver the arm's joints and all moves, made as steps of the setpoint. following error: the largest of a joint in"
-        "\nrad or m, on the same moves as smooth motions with setpoint rates. settled / in time: moves of which every"
-        "\njoint settled, within the run and within a second or 1.2 times the shortest that the effort limits allow."
-        "\nchatter: variation of the effort over that of the smooth move."
+        "\nMedian / worst over the arm's joints and all moves, made as steps of the setpoint. following error: largest"
+        "\n|qpos - setpoint| of a joint [rad or m] on the same moves as smooth motions with setpoint rates. settled / in"
+        "\ntime: moves of which every joint settled, within the run and within a second or 1.2 times the shortest that"
+        "\nthe effort limits allow. chatter: variation of the effort over that of the smooth move."
     )
 
 

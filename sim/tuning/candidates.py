@@ -113,10 +113,11 @@ class Candidates:
         self._limit = settling_limits(robot, moves)
         # Envs of a candidate: each move as a step, then the followed ones. The same move has the same drawn robot.
         durations = smooth_durations(robot, moves)
-        shortest = np.argsort(durations, kind="stable")[: max(1, len(durations) // 2)] if weights.following else []
+        followed = max(1, len(durations) // 2) if weights.following else 0
+        shortest = np.argsort(durations, kind="stable")[:followed]
         steps = np.arange(len(durations))
-        self._moves = np.concatenate([steps, shortest]).astype(np.int64)
-        self._durations = np.concatenate([np.zeros(len(steps)), durations[shortest]]) if len(shortest) else None
+        self._moves = np.concatenate([steps, shortest])
+        self._durations = np.concatenate([np.zeros(len(steps)), durations[shortest]]) if followed else None
         self._size = np.maximum(np.abs(moves.target - moves.start), self._band / 0.02)
         # The plant that the gains see: mass matrices, the gains' unit per joint, and viscous damping.
         if gain_units == "mass_matrix":

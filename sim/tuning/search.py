@@ -1,8 +1,9 @@
 r"""Black-box search for gains by simulation: CMA-ES from the designed gains, in log space.
 
 Each env runs one move of one candidate, as a step or as a smooth motion of the setpoint, so a generation is one rollout
-and gains are found that are good at both. The moves are free of contact, so the robots have no collision shapes in the search. A share of the effort limits is a reserve for harder moves.
-:mod:`batchpid.sim.tuning.candidates` defines the cost. The search itself is the package ``cmaes`` (N. Hansen, "The CMA
+and the gains found are good at both. The moves are free of contact, so the robots have no collision shapes in the
+search. A share of the effort limits is a reserve for harder moves. :mod:`batchpid.sim.tuning.candidates` defines the
+cost and the weight of each. The search itself is the package ``cmaes`` (N. Hansen, "The CMA
 evolution strategy: a tutorial", arXiv:1604.00772).
 
 Good gains for robots that differ from the model, by actuators or a randomization, are farther from the designed ones.
