@@ -165,9 +165,9 @@ def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
         headers.append("diverged")
     return table(rows, headers, "l" + "r" * (len(headers) - 1)) + (
         "\nMedian / worst over the arm's joints and all moves, made as steps of the setpoint. following error: largest"
-        "\n|qpos - setpoint| of a joint [rad or m] on the same moves as smooth motions with setpoint rates. settled / in"
-        "\ntime: moves of which every joint settled, within the run and within a second or 1.2 times the shortest that"
-        "\nthe effort limits allow. chatter: variation of the effort over that of the smooth move."
+        "\n|qpos - setpoint| of a joint [rad or m] on the same moves as smooth motions, with setpoint rates. chatter:"
+        "\nvariation of the effort over that of the smooth move. settled / in time: moves of which every joint settled,"
+        "\nwithin the run and within a second or 1.2 times the shortest that the effort limits allow."
     )
 
 
