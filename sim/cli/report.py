@@ -153,7 +153,7 @@ def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
                 _median_and_worst(lost, ".2g"),
                 _median_and_worst(metrics.overshoot[:, arm], ".1%"),
                 _median_and_worst(metrics.steady_state_error[:, arm], ".1e"),
-                _median_and_worst(evaluation.chatter[:, arm], ".2g"),
+                _median_and_worst(evaluation.chatter[:, arm], ".1f"),
                 f"{settled.sum()} / {in_time.sum()} of {len(evaluation.moves.start)}",
                 str(diverged or "-"),
             ]
