@@ -15,7 +15,7 @@ accelerations. The mean over them plus the worst is added of::
     w_following log(1 + F / (10 b))
 
 where F is the largest following error, b the least half width of the settling band, 1e-3 rad or 1e-4 m, and F / b that
-of the arm's worst joint. w_following is 0.5; with 0 there are no such motions.
+of the arm's worst joint. w_following is 1 by default; with 0 there are no such motions.
 
 With a randomization, a robot may be drawn that no gains can control; then twice the mean over moves replaces the sum of
 mean and worst. Ts is limited to 1.5 times the run; Tmax is the settling time asked for. A is the joint's move, or the

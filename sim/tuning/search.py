@@ -113,7 +113,8 @@ def tune(
     per_joint
         Search for a factor of each joint's gains too, which needs more generations.
     weights
-        Of the terms of the cost.
+        Of the terms of the cost. Default: 1 for a second of a step's settling time and 1 for the logarithm of the
+        following error.
     moves
         Default: :func:`batchpid.sim.tuning.moves.search_moves`, and FINAL_MOVES random ones in the final round. For
         robots with actuators or a randomization, the search uses the tutorial's move and VARIED_MOVES random ones,

@@ -207,6 +207,16 @@ def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(
     assert len(late) - late.sum() >= least
 
 
+@pytest.mark.slow
+def test_gains_of_the_search_follow_unseen_motions_more_closely_than_designed_ones(panda):
+    found = tune(panda)
+    sets = GainSet("designed", found.start_params), GainSet("tuned", found.params)
+    designed, tuned = evaluate_sets(panda, sets, moves=20, seed=0, randomization=None)
+    arm = arm_joints(panda)
+    assert tuned.following_error[:, arm].max() < 0.8 * designed.following_error[:, arm].max()
+    assert tuned.metrics.settling_time[:, arm].max() <= designed.metrics.settling_time[:, arm].max()
+
+
 def test_time_limit_ends_the_search_after_a_generation(panda):
     found = tune(panda, moves=random_moves(panda, 1, 0), workers=0, time_limit=0.0, **SMALL)
     assert len(found.history) == found.settings["generations"] == 1
