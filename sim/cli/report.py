@@ -144,10 +144,13 @@ def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
         settled = np.isfinite(metrics.settling_time[:, arm]).all(axis=1)
         in_time = np.where(arm, metrics.settling_time, 0).max(1) <= evaluation.settling_limit
         diverged = int((~evaluation.rollout.ok.all(0)).sum())
+        followed = evaluation.following_error
+        lost = np.full(1, np.nan) if followed is None else np.where(arm, followed, 0.0).max(1)
         rows.append(
             [
                 evaluation.name,
                 _median_and_worst(metrics.settling_time[:, arm], ".2f", " s"),
+                _median_and_worst(lost, ".2g"),
                 _median_and_worst(metrics.overshoot[:, arm], ".1%"),
                 _median_and_worst(metrics.steady_state_error[:, arm], ".1e"),
                 _median_and_worst(evaluation.chatter[:, arm], ".1f"),
@@ -155,11 +158,16 @@ def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
                 str(diverged or "-"),
             ]
         )
-    headers = ["median / worst", "settling", "overshoot", "final error", "chatter", "settled / in time", "diverged"]
-    return table(rows, headers, "lrrrrrr") + (
-        "\nOver the arm's joints and all moves. settled / in time: moves of which every joint settled, within the run"
-        "\nand within a second or 1.2 times the shortest that the effort limits allow. chatter: variation of the effort"
-        "\nover that of the smooth move."
+    headers = ["gains", "settling", "following error", "overshoot", "final error", "chatter", "settled /\nin time"]
+    if all(row[-1] == "-" for row in rows):
+        rows = [row[:-1] for row in rows]
+    else:
+        headers.append("diverged")
+    return table(rows, headers, "l" + "r" * (len(headers) - 1)) + (
+        "\nMedian / worst over the arm's joints and all moves, made as steps of the setpoint. following error: largest"
+        "\n|qpos - setpoint| of a joint [rad or m] on the same moves as smooth motions, with setpoint rates. chatter:"
+        "\nvariation of the effort over that of the smooth move. settled / in time: moves of which every joint settled,"
+        "\nwithin the run and within a second or 1.2 times the shortest that the effort limits allow."
     )
 
 

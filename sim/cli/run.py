@@ -84,6 +84,7 @@ def evaluate_sets(
         drawn = at_the_joints(drawn) if each.control == "drive" else drawn
         name = each.name if len(titles) == 1 else f"{each.name}, {titles[engine]}"
         known = options | {"name": name, "control": each.control, "randomization": drawn, "engine": engine}
+        known["follow"] = True
         return evaluate_gains(robot, each.params, unseen, **known)
 
     return [evaluate(*each) for each in bar("comparing", unit="set")(list(product(sets, titles)))]

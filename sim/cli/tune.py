@@ -102,7 +102,10 @@ class TuneCommand:
             **flags.chosen(self, "seed generations population gain_units per_joint weights time_limit"),
             **flags.chosen(self, "workers cluster engine physics collisions"),
         )
-        print(f"{robot.name}: cost {found.start_cost:.4f} as designed, {found.cost:.4f} as tuned\n")
+        print(
+            f"{robot.name}: cost {found.start_cost:.4f} as designed, {found.cost:.4f} as tuned; weight of the settling "
+            f"time {self.weights.settling:g}, of the following error {self.weights.following:g}\n"
+        )
         sets = GainSet("designed", found.start_params), GainSet("tuned", found.params)
         options = flags.chosen(self, "seed workers cluster physics collisions")
         evaluations = evaluate_sets(
@@ -113,7 +116,8 @@ class TuneCommand:
         rejected = found.rejected or evaluations[1].drawback(evaluations[0], arm)
         chosen = 0 if rejected else 1
         judged = evaluations[chosen]
-        worst = judged.metrics.worst()
+        worst, followed = judged.metrics.worst(), judged.following_error
+        assert followed is not None  # evaluate_sets asks for it
         if rejected:
             print(f"\nThe designed gains are written, the tuned ones are rejected: {rejected}.")
         about = found.settings | {
@@ -128,6 +132,7 @@ class TuneCommand:
                 "overshoot": float(worst.overshoot[arm].max()),
                 "steady_state_error": float(worst.steady_state_error[arm].max()),
                 "chatter": float(judged.chatter[:, arm].max()),
+                "following_error": float(followed[:, arm].max()),
             },
         }
         save_params(out, sets[chosen].params, robot.joint_names, about)

@@ -5,9 +5,20 @@ The cost of a candidate is the mean over joints, taken as the mean over moves pl
     w_itae log(1 + ITAE / (A 1 s^2)) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %) + w_final log(1 + E / 1e-3)
         + w_chatter log(1 + max(TV / TV_smooth - 1, 0)) + w_saturation S
 
-plus the mean over moves of w_late log(1 + max(Ts / Tmax - 1, 0) / 5 %) for the arm's joint that settles last. With a
-randomization, a robot may be drawn that no gains can control; then twice the mean over moves replaces the sum of mean
-and worst. Ts is limited to 1.5 times the run; Tmax is the settling time asked for. A is the joint's move, or the
+plus the mean over moves of w_late log(1 + max(Ts / Tmax - 1, 0) / 5 %) for the arm's joint that settles last.
+
+Steps alone do not show how closely a moving setpoint is followed, and the gains that decide it, above all ki, are not
+those that decide the approach of a step, where the setpoint weight acts too. So some moves are also made as smooth
+motions of the setpoint, with its rate: the half whose motions are the shortest, because these have the largest
+accelerations. The mean over them plus the worst is added of::
+
+    w_following log(1 + F / (10 b))
+
+where F is the largest following error, b the least half width of the settling band, 1e-3 rad or 1e-4 m, and F / b that
+of the arm's worst joint. w_following is 1 by default; with 0 there are no such motions.
+
+With a randomization, a robot may be drawn that no gains can control; then twice the mean over moves replaces the sum of
+mean and worst. Ts is limited to 1.5 times the run; Tmax is the settling time asked for. A is the joint's move, or the
 smallest move that counts; O the overshoot as a fraction of A; E the final error; TV the total variation of the effort,
 and TV_smooth its variation in the smooth motion that takes a second; S the share of time in saturation. The logarithms
 prevent that a single move or joint decides.
@@ -28,8 +39,14 @@ from batchpid.metrics import StepMetrics
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
-from batchpid.sim.tuning.evaluation import absolute_band, arm_joints, run_moves, settling_limits
-from batchpid.sim.tuning.moves import Moves, smooth_variation
+from batchpid.sim.tuning.evaluation import (
+    absolute_band,
+    arm_joints,
+    following_error,
+    run_moves,
+    settling_limits,
+)
+from batchpid.sim.tuning.moves import Moves, smooth_durations, smooth_variation
 from batchpid.sim.tuning.weights import Weights
 
 FACTORS = {
@@ -94,6 +111,13 @@ class Candidates:
         self._band = absolute_band(robot)
         self._smooth = smooth_variation(robot, moves, 1.0)
         self._limit = settling_limits(robot, moves)
+        # Envs of a candidate: each move as a step, then the followed ones. The same move has the same drawn robot.
+        durations = smooth_durations(robot, moves)
+        followed = max(1, len(durations) // 2) if weights.following else 0
+        shortest = np.argsort(durations, kind="stable")[:followed]
+        steps = np.arange(len(durations))
+        self._moves = np.concatenate([steps, shortest])
+        self._durations = np.concatenate([np.zeros(len(steps)), durations[shortest]]) if followed else None
         self._size = np.maximum(np.abs(moves.target - moves.start), self._band / 0.02)
         # The plant that the gains see: mass matrices, the gains' unit per joint, and viscous damping.
         if gain_units == "mass_matrix":
@@ -104,6 +128,11 @@ class Candidates:
                 self._mass, self._damping = coupling.reduced(self._mass), coupling.reduced_damping(self._damping)
         inertia = gain_units == "inertia"
         self._unit = np.diagonal(self._mass, axis1=1, axis2=2) if inertia else np.ones(joints)
+
+    @property
+    def envs(self) -> int:
+        """Number of envs of a candidate."""
+        return len(self._moves)
 
     def points(self, gains: Sequence[Float64]) -> Float64:
         """Return the points (n, dimension) of ``gains``: (ki, kp, kd) each, per unit of inertia.
@@ -135,18 +164,20 @@ class Candidates:
         )
 
     def costs(self, runner: Runner, points: Float64) -> tuple[float, ...]:
-        """Return the cost of each of ``points``, run on ``runner``, whose envs are candidates x moves."""
+        """Return the cost of each of ``points``, run on ``runner``, which has :attr:`envs` for each."""
         count, moves, params = len(points), self.moves, self.params(points)
         limits = {name: getattr(params, name) for name in ("effort_min", "effort_max")}
         limited = params.replace(**{name: self.headroom * limit for name, limit in limits.items() if limit is not None})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", StabilityWarning)  # a candidate beyond the bound gets a penalty
-            runner.params = limited.for_envs(np.repeat(np.arange(count), len(moves.start)))
-        each = np.tile(np.arange(len(moves.start)), count)
-        rollout, m = run_moves(runner, moves.take(each), self.seconds, streams=each)
+            runner.params = limited.for_envs(np.repeat(np.arange(count), self.envs))
+        each = np.tile(self._moves, count)
+        durations = None if self._durations is None else np.tile(self._durations, count)
+        rollout, m = run_moves(runner, moves.take(each), self.seconds, streams=each, durations=durations)
+        steps = slice(len(moves.start))
         w = self.weights
 
-        m = StepMetrics(*(bounded(figure).reshape(count, *moves.start.shape) for figure in m))
+        m = StepMetrics(*(bounded(figure).reshape(count, self.envs, -1)[:, steps] for figure in m))
         settling = np.minimum(m.settling_time, 1.5 * self.seconds)
         cost = (
             response_cost(w, m._replace(settling_time=settling), self._size, self._band)
@@ -155,11 +186,19 @@ class Candidates:
         )[..., self.robot.independent].mean(2)
         late = np.maximum(settling[..., arm_joints(self.robot)].max(2) / self._limit - 1, 0)
         lasted = rollout.ok.mean(0).reshape(count, -1)
-        other = cost.mean(1) if self.varied else cost.max(1)
-        total = cost.mean(1) + other + w.late * np.log1p(late / 0.05).mean(1)
+        total = self._over_moves(cost) + w.late * np.log1p(late / 0.05).mean(1)
+        if self.envs > len(moves.start):
+            error = (following_error(self.robot, rollout) / self._band)[:, arm_joints(self.robot)].max(1)
+            followed = bounded(error).reshape(count, self.envs)[:, len(moves.start) :]
+            total = total + w.following * self._over_moves(np.log1p(followed / 10))
         total = np.minimum(total, DIVERGED_COST)
         total = np.where(lasted.min(1) < 1, DIVERGED_COST * (2 - lasted.mean(1)), total)
         return tuple((total + self._stability_penalty(params, runner.timestep)).tolist())
+
+    def _over_moves(self, cost: Float64) -> Float64:
+        """Return the mean of costs (count, moves) over moves plus the worst, or twice the mean (count,)."""
+        total: Float64 = cost.mean(1) + (cost.mean(1) if self.varied else cost.max(1))
+        return total
 
     def _stability_penalty(self, params: bp.PIDParams, dt: float) -> Float64:
         """Return the penalty (count,) of candidates near the stability bound, whose moves may look stable."""

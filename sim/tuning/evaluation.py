@@ -1,4 +1,8 @@
-"""Evaluation of gains: a set of moves, each in a separate env, all at once, with metrics of every joint."""
+"""Evaluation of gains: a set of moves, each in a separate env, all at once, with metrics of every joint.
+
+A move is made in two ways: as a step of the setpoint, which shows how fast and how cleanly it is approached, and as a
+minimum-jerk motion of the setpoint, with its rate, which shows how closely it is followed.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +16,21 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
+from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.limits import SetpointWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
-from batchpid.sim.tuning.moves import MAX_OVERSHOOT, Moves, shortest_durations, smooth_variation
+from batchpid.sim.tuning.moves import (
+    MAX_OVERSHOOT,
+    Moves,
+    shortest_durations,
+    smooth_durations,
+    smooth_variation,
+)
+from batchpid.trajectories import minimum_jerk
 
 SUBSTEPS = 5
 """Sim steps of a tick: an odd number, so that an effort that alternates from step to step shows in the samples."""
@@ -43,6 +55,8 @@ class Evaluation(NamedTuple):
     """Total variation of the effort, over the variation in a smooth (minimum-jerk) motion of the same duration."""
     settling_limit: Float64
     """Settling time asked for (moves,) [s]."""
+    following_error: Float64 | None = None
+    """Largest error on the same moves as smooth motions [rad or m]: :func:`following_error`; None if not asked for."""
 
     def demands(self, joints: NDArray[np.bool_]) -> dict[str, Float64]:
         """Return the figure of each demand on ``joints`` (dof,), in units of its limit (moves, dof); 0 elsewhere.
@@ -123,6 +137,18 @@ def step_response_metrics(
     return metrics if robot.coupling is None else StepMetrics(*map(robot.coupling.of_leaders, metrics))
 
 
+def following_error(robot: Robot, rollout: Rollout) -> Float64:
+    """Return the largest |qpos - setpoint| at the ends of the ticks (envs, dof) [rad or m]; inf for envs that diverged.
+
+    A setpoint and its rate hold at the end of their tick, so the error of an ideal loop is 0. Followers have the error
+    of their leaders. The errors of continuous joints are modulo 2 pi.
+    """
+    error = rollout.qpos - rollout.setpoint
+    error = np.abs(np.where(robot.continuous, error - TURN * np.rint(error / TURN), error))
+    largest: Float64 = np.where(rollout.ok[..., None], error, np.inf).max(0)
+    return largest if robot.coupling is None else robot.coupling.of_leaders(largest)
+
+
 def arm_joints(robot: Robot) -> NDArray[np.bool_]:
     """Return which joints belong to the arm (dof,): those that carry more than one leaf link, so no fingers.
 
@@ -149,20 +175,37 @@ def run_moves(
     seconds: float,
     progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
     streams: NDArray[np.int64] | None = None,
+    *,
+    durations: NDArray[np.float64] | None = None,
+    accelerations: bool = False,
 ) -> tuple[Rollout, StepMetrics]:
     """Run ``moves``, one per env, from rest for ``seconds``, two ticks at least; return the rollout and its metrics.
 
     ``progress`` wraps the range of ticks, e.g. ``tqdm.tqdm``. ``streams`` (moves,) are streams of the runner's
     randomization, by default one for each move, so that the draws are the same at every call.
+
+    A move is a step of the setpoint, or, where ``durations`` (moves,) [s] are above 0, a minimum-jerk motion of that
+    duration, or its beginning, with setpoint rates and, with ``accelerations``, setpoint accelerations.
     """
-    ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
+    tick = runner.timestep * runner.substeps
+    ticks = max(2, round(seconds / tick))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SetpointWarning)
         randomized = runner.options.randomization is not None
         start = runner.reset(moves.start, seed=(0 if streams is None else streams) if randomized else None)
-        rollout = runner.rollout(np.broadcast_to(moves.target, (ticks, *moves.target.shape)), progress=progress)
+        began = start.qpos.astype(np.float64) if randomized else moves.start
+        setpoints, further = np.broadcast_to(moves.target, (ticks, *moves.target.shape)), {}
+        if durations is not None:
+            total = np.maximum(durations, tick)[:, None]
+            motion = minimum_jerk(began, moves.target, tick, duration=total)
+            rows = np.minimum(np.arange(ticks), motion.ticks - 1)  # the last one holds the target, at rest
+            smooth = durations[:, None] > 0
+            setpoints = np.where(smooth, motion.position[rows], setpoints)
+            further["setpoint_rates"] = np.where(smooth, motion.velocity[rows], 0.0)
+            if accelerations:
+                further["setpoint_accelerations"] = np.where(smooth, motion.acceleration[rows], 0.0)
+        rollout = runner.rollout(setpoints, progress=progress, **further)
     with_effort = runner.control != "drive"
-    began = start.qpos if randomized else moves.start
     return rollout, step_response_metrics(runner.robot, rollout, began, with_effort=with_effort)
 
 
@@ -173,14 +216,21 @@ def evaluate_gains(
     *,
     name: str = "gains",
     seconds: float = 2.0,
+    follow: bool = False,
     **runner_options: Any,
 ) -> Evaluation:
     """Run ``moves`` from rest for ``seconds`` under ``params``, all at once, and return the metrics of every joint.
 
     ``params`` have one row for all moves, or one row per move; ``runner_options`` go to :class:`batchpid.sim.Runner`.
+    With ``follow`` the moves are made once more, as smooth motions of :func:`smooth_durations`, of which the first
+    ``seconds`` are run, with setpoint rates and without accelerations.
     """
     with Runner(robot, len(moves.start), params=params, **{"substeps": SUBSTEPS, **runner_options}) as runner:
         rollout, metrics = run_moves(runner, moves, seconds)
+        followed = None
+        if follow:
+            motion, _ = run_moves(runner, moves, seconds, durations=smooth_durations(robot, moves))
+            followed = following_error(robot, motion)
     shortest = shortest_durations(robot, moves)
     # The smooth motion to compare with takes as long as the slowest arm joint took to settle.
     settled = np.where(np.isfinite(metrics.settling_time) & arm_joints(robot), metrics.settling_time, 0.0).max(1)
@@ -192,4 +242,5 @@ def evaluate_gains(
         metrics=metrics,
         chatter=metrics.effort_variation / smooth_variation(robot, moves, durations),
         settling_limit=settling_limits(robot, moves),
+        following_error=followed,
     )

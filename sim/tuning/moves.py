@@ -10,7 +10,9 @@ shortest bang-bang motion, accelerating up to half the way and braking from ther
 
     room_j = limit_j -+ gravity_j - F_j         B and F without effect where they help to brake
 
-Such a motion exists, so the shortest of all motions takes no longer.
+Such a motion exists, so the shortest of all motions takes no longer. The duration of a smooth (minimum-jerk) motion is
+the longer of two: the one that a share of room_j allows, in the same form, and the one at a share of the velocity
+limits.
 """
 
 from __future__ import annotations
@@ -33,6 +35,11 @@ MAX_OVERSHOOT = 0.05
 """Overshoot that a good move may have, as a fraction of it."""
 LONGEST = 1.0
 """Shortest duration [s] above which a random move is too hard for the effort limits to be drawn."""
+SMOOTH_VELOCITY, SMOOTH_EFFORT = 0.5, 0.7
+"""Shares of the velocity limits, and of the effort limits beside gravity, that a smooth motion may take."""
+FREE_VELOCITY = {"rad": 2.0, "m": 0.3}
+"""Velocity limit of joints without one, in a smooth motion, per second."""
+_PEAK_VELOCITY = 15 / 8  # of the minimum-jerk motion in unit time
 _LINE = 24
 """Points of a move's line."""
 _EASY, _ROUNDS, _TRIED, _CHANGED = 0.6, 80, 8, 0.3
@@ -208,11 +215,33 @@ def draw_moves(robot: Robot, count: int, draw: Callable[[int], tuple[Float64, Fl
 
 def shortest_durations(robot: Robot, moves: Moves) -> Float64:
     """Return the time of the shortest bang-bang motion along each move (moves,) [s]; inf if gravity forbids it."""
-    limit = robot.design_effort_limit
     t = (np.arange(2 * _LINE)[:, None] + 0.5) / (2 * _LINE)
     early = t < 0.5
     z = np.where(early, 2 * t**2, 1 - 2 * (1 - t) ** 2)
-    rate, acceleration = np.where(early, 4 * t, 4 * (1 - t)), np.where(early, 4.0, -4.0)
+    return _durations(robot, moves, z, np.where(early, 4 * t, 4 * (1 - t)), np.where(early, 4.0, -4.0))
+
+
+def smooth_durations(robot: Robot, moves: Moves) -> Float64:
+    """Return the time of a minimum-jerk motion along each move that a robot follows with ease (moves,) [s].
+
+    No joint is faster than half its velocity limit (FREE_VELOCITY where it has none), and motion and friction take at
+    most 0.7 of the effort that gravity leaves. Where gravity leaves none, the velocity limits alone count.
+    """
+    velocity = np.where(
+        np.isfinite(robot.velocity_limit), robot.velocity_limit, [FREE_VELOCITY[u] for u in robot.units]
+    )
+    by_velocity = (_PEAK_VELOCITY * np.abs(moves.target - moves.start) / (SMOOTH_VELOCITY * velocity)).max(1)
+    t = (np.arange(2 * _LINE)[:, None] + 0.5) / (2 * _LINE)
+    profile = t**3 * (10 - 15 * t + 6 * t**2), 30 * t**2 * (1 - t) ** 2, 60 * t * (1 - t) * (1 - 2 * t)
+    by_effort = _durations(robot, moves, *profile, SMOOTH_EFFORT)
+    return np.maximum(by_velocity, np.where(np.isfinite(by_effort), by_effort, 0.0))
+
+
+def _durations(
+    robot: Robot, moves: Moves, z: Float64, rate: Float64, acceleration: Float64, share: float = 1.0
+) -> Float64:
+    """Return the shortest time (moves,) [s] of a motion z in unit time that takes ``share`` of the room; inf: none."""
+    limit = robot.design_effort_limit
     durations = np.full(len(moves.start), np.inf)
     for row, (start, target) in enumerate(zip(moves.start, moves.target, strict=True)):
         step = target - start
@@ -221,7 +250,7 @@ def shortest_durations(robot: Robot, moves: Moves) -> Float64:
         gravity = motion_effort(robot, qpos, still, still)
         moving = motion_effort(robot, qpos, rate * step, acceleration * step) - gravity
         along = moving * step > 0  # there friction and damping take their share of the effort
-        room = np.where(moving > 0, limit - gravity, limit + gravity) - along * robot.friction
+        room = share * np.where(moving > 0, limit - gravity, limit + gravity) - along * robot.friction
         if (room > 0).all() and (np.abs(gravity) < limit).all():
             drag = along * robot.damping * np.abs(rate * step)  # room T^2 - drag T - |moving| >= 0
             durations[row] = ((drag + np.sqrt(drag**2 + 4 * room * np.abs(moving))) / (2 * room)).max()

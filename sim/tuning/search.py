@@ -1,8 +1,9 @@
 r"""Black-box search for gains by simulation: CMA-ES from the designed gains, in log space.
 
-Each env runs one move of one candidate, so a generation is one rollout. The moves are free of contact, so the robots
-have no collision shapes in the search. A share of the effort limits is a reserve for harder moves.
-:mod:`batchpid.sim.tuning.candidates` defines the cost. The search itself is the package ``cmaes`` (N. Hansen, "The CMA
+Each env runs one move of one candidate, as a step or as a smooth motion of the setpoint, so a generation is one rollout
+and the gains found are good at both. The moves are free of contact, so the robots have no collision shapes in the
+search. A share of the effort limits is a reserve for harder moves. :mod:`batchpid.sim.tuning.candidates` defines the
+cost and the weight of each. The search itself is the package ``cmaes`` (N. Hansen, "The CMA
 evolution strategy: a tutorial", arXiv:1604.00772).
 
 Good gains for robots that differ from the model, by actuators or a randomization, are farther from the designed ones.
@@ -111,7 +112,8 @@ def tune(
     per_joint
         Search for a factor of each joint's gains too, which needs more generations.
     weights
-        Of the terms of the cost.
+        Of the terms of the cost. Default: 1 for a second of a step's settling time and 1 for the logarithm of the
+        following error.
     moves
         Default: :func:`batchpid.sim.tuning.moves.search_moves`, and FINAL_MOVES random ones in the final round. For
         robots with actuators or a randomization, the search uses the tutorial's move and VARIED_MOVES random ones,
@@ -179,7 +181,7 @@ def tune(
     where = {"workers": workers, "cluster": cluster, "randomization": reseeded(randomization, seed)}
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, **where} | runner_options
     search_options = options | {"ground": None, **SEARCH_PHYSICS} if is_free else options
-    with Runner(robot, population * len(moves.start), **search_options) as runner:
+    with Runner(robot, population * search.envs, **search_options) as runner:
         points, costs = evolve(
             lambda points: search.costs(runner, points),
             firsts,
@@ -200,7 +202,7 @@ def tune(
         finalists = [*dict.fromkeys([*ranking, 0])]  # 0: the designed gains
         judge = Candidates(robot, gain_units, per_joint, final, seconds, weights, headroom=1.0, varied=is_varied)
         options["randomization"] = reseeded(randomization, seed + _FINAL_SEED)
-        with Runner(robot, FINAL_MOVES * len(finalists), **options) as runner:
+        with Runner(robot, judge.envs * len(finalists), **options) as runner:
             finals = judge.costs(runner, points[finalists])
         best = finalists[int(np.argmin(finals))]
         if not best:

@@ -25,6 +25,9 @@ class Weights:
     """Weight of log(variation of the effort / variation in the smooth move), if that is positive."""
     saturation: float = 3.0
     """Weight of the share of time in saturation."""
+    following: float = 1.0
+    """Weight of log(1 + following error / 10 times the least half width of the settling band), where moves are smooth
+    motions of the setpoint; 0: steps alone. Gains of a tool are searched on steps alone."""
 
     def __post_init__(self) -> None:
         for each in fields(self):

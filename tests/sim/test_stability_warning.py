@@ -100,7 +100,7 @@ def test_candidates_of_a_search_do_not_warn(arm, monkeypatch):
 
     some = moves.random_moves(arm, 2, 0)
     search = Candidates(arm, "effort", False, some, 0.02, Weights(), headroom=1.0, varied=False)
-    with make(arm, 2, params=arm.params(**GOOD)) as runner, warnings.catch_warnings():
+    with make(arm, search.envs, params=arm.params(**GOOD)) as runner, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", StabilityWarning)
         search.costs(runner, np.zeros((1, search.dimension)))

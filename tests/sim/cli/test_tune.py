@@ -149,6 +149,8 @@ def test_compare_runs_each_set_in_both_engines(drawn, batchpid, tmp_path, reques
     assert status == 0, error
     rows = {line.split("  ")[0]: line.split()[2:8] for line in said.splitlines() if " of 2" in line}
     assert rows.keys() == {"tuned, SAPIEN", "tuned, MuJoCo"}
+    assert "following error" in said
+    assert max(map(len, said.splitlines())) <= 120
     assert rows["tuned, SAPIEN"] == rows["tuned, MuJoCo"]  # settling times in hundredths of a second
     assert not drawn or picture.stat().st_size > 10_000
 

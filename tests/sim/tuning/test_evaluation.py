@@ -8,8 +8,14 @@ import pytest
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import LogUniform, Randomization, Runner, Uniform
-from batchpid.sim.tuning.evaluation import arm_joints, evaluate_gains, step_response_metrics
-from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
+from batchpid.sim.tuning.evaluation import (
+    arm_joints,
+    evaluate_gains,
+    following_error,
+    run_moves,
+    step_response_metrics,
+)
+from batchpid.sim.tuning.moves import Moves, random_moves, smooth_durations, tutorial_move
 from batchpid.sim.tuning.randomization_presets import PRESETS, load_randomization, payload_capacity, usual_variation
 
 
@@ -35,6 +41,41 @@ def test_metrics_do_not_depend_on_how_long_the_runner_has_run(panda):
 def test_arm_joints_leave_out_fingers(panda, jaco2):
     assert arm_joints(panda).sum() == 7
     assert arm_joints(jaco2).sum() == 7
+
+
+def following_and_settling(robot, params, moves, **options):
+    found = evaluate_gains(robot, params, moves, workers=0, seconds=1.2, follow=True, **options)
+    arm = arm_joints(robot)
+    return found.following_error[:, arm].max(1), found.metrics.settling_time[:, arm].max()
+
+
+def test_setpoint_weights_change_how_steps_are_approached_and_not_how_motions_are_followed(panda):
+    moves, tuned = random_moves(panda, 2, seed=4), panda.tuned()
+    (low, slow), (high, fast) = (
+        following_and_settling(panda, tuned.replace(setpoint_weight=np.full(panda.dof, b)), moves) for b in (0.0, 0.9)
+    )
+    assert low.min() > 1e-4
+    np.testing.assert_allclose(high, low, rtol=0.03)
+    assert abs(fast / slow - 1) > 0.05
+
+
+def test_setpoint_accelerations_leave_less_of_the_following_error(panda):
+    moves = random_moves(panda, 2, seed=4)
+    durations = smooth_durations(panda, moves)
+    with Runner(panda, 2, params=panda.tuned(), workers=0, substeps=5) as runner:
+        with_rates, with_both = (
+            following_error(panda, run_moves(runner, moves, 0.6, durations=durations, accelerations=given)[0])
+            for given in (False, True)
+        )
+    assert with_both.max() < 0.2 * with_rates.max()
+
+
+def test_a_step_is_the_same_beside_a_smooth_motion(panda):
+    moves = random_moves(panda, 1, seed=4).take([0, 0])
+    with Runner(panda, 2, params=panda.tuned(), workers=0, substeps=5) as runner:
+        (step, _), (mixed, _) = (run_moves(runner, moves, 0.1, durations=each) for each in (None, np.array([0.0, 1.0])))
+    np.testing.assert_allclose(mixed.qpos[:, 0], step.qpos[:, 0], rtol=0, atol=1e-6)
+    assert following_error(panda, mixed)[0].max() > 5 * following_error(panda, mixed)[1].max()
 
 
 @pytest.mark.slow

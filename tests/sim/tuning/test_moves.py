@@ -10,10 +10,12 @@ from batchpid.sim.tuning.moves import (
     random_moves,
     search_moves,
     shortest_durations,
+    smooth_durations,
     smooth_effort,
     smooth_variation,
     tutorial_move,
 )
+from batchpid.trajectories import minimum_jerk
 
 
 def test_random_moves_are_seeded_within_limits_and_free_of_contact(panda):
@@ -50,6 +52,22 @@ def test_shortest_duration_is_the_double_integrators_bang_bang_for_a_lone_joint(
     expected = 2 * np.sqrt(inertia / limit)
     # the others must hold against it, with room to spare
     assert shortest_durations(panda, Moves(start[None], target[None], ("",)))[0] == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["panda", "jaco2"])
+def test_smooth_motions_take_half_of_the_velocity_limits_and_leave_a_reserve_of_effort(name, request):
+    robot = request.getfixturevalue(name)
+    moves = random_moves(robot, 4, 3)
+    durations = smooth_durations(robot, moves)
+    assert (durations > shortest_durations(robot, moves)).all()
+    for start, target, duration in zip(moves.start, moves.target, durations, strict=True):
+        peak = np.abs(minimum_jerk(start, target, duration / 500, duration=duration).velocity).max(0)
+        velocity = (peak / robot.velocity_limit).max()
+        effort, still = (smooth_effort(robot, start, target, each) for each in (duration, 1e3 * duration))
+        shares = (np.abs(effort) - np.abs(still)) / (robot.design_effort_limit - np.abs(still))
+        assert velocity <= 0.5 + 1e-6
+        assert shares.max() <= 0.71
+        assert velocity > 0.499 or shares.max() > 0.6
 
 
 def test_smooth_effort_is_gravity_at_both_ends(panda):

@@ -115,6 +115,7 @@ def test_a_history_of_other_inputs_is_refused_by_their_names(panda, tmp_path):
     refused("timestep", timestep=1 / 1000)
     refused("speed_limit", speed_limit=np.full(panda.dof, 9.0))
     refused("weights", weights=Weights(itae=2.0))
+    refused("weights", weights=Weights(following=3.0))
     refused("seconds", seconds=0.25)
     refused("randomization", randomization=Randomization(payload=Uniform(0, 1)))
     with pytest.raises(InvalidArgumentError, match="whether build is the same"):
@@ -130,6 +131,18 @@ def test_the_result_is_the_best_of_the_final_not_of_the_search(panda, monkeypatc
     costs = sorted(cost for row in found.history for cost in row)
     assert found.cost in [*costs[:3], found.start_cost]
     assert found.cost <= found.start_cost
+
+
+def test_cost_is_linear_in_the_weight_of_the_following_error(panda):
+    moves = random_moves(panda, 3, 0)
+
+    def start_cost(weight: float) -> float:
+        options = SMALL | {"generations": 1, "weights": Weights(following=weight)}
+        return tune(panda, moves=moves, workers=0, **options).start_cost
+
+    none, some, more = map(start_cost, (0.0, 0.5, 2.0))
+    assert some > none + 1e-4
+    assert more - none == pytest.approx(4 * (some - none))
 
 
 def test_search_starts_from_the_designed_gains(panda):
@@ -192,6 +205,16 @@ def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(
     (judged,) = evaluate_sets(robot, [GainSet("tuned", found.params)], moves=20, seed=0, randomization=payload)
     late = judged.demands(arm_joints(robot))["settling time"].max(1) > 1
     assert len(late) - late.sum() >= least
+
+
+@pytest.mark.slow
+def test_gains_of_the_search_follow_unseen_motions_more_closely_than_designed_ones(panda):
+    found = tune(panda)
+    sets = GainSet("designed", found.start_params), GainSet("tuned", found.params)
+    designed, tuned = evaluate_sets(panda, sets, moves=20, seed=0, randomization=None)
+    arm = arm_joints(panda)
+    assert tuned.following_error[:, arm].max() < 0.8 * designed.following_error[:, arm].max()
+    assert tuned.metrics.settling_time[:, arm].max() <= designed.metrics.settling_time[:, arm].max()
 
 
 def test_time_limit_ends_the_search_after_a_generation(panda):
