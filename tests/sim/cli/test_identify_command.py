@@ -98,9 +98,17 @@ def effort_log(path, wrong=0.0):
     return path
 
 
+@pytest.fixture
+def short_search(monkeypatch):
+    """The search has few steps: one generation, short fits of neighbours."""
+    monkeypatch.setattr("batchpid.sim.identification.start.GENERATIONS", 1)
+    monkeypatch.setattr("batchpid.sim.identification.fit_search.NEIGHBOUR_EVALUATIONS", 1)
+
+
 ERROR = re.compile(r"position error on the part that was kept: (\S+) as described, (\S+) by the values of the file")
 
 
+@pytest.mark.usefixtures("short_search")
 def test_a_motion_that_is_explained_ends_in_a_file_whose_error_is_printed(batchpid, tmp_path):
     """The printed error is that of the file: printed again for the file alone, it is the same; and it depends on the
     file's values, of other programs' files too.
@@ -131,6 +139,7 @@ def test_a_motion_that_is_explained_ends_in_a_file_whose_error_is_printed(batchp
     assert (status, "lag" in error, "'hinge'" in error) == (2, True, True)
 
 
+@pytest.mark.usefixtures("short_search")
 def test_a_motion_that_nothing_explains_ends_in_an_error_and_no_file(batchpid, tmp_path):
     """The sign of the efforts is reversed on all rows that are fitted."""
     (robot := tmp_path / "pendulum.urdf").write_text(PENDULUM)
