@@ -107,7 +107,7 @@ class IdentifyCommand:
         print(report(found))
         if not found.explains:
             problem = "are not explained: the error on the held-out part did not fall, and no file is written"
-            remedy = "check --params, --timestep and --compensate, or leave out the joint that did not move"
+            remedy = f"check --params, --timestep and --compensate, and the columns of {found.worst_joint!r}"
             raise InvalidArgumentError("logs", problem, remedy=remedy)
         found.save(out)
         print(f"\nwritten: {out}")
@@ -200,8 +200,8 @@ def report(found: Identification) -> str:
     text.append(_errors(*found.held_out_error))
     if found.misfit > EXPLAINED:
         text.append(
-            f"the error there is {found.misfit:.2g} times the noise of the sensors: the model does not explain all of "
-            "the motion, and the intervals hold for this motion only"
+            f"the error there is up to {found.misfit:.2g} times the noise of the sensors, at {found.worst_joint!r}: "
+            "the model does not explain all of the motion, and the intervals hold for this motion only"
         )
     return "\n".join(text + _not_identified(found))
 

@@ -32,7 +32,7 @@ from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import Motion, Regression, best_drive, hypotheses, smooth, variants
 from batchpid.sim.identification.result import Fit, Identification, actuators_at
 from batchpid.sim.identification.start import begin
-from batchpid.sim.identification.statistics import EXPLAINED, misfit, uncertainty
+from batchpid.sim.identification.statistics import EXPLAINED, misfits, uncertainty
 from batchpid.sim.identification.unknowns import Unknowns
 from batchpid.sim.identification.windows import rows_of
 from batchpid.sim.robot.robot import Robot
@@ -147,7 +147,7 @@ def identify(
             return search(problems, state, evaluations, record, Progress(len(problems), evaluations, progress))
 
         fits_of_ways = [fit_under(drive, regression, record)]
-        if misfit(*fits_of_ways[0]) > EXPLAINED:  # then the regression may have chosen the wrong compensation
+        if misfits(*fits_of_ways[0]).max() > EXPLAINED:  # then the regression may have chosen the wrong compensation
             for way in hypotheses(assumed, payload):
                 if way.compensation != drive.compensation:
                     other = Regression(Plant(resting, joints, way), found, motions, payload)
@@ -172,7 +172,7 @@ def identify(
         best.theta,
         sure,
         (errors[0], errors[1]),
-        misfit(problem, best),
+        misfits(problem, best),
         noise,
         problem.drive,
         settings,

@@ -22,6 +22,9 @@ from batchpid.sim.robot.robot import Robot
 STILL, SHARE, SHAKEN = {"rad": 1e-3, "m": 1e-4}, 0.01, 1.5
 """Standard deviation of the positions up to which a joint did not move: absolute, or as a share of the joint with the
 largest one, whichever is less; or over the noise from row to row."""
+FOLLOWS = 0.05
+"""Standard deviation of the positions, over that of the setpoints, up to which a joint did not follow its setpoint: it
+is stuck, and gives a little."""
 
 
 class Inputs(NamedTuple):
@@ -103,18 +106,24 @@ def _without_still(robot: Robot, logs: list[Log]) -> tuple[list[Log], Robot, lis
     noise = np.sqrt(np.mean(np.concatenate([np.diff(log.qpos, axis=0) for log in logs]) ** 2, axis=0) / 2)
     moved = qpos.std(0)
     least = np.clip(SHARE * moved.max(), 1e-9, [STILL[robot.units[joint]] for joint in joints])
-    moves = moved > np.maximum(least, SHAKEN * noise)
+    stands = moved <= np.maximum(least, SHAKEN * noise)
+    moves = ~stands
+    if logs[0].kind == "setpoint":
+        moves &= moved > FOLLOWS * np.concatenate([log.command for log in logs]).std(0)
     if moves.all():
         return logs, robot, []
-    names = [robot.joint_names[joint] for joint, each in zip(joints, moves, strict=True) if not each]
-    listed = ", ".join(map(repr, names))
+    names = [robot.joint_names[joint] for joint in joints]
+    still = [name for name, each in zip(names, moves, strict=True) if not each]
     if not moves.any():
-        problem = f"show no motion of any joint ({listed})"
+        problem = f"show no motion of any joint ({_quoted(still)})"
         raise InvalidArgumentError("logs", problem, remedy="record a motion, such as one of batchpid excite")
+    for fault, these in (("move", stands), ("follow its setpoint", ~moves & ~stands)):
+        if these.any():
+            listed = _quoted([name for name, each in zip(names, these, strict=True) if each])
+            message = f"{listed} did not {fault}: left out, and held where the logs have it"
+            warnings.warn(f"{message}; its motor cannot be identified", LogWarning, stacklevel=4)
     start = robot.start
     start[[joint for joint, each in zip(joints, moves, strict=True) if not each]] = qpos.mean(0)[~moves]
-    message = f"{listed} did not move: left out, and held where the logs have it; its motor cannot be identified"
-    warnings.warn(message, LogWarning, stacklevel=4)
     kept = tuple(joint for joint, each in zip(joints, moves, strict=True) if each)
     found = [
         replace(
@@ -126,7 +135,11 @@ def _without_still(robot: Robot, logs: list[Log]) -> tuple[list[Log], Robot, lis
         )
         for log in logs
     ]
-    return found, replace(robot, settings=None, defaults=FileDefaults(start)), names
+    return found, replace(robot, settings=None, defaults=FileDefaults(start)), still
+
+
+def _quoted(names: list[str]) -> str:
+    return ", ".join(map(repr, names))
 
 
 def _recorded(name: str, given: Any, logs: list[Log], default: Any) -> Any:

@@ -47,8 +47,8 @@ class Identification(NamedTuple):
     held_out_error: tuple[float, float]
     """Root mean square of the position error [rad or m] on the held-out part of the logs, of the robot as described and
     as identified; inf if the simulation diverges."""
-    misfit: float
-    """Held-out residuals over the noise of the sensors, worst joint: about 1 if the model explains the motion."""
+    misfits: Float64
+    """Held-out residuals over the noise of the sensors (joints,): about 1 if the model explains the motion."""
     noise: Float64
     """Root mean square of the residuals (joints,) [rad or m]."""
     drive: Drive
@@ -153,6 +153,16 @@ class Identification(NamedTuple):
             "compensation": "through the motors" if self.drive.through else self.drive.compensate,
             "about": self.settings,
         }
+
+    @property
+    def misfit(self) -> float:
+        """The largest of :attr:`misfits`."""
+        return float(self.misfits.max())
+
+    @property
+    def worst_joint(self) -> str:
+        """Name of the joint with the largest of :attr:`misfits`."""
+        return self.robot.joint_names[self.joints[int(self.misfits.argmax())]]
 
     @property
     def explains(self) -> bool:

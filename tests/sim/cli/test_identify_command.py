@@ -144,8 +144,8 @@ def test_a_motion_that_nothing_explains_ends_in_an_error_and_no_file(batchpid, t
     """The sign of the efforts is reversed on all rows that are fitted."""
     (robot := tmp_path / "pendulum.urdf").write_text(PENDULUM)
     log, out = effort_log(tmp_path / "log.csv", wrong=0.75), tmp_path / "motors.yaml"
-    flags = ("--compensate", "none", "--timestep", 1e-3, "--evaluations", 2, "--workers", 0, "--no-payload", "--out", out)
-    status, said, error = batchpid("identify", robot, log, *flags)
+    flags = ("--compensate", "none", "--timestep", 1e-3, "--workers", 0, "--no-payload", "--out", out)
+    status, said, error = batchpid("identify", robot, log, "--evaluations", 2, *flags)
     assert status == 2
     assert "logs: are not explained" in error
     before, after = map(float, ERROR.search(said).groups())
