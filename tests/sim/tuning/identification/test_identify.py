@@ -281,7 +281,7 @@ def test_a_joint_that_did_not_move_is_left_out_by_name(mujoco_log, tmp_path):
     ("kind", "asked", "gives"),
     [
         ("effort", True, 0.0),
-        ("effort", False, 0.0),
+        pytest.param("effort", False, 0.0, marks=pytest.mark.slow),
         *(
             pytest.param("setpoint", asked, gives, marks=pytest.mark.slow)
             for asked, gives in ((True, 0.0), (False, 0.0), (True, 3e-3))
@@ -298,10 +298,12 @@ def test_a_joint_of_six_that_stuck_does_not_spoil_the_others(mujoco_log, tmp_pat
         (tmp_path / f"{name}.urdf").write_text(six_joints(fixed))
     six, five = (Robot.load(tmp_path / f"{name}.urdf") for name in ("six", "five"))
     truth, params = mujoco_log["plausible"](six, 0), six.designed("effort")
-    motion = excite(six, 1.5, lowest=0.8)
+    motion = excite(six, 1.0, lowest=1.0)
     of_five = truth._replace(**{name: getattr(truth, name)[rest] for name in PER_JOINT})
     moved = type(motion)(motion.time, *(leaf[:, rest] for leaf in motion[1:]))
-    table = mujoco_log["simulate"](five, of_five, moved, params.for_joints(rest), timestep=DT, every=1)
+    table = mujoco_log["simulate"](
+        five, of_five, moved, params.for_joints(rest), timestep=DT, every=1, compensate=False
+    )
     time, rows = table["time"], len(table["time"])
     setpoint = np.interp(time, motion.time - motion.time[0], motion.position[:, stuck]) * asked
     qpos, command = np.zeros((2, rows, 6))
@@ -309,7 +311,7 @@ def test_a_joint_of_six_that_stuck_does_not_spoil_the_others(mujoco_log, tmp_pat
     qpos[:, stuck] = 2e-5 * np.random.default_rng(1).standard_normal(rows)
     qpos[:, stuck] += gives * (setpoint - setpoint.mean()) / max(setpoint.std(), 1e-9)
     command[:, stuck] = setpoint if kind == "setpoint" else 50.0 * (setpoint - qpos[:, stuck])
-    options = {"timestep": DT, "workers": 0, "payload": False, "evaluations": 3}
+    options = {"timestep": DT, "compensate": "none", "workers": 0, "payload": False, "evaluations": 2}
     by_law = kind == "setpoint"
     alone = identify(five, as_log(five, table, kind), params=params.for_joints(rest) if by_law else None, **options)
     log = Log("log", tuple(range(6)), kind, time, qpos, time, command, False)
