@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json as json_text
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -50,7 +50,10 @@ class IdentifyCommand:
     """The tool carries no payload."""
     evaluations: int = 25
     """Largest number of evaluations of the fit; each simulates the robot along the logs and, for each unknown,
-    a perturbed one, so that a minute of logs takes six times as long as ten seconds."""
+    a perturbed one, so that a minute of logs takes six times as long as ten seconds. 0, with --actuators: no fit."""
+    actuators: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """With --evaluations 0: an actuators file whose error on the held-out part is printed. Nothing is fitted or
+    written."""
     seed: int = 0
     """Seed of CMA-ES, which finds the start of the fit. The result does not depend on the number of workers."""
     workers: flags.Workers = None
@@ -81,6 +84,8 @@ class IdentifyCommand:
         robot = Robot.load(self.robot, **vars(self.meshes))
         if not self.logs:
             raise InvalidArgumentError("logs", "are missing", remedy="name one file or more after the robot")
+        if self.actuators is not None or self.evaluations == 0:
+            return self._judge(robot)
         out = self.out or Path(f"out/{robot.path.stem}.actuators.yaml")
         outputs = Outputs(force=self.force, inputs=(None if self.params is None else Path(self.params), *self.logs))
         out = outputs.path("out", out, (".yaml", ".yml", ".json"))
@@ -102,7 +107,7 @@ class IdentifyCommand:
         print(report(found))
         if not found.explains:
             problem = "are not explained: the error on the held-out part did not fall, and no file is written"
-            remedy = "check --params, --timestep and --compensate, or leave out the joint that did not move"
+            remedy = f"check --params, --timestep and --compensate, and the columns of {found.worst_joint!r}"
             raise InvalidArgumentError("logs", problem, remedy=remedy)
         found.save(out)
         print(f"\nwritten: {out}")
@@ -115,6 +120,35 @@ class IdentifyCommand:
         title = f"{robot.name}: position error, shaded where it was not fitted"
         print(f"picture: {plots.save(plots.fit_errors(errors, names, units, title), picture)}")
         history.unlink(missing_ok=True)
+
+    def _judge(self, robot: Robot) -> None:
+        """Print the error of an actuators file."""
+        from batchpid.sim.identification.held_out import held_out_error
+
+        if self.actuators is None:
+            remedy = "give 1 or more, or name an actuators file as --actuators"
+            raise InvalidArgumentError("evaluations", "is 0, and there is no file", value=0, remedy=remedy)
+        if self.evaluations:
+            remedy = "add --evaluations 0 to print the error of the file, or leave it out to fit"
+            raise InvalidArgumentError("actuators", "are not the start of a fit", value=self.actuators, remedy=remedy)
+        defaults = {each.name: each.default for each in fields(self)}
+        for name in ("no_payload", "seed", "workers", "resume", "out", "json", "picture"):
+            if (value := getattr(self, name)) != defaults[name]:
+                problem = "is for a fit, and --evaluations 0 fits nothing"
+                raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
+        errors = held_out_error(
+            robot,
+            self.logs,
+            self.actuators,
+            params=None if self.params is None else _params(robot, self.params),
+            **flags.chosen(self, "compensate timestep sim_steps hold"),
+        )
+        print(_errors(*errors))
+
+
+def _errors(before: float, after: float) -> str:
+    """Return a line with the errors on the held-out part, of ideal motors and of an actuators file."""
+    return f"position error on the part that was kept: {before:.3g} as described, {after:.3g} by the values of the file"
 
 
 def _params(robot: Robot, name: str) -> Any:
@@ -163,14 +197,11 @@ def report(found: Identification) -> str:
     elif found.drive.compensate != "none":
         way = "through its motors" if found.drive.through else "apart from its motors"
         text.append(f"the robot compensates {found.drive.compensate} {way}")
-    before, after = found.held_out_error
-    text.append(
-        f"position error on the part that was kept: {before:.3g} as described, {after:.3g} by the values of the file"
-    )
+    text.append(_errors(*found.held_out_error))
     if found.misfit > EXPLAINED:
         text.append(
-            f"the error there is {found.misfit:.2g} times the noise of the sensors: the model does not explain all of "
-            "the motion, and the intervals hold for this motion only"
+            f"the error there is up to {found.misfit:.2g} times the noise of the sensors, at {found.worst_joint!r}: "
+            "the model does not explain all of the motion, and the intervals hold for this motion only"
         )
     return "\n".join(text + _not_identified(found))
 

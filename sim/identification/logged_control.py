@@ -37,6 +37,17 @@ class Drive:
         """Hypothesis about the compensation."""
         return self.compensate, self.through, self.knows_payload
 
+    @property
+    def assumptions(self) -> dict[str, str | bool]:
+        """Hypotheses about compensation and law, as plain values."""
+        return {
+            "compensation": self.compensate,
+            "through_the_motors": self.through,
+            "knows_payload": self.knows_payload,
+            "noise_in_the_law": self.noisy,
+            "measured_rate": self.measured_rate,
+        }
+
 
 class Law:
     """PID law of many candidates."""

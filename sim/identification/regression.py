@@ -224,6 +224,18 @@ def hypotheses(drive: Drive, payload: bool) -> list[Drive]:
     return ways if drive.params is not None else [*ways, replace(drive, compensate="none")]
 
 
+def variants(drive: Drive, motions: list[Motion]) -> list[Drive]:
+    """Return the possible measurements of the law: with or without sensor noise, rates or differences of positions.
+
+    Without noise, the law gets the simulated positions and rates.
+    """
+    if drive.params is None:
+        return [drive]
+    quiet = replace(drive, measured_rate=False)
+    seen = any(motion.sensor.size.any() for motion in motions)
+    return [*([replace(quiet, noisy=True)] if seen else []), quiet, *([drive] if drive.measured_rate else [])]
+
+
 def best_drive(
     robot: Any, joints: tuple[int, ...], drive: Drive, logs: list[Log], motions: list[Motion], payload: bool
 ) -> tuple[Drive, Regression]:

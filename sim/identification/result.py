@@ -12,6 +12,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, integer
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.identification.held_out import ASSUMED
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.statistics import INTERVAL, Uncertainty
 from batchpid.sim.identification.unknowns import PER_JOINT, Unknowns
@@ -46,8 +47,8 @@ class Identification(NamedTuple):
     held_out_error: tuple[float, float]
     """Root mean square of the position error [rad or m] on the held-out part of the logs, of the robot as described and
     as identified; inf if the simulation diverges."""
-    misfit: float
-    """Held-out residuals over the noise of the sensors, worst joint: about 1 if the model explains the motion."""
+    misfits: Float64
+    """Held-out residuals over the noise of the sensors (joints,): about 1 if the model explains the motion."""
     noise: Float64
     """Root mean square of the residuals (joints,) [rad or m]."""
     drive: Drive
@@ -106,13 +107,15 @@ class Identification(NamedTuple):
         The values are a joint optimum, and correlated: all are kept, also those whose interval is wide.
         """
         of_joints, others = self.missing()
-        document = self.document()
+        document, motors = self.document(), self.unknowns.motors(self.estimate[None])
         logged = {self.robot.joint_names[number] for number in self.joints}
         own = zip(self.robot.joint_names, self.robot.independent, strict=True)
         about = {
             "identified_from": self.settings["logs"],
             "held_out_error": document["held_out_error"],
             "misfit": document["misfit"],
+            ASSUMED: self.drive.assumptions
+            | {kind: float(getattr(motors, kind)[0, 0]) for kind in ("stopping", "payload")},
             "intervals": document["joints"]
             | {kind: document[kind] for kind in ("delay", "payload") if kind in document},
             "not_well_determined": of_joints | ({"all joints": others} if others else {}),
@@ -150,6 +153,16 @@ class Identification(NamedTuple):
             "compensation": "through the motors" if self.drive.through else self.drive.compensate,
             "about": self.settings,
         }
+
+    @property
+    def misfit(self) -> float:
+        """The largest of :attr:`misfits`."""
+        return float(self.misfits.max())
+
+    @property
+    def worst_joint(self) -> str:
+        """Name of the joint with the largest of :attr:`misfits`."""
+        return self.robot.joint_names[self.joints[int(self.misfits.argmax())]]
 
     @property
     def explains(self) -> bool:

@@ -37,7 +37,7 @@ RESOLVED, DELAY_RESOLVED = 0.05, 0.1
 LEAST_MOTION = 30.0
 """Least standard deviation of a joint's positions, over their noise, of a joint that is moved and not only shaken."""
 EXPLAINED = 1.5
-"""Largest :func:`misfit` of a model that explains the motion: right models had up to 1.2, wrong ones 4 to 12."""
+"""Largest of the :func:`misfits` if a model explains the motion: right models had up to 1.2, wrong ones 4 to 12."""
 
 
 class Uncertainty(NamedTuple):
@@ -89,13 +89,13 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     return Uncertainty(deviation, identified, moves, values / max(values[0], 1e-300))
 
 
-def misfit(problem: Problem, point: Solution) -> float:
-    """Return the held-out residuals over their standard deviations by sensor noise alone, of the worst joint."""
+def misfits(problem: Problem, point: Solution) -> Float64:
+    """Return the held-out residuals of each joint over their standard deviations by sensor noise alone (joints,)."""
     held_out = zip(point.windows, problem.windows, strict=True)
     ratios = np.concatenate([(each.residual / each.expected)[~window.fitted] for each, window in held_out])
     with np.errstate(invalid="ignore", over="ignore"):
-        worst = float(np.sqrt((ratios**2).mean(0)).max())
-    return worst if np.isfinite(worst) else float("inf")
+        sizes = np.sqrt((ratios**2).mean(0))
+    return np.where(np.isfinite(sizes), sizes, np.inf)
 
 
 def _motion(problem: Problem) -> Float64:

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
+import yaml
 from tqdm import tqdm
 
 import batchpid as bp
@@ -77,12 +79,88 @@ def test_motors_are_written_for_other_commands(batchpid, tmp_path, monkeypatch, 
     assert shown == "identifying: 8 of at most 91 evaluations, 01:03, at most 10:53 more, error=0.1"
 
 
+def effort_log(path, wrong=0.0):
+    """Write a log of efforts, made by the equations of a hinge; on its first rows ``wrong`` (a share) has their sign
+    reversed.
+    """
+    inertia, damping, dt, count = 0.03 + 2 * 0.3**2 + 0.02, 0.1, 1e-3, 1000
+    time = dt * np.arange(count)
+    effort = 3.0 * np.sin(2 * np.pi * (1.0 + 1.5 * time) * time)
+    qpos, q, v = np.empty(count), 0.1, 0.0
+    for step in range(count):
+        qpos[step] = q
+        v = (inertia * v + dt * (0.9 * effort[step] + 9.81 * 2 * 0.3 * np.sin(np.pi + q))) / (inertia + dt * damping)
+        q += dt * v
+    qpos += 1e-5 * np.random.default_rng(0).standard_normal(count)
+    logged = np.where(np.arange(count) < wrong * count, -effort, effort)
+    rows = [f"{a:.9g},{b:.12g},{c:.12g}" for a, b, c in zip(time, logged, qpos, strict=True)]
+    path.write_text("\n".join(["time,effort:hinge,qpos:hinge", *rows]))
+    return path
+
+
+@pytest.fixture
+def short_search(monkeypatch):
+    """The search has few steps: one generation, short fits of neighbours."""
+    monkeypatch.setattr("batchpid.sim.identification.start.GENERATIONS", 1)
+    monkeypatch.setattr("batchpid.sim.identification.fit_search.NEIGHBOUR_EVALUATIONS", 1)
+
+
+ERROR = re.compile(r"position error on the part that was kept: (\S+) as described, (\S+) by the values of the file")
+
+
+@pytest.mark.usefixtures("short_search")
+def test_a_motion_that_is_explained_ends_in_a_file_whose_error_is_printed(batchpid, tmp_path):
+    """The printed error is that of the file: printed again for the file alone, it is the same; and it depends on the
+    file's values, of other programs' files too.
+    """
+    (robot := tmp_path / "pendulum.urdf").write_text(PENDULUM)
+    log, out = effort_log(tmp_path / "log.csv"), tmp_path / "motors.yaml"
+    common = ("identify", robot, log, "--compensate", "none", "--timestep", 1e-3, "--evaluations")
+    status, said, error = batchpid(*common, 3, "--workers", 0, "--no-payload", "--out", out)
+    assert status == 0, error
+    before, after = ERROR.search(said).groups()
+    assert float(after) < 0.1 * float(before)
+    judge = (*common, 0, "--actuators", out)
+    status, said, error = batchpid(*judge)
+    assert status == 0, error
+    assert ERROR.search(said).groups() == (before, after)
+    document = yaml.safe_load(out.read_text())
+    del document["about"]  # as if by other programs: neither noise nor stopping time is known
+    out.write_text(yaml.safe_dump(document))
+    _, said, _ = batchpid(*judge)
+    assert float(ERROR.search(said)[2]) == pytest.approx(float(after), rel=0.5)
+    document["joints"]["hinge"]["strength"] *= 0.8
+    out.write_text(yaml.safe_dump(document))
+    _, said, _ = batchpid(*judge)
+    assert float(ERROR.search(said)[2]) > 5 * float(after)
+    document["joints"]["hinge"] = {"lag": 0.01}
+    out.write_text(yaml.safe_dump(document))
+    status, _, error = batchpid(*judge)
+    assert (status, "lag" in error, "'hinge'" in error) == (2, True, True)
+
+
+@pytest.mark.usefixtures("short_search")
+def test_a_motion_that_nothing_explains_ends_in_an_error_and_no_file(batchpid, tmp_path):
+    """The sign of the efforts is reversed on all rows that are fitted."""
+    (robot := tmp_path / "pendulum.urdf").write_text(PENDULUM)
+    log, out = effort_log(tmp_path / "log.csv", wrong=0.75), tmp_path / "motors.yaml"
+    flags = ("--compensate", "none", "--timestep", 1e-3, "--workers", 0, "--no-payload", "--out", out)
+    status, said, error = batchpid("identify", robot, log, "--evaluations", 2, *flags)
+    assert status == 2
+    assert "logs: are not explained" in error
+    before, after = map(float, ERROR.search(said).groups())
+    assert after > before
+    assert not out.exists()
+
+
 def test_what_is_missing_is_named(batchpid, log, tmp_path):
     robot, recording, _ = log
     for words, message in (
         (("identify", robot), "logs: are missing"),
         (("identify", robot, recording), "fit its setpoints"),
-        (("identify", robot, recording, "--evaluations", 0), "evaluations"),
+        (("identify", robot, recording, "--evaluations", 0), "evaluations: is 0"),
+        (("identify", robot, recording, "--actuators", "motors.yaml"), "actuators: are not the start of a fit"),
+        (("identify", robot, recording, "--evaluations", 0, "--actuators", "a.yaml"), "out: is for a fit"),
         (("identify", robot, recording, "--params", "nothing.yaml"), "params: is neither a name nor a file of gains"),
     ):
         status, _, error = batchpid(*words, "--out", tmp_path / "motors.yaml")

@@ -16,7 +16,7 @@ import pytest
 from identical import assert_identical
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError
-from batchpid.sim import FaultWarning, RecordingError, RunInfo, Runner, read_recording, write_recording
+from batchpid.sim import FaultWarning, RecordingError, Rollout, RunInfo, Runner, read_recording, write_recording
 from batchpid.sim.recording import hdf5
 from batchpid.sim.recording import recording_files as files
 from batchpid.sim.recording.recording_files import attribute_checksum
@@ -89,6 +89,26 @@ def test_existing_files_are_replaced_only_when_asked(suffix, tmp_path, rollout):
         write_recording(rollout, path)
     assert path.read_text() == "precious"
     write_recording(rollout, path, overwrite=True)
+    assert_identical(read_recording(path), rollout)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_file_that_appears_during_the_write_is_kept(suffix, tmp_path, rollout, monkeypatch):
+    """Another program makes it after the look at the folder, while the arrays are compressed."""
+    skip_without_h5py(suffix)
+    path, arrays = tmp_path / f"run{suffix}", Rollout.arrays
+
+    def late(self):
+        path.write_text("theirs")
+        return arrays(self)
+
+    monkeypatch.setattr(Rollout, "arrays", late)
+    with pytest.raises(RecordingError, match=rf"run\{suffix}: was made by another program"):
+        write_recording(rollout, path)
+    assert path.read_text() == "theirs"
+    assert os.listdir(tmp_path) == [path.name]
+    write_recording(rollout, path, overwrite=True)
+    monkeypatch.undo()
     assert_identical(read_recording(path), rollout)
 
 

@@ -48,6 +48,25 @@ def test_gains_and_implicit_laws_are_refused(panda):
             search(panda, workers=0, **{name: value})
 
 
+def test_a_search_of_tool_gains_with_other_motors_is_refused(panda, tmp_path, monkeypatch):
+    """Costs in a history are those of the motors that they were measured with."""
+    for name in ("MOVES", "FINAL_MOVES"):
+        monkeypatch.setattr(f"batchpid.sim.tuning.tool_search.{name}", 1)
+    every = "batchpid.sim.tuning.tool_candidates.reaches"  # whether a move is good does not matter here
+    monkeypatch.setattr(every, lambda robot, control, start, goal: np.ones(len(start), bool))
+    history = tmp_path / "search.json"
+    options = {"workers": 0, "tool": "panda_hand", "generations": 1, "population": 4, "seconds": 0.05, "seed": 0}
+    slow, weak = (
+        dataclasses.replace(panda, actuators=make_actuators(panda.dof, **motors))
+        for motors in ({"command_delay": 0.004}, {"strength": 0.6})
+    )
+    found = tune_tool(slow, history=history, physics="fast", **options)
+    for other in (panda, weak):
+        with pytest.raises(InvalidArgumentError, match=r"another search \(actuators differ\)"):
+            tune_tool(other, history=history, physics="fast", **options)
+    assert tune_tool(slow, history=history, physics="fast", **options).costs == found.costs
+
+
 def test_same_seed_gives_bit_identical_gains_for_any_number_of_workers(panda, few_moves):
     found, other = (tune(panda, workers=workers, seed=5, **SMALL) for workers in (0, 2))
     assert other.history == found.history

@@ -43,6 +43,24 @@ ARM = """<robot name="arm2"><link name="base"/>
 <axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="20" velocity="6"/></joint></robot>"""
 
 
+def six_joints(fixed: int | None = None) -> str:
+    """Return the URDF of an arm of six joints, j0 to j5, one of which may be fixed at 0."""
+    parts = ['<robot name="arm6"><link name="l0"/>']
+    sizes = [(4, 0.2, 150), (5, 0.4, 150), (3, 0.35, 100), (1.5, 0.1, 30), (1.2, 0.1, 30), (0.5, 0.08, 15)]
+    above = 0.1
+    for number, (mass, length, effort) in enumerate(sizes):
+        axis, kind = "0 0 1" if number in (0, 4) else "0 1 0", "fixed" if number == fixed else "revolute"
+        across = mass * (length**2 / 12 + 0.002)
+        tensor = f'ixx="{across}" iyy="{across}" izz="{0.003 * mass}" ixy="0" ixz="0" iyz="0"'
+        inertial = f'<origin xyz="0.01 0 {length / 2}"/><mass value="{mass}"/><inertia {tensor}/>'
+        ends = f'<parent link="l{number}"/><child link="l{number + 1}"/><origin xyz="0 0 {above}"/><axis xyz="{axis}"/>'
+        limit = f'<limit lower="-2.5" upper="2.5" effort="{effort}" velocity="4"/>'
+        parts.append(f'<link name="l{number + 1}"><inertial>{inertial}</inertial></link>')
+        parts.append(f'<joint name="j{number}" type="{kind}">{ends}{limit}</joint>')
+        above = length
+    return "".join([*parts, "</robot>"])
+
+
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory) -> Robot:
     path = tmp_path_factory.mktemp("arm") / "arm.urdf"
@@ -259,6 +277,52 @@ def test_a_joint_that_did_not_move_is_left_out_by_name(mujoco_log, tmp_path):
     stuck = replace(log, qpos=np.tile(log.qpos[:1], (len(log.qpos), 1)))
     with pytest.raises(bp.InvalidArgumentError, match="no motion of any joint"):
         identify(turret, stuck, **options)
+
+
+@pytest.mark.parametrize(
+    ("kind", "asked", "gives"),
+    [
+        ("effort", True, 0.0),
+        pytest.param("effort", False, 0.0, marks=pytest.mark.slow),
+        *(
+            pytest.param("setpoint", asked, gives, marks=pytest.mark.slow)
+            for asked, gives in ((True, 0.0), (False, 0.0), (True, 1e-3))
+        ),
+    ],
+)
+@pytest.mark.usefixtures("short_search")
+def test_a_joint_of_six_that_stuck_does_not_spoil_the_others(mujoco_log, tmp_path, kind, asked, gives):
+    """With its columns, where its commands move or rest, the other joints are explained as well as on a robot that has
+    a fixed joint in its place; also if it gives by 1 mrad in proportion to its setpoint.
+    """
+    stuck, rest = 2, [0, 1, 3, 4, 5]
+    for name, fixed in (("six", None), ("five", stuck)):
+        (tmp_path / f"{name}.urdf").write_text(six_joints(fixed))
+    six, five = (Robot.load(tmp_path / f"{name}.urdf") for name in ("six", "five"))
+    truth, params = mujoco_log["plausible"](six, 0), six.designed("effort")
+    motion = excite(six, 1.0, lowest=1.0)
+    of_five = truth._replace(**{name: getattr(truth, name)[rest] for name in PER_JOINT})
+    moved = type(motion)(motion.time, *(leaf[:, rest] for leaf in motion[1:]))
+    table = mujoco_log["simulate"](
+        five, of_five, moved, params.for_joints(rest), timestep=DT, every=1, compensate=False
+    )
+    time, rows = table["time"], len(table["time"])
+    setpoint = np.interp(time, motion.time - motion.time[0], motion.position[:, stuck]) * asked
+    qpos, command = np.zeros((2, rows, 6))
+    qpos[:, rest], command[:, rest] = table["qpos"], table[kind]
+    qpos[:, stuck] = 2e-5 * np.random.default_rng(1).standard_normal(rows)
+    qpos[:, stuck] += gives * (setpoint - setpoint.mean()) / max(setpoint.std(), 1e-9)
+    command[:, stuck] = setpoint if kind == "setpoint" else 50.0 * (setpoint - qpos[:, stuck])
+    options = {"timestep": DT, "compensate": "none", "workers": 0, "payload": False, "evaluations": 2}
+    by_law = kind == "setpoint"
+    alone = identify(five, as_log(five, table, kind), params=params.for_joints(rest) if by_law else None, **options)
+    log = Log("log", tuple(range(6)), kind, time, qpos, time, command, False)
+    with pytest.warns(LogWarning, match=f"'j2' did not {'follow its setpoint' if gives else 'move'}: left out"):
+        found = identify(six, log, params=params if by_law else None, **options)
+    assert found.joints == tuple(rest)
+    assert alone.held_out_error[1] < 0.1 * alone.held_out_error[0]
+    for with_it, without in zip(found.held_out_error, alone.held_out_error, strict=True):
+        assert with_it == pytest.approx(without, rel=0.05)
 
 
 @pytest.mark.slow

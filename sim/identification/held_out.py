@@ -1,0 +1,151 @@
+"""Errors of motors on the held-out part of logs: of ideal motors, and of the motors in an actuators file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+import batchpid as bp
+from batchpid.arrays.array_types import Float64
+from batchpid.errors import InvalidArgumentError
+from batchpid.io import documents
+from batchpid.motors.actuator_fields import FIELDS
+from batchpid.sim.identification.inputs import read_inputs
+from batchpid.sim.identification.log import Log
+from batchpid.sim.identification.plant import Motors
+from batchpid.sim.identification.problem import Problem
+from batchpid.sim.identification.regression import STOPPING, hypotheses, smooth, variants
+from batchpid.sim.identification.unknowns import LIMITS, Unknowns
+from batchpid.sim.robot.actuator_checks import load_robot_actuators
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner_keywords import Compensation
+
+_MODELLED = ("command_delay", "strength", "bias", "coulomb", "viscous", "armature")
+"""Fields of actuators that the model has."""
+ASSUMED = "simulated_with"
+"""Key of an actuators file, under "about": how the error that it states was simulated."""
+
+
+def held_out_error(
+    robot: Robot,
+    logs: Iterable[str | os.PathLike[str] | Log],
+    actuators: str | os.PathLike[str],
+    *,
+    params: bp.PIDParams | None = None,
+    compensate: Compensation | None = None,
+    timestep: float | None = None,
+    sim_steps: int = 1,
+    hold: bool = False,
+) -> tuple[float, float]:
+    """Return the position errors of ideal motors and of an actuators file on the held-out part of logs; fit nothing.
+
+    Both are root mean squares [rad or m], inf if the simulation diverges. A file of
+    :meth:`~batchpid.sim.identification.result.Identification.save` says with which payload, compensation and noise it
+    was fitted. Of other files the payload is 0, and the likeliest compensation and noise are taken.
+
+    Parameters
+    ----------
+    actuators
+        Actuators file (.yaml or .json).
+
+    The other arguments are those of :func:`batchpid.sim.identification.identify`.
+
+    Raises
+    ------
+    InvalidArgumentError
+        As for :func:`batchpid.sim.identification.identify`; or the file holds actuators of another robot, of several
+        envs, or effects that the model lacks.
+    FileNotFoundError
+        A file does not exist.
+    MissingDependencyError
+        A package is missing.
+    """
+    inputs = read_inputs(robot, logs, params, compensate, timestep, sim_steps, hold)
+    joints, source = inputs.joints, str(actuators)
+    own = load_robot_actuators(source, robot)
+    assumed = _assumed(source, documents.read(source))
+    _check_modelled(source, own, robot, joints)
+    motors = motors_of(own, robot, joints, float(assumed["stopping"]), float(assumed["payload"]))
+    one = np.ones(len(joints))
+    unknowns = Unknowns.of(one, one, one, one, payload=True)
+    motions = [smooth(log, inputs.drive.timestep) for log in inputs.logs]
+    ways = [each for way in hypotheses(inputs.drive, payload=True) for each in variants(way, motions)]
+    stated = [way for way in ways if way.assumptions.items() <= assumed.items()]
+    point, tried = unknowns.point(motors)[None], []
+    for way in stated or ways:
+        problem = Problem(inputs.robot, joints, way, inputs.logs, motions, unknowns)
+        residuals = problem.residuals(point)
+        tried.append((problem.costs(problem.sizes(residuals)).sum(), problem, residuals))
+    _, problem, residuals = min(tried, key=lambda each: each[0])
+    before = problem.residuals(unknowns.point(ideal_motors(robot, joints))[None])
+    return error_of(problem, before), error_of(problem, residuals)
+
+
+def error_of(problem: Problem, residuals: list[Float64]) -> float:
+    """Return the root mean square of the residuals (1, rows, joints) of each window on the held-out rows."""
+    kept = [r[0][~w.fitted] for r, w in zip(residuals, problem.windows, strict=True)]
+    with np.errstate(invalid="ignore", over="ignore"):
+        error = float(np.sqrt((np.concatenate(kept) ** 2).mean()))
+    return error if np.isfinite(error) else float("inf")
+
+
+def ideal_motors(robot: Robot, joints: tuple[int, ...]) -> Motors:
+    """Return the motors according to the robot's description."""
+    zero, own = np.zeros((1, len(joints))), list(joints)
+    damping, friction, none = robot.damping[None, own], robot.friction[None, own], np.zeros((1, 1))
+    return Motors(zero, damping, friction, zero + 1, zero, none, none, none)
+
+
+def motors_of(
+    actuators: bp.Actuators, robot: Robot, joints: tuple[int, ...], stopping: float, payload: float
+) -> Motors:
+    """Return the motors of ``joints`` with ``actuators`` of ``robot``, a stopping time [s] and a payload [kg]."""
+
+    def row(name: str, neutral: float = 0.0) -> Float64:
+        leaf = getattr(actuators, name)
+        return np.full((1, len(joints)), neutral) if leaf is None else np.array(leaf, float)[:1, list(joints)]
+
+    own = list(joints)
+    return Motors(
+        armature=row("armature"),
+        damping=robot.damping[own] + row("viscous"),
+        friction=robot.friction[own] + row("coulomb"),
+        strength=row("strength", 1.0),
+        bias=row("bias"),
+        delay=row("command_delay")[:, :1],
+        stopping=np.array([[stopping]]),
+        payload=np.array([[payload]]),
+    )
+
+
+def _assumed(source: str, document: Any) -> dict[str, Any]:
+    """Return the assumptions of an actuators file; stopping time and payload alone if it states none."""
+    stated = document.get("about", {}).get(ASSUMED, {})
+    found = {"stopping": STOPPING, "payload": 0.0} | (stated if isinstance(stated, dict) else {})
+    for name in ("stopping", "payload"):
+        low, high = LIMITS[name]
+        if not documents.is_number(found[name]) or not low <= float(found[name]) <= high:
+            remedy = f"give a number from {low:g} to {high:g}, or leave out {ASSUMED}"
+            raise InvalidArgumentError(f"{source}: {name}", "is out of range", value=found[name], remedy=remedy)
+    return found
+
+
+def _check_modelled(source: str, actuators: bp.Actuators, robot: Robot, joints: tuple[int, ...]) -> None:
+    """Raise InvalidArgumentError if ``joints`` have effects in ``actuators`` that the model lacks."""
+    for name, field in FIELDS.items():
+        leaf = getattr(actuators, name)
+        if leaf is None:
+            continue
+        values = np.array(leaf, float)[:, list(joints)]
+        if name not in _MODELLED and (values != field.neutral).any():
+            joint = robot.joint_names[joints[int((values != field.neutral).any(0).argmax())]]
+            remedy = f"leave it out; the model has {', '.join(_MODELLED)}"
+            raise InvalidArgumentError(f"{source}: {name}", "is not part of the model", joint=joint, remedy=remedy)
+        if name == "command_delay" and np.ptp(values) > 0:
+            problem = "differs between joints, and the model has one delay"
+            raise InvalidArgumentError(f"{source}: {name}", problem, remedy="give every joint the same")
+    if actuators.limit_positions is not None:
+        raise InvalidArgumentError(f"{source}: position_limit", "is not part of the model", remedy="leave it out")
