@@ -14,7 +14,7 @@ import sysconfig
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from operator import itemgetter
 from types import CellType, CodeType, FunctionType, MappingProxyType, ModuleType
 from typing import Any
@@ -41,8 +41,6 @@ _OF_EVERY_CLASS = {
     "__firstlineno__", "__static_attributes__", "__annotate__", "__annotate_func__", "__annotations_cache__",
 }  # fmt: skip
 """Attributes of a class that its calls do not depend on."""
-_FOLDERS = tuple({sysconfig.get_path(name) + os.sep for name in ("stdlib", "platstdlib", "purelib", "platlib")})
-"""Folders of Python and of installed packages."""
 
 
 def digest(*values: Any) -> str:
@@ -197,7 +195,7 @@ def _is_installed(module: Any) -> bool:
     if not isinstance(module, str) or module == "__main__" or module not in sys.modules:
         return False
     file = getattr(sys.modules[module], "__file__", None)
-    return file is None or module.partition(".")[0] == "batchpid" or file.startswith(_FOLDERS)
+    return file is None or module.partition(".")[0] == "batchpid" or file.startswith(_folders())
 
 
 def _digest(value: Any, where: str) -> bytes:
@@ -258,3 +256,9 @@ def _of_bytes(kind: str, content: bytes) -> bytes:
 def _of_parts(kind: str, parts: list[bytes]) -> bytes:
     """Return the digest of digests, which all have the same length, so that no separator is needed."""
     return _of_bytes(kind, b"".join(parts))
+
+
+@cache
+def _folders() -> tuple[str, ...]:
+    """Return the folders of Python and of installed packages."""
+    return tuple({sysconfig.get_path(name) + os.sep for name in ("stdlib", "platstdlib", "purelib", "platlib")})

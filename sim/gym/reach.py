@@ -35,8 +35,9 @@ class ReachVectorEnv(RobotVectorEnv):
     bounds of its :class:`batchpid.sim.CommandSpec`.
 
     - *Observation* (envs, 3 joints): qpos, qvel, goal [rad or m, and per second], clipped to the space.
-    - *Action* (envs, size) in [-1, 1]: the setpoint within its limits, or an increment of the setpoint. An episode
-      begins with the setpoint at the joints' pose, or with the ``neutral`` one of the command.
+    - *Action* (envs, size) in [-1, 1]: the setpoint within its limits, or an increment of the setpoint, which moves
+      during the step. An episode begins with the setpoint at the joints' pose, or with the ``neutral`` one of the
+      command.
     - *Reward*: minus the mean over joints of |goal - qpos| / range, plus 1 where every joint is within ``tolerance``.
       A joint without a range counts as 0.
     - *Terminated*: the env diverged (``info["diverged"]``), or reached its goal if ``terminate_on_success``.
@@ -132,6 +133,14 @@ class ReachVectorEnv(RobotVectorEnv):
             last = setpoint if self._own is not None else setpoint[:, self._joints.index]
             chosen = np.clip(wrap(last + action * self.max_increment, self._setpoint_turns, np), low, high)
         return self._joints.of_robot(chosen) if self._own is None else chosen
+
+    def rate(self, setpoint: Float64, last: Float64) -> Float64 | None:
+        """Return the rates of increments, the short way round on continuous joints; None for other actions."""
+        if self.actions == "setpoint" or self._own is not None:
+            return None
+        rate, index = np.zeros_like(setpoint), self._joints.index  # the rates of followers are those of their leaders
+        rate[:, index] = wrap((setpoint - last)[:, index], self._setpoint_turns, np) / self.step_seconds
+        return rate
 
     def observe(self, observed: Observation) -> Float32:
         """Return qpos, qvel and goal."""

@@ -46,6 +46,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     - :meth:`runner_options`: options of the runner that belong to the task, such as ``control`` and ``build``;
     - :meth:`draw`: the start and the goal of an episode, drawn for one env;
     - :meth:`first_setpoint`, :meth:`command`: the setpoint at the start of an episode, and for an action;
+    - :meth:`rate`: the rate of a setpoint that moves;
     - :meth:`observe`: the observation, made from the runner's;
     - :meth:`success`, :meth:`reward`, :meth:`terminated`, :meth:`info`: results, from the observation.
 
@@ -189,6 +190,14 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """
         return action
 
+    def rate(self, setpoint: Float64, last: Float64) -> ArrayLike | None:
+        """Return the rates (envs, command size) per second at which the setpoints move from ``last`` to ``setpoint``.
+
+        Increments move the setpoint over the whole step: their rate is the change by :attr:`step_seconds`. Without a
+        rate, setpoints that move in every step are followed with a lag. None: setpoints are steps. Default: None.
+        """
+        return None
+
     @abstractmethod
     def observe(self, observed: Observation) -> ArrayLike:
         """Return the observations (envs, n) for the last observation of the runner.
@@ -282,7 +291,10 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             raise error.ResetNeeded(f"reset env {int(np.argmax(begins))} before the next step")
         setpoint = self._returned("command", self.command(action, self._setpoint), self._setpoint.shape, np.float64)
         setpoint = np.where(begins[:, None], self._setpoint, setpoint)
-        self.runner.send(setpoint)
+        rate = self.rate(setpoint, self._setpoint)
+        if rate is not None:
+            rate = np.where(begins[:, None], 0.0, self._returned("rate", rate, setpoint.shape, np.float64))
+        self.runner.send(setpoint, setpoint_rate=rate)
         self.action, self._setpoint, self._is_stepping = action, setpoint, True
 
     def step_wait(self) -> tuple[Float32, Float64, Bool, Bool, dict[str, Any]]:

@@ -52,7 +52,7 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
     rotation
         Largest component of the rotation vector of a target [rad].
     actions
-        ``"setpoint"``: the target in the workspace; or ``"increment"``: a change of it.
+        ``"setpoint"``: the target in the workspace; or ``"increment"``: a change of it, whose twist the control takes.
     max_increment
         Change of the target by an increment of 1, scalar or (3,), with a rotation (6,) [m, rad].
     osc
@@ -112,7 +112,8 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
         self.tool = kinematics.links[kinematics.tool]
         if self._tool is not None:
             self.tool = choice("tool", self._tool, kinematics.links)
-        self._control = OperationalSpace(robot, self.tool, posture=self.posture, **self._osc)
+        options = {"twist": self.actions == "increment"} | self._osc
+        self._control = OperationalSpace(robot, self.tool, posture=self.posture, **options)
         self._home = np.array(self._control.command.neutral)[:7]
         self.center = self._home[:3] + self.center_offset
         """Center of the workspace (3,) [m]."""
@@ -142,16 +143,25 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
 
     def first_setpoint(self, qpos: Float64) -> Float64:
         """Return the poses of the tool."""
-        return self._near_home(self._control.tool_pose(qpos))
+        return self._setpoint_at(self._near_home(self._control.tool_pose(qpos)))
 
     def command(self, action: Float64, setpoint: Float64) -> Float64:
-        """Return the poses of the target (envs, 7) for actions in [-1, 1]."""
+        """Return the target for actions in [-1, 1]: poses (envs, 7), and for increments also the twist (envs, 13)."""
         limits = np.concatenate([self._half, np.full(3, self.rotation)])[: action.shape[1]]
         if self.actions == "setpoint":
-            return self.pose_at(action * limits)
-        turn = rotation_error(setpoint[:, 3:], self._home[3:])
-        last = np.concatenate([setpoint[:, :3] - self.center, turn], axis=1)[:, : action.shape[1]]
-        return self.pose_at(np.clip(last + action * self.max_increment, -limits, limits))
+            return self._setpoint_at(self.pose_at(action * limits))
+        last = setpoint[:, :7]
+        turn = rotation_error(last[:, 3:], self._home[3:])
+        place = np.concatenate([last[:, :3] - self.center, turn], axis=1)[:, : action.shape[1]]
+        return self._setpoint_at(self.pose_at(np.clip(place + action * self.max_increment, -limits, limits)), last)
+
+    def _setpoint_at(self, pose: Float64, last: Float64 | None = None) -> Float64:
+        """Return setpoints of the control at poses (envs, 7), with the twist from poses ``last``, or at rest."""
+        rest = np.zeros((len(pose), len(self._control.command.names) - 7))
+        if last is not None and rest.shape[1] == 6:
+            turn = rotation_error(pose[:, 3:], last[:, 3:])
+            rest = np.concatenate([pose[:, :3] - last[:, :3], turn], axis=1) / self.step_seconds
+        return np.concatenate([pose, rest], axis=1)
 
     def pose_at(self, place: Float64) -> Float64:
         """Return the poses (..., 7) at places in the workspace (..., 3) or (..., 6).

@@ -250,8 +250,6 @@ class Snapshot:
         if targets is not None and (targets.shape != (num_envs, dof) or not np.isfinite(targets).all()):
             raise ValueError(f"its targets are not positions of {num_envs} envs of {dof} joints")
         motion = tables.pop("motion", None)
-        if motion is not None and (motion.shape != (2, num_envs, dof) or motion.dtype != np.float64):
-            raise ValueError(f"its motion is not a setpoint and a rate of {num_envs} envs of {dof} joints")
         groups = nest(tables)
         motors = groups.pop(_ACTUATORS, None)
         motors = {name: leaf if leaf.ndim else leaf.item() for name, leaf in (motors or {}).items()}
@@ -274,6 +272,8 @@ class Snapshot:
             motors = states.actuators  # the runner that restores it checks them
         size = dof if about.get("command") is None else len(names("command", about["command"]))
         states.check(num_envs, dof, controller, bool(states.friction), motors, bool(states.guard), (), size)
+        if motion is not None and (motion.shape != (2, num_envs, dof) or motion.dtype != np.float64):
+            raise ValueError(f"its motion is not a setpoint and a rate of {num_envs} envs of {dof} joints")
         return cls(about, steps, params, states, actuators, episodes, targets, motion)
 
     def __repr__(self) -> str:

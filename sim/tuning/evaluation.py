@@ -177,7 +177,6 @@ def run_moves(
     streams: NDArray[np.int64] | None = None,
     *,
     durations: NDArray[np.float64] | None = None,
-    accelerations: bool = False,
 ) -> tuple[Rollout, StepMetrics]:
     """Run ``moves``, one per env, from rest for ``seconds``, two ticks at least; return the rollout and its metrics.
 
@@ -185,7 +184,7 @@ def run_moves(
     randomization, by default one for each move, so that the draws are the same at every call.
 
     A move is a step of the setpoint, or, where ``durations`` (moves,) [s] are above 0, a minimum-jerk motion of that
-    duration, or its beginning, with setpoint rates and, with ``accelerations``, setpoint accelerations.
+    duration, or its beginning, with setpoint rates.
     """
     tick = runner.timestep * runner.substeps
     ticks = max(2, round(seconds / tick))
@@ -202,8 +201,6 @@ def run_moves(
             smooth = durations[:, None] > 0
             setpoints = np.where(smooth, motion.position[rows], setpoints)
             further["setpoint_rates"] = np.where(smooth, motion.velocity[rows], 0.0)
-            if accelerations:
-                further["setpoint_accelerations"] = np.where(smooth, motion.acceleration[rows], 0.0)
         rollout = runner.rollout(setpoints, progress=progress, **further)
     with_effort = runner.control != "drive"
     return rollout, step_response_metrics(runner.robot, rollout, began, with_effort=with_effort)
@@ -223,7 +220,7 @@ def evaluate_gains(
 
     ``params`` have one row for all moves, or one row per move; ``runner_options`` go to :class:`batchpid.sim.Runner`.
     With ``follow`` the moves are made once more, as smooth motions of :func:`smooth_durations`, of which the first
-    ``seconds`` are run, with setpoint rates and without accelerations.
+    ``seconds`` are run, with setpoint rates.
     """
     with Runner(robot, len(moves.start), params=params, **{"substeps": SUBSTEPS, **runner_options}) as runner:
         rollout, metrics = run_moves(runner, moves, seconds)

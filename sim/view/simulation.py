@@ -105,6 +105,8 @@ class LiveSimulation(SingleOwner):
         """Setpoint at the start (dof,) [rad or m], or (7,)."""
         self.setpoint = np.tile(self.neutral, (self.per_group, 1))
         """Setpoints of the robots of each group (envs, dof) [rad or m], or (envs, 7)."""
+        self._last: Float64 = self.setpoint
+        self._rate: Float64 | None = None
         self.payload = 0.0
         """Mass at the load link, a weight without inertia [kg]."""
         self.load_link = self.kinematics.tool
@@ -131,6 +133,7 @@ class LiveSimulation(SingleOwner):
         """Put every robot back to its start pose, at rest, with a reset controller."""
         for runner in self._runners:
             runner.reset(self.start)
+        self._last, self._rate = self.setpoint.copy(), None
         self._count = self._push_frames = 0
         self._frames.clear()
         self._observe(np.zeros((len(self.groups) * self.per_group, self.robot.dof)))
@@ -192,6 +195,7 @@ class LiveSimulation(SingleOwner):
     def advance(self) -> None:
         """Run one frame of all groups concurrently."""
         disturbance = self._disturbance()
+        self._rate, self._last = self._dragged(), self.setpoint.copy()
         list(self._pool.map(self._step, self.groups, self._runners, np.split(disturbance, len(self.groups))))
         self._count += 1
         self._push_frames = max(0, self._push_frames - 1)
@@ -207,7 +211,18 @@ class LiveSimulation(SingleOwner):
             params = gains.params_under(disturbance) if loaded and control == "pid" else gains.params
             if runner.params is not params:
                 runner.params = params
-        runner.step(self.setpoint, feedforward=disturbance if loaded else None)
+        runner.step(self.setpoint, setpoint_rate=self._rate, feedforward=disturbance if loaded else None)
+
+    def _dragged(self) -> Float64 | None:
+        """Return the rates of setpoints that move within the velocity limits (envs, dof), as a slider that is dragged.
+
+        Larger changes are steps, with a rate of 0. None if nothing moves so, and for poses.
+        """
+        if self.command is not None:
+            return None
+        rate = (self.setpoint - self._last) / self.period
+        rate[np.abs(rate) > self.robot.velocity_limit] = 0.0
+        return rate if rate.any() else None
 
     def _disturbance(self) -> Float64:
         """Return the joint efforts (robots, dof) [N m or N] of payload and push."""

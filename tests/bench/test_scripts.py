@@ -10,6 +10,7 @@ from robots import load_bundled
 from scripts import ROOT, load_script
 
 TESTED = {"accuracy", "circles", "cluster", "contact", "draw", "motions", "newcomer", "scale", "view"}
+TESTED |= {"trajectories"}
 
 
 def rows(text):
@@ -144,3 +145,13 @@ class TestOnRay:
             bench.run(address)
             assert len(rows(capsys.readouterr().out)) == 3
             assert "round trip" in load_script("scale").measure(calls=2, address=address, ignore_reinit_error=True)
+
+
+@pytest.mark.parametrize("sines", [False, True])
+def test_trajectories(sines, monkeypatch, capsys):
+    trajectories = load_script("trajectories")
+    monkeypatch.setattr(trajectories, "MOVES", 1)
+    trajectories.Trajectories(("jaco2",), sines=sines).run()
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 + (4 if sines else 10)
+    assert all(line.startswith("jaco2") for line in lines[2:])

@@ -302,3 +302,44 @@ def test_a_reset_while_a_step_is_under_way_is_an_error(carousel):
 def test_a_wrong_argument_is_named_with_the_nearest(make, options, message):
     with pytest.raises(InvalidArgumentError, match=message):
         make(**options)
+
+
+class WithoutRates(ReachVectorEnv):
+    def rate(self, setpoint, last):
+        return None
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
+def test_increments_are_followed_closely():
+    """Half a second into a constant increment joints are at most 20 ms behind the setpoint, and without rates 0.2 s.
+
+    At first they have to reach its speed, and are 45 ms behind at most.
+    """
+    behind = {}
+    for task in (ReachVectorEnv, WithoutRates):
+        envs = task(1, actions="increment", workers=0, collisions=False, max_increment=0.005, max_episode_steps=None)
+        envs.reset(seed=3)
+        action = np.array([[1.0, -1, 1, -1, 1, 1, -1, 0, 0]])
+        start = envs._setpoint.copy()
+        lags = []
+        for _ in range(50):
+            envs.step(action)
+            lags.append(np.abs(envs._setpoint - envs.observed.qpos)[0, :7].max() / 0.25)
+        assert np.abs(envs._setpoint - start)[0, :7].min() > 0.2
+        behind[task] = max(lags), max(lags[25:])
+        envs.close()
+    assert behind[ReachVectorEnv][0] < 0.045
+    assert behind[ReachVectorEnv][1] < 0.02
+    assert behind[WithoutRates][1] > 0.2
+
+
+def test_the_rates_of_a_task_are_checked():
+    class Wrong(ReachVectorEnv):
+        def rate(self, setpoint, last):
+            return setpoint[:, :2]
+
+    envs = Wrong(2, workers=0)
+    envs.reset(seed=0)
+    with pytest.raises(InvalidArgumentError, match=r"Wrong\.rate: returned an array of shape \(2, 2\)"):
+        envs.step(np.zeros((2, 9)))
+    envs.close()

@@ -200,14 +200,16 @@ def test_increments_move_the_target_within_the_workspace():
     observation, _ = envs.reset(seed=0)
     tool = observation[:, -14:-7]
     envs.step(np.array([[0, 0.5, 0, 0, 0, 0]] * 2))
-    moved = envs._setpoint - tool
+    moved = envs._setpoint[:, :7] - tool
     np.testing.assert_allclose(moved[:, :3], [[0, 0.01, 0]] * 2, atol=2e-7)
     np.testing.assert_allclose(moved[:, 3:], 0, atol=2e-7)  # the orientation is the one drawn at the start
+    np.testing.assert_allclose(envs._setpoint[:, 7:], [[0, 0.5, 0, 0, 0, 0]] * 2, atol=1e-5)  # 0.01 m in 20 ms
     for _ in range(12):
         observation, *_ = envs.step(np.array([[1.0, -1, 0, 1, 0, 0]] * 2))
     np.testing.assert_allclose(envs._setpoint[:, :2] - envs.center[:2], [[0.05, -0.1]] * 2, atol=1e-12)
-    turn = rotation_error(envs._setpoint[:, 3:], envs.pose_at(np.zeros(6))[3:])
+    turn = rotation_error(envs._setpoint[:, 3:7], envs.pose_at(np.zeros(6))[3:])
     np.testing.assert_allclose(turn[:, 0], 0.2, atol=1e-12)
+    assert np.abs(envs._setpoint[:, 7:]).max() < 1e-9  # at rest at the limits
     assert envs.observation_space.contains(observation)
     envs.close()
 

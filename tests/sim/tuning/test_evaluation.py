@@ -15,7 +15,7 @@ from batchpid.sim.tuning.evaluation import (
     run_moves,
     step_response_metrics,
 )
-from batchpid.sim.tuning.moves import Moves, random_moves, smooth_durations, tutorial_move
+from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 from batchpid.sim.tuning.randomization_presets import PRESETS, load_randomization, payload_capacity, usual_variation
 
 
@@ -54,20 +54,9 @@ def test_setpoint_weights_change_how_steps_are_approached_and_not_how_motions_ar
     (low, slow), (high, fast) = (
         following_and_settling(panda, tuned.replace(setpoint_weight=np.full(panda.dof, b)), moves) for b in (0.0, 0.9)
     )
-    assert low.min() > 1e-4
-    np.testing.assert_allclose(high, low, rtol=0.03)
+    assert low.max() < 1e-3
+    np.testing.assert_allclose(high, low, atol=3e-4)
     assert abs(fast / slow - 1) > 0.05
-
-
-def test_setpoint_accelerations_leave_less_of_the_following_error(panda):
-    moves = random_moves(panda, 2, seed=4)
-    durations = smooth_durations(panda, moves)
-    with Runner(panda, 2, params=panda.tuned(), workers=0, substeps=5) as runner:
-        with_rates, with_both = (
-            following_error(panda, run_moves(runner, moves, 0.6, durations=durations, accelerations=given)[0])
-            for given in (False, True)
-        )
-    assert with_both.max() < 0.2 * with_rates.max()
 
 
 def test_a_step_is_the_same_beside_a_smooth_motion(panda):

@@ -62,7 +62,7 @@ def test_a_search_of_tool_gains_with_other_motors_is_refused(panda, tmp_path, mo
     )
     found = tune_tool(slow, history=history, physics="fast", **options)
     for other in (panda, weak):
-        with pytest.raises(InvalidArgumentError, match=r"another search \(actuators differ\)"):
+        with pytest.raises(InvalidArgumentError, match=r"another search \(robot_actuators differ\)"):
             tune_tool(other, history=history, physics="fast", **options)
     assert tune_tool(slow, history=history, physics="fast", **options).costs == found.costs
 

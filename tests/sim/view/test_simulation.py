@@ -196,3 +196,19 @@ def test_a_drive_has_no_sliders_of_options_that_it_lacks(jaco2):
         with pytest.raises(InvalidArgumentError, match=gain):
             live.gains["drive"].set(gain, 0, 0.5)
     live.close()
+
+
+def test_a_dragged_slider_is_followed_at_once_and_a_jump_is_a_step(panda):
+    live = LiveSimulation(panda, 1, workers=0, spread=0.0, physics="fast")
+    for _ in range(15):  # 1 rad/s
+        live.set_setpoint(live.setpoint[0, 0] + live.period, joint=0)
+        live.advance()
+    assert live.setpoint[0, 0] - live.frame().qpos[0, 0, 0] < 0.05
+    live.reset()
+    live.set_setpoint(panda.settings.target)
+    live.advance()
+    with Runner(panda, 1, workers=0, physics="fast", params=panda.tuned()) as runner:
+        runner.reset(live.start)
+        observation = runner.step(live.setpoint, substeps=round(live.period * 2000))
+    np.testing.assert_array_equal(live.frame().qpos[0], observation.qpos)
+    live.close()

@@ -347,7 +347,7 @@ def test_a_tick_whose_call_ends_after_the_workers_answers_is_replayed_once(monke
 
     with make_runner(workers=1) as runner, make_runner(workers=0) as model:
         with monkeypatch.context() as patched:
-            patched.setattr("batchpid.sim.session._followed", interrupt)
+            patched.setattr("batchpid.sim.session.MovingSetpointCheck.see", interrupt)
             with pytest.raises(KeyboardInterrupt):
                 runner.step(setpoints()[0])
         assert_identical(runner.observe(), model.step(setpoints()[0]))
