@@ -17,8 +17,9 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, Runner, read_recording
 from batchpid.sim.cli.flags import MeshOptions
 from batchpid.sim.cli.progress import bar
-from batchpid.sim.cli.report import run_report, tool_report
+from batchpid.sim.cli.report import run_report, tool_report, trajectory_report
 from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.identification.setpoint_files import Setpoints
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.tuning.evaluation import Evaluation, evaluate_gains, run_moves
 from batchpid.sim.tuning.gain_sets import GainSet
@@ -59,6 +60,19 @@ def hold_pose(runner: Runner, start: NDArray[Any], goal: NDArray[Any], seconds: 
     ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
     rollout = runner.rollout(np.tile(goal, (ticks, 1)), progress=bar("simulating", unit="tick"))
     return rollout, tool_report(runner, rollout, time.perf_counter() - began)
+
+
+def follow(runner: Runner, start: NDArray[Any], setpoints: Setpoints) -> tuple[Rollout, str]:
+    """Follow the ``setpoints`` of a file from ``start`` (envs, dof); return the rollout and a report on it."""
+    began = time.perf_counter()
+    runner.reset(start, seed=None if runner.options.randomization is None else 0)
+    rollout = runner.rollout(
+        setpoints.position,
+        setpoint_rates=setpoints.rate,
+        setpoint_accelerations=setpoints.acceleration,
+        progress=bar("simulating", unit="tick"),
+    )
+    return rollout, trajectory_report(runner, rollout, setpoints, time.perf_counter() - began)
 
 
 def evaluate_sets(
