@@ -12,7 +12,7 @@ from batchpid.sim import Robot, Runner
 from batchpid.sim.cli import main
 from batchpid.sim.cli.run import start_poses
 from batchpid.sim.identification.setpoint_files import read_setpoints
-from batchpid.trajectories import minimum_jerk
+from batchpid.trajectories import Trajectory, minimum_jerk
 from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write
 
 SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
@@ -177,17 +177,24 @@ def motion(panda):
     return minimum_jerk(panda.start, there, 0.005, duration=0.4)
 
 
-def csv(robot, motion, *quantities, start=True, delimiter=",", end="\n", header="{}"):
-    """Return setpoints and further quantities of a motion as CSV, with a row at time 0 for its ``start``."""
-    columns = {"time": motion.time[:, None], "setpoint": motion.position}
-    columns |= {name: getattr(motion, name.replace("setpoint_rate", "velocity")[-12:]) for name in quantities}
-    names = [header.format(f"{key}:{name}") for key in list(columns)[1:] for name in robot.joint_names]
-    rows = np.hstack(list(columns.values()))
+OF_TRAJECTORY = {"setpoint": "position", "setpoint_rate": "velocity", "setpoint_acceleration": "acceleration"}
+
+
+def csv(robot, motion, *further, start=True, delimiter=",", end="\n", header="{}"):
+    """Return setpoints and ``further`` quantities of a motion as CSV, with a row at time 0 for ``robot.start``."""
+    tables = [getattr(motion, OF_TRAJECTORY[name]) for name in ("setpoint", *further)]
+    names = [header.format(f"{key}:{name}") for key in ("setpoint", *further) for name in robot.joint_names]
+    rows = np.hstack([motion.time[:, None], *tables])
     if start:
-        rest = np.concatenate([[0], robot.start, np.zeros(robot.dof * len(quantities))])
-        rows = np.vstack([rest, rows])
+        rows = np.vstack([np.concatenate([[0], robot.start, np.zeros(robot.dof * len(further))]), rows])
     cells = [[header.format("time"), *names], *([f"{cell:.9g}" for cell in row] for row in rows)]
     return "".join(delimiter.join(row) + end for row in cells)
+
+
+def through(poses):
+    """Return a motion in ticks of 10 ms through poses, whose first is at time 0."""
+    poses = np.array(poses)
+    return Trajectory(0.01 * np.arange(len(poses)), poses, 0 * poses, 0 * poses)
 
 
 def following_errors(report):
@@ -242,11 +249,8 @@ def test_a_file_without_a_row_at_time_0_begins_at_the_start_pose(batchpid, tmp_p
 
 
 def test_the_first_row_is_the_start_of_env_0_and_others_spread_around_it(batchpid, tmp_path, panda):
-    there = minimum_jerk(panda.settings.target, panda.start, 0.01, duration=0.05)
     path = tmp_path / "motion.csv"
-    path.write_text(csv(panda, there._replace(position=np.vstack([panda.settings.target, there.position[:-1]])),
-                        start=False).replace("\n0.01,", "\n0,").replace("\n0.02,", "\n0.01,"))  # fmt: skip
-    path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
+    path.write_text(csv(panda, through([panda.settings.target] * 2), start=False))
     status, _, error = batchpid("rollout", "--trajectory", path, *SHORT[:4], "--out", tmp_path / "run.npz")
     assert status == 0, error
     with np.load(tmp_path / "run.npz") as file:
@@ -286,10 +290,8 @@ def test_the_motion_of_excite_is_followed(batchpid, tmp_path):
 
 def test_changes_beyond_the_velocity_limits_are_steps(batchpid, tmp_path, panda):
     path = tmp_path / "step.csv"
-    header = ",".join(["time", *(f"setpoint:{name}" for name in panda.joint_names)])
     poses = [panda.start, panda.start, panda.settings.target, panda.settings.target]
-    rows = [",".join([f"{0.01 * k:g}", *map(str, pose)]) for k, pose in enumerate(poses)]
-    path.write_text("\n".join([header, *rows]))
+    path.write_text(csv(panda, through(poses), start=False))
     found = read_setpoints(panda, path, 1 / 2000)
     assert found.steps == np.count_nonzero(panda.settings.target != panda.start) > 0
     np.testing.assert_array_equal(found.rate, 0.0)
