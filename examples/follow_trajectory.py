@@ -2,8 +2,9 @@
 
     python examples/follow_trajectory.py
 
-Each robot of the batch follows another profile over the same path. The PID gets the setpoint's rate, so that it damps
-the velocity error and not the velocity: the errors that remain show how hard a profile is to follow.
+Each robot of the batch follows another profile over the same path, under a PD with gains in efforts and under the tuned
+gains, which are per mass matrix. Both get the setpoint's rate, so that they damp the velocity error and not the
+velocity. What remains of the PD's error is due to the acceleration: gains per mass matrix take it from the rates.
 """
 
 import numpy as np
@@ -34,7 +35,7 @@ def profiles(start, target, velocity, acceleration) -> dict[str, Trajectory]:
 
 
 def main():
-    """Run one robot per profile and print the errors of each."""
+    """Run one robot per profile under each set of gains, and print the errors."""
     robot = Robot.load("panda")
     velocity = 0.5 * robot.velocity_limit
     moves = profiles(robot.start, robot.settings.target, velocity, acceleration=4 * velocity)
@@ -42,18 +43,19 @@ def main():
     position, rate = (
         np.stack([getattr(move, name)[:ticks] for move in moves.values()], axis=1) for name in ("position", "velocity")
     )
-    params = robot.params(kp=KP, ki=0.0, kd=KD, derivative_filter_time=0.002)
-    with Runner(robot, len(moves), params=params) as runner:
-        rollout = runner.rollout(position, setpoint_rates=rate)
-    arm = slice(0, 7)
-    error = np.abs(rollout.qpos - rollout.setpoint)[:, :, arm]
-    print(f"{'profile':14} {'arrives':>9} {'worst error':>12} {'final error':>12} {'peak effort':>12}")
-    for env, (name, move) in enumerate(moves.items()):
-        arrival = move.time[np.argmax((move.position == move.position[-1]).all(-1))]
-        print(
-            f"{name:14} {arrival:7.2f} s {error[:, env].max():8.3f} rad {error[-1, env].max():8.4f} rad "
-            f"{np.abs(rollout.effort[:, env, arm]).max():8.1f} N m"
-        )
+    sets = {"PD": robot.params(kp=KP, ki=0.0, kd=KD, derivative_filter_time=0.002), "tuned": robot.tuned()}
+    arrivals = [move.time[np.argmax((move.position == move.position[-1]).all(-1))] for move in moves.values()]
+    rows = [f"{name:16}{arrival:8.2f} s" for name, arrival in zip(moves, arrivals, strict=True)]
+    for params in sets.values():
+        with Runner(robot, len(moves), params=params) as runner:
+            rollout = runner.rollout(position, setpoint_rates=rate)
+        errors = np.abs(rollout.qpos - rollout.setpoint)[:, :, :7].max((0, 2))  # of the arm
+        efforts = np.abs(rollout.effort)[:, :, :7].max((0, 2))
+        pairs = zip(rows, errors, efforts, strict=True)
+        rows = [f"{row}{error:10.4f} rad{effort:8.1f} N m" for row, error, effort in pairs]
+    print(f"{'':26}" + "".join(f"{name:>26}" for name in sets))
+    print(f"{'profile':16}{'arrives':>10}" + 2 * f"{'worst error':>14}{'effort':>12}")
+    print("\n".join(rows))
 
 
 if __name__ == "__main__":
