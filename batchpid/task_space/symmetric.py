@@ -69,45 +69,50 @@ def solve(matrix: Any, right: Any) -> Any:
     return gram(factor, gram(namespace(right).swapaxes(factor, -1, -2), right))
 
 
-def bounded_inverse(matrix: Any, smallest: Any) -> tuple[Any, Any]:
+def bounded_inverse(matrix: Any, smallest: Any, *lower: Any) -> tuple[Any, ...]:
     """Return the bounded inverses (..., n, n) of positive semidefinite matrices, and where they differ from inverses.
 
     An eigenvalue s becomes 1/s if s >= s0 = ``smallest`` (a number or (...)), else s/s0^2: continuous, at most 1/s0,
-    and 0 where s is 0. Where 1/|matrix^-1| >= s0, no eigenvalue is below s0, and the inverse is Cholesky's.
+    and 0 where s is 0. Where 1/|matrix^-1| >= s0, no eigenvalue is below s0, and the inverse is Cholesky's. Inverses
+    with ``lower`` bounds follow the first, to the bit the same where no eigenvalue is below s0.
     """
     with quiet():
         if matrix.ndim > 2:
-            return _bounded_inverse(matrix, smallest)
-        found, near = _bounded_inverse(matrix[None], smallest)
-        return found[0], near[0]
+            return _bounded_inverse(matrix, smallest, *lower)
+        return tuple([leaf[0] for leaf in _bounded_inverse(matrix[None], smallest, *lower)])
 
 
-def _bounded_inverse(matrix: Any, smallest: Any) -> tuple[Any, Any]:
+def _bounded_inverse(matrix: Any, *bounds: Any) -> tuple[Any, ...]:
     xp = namespace(matrix)
     plain = inverse(matrix)
-    s0 = xp.asarray(smallest, dtype=matrix.dtype)
+    s0, *lower = [xp.asarray(bound, dtype=matrix.dtype) for bound in bounds]
     norm = xp.sqrt((plain * plain).sum(-1).sum(-1))
     sure = norm * s0 <= 1  # False for NaN
     if xp is not np:
-        bounded, low = _bounded(matrix, s0)
-        return xp.where(sure[..., None, None], plain, bounded), ~sure & low
+        *bounded, low = _bounded(matrix, s0, *lower)
+        return *[xp.where(sure[..., None, None], plain, each) for each in bounded], ~sure & low
     if sure.all():
-        return plain, ~sure
-    out, near = plain.copy(), ~sure
-    rows = np.broadcast_to(s0, near.shape)[near]
-    out[near], near[near] = _bounded(matrix[near], rows)
-    return out, near
+        return *[plain for _ in bounds], ~sure
+    out, near = [plain.copy() for _ in bounds], ~sure
+    *bounded, low = _bounded(matrix[near], *[np.broadcast_to(bound, near.shape)[near] for bound in (s0, *lower)])
+    for leaf, rows in zip(out, bounded, strict=True):
+        leaf[near] = rows
+    near[near] = low
+    return *out, near
 
 
-def _bounded(matrix: Any, smallest: Any) -> tuple[Any, Any]:
-    """Return the bounded inverse by eigenvalues, and whether any is below ``smallest`` (...)."""
+def _bounded(matrix: Any, *bounds: Any) -> tuple[Any, ...]:
+    """Return the inverses by eigenvalues for each of ``bounds`` (...), and whether any is below the first."""
     xp = namespace(matrix)
     values, vectors = eigen(matrix)
-    s0 = smallest[..., None]
-    large = values >= s0
-    scale = xp.where(large, 1 / xp.where(large, values, 1.0), xp.maximum(values, 0.0) / (s0 * s0))
     rows = xp.swapaxes(vectors, -1, -2)
-    return gram(rows * scale[..., None], rows), ~large.all(-1)
+
+    def inverse_above(s0: Any) -> Any:
+        large = values >= s0
+        scale = xp.where(large, 1 / xp.where(large, values, 1.0), xp.maximum(values, 0.0) / (s0 * s0))
+        return gram(rows * scale[..., None], rows)
+
+    return *[inverse_above(bound[..., None]) for bound in bounds], ~(values >= bounds[0][..., None]).all(-1)
 
 
 def eigen(matrix: Any) -> tuple[Any, Any]:
