@@ -13,7 +13,7 @@
 namespace batchpid {
 
 constexpr int SWEEPS = 12;
-constexpr double SPRING_BOUND = 0.1;  // as in projections.py
+constexpr double SPRING_BOUND = 0.2;  // as in projections.py
 constexpr double CLEAR = 1e-17;  // least entry off the diagonal that is turned away, as a share of the trace: below
                                  // the rounding of the matrix itself
 constexpr int PAIRS = AXES / 2;
@@ -105,7 +105,7 @@ struct Weighted {
 };
 
 // Write the bounded inverses by eigenvalues in the lanes of `unsure`; `near` gets 1.0 where any is below s0, and `more`
-// the inverse with the bound SPRING_BOUND * s0 less this one, of any value in the other lanes.
+// the smooth inverse with the bound SPRING_BOUND * s0 less this one, of any value in the other lanes.
 inline void bound_inverses(Lanes const *matrix, Lanes s0, Lanes unsure, Lanes *out, Lanes &near, Weighted &more) {
   Symmetric a;
   Lanes(&vectors)[AXES][AXES] = more.vectors;
@@ -119,8 +119,8 @@ inline void bound_inverses(Lanes const *matrix, Lanes s0, Lanes unsure, Lanes *o
   for (int c = 0; c < AXES; ++c) {
     Lanes const s = a(c, c), large = at_least_mask(s, s0);
     Lanes const exact = 1.0 / s, least = at_least(s, 0.0), scale = where_positive(large, exact, least * steepest);
-    Lanes const of_springs = where_positive(at_least_mask(s, s1), exact, least * steepest_of_springs);
-    more.weights[c] = where_positive(large, 0.0, of_springs - scale);
+    Lanes const smooth = least * (2.0 - least * least * steepest_of_springs) * steepest_of_springs;
+    more.weights[c] = where_positive(large, 0.0, where_positive(at_least_mask(s, s1), exact, smooth) - scale);
     low = where_positive(large, low, 1.0);
     for (int i = 0; i < AXES; ++i) scaled[i][c] = scale * vectors[i][c];
   }

@@ -27,10 +27,11 @@ and rotations are left out of L. A bounded inverse turns an eigenvalue s into 1/
 singularity the direction in which the tool cannot move loses its stiffness to the posture, continuously, and the motion
 returns from it.
 
-The bound of L and L_n is s0, the bound of L_s is s0/10. Below the bound of its inertia the posture enters the task.
-With damping it has to: there the task has lost most of its own. With springs it pulls the tool off a pose that it
-reaches. With L_n in the place of L_s, the error at rest would be (s0^2/s^2 - 1) (v J a_s) / kp along the eigenvector v.
-It is 0 for s >= s0/10. Below, the springs draw the robot out of the singular pose.
+Below its bound an inertia lets the posture into the task. The damping has to enter below s0, where the task loses its
+own. The springs would pull the tool off poses that it reaches: at rest its error would be (s0^2/s^2 - 1) (v J a_s) / kp
+along the eigenvector v. So L_s has a lower bound s1 = s0/5, below which the springs draw the robot out of the singular
+pose: an eigenvalue s turns into 1/s, or s (2 - s^2/s1^2) / s1^2 below s1. The derivative is continuous, since a robot
+whose setpoint is out of reach rests just below s1, where a kink would chatter.
 
 Saturation keeps the direction of the motion: s1 in [0, 1] is the largest share of the task with which all joints are
 within their limits, and s2 the largest share of the posture in the room that is left. A joint whose u is out of limits

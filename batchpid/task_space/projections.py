@@ -14,8 +14,8 @@ from batchpid.task_space.osc_state import TaskDynamics
 from batchpid.task_space.symmetric import bounded_inverse, gram, product, whitened
 
 
-SPRING_BOUND = 0.1
-"""Bound of L_s, the inertia against the springs of the posture, as a share of the bound s0 of L_n."""
+SPRING_BOUND = 0.2
+"""Bound s1 of L_s, as a share of the bound s0 of L_n."""
 
 
 class Projections(NamedTuple):
@@ -96,15 +96,15 @@ def _inertias(k: OSCCoefficients, mobility: Any, xp: Any) -> tuple[Any, Any, Any
     return task, null, springs, near | bounded
 
 
-def _selected_inverse(mobility: Any, axes: Any, xp: Any, smallest: Any, *lower: Any) -> tuple[Any, ...]:
+def _selected_inverse(mobility: Any, axes: Any, xp: Any, smallest: Any, *smooth: Any) -> tuple[Any, ...]:
     """Return S^T (S A S^T)^-1 S, for each bound, with the selected ``axes`` (1 | envs, 6), and where it is bounded."""
     if axes is None:
-        return bounded_inverse(mobility, smallest, *lower)
+        return bounded_inverse(mobility, smallest, *smooth)
     both = axes[..., :, None] * axes[..., None, :] > 0
     free = (1 - axes)[..., None] * xp.eye(6, dtype=mobility.dtype)
     # The other axes get an eigenvalue apart from the selected ones, at or above the bound.
     alone = free * xp.maximum(smallest, 1.0)[..., None, None]
-    *inverses, near = bounded_inverse(xp.where(both, mobility, alone), smallest, *lower)
+    *inverses, near = bounded_inverse(xp.where(both, mobility, alone), smallest, *smooth)
     return *[xp.where(both, inverse, xp.zeros_like(inverse)) for inverse in inverses], near
 
 
