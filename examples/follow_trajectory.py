@@ -2,9 +2,8 @@
 
     python examples/follow_trajectory.py
 
-Each robot of the batch follows another profile over the same path, under a PD with gains in efforts and under the tuned
-gains, which are per mass matrix. Both get the setpoint's rate, so that they damp the velocity error and not the
-velocity. What remains of the PD's error is due to the acceleration: gains per mass matrix take it from the rates.
+Each robot of the batch follows another profile over the same path, under the default gains. The runner gets rates and
+accelerations of the setpoint: the errors that remain show how hard a profile is to follow.
 """
 
 import numpy as np
@@ -14,9 +13,6 @@ from batchpid.sim import Robot, Runner
 from batchpid.trajectories import Trajectory, jerk_limited, minimum_jerk, trapezoidal
 
 DT = 0.01  # a tick: 20 sim steps [s]
-# Stiffness and damping of the arm in libfranka's joint impedance example, and a soft hold of the fingers.
-KP = [600, 600, 600, 600, 250, 150, 50, 100, 100]  # N m/rad, N/m
-KD = [50, 50, 50, 50, 30, 25, 15, 10, 10]  # N m s/rad, N s/m
 
 
 def profiles(start, target, velocity, acceleration) -> dict[str, Trajectory]:
@@ -35,27 +31,26 @@ def profiles(start, target, velocity, acceleration) -> dict[str, Trajectory]:
 
 
 def main():
-    """Run one robot per profile under each set of gains, and print the errors."""
+    """Run one robot per profile and print the errors of each."""
     robot = Robot.load("panda")
     velocity = 0.5 * robot.velocity_limit
     moves = profiles(robot.start, robot.settings.target, velocity, acceleration=4 * velocity)
     ticks = min(move.ticks for move in moves.values())
-    position, rate = (
-        np.stack([getattr(move, name)[:ticks] for move in moves.values()], axis=1) for name in ("position", "velocity")
+    position, rate, acceleration = (
+        np.stack([getattr(move, name)[:ticks] for move in moves.values()], axis=1)
+        for name in ("position", "velocity", "acceleration")
     )
-    sets = {"PD": robot.params(kp=KP, ki=0.0, kd=KD, derivative_filter_time=0.002), "tuned": robot.tuned()}
-    arrivals = [move.time[np.argmax((move.position == move.position[-1]).all(-1))] for move in moves.values()]
-    rows = [f"{name:16}{arrival:8.2f} s" for name, arrival in zip(moves, arrivals, strict=True)]
-    for params in sets.values():
-        with Runner(robot, len(moves), params=params) as runner:
-            rollout = runner.rollout(position, setpoint_rates=rate)
-        errors = np.abs(rollout.qpos - rollout.setpoint)[:, :, :7].max((0, 2))  # of the arm
-        efforts = np.abs(rollout.effort)[:, :, :7].max((0, 2))
-        pairs = zip(rows, errors, efforts, strict=True)
-        rows = [f"{row}{error:10.4f} rad{effort:8.1f} N m" for row, error, effort in pairs]
-    print(f"{'':26}" + "".join(f"{name:>26}" for name in sets))
-    print(f"{'profile':16}{'arrives':>10}" + 2 * f"{'worst error':>14}{'effort':>12}")
-    print("\n".join(rows))
+    with Runner(robot, len(moves)) as runner:
+        rollout = runner.rollout(position, setpoint_rates=rate, setpoint_accelerations=acceleration)
+    arm = slice(0, 7)
+    error = np.abs(rollout.qpos - rollout.setpoint)[:, :, arm]
+    print(f"{'profile':14} {'arrives':>9} {'worst error':>12} {'final error':>12} {'peak effort':>12}")
+    for env, (name, move) in enumerate(moves.items()):
+        arrival = move.time[np.argmax((move.position == move.position[-1]).all(-1))]
+        print(
+            f"{name:14} {arrival:7.2f} s {1e3 * error[:, env].max():7.2f} mrad {1e3 * error[-1, env].max():7.3f} mrad "
+            f"{np.abs(rollout.effort[:, env, arm]).max():8.1f} N m"
+        )
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@
 namespace batchpid {
 
 constexpr int SWEEPS = 12;
+constexpr double SPRING_BOUND = 0.2;  // as in projections.py
 constexpr double CLEAR = 1e-17;  // least entry off the diagonal that is turned away, as a share of the trace: below
                                  // the rounding of the matrix itself
 constexpr int PAIRS = AXES / 2;
@@ -88,19 +89,38 @@ inline void eigen(Symmetric &a, Lanes (&vectors)[AXES][AXES]) {
   }
 }
 
-// Write the bounded inverses by eigenvalues in the lanes of `unsure`; `near` gets 1.0 where any is below s0.
-inline void bound_inverses(Lanes const *matrix, Lanes s0, Lanes unsure, Lanes *out, Lanes &near) {
+// Eigenvectors, as columns, and weights: a symmetric matrix.
+struct Weighted {
+  // Add the product with a vector to `out`.
+  void add(Lanes const *vector, Lanes *out) const {
+    for (int c = 0; c < AXES; ++c) {
+      Lanes sum{};
+      for (int i = 0; i < AXES; ++i) sum += vectors[i][c] * vector[i];
+      sum = weights[c] * sum;
+      for (int i = 0; i < AXES; ++i) out[i] += vectors[i][c] * sum;
+    }
+  }
+
+  Lanes vectors[AXES][AXES], weights[AXES];
+};
+
+// Write the bounded inverses by eigenvalues in the lanes of `unsure`; `near` gets 1.0 where any is below s0, and `more`
+// the smooth inverse with the bound SPRING_BOUND * s0 less this one, of any value in the other lanes.
+inline void bound_inverses(Lanes const *matrix, Lanes s0, Lanes unsure, Lanes *out, Lanes &near, Weighted &more) {
   Symmetric a;
-  Lanes vectors[AXES][AXES], scaled[AXES][AXES], low{};
+  Lanes(&vectors)[AXES][AXES] = more.vectors;
+  Lanes scaled[AXES][AXES], low{};
   for (int i = 0; i < AXES; ++i) {
     // The lanes that are left out are diagonal, and end at once.
     for (int j = i; j < AXES; ++j) a(i, j) = where_positive(unsure, matrix[i * AXES + j], i == j ? 1.0 : 0.0);
   }
   eigen(a, vectors);
-  Lanes const steepest = 1.0 / (s0 * s0);
+  Lanes const s1 = SPRING_BOUND * s0, steepest = 1.0 / (s0 * s0), steepest_of_springs = 1.0 / (s1 * s1);
   for (int c = 0; c < AXES; ++c) {
     Lanes const s = a(c, c), large = at_least_mask(s, s0);
-    Lanes const scale = where_positive(large, 1.0 / s, at_least(s, 0.0) * steepest);
+    Lanes const exact = 1.0 / s, least = at_least(s, 0.0), scale = where_positive(large, exact, least * steepest);
+    Lanes const smooth = least * (2.0 - least * least * steepest_of_springs) * steepest_of_springs;
+    more.weights[c] = where_positive(large, 0.0, where_positive(at_least_mask(s, s1), exact, smooth) - scale);
     low = where_positive(large, low, 1.0);
     for (int i = 0; i < AXES; ++i) scaled[i][c] = scale * vectors[i][c];
   }
@@ -115,9 +135,10 @@ inline void bound_inverses(Lanes const *matrix, Lanes s0, Lanes unsure, Lanes *o
   }
 }
 
-// Write the bounded inverses of mobilities over the selected axes; `near` gets 1.0 in the lanes where it is bounded.
+// Write the bounded inverses of mobilities over the selected axes; `near` gets 1.0 in the lanes where it is bounded,
+// where `more` is as in bound_inverses, with 0 for the other axes.
 inline void selected_inverse(Lanes const (&mobility)[AXES * AXES], Lanes const *axes, Lanes s0,
-                             Lanes (&out)[AXES * AXES], Lanes &near) {
+                             Lanes (&out)[AXES * AXES], Lanes &near, Weighted &more) {
   Lanes matrix[AXES * AXES], room[AXES * AXES];
   std::copy(mobility, mobility + AXES * AXES, matrix);
   for (int i = 0; i < AXES && axes != nullptr; ++i) {
@@ -131,7 +152,7 @@ inline void selected_inverse(Lanes const (&mobility)[AXES * AXES], Lanes const *
   Lanes square{};
   for (Lanes const &entry : out) square += entry * entry;
   Lanes const sure = at_least_mask(1.0, root(square) * s0);  // no eigenvalue is below s0; 0.0 for nan
-  if (any_positive(1.0 - sure)) bound_inverses(matrix, s0, 1.0 - sure, out, near);
+  if (any_positive(1.0 - sure)) bound_inverses(matrix, s0, 1.0 - sure, out, near, more);
   for (int i = 0; i < AXES && axes != nullptr; ++i) {
     for (int j = 0; j < AXES; ++j) {
       out[i * AXES + j] = where_positive(axes[i] * axes[j], out[i * AXES + j], Lanes{});

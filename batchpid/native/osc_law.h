@@ -143,7 +143,7 @@ class OSCLaw {
     factor_.resize(links * links);
     white_.resize(links * AXES);
     both_.resize(links * 2);
-    for (auto *leaf : {&a_n_, &base_, &task_, &posture_, &of_task_, &of_posture_, &effort_, &whole_, &limited_}) {
+    for (auto *leaf : {&a_n_, &a_s_, &base_, &task_, &posture_, &of_task_, &of_posture_, &effort_, &whole_, &limited_}) {
       leaf->resize(n);
     }
     if (dynamics == nullptr) return;
@@ -177,7 +177,7 @@ class OSCLaw {
 
   std::int64_t links() const { return static_cast<std::int64_t>(chain_.size()); }
 
-  // Set error, a and a_n.
+  // Set error, a, a_n and a_s.
   void set_accelerations() {
     Lanes *jacobian = given_[TASK_JACOBIAN], *rate = given_[TASK_RATE];
     Lanes const *qpos = given_[LAW_QPOS], *qvel = given_[LAW_QVEL];
@@ -213,18 +213,20 @@ class OSCLaw {
       for (int k = 0; k < WIDTH && given_[TURNS] != nullptr; ++k) {
         away.of[k] -= TURN * std::nearbyint(away.of[k] * given_[TURNS][j].of[k]);
       }
-      a_n_[j] = given_[POSTURE_KP][j] * away - given_[POSTURE_KD][j] * qvel[j];
+      a_s_[j] = given_[POSTURE_KP][j] * away;
+      a_n_[j] = a_s_[j] - given_[POSTURE_KD][j] * qvel[j];
       if (given_[LIMIT_KP] == nullptr) continue;
       Lanes const low = given_[LIMIT_LOW][j] - qpos[j], high = qpos[j] - given_[LIMIT_HIGH][j];
       Lanes const depth = at_least(low, 0.0) - at_least(high, 0.0), within = absolute(depth);
       if (!any_positive(within)) continue;
       Lanes const damped = given_[LIMIT_KD][j] * qvel[j] * within / given_[LIMIT_MARGIN][j];
-      Lanes const pushed = a_n_[j] + given_[CHAIN][j] * (given_[LIMIT_KP][j] * depth - damped);
-      a_n_[j] = where_positive(within, pushed, a_n_[j]);
+      Lanes const pushed = given_[LIMIT_KP][j] * depth;
+      a_s_[j] = where_positive(within, a_s_[j] + given_[CHAIN][j] * pushed, a_s_[j]);
+      a_n_[j] = where_positive(within, a_n_[j] + given_[CHAIN][j] * (pushed - damped), a_n_[j]);
     }
   }
 
-  // Set the factor of M_cc, L and L_n.
+  // Set the factor of M_cc, L, L_n and L_s.
   void set_inertias() {
     Lanes const *jacobian = given_[TASK_JACOBIAN], *mass = given_[TASK_MASS], *axes = given_[SELECTED];
     std::int64_t const size = links();
@@ -251,7 +253,8 @@ class OSCLaw {
     }
     Lanes const s0 = *given_[SMALLEST];
     near_ = {};
-    selected_inverse(mobility, axes == nullptr ? nullptr : allowed, s0, null_inertia_, near_);
+    selected_inverse(mobility, axes == nullptr ? nullptr : allowed, s0, null_inertia_, near_, more_of_springs_);
+    null_near_ = near_;
     inertia_ = null_inertia_;
     if (decoupling_ != PARTIAL && !(decoupling_ == FULL && force_too)) return;
     for (int i = 0; i < AXES && decoupling_ == PARTIAL; ++i) {
@@ -259,7 +262,8 @@ class OSCLaw {
         if ((i < 3) != (j < 3)) mobility[i * AXES + j] = mobility[i * AXES + j] * 0.0;
       }
     }
-    selected_inverse(mobility, axes, s0, task_inertia_, near_);
+    Weighted unused;
+    selected_inverse(mobility, axes, s0, task_inertia_, near_, unused);
     inertia_ = task_inertia_;
   }
 
@@ -280,6 +284,16 @@ class OSCLaw {
                                          : moved[axis];
       if (given_[WRENCH] != nullptr) force_[axis] += given_[WRENCH][axis];
       drop[axis] = along(null_inertia_ + axis * AXES, pulled, AXES);
+    }
+    if (any_positive(null_near_)) {  // (L_s - L_n) J a_s
+      Lanes sprung[AXES], held[AXES];
+      for (std::int64_t const i : chain_) {
+        for (int axis = 0; axis < AXES; ++axis) sprung[axis] += jacobian[axis * dof_ + i] * a_s_[i];
+      }
+      more_of_springs_.add(sprung, held);
+      for (int axis = 0; axis < AXES; ++axis) {
+        drop[axis] = where_positive(null_near_, drop[axis] + held[axis], drop[axis]);
+      }
     }
     for (std::size_t c = 0; c < chain_.size(); ++c) {
       std::int64_t const i = chain_[c];
@@ -359,11 +373,12 @@ class OSCLaw {
   Given given_;
   std::vector<std::int64_t> chain_, others_;
   std::vector<Lanes> factor_, white_, both_;
-  std::vector<Lanes> a_n_, base_, task_, posture_, of_task_, of_posture_;  // 0 for joints without a part in an effort
+  std::vector<Lanes> a_n_, a_s_, base_, task_, posture_, of_task_, of_posture_;  // 0 for joints without a part in an effort
   std::vector<Lanes> effort_, whole_, limited_;
-  Lanes error_[AXES], near_error_[AXES], turned_[2][AXES], a_[AXES], force_[AXES], near_;
+  Lanes error_[AXES], near_error_[AXES], turned_[2][AXES], a_[AXES], force_[AXES], near_, null_near_;
   Lanes const *target_ = nullptr;  // twist of the setpoint in the law's axes
   Lanes task_inertia_[AXES * AXES], null_inertia_[AXES * AXES], *inertia_ = null_inertia_;
+  Weighted more_of_springs_;  // L_s - L_n, in the lanes of null_near_
 };
 
 }  // namespace batchpid

@@ -9,22 +9,29 @@ kd_n of the posture::
     A     = J M_cc^-1 J^T
     L     = (S A S^T)^-1, bounded                               its inertia, in the selected axes S
     F     = L (a - J' q') + wrench                              decoupling "full"; F = a + wrench with "none"
-    a_n   = kp_n (posture - q) - kd_n q' + limits(q, q')        acceleration of the posture
+    a_n   = a_s - a_d                                           acceleration of the posture: springs and damping
+    a_s   = kp_n (posture - q) + kp_l x
+    a_d   = kd_n q' + 2 sqrt(kp_l) q' |x| / margin
     task  = J^T F
-    null  = M_cc a_n - J^T L_n J a_n                            = N^T M_cc a_n, with J M_cc^-1 N^T = 0
+    null  = M_cc a_n - J^T (L_s J a_s - L_n J a_d)              = N^T M_cc a_n, with J M_cc^-1 N^T = 0
     u_c   = h + M_co a_o + s1 task + s2 null + feedforward      a_o = a_n of the other joints
     u_o   = h + M_oo a_o + M_oc M_cc^-1 (s1 task + s2 null) + feedforward
     I    <- I + ki dt e, within its limit, unless s1 < 1, u is clipped or L is bounded, and a e > 0
 
-These are the gains of the explicit law; :mod:`batchpid.task_space.osc_coefficients` has the implicit one. limits(q, q')
-pushes joints of the chain away from their limits: with the depth x of q in the margin, kp_l x - 2 sqrt(kp_l) q' |x| /
-margin.
+These are the gains of the explicit law; :mod:`batchpid.task_space.osc_coefficients` has the implicit one. Springs of
+stiffness kp_l push joints of the chain away from their limits; x is the depth of q in the margin.
 
 The other joints, such as fingers, are controlled by computed torque: in the task they would move with the hand. L_n is
 the inertia over the axes of motion and force, with full decoupling. With "partial" the blocks of A between positions
 and rotations are left out of L. A bounded inverse turns an eigenvalue s into 1/s, or s/s0^2 below s0: near a
 singularity the direction in which the tool cannot move loses its stiffness to the posture, continuously, and the motion
 returns from it.
+
+Below its bound an inertia lets the posture into the task. The damping has to enter below s0, where the task loses its
+own. The springs would pull the tool off poses that it reaches: at rest its error would be (s0^2/s^2 - 1) (v J a_s) / kp
+along the eigenvector v. So L_s has a lower bound s1 = s0/5, below which the springs draw the robot out of the singular
+pose: an eigenvalue s turns into 1/s, or s (2 - s^2/s1^2) / s1^2 below s1. The derivative is continuous, since a robot
+whose setpoint is out of reach rests just below s1, where a kink would chatter.
 
 Saturation keeps the direction of the motion: s1 in [0, 1] is the largest share of the task with which all joints are
 within their limits, and s2 the largest share of the posture in the room that is left. A joint whose u is out of limits
@@ -296,8 +303,8 @@ def _sums(
     xp = namespace(*k, *state, *dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward)
     task = in_frame(k, dynamics, setpoint, qvel, twist, acceleration, xp)
     a = _accelerations(k.kp, k.kd, k.c, k.acceleration_share, *task.motion, state.integral)
-    a_n = posture_acceleration(k, dynamics, state.posture, qpos, qvel)
-    p = projections(k, task.dynamics, a, a_n, wrench, feedforward)
+    a_n, a_s = posture_acceleration(k, dynamics, state.posture, qpos, qvel)
+    p = projections(k, task.dynamics, a, a_n, wrench, feedforward, a_s)
     parts = p.base, p.task, p.posture, p.task_of_others, p.posture_of_others, k.effort_min, k.effort_max
     return _Sums(task, a, p, parts)
 
@@ -370,14 +377,16 @@ def _accelerations(kp: Any, kd: Any, c: Any, share: Any, e: Any, v: Any, twist: 
     return a if i is None else a + i
 
 
-def posture_acceleration(k: OSCCoefficients, d: TaskDynamics, posture: Any, q: Any, v: Any) -> Any:
-    """Return a_n (envs, dof)."""
+def posture_acceleration(k: OSCCoefficients, d: TaskDynamics, posture: Any, q: Any, v: Any) -> tuple[Any, Any]:
+    """Return a_n and its part a_s (envs, dof)."""
     xp = namespace(posture, q, v)
-    a = k.posture_kp * wrap(posture - q, k.turns, xp) - k.posture_kd * v
+    springs = k.posture_kp * wrap(posture - q, k.turns, xp)
+    a = springs - k.posture_kd * v
     if k.limit_kp is None:
-        return a
+        return a, springs
     depth = xp.maximum(k.limit_low - q, 0.0) - xp.maximum(q - k.limit_high, 0.0)
-    return a + d.chain * (k.limit_kp * depth - k.limit_kd * v * xp.abs(depth) / k.limit_margin)
+    pushed = k.limit_kp * depth
+    return a + d.chain * (pushed - k.limit_kd * v * xp.abs(depth) / k.limit_margin), springs + d.chain * pushed
 
 
 def _saturated(

@@ -56,7 +56,7 @@ def track(
         known = bias if feedforward is None else bias + feedforward
         qacc = solve(mass, (effort - known)[..., None])[..., 0]
         stiff = k.posture_kp > 0
-        rest = qacc - posture_acceleration(k, dynamics, qpos, qpos, qvel)
+        rest = qacc - posture_acceleration(k, dynamics, qpos, qpos, qvel)[0]
         posture = qpos + xp.where(stiff, rest / xp.where(stiff, k.posture_kp, 1.0), 0.0)
         task = in_frame(k, dynamics, setpoint, qvel, twist, acceleration, xp)
         wanted = product(task.dynamics.jacobian, qacc) + task.dynamics.jacobian_rate

@@ -14,6 +14,10 @@ from batchpid.task_space.osc_state import TaskDynamics
 from batchpid.task_space.symmetric import bounded_inverse, gram, product, whitened
 
 
+SPRING_BOUND = 0.2
+"""Bound s1 of L_s, as a share of the bound s0 of L_n."""
+
+
 class Projections(NamedTuple):
     """Efforts before saturation, arrays (envs, dof)."""
 
@@ -22,7 +26,7 @@ class Projections(NamedTuple):
     task: Any
     """J^T F."""
     posture: Any
-    """N^T M_cc a_n of the chain."""
+    """N^T M_cc a_n of the chain: M_cc a_n - J^T (L_n J a_n + (L_s - L_n) J a_s)."""
     base: Any
     """h + M a_o + feedforward."""
     task_of_others: Any
@@ -34,21 +38,32 @@ class Projections(NamedTuple):
 
 
 def projections(
-    k: OSCCoefficients, d: TaskDynamics, a: Any, a_n: Any, wrench: Any = None, feedforward: Any = None
+    k: OSCCoefficients,
+    d: TaskDynamics,
+    a: Any,
+    a_n: Any,
+    wrench: Any = None,
+    feedforward: Any = None,
+    springs: Any = None,
 ) -> Projections:
-    """Return the efforts of the accelerations ``a`` (envs, 6) of the task and ``a_n`` (envs, dof) of the posture."""
+    """Return the efforts of the accelerations ``a`` (envs, 6) of the task and ``a_n`` (envs, dof) of the posture.
+
+    ``springs`` (envs, dof) is the part a_s of a_n, all of it if None.
+    """
     xp = namespace(*k, *d, a, a_n, wrench, feedforward)
     j, m, chain = d.jacobian, d.mass_matrix, d.chain
     eye = xp.eye(m.shape[-1], dtype=m.dtype)
     m_cc = xp.where((chain[:, None] * chain) > 0, m, eye)  # the other joints apart, with unit inertia
     y = whitened(m_cc, xp.concatenate([xp.swapaxes(j, -1, -2), eye + xp.zeros_like(m)], axis=-1))
-    task_inertia, null_inertia, singular = _inertias(k, gram(y[..., :6], y[..., :6]), xp)
+    task_inertia, null_inertia, spring_inertia, singular = _inertias(k, gram(y[..., :6], y[..., :6]), xp)
     f = product(task_inertia, a - d.jacobian_rate) if task_inertia is not None else _selected(k.axes, a)
     f = f if wrench is None else f + wrench
     task = gram(j, f[..., None])[..., 0]
 
     a_c, a_o = a_n * chain, a_n * (1 - chain)
-    null = product(m, a_c) - gram(j, product(null_inertia, product(j, a_c))[..., None])[..., 0]
+    # The difference is 0 to the bit where neither inertia is bounded.
+    held = product(spring_inertia - null_inertia, product(j, (a_n if springs is None else springs) * chain))
+    null = product(m, a_c) - gram(j, (product(null_inertia, product(j, a_c)) + held)[..., None])[..., 0]
     null = null * chain
     base = d.bias + product(m, a_o)
     base = base if feedforward is None else base + feedforward
@@ -62,35 +77,35 @@ def projections(
     return Projections(f, task, null, base, of_others(task), of_others(null), singular)
 
 
-def _inertias(k: OSCCoefficients, mobility: Any, xp: Any) -> tuple[Any, Any, Any]:
-    """Return L, None with decoupling "none", and L_n of the mobility A (envs, 6, 6), and where either is bounded."""
+def _inertias(k: OSCCoefficients, mobility: Any, xp: Any) -> tuple[Any, Any, Any, Any]:
+    """Return L, None with decoupling "none", L_n and L_s of the mobility A (envs, 6, 6), and where any is bounded."""
     s0 = k.smallest_eigenvalue[..., 0]
     allowed = k.axes
     if k.force_axes is not None and k.axes is not None:
         allowed = xp.maximum(k.axes, k.force_axes)
-    null, near = _selected_inverse(mobility, allowed, s0, xp)
+    null, springs, near = _selected_inverse(mobility, allowed, xp, s0, SPRING_BOUND * s0)
     if isinstance(k.decoupling, NoDecoupling):
-        return None, null, near
+        return None, null, springs, near
     partial = isinstance(k.decoupling, PartialDecoupling)
     if allowed is k.axes and not partial:
-        return null, null, near
+        return null, null, springs, near
     if partial:
         half = xp.asarray([1.0] * 3 + [0.0] * 3, dtype=mobility.dtype)
         mobility = mobility * (half[:, None] * half + (1 - half)[:, None] * (1 - half))
-    task, bounded = _selected_inverse(mobility, k.axes, s0, xp)
-    return task, null, near | bounded
+    task, bounded = _selected_inverse(mobility, k.axes, xp, s0)
+    return task, null, springs, near | bounded
 
 
-def _selected_inverse(mobility: Any, axes: Any, smallest: Any, xp: Any) -> tuple[Any, Any]:
-    """Return S^T (S A S^T)^-1 S, bounded, for the selected ``axes`` (1 | envs, 6), and where it is bounded."""
+def _selected_inverse(mobility: Any, axes: Any, xp: Any, smallest: Any, *smooth: Any) -> tuple[Any, ...]:
+    """Return S^T (S A S^T)^-1 S, for each bound, with the selected ``axes`` (1 | envs, 6), and where it is bounded."""
     if axes is None:
-        return bounded_inverse(mobility, smallest)
+        return bounded_inverse(mobility, smallest, *smooth)
     both = axes[..., :, None] * axes[..., None, :] > 0
     free = (1 - axes)[..., None] * xp.eye(6, dtype=mobility.dtype)
     # The other axes get an eigenvalue apart from the selected ones, at or above the bound.
     alone = free * xp.maximum(smallest, 1.0)[..., None, None]
-    inverse, near = bounded_inverse(xp.where(both, mobility, alone), smallest)
-    return xp.where(both, inverse, xp.zeros_like(inverse)), near
+    *inverses, near = bounded_inverse(xp.where(both, mobility, alone), smallest, *smooth)
+    return *[xp.where(both, inverse, xp.zeros_like(inverse)) for inverse in inverses], near
 
 
 def _selected(axes: Any, vector: Any) -> Any:

@@ -69,45 +69,56 @@ def solve(matrix: Any, right: Any) -> Any:
     return gram(factor, gram(namespace(right).swapaxes(factor, -1, -2), right))
 
 
-def bounded_inverse(matrix: Any, smallest: Any) -> tuple[Any, Any]:
+def bounded_inverse(matrix: Any, smallest: Any, *smooth: Any) -> tuple[Any, ...]:
     """Return the bounded inverses (..., n, n) of positive semidefinite matrices, and where they differ from inverses.
 
     An eigenvalue s becomes 1/s if s >= s0 = ``smallest`` (a number or (...)), else s/s0^2: continuous, at most 1/s0,
     and 0 where s is 0. Where 1/|matrix^-1| >= s0, no eigenvalue is below s0, and the inverse is Cholesky's.
+
+    For each further bound s1 <= s0 of ``smooth``, an inverse follows the first in which s becomes s (2 - s^2/s1^2) /
+    s1^2 below s1, with a continuous derivative. It has the bits of the first where no eigenvalue is below s0.
     """
     with quiet():
         if matrix.ndim > 2:
-            return _bounded_inverse(matrix, smallest)
-        found, near = _bounded_inverse(matrix[None], smallest)
-        return found[0], near[0]
+            return _bounded_inverse(matrix, smallest, *smooth)
+        return tuple([leaf[0] for leaf in _bounded_inverse(matrix[None], smallest, *smooth)])
 
 
-def _bounded_inverse(matrix: Any, smallest: Any) -> tuple[Any, Any]:
+def _bounded_inverse(matrix: Any, *bounds: Any) -> tuple[Any, ...]:
     xp = namespace(matrix)
     plain = inverse(matrix)
-    s0 = xp.asarray(smallest, dtype=matrix.dtype)
+    s0, *smooth = [xp.asarray(bound, dtype=matrix.dtype) for bound in bounds]
     norm = xp.sqrt((plain * plain).sum(-1).sum(-1))
     sure = norm * s0 <= 1  # False for NaN
     if xp is not np:
-        bounded, low = _bounded(matrix, s0)
-        return xp.where(sure[..., None, None], plain, bounded), ~sure & low
+        *bounded, low = _bounded(matrix, s0, *smooth)
+        return *[xp.where(sure[..., None, None], plain, each) for each in bounded], ~sure & low
     if sure.all():
-        return plain, ~sure
-    out, near = plain.copy(), ~sure
-    rows = np.broadcast_to(s0, near.shape)[near]
-    out[near], near[near] = _bounded(matrix[near], rows)
-    return out, near
+        return *[plain for _ in bounds], ~sure
+    out, near = [plain.copy() for _ in bounds], ~sure
+    *bounded, low = _bounded(matrix[near], *[np.broadcast_to(bound, near.shape)[near] for bound in (s0, *smooth)])
+    for leaf, rows in zip(out, bounded, strict=True):
+        leaf[near] = rows
+    near[near] = low
+    return *out, near
 
 
-def _bounded(matrix: Any, smallest: Any) -> tuple[Any, Any]:
-    """Return the bounded inverse by eigenvalues, and whether any is below ``smallest`` (...)."""
+def _bounded(matrix: Any, smallest: Any, *smooth: Any) -> tuple[Any, ...]:
+    """Return the inverses by eigenvalues, and whether any is below ``smallest`` (...)."""
     xp = namespace(matrix)
     values, vectors = eigen(matrix)
+    positive, rows = xp.maximum(values, 0.0), xp.swapaxes(vectors, -1, -2)
+
+    def inverse_with(bound: Any, below: Any) -> Any:
+        large = values >= bound
+        scale = xp.where(large, 1 / xp.where(large, values, 1.0), below / (bound * bound))
+        return gram(rows * scale[..., None], rows)
+
     s0 = smallest[..., None]
-    large = values >= s0
-    scale = xp.where(large, 1 / xp.where(large, values, 1.0), xp.maximum(values, 0.0) / (s0 * s0))
-    rows = xp.swapaxes(vectors, -1, -2)
-    return gram(rows * scale[..., None], rows), ~large.all(-1)
+    inverses = [inverse_with(s0, positive)]
+    for s1 in (each[..., None] for each in smooth):
+        inverses.append(inverse_with(s1, positive * (2 - (positive / s1) ** 2)))
+    return *inverses, ~(values >= s0).all(-1)
 
 
 def eigen(matrix: Any) -> tuple[Any, Any]:

@@ -89,11 +89,9 @@ def test_list_joints_lists_every_joint(run):
 @pytest.mark.usefixtures("one_process")
 def test_a_profile_is_followed_with_less_error_than_a_step(run):
     text = run("follow_trajectory.py")
-    rows = {row[:16].strip(): row[16:].split() for row in text.splitlines() if " rad " in row}
-    assert set(rows) >= {"trapezoidal", "minimum jerk", "step"}
-    worst, worst_of_tuned = ({name: float(row[column]) for name, row in rows.items()} for column in (2, 7))
-    assert worst["minimum jerk"] < worst["trapezoidal"] < 0.1 < worst["step"]
-    assert max(worst_of_tuned["minimum jerk"], worst_of_tuned["trapezoidal"]) < 1e-3 < 0.5 < worst_of_tuned["step"]
+    worst = {row[:14].strip(): float(row[14:].split()[2]) for row in text.splitlines() if " mrad " in row}
+    assert set(worst) >= {"trapezoidal", "minimum jerk", "step"}
+    assert max(worst["minimum jerk"], worst["trapezoidal"]) < 1 < 500 < worst["step"]  # mrad
 
 
 @pytest.mark.slow

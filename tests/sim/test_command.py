@@ -509,7 +509,7 @@ def test_gymnasium_actions_are_commands_within_their_bounds(arm, actions):
     env = ReachVectorEnv(3, arm, actions=actions, control=Cartesian(), workers=0, max_episode_steps=4, **increment)
     given = []
     send = env.runner.send
-    env.runner.send = lambda setpoint: given.append(setpoint) or send(setpoint)
+    env.runner.send = lambda setpoint, **more: given.append(setpoint) or send(setpoint, **more)
     assert env.single_action_space.shape == (2,)
     assert env.single_observation_space.shape == (6,)
     env.reset(seed=1)

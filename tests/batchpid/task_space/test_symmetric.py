@@ -67,6 +67,23 @@ def test_it_is_continuous_where_the_bound_begins():
         np.testing.assert_array_equal(near, [True, False, False])
 
 
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**31))
+def test_the_smooth_bounded_inverse_has_a_continuous_derivative(seed):
+    matrix, _ = matrices(seed, 6, 6)
+    s0, s1 = 0.5, 0.2
+    first, found, near = bounded_inverse(matrix, s0, s1)
+    np.testing.assert_array_equal(first, bounded_inverse(matrix, s0)[0])
+    np.testing.assert_array_equal(found[~near], first[~near])
+    values, axes = np.linalg.eigh(matrix)
+    smooth = np.where(values >= s1, 1 / np.maximum(values, s1), values * (2 - (values / s1) ** 2) / s1**2)
+    np.testing.assert_allclose(found, (axes * smooth[:, None]) @ axes.transpose(0, 2, 1), atol=1e-9)
+    step = 1e-5
+    around = s1 * np.array([1 - 2 * step, 1 - step, 1, 1 + step, 1 + 2 * step])
+    along = bounded_inverse(around[:, None, None], s0, s1)[1][:, 0, 0]
+    np.testing.assert_allclose(np.diff(along) / (s1 * step), -1 / s1**2, rtol=1e-3)
+
+
 def test_a_row_does_not_depend_on_the_others_and_nan_stays_alone():
     matrix, _ = matrices(0, 30, 6, spread=3.0)
     matrix[4], matrix[5, 0, 0] = np.nan, np.inf

@@ -17,6 +17,7 @@ from batchpid.sim.identification.excitation import excite
 pytest.importorskip("scipy")
 pytest.importorskip("cmaes")
 
+pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
 
 PENDULUM = """<robot name="pendulum"><link name="base"/>
 <link name="bob"><inertial><origin xyz="0 0 -0.3"/><mass value="2"/>
