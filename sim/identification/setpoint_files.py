@@ -30,7 +30,7 @@ SHARE = 0.2
 LONGEST = 1.0
 """Longest time from row to row [s]."""
 STEP = 2.0
-"""Change of a setpoint over a tick above which it is a step, over what the velocity limit allows."""
+"""Speed of a setpoint, in velocity limits, above which its change over a tick counts as a step."""
 
 
 class Setpoints(NamedTuple):
