@@ -405,6 +405,5 @@ def test_a_recording_with_setpoint_rates_is_refused(panda, tmp_path):
     assert (without.info.rates, rated.info.rates, Rollout.join([without, rated]).info.rates) == (False, True, True)
     path = write_recording(rated, tmp_path / "run.npz")
     assert read_recording(path).info.rates
-    assert len(read_logs(panda, [write_recording(without, tmp_path / "plain.npz")])) == 1
-    with pytest.raises(bp.InvalidArgumentError, match="was made with setpoint rates.*record one without"):
+    with pytest.raises(bp.InvalidArgumentError, match=r"was made with setpoint rates.*record one without"):
         read_logs(panda, [path])
