@@ -30,6 +30,23 @@ def run_report(runner: Runner, rollout: Rollout, metrics: StepMetrics, wall: flo
     return f"{speed}\n\n{joint_table(runner.robot, metrics)}\n\n{outcome}"
 
 
+def following_report(runner: Runner, rollout: Rollout, source: str, wall: float) -> str:
+    """Return the report of a ``rollout`` along a trajectory, whose rates are ``source``."""
+    speed = speed_line(rollout.num_envs, rollout.tick * len(rollout.time), runner.timestep, wall)
+    robot, error = runner.robot, rollout.qpos - rollout.setpoint
+    turns = np.where(robot.continuous, np.rint(error / (2 * np.pi)), 0.0)
+    largest = np.abs(error - 2 * np.pi * turns).max(0)
+    rows = [
+        [name, *(f"{worst:.2g} {unit}" for worst in (largest[0, j], np.median(largest[:, j]), largest[:, j].max()))]
+        for j, (name, unit) in enumerate(zip(robot.joint_names, robot.units, strict=True))
+    ]
+    headers = ["largest |qpos - setpoint|", "env 0", "median env", "worst env"]
+    failed = np.flatnonzero(~rollout.ok.all(0))
+    outcome = f"FAILED: {len(failed)} of {rollout.num_envs} envs, the first is env {failed[0]}." if len(failed) else ""
+    about = f"Env 0 starts on the trajectory, others beside it. Rates: {source}."
+    return f"{speed}\n\n{table(rows, headers, 'lrrr')}\n\n{about}\n{outcome}".rstrip()
+
+
 def tool_report(runner: Runner, rollout: Rollout, wall: float) -> str:
     """Return the report of a ``rollout`` to a pose of the tool (7,) that took ``wall`` seconds."""
     speed = speed_line(rollout.num_envs, rollout.tick * len(rollout.time), runner.timestep, wall)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 import batchpid as bp
-from batchpid.sim import Runner
+from batchpid.sim import Runner, read_recording
 from batchpid.sim.cli import main
 from batchpid.sim.cli.run import start_poses
+from batchpid.trajectories import minimum_jerk
 
 SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
 
@@ -158,3 +161,74 @@ def test_picture(batchpid, tmp_path):
     path = tmp_path / "run.svg"
     assert batchpid("rollout", *SHORT, "--picture", path)[0] == 0
     assert "panda_joint7" in path.read_text()
+
+
+def trajectory(path, robot, *, rates=True, ends="\n", quote='"', edit=None):
+    """Write a move of the robot as a CSV with quoted names and these line ends."""
+    move = minimum_jerk(robot.settings.start, robot.settings.target, 0.01, duration=1.5)
+    kinds = {"setpoint": (robot.settings.start, move.position), "setpoint_rate": (0 * robot.start, move.velocity)}
+    names, table = ["time"], [np.append(0.0, move.time)[:, None]]
+    for kind, (first, rows) in list(kinds.items())[: 1 + rates]:
+        names += [f"{kind}:{name}" for name in robot.joint_names]
+        table.append(np.vstack([first, rows]))
+    lines = [",".join(f"{quote}{name}{quote}" for name in names)]
+    lines += [",".join(f"{number:.12g}" for number in row) for row in np.hstack(table)]
+    if edit is not None:
+        lines = edit(lines)
+    path.write_bytes(ends.join([*lines, ""]).encode())
+    return path
+
+
+@pytest.mark.parametrize(("rates", "ends"), [(True, "\r\n"), (False, "\n")])
+def test_a_trajectory_is_followed(batchpid, panda, tmp_path, rates, ends):
+    path, out = trajectory(tmp_path / "move.csv", panda, rates=rates, ends=ends), tmp_path / "run.npz"
+    status, said, error = batchpid("rollout", "--num-envs", 2, "--workers", 0, "--trajectory", path, "--out", out)
+    assert status == 0, error
+    assert ("Rates: those of the file." if rates else "Rates: differences of the rows.") in said
+    rollout = read_recording(out)
+    assert len(rollout.time) == 150
+    assert rollout.info.rates
+    assert np.abs(rollout.qpos - rollout.setpoint)[:, 0].max() < 0.002
+    np.testing.assert_allclose(rollout.qpos[-1, 0], panda.settings.target, atol=0.002)
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
+def test_a_trajectory_without_rates_is_a_log(batchpid, panda, tmp_path):
+    path, out = trajectory(tmp_path / "move.csv", panda), tmp_path / "run.npz"
+    flags = ("--num-envs", 1, "--workers", 0, "--trajectory", path, "--no-rates", "--out", out)
+    status, said, error = batchpid("rollout", *flags)
+    assert status == 0, error
+    assert "Rates: not given." in said
+    assert read_recording(out).info.rates is False
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda lines: [lines[0].replace("setpoint:panda_joint3", "setpoint:elbow"), *lines[1:]], "'setpoint:elbow'"),
+        (
+            lambda lines: [line.rpartition(",")[0] for line in lines],
+            "no column 'setpoint_rate:panda_finger_joint2'",
+        ),
+        (lambda lines: [*lines[:4], *lines[5:]], r"line 5: its time is not 0.01 s after"),
+        (
+            lambda lines: [*lines[:3], lines[3].replace(lines[3].split(",")[2], "nan", 1), *lines[4:]],
+            "line 4.* finite",
+        ),
+        (lambda lines: [lines[0], *lines[4:]], "begins at 0.03 s"),
+        (lambda lines: lines[:2], "has one row"),
+    ],
+)
+def test_what_is_no_trajectory_is_named(batchpid, panda, tmp_path, edit, message):
+    path = trajectory(tmp_path / "move.csv", panda, edit=edit)
+    status, _, error = batchpid("rollout", "--num-envs", 1, "--workers", 0, "--trajectory", path)
+    assert status != 0
+    assert re.search(message, error.replace("\n", " ")), error
+
+
+@pytest.mark.parametrize("flags", [("--seconds", 1), ("--substeps", 10), ("--control", "osc")])
+def test_what_a_trajectory_replaces_is_refused(batchpid, panda, tmp_path, flags):
+    path = trajectory(tmp_path / "move.csv", panda)
+    status, _, error = batchpid("rollout", "--trajectory", path, *flags)
+    assert status != 0
+    assert error.startswith(f"batchpid: {flags[0][2:]}: "), error
