@@ -150,6 +150,8 @@ class RunInfo:
     """False if the robots had no collision shapes."""
     ground: bool | None = None
     """True if the scenes had a ground at height 0."""
+    rates: bool | None = None
+    """True if setpoints were given with rates, so that they moved within the ticks."""
     params: PIDParams | None = None
     """PID parameters at the start."""
     actuators: Actuators | None = None
@@ -222,7 +224,7 @@ class RunInfo:
 
 
 OWN_OF_PARTS = {"params", "actuators", "start", "seed", "versions", "begun", "draws", "episodes"}
-OWN_OF_PARTS |= {"complete", "faults", "redraws"}
+OWN_OF_PARTS |= {"complete", "faults", "rates", "redraws"}
 """Fields of :class:`RunInfo` in which parts of a run may differ: state and origin at their start, and events."""
 
 
@@ -276,7 +278,8 @@ class Rollout:
     def join(parts: Sequence[Rollout]) -> Rollout:
         """Return successive rollouts of one run as one.
 
-        The info is the first part's, with the faults of the last and the redraws of all. It is complete if all are.
+        The info is the first part's, with the faults of the last and the redraws of all. It is complete if all are, and
+        has rates if one has.
 
         Raises InvalidArgumentError if ``parts`` are empty, or differ in the robot, an option, the tick or the
         number of envs.
@@ -293,7 +296,9 @@ class Rollout:
         time, setpoint = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "setpoint"))
         redraws = tuple(dict.fromkeys(each for part in parts for each in part.info.redraws))
         complete = all(part.info.complete for part in parts)
-        info = replace(first.info, faults=parts[-1].info.faults, redraws=redraws, complete=complete)
+        known = [part.info.rates for part in parts if part.info.rates is not None]
+        rates = any(known) if known else None
+        info = replace(first.info, faults=parts[-1].info.faults, redraws=redraws, complete=complete, rates=rates)
         return Rollout(time, setpoint, seen, first.tick, info)
 
     def __repr__(self) -> str:

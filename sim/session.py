@@ -231,7 +231,7 @@ class Session:
         ticks = len(command.setpoint)
         seen = empty_observation(ticks, options.num_envs, options.robot.dof)
         times = (steps + options.substeps * np.arange(1.0, ticks + 1)) * options.timestep
-        info, done = self.info(), 0
+        info, done = replace(self.info(), rates=command.setpoint_rate is not None), 0
         shown = iter(range(ticks) if progress is None else progress(range(ticks)))
         for tick in range(ticks):  # not over ``shown``, which may yield anything
             next(shown, None)
@@ -360,6 +360,7 @@ class Session:
         return options.robot.run_info(
             **options.values_for("recording"),
             own_command=options.own_command,
+            rates=state.rated,
             params=state.params,
             actuators=state.actuators,
             start=start,
@@ -420,6 +421,7 @@ class Session:
                 steps=state.steps + steps,
                 targets=None if state.targets is None else _followed(state.targets, setpoint[:count]),
                 motion=motion,
+                rated=state.rated or rate is not None,
                 steps_since_checkpoint=state.steps_since_checkpoint + steps,
                 work=state.work if pool.failure else (tuple(seconds), ticks),
             )

@@ -13,7 +13,6 @@ from batchpid.task_space.osc_params import NoDecoupling, PartialDecoupling
 from batchpid.task_space.osc_state import TaskDynamics
 from batchpid.task_space.symmetric import bounded_inverse, gram, product, whitened
 
-
 SPRING_BOUND = 0.2
 """Bound s1 of L_s, as a share of the bound s0 of L_n."""
 

@@ -116,8 +116,8 @@ def _bounded(matrix: Any, smallest: Any, *smooth: Any) -> tuple[Any, ...]:
 
     s0 = smallest[..., None]
     inverses = [inverse_with(s0, positive)]
-    for s1 in (each[..., None] for each in smooth):
-        inverses.append(inverse_with(s1, positive * (2 - (positive / s1) ** 2)))
+    bounds = [each[..., None] for each in smooth]
+    inverses += [inverse_with(s1, positive * (2 - (positive / s1) ** 2)) for s1 in bounds]
     return *inverses, ~(values >= s0).all(-1)
 
 

@@ -63,7 +63,9 @@ def trajectory_report(runner: Runner, rollout: Rollout, setpoints: Setpoints, wa
         for j, joint in enumerate(robot.joints)
     ]
     rates = "Rates of the setpoints: from the file."
-    if not setpoints.has_rates:
+    if setpoints.rate is None:
+        rates = "Rates of the setpoints: not given."
+    elif not setpoints.has_rates:
         rates = "Rates of the setpoints: central differences of the rows."
         if setpoints.steps:
             rates += f" {setpoints.steps} changes are too fast for the velocity limits: steps, with rate 0."

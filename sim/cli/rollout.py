@@ -45,7 +45,10 @@ class RolloutCommand:
     trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Setpoints to follow instead: a CSV file with the columns time, setpoint:JOINT ..., and, where they are known,
     setpoint_rate:JOINT ... and setpoint_acceleration:JOINT ... A row holds at its time, and rows are equally spaced: by
-    a tick. The first is at 0, with the start pose of env 0, or at the end of the first tick."""
+    a tick. The first is at 0, with the start pose of env 0, or at the end of the first tick. Rates that are missing are
+    central differences."""
+    rates: bool = True
+    """With --no-rates the trajectory's setpoints have none, as a recording for `batchpid identify` needs it."""
     seconds: flags.Seconds = 2.0
     timestep: float = 1 / 2000
     """Time step of simulation and control [s]."""
@@ -106,7 +109,7 @@ class RolloutCommand:
             setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
             gains = gain_set(robot, self.gains or ("drive" if self.control == "drive" else None))
             params, control = gains.params, "drive" if gains.control == "drive" else self.control
-            if setpoints is not None and setpoints.acceleration is not None:
+            if self.rates and setpoints is not None and setpoints.acceleration is not None:
                 _check_accelerations(self.trajectory, control == "pid" and params.gain_units is not None)
         with Runner(
             robot,
@@ -120,7 +123,7 @@ class RolloutCommand:
             streamed = out is not None and out.suffix.lower() != ".npz"
             with Recorder(out, runner, seed=self.seed, overwrite=self.force) if out and streamed else nullcontext():
                 if setpoints is not None:
-                    rollout, report = follow(runner, start, setpoints)
+                    rollout, report = follow(runner, start, setpoints if self.rates else setpoints.without_rates())
                 else:
                     rollout, report = (hold_pose if osc else hold_setpoint)(runner, start, setpoint, seconds)
         if out is not None and not streamed:
@@ -136,15 +139,12 @@ class RolloutCommand:
         """Return the setpoints in a file, if no flag contradicts them."""
         from batchpid.sim.identification.setpoint_files import read_setpoints
 
-        others = {
-            "--setpoint": self.setpoint is not None,
-            "--seconds": self.seconds != RolloutCommand.seconds,
-            "--control osc": self.control == "osc",
-        }
-        for name, is_given in others.items():
-            if is_given:
-                remedy = "leave one of them out; a trajectory has joint setpoints, and lasts as long as its file"
-                raise InvalidArgumentError("trajectory", f"excludes {name}", remedy=remedy)
+        given = {"setpoint": self.setpoint is not None, "seconds": self.seconds != RolloutCommand.seconds}
+        for name in [name for name, is_given in given.items() if is_given]:
+            raise InvalidArgumentError(name, "is given by the trajectory", remedy=f"leave out --{name}")
+        if self.control == "osc":
+            remedy = "use --control pid or drive"
+            raise InvalidArgumentError("control", "'osc' follows poses, and a trajectory is of joints", remedy=remedy)
         setpoints = read_setpoints(robot, path, number("timestep", self.timestep, 1e-6, 0.1, "seconds"))
         if self.substeps not in (RolloutCommand.substeps, setpoints.substeps):
             problem, remedy = f"differs from the ticks of {path}", f"leave it out, or use {setpoints.substeps}"

@@ -116,6 +116,9 @@ def logs_of_rollout(
     if kind is not None and kind != found:
         problem = f"was made under control {info.control!r} and holds {found}s"
         raise InvalidArgumentError(source, problem, remedy=f"fit its {found}s")
+    if info.rates and found == "setpoint":
+        problem, remedy = "was made with setpoint rates, which the model of the law does not have", "record one without"
+        raise InvalidArgumentError(source, problem, remedy=remedy)
     if not rollout.ok.all():
         env = int(np.argmin(rollout.ok.all(0)))
         raise InvalidArgumentError(source, "has failed", env=env, remedy="record a run without faults")

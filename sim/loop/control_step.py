@@ -312,7 +312,10 @@ def _pid(layout: Layout, constants: Constants, state: StepState, given: Inputs) 
     viscous = None if constants.damping is None else constants.damping * qvel
     if viscous is not None and constants.coupling is not None:
         viscous = constants.coupling.efforts(viscous)
-    inputs = (command[:3], seen.qpos, qvel, seen.passive, matrix, viscous, *limits)
+    setpoint, rate, acceleration, _ = command
+    if acceleration is not None and constants.coupling is not None:  # the leaders' mass matrix has the followers' share
+        acceleration = namespace(acceleration).where(constants.coupling.independent, acceleration, 0.0)
+    inputs = ((setpoint, rate, acceleration), seen.qpos, qvel, seen.passive, matrix, viscous, *limits)
     new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs, observed=step.observed)
     return state._replace(law=new, matrix=matrix), Outputs(effort, effort, saturated)
 

@@ -85,7 +85,7 @@ class PartialFile(SingleOwner):
         self._file.close()
         self._partial.unlink()
 
-    def finish(self, complete: bool, faults: str, redraws: str) -> None:
+    def finish(self, complete: bool, faults: str, redraws: str, rates: bool) -> None:
         """Close the file and give it its name; one that is not ``complete`` keeps the partial name if that one exists.
 
         Raises RecordingError if it cannot be completed, or another program has made a file of its name.
@@ -101,6 +101,7 @@ class PartialFile(SingleOwner):
                     file.attrs["complete"] = complete
                     file.attrs["faults"] = faults
                     file.attrs["redraws"] = redraws
+                    file.attrs["rates"] = rates
                     file.attrs["checksum"] = files.attribute_checksum(file.attrs)
                     file.flush()
                 except BaseException:

@@ -107,6 +107,7 @@ class Recorder(SingleOwner):
         self._oldest = math.inf  # when the oldest row was recorded that is being written
         self._faults: tuple[Fault, ...] = runner.faults  # up to the last row
         self._episodes, self._redraws = runner.episodes, list[Redraw]()
+        self._rates = False  # whether a tick had rates
         self._end: Callable[[PartialFile], None] | None = None
         self._error: RecordingError | None = None
         self._has_raised = False
@@ -154,9 +155,10 @@ class Recorder(SingleOwner):
                 except BatchPIDError as error:
                     failure = error
                 self._faults = runner.faults
+            self._rates = bool(runner.info.rates)
             runner.recorder = None
         faults, redraws = files.faults_text(self._faults), files.redraws_text(self._redraws)
-        self._finish_with(lambda file: file.finish(complete, faults, redraws))
+        self._finish_with(lambda file: file.finish(complete, faults, redraws, self._rates))
         try:
             self._writing.result()
             self._check()

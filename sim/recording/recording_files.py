@@ -272,7 +272,7 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
         **dict.fromkeys(("lower", "upper", "effort_limit", "start", "episodes"), _numbers),
         "timestep": float,
         "substeps": int,
-        **dict.fromkeys(("complete", "merge_fixed", "collisions", "ground"), bool),
+        **dict.fromkeys(("complete", "merge_fixed", "collisions", "ground", "rates"), bool),
         "params": lambda text: bp.loads_params(str(text), names)[0],
         "actuators": lambda text: bp.motors.loads_actuators(str(text), names)[0],
         "seed": lambda value: None if str(value) == "none" else int(value),

@@ -57,6 +57,8 @@ class RunnerState(NamedTuple):
     """Observation of the last tick that :meth:`Runner.send` began."""
     targets: NDArray[Any] | None = None
     """Last joint setpoints (envs, dof), where searches for poses of the tool start; None without such poses."""
+    rated: bool = False
+    """Whether a tick had setpoints with rates."""
     motion: tuple[NDArray[Any], NDArray[Any] | None] | None = None
     """Setpoint of the last tick and its rate (envs, dof), None for 0; after a reset positions and velocities.
 

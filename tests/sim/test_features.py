@@ -15,7 +15,10 @@ import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.errors import BatchPIDError
 from batchpid.sim import OperationalSpace, Robot, Runner
+from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+from batchpid.sim.robot.urdf_export import to_urdf
 from batchpid.task_space.frames import pose_error
+from batchpid.trajectories import minimum_jerk
 from tests.sim.tiny_urdf import write
 
 AXES = ("0 0 1", "0 1 0", "1 0 0", "0 1 0", "0 0 1", "1 0 0", "0 1 0", "0 0 1", "0 1 0")
@@ -61,8 +64,8 @@ def inertial(kg: float, moment: float, x: float = 0.0) -> str:
 
 
 @functools.cache
-def robot_with(*features: str) -> Robot:
-    """Return an arm of nine joints with these features."""
+def robot_with(*features: str, folder: Path | None = None) -> Robot:
+    """Return an arm of nine joints with these features, and keep its file in ``folder``."""
     chosen = [FEATURES[feature] for feature in features]
     types, mimics = (
         {joint: law for feature in chosen for joint, law in feature.get(name, {}).items()}
@@ -81,8 +84,11 @@ def robot_with(*features: str) -> Robot:
     options: dict = {"fixed_base": all(feature.get("fixed_base", True) for feature in chosen)}
     if armature:
         options["actuators"] = bp.make_actuators(len(AXES), armature=armature)
-    with tempfile.TemporaryDirectory() as folder:
-        return Robot.load(write(Path(folder), f'<robot name="featured">{"".join(parts)}</robot>'), **options)
+    text = f'<robot name="featured">{"".join(parts)}</robot>'
+    if folder is not None:
+        return Robot.load(write(folder, text), **options)
+    with tempfile.TemporaryDirectory() as passing:
+        return Robot.load(write(Path(passing), text), **options)
 
 
 def poses(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -171,3 +177,48 @@ def test_kinematics_and_dynamics_are_those_of_the_leaders(feature, native, monke
     found = ts.inverse_kinematics(tree, "l8", goal, robot.coupled(qpos + 0.1))
     close(found.qpos, robot.coupled(found.qpos))
     close(ts.link_poses(tree, found.qpos, ["l8"])[:, 0, :3], goal[:, :3], atol=2e-5)
+
+
+@pytest.mark.parametrize("feature", FEATURES)
+def test_every_feature_is_followed_along_a_trajectory(feature, engine):
+    robot = robot_with(feature)
+    start, goal = poses(robot)
+    move = minimum_jerk(start, goal, 0.01, duration=1.0)
+    with Runner(robot, 1, workers=0, engine=engine, ground=False) as runner:
+        runner.reset(start)
+        seen = runner.rollout(move.position, setpoint_rates=move.velocity)
+    left = seen.qpos[:, 0] - move.position
+    left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
+    assert np.abs(left[:, robot.independent]).max() < (1e-3 if robot.fixed_base else 0.03)  # a free base moves away
+
+
+@pytest.mark.parametrize("feature", FEATURES)
+def test_every_feature_reaches_its_goal_by_efforts(feature, engine):
+    """The law outside of the runner, whose setpoints are its efforts."""
+    robot = robot_with(feature)
+    start, goal = poses(robot)
+    pid = bp.BatchPID(robot.designed("effort").replace(measurement_rate="difference"), 1, 1 / 2000)
+    with Runner(robot, 1, workers=0, engine=engine, ground=False, control="effort", substeps=1) as runner:
+        seen = runner.reset(start)
+        pid.reset(seen.qpos.astype(float))
+        for _ in range(3000):
+            seen = runner.step(pid(goal[None], seen.qpos.astype(float)))
+    assert seen.ok.all()
+    left = seen.qpos[0] - goal
+    left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
+    np.testing.assert_allclose(left[robot.independent], 0.0, atol=0.03)
+
+
+@pytest.mark.parametrize("kind", ["urdf", "xml"])
+@pytest.mark.parametrize("feature", FEATURES)
+def test_every_feature_is_in_an_exported_description(feature, kind, tmp_path):
+    """Read again, it is a robot with the same joints and dynamics."""
+    robot, path = robot_with(feature, folder=tmp_path), tmp_path / f"featured.{kind}"
+    exported = to_urdf(robot, tmp_path) if kind == "urdf" else to_mjcf(robot, None, 1 / 2000)
+    path.write_text(exported.text)
+    other = Robot.load(path, fixed_base=robot.fixed_base)
+    assert other.joint_names == robot.joint_names
+    assert (other.fixed_base, tuple(other.continuous)) == (robot.fixed_base, tuple(robot.continuous))
+    qpos = robot.coupled(np.random.default_rng(0).normal(size=(4, robot.dof)))
+    np.testing.assert_allclose(other.coupled(qpos), qpos, atol=1e-6)
+    np.testing.assert_allclose(other.mass_matrix(qpos), robot.mass_matrix(qpos), rtol=1e-5, atol=1e-6)

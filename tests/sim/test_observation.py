@@ -53,7 +53,7 @@ def test_unknown_fields_are_named(rollout):
         _ = rollout.speed
 
 
-GATHERED = {"faults", "redraws", "complete"}
+GATHERED = {"rates", "faults", "redraws", "complete"}
 """Fields of RunInfo that all parts of a run contribute to."""
 OF_THE_START = {"params", "actuators", "start", "seed", "versions", "begun", "draws", "episodes"}
 """Fields that the joined rollout has from its first part. All others are the same in all parts."""

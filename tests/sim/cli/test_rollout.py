@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from batchpid.sim import Robot, Runner
+from batchpid.sim import Robot, Runner, read_recording
 from batchpid.sim.cli import main
 from batchpid.sim.cli.run import start_poses
 from batchpid.sim.identification.setpoint_files import read_setpoints
@@ -368,12 +368,23 @@ def test_a_wrong_trajectory_is_refused(batchpid, tmp_path, panda, motion, change
     assert error.count("\n") == 1
 
 
+@pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
+def test_a_trajectory_without_rates_is_a_log(batchpid, tmp_path, panda, motion):
+    path, out = tmp_path / "motion.csv", tmp_path / "run.npz"
+    path.write_text(csv(panda, motion, "setpoint_rate", "setpoint_acceleration"))
+    for flags, has_rates in ((), True), (("--no-rates", "--gains", "tutorial"), False):
+        status, said, error = batchpid("rollout", "--trajectory", path, *ONE, "--out", out, "--force", *flags)
+        assert status == 0, error
+        assert ("Rates of the setpoints: not given." in said) is not has_rates
+        assert read_recording(out).info.rates is has_rates
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--seconds", 1), "trajectory: excludes --seconds"),
-        (("--setpoint", 0, 0), "trajectory: excludes --setpoint"),
-        (("--control", "osc"), "trajectory: excludes --control osc"),
+        (("--seconds", 1), "seconds: is given by the trajectory; leave out --seconds"),
+        (("--setpoint", 0, 0), "setpoint: is given by the trajectory"),
+        (("--control", "osc"), "control: 'osc' follows poses"),
         (("--substeps", 7), r"substeps: differs from the ticks .*use 10"),
         (("--gains", "tutorial"), "setpoint_acceleration: needs gains in accelerations; use --gains designed"),
         (("--control", "drive"), "setpoint_acceleration: needs gains in accelerations"),

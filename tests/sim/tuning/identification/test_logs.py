@@ -4,7 +4,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid.sim import Robot, Runner, write_recording
+from batchpid.sim import Robot, Rollout, Runner, read_recording, write_recording
 from batchpid.sim.identification import identify
 from batchpid.sim.identification.gaps import divided
 from batchpid.sim.identification.logs import Log, LogWarning, at_limits, logs_of_rollout, read_logs
@@ -394,3 +394,16 @@ def test_a_recording_says_its_time_step_compensation_and_control(tmp_path):
     for option in ({"timestep": 1 / 2000}, {"compensate": "none"}):
         with pytest.raises(bp.InvalidArgumentError, match=f"{next(iter(option))}: contradicts .*pid.npz"):
             identify(robot, [paths["pid"]], params=gains, workers=0, **option)
+
+
+def test_a_recording_with_setpoint_rates_is_refused(panda, tmp_path):
+    """The model has the law without rates, and would take its lag for that of the motors."""
+    setpoints = np.tile(panda.start, (3, 1))
+    with Runner(panda, 1, workers=0) as runner:
+        without = runner.rollout(setpoints)
+        rated = runner.rollout(setpoints, setpoint_rates=0 * setpoints)
+    assert (without.info.rates, rated.info.rates, Rollout.join([without, rated]).info.rates) == (False, True, True)
+    path = write_recording(rated, tmp_path / "run.npz")
+    assert read_recording(path).info.rates
+    with pytest.raises(bp.InvalidArgumentError, match=r"was made with setpoint rates.*record one without"):
+        read_logs(panda, [path])
