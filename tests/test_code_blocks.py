@@ -208,4 +208,7 @@ def command(name: str, *flags: str) -> None:
         return
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # findings of the preflight
-        assert main([name, *flags, *SHORTER.get(name, [])]) in (0, None)
+        shorter = SHORTER.get(name, [])
+        if "--trajectory" in flags:  # it lasts as long as its file
+            shorter = shorter[: shorter.index("--seconds")]
+        assert main([name, *flags, *shorter]) in (0, None)

@@ -14,9 +14,9 @@ from batchpid.sim.cli.outputs import Outputs
 class ExciteCommand:
     """Make the motion to record for identification: a chirp of every joint.
 
-    It keeps the limits of position, velocity and effort, and is free of contact. Writes setpoints as CSV with the
-    header "time, setpoint:JOINT, ...". Move the robot to the first row before it starts, and add the measured positions
-    to the log as qpos:JOINT.
+    It keeps the limits of position, velocity and effort, and is free of contact. Writes setpoints and their rates as
+    CSV with the header "time, setpoint:JOINT, ..., setpoint_rate:JOINT, ...", which `batchpid rollout --trajectory`
+    follows. Move the robot to the first row before it starts, and add the measured positions to the log as qpos:JOINT.
     """
 
     robot: flags.RobotName = "panda"
@@ -42,7 +42,7 @@ class ExciteCommand:
         from batchpid.io.files import write_atomically
         from batchpid.sim.cli.report import table
         from batchpid.sim.identification.excitation import excite
-        from batchpid.sim.identification.logs import setpoint_csv
+        from batchpid.sim.identification.setpoint_files import setpoint_csv
 
         robot = Robot.load(self.robot, **vars(self.meshes))
         out = self.out or Path(f"out/{robot.path.stem}.excite.csv")

@@ -13,7 +13,8 @@ from tabulate import tabulate
 
 from batchpid.metrics import StepMetrics
 from batchpid.sim import Robot, Rollout, Runner
-from batchpid.sim.tuning.evaluation import Evaluation, arm_joints
+from batchpid.sim.identification.setpoint_files import Setpoints
+from batchpid.sim.tuning.evaluation import Evaluation, arm_joints, following_error
 from batchpid.task_space.frames import pose_error
 
 
@@ -28,23 +29,6 @@ def run_report(runner: Runner, rollout: Rollout, metrics: StepMetrics, wall: flo
     speed = speed_line(rollout.num_envs, rollout.tick * len(rollout.time), runner.timestep, wall)
     outcome = "\n".join(outcome_lines(runner.robot, rollout, metrics))
     return f"{speed}\n\n{joint_table(runner.robot, metrics)}\n\n{outcome}"
-
-
-def following_report(runner: Runner, rollout: Rollout, source: str, wall: float) -> str:
-    """Return the report of a ``rollout`` along a trajectory, whose rates are ``source``."""
-    speed = speed_line(rollout.num_envs, rollout.tick * len(rollout.time), runner.timestep, wall)
-    robot, error = runner.robot, rollout.qpos - rollout.setpoint
-    turns = np.where(robot.continuous, np.rint(error / (2 * np.pi)), 0.0)
-    largest = np.abs(error - 2 * np.pi * turns).max(0)
-    rows = [
-        [name, *(f"{worst:.2g} {unit}" for worst in (largest[0, j], np.median(largest[:, j]), largest[:, j].max()))]
-        for j, (name, unit) in enumerate(zip(robot.joint_names, robot.units, strict=True))
-    ]
-    headers = ["largest |qpos - setpoint|", "env 0", "median env", "worst env"]
-    failed = np.flatnonzero(~rollout.ok.all(0))
-    outcome = f"FAILED: {len(failed)} of {rollout.num_envs} envs, the first is env {failed[0]}." if len(failed) else ""
-    about = f"Env 0 starts on the trajectory, others beside it. Rates: {source}."
-    return f"{speed}\n\n{table(rows, headers, 'lrrr')}\n\n{about}\n{outcome}".rstrip()
 
 
 def tool_report(runner: Runner, rollout: Rollout, wall: float) -> str:
@@ -62,6 +46,41 @@ def tool_report(runner: Runner, rollout: Rollout, wall: float) -> str:
     outcome = f"FAILED: {len(failed)} of {rollout.num_envs} envs, the first is env {failed[0]}." if len(failed) else ""
     about = f"Tool: {runner.options.tool}. final error: the largest in the last tenth of the run."
     return f"{speed}\n\n{table(rows, headers, 'lrr')}\n\n{about}\n{outcome}".rstrip()
+
+
+def trajectory_report(runner: Runner, rollout: Rollout, setpoints: Setpoints | None, wall: float) -> str:
+    """Return the report of a ``rollout`` along a trajectory that took ``wall`` seconds.
+
+    ``setpoints`` are those of the file, or None if their rates were not given.
+    """
+    robot, ticks = runner.robot, len(rollout.time)
+    ends = rollout.for_ticks(slice(-max(1, ticks // 10), None))
+    errors = [following_error(robot, each) for each in (rollout, ends)]
+    saturated = rollout.saturated.mean((0, 1))
+    rows = [
+        [
+            joint.name,
+            *(f"{_cell(error[0, j], '.2g')} / {_cell(error[:, j].max(), '.2g')} {joint.unit}" for error in errors),
+            "-" if runner.control == "drive" else f"{saturated[j]:.0%}",
+        ]
+        for j, joint in enumerate(robot.joints)
+    ]
+    rates = "Rates of the setpoints: from the file."
+    if setpoints is None:
+        rates = "Rates of the setpoints: not given."
+    elif not setpoints.has_rates:
+        rates = "Rates of the setpoints: central differences of the rows."
+        if setpoints.steps:
+            rates += f" {setpoints.steps} changes are too fast for the velocity limits: steps, with rate 0."
+    lines = [
+        speed_line(rollout.num_envs, rollout.tick * ticks, runner.timestep, wall) + "\n",
+        table(rows, ["env 0 / worst env", "following error", "at the end", "saturated"], "lrrr"),
+        "following error: the largest |qpos - setpoint| at the ends of ticks; at the end: in the last tenth;\n"
+        "saturated: share of samples. Envs other than 0 start beside the trajectory.\n",
+        rates,
+        *_diverged_lines(rollout),
+    ]
+    return "\n".join(lines)
 
 
 def gains_table(names: Sequence[str], metrics: Sequence[StepMetrics]) -> str:
@@ -120,15 +139,8 @@ def joint_table(robot: Robot, metrics: StepMetrics) -> str:
 
 def outcome_lines(robot: Robot, rollout: Rollout, metrics: StepMetrics) -> Iterator[str]:
     """Yield a line on envs that diverged, one on joints that did not settle, and the lines of :func:`limit_lines`."""
-    seconds, num_envs = rollout.tick * len(rollout.time), rollout.num_envs
-    diverged = np.flatnonzero(~rollout.ok.all(0))
-    if diverged.size:
-        first = rollout.tick * (1 + np.argmin(rollout.ok[:, diverged].all(1)))
-        more = f" and {diverged.size - 8} more" if diverged.size > 8 else ""
-        yield (
-            f"DIVERGED: {diverged.size} of {num_envs} envs are no longer finite, the first after {first:.3g} s: "
-            f"env {', '.join(map(str, diverged[:8]))}{more}. These gains are unstable on this robot."
-        )
+    seconds, diverged = rollout.tick * len(rollout.time), np.flatnonzero(~rollout.ok.all(0))
+    yield from _diverged_lines(rollout)
     never = np.isinf(np.delete(metrics.settling_time, diverged, axis=0)).sum(0) * robot.independent
     unsettled = [f"{name} ({count})" for name, count in zip(robot.joint_names, never, strict=True) if count]
     if unsettled:
@@ -136,6 +148,18 @@ def outcome_lines(robot: Robot, rollout: Rollout, metrics: StepMetrics) -> Itera
     if not diverged.size and not unsettled:
         yield f"Every joint of every env settled within {seconds:g} s to 2 % of its move."
     yield from limit_lines(robot, rollout.setpoint[-1])
+
+
+def _diverged_lines(rollout: Rollout) -> Iterator[str]:
+    """Yield a line on envs that diverged, if there are any."""
+    diverged = np.flatnonzero(~rollout.ok.all(0))
+    if diverged.size:
+        first = rollout.tick * (1 + np.argmin(rollout.ok[:, diverged].all(1)))
+        more = f" and {diverged.size - 8} more" if diverged.size > 8 else ""
+        yield (
+            f"DIVERGED: {diverged.size} of {rollout.num_envs} envs are no longer finite, the first after {first:.3g} "
+            f"s: env {', '.join(map(str, diverged[:8]))}{more}. These gains are unstable on this robot."
+        )
 
 
 def limit_lines(robot: Robot, setpoint: NDArray[Any]) -> Iterator[str]:

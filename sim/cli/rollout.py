@@ -1,11 +1,11 @@
-"""``batchpid rollout``: N of any robot hold a setpoint; the run is written to a file."""
+"""``batchpid rollout``: N of any robot hold a setpoint or follow a trajectory; the run is written to a file."""
 
 from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -19,13 +19,17 @@ from batchpid.sim.tool_space.tool_goals import default_goal
 from batchpid.sim.tuning.gain_sets import gain_set
 from batchpid.task_space import load_osc_options
 
+if TYPE_CHECKING:
+    from batchpid.sim.identification.setpoint_files import Setpoints
+
 
 @dataclass(frozen=True)
 class RolloutCommand:
-    """Move N of any robot from seeded poses to a setpoint; print a table and write the run to a file.
+    """Move N of any robot to a setpoint or along a trajectory; print a table and write the run to a file.
 
-    The file holds time (ticks,), setpoint, qpos, qvel, effort and saturated (ticks, envs, joints), ok (ticks, envs),
-    with --control osc tool_pose (ticks, envs, 7), and the robot's joint names, units and limits.
+    Robots start from seeded poses. The file holds time (ticks,), setpoint, qpos, qvel, effort and saturated (ticks,
+    envs, joints), ok (ticks, envs), with --control osc tool_pose (ticks, envs, 7), and the robot's joint names, units
+    and limits.
     """
 
     robot: flags.RobotName = "panda"
@@ -39,21 +43,21 @@ class RolloutCommand:
     """One position per joint [rad or m]; with --control osc x y z qw qx qy qz of the tool. Default: the bundled robot's
     target, else the start pose; with --control osc a pose near that, which all robots reach within joint limits."""
     trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
-    """CSV to follow in place of --setpoint, with columns time, setpoint:JOINT, and if known setpoint_rate:JOINT. A row
-    holds at its time; one at time 0 is the start. Rates are by default differences of the rows."""
+    """Setpoints to follow instead: a CSV file with the columns time, setpoint:JOINT ..., and, where they are known,
+    setpoint_rate:JOINT ... and setpoint_acceleration:JOINT ... A row holds at its time, and rows are equally spaced: by
+    a tick. The first is at 0, with the start pose of env 0, or at the end of the first tick."""
     rates: bool = True
-    """With --no-rates the trajectory's setpoints have none, as a recording for `batchpid identify` needs it."""
-    seconds: Annotated[float | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """Simulated time [s]. Default: 2, or that of the trajectory."""
+    """With --no-rates the setpoints of the trajectory have none, as in a recording that `batchpid identify` reads."""
+    seconds: flags.Seconds = 2.0
     timestep: float = 1 / 2000
     """Time step of simulation and control [s]."""
-    substeps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """Sim steps of a tick, from one sample to the next. Default: 20, or those from row to row of the trajectory."""
+    substeps: int = 20
+    """Sim steps of a tick, from one sample to the next; with --trajectory as the times of its rows say."""
     seed: int = 0
     """Seed of the start poses."""
     spread: float = 0.3
-    """Largest distance of a start pose from the robot's own, with --control osc from the bundled robot's target [rad or
-    m]; env 0 starts at that itself."""
+    """Largest distance of a start pose from the robot's own, with --control osc from the bundled robot's target, with
+    --trajectory from its first row at time 0 [rad or m]; env 0 starts at that itself."""
     compensate: flags.Compensate = "gravity+coriolis+friction"
     engine: flags.Engine = "sapien"
     physics: flags.Physics = "accurate"
@@ -77,18 +81,17 @@ class RolloutCommand:
     def run(self) -> None:
         """Run the command."""
         from batchpid.sim import Runner, plots
-        from batchpid.sim.cli.run import follow, hold_pose, hold_setpoint, read_trajectory, read_variation, start_poses
+        from batchpid.sim.cli.run import follow, hold_pose, hold_setpoint, read_variation, start_poses
 
         outputs = Outputs(force=self.force)
         out = outputs.path("out", self.out, (".npz", ".h5", ".hdf5"))
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         robot = Robot.load(self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes))
         robot, randomization = read_variation(robot, self.randomize)
-        seconds = number("seconds", 2.0 if self.seconds is None else self.seconds, 1e-6, 1e6, "simulated time")
-        self._check_trajectory()
+        seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
         target = robot.start if robot.settings is None else robot.settings.target
+        setpoints = None if self.trajectory is None else self._read(robot, self.trajectory)
         params: Any = None
-        path = None
         if osc := self.control == "osc":
             options = {} if self.gains is None else load_osc_options(self._osc_file(self.gains))
             control: Any = OperationalSpace(robot, self.tool or default_tool(robot), posture=target, **options)
@@ -99,25 +102,27 @@ class RolloutCommand:
             else:
                 setpoint = array("setpoint", self.setpoint, (1, 7), control.command.names, kind="entry")[0]
         else:
-            path = None if self.trajectory is None else read_trajectory(robot, self.trajectory, self.timestep)
-            start = start_poses(robot, self.num_envs, self.spread, self.seed, None if path is None else path.start)
+            center = None if setpoints is None else setpoints.start
+            start = start_poses(robot, self.num_envs, self.spread, self.seed, center)
             goal: Any = target if self.setpoint is None else self.setpoint
             setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
             gains = gain_set(robot, self.gains or ("drive" if self.control == "drive" else None))
             params, control = gains.params, "drive" if gains.control == "drive" else self.control
+            if setpoints is not None and setpoints.acceleration is not None:
+                _check_accelerations(self.trajectory, control == "pid" and params.gain_units is not None)
         with Runner(
             robot,
             self.num_envs,
             params=params,
             control=control,
-            substeps=path.substeps if path else 20 if self.substeps is None else self.substeps,
             **flags.chosen(self, "tool workers cluster timestep compensate engine physics backend collisions"),
+            substeps=self.substeps if setpoints is None else setpoints.substeps,
             randomization=randomization,
         ) as runner:
             streamed = out is not None and out.suffix.lower() != ".npz"
             with Recorder(out, runner, seed=self.seed, overwrite=self.force) if out and streamed else nullcontext():
-                if path is not None:
-                    rollout, report = follow(runner, start, path, self.rates)
+                if setpoints is not None:
+                    rollout, report = follow(runner, start, setpoints, self.rates)
                 else:
                     rollout, report = (hold_pose if osc else hold_setpoint)(runner, start, setpoint, seconds)
         if out is not None and not streamed:
@@ -129,16 +134,24 @@ class RolloutCommand:
             figure = plots.step_responses(rollout, mark=0, title=robot.name)
             print(f"picture: {plots.save(figure, picture)}")
 
-    def _check_trajectory(self) -> None:
-        """Raise InvalidArgumentError for flags that a trajectory replaces, or that cannot follow one."""
-        if self.trajectory is None:
-            return
-        for name in ("setpoint", "seconds", "substeps"):
-            if getattr(self, name) is not None:
-                raise InvalidArgumentError(name, "is given by the trajectory", remedy=f"leave out --{name}")
-        if self.control == "osc":
-            remedy = "use --control pid or drive"
-            raise InvalidArgumentError("control", "'osc' follows poses, and a trajectory is of joints", remedy=remedy)
+    def _read(self, robot: Robot, path: Path) -> Setpoints:
+        """Return the setpoints in a file, if no flag contradicts them."""
+        from batchpid.sim.identification.setpoint_files import read_setpoints
+
+        others = {
+            "--setpoint": self.setpoint is not None,
+            "--seconds": self.seconds != RolloutCommand.seconds,
+            "--control osc": self.control == "osc",
+        }
+        for name, is_given in others.items():
+            if is_given:
+                remedy = "leave one of them out; a trajectory has joint setpoints, and lasts as long as its file"
+                raise InvalidArgumentError("trajectory", f"excludes {name}", remedy=remedy)
+        setpoints = read_setpoints(robot, path, number("timestep", self.timestep, 1e-6, 0.1, "seconds"))
+        if self.substeps not in (RolloutCommand.substeps, setpoints.substeps):
+            problem, remedy = f"differs from the ticks of {path}", f"leave it out, or use {setpoints.substeps}"
+            raise InvalidArgumentError("substeps", problem, value=self.substeps, remedy=remedy)
+        return setpoints
 
     def _osc_file(self, name: str) -> Path:
         """Return the path of the gains for ``--control osc``."""
@@ -147,3 +160,10 @@ class RolloutCommand:
             remedy = "give a file of batchpid tune --control osc, or leave it out"
             raise InvalidArgumentError("gains", problem, value=name, remedy=remedy)
         return path
+
+
+def _check_accelerations(path: Path | None, are_taken: bool) -> None:
+    """Raise InvalidArgumentError unless the gains take the accelerations in a file."""
+    if not are_taken:
+        problem, remedy = "needs gains in accelerations", "use --gains designed, or remove the columns"
+        raise InvalidArgumentError(f"{path}: column setpoint_acceleration", problem, remedy=remedy)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,9 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, Runner, read_recording
 from batchpid.sim.cli.flags import MeshOptions
 from batchpid.sim.cli.progress import bar
-from batchpid.sim.cli.report import following_report, run_report, tool_report
+from batchpid.sim.cli.report import run_report, tool_report, trajectory_report
 from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.identification.setpoint_files import Setpoints
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.tuning.evaluation import Evaluation, evaluate_gains, run_moves
 from batchpid.sim.tuning.gain_sets import GainSet
@@ -52,81 +53,6 @@ def hold_setpoint(runner: Runner, start: NDArray[Any], setpoint: NDArray[Any], s
     return rollout, run_report(runner, rollout, metrics, time.perf_counter() - began)
 
 
-class JointPath(NamedTuple):
-    """Setpoints that a file describes."""
-
-    start: NDArray[np.float64]
-    """Start of the robots (dof,)."""
-    position: NDArray[np.float64]
-    """(ticks, dof)"""
-    rate: NDArray[np.float64]
-    substeps: int
-    has_rates: bool
-    """Whether the rates are those of the file."""
-
-
-def read_trajectory(robot: Robot, path: Path, timestep: float) -> JointPath:
-    """Return the setpoints in a CSV file, whose rows are whole numbers of time steps apart [s].
-
-    Raises InvalidArgumentError that names the file, and column or line, if it is no trajectory of this robot.
-    """
-    from batchpid.sim.identification.columns import error, read_csv
-
-    if not path.is_file():
-        raise error(str(path), "is no file", "name a CSV file")
-    columns, lines = read_csv(path)
-    joints = [name for name, own in zip(robot.joint_names, robot.independent, strict=True) if own]
-    known = {"time", *(f"{kind}:{name}" for kind in ("setpoint", "setpoint_rate") for name in robot.joint_names)}
-    for name in columns:
-        if name not in known:
-            raise error(str(path), f"has a column {name!r}", f"name columns time, setpoint:{joints[0]}, ...")
-    has_rates = any(name.startswith("setpoint_rate:") for name in columns)
-    for kind in ("setpoint", "setpoint_rate")[: 1 + has_rates]:
-        for name in ("time", *(f"{kind}:{joint}" for joint in joints)):
-            if name not in columns:
-                raise error(str(path), f"has no column {name!r}", "add it")
-    for name, values in columns.items():
-        if not (good := np.isfinite(values)).all():
-            raise error(str(path), f"line {lines[int(good.argmin())]}, {name}: is not finite", "give a number")
-    time = columns["time"]
-    if len(time) < 2:
-        raise error(str(path), "has one row", "give two rows or more")
-    substeps = round((time[-1] - time[0]) / (len(time) - 1) / timestep)
-    even = np.abs(np.diff(time) - substeps * timestep) < 1e-3 * timestep
-    if substeps < 1 or not even.all():
-        at = lines[1 + int(even.argmin())]
-        problem = f"line {at}: its time is not {max(substeps, 1) * timestep:g} s after the line before"
-        raise error(str(path), problem, f"give rows a whole number of time steps of {timestep:g} s apart, all alike")
-    tables = []
-    for kind in ("setpoint", "setpoint_rate")[: 1 + has_rates]:
-        table = np.zeros((len(time), robot.dof))
-        for index, name in enumerate(robot.joint_names):
-            table[:, index] = columns.get(f"{kind}:{name}", 0.0)
-        tables.append(table)
-    position, start, tick = robot.coupled(tables[0]), robot.start, substeps * timestep
-    rate = tables[1] if has_rates else np.zeros_like(position)
-    if abs(time[0]) < 1e-3 * timestep:
-        start, position, rate = position[0], position[1:], rate[1:]
-    elif abs(time[0] - tick) > 1e-3 * timestep:
-        raise error(str(path), f"begins at {time[0]:g} s", f"begin at 0, or at {tick:g} s, the end of the first tick")
-    if not has_rates:
-        rows = np.vstack([start[None], position])
-        rows = np.where(robot.continuous, np.unwrap(rows, axis=0), rows)
-        rate = np.gradient(rows, tick, axis=0)[1:]
-    return JointPath(start, position, rate, substeps, has_rates)
-
-
-def follow(runner: Runner, start: NDArray[Any], path: JointPath, rates: bool) -> tuple[Rollout, str]:
-    """Follow the setpoints of a file from ``start`` (envs, dof), with or without rates; return rollout and report."""
-    began = time.perf_counter()
-    runner.reset(start, seed=None if runner.options.randomization is None else 0)
-    given = path.rate if rates else None
-    rollout = runner.rollout(path.position, setpoint_rates=given, progress=bar("simulating", unit="tick"))
-    source = "those of the file" if path.has_rates else "differences of the rows"
-    source = source if rates else "not given"
-    return rollout, following_report(runner, rollout, source, time.perf_counter() - began)
-
-
 def hold_pose(runner: Runner, start: NDArray[Any], goal: NDArray[Any], seconds: float) -> tuple[Rollout, str]:
     """Hold the pose ``goal`` (7,) of a tool from ``start`` (envs, dof) for ``seconds``; return rollout and report."""
     began = time.perf_counter()
@@ -134,6 +60,19 @@ def hold_pose(runner: Runner, start: NDArray[Any], goal: NDArray[Any], seconds: 
     ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
     rollout = runner.rollout(np.tile(goal, (ticks, 1)), progress=bar("simulating", unit="tick"))
     return rollout, tool_report(runner, rollout, time.perf_counter() - began)
+
+
+def follow(runner: Runner, start: NDArray[Any], setpoints: Setpoints, rates: bool) -> tuple[Rollout, str]:
+    """Follow ``setpoints`` of a file from ``start`` (envs, dof), with its rates or without; return rollout and report."""
+    began = time.perf_counter()
+    runner.reset(start, seed=None if runner.options.randomization is None else 0)
+    rollout = runner.rollout(
+        setpoints.position,
+        setpoint_rates=setpoints.rate if rates else None,
+        setpoint_accelerations=setpoints.acceleration if rates else None,
+        progress=bar("simulating", unit="tick"),
+    )
+    return rollout, trajectory_report(runner, rollout, setpoints if rates else None, time.perf_counter() - began)
 
 
 def evaluate_sets(

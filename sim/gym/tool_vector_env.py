@@ -38,6 +38,10 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
     rotation vector in the world's axes. Without, the target keeps that orientation. An episode begins with the target
     at the tool.
 
+    With increments a setpoint also has the twist of the target (``twist`` of :class:`batchpid.sim.OperationalSpace`):
+    the increment per second, 0 where the target is clipped. The law holds the pose, and not the twist, within a step:
+    the tool of a moving target is ahead of it by half a step, where without twist it lags by kd / kp.
+
     Parameters
     ----------
     num_envs, robot
@@ -52,7 +56,7 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
     rotation
         Largest component of the rotation vector of a target [rad].
     actions
-        ``"setpoint"``: the target in the workspace; or ``"increment"``: a change of it, whose twist the control takes.
+        ``"setpoint"``: the target in the workspace; or ``"increment"``: a change of it.
     max_increment
         Change of the target by an increment of 1, scalar or (3,), with a rotation (6,) [m, rad].
     osc
@@ -152,15 +156,20 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
             return self._setpoint_at(self.pose_at(action * limits))
         last = setpoint[:, :7]
         turn = rotation_error(last[:, 3:], self._home[3:])
-        place = np.concatenate([last[:, :3] - self.center, turn], axis=1)[:, : action.shape[1]]
-        return self._setpoint_at(self.pose_at(np.clip(place + action * self.max_increment, -limits, limits)), last)
+        asked = np.concatenate([last[:, :3] - self.center, turn], axis=1)[:, : action.shape[1]]
+        asked = asked + action * self.max_increment
+        place = np.clip(asked, -limits, limits)
+        pose, is_inside, change = self.pose_at(place), place == asked, np.zeros((len(action), 6))
+        change[:, :3] = (pose - last)[:, :3] * is_inside[:, :3]
+        if self.rotation:
+            change[:, 3:] = rotation_error(pose[:, 3:], last[:, 3:]) * is_inside[:, 3:].all(1, keepdims=True)
+        return self._setpoint_at(pose, change / self.step_seconds)
 
-    def _setpoint_at(self, pose: Float64, last: Float64 | None = None) -> Float64:
-        """Return setpoints of the control at poses (envs, 7), with the twist from poses ``last``, or at rest."""
-        rest = np.zeros((len(pose), len(self._control.command.names) - 7))
-        if last is not None and rest.shape[1] == 6:
-            turn = rotation_error(pose[:, 3:], last[:, 3:])
-            rest = np.concatenate([pose[:, :3] - last[:, :3], turn], axis=1) / self.step_seconds
+    def _setpoint_at(self, pose: Float64, twist: Float64 | None = None) -> Float64:
+        """Return setpoints of the control at poses (envs, 7), with ``twist`` (envs, 6) if it takes one, or at rest."""
+        rest = np.zeros((len(pose), self._control.command.size - 7))
+        if twist is not None and rest.shape[1] == 6:
+            rest = twist
         return np.concatenate([pose, rest], axis=1)
 
     def pose_at(self, place: Float64) -> Float64:

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,11 @@ def error(source: str, problem: str, remedy: str, value: Any = None) -> InvalidA
     return InvalidArgumentError(source, problem, remedy=remedy, value=value)
 
 
-def read_csv(path: Path) -> tuple[dict[str, Float64], list[int]]:
-    """Return the columns of a CSV file by name, and the line of each row."""
+def read_csv(path: Path, quantities: Sequence[str] = QUANTITIES) -> tuple[dict[str, Float64], list[int]]:
+    """Return the columns of a CSV file by name, and the line of each row.
+
+    Empty cells are NaN, and so is text in columns of other quantities than ``quantities`` and the time.
+    """
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as bad:
@@ -57,7 +61,7 @@ def read_csv(path: Path) -> tuple[dict[str, Float64], list[int]]:
         try:
             rows.append([float(cell) for cell in cells])
         except ValueError:  # a cell is empty, or text
-            rows.append(_read_row(path, number, header, cells))
+            rows.append(_read_row(path, number, header, cells, quantities))
         lines.append(number)
     if header is None or not rows:
         raise error(str(path), "has no rows", "give a header and one row per sample")
@@ -81,7 +85,7 @@ def _unquoted(path: Path, number: int, line: str, delimiter: str) -> list[str]:
     return cells
 
 
-def _read_row(path: Path, number: int, header: list[str], cells: list[str]) -> list[float]:
+def _read_row(path: Path, number: int, header: list[str], cells: list[str], quantities: Sequence[str]) -> list[float]:
     """Return the numbers of line ``number``; NaN for empty cells, and for text in columns of other quantities."""
     row = []
     for column, cell in zip(header, cells, strict=True):
@@ -89,7 +93,7 @@ def _read_row(path: Path, number: int, header: list[str], cells: list[str]) -> l
         try:
             row.append(float(text) if text else math.nan)
         except ValueError:
-            if column.partition(":")[0].strip() in (*QUANTITIES, "time"):
+            if column.partition(":")[0].strip() in (*quantities, "time"):
                 problem = f"line {number}, column {column!r} is not a number"
                 raise error(str(path), problem, _remedy(text), text) from None
             row.append(math.nan)

@@ -6,7 +6,8 @@ A CSV file has a header and one row per sample, in SI units::
 
 An HDF5 file has one dataset per column, of the same names. A row holds the position measured at ``time`` and the
 command computed from it, which acts from then on. Columns may have any order, joints may be missing, and times need not
-be equidistant. Columns of other quantities are ignored.
+be equidistant. Columns of other quantities are ignored, such as the rates of setpoints that ``batchpid excite``
+writes.
 
 Where the times have a gap, such as between two recordings, each stretch without gap is a log
 (:mod:`batchpid.sim.identification.gaps`). Positions and setpoints that wrap at +-pi or at 0 and 2 pi are unwrapped
@@ -37,9 +38,8 @@ from batchpid.sim.identification.turns import unwrapped
 from batchpid.sim.observation import Rollout
 from batchpid.sim.recording.recording_files import HDF5, read_recording
 from batchpid.sim.robot.robot import Robot
-from batchpid.trajectories import Trajectory
 
-__all__ = ["CommandKind", "Log", "LogWarning", "at_limits", "checked", "logs_of_rollout", "read_logs", "setpoint_csv"]
+__all__ = ["CommandKind", "Log", "LogWarning", "at_limits", "checked", "logs_of_rollout", "read_logs"]
 
 SUFFIXES = (".csv", ".txt", ".npz", *HDF5)
 AT_LIMIT = 1e-3
@@ -261,12 +261,3 @@ def at_limits(robot: Robot, log: Log) -> list[str]:
             place = f"{log.source}: joint {robot.joint_names[joint]!r} is at its limit"
             lines.append(f"{place} in {touching.mean():.2g} of the rows ({limits})")
     return lines
-
-
-def setpoint_csv(robot: Robot, motion: Trajectory) -> str:
-    """Return the setpoints of ``motion`` as CSV, with the header of a log; its first row is for time 0."""
-    lines = [",".join(["time", *(f"setpoint:{name}" for name in robot.joint_names)])]
-    dt = float(motion.time[0])
-    for time, row in zip(motion.time - dt, motion.position, strict=True):
-        lines.append(",".join([f"{time:.9g}", *(f"{value:.9g}" for value in row)]))
-    return "\n".join(lines) + "\n"

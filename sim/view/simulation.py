@@ -35,6 +35,8 @@ MAX_DISTANCE = 10.0
 """Largest distance of a target from the robot's base along an axis [m]."""
 PUSH_SECONDS = 0.25
 """Duration of a push [s]."""
+FASTEST = 3.0
+"""Fastest motion of a setpoint that counts as a drag, if the joint's velocity limit is not lower [rad/s or m/s]."""
 GRAVITY = 9.81
 """Acceleration of a payload [m/s^2]."""
 
@@ -214,14 +216,14 @@ class LiveSimulation(SingleOwner):
         runner.step(self.setpoint, setpoint_rate=self._rate, feedforward=disturbance if loaded else None)
 
     def _dragged(self) -> Float64 | None:
-        """Return the rates of setpoints that move within the velocity limits (envs, dof), as a slider that is dragged.
+        """Return the rates of setpoints that move slowly (envs, dof), as a slider that is dragged.
 
         Larger changes are steps, with a rate of 0. None if nothing moves so, and for poses.
         """
         if self.command is not None:
             return None
         rate = (self.setpoint - self._last) / self.period
-        rate[np.abs(rate) > self.robot.velocity_limit] = 0.0
+        rate[np.abs(rate) > np.minimum(self.robot.velocity_limit, FASTEST)] = 0.0
         return rate if rate.any() else None
 
     def _disturbance(self) -> Float64:

@@ -15,7 +15,7 @@ from gymnasium import spaces  # noqa: E402
 from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError  # noqa: E402
-from batchpid.sim import RecoveryWarning, Robot  # noqa: E402
+from batchpid.sim import RecoveryWarning, Robot, Runner  # noqa: E402
 from batchpid.sim.gym import PushVectorEnv, RobotEnv, RobotVectorEnv, ToolReachVectorEnv  # noqa: E402
 from batchpid.sim.view import renderer  # noqa: E402
 from batchpid.task_space.frames import rotation_error  # noqa: E402
@@ -39,6 +39,9 @@ class Swing(RobotVectorEnv):
     def command(self, action, setpoint):
         self.last = setpoint
         return self._or("command", action)
+
+    def rate(self, setpoint, last):
+        return self._or("rate", None)
 
     def observe(self, observed):
         return self._or("observe", np.concatenate([observed.qpos, observed.qvel], axis=1))
@@ -121,6 +124,8 @@ def test_an_effort_is_zero_until_the_first_action(swings):
         ("observe", np.zeros((3, 1)), r"Swing.observe: .*\(3, 1\)"),
         ("observe", np.array([[0.0, 0], [0, np.nan], [0, 0]]), r"Swing.observe: .*not finite, at index \(1, 1\)"),
         ("command", np.zeros(3), "Swing.command"),
+        ("rate", np.zeros(3), r"Swing.rate: .*\(3, 1\)"),
+        ("rate", np.full((3, 1), np.inf), "Swing.rate: .*not finite"),
         ("success", np.zeros((3, 1), bool), "Swing.success"),
         ("reward", 0.0, "Swing.reward"),
         ("reward", np.array([0, np.inf, 0]), r"Swing.reward: .*index \(1,\)"),
@@ -136,6 +141,47 @@ def test_a_wrong_result_of_a_hook_is_named(swings, hook, value, message):
     swings.returned = None
     swings.reset(seed=0)  # the task goes on
     assert np.isfinite(swings.step(np.zeros((3, 1)))[0]).all()
+
+
+class Nod(RobotVectorEnv):
+    """A hinge whose setpoint moves by the action; its runner's ticks are repeated by the test."""
+
+    def spaces(self):
+        return spaces.Box(-50, 50, (2,)), spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def command(self, action, setpoint):
+        return setpoint + 0.02 * action
+
+    def observe(self, observed):
+        return np.concatenate([observed.qpos, observed.qvel], axis=1)
+
+    def reward(self, observation, success):
+        return observation[:, 0]
+
+
+class SmoothNod(Nod):
+    def rate(self, setpoint, last):
+        return (setpoint - last) / self.step_seconds
+
+
+@pytest.mark.parametrize("task", [Nod, SmoothNod])
+def test_setpoints_are_steps_unless_a_task_gives_their_rates(hinge, task):
+    envs, actions = task(2, hinge, workers=0, max_episode_steps=4), np.array([[1.0], [-0.5]])
+    observation, _ = envs.reset(seed=0)
+    with Runner(hinge, 2, workers=0, substeps=envs.runner.substeps) as runner:
+        setpoint = runner.reset(observation[:, :1]).qpos.astype(float)
+        for number in range(6):
+            begins = number == 4  # the step after a time limit begins the next episode
+            rate = np.zeros((2, 1)) if begins else 0.02 * actions / envs.step_seconds
+            setpoint = setpoint if begins else setpoint + 0.02 * actions
+            seen = runner.step(setpoint, setpoint_rate=rate if task is SmoothNod else None)
+            if begins:
+                seen = runner.reset()
+                setpoint = seen.qpos.astype(float)
+            observation, *_ = envs.step(actions)
+            np.testing.assert_array_equal(observation, np.concatenate([seen.qpos, seen.qvel], axis=1))
+    assert np.abs(observation[:, 1]).min() > 0
+    envs.close()
 
 
 def test_a_step_whose_hook_was_interrupted_can_be_waited_for_again(swings, monkeypatch):
@@ -214,6 +260,56 @@ def test_increments_move_the_target_within_the_workspace():
     envs.close()
 
 
+def tool_after_increments(action, steps, **osc):
+    """Return the targets and the tools (1, 3) after equal increments, and the last change of the target per second."""
+    options = {"rotation": 0.6} if len(action) == 6 else {}
+    envs = ToolReachVectorEnv(1, workers=0, actions="increment", osc={"stiffness": 400.0, **osc}, **options)
+    envs.reset(seed=0)
+    first = envs._setpoint
+    for _ in range(steps):
+        last = envs._setpoint
+        envs.step(np.array([action]))
+    setpoint, tool, seconds = envs._setpoint, envs.observed.tool_pose.astype(float), envs.step_seconds
+    envs.close()
+    np.testing.assert_array_equal(first[:, 7:], 0.0)
+    rate = np.concatenate([setpoint[:, :3] - last[:, :3], rotation_error(setpoint[:, 3:7], last[:, 3:7])], axis=1)
+    error = np.concatenate([setpoint[:, :3] - tool[:, :3], rotation_error(setpoint[:, 3:7], tool[:, 3:])], axis=1)
+    return setpoint, error[0], rate[0] / seconds
+
+
+def test_a_tool_follows_increments_with_less_lag_than_without_twist():
+    action = [0.0, -0.1, 0.0, 0.0, 0.0, 0.2]
+    setpoint, error, rate = tool_after_increments(action, 20)
+    np.testing.assert_allclose(setpoint[0, 7:], rate, atol=1e-12)
+    assert np.abs(rate)[[1, 5]] == pytest.approx([0.1, 1.0], rel=0.01)
+    setpoint, late, _ = tool_after_increments(action, 20, twist=False)
+    assert setpoint.shape == (1, 7)
+    lag, lag_without = error[[1, 5]] / rate[[1, 5]], late[[1, 5]] / rate[[1, 5]]
+    assert (lag_without > 0.08).all()
+    assert (np.abs(lag) < 0.015).all()  # the pose is held for a step of 20 ms, half of which the tool is ahead
+
+
+def test_a_target_that_returns_to_the_workspace_is_a_step_without_twist():
+    setpoint, *_ = tool_after_increments([0.0, 0.1, 0.0], 1)
+    envs = ToolReachVectorEnv(1, workers=0, actions="increment", workspace=0.0)
+    envs.reset(seed=0)
+    envs.step(np.array([[0.0, 0.1, 0.0]]))
+    assert setpoint[0, 7:].tolist() == pytest.approx([0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
+    assert (envs._setpoint[0, :3] == envs.center).all()
+    np.testing.assert_array_equal(envs._setpoint[0, 7:], 0.0)
+    envs.close()
+
+
+def test_targets_in_the_workspace_are_steps_of_the_pose():
+    for osc, size in ({"stiffness": 400.0}, 7), ({"twist": True}, 13):
+        envs = ToolReachVectorEnv(1, workers=0, osc=osc)
+        envs.reset(seed=0)
+        envs.step(np.full((1, 3), 0.5))
+        assert envs._setpoint.shape == (1, size)
+        np.testing.assert_array_equal(envs._setpoint[0, 7:], 0.0)
+        envs.close()
+
+
 def test_the_tools_task_is_bit_identical_to_gymnasiums_vector_of_single_envs():
     name, options = "batchpid.sim.gym:batchpid/ToolReach-v0", {"actions": "increment"}
     ours = gymnasium.make_vec(name, num_envs=2, workers=0, max_episode_steps=3, **options)
@@ -282,7 +378,7 @@ def test_every_goal_of_a_box_can_be_reached():
     envs = PushVectorEnv(12, actions="increment", max_episode_steps=None)
     observation, _ = envs.reset(seed=100)
     reached = np.zeros(12, bool)
-    for _ in range(150):
+    for _ in range(250):
         tool, box, goal = (
             observation[:, part].astype(float) for part in (slice(-16, -14), slice(-9, -7), slice(-2, None))
         )

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from batchpid.sim import Runner, read_recording
+from batchpid.sim import Robot, Runner
 from batchpid.sim.cli import main
 from batchpid.sim.cli.run import start_poses
-from batchpid.trajectories import minimum_jerk
+from batchpid.sim.identification.setpoint_files import read_setpoints
+from batchpid.trajectories import Trajectory, minimum_jerk
+from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write
 
 SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
 
@@ -163,72 +165,237 @@ def test_picture(batchpid, tmp_path):
     assert "panda_joint7" in path.read_text()
 
 
-def trajectory(path, robot, *, rates=True, ends="\n", quote='"', edit=None):
-    """Write a move of the robot as a CSV with quoted names and these line ends."""
-    move = minimum_jerk(robot.settings.start, robot.settings.target, 0.01, duration=1.5)
-    kinds = {"setpoint": (robot.settings.start, move.position), "setpoint_rate": (0 * robot.start, move.velocity)}
-    names, table = ["time"], [np.append(0.0, move.time)[:, None]]
-    for kind, (first, rows) in list(kinds.items())[: 1 + rates]:
-        names += [f"{kind}:{name}" for name in robot.joint_names]
-        table.append(np.vstack([first, rows]))
-    lines = [",".join(f"{quote}{name}{quote}" for name in names)]
-    lines += [",".join(f"{number:.12g}" for number in row) for row in np.hstack(table)]
-    if edit is not None:
-        lines = edit(lines)
-    path.write_bytes(ends.join([*lines, ""]).encode())
-    return path
+# -- trajectories ------------------------------------------------------------------------------------------------------
+
+ONE = ("--num-envs", 1, "--workers", 0)
 
 
-@pytest.mark.parametrize(("rates", "ends"), [(True, "\r\n"), (False, "\n")])
-def test_a_trajectory_is_followed(batchpid, panda, tmp_path, rates, ends):
-    path, out = trajectory(tmp_path / "move.csv", panda, rates=rates, ends=ends), tmp_path / "run.npz"
-    status, said, error = batchpid("rollout", "--num-envs", 2, "--workers", 0, "--trajectory", path, "--out", out)
+@pytest.fixture(scope="module")
+def motion(panda):
+    """Motion of the panda from rest at its start pose, in ticks of 5 ms."""
+    there = panda.start + 0.2 * (panda.settings.target - panda.start)
+    return minimum_jerk(panda.start, there, 0.005, duration=0.4)
+
+
+OF_TRAJECTORY = {"setpoint": "position", "setpoint_rate": "velocity", "setpoint_acceleration": "acceleration"}
+
+
+def csv(robot, motion, *further, start=True, delimiter=",", end="\n", header="{}"):
+    """Return setpoints and ``further`` quantities of a motion as CSV, with a row at time 0 for ``robot.start``."""
+    tables = [getattr(motion, OF_TRAJECTORY[name]) for name in ("setpoint", *further)]
+    names = [header.format(f"{key}:{name}") for key in ("setpoint", *further) for name in robot.joint_names]
+    rows = np.hstack([motion.time[:, None], *tables])
+    if start:
+        rows = np.vstack([np.concatenate([[0], robot.start, np.zeros(robot.dof * len(further))]), rows])
+    cells = [[header.format("time"), *names], *([f"{cell:.9g}" for cell in row] for row in rows)]
+    return "".join(delimiter.join(row) + end for row in cells)
+
+
+def through(poses):
+    """Return a motion in ticks of 10 ms through poses, whose first is at time 0."""
+    poses = np.array(poses)
+    return Trajectory(0.01 * np.arange(len(poses)), poses, 0 * poses, 0 * poses)
+
+
+def following_errors(report):
+    """Return the largest and the last following errors of env 0 (joints,), as the report prints them."""
+    rows = [line.split() for line in report.splitlines() if line.startswith("panda_")]
+    assert len(rows) == 9
+    return np.array([[float(row[1]), float(row[5])] for row in rows]).T
+
+
+def test_a_trajectory_is_followed_as_by_a_runner_with_its_rates(batchpid, tmp_path, panda, motion):
+    path = tmp_path / "motion.csv"
+    path.write_text(csv(panda, motion, "setpoint_rate"))
+    flags = ("--num-envs", 3, "--workers", 0, "--out", tmp_path / "run.npz")
+    status, said, error = batchpid("rollout", "--trajectory", path, *flags)
     assert status == 0, error
-    assert ("Rates: those of the file." if rates else "Rates: differences of the rows.") in said
-    rollout = read_recording(out)
-    assert len(rollout.time) == 150
-    assert rollout.info.rates
-    assert np.abs(rollout.qpos - rollout.setpoint)[:, 0].max() < 0.002
-    np.testing.assert_allclose(rollout.qpos[-1, 0], panda.settings.target, atol=0.002)
+    assert "Rates of the setpoints: from the file." in said
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)[1:, 1:]
+    with Runner(panda, 3, workers=0, params=panda.tuned(), substeps=10) as runner:
+        runner.reset(start_poses(panda, 3, 0.3, 0))
+        expected = runner.rollout(rows[:, :9], setpoint_rates=rows[:, 9:])
+    with np.load(tmp_path / "run.npz") as file:
+        for name, value in expected.arrays().items():
+            np.testing.assert_array_equal(file[name], value)
+    error = np.abs(expected.qpos - expected.setpoint)[:, 0].max(0)
+    assert error.max() < 2e-3
+    np.testing.assert_allclose(following_errors(said)[0], error, rtol=0.06)
+
+
+def test_rates_that_a_file_lacks_are_central_differences(batchpid, tmp_path, panda, motion):
+    path = tmp_path / "motion.csv"
+    path.write_text(csv(panda, motion))
+    status, said, error = batchpid("rollout", "--trajectory", path, *ONE, "--out", tmp_path / "run.npz")
+    assert status == 0, error
+    assert "Rates of the setpoints: central differences of the rows.\n" in said
+    setpoints = np.loadtxt(path, delimiter=",", skiprows=1)[:, 1:]
+    with Runner(panda, 1, workers=0, params=panda.tuned(), substeps=10) as runner:
+        expected = runner.rollout(setpoints[1:], setpoint_rates=np.gradient(setpoints, 0.005, axis=0)[1:])
+    with np.load(tmp_path / "run.npz") as file:
+        np.testing.assert_allclose(file["qpos"], expected.qpos, atol=1e-6)
+    assert following_errors(said)[0].max() < 2e-3
+
+
+def test_a_file_without_a_row_at_time_0_begins_at_the_start_pose(batchpid, tmp_path, panda, motion):
+    path = tmp_path / "motion.csv"
+    path.write_text(csv(panda, motion, start=False))
+    status, said, error = batchpid("rollout", "--trajectory", path, *ONE, "--out", tmp_path / "run.npz")
+    assert status == 0, error
+    with np.load(tmp_path / "run.npz") as file:
+        np.testing.assert_array_equal(file["start"][0], panda.start.astype(np.float32))
+        np.testing.assert_allclose(file["time"], motion.time)
+    assert following_errors(said)[0].max() < 2e-3
+
+
+def test_the_first_row_is_the_start_of_env_0_and_others_spread_around_it(batchpid, tmp_path, panda):
+    path = tmp_path / "motion.csv"
+    path.write_text(csv(panda, through([panda.settings.target] * 2), start=False))
+    status, _, error = batchpid("rollout", "--trajectory", path, *SHORT[:4], "--out", tmp_path / "run.npz")
+    assert status == 0, error
+    with np.load(tmp_path / "run.npz") as file:
+        expected = start_poses(panda, 3, 0.3, 0, panda.settings.target)
+        np.testing.assert_allclose(file["start"], expected, atol=1e-6)
+        assert len(file["time"]) == 1
+
+
+@pytest.mark.parametrize(
+    "style",
+    [
+        {"delimiter": ";"},
+        {"delimiter": "\t"},
+        {"end": "\r\n"},
+        {"header": '"{}"', "end": "\r\n"},
+    ],
+)
+def test_files_of_other_programs_read_as_those_of_this_one(tmp_path, panda, motion, style):
+    plain, other = tmp_path / "plain.csv", tmp_path / "other.csv"
+    plain.write_text(csv(panda, motion, "setpoint_rate", "setpoint_acceleration"))
+    other.write_bytes(csv(panda, motion, "setpoint_rate", "setpoint_acceleration", **style).encode("utf-8-sig"))
+    expected, found = (read_setpoints(panda, path, 1 / 2000) for path in (plain, other))
+    for one, another in zip(expected, found, strict=True):
+        np.testing.assert_array_equal(one, another)
+    assert found.has_rates
+    np.testing.assert_allclose(found.acceleration, motion.acceleration, rtol=1e-8, atol=1e-8)
+
+
+def test_the_motion_of_excite_is_followed(batchpid, tmp_path):
+    path = tmp_path / "x.csv"
+    assert batchpid("excite", "panda", "--duration", 2, "--rate", 200, "--out", path)[0] == 0
+    status, said, error = batchpid("rollout", "--trajectory", path, *ONE)
+    assert status == 0, error
+    assert "real-time" in said
+    assert following_errors(said)[0].max() < 5e-3
+
+
+def test_changes_beyond_the_velocity_limits_are_steps(batchpid, tmp_path, panda):
+    path = tmp_path / "step.csv"
+    poses = [panda.start, panda.start, panda.settings.target, panda.settings.target]
+    path.write_text(csv(panda, through(poses), start=False))
+    found = read_setpoints(panda, path, 1 / 2000)
+    assert found.steps == np.count_nonzero(panda.settings.target != panda.start) > 0
+    np.testing.assert_array_equal(found.rate, 0.0)
+    assert f"{found.steps} changes are too fast" in batchpid("rollout", "--trajectory", path, *ONE)[1]
+
+
+def test_rates_take_the_short_way_round_and_followers_need_no_column(tmp_path):
+    follower = joint("right", "base", "r", inner=LIMIT + '<mimic joint="left" multiplier="-0.5"/>', origin="0 -1 1")
+    turning = joint("turn", "base", "t", "continuous", '<limit effort="50" velocity="9"/>', origin="0 3 1")
+    parts = (*map(link, ("base", "l", "r", "t")), follower, joint("left", "base", "l", origin="0 1 1"), turning)
+    arm, path = Robot.load(write(tmp_path, robot(*parts))), tmp_path / "motion.csv"
+    path.write_text("time,setpoint:left,setpoint:turn\n0,0.1,3.13\n0.01,0.12,-3.13\n")
+    found = read_setpoints(arm, path, 1 / 2000)
+    left, right, turn = (arm.joint_names.index(name) for name in ("left", "right", "turn"))
+    assert found.rate[0, [left, turn]] == pytest.approx([2.0, (2 * np.pi - 6.26) / 0.01])
+    assert found.position[0, right] == pytest.approx(-0.06)
+    assert found.substeps == 20
+
+
+def cut(change):
+    """Return a function that changes the lines of a file, each a list of cells."""
+
+    def changed(text):
+        lines = [line.split(",") for line in text.splitlines()]
+        change(lines)
+        return "\n".join(map(",".join, lines))
+
+    return changed
+
+
+def in_column(column, function):
+    """Return a change of all cells of a column but its name."""
+
+    def change(lines):
+        for line in lines[1:]:
+            line[column] = function(line[column])
+
+    return cut(change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (cut(lambda lines: lines.pop(20)), "line 21: time is 0.1 s, and not 0.095 s; .*resample"),
+        (cut(lambda lines: lines.insert(5, lines[2])), "line 6: time does not increase"),
+        (in_column(0, lambda cell: str(1000 * float(cell))), "rows every 5 s; .*seconds"),
+        (in_column(0, lambda cell: str(0.0033 + float(cell))), "line 2: the first row is at 0.0033 s; begin at 0"),
+        (in_column(0, lambda cell: str(0.74 * float(cell))), "rows every 0.0037 s, .*use --timestep 0.0005285714"),
+        (in_column(4, lambda cell: str(57.3 * float(cell))), "panda_joint4' is outside .*got -.*within -3.07"),
+        (in_column(3, lambda cell: "nan"), "line 2, column 'setpoint:panda_joint3' is empty or not finite"),
+        (in_column(3, lambda cell: ""), "line 2, column 'setpoint:panda_joint3' is empty or not finite"),
+        (in_column(12, lambda cell: "fast"), "line 2, column 'setpoint_rate:panda_joint3' is not a number"),
+        (cut(lambda lines: lines[0].__setitem__(0, "t")), "no column 'time'"),
+        (cut(lambda lines: lines[0].__setitem__(3, "qpos:panda_joint3")), "unknown column 'qpos:panda_joint3'"),
+        (cut(lambda lines: lines[0].__setitem__(3, "setpoint:elbow")), "'setpoint:elbow': joint: unknown"),
+        (cut(lambda lines: lines[0].__setitem__(3, " setpoint: panda_joint1")), "'setpoint:panda_joint1' twice"),
+        (cut(lambda lines: [line.pop(3) for line in lines]), "column setpoint:panda_joint3: is missing"),
+        (cut(lambda lines: [line.pop(12) for line in lines]), "column setpoint_rate:panda_joint3: is missing"),
+        (cut(lambda lines: lines.__delitem__(slice(2, None))), "line 2: the only row is at 0 s"),
+        (
+            lambda text: text.replace(",", ";").replace(".", ","),
+            "line 2, column 'time' is not a number .*decimal point",
+        ),
+        (lambda text: text.replace("setpoint_rate", "setpoint_acceleration"), "accelerations need the rates"),
+    ],
+)
+def test_a_wrong_trajectory_is_refused(batchpid, tmp_path, panda, motion, change, message):
+    path = tmp_path / "motion.csv"
+    path.write_text(change(csv(panda, motion, "setpoint_rate").replace("\n0,", "\n0.0,")))
+    status, _, error = batchpid("rollout", "--trajectory", path, *ONE)
+    assert status == 2
+    assert error.startswith(f"batchpid: {path}: ")
+    assert re.search(message, error), error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--seconds", 1), "trajectory: excludes --seconds"),
+        (("--setpoint", 0, 0), "trajectory: excludes --setpoint"),
+        (("--control", "osc"), "trajectory: excludes --control osc"),
+        (("--substeps", 7), r"substeps: differs from the ticks .*use 10"),
+        (("--gains", "tutorial"), "setpoint_acceleration: needs gains in accelerations; use --gains designed"),
+        (("--control", "drive"), "setpoint_acceleration: needs gains in accelerations"),
+    ],
+)
+def test_flags_that_contradict_a_trajectory_are_refused(batchpid, tmp_path, panda, motion, flags, message):
+    path = tmp_path / "motion.csv"
+    path.write_text(csv(panda, motion, "setpoint_rate", "setpoint_acceleration"))
+    status, _, error = batchpid("rollout", "--trajectory", path, *ONE, *flags)
+    assert status == 2
+    assert re.search(message, error), error
 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
 def test_a_trajectory_without_rates_is_a_log(batchpid, panda, tmp_path):
-    path, out = trajectory(tmp_path / "move.csv", panda), tmp_path / "run.npz"
-    flags = ("--num-envs", 1, "--workers", 0, "--trajectory", path, "--no-rates", "--out", out)
-    status, said, error = batchpid("rollout", *flags)
+    rows = np.linspace(panda.settings.target, panda.settings.target - 0.01, 4)
+    path, out = tmp_path / "move.csv", tmp_path / "run.npz"
+    header = ",".join(["time", *(f"setpoint:{name}" for name in panda.joint_names)])
+    np.savetxt(path, np.column_stack([0.01 * np.arange(4), rows]), delimiter=",", header=header, comments="")
+    status, said, error = batchpid(
+        "rollout", "--num-envs", 1, "--workers", 0, "--trajectory", path, "--no-rates", "--out", out
+    )
     assert status == 0, error
-    assert "Rates: not given." in said
+    assert "not given" in said
     assert read_recording(out).info.rates is False
-
-
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (lambda lines: [lines[0].replace("setpoint:panda_joint3", "setpoint:elbow"), *lines[1:]], "'setpoint:elbow'"),
-        (
-            lambda lines: [line.rpartition(",")[0] for line in lines],
-            "no column 'setpoint_rate:panda_finger_joint2'",
-        ),
-        (lambda lines: [*lines[:4], *lines[5:]], r"line 5: its time is not 0.01 s after"),
-        (
-            lambda lines: [*lines[:3], lines[3].replace(lines[3].split(",")[2], "nan", 1), *lines[4:]],
-            "line 4.* finite",
-        ),
-        (lambda lines: [lines[0], *lines[4:]], "begins at 0.03 s"),
-        (lambda lines: lines[:2], "has one row"),
-    ],
-)
-def test_what_is_no_trajectory_is_named(batchpid, panda, tmp_path, edit, message):
-    path = trajectory(tmp_path / "move.csv", panda, edit=edit)
-    status, _, error = batchpid("rollout", "--num-envs", 1, "--workers", 0, "--trajectory", path)
-    assert status != 0
-    assert re.search(message, error.replace("\n", " ")), error
-
-
-@pytest.mark.parametrize("flags", [("--seconds", 1), ("--substeps", 10), ("--control", "osc")])
-def test_what_a_trajectory_replaces_is_refused(batchpid, panda, tmp_path, flags):
-    path = trajectory(tmp_path / "move.csv", panda)
-    status, _, error = batchpid("rollout", "--trajectory", path, *flags)
-    assert status != 0
-    assert error.startswith(f"batchpid: {flags[0][2:]}: "), error

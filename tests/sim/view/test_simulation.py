@@ -5,8 +5,9 @@ import pytest
 from identical import assert_identical
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import FaultWarning, Runner
+from batchpid.sim import FaultWarning, Robot, Runner
 from batchpid.sim.view import LiveSimulation
+from tests.sim.tiny_urdf import one_joint, write
 
 STIFF = {"kp": 600.0, "ki": 900.0, "kd": 50.0, "derivative_filter_time": 2e-3}
 """Gains per effort that hold a panda under a payload."""
@@ -195,6 +196,37 @@ def test_a_drive_has_no_sliders_of_options_that_it_lacks(jaco2):
     for gain in ("setpoint_weight", "derivative_filter_time"):
         with pytest.raises(InvalidArgumentError, match=gain):
             live.gains["drive"].set(gain, 0, 0.5)
+    live.close()
+
+
+def test_a_jump_of_a_joint_without_velocity_limit_is_a_step(tmp_path):
+    robot = Robot.load(write(tmp_path, one_joint('<limit lower="-1" upper="1" effort="50" velocity="0"/>')))
+    live = LiveSimulation(robot, 1, workers=0, spread=0.0)
+    live.advance()
+    live.set_setpoint([0.5])
+    live.advance()
+    with Runner(robot, 1, workers=0, params=live.gains["pid"].params) as runner:
+        runner.reset(live.start)
+        for setpoint in ([0.0], [0.5]):
+            observation = runner.step(setpoint, substeps=round(live.period * 2000))
+    assert np.isinf(robot.velocity_limit).all()
+    np.testing.assert_array_equal(live.frame().qpos[0], observation.qpos)
+    live.close()
+
+
+def test_pid_and_drive_in_two_groups_follow_a_dragged_slider(jaco2):
+    live = LiveSimulation(jaco2, 1, controls=("pid", "drive"), workers=0, spread=0.0, physics="fast")
+    for _ in range(15):  # 0.5 rad/s
+        live.set_setpoint(live.setpoint[0, 1] + 0.5 * live.period, joint=1)
+        live.advance()
+    behind = live.setpoint[0, 1] - live.frame().qpos[0, :, 1]
+    with Runner(jaco2, 1, control="drive", workers=0, physics="fast", substeps=round(live.period * 2000)) as runner:
+        runner.reset(live.start)
+        steps = jaco2.start + np.eye(jaco2.dof)[1] * 0.5 * live.period * np.arange(1, 16)[:, None]
+        without = runner.rollout(steps).qpos[-1, 0, 1]
+    np.testing.assert_allclose(live.setpoint[0], steps[-1])
+    assert np.abs(behind[0]) < 0.02
+    assert behind[1] < steps[-1, 1] - without - 0.02
     live.close()
 
 
