@@ -63,7 +63,7 @@ def hold_pose(runner: Runner, start: NDArray[Any], goal: NDArray[Any], seconds: 
 
 
 def follow(runner: Runner, start: NDArray[Any], setpoints: Setpoints, rates: bool) -> tuple[Rollout, str]:
-    """Follow ``setpoints`` of a file from ``start`` (envs, dof), with its rates or without; return rollout and report."""
+    """Follow setpoints of a file from ``start`` (envs, dof), with rates or without; return the rollout and a report."""
     began = time.perf_counter()
     runner.reset(start, seed=None if runner.options.randomization is None else 0)
     rollout = runner.rollout(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from batchpid.sim import Robot, Runner
+from batchpid.sim import Robot, Runner, read_recording
 from batchpid.sim.cli import main
 from batchpid.sim.cli.run import start_poses
 from batchpid.sim.identification.setpoint_files import read_setpoints
