@@ -167,7 +167,7 @@ def make_osc_params(
         Largest norm of the error that enters the law [m, rad]; inf for none.
     smallest_eigenvalue
         s0 > 0 of the bounded inverse (:func:`batchpid.task_space.symmetric.bounded_inverse`): below it, directions near
-        a singularity lose stiffness [1/kg, 1/(kg m^2)].
+        a singularity lose stiffness; below s0/5 the posture pulls the tool there [1/kg, 1/(kg m^2)].
     effort_limit, effort_min, effort_max
         Limits of the total effort of the joints [N m or N]: ``effort_limit=x`` is ``effort_min=-x, effort_max=x``.
     decoupling

@@ -48,8 +48,11 @@ def tool_report(runner: Runner, rollout: Rollout, wall: float) -> str:
     return f"{speed}\n\n{table(rows, headers, 'lrr')}\n\n{about}\n{outcome}".rstrip()
 
 
-def trajectory_report(runner: Runner, rollout: Rollout, setpoints: Setpoints, wall: float) -> str:
-    """Return the report of a ``rollout`` along the ``setpoints`` of a file that took ``wall`` seconds."""
+def trajectory_report(runner: Runner, rollout: Rollout, setpoints: Setpoints | None, wall: float) -> str:
+    """Return the report of a ``rollout`` along a trajectory that took ``wall`` seconds.
+
+    ``setpoints`` are those of the file, or None if their rates were not given.
+    """
     robot, ticks = runner.robot, len(rollout.time)
     ends = rollout.for_ticks(slice(-max(1, ticks // 10), None))
     errors = [following_error(robot, each) for each in (rollout, ends)]
@@ -63,7 +66,7 @@ def trajectory_report(runner: Runner, rollout: Rollout, setpoints: Setpoints, wa
         for j, joint in enumerate(robot.joints)
     ]
     rates = "Rates of the setpoints: from the file."
-    if setpoints.rate is None:
+    if setpoints is None:
         rates = "Rates of the setpoints: not given."
     elif not setpoints.has_rates:
         rates = "Rates of the setpoints: central differences of the rows."

@@ -45,10 +45,9 @@ class RolloutCommand:
     trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Setpoints to follow instead: a CSV file with the columns time, setpoint:JOINT ..., and, where they are known,
     setpoint_rate:JOINT ... and setpoint_acceleration:JOINT ... A row holds at its time, and rows are equally spaced: by
-    a tick. The first is at 0, with the start pose of env 0, or at the end of the first tick. Rates that are missing are
-    central differences."""
+    a tick. The first is at 0, with the start pose of env 0, or at the end of the first tick."""
     rates: bool = True
-    """With --no-rates the trajectory's setpoints have none, as a recording for `batchpid identify` needs it."""
+    """With --no-rates the setpoints of the trajectory have none, as in a recording that `batchpid identify` reads."""
     seconds: flags.Seconds = 2.0
     timestep: float = 1 / 2000
     """Time step of simulation and control [s]."""
@@ -123,7 +122,7 @@ class RolloutCommand:
             streamed = out is not None and out.suffix.lower() != ".npz"
             with Recorder(out, runner, seed=self.seed, overwrite=self.force) if out and streamed else nullcontext():
                 if setpoints is not None:
-                    rollout, report = follow(runner, start, setpoints if self.rates else setpoints.without_rates())
+                    rollout, report = follow(runner, start, setpoints, self.rates)
                 else:
                     rollout, report = (hold_pose if osc else hold_setpoint)(runner, start, setpoint, seconds)
         if out is not None and not streamed:
@@ -139,12 +138,15 @@ class RolloutCommand:
         """Return the setpoints in a file, if no flag contradicts them."""
         from batchpid.sim.identification.setpoint_files import read_setpoints
 
-        given = {"setpoint": self.setpoint is not None, "seconds": self.seconds != RolloutCommand.seconds}
-        for name in [name for name, is_given in given.items() if is_given]:
-            raise InvalidArgumentError(name, "is given by the trajectory", remedy=f"leave out --{name}")
-        if self.control == "osc":
-            remedy = "use --control pid or drive"
-            raise InvalidArgumentError("control", "'osc' follows poses, and a trajectory is of joints", remedy=remedy)
+        others = {
+            "--setpoint": self.setpoint is not None,
+            "--seconds": self.seconds != RolloutCommand.seconds,
+            "--control osc": self.control == "osc",
+        }
+        for name, is_given in others.items():
+            if is_given:
+                remedy = "leave one of them out; a trajectory has joint setpoints, and lasts as long as its file"
+                raise InvalidArgumentError("trajectory", f"excludes {name}", remedy=remedy)
         setpoints = read_setpoints(robot, path, number("timestep", self.timestep, 1e-6, 0.1, "seconds"))
         if self.substeps not in (RolloutCommand.substeps, setpoints.substeps):
             problem, remedy = f"differs from the ticks of {path}", f"leave it out, or use {setpoints.substeps}"

@@ -62,17 +62,17 @@ def hold_pose(runner: Runner, start: NDArray[Any], goal: NDArray[Any], seconds: 
     return rollout, tool_report(runner, rollout, time.perf_counter() - began)
 
 
-def follow(runner: Runner, start: NDArray[Any], setpoints: Setpoints) -> tuple[Rollout, str]:
-    """Follow the ``setpoints`` of a file from ``start`` (envs, dof); return the rollout and a report on it."""
+def follow(runner: Runner, start: NDArray[Any], setpoints: Setpoints, rates: bool) -> tuple[Rollout, str]:
+    """Follow setpoints of a file from ``start`` (envs, dof), with rates or without; return the rollout and a report."""
     began = time.perf_counter()
     runner.reset(start, seed=None if runner.options.randomization is None else 0)
     rollout = runner.rollout(
         setpoints.position,
-        setpoint_rates=setpoints.rate,
-        setpoint_accelerations=setpoints.acceleration,
+        setpoint_rates=setpoints.rate if rates else None,
+        setpoint_accelerations=setpoints.acceleration if rates else None,
         progress=bar("simulating", unit="tick"),
     )
-    return rollout, trajectory_report(runner, rollout, setpoints, time.perf_counter() - began)
+    return rollout, trajectory_report(runner, rollout, setpoints if rates else None, time.perf_counter() - began)
 
 
 def evaluate_sets(

@@ -39,7 +39,7 @@ class Setpoints(NamedTuple):
     start: Float64 | None
     """Pose (dof,) of the row at time 0; None without such a row."""
     position: Float64
-    rate: Float64 | None
+    rate: Float64
     acceleration: Float64 | None
     """None where the file has no accelerations."""
     substeps: int
@@ -48,10 +48,6 @@ class Setpoints(NamedTuple):
     """False if the rates are central differences."""
     steps: int
     """Number of changes that count as steps of the setpoint, with rate 0."""
-
-    def without_rates(self) -> Setpoints:
-        """Return the setpoints alone."""
-        return self._replace(rate=None, acceleration=None)
 
 
 def setpoint_csv(robot: Robot, motion: Trajectory) -> str:

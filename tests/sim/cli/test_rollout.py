@@ -368,23 +368,12 @@ def test_a_wrong_trajectory_is_refused(batchpid, tmp_path, panda, motion, change
     assert error.count("\n") == 1
 
 
-@pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
-def test_a_trajectory_without_rates_is_a_log(batchpid, tmp_path, panda, motion):
-    path, out = tmp_path / "motion.csv", tmp_path / "run.npz"
-    path.write_text(csv(panda, motion, "setpoint_rate", "setpoint_acceleration"))
-    for flags, has_rates in ((), True), (("--no-rates", "--gains", "tutorial"), False):
-        status, said, error = batchpid("rollout", "--trajectory", path, *ONE, "--out", out, "--force", *flags)
-        assert status == 0, error
-        assert ("Rates of the setpoints: not given." in said) is not has_rates
-        assert read_recording(out).info.rates is has_rates
-
-
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--seconds", 1), "seconds: is given by the trajectory; leave out --seconds"),
-        (("--setpoint", 0, 0), "setpoint: is given by the trajectory"),
-        (("--control", "osc"), "control: 'osc' follows poses"),
+        (("--seconds", 1), "trajectory: excludes --seconds"),
+        (("--setpoint", 0, 0), "trajectory: excludes --setpoint"),
+        (("--control", "osc"), "trajectory: excludes --control osc"),
         (("--substeps", 7), r"substeps: differs from the ticks .*use 10"),
         (("--gains", "tutorial"), "setpoint_acceleration: needs gains in accelerations; use --gains designed"),
         (("--control", "drive"), "setpoint_acceleration: needs gains in accelerations"),
@@ -396,3 +385,26 @@ def test_flags_that_contradict_a_trajectory_are_refused(batchpid, tmp_path, pand
     status, _, error = batchpid("rollout", "--trajectory", path, *ONE, *flags)
     assert status == 2
     assert re.search(message, error), error
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
+def test_a_trajectory_without_rates_is_a_log(batchpid, panda, tmp_path):
+    rows = np.linspace(panda.settings.target, panda.settings.target - 0.01, 4)
+    path, out = tmp_path / "move.csv", tmp_path / "run.npz"
+    header = ",".join(["time", *(f"setpoint:{name}" for name in panda.joint_names)])
+    np.savetxt(path, np.column_stack([0.01 * np.arange(4), rows]), delimiter=",", header=header, comments="")
+    status, said, error = batchpid(
+        "rollout", "--num-envs", 1, "--workers", 0, "--trajectory", path, "--no-rates", "--out", out
+    )
+    assert status == 0, error
+    assert "not given" in said
+    assert read_recording(out).info.rates is False
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
+def test_without_rates_a_trajectory_has_no_accelerations_either(batchpid, tmp_path, panda, motion):
+    path = tmp_path / "motion.csv"
+    path.write_text(csv(panda, motion, "setpoint_rate", "setpoint_acceleration"))
+    status, said, error = batchpid("rollout", "--trajectory", path, *ONE, "--no-rates", "--gains", "tutorial")
+    assert status == 0, error
+    assert "not given" in said
