@@ -29,9 +29,9 @@ returns from it.
 
 Below its bound an inertia lets the posture into the task. The damping has to enter below s0, where the task loses its
 own. The springs would pull the tool off poses that it reaches: at rest its error would be (s0^2/s^2 - 1) (v J a_s) / kp
-along the eigenvector v. So L_s has a lower bound r = s0/5, below which the springs draw the robot out of the singular
-pose: an eigenvalue s turns into 1/s, or s (2 - s^2/r^2) / r^2 below r. The derivative is continuous, since a robot whose
-setpoint is out of reach rests just below r, where a kink would chatter.
+along the eigenvector v. So L_s has a lower bound s1 = s0/5, below which the springs draw the robot out of the singular
+pose: an eigenvalue s turns into 1/s, or s (2 - s^2/s1^2) / s1^2 below s1. The derivative is continuous, since a robot
+whose setpoint is out of reach rests just below s1, where a kink would chatter.
 
 Saturation keeps the direction of the motion: s1 in [0, 1] is the largest share of the task with which all joints are
 within their limits, and s2 the largest share of the posture in the room that is left. A joint whose u is out of limits

@@ -14,7 +14,7 @@ from batchpid.task_space.osc_state import TaskDynamics
 from batchpid.task_space.symmetric import bounded_inverse, gram, product, whitened
 
 SPRING_BOUND = 0.2
-"""Bound r of L_s, as a share of the bound s0 of L_n."""
+"""Bound s1 of L_s, as a share of the bound s0 of L_n."""
 
 
 class Projections(NamedTuple):
