@@ -151,7 +151,7 @@ class RunInfo:
     ground: bool | None = None
     """True if the scenes had a ground at height 0."""
     rates: bool | None = None
-    """True if setpoints were given with rates, so that they moved within the ticks."""
+    """True if setpoints were given with rates, so that they moved within the ticks; None if unknown, as after a kill."""
     params: PIDParams | None = None
     """PID parameters at the start."""
     actuators: Actuators | None = None
@@ -279,7 +279,7 @@ class Rollout:
         """Return successive rollouts of one run as one.
 
         The info is the first part's, with the faults of the last and the redraws of all. It is complete if all are, and
-        has rates if one has.
+        has rates if one has; if others are unknown, so is the whole.
 
         Raises InvalidArgumentError if ``parts`` are empty, or differ in the robot, an option, the tick or the
         number of envs.
@@ -296,8 +296,8 @@ class Rollout:
         time, setpoint = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "setpoint"))
         redraws = tuple(dict.fromkeys(each for part in parts for each in part.info.redraws))
         complete = all(part.info.complete for part in parts)
-        known = [part.info.rates for part in parts if part.info.rates is not None]
-        rates = any(known) if known else None
+        each = [part.info.rates for part in parts]
+        rates = True if True in each else None if None in each else False
         info = replace(first.info, faults=parts[-1].info.faults, redraws=redraws, complete=complete, rates=rates)
         return Rollout(time, setpoint, seen, first.tick, info)
 

@@ -56,8 +56,8 @@ class TickRecorder(Protocol):
 
     path: Path
 
-    def append(self, time_: float, setpoint: NDArray[Any], observation: Observation) -> None:
-        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size).
+    def append(self, time_: float, setpoint: NDArray[Any], observation: Observation, has_rates: bool) -> None:
+        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size), with rates or without.
 
         After an interrupt it is called again, with the same ``observation``; it is to be recorded once.
         """
@@ -360,7 +360,6 @@ class Session:
         return options.robot.run_info(
             **options.values_for("recording"),
             own_command=options.own_command,
-            rates=state.rated,
             params=state.params,
             actuators=state.actuators,
             start=start,
@@ -404,7 +403,7 @@ class Session:
                 if self.recorder is not None:
                     time = (state.steps + done * substeps) * timestep
                     observation = self._seen(arrays.observation)
-                    unrecorded += ((time, arrays.command.setpoint.copy(), observation),)
+                    unrecorded += ((time, arrays.command.setpoint.copy(), observation, rate is not None),)
             if self._moving is not None:
                 self._moving.see(setpoint[:count], rate is not None, substeps * timestep)
             if self._chatter is not None and self._chatter.is_watching:
@@ -421,7 +420,6 @@ class Session:
                 steps=state.steps + steps,
                 targets=None if state.targets is None else _followed(state.targets, setpoint[:count]),
                 motion=motion,
-                rated=state.rated or rate is not None,
                 steps_since_checkpoint=state.steps_since_checkpoint + steps,
                 work=state.work if pool.failure else (tuple(seconds), ticks),
             )

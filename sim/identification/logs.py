@@ -119,6 +119,9 @@ def logs_of_rollout(
     if info.rates and found == "setpoint":
         problem, remedy = "was made with setpoint rates, which the model of the law does not have", "record one without"
         raise InvalidArgumentError(source, problem, remedy=remedy)
+    if info.rates is None and not info.complete and found == "setpoint":
+        problem = f"{source}: was cut short, before it said whether setpoints had rates"
+        warnings.warn(f"{problem}; it is fitted as a run without: if it had them, record another", LogWarning, 2)
     if not rollout.ok.all():
         env = int(np.argmin(rollout.ok.all(0)))
         raise InvalidArgumentError(source, "has failed", env=env, remedy="record a run without faults")

@@ -107,7 +107,7 @@ class Recorder(SingleOwner):
         self._oldest = math.inf  # when the oldest row was recorded that is being written
         self._faults: tuple[Fault, ...] = runner.faults  # up to the last row
         self._episodes, self._redraws = runner.episodes, list[Redraw]()
-        self._rates = False  # whether a tick had rates
+        self._rates = False  # whether a recorded tick had rates
         self._end: Callable[[PartialFile], None] | None = None
         self._error: RecordingError | None = None
         self._has_raised = False
@@ -124,8 +124,10 @@ class Recorder(SingleOwner):
             self._finish_with(PartialFile.discard)
             raise
 
-    def append(self, time_: float, setpoint: NDArray[Any], observation: Observation) -> None:
-        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size). The runner calls it.
+    def append(self, time_: float, setpoint: NDArray[Any], observation: Observation, has_rates: bool) -> None:
+        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size), with rates or without.
+
+        The runner calls it.
 
         Repeated with the same ``observation``, after an interrupt, it has no effect.
         """
@@ -137,6 +139,7 @@ class Recorder(SingleOwner):
         for env in np.flatnonzero((episodes != self._episodes).any(1)).tolist():
             self._redraws.append(Redraw(time_, env, *episodes[env].tolist()))
         self._episodes = episodes
+        self._rates |= has_rates
         self._rows.put(_Row(time.monotonic(), time_, np.array(setpoint), observation))
 
     def close(self, complete: bool = True) -> None:
@@ -155,7 +158,6 @@ class Recorder(SingleOwner):
                 except BatchPIDError as error:
                     failure = error
                 self._faults = runner.faults
-            self._rates = bool(runner.info.rates)
             runner.recorder = None
         faults, redraws = files.faults_text(self._faults), files.redraws_text(self._redraws)
         self._finish_with(lambda file: file.finish(complete, faults, redraws, self._rates))

@@ -48,8 +48,8 @@ class RunnerState(NamedTuple):
     steps_since_checkpoint: int = 0
     work: tuple[tuple[float, ...], int] = ((), 1)
     """Seconds of each worker in the last run, and the ticks of that run."""
-    unrecorded: tuple[tuple[float, NDArray[Any], Observation], ...] = ()
-    """Ticks for the recorder: time [s], setpoint and observation."""
+    unrecorded: tuple[tuple[float, NDArray[Any], Observation, bool], ...] = ()
+    """Ticks for the recorder: time [s], setpoint, observation, and whether the setpoint had rates."""
     actuators: bp.Actuators | None = None
     contacts: MissedContactLog | None = None
     """None with collisions."""
@@ -57,8 +57,6 @@ class RunnerState(NamedTuple):
     """Observation of the last tick that :meth:`Runner.send` began."""
     targets: NDArray[Any] | None = None
     """Last joint setpoints (envs, dof), where searches for poses of the tool start; None without such poses."""
-    rated: bool = False
-    """Whether a tick had setpoints with rates."""
     motion: tuple[NDArray[Any], NDArray[Any] | None] | None = None
     """Setpoint of the last tick and its rate (envs, dof), None for 0; after a reset positions and velocities.
 
