@@ -430,9 +430,9 @@ class Session:
     def _accelerated(self, command: Command, seconds: float) -> Command:
         """Return ``command`` (ticks, envs, ...) with the mean accelerations in ticks of ``seconds`` with rates.
 
-        The mean is the change of the rate over the tick. It is taken where the setpoints confirm that the rate is the
-        one at the tick's end: where they change by the mean of the old and the new rate rather than by the new one, as
-        increments do. Elsewhere the given acceleration is kept, or 0.
+        The mean is the change of the rate over the tick. It is taken where the setpoints confirm that rates (and given
+        accelerations) are those at the tick's end, since they change by the mean of the old and the new rate rather
+        than by the new one, as increments do. Elsewhere the given acceleration is kept, or 0.
         """
         setpoint, rate, given, _ = command
         state = self._transactions.state
@@ -444,6 +444,9 @@ class Session:
             moved, change = (np.diff(rows, axis=0, prepend=first[None]) for rows, first in both)
             ahead = moved - seconds * rate  # of increments 0, else minus half the change
             fits = np.abs(ahead + 0.5 * seconds * change) < 4 * np.abs(ahead)
+            if given is not None:  # with the jerk (given - mean) / (seconds / 2), where the rate is at its largest, too
+                end = seconds**2 * given
+                fits |= np.abs(ahead + end / 6 + seconds * change / 3) < np.abs(end) / 24
         return command._replace(setpoint_acceleration=np.where(fits, change / seconds, 0.0 if given is None else given))
 
     def _joints(
