@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import subprocess
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +15,16 @@ import pytest
 import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.errors import BatchPIDError
+from batchpid.export import to_c
 from batchpid.sim import OperationalSpace, Robot, Runner
 from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
+from batchpid.sim.identification import identify
+from batchpid.sim.recording.recording_files import write_recording
 from batchpid.sim.robot.urdf_export import to_urdf
+from batchpid.sim.tuning.search import tune
 from batchpid.task_space.frames import pose_error
 from batchpid.trajectories import minimum_jerk
+from tests.c_programs import COMPILERS, TABLE, compiled
 from tests.sim.tiny_urdf import write
 
 AXES = ("0 0 1", "0 1 0", "1 0 0", "0 1 0", "0 0 1", "1 0 0", "0 1 0", "0 0 1", "0 1 0")
@@ -222,3 +228,68 @@ def test_every_feature_is_in_an_exported_description(feature, kind, tmp_path):
     qpos = robot.coupled(np.random.default_rng(0).normal(size=(4, robot.dof)))
     np.testing.assert_allclose(other.coupled(qpos), qpos, atol=1e-6)
     np.testing.assert_allclose(other.mass_matrix(qpos), robot.mass_matrix(qpos), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("feature", FEATURES)
+def test_every_feature_is_identified_or_refused(feature, tmp_path):
+    """The motors found explain the held-out part of a run ten times as well as ideal ones."""
+    robot = robot_with(feature)
+    start, _ = poses(robot)
+    time = 0.01 * np.arange(300)[:, None]
+    swing = 0.25 * np.sin(2 * np.pi * (0.5 + 0.13 * np.arange(robot.dof)) * time)
+    params = robot.params(kp=200.0, ki=0.0, kd=20.0)
+    motors = bp.make_actuators(robot.dof, armature=0.05, coulomb=1.0, viscous=2.0)
+    with Runner(robot, 1, workers=0, ground=False, params=params, actuators=motors) as runner:
+        runner.reset(start)
+        run = runner.rollout(robot.coupled(start + swing)[:, None])
+    assert run.ok.all()
+    path = write_recording(run, tmp_path / "run.npz")
+    try:
+        found = identify(robot, [path], params=params, evaluations=6, workers=0)
+    except BatchPIDError:
+        if feature != "floating base":
+            raise
+        return
+    before, after = found.held_out_error
+    assert feature != "floating base"
+    assert after < 0.1 * before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("feature", FEATURES)
+def test_every_feature_is_tuned(feature):
+    """The gains found settle in the moves of the search."""
+    robot = robot_with(feature)
+    found = tune(robot, generations=1, population=4, seconds=1.0, workers=0)
+    assert np.isfinite(found.cost)
+    assert found.cost <= found.start_cost
+    start, goal = poses(robot)
+    with Runner(robot, 1, workers=0, ground=False, params=found.params) as runner:
+        runner.reset(start)
+        seen = runner.rollout(np.tile(goal, (250, 1)))
+    left = seen.qpos[-1, 0] - goal
+    left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
+    np.testing.assert_allclose(left[robot.independent], 0.0, atol=0.03)
+
+
+@pytest.mark.skipif(not COMPILERS, reason="no C compiler")
+@pytest.mark.parametrize("feature", FEATURES)
+def test_every_feature_is_in_the_dynamics_of_the_c_header(feature, tmp_path):
+    robot = robot_with(feature)
+    n, rng = robot.dof, np.random.default_rng(0)
+    qpos, qvel = robot.coupled(rng.normal(size=(4, n))), rng.normal(size=(4, n))
+    try:
+        tree = robot.kinematic_tree()
+        header = to_c(robot.params(kp=1.0), 1 / 2000, joint_names=robot.joint_names, prefix="arm", tree=tree)
+    except BatchPIDError:
+        if feature != "floating base":
+            raise
+        return
+    assert feature != "floating base"
+    (tmp_path / "arm.h").write_text(header.text)
+    binary = compiled(tmp_path, TABLE.format(n=n, t="double"), "-std=c99", "-O1")
+    ran = subprocess.run([binary], input=np.hstack([qpos, qvel]).tobytes(), capture_output=True, check=True)
+    found = np.frombuffer(ran.stdout).reshape(4, -1)
+    expected = ts.mass_matrix(tree, qpos).reshape(4, -1), ts.bias(tree, qpos, qvel), ts.gravity(tree, qpos)
+    np.testing.assert_allclose(found, np.hstack(expected), rtol=1e-9, atol=1e-9)

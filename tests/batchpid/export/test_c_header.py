@@ -6,7 +6,6 @@ import dataclasses
 import re
 import shutil
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,10 +20,9 @@ from batchpid.export import to_c, to_c_project
 from batchpid.law.computed_torque import advance_with_mass_matrix, per_inertia
 from batchpid.motors import guard as guards
 from batchpid.task_space import bias, gravity, mass_matrix
+from tests.c_programs import COMPILERS, STRICT, TABLE, compiled
 
-COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
 pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
-STRICT = ("-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off")
 SINGLE = {name: case for name, case in OPTIONS.items() if not name.endswith("per env")}
 # The others run in float32 among the random settings.
 IN_FLOAT32 = ("p", "rate and limits", "kick", "back calculation", "mixed", "continuous", "hold effort", "everything")
@@ -52,13 +50,6 @@ int main(void) {{
   }}
 }}
 """
-
-
-def compiled(folder: Path, text: str, *flags: str, compiler: str = COMPILERS[0] if COMPILERS else "") -> Path:
-    source, binary = folder / "law.c", folder / "law"
-    source.write_text(text)
-    subprocess.run([compiler, *STRICT, *flags, str(source), "-o", str(binary), "-lm"], check=True)
-    return binary
 
 
 def efforts_in_c(folder, params, options, columns, *flags, compiler=None):
@@ -241,21 +232,6 @@ def test_it_compiles_as_cpp_and_neither_allocates_nor_keeps_global_state(tmp_pat
     listed = subprocess.run(["nm", "law.o"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
     # Nothing undefined but mathematics (malloc would be), and no data that can change.
     assert not re.search(r" U (?!sincos|sin|cos|sqrt|__stack_chk_fail|_GLOBAL)| [BbDd] ", listed), listed
-
-
-TABLE = """#include <stdio.h>
-#include "arm.h"
-int main(void) {{
-  {t} state[2 * {n}], found[{n} * {n} + 2 * {n}];
-  while (fread(state, sizeof state, 1, stdin) == 1) {{
-    arm_mass_matrix(state, found);
-    arm_bias(state, state + {n}, found + {n} * {n});
-    arm_gravity(state, found + {n} * {n} + {n});
-    fwrite(found, sizeof found, 1, stdout);
-  }}
-  return 0;
-}}
-"""
 
 
 @pytest.mark.parametrize(
