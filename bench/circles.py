@@ -37,7 +37,7 @@ def circle(start: NDArray[Any], phase: NDArray[Any]) -> NDArray[Any]:
     return rows
 
 
-def start_of(tree: ts.KinematicTree, link: str) -> NDArray[Any]:
+def start_of(tree: ts.RigidTree, link: str) -> NDArray[Any]:
     """Return joint positions from which the whole circle is in reach, away from limits and singular poses."""
     rng, chain = np.random.default_rng(0), tree.chain(link)
     for _ in range(POSES):

@@ -151,7 +151,7 @@ class RunInfo:
     ground: bool | None = None
     """True if the scenes had a ground at height 0."""
     rates: bool | None = None
-    """True if setpoints were given with rates, so that they moved within the ticks; None if unknown, as after a kill."""
+    """True if setpoints were given with rates, and moved within the ticks; None if unknown, as after a kill."""
     params: PIDParams | None = None
     """PID parameters at the start."""
     actuators: Actuators | None = None

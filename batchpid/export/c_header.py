@@ -30,7 +30,7 @@ from batchpid.motors import guard as guard_model
 from batchpid.motors.guard import Guard, GuardState, check_guard
 from batchpid.native.symbols import Symbol
 from batchpid.native.tracing import trace
-from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.rigid_tree import RigidTree
 
 RATES = {
     "measurement_rate": "measured velocity [rad/s or m/s]",
@@ -48,7 +48,7 @@ def to_c(
     guard: Guard | None = None,
     inputs: Sequence[str] | None = None,
     prefix: str = "batchpid",
-    tree: KinematicTree | None = None,
+    tree: RigidTree | None = None,
 ) -> Exported:
     """Return a C header with the law of one robot; its numbers have the params' dtype.
 
@@ -92,7 +92,7 @@ class Header:
         guard: Guard | None,
         inputs: Sequence[str] | None,
         prefix: str,
-        tree: KinematicTree | None,
+        tree: RigidTree | None,
     ) -> None:
         instance("params", params, PIDParams, "build them with make_params()")
         time_step("dt", dt)
@@ -117,7 +117,7 @@ class Header:
             remedy = "add it, or use params.replace(measurement_rate='difference')"
             raise InvalidArgumentError("inputs", "lack measurement_rate, which the params use", remedy=remedy)
         if tree is not None:
-            instance("tree", tree, KinematicTree, "use robot.kinematic_tree()")
+            instance("tree", tree, RigidTree, "use robot.kinematic_tree()")
             if list(tree.joint_names) != list(labels):
                 problem = f"has the joints {', '.join(tree.joint_names)}, not {', '.join(labels)}"
                 raise InvalidArgumentError("tree", problem, remedy="pass joint_names=, in the tree's order")

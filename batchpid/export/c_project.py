@@ -10,7 +10,7 @@ from batchpid.checks.validate import file_path
 from batchpid.export.c_header import Header
 from batchpid.law.params import PIDParams
 from batchpid.motors.guard import Guard
-from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.rigid_tree import RigidTree
 
 
 def to_c_project(
@@ -22,7 +22,7 @@ def to_c_project(
     guard: Guard | None = None,
     inputs: Sequence[str] | None = None,
     prefix: str = "batchpid",
-    tree: KinematicTree | None = None,
+    tree: RigidTree | None = None,
 ) -> dict[str, str]:
     """Return the files of a C project by name: the header, ``CMakeLists.txt`` and ``example.c``.
 

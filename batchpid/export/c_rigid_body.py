@@ -11,16 +11,16 @@ import numpy as np
 
 from batchpid.export.c_step import Dialect
 from batchpid.motors.coupling import Coupling
-from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.rigid_tree import RigidTree
 
 
-def rigid_body(c: Dialect, tree: KinematicTree) -> str:
+def rigid_body(c: Dialect, tree: RigidTree) -> str:
     """Return the functions ``PREFIX_mass_matrix``, ``PREFIX_bias`` and ``PREFIX_gravity`` of a tree."""
     bodies, p, t, n, f = tree.bodies, c.prefix, c.type, c.size, c.suffix
     rotations = {"turn": bodies.at_zero, "sine": bodies.sine, "cosine": bodies.cosine}
     poses = "".join(c.table(f"k_{name}", leaf[:, :, :3].reshape(-1, 9)) for name, leaf in rotations.items())
     poses += c.table("k_place", bodies.at_zero[..., 3]) + c.table("k_slide", bodies.slide[..., 3])
-    poses += c.table("k_axis", bodies.axis) + c.table("k_center", bodies.center)
+    poses += c.table("k_center", bodies.center)
     poses += c.table("k_tensor", bodies.tensor.reshape(-1, 9)) + _integers(c, "slides", bodies.slides[:, 0])
     above, masses = _integers(c, "above", tree.body_parents), c.table("k_mass", bodies.mass[:, 0])
     fall = ", ".join(map(c.number, bodies.gravity.tolist()))
@@ -59,7 +59,7 @@ static inline void {p}_place(const {t} *qpos, {p}_bodies *b) {{
       b->place[j][i] = up < 0 ? place[i] : {p}_dot(b->turn[up] + 3 * i, place) + b->place[up][i];
       b->linear[j][i] = b->angular[j][i] = {c.number(0.0)};
     }}
-    {p}_rotate(b->turn[j], k_axis[j], slides[j] ? b->linear[j] : b->angular[j]);
+    for (int i = 0; i < 3; ++i) (slides[j] ? b->linear[j] : b->angular[j])[i] = b->turn[j][3 * i];
     if (!slides[j]) {p}_add_cross(b->place[j], b->angular[j], b->linear[j]);
     {p}_rotate(b->turn[j], k_center[j], b->center[j]);
     for (int i = 0; i < 3; ++i) b->center[j][i] += b->place[j][i];
@@ -161,7 +161,7 @@ static inline void {p}_gravity(const {t} qpos[{n}], {t} bias[{n}]) {{
 """
 
 
-def _folded_matrix(c: Dialect, tree: KinematicTree) -> str:
+def _folded_matrix(c: Dialect, tree: RigidTree) -> str:
     """Return the lines that reduce ``matrix`` to the leaders of coupled joints: :meth:`Coupling.mass_matrix`."""
     if tree.coupling is None:
         return ""
@@ -180,7 +180,7 @@ def _folded_matrix(c: Dialect, tree: KinematicTree) -> str:
 """
 
 
-def _folded_bias(c: Dialect, tree: KinematicTree) -> str:
+def _folded_bias(c: Dialect, tree: RigidTree) -> str:
     """Return the lines that reduce ``bias`` to the leaders of coupled joints: :meth:`Coupling.efforts`."""
     if tree.coupling is None:
         return ""

@@ -21,7 +21,7 @@ using namespace batchpid;
 namespace {
 
 constexpr Py_ssize_t COLUMNS = sizeof(BodyRow<double>) / sizeof(double);
-char const *const TREE = "batchpid.KinematicTree";
+char const *const TREE = "batchpid.RigidTree";
 
 Tree *tree_of(PyObject *capsule) { return static_cast<Tree *>(PyCapsule_GetPointer(capsule, TREE)); }
 

@@ -1,4 +1,4 @@
-"""Kinematics, dynamics and control in the space of a tool: pure functions of a :class:`KinematicTree`.
+"""Kinematics, dynamics and control in the space of a tool: pure functions of a :class:`RigidTree`.
 
 Arrays are (envs, dof), or have any other leading axes; poses are (..., 7): a position and a quaternion (w, x, y, z);
 twists, wrenches and Jacobians have linear parts first. NumPy computes in float64; JAX's arrays keep their dtype.
@@ -6,24 +6,24 @@ twists, wrenches and Jacobians have linear parts first. NumPy computes in float6
 
 from batchpid.task_space import osc_presets as presets
 from batchpid.task_space.inverse_kinematics import IKResult, InverseKinematicsWarning, inverse_kinematics
-from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.operational_space import advance, advance_terms, init, reset, step, step_terms
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
 from batchpid.task_space.osc_files import load_osc_options, save_osc_options
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
 from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, task_dynamics
 from batchpid.task_space.osc_transfer import track
+from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_dynamics import bias, forward_dynamics, gravity, inverse_dynamics, mass_matrix
 from batchpid.task_space.tree_kinematics import jacobian, jacobian_rate, link_poses
 
 __all__ = [
     "IKResult",
     "InverseKinematicsWarning",
-    "KinematicTree",
     "OSCCoefficients",
     "OSCParams",
     "OSCState",
     "OSCTerms",
+    "RigidTree",
     "TaskDynamics",
     "advance",
     "advance_terms",

@@ -29,7 +29,7 @@ from batchpid.checks.validate import array, broadcast, choice, entries, integer,
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import pose_error, pose_of
-from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.symmetric import gram, product, quiet, whitened
 from batchpid.task_space.tree_kinematics import jacobian_at, motions_of, rate_at, tool_frame, velocities_of
 
@@ -67,7 +67,7 @@ class IKResult(NamedTuple):
 
 
 def inverse_kinematics(
-    tree: KinematicTree,
+    tree: RigidTree,
     link: str,
     pose: ArrayLike,
     start: ArrayLike,
@@ -138,9 +138,7 @@ def inverse_kinematics(
 class _Search:
     """Searches for the poses of one tool."""
 
-    def __init__(
-        self, tree: KinematicTree, index: int, point: Float64 | None, tolerance: Float64, iterations: int
-    ) -> None:
+    def __init__(self, tree: RigidTree, index: int, point: Float64 | None, tolerance: Float64, iterations: int) -> None:
         self._tree, self._index, self._point = tree, index, point
         self._tolerance, self._iterations = tolerance, iterations
         self._chain = tree.chain(tree.links[index])
@@ -208,7 +206,7 @@ class _Search:
 class _At:
     """Tool at given positions (n, dof)."""
 
-    def __init__(self, tree: KinematicTree, index: int, point: Float64 | None, qpos: Float64) -> None:
+    def __init__(self, tree: RigidTree, index: int, point: Float64 | None, qpos: Float64) -> None:
         self._tree, self._index = tree, index
         self._motions = motions_of(tree, tree.bodies, qpos, np)
         tool = tool_frame(tree, tree.bodies, self._motions.frames, index, point)
@@ -248,7 +246,7 @@ def _damped(part: Float64, damping: Float64, vector: Float64) -> Float64:
     return gram(factor[..., :-1], factor[..., -1:])[..., 0]
 
 
-def _goals_and_starts(tree: KinematicTree, pose: ArrayLike, start: ArrayLike) -> tuple[Float64, Float64]:
+def _goals_and_starts(tree: RigidTree, pose: ArrayLike, start: ArrayLike) -> tuple[Float64, Float64]:
     """Return checked poses (envs, 7) and starts (envs, dof)."""
     columns = ("x", "y", "z", "qw", "qx", "qy", "qz")
     envs = max(1, *(np.shape(given)[0] for given in (pose, start) if np.ndim(given) == 2), 1)
@@ -261,7 +259,7 @@ def _goals_and_starts(tree: KinematicTree, pose: ArrayLike, start: ArrayLike) ->
     return goal, tree.positions(np.clip(rows, tree.lower, tree.upper))
 
 
-def _wholly_turning(tree: KinematicTree) -> NDArray[np.bool_]:
+def _wholly_turning(tree: RigidTree) -> NDArray[np.bool_]:
     """Return the joints (dof,) that a whole turn brings back to the same pose of all links."""
     turning = tree.bodies.slides[:, 0] == 0
     if tree.coupling is None:

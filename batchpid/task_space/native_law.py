@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from batchpid.native.task_space_extension import DECOUPLING, FRICTION, LAW
 from batchpid.task_space import native_rows
-from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.osc_coefficients import OSCCoefficients
 from batchpid.task_space.osc_params import NoDecoupling, PartialDecoupling
+from batchpid.task_space.rigid_tree import RigidTree
 
 Float64 = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ def law(k: OSCCoefficients, dynamics: Any, inputs: tuple[Any, ...], wanted: tupl
 
 
 def step(
-    tree: KinematicTree, link: str, point: Any, k: OSCCoefficients, inputs: tuple[Any, ...], wanted: tuple[str, ...]
+    tree: RigidTree, link: str, point: Any, k: OSCCoefficients, inputs: tuple[Any, ...], wanted: tuple[str, ...]
 ) -> list[Float64] | None:
     """Return the results of :func:`law` with the dynamics of ``tree``: a ``point`` (3,) of ``link`` is the tool."""
     qpos = inputs[1]
@@ -62,7 +62,7 @@ def friction(arrays: Mapping[str, Any]) -> Float64 | None:
 
 
 def bind(
-    tree: KinematicTree, link: str, point: Any, k: OSCCoefficients, arrays: Mapping[str, Any]
+    tree: RigidTree, link: str, point: Any, k: OSCCoefficients, arrays: Mapping[str, Any]
 ) -> tuple[Any, int] | None:
     """Return an object that keeps ``arrays``, and the address of a Call (call.h) that runs :func:`step` on them.
 
@@ -81,7 +81,7 @@ def bind(
 
 
 def _of_tree(
-    native: Any, tree: KinematicTree, link: str, point: Any, rows: int, k: OSCCoefficients
+    native: Any, tree: RigidTree, link: str, point: Any, rows: int, k: OSCCoefficients
 ) -> tuple[tuple[Any, ...], Float64]:
     """Return the arguments of ``step`` and ``bind`` before the arrays of the law, and the chain to the tool (dof,)."""
     own, index = native_rows.native_tree(native, tree), tree.index(link)

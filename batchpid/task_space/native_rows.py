@@ -21,13 +21,15 @@ from numpy.typing import NDArray
 from batchpid.motors.coupling import Coupling
 from batchpid.native.availability import SWITCH
 from batchpid.native.extensions import StaleExtensionError, load
-from batchpid.native.task_space_extension import BODY, KINEMATICS, TASK_SPACE
-from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.native.task_space_extension import KINEMATICS, TASK_SPACE
+from batchpid.task_space.rigid_tree import RigidTree
 
 Float64 = NDArray[np.float64]
 
 _SIZES = {"pose": (7,), "jacobian": (6, -1), "jacobian_rate": (6,), "mass_matrix": (-1, -1), "bias": (-1,)}
 """Shapes of the results of :func:`kinematics`; -1 stands for the degrees of freedom."""
+_DYNAMICS = {"mass_matrix", "bias"}
+"""Results that the extension computes on a fixed base alone."""
 
 
 class _NativeTree(NamedTuple):
@@ -37,7 +39,7 @@ class _NativeTree(NamedTuple):
     """Frames of the links in their bodies (links, 3, 4)."""
 
 
-_trees: WeakKeyDictionary[KinematicTree, _NativeTree] = WeakKeyDictionary()
+_trees: WeakKeyDictionary[RigidTree, _NativeTree] = WeakKeyDictionary()
 
 
 def in_use() -> Any:
@@ -58,7 +60,7 @@ def _extension() -> Any:
 
 
 def kinematics(
-    tree: KinematicTree, wanted: tuple[str, ...], qpos: Any, qvel: Any = None, index: int = 0, point: Any = None
+    tree: RigidTree, wanted: tuple[str, ...], qpos: Any, qvel: Any = None, index: int = 0, point: Any = None
 ) -> tuple[Any, ...] | None:
     """Return the ``wanted`` arrays (..., ...), of "pose", "jacobian", "jacobian_rate", "mass_matrix" and "bias".
 
@@ -66,7 +68,7 @@ def kinematics(
     ``qvel``. ``qpos`` and ``qvel`` are checked arrays (..., dof).
     """
     native = in_use() if type(qpos) is np.ndarray and (point is None or isinstance(point, np.ndarray)) else None
-    if native is None:
+    if native is None or not (tree.fixed_base or _DYNAMICS.isdisjoint(wanted)):
         return None
     own = native_tree(native, tree)
     dof, leading, rows = tree.dof, qpos.shape[:-1], math.prod(qpos.shape[:-1])
@@ -84,7 +86,7 @@ def empty(wanted: tuple[str, ...], leading: tuple[int, ...], dof: int) -> dict[s
 
 
 def search(
-    tree: KinematicTree,
+    tree: RigidTree,
     index: int,
     point: Any,
     limits: tuple[Float64, Float64],
@@ -118,33 +120,16 @@ def tool(own: _NativeTree, index: int, point: Any) -> Float64:
     return tool.reshape(-1, 12)
 
 
-def native_tree(native: Any, tree: KinematicTree) -> _NativeTree:
-    """Return the constants of a tree for the extension, in body frames whose x axis is the axis of the joint."""
+def native_tree(native: Any, tree: RigidTree) -> _NativeTree:
+    """Return the constants of a tree for the extension."""
     if (own := _trees.get(tree)) is not None:
         return own
-    bodies, turns = tree.bodies, [_turn(axis) for axis in tree.bodies.axis]
-    turns.append(np.eye(3))  # of the base, number -1
-    rows, kinds = [], []
-    for joint, above in enumerate(tree.body_parents):
-        place, turn = turns[above].T @ bodies.at_zero[joint], turns[joint]
-        mass, center = bodies.mass[joint], bodies.center[joint] @ turn
-        parts = place[:, :3] @ turn, place[:, 3], mass, center, turn.T @ bodies.tensor[joint] @ turn
-        rows.append(np.concatenate([np.ravel(part) for part in parts]))
-        kinds.append((above, int(bodies.slides[joint, 0])))
-    tools = np.stack([turns[body].T @ own for body, own in zip(tree.link_bodies, bodies.link_frames, strict=True)])
-    table = np.array(rows, np.float64).reshape(tree.dof, sum(BODY.values()))
-    arguments = np.array(kinds, np.int32), table, np.array(bodies.armature), tuple(bodies.gravity.tolist())
+    bodies, (kinds, rows) = tree.bodies, tree.tables
+    arguments = kinds, rows, np.array(bodies.armature), tuple(bodies.gravity.tolist())
     coupling = Coupling(tree.dof, []) if tree.coupling is None else tree.coupling
     laws = coupling.leader.astype(np.int32), coupling.multiplier, coupling.offset
-    _trees[tree] = own = _NativeTree(native.tree(tree.dof, *arguments, *laws), tools)
+    _trees[tree] = own = _NativeTree(native.tree(tree.dof, *arguments, *laws), bodies.link_frames)
     return own
-
-
-def _turn(axis: Float64) -> Float64:
-    """Return a rotation matrix (3, 3) whose first column is the unit vector ``axis``."""
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    across /= np.linalg.norm(across)
-    return np.column_stack([axis, across, np.cross(axis, across)])
 
 
 def for_rows(like: Any, *arrays: Any) -> Any:

@@ -54,11 +54,11 @@ from batchpid.arrays.elementwise import clip, namespace, wrap
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_law
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
-from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
 from batchpid.task_space.osc_params import OSCParams
 from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, in_tool_axes, task_dynamics
 from batchpid.task_space.projections import Projections, projections
+from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.symmetric import product, quiet
 from batchpid.task_space.tree_kinematics import prepared, read_point
 
@@ -88,7 +88,7 @@ def step(
     qvel: Any,
     dt: Any,
     *,
-    tree: KinematicTree,
+    tree: RigidTree,
     link: str,
     point: Any = None,
     twist: Any = None,
@@ -137,7 +137,7 @@ def step_terms(
     qvel: Any,
     dt: Any,
     *,
-    tree: KinematicTree,
+    tree: RigidTree,
     link: str,
     point: Any = None,
     **inputs: Any,
@@ -213,7 +213,7 @@ def _terms(results: list[Any]) -> OSCTerms:
 def _native_step(
     k: OSCCoefficients,
     state: OSCState,
-    tool: tuple[KinematicTree, str, Any],
+    tool: tuple[RigidTree, str, Any],
     setpoint: Any,
     qpos: Any,
     qvel: Any,
@@ -324,7 +324,7 @@ def _integrated(k: OSCCoefficients, state: OSCState, sums: _Sums, clipped: Any) 
 
 def _check_shapes(
     params: OSCParams,
-    tree: KinematicTree,
+    tree: RigidTree,
     setpoint: Any,
     qpos: Any,
     twist: Any = None,

@@ -15,7 +15,7 @@ from batchpid.arrays.field_tables import Field
 from batchpid.checks.keywords import known_keywords
 from batchpid.checks.validate import array, choice, entries, instance, read_array
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_dynamics import check_masses
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -118,7 +118,7 @@ class OSCParams(NamedTuple):
 
 @known_keywords
 def make_osc_params(
-    tree: KinematicTree,
+    tree: RigidTree,
     *,
     stiffness: ArrayLike = 150.0,
     damping_ratio: ArrayLike = 1.0,
@@ -184,7 +184,7 @@ def make_osc_params(
     InvalidArgumentError
         Naming the option, axis or joint, env and value.
     """
-    check_masses(instance("tree", tree, KinematicTree, "pass robot.kinematic_tree()"))
+    check_masses(instance("tree", tree, RigidTree, "pass robot.kinematic_tree()"))
     joints = tree.joint_names
     _check_unused("damping_ratio", damping_ratio, 1.0, damping is not None, "damping is given, too")
     _check_unused("integral_limit", integral_limit, math.inf, integral_gain is None, "integral_gain is not given")

@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from batchpid.task_space.kinematic_tree import KinematicTree
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
+from batchpid.task_space.rigid_tree import RigidTree
 
 _UNLIMITED = {"position_error_limit": math.inf, "rotation_error_limit": math.inf}
 
 
-def robosuite(tree: KinematicTree, **options: Any) -> OSCParams:
+def robosuite(tree: RigidTree, **options: Any) -> OSCParams:
     """Return params of robosuite's OSC_POSE: stiffness 150, damping ratio 1, partial decoupling, posture stiffness 10.
 
     robosuite leaves out J' q', and truncates singular values below 2.5e-4 where this law bounds their inverses. Its
@@ -24,7 +24,7 @@ def robosuite(tree: KinematicTree, **options: Any) -> OSCParams:
     return make_osc_params(tree, **{**own, **options})
 
 
-def isaac_lab(tree: KinematicTree, **options: Any) -> OSCParams:
+def isaac_lab(tree: RigidTree, **options: Any) -> OSCParams:
     """Return params of Isaac Lab's OperationalSpaceController: stiffness 100, damping ratio 1, gains as forces.
 
     By default it has neither decoupling nor posture, nor compensation of gravity: the latter is an option of the

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from batchpid.arrays.display import array_summary
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import in_axes, matrix_of, pose_of
-from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.symmetric import quiet
 from batchpid.task_space.tree_dynamics import effort_of, mass_matrix_of
 from batchpid.task_space.tree_kinematics import (
@@ -78,7 +78,7 @@ class OSCTerms(NamedTuple):
 
 
 def task_dynamics(
-    tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point: Any = None, bias: Any = None
+    tree: RigidTree, qpos: Any, qvel: Any, link: str, *, point: Any = None, bias: Any = None
 ) -> TaskDynamics:
     """Return the dynamics of ``tree`` with a tool: a ``point`` (3,) [m] of ``link``, default its origin.
 

@@ -1,4 +1,4 @@
-r"""Dynamics of a kinematic tree: M(q) q'' + h(q, q') = tau, without friction and damping.
+r"""Dynamics of a rigid tree: M(q) q'' + h(q, q') = tau, without friction and damping.
 
 All quantities are in the axes of the world and about its origin. With the motions s_j = (v_j, w_j) of the joints, and
 for all that joint j moves the mass m, the first moment c and the inertia tensor I, the momenta under s_j and the mass
@@ -13,17 +13,24 @@ mass r of a body, its inertia tensor I about it, its angular velocity w and its 
 
     f = m (a - g)      n = I w' + w x I w + r x f      h_j = s_j . (sum of (f, n) of all that joint j moves)
 
+On a floating base (b; j are the joints) the joints show the Schur complements::
+
+    M = M_jj - M_jb M_bb^-1 M_bj        h = h_j - M_jb M_bb^-1 h_b
+
+where the columns of M_bj are the momenta (l_j, k_j), and M_bb, h_b are those of all bodies together. Gravity, and the
+velocity and acceleration of the base's origin, cancel: h depends on the rate at which the base turns.
+
 The results for coupled joints are reduced to their leaders, G^T M G and G^T h (:mod:`batchpid.motors.coupling`).
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import cross, multiply, rotate
-from batchpid.task_space.kinematic_tree import Bodies, KinematicTree
+from batchpid.task_space.rigid_tree import Bodies, RigidTree
 from batchpid.task_space.symmetric import product, quiet, solve
 from batchpid.task_space.tree_kinematics import (
     Motions,
@@ -36,7 +43,7 @@ from batchpid.task_space.tree_kinematics import (
 )
 
 
-def mass_matrix(tree: KinematicTree, qpos: Any) -> Any:
+def mass_matrix(tree: RigidTree, qpos: Any) -> Any:
     """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof), armature included.
 
     Raises
@@ -51,8 +58,10 @@ def mass_matrix(tree: KinematicTree, qpos: Any) -> Any:
         return mass_matrix_of(tree, bodies, motions_of(tree, bodies, q, xp), xp)
 
 
-def bias(tree: KinematicTree, qpos: Any, qvel: Any) -> Any:
+def bias(tree: RigidTree, qpos: Any, qvel: Any, turning: Any = None) -> Any:
     """Return h(q, q') (..., dof) [N m or N]: the efforts that cancel gravity and Coriolis and centrifugal forces.
+
+    A floating base turns at ``turning`` (..., 3) [rad/s], in its own axes; default 0.
 
     Raises
     ------
@@ -64,15 +73,15 @@ def bias(tree: KinematicTree, qpos: Any, qvel: Any) -> Any:
         return found[0]
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
-        return effort_of(tree, bodies, motions, velocities_of(tree, motions, v, xp), xp)
+        return effort_of(tree, bodies, motions, velocities_of(tree, motions, v, xp, turning), xp, turning)
 
 
-def gravity(tree: KinematicTree, qpos: Any) -> Any:
+def gravity(tree: RigidTree, qpos: Any) -> Any:
     """Return the efforts (..., dof) [N m or N] that hold the robot at ``qpos`` (..., dof): h(q, 0)."""
     return bias(tree, qpos, 0 * qpos if hasattr(qpos, "shape") else [0 * entry for entry in qpos])
 
 
-def inverse_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, qacc: Any) -> Any:
+def inverse_dynamics(tree: RigidTree, qpos: Any, qvel: Any, qacc: Any) -> Any:
     """Return the efforts (..., dof) [N m or N] of the accelerations ``qacc`` (..., dof): M q'' + h.
 
     Raises
@@ -95,7 +104,7 @@ def inverse_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, qacc: Any) -> An
         return tree.efforts(effort_of(tree, bodies, motions, moving, xp) + bodies.armature * a)
 
 
-def forward_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, effort: Any) -> Any:
+def forward_dynamics(tree: RigidTree, qpos: Any, qvel: Any, effort: Any) -> Any:
     """Return the accelerations (..., dof) [rad/s^2 or m/s^2] under ``effort`` (..., dof): M^-1 (tau - h).
 
     Raises
@@ -115,7 +124,7 @@ def forward_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, effort: Any) -> 
         return tree.rates(solve(mass_matrix_of(tree, bodies, motions, xp), (u - force)[..., None])[..., 0])
 
 
-def check_masses(tree: KinematicTree) -> None:
+def check_masses(tree: RigidTree) -> None:
     """Raise InvalidArgumentError for a joint that moves no mass and has no armature: its mass matrix is singular."""
     moved = tree.bodies.moves.T @ tree.bodies.mass[:, 0] + tree.bodies.armature
     if tree.coupling is not None:
@@ -126,13 +135,24 @@ def check_masses(tree: KinematicTree) -> None:
             raise InvalidArgumentError("tree", problem, joint=joint, remedy="give one of its links a mass")
 
 
-def mass_matrix_of(tree: KinematicTree, bodies: Bodies, motions: Motions, xp: Any) -> Any:
-    """Return the mass matrices (..., dof, dof) at given motions of the joints."""
+class _Composite(NamedTuple):
+    """All that each joint moves, as one rigid body, and the momenta under the motions of the joints."""
+
+    mass: Any
+    """(..., dof, 1)"""
+    moment: Any
+    """First moment about the origin (..., dof, 3)."""
+    tensor: Any
+    """Inertia tensor about the origin (..., dof, 3, 3)."""
+    momenta: Any
+    """Linear and angular (..., dof, 6)."""
+
+
+def _composite(tree: RigidTree, bodies: Bodies, motions: Motions, xp: Any) -> _Composite:
     turn = motions.frames[..., :3]
     center = rotate(turn, bodies.center) + motions.frames[..., 3]
     moment = bodies.mass * center
-    square = (moment * center).sum(-1)[..., None, None] * xp.eye(3, dtype=center.dtype)
-    tensor = _in_world(turn, bodies.tensor, xp) + square - moment[..., :, None] * center[..., None, :]
+    tensor = _in_world(turn, bodies.tensor, xp) + _about_origin(moment, center, xp)
     packed = xp.concatenate([moment, tensor.reshape(*tensor.shape[:-2], 9)], axis=-1)
     composite = from_tips(tree, packed, xp)
     mass = from_tips(tree, bodies.mass, xp)
@@ -140,26 +160,72 @@ def mass_matrix_of(tree: KinematicTree, bodies: Bodies, motions: Motions, xp: An
     v, w = motions.linear, motions.angular
     linear = mass * v + cross(w, moment)
     angular = rotate(tensor, w) + cross(moment, v)
-    s, momentum = xp.concatenate([v, w], axis=-1), xp.concatenate([linear, angular], axis=-1)
-    table = (s[..., :, None, :] * momentum[..., None, :, :]).sum(-1)
+    return _Composite(mass, moment, tensor, xp.concatenate([linear, angular], axis=-1))
+
+
+def _about_origin(moment: Any, center: Any, xp: Any) -> Any:
+    """Return the inertia tensors (..., 3, 3) about the origin of points with first moments ``moment``."""
+    square = (moment * center).sum(-1)[..., None, None] * xp.eye(3, dtype=center.dtype)
+    return square - moment[..., :, None] * center[..., None, :]
+
+
+def _of_base(tree: RigidTree, bodies: Bodies, all_: _Composite, xp: Any) -> Any:
+    """Return M_bb (..., 6, 6), linear parts first: the momenta of the whole robot under the motions of its base."""
+    roots = [joint for joint, above in enumerate(tree.body_parents) if above < 0]
+    own = bodies.base_mass * bodies.base_center
+    mass = all_.mass[..., roots, :].sum(-2) + bodies.base_mass
+    moment = all_.moment[..., roots, :].sum(-2) + own
+    tensor = all_.tensor[..., roots, :, :].sum(-3) + bodies.base_tensor + _about_origin(own, bodies.base_center, xp)
+    eye = xp.eye(3, dtype=moment.dtype)
+    crossed = xp.stack([cross(moment, eye[axis] + xp.zeros_like(moment)) for axis in range(3)], axis=-1)  # c x
+    upper = xp.concatenate([mass[..., None] * eye, -crossed], axis=-1)
+    lower = xp.concatenate([crossed, tensor + xp.zeros_like(crossed)], axis=-1)
+    return xp.concatenate([upper + xp.zeros_like(lower), lower], axis=-2)
+
+
+def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: Any) -> Any:
+    """Return the mass matrices (..., dof, dof) at given motions of the joints."""
+    all_ = _composite(tree, bodies, motions, xp)
+    s = xp.concatenate([motions.linear, motions.angular], axis=-1)
+    table = (s[..., :, None, :] * all_.momenta[..., None, :, :]).sum(-1)
     above = xp.swapaxes(bodies.moves, 0, 1) > 0
     rest = xp.where(bodies.moves > 0, xp.swapaxes(table, -1, -2), xp.zeros_like(table))
     matrix = xp.where(above, table, rest)
+    if not tree.fixed_base:
+        falls = solve(_of_base(tree, bodies, all_, xp), xp.swapaxes(all_.momenta, -1, -2))
+        matrix = matrix - (all_.momenta[..., :, None, :] * xp.swapaxes(falls, -1, -2)[..., None, :, :]).sum(-1)
     matrix = matrix + bodies.armature * xp.eye(tree.dof, dtype=matrix.dtype)
     return matrix if tree.coupling is None else tree.coupling.arrays.mass_matrix(matrix).astype(matrix.dtype)
 
 
-def effort_of(tree: KinematicTree, bodies: Bodies, motions: Motions, rates: Velocities, xp: Any) -> Any:
-    """Return the efforts (..., dof) of given velocities and accelerations of the bodies, armature left out."""
+def effort_of(
+    tree: RigidTree, bodies: Bodies, motions: Motions, rates: Velocities, xp: Any, turning: Any = None
+) -> Any:
+    """Return the efforts (..., dof) of given velocities and accelerations of the bodies, armature left out.
+
+    A floating base turns at ``turning`` (..., 3) [rad/s], with which the velocities were made.
+    """
     turn = motions.frames[..., :3]
     center = rotate(turn, bodies.center) + motions.frames[..., 3]
     tensor = _in_world(turn, bodies.tensor, xp)
     v, w = rates.linear, rates.angular
     acceleration = rates.linear_rate + cross(rates.angular_rate, center) + cross(w, v + cross(w, center))
-    force = bodies.mass * (acceleration - bodies.gravity)
+    force = bodies.mass * (acceleration - bodies.gravity if tree.fixed_base else acceleration)
     spin = rotate(tensor, rates.angular_rate) + cross(w, rotate(tensor, w))
     wrench = from_tips(tree, xp.concatenate([force, spin + cross(center, force)], axis=-1), xp)
-    return tree.efforts((xp.concatenate([motions.linear, motions.angular], axis=-1) * wrench).sum(-1))
+    effort = (xp.concatenate([motions.linear, motions.angular], axis=-1) * wrench).sum(-1)
+    if not tree.fixed_base:
+        all_ = _composite(tree, bodies, motions, xp)
+        on_base = sum(wrench[..., joint, :] for joint, above in enumerate(tree.body_parents) if above < 0)
+        if turning is not None:
+            own = bodies.base_mass * cross(turning, cross(turning, bodies.base_center + xp.zeros_like(turning)))
+            torque = cross(turning, rotate(bodies.base_tensor, turning)) + cross(
+                bodies.base_center + xp.zeros_like(own), own
+            )
+            on_base = on_base + xp.concatenate([own, torque], axis=-1)
+        falls = solve(_of_base(tree, bodies, all_, xp), on_base[..., None])[..., 0]
+        effort = effort - (all_.momenta * falls[..., None, :]).sum(-1)
+    return tree.efforts(effort)
 
 
 def _in_world(turn: Any, tensor: Any, xp: Any) -> Any:

@@ -27,7 +27,7 @@ from batchpid.checks.validate import choice, is_traced, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import cross, in_axes, matrix_of, pose_of, rotate, turned
-from batchpid.task_space.kinematic_tree import Bodies, KinematicTree
+from batchpid.task_space.rigid_tree import Bodies, RigidTree
 from batchpid.task_space.symmetric import quiet
 
 FRAMES = ("world", "tool")
@@ -54,7 +54,7 @@ class Velocities(NamedTuple):
     angular_rate: Any
 
 
-def link_poses(tree: KinematicTree, qpos: Any, links: Sequence[str] | None = None, *, point: Any = None) -> Any:
+def link_poses(tree: RigidTree, qpos: Any, links: Sequence[str] | None = None, *, point: Any = None) -> Any:
     """Return the poses (..., links, 7) of ``links``, by default all, at ``qpos`` (..., dof) [rad or m].
 
     With a ``point`` (3,) in the frame of the links [m], the positions of this point.
@@ -79,7 +79,7 @@ def link_poses(tree: KinematicTree, qpos: Any, links: Sequence[str] | None = Non
         return xp.stack([pose_of(tool_frame(tree, bodies, frames, index, at)) for index in indices], axis=-2)
 
 
-def jacobian(tree: KinematicTree, qpos: Any, link: str, *, point: Any = None, frame: str = "world") -> Any:
+def jacobian(tree: RigidTree, qpos: Any, link: str, *, point: Any = None, frame: str = "world") -> Any:
     """Return the Jacobian (..., 6, dof) of a point of ``link`` at ``qpos`` (..., dof).
 
     Parameters
@@ -107,9 +107,7 @@ def jacobian(tree: KinematicTree, qpos: Any, link: str, *, point: Any = None, fr
         return matrix if frame == "world" else in_axes(tool[..., :3], matrix)
 
 
-def jacobian_rate(
-    tree: KinematicTree, qpos: Any, qvel: Any, link: str, *, point: Any = None, frame: str = "world"
-) -> Any:
+def jacobian_rate(tree: RigidTree, qpos: Any, qvel: Any, link: str, *, point: Any = None, frame: str = "world") -> Any:
     """Return J' q' (..., 6): the acceleration [m/s^2, rad/s^2] that a point of ``link`` has by velocities alone.
 
     ``qpos`` and ``qvel`` are (..., dof). With frame "tool" the same vectors are given in the axes of the link. Other
@@ -128,7 +126,7 @@ def jacobian_rate(
         return rate if frame == "world" else in_axes(tool[..., :3], rate[..., None])[..., 0]
 
 
-def prepared(tree: KinematicTree, **arrays: Any) -> tuple[list[Any], Bodies, Any]:
+def prepared(tree: RigidTree, **arrays: Any) -> tuple[list[Any], Bodies, Any]:
     """Return checked arrays (..., dof) in one dtype, the tree's bodies in it, and their namespace."""
     xp = namespace(*arrays.values())
     checked, shape = [], None
@@ -148,7 +146,7 @@ def prepared(tree: KinematicTree, **arrays: Any) -> tuple[list[Any], Bodies, Any
     return [a.astype(dtype) for a in checked], Bodies(*(xp.asarray(leaf, dtype) for leaf in tree.bodies)), xp
 
 
-def frames_of_bodies(tree: KinematicTree, bodies: Bodies, qpos: Any, xp: Any) -> Any:
+def frames_of_bodies(tree: RigidTree, bodies: Bodies, qpos: Any, xp: Any) -> Any:
     """Return the frames (..., dof, 3, 4) of the bodies in the world."""
     with quiet():
         q = qpos[..., None, None]
@@ -160,24 +158,26 @@ def frames_of_bodies(tree: KinematicTree, bodies: Bodies, qpos: Any, xp: Any) ->
         return xp.stack(frames, axis=-3)
 
 
-def motions_of(tree: KinematicTree, bodies: Bodies, qpos: Any, xp: Any) -> Motions:
+def motions_of(tree: RigidTree, bodies: Bodies, qpos: Any, xp: Any) -> Motions:
     """Return the frames of the bodies and the motions of the joints."""
     frames = frames_of_bodies(tree, bodies, qpos, xp)
-    axis = rotate(frames[..., :3], bodies.axis)
+    axis = frames[..., 0]
     turning = axis * (1 - bodies.slides)
     return Motions(frames, cross(frames[..., 3], turning) + axis * bodies.slides, turning)
 
 
-def velocities_of(tree: KinematicTree, motions: Motions, qvel: Any, xp: Any) -> Velocities:
-    """Return the velocities of the bodies, and their accelerations at q'' = 0."""
+def velocities_of(tree: RigidTree, motions: Motions, qvel: Any, xp: Any, turning: Any = None) -> Velocities:
+    """Return the velocities of the bodies, and their accelerations at q'' = 0, on a base that turns at ``turning``."""
     linear, angular = motions.linear * qvel[..., None], motions.angular * qvel[..., None]
     v, w = from_base(tree, linear, xp), from_base(tree, angular, xp)
+    if turning is not None:
+        w = w + turning[..., None, :]
     return Velocities(
         v, w, from_base(tree, cross(w, linear) + cross(v, angular), xp), from_base(tree, cross(w, angular), xp)
     )
 
 
-def from_base(tree: KinematicTree, steps: Any, xp: Any) -> Any:
+def from_base(tree: RigidTree, steps: Any, xp: Any) -> Any:
     """Return the sums of ``steps`` (..., dof, k) over the joints between the base and each body."""
     sums: list[Any] = []
     for joint, above in enumerate(tree.body_parents):
@@ -185,7 +185,7 @@ def from_base(tree: KinematicTree, steps: Any, xp: Any) -> Any:
     return xp.stack(sums, axis=-2)
 
 
-def from_tips(tree: KinematicTree, parts: Any, xp: Any) -> Any:
+def from_tips(tree: RigidTree, parts: Any, xp: Any) -> Any:
     """Return the sums of ``parts`` (..., dof, k) over the bodies that each joint moves."""
     sums = [parts[..., joint, :] for joint in range(tree.dof)]
     for joint, above in reversed(list(enumerate(tree.body_parents))):
@@ -194,7 +194,7 @@ def from_tips(tree: KinematicTree, parts: Any, xp: Any) -> Any:
     return xp.stack(sums, axis=-2)
 
 
-def frame_of_link(tree: KinematicTree, bodies: Bodies, frames: Any, index: int) -> Any:
+def frame_of_link(tree: RigidTree, bodies: Bodies, frames: Any, index: int) -> Any:
     """Return the frame (..., 3, 4) of a link, from the frames of the bodies."""
     body, own = tree.link_bodies[index], bodies.link_frames[index]
     if body >= 0:
@@ -202,7 +202,7 @@ def frame_of_link(tree: KinematicTree, bodies: Bodies, frames: Any, index: int) 
     return own + namespace(frames).zeros_like(frames[..., 0, :, :])
 
 
-def tool_frame(tree: KinematicTree, bodies: Bodies, frames: Any, index: int, point: Any) -> Any:
+def tool_frame(tree: RigidTree, bodies: Bodies, frames: Any, index: int, point: Any) -> Any:
     """Return the frame (..., 3, 4) of a link with its origin at ``point`` (..., 3) of the link."""
     frame = frame_of_link(tree, bodies, frames, index)
     if point is None:
@@ -224,7 +224,7 @@ def read_point(like: Any, point: Any) -> Any:
     return at
 
 
-def jacobian_at(tree: KinematicTree, bodies: Bodies, motions: Motions, index: int, place: Any) -> Any:
+def jacobian_at(tree: RigidTree, bodies: Bodies, motions: Motions, index: int, place: Any) -> Any:
     """Return the Jacobian (..., 6, dof) of a link's point at ``place`` (..., 3) in the world, J G of coupled joints."""
     xp, body = namespace(place), tree.link_bodies[index]
     linear = motions.linear + cross(motions.angular, place[..., None, :])
@@ -233,7 +233,7 @@ def jacobian_at(tree: KinematicTree, bodies: Bodies, motions: Motions, index: in
     return tree.efforts(xp.moveaxis(xp.where(moved, columns, xp.zeros_like(columns)), -1, -2))
 
 
-def rate_at(tree: KinematicTree, velocities: Velocities, index: int, place: Any) -> Any:
+def rate_at(tree: RigidTree, velocities: Velocities, index: int, place: Any) -> Any:
     """Return J' q' (..., 6) of a link's point at ``place`` (..., 3) in the world."""
     xp, body = namespace(place), tree.link_bodies[index]
     if body < 0:

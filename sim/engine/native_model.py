@@ -61,7 +61,7 @@ class NativeModel:
     def vary(self, rows: Sequence[int], size: int, added: Mapping[str, Float64]) -> None:
         """Add spatial inertias (size, 6, 6) to links, by name, of the robots ``rows`` of ``size`` in place.
 
-        They are :func:`batchpid.sim.robot.spatial_inertia.spatial_matrix`, in the axes of the links.
+        They are :func:`batchpid.task_space.spatial_inertia.spatial_matrix`, in the axes of the links.
         """
         if self._inertias is None:
             self.__dict__.pop("_structure", None)

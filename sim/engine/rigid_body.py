@@ -22,7 +22,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.read_only import read_only
 from batchpid.native.task_space_extension import BODY
 from batchpid.sim.engine.native import xla
-from batchpid.sim.robot.spatial_inertia import SpatialInertia, inertia_rows, moved_matrix, spatial_matrix
+from batchpid.task_space.spatial_inertia import SpatialInertia, inertia_rows, moved_matrix, spatial_matrix
 
 
 class RigidBodies(NamedTuple):

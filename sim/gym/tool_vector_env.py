@@ -18,9 +18,9 @@ from batchpid.sim.gym.robot_vector_env import Float32, Float64, RobotVectorEnv
 from batchpid.sim.observation import Observation
 from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.rotations import about, multiply
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.task_space.frames import rotation_error
+from batchpid.task_space.rotations import about, multiply
 
 STIFFNESS = 400.0
 """Default stiffness of the tool [1/s^2]: with damping ratio 1, a time constant of 50 ms."""

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.rotations import about, from_rpy, multiply, rotate
+from batchpid.task_space.rotations import about, from_rpy, multiply, rotate
 
 
 class Poses(NamedTuple):

@@ -18,9 +18,9 @@ from lxml import etree
 
 from batchpid.arrays.read_only import read_only
 from batchpid.sim.robot.parts import MOVING_TYPES, Placement
-from batchpid.sim.robot.rotations import from_rpy, multiply, rotate, to_rpy
-from batchpid.sim.robot.spatial_inertia import SpatialInertia, total
 from batchpid.sim.robot.xml import number, numbers
+from batchpid.task_space.rotations import from_rpy, multiply, rotate, to_rpy
+from batchpid.task_space.spatial_inertia import SpatialInertia, total
 
 _IDENTITY = Placement("", read_only(np.zeros(3)), read_only(np.array([1.0, 0.0, 0.0, 0.0])))
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.observation import OBSERVED
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.spatial_inertia import SpatialInertia
+from batchpid.task_space.spatial_inertia import SpatialInertia
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 """URDF joint types that SAPIEN turns into degrees of freedom."""

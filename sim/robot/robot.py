@@ -30,7 +30,7 @@ from batchpid.sim.robot.robot_tree import kinematic_tree
 from batchpid.sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
 from batchpid.sim.robot.source import read_source
 from batchpid.sim.robot.urdf import read_urdf
-from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.rigid_tree import RigidTree
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.mjcf.mjcf_reader import Mjcf
@@ -205,7 +205,7 @@ class Robot(RobotDescription):
             return bp.design_gains(self, 2.25, **options)
         return bp.design_gains(self, DESIGN_HZ, 0.82, integral_time=4.5 / (2 * np.pi * DESIGN_HZ), **options)
 
-    def kinematic_tree(self, **options: Any) -> KinematicTree:
+    def kinematic_tree(self, **options: Any) -> RigidTree:
         """Return the kinematic tree of this robot, for :mod:`batchpid.task_space`, in float64.
 
         No engine is needed, unless a link has collision shapes and no ``<inertial>``: SAPIEN computes its inertia.

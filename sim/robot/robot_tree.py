@@ -9,12 +9,12 @@ import numpy as np
 from batchpid.errors import RobotError
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.merging import merge_fixed_links
-from batchpid.sim.robot.rotations import from_rpy
-from batchpid.sim.robot.spatial_inertia import SpatialInertia
-from batchpid.task_space.kinematic_tree import KinematicTree
+from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.rotations import from_rpy
+from batchpid.task_space.spatial_inertia import SpatialInertia
 
 
-def kinematic_tree(robot: RobotDescription, **options: Any) -> KinematicTree:
+def kinematic_tree(robot: RobotDescription, **options: Any) -> RigidTree:
     """Return the tree of ``robot``; ``options`` are its armature and gravity.
 
     Masses are from the URDF, or from SAPIEN for links without ``<inertial>`` but with collision shapes.
@@ -34,7 +34,7 @@ def kinematic_tree(robot: RobotDescription, **options: Any) -> KinematicTree:
     (root,) = (link.name for link in robot.links if link.name not in children)
     links = [root, *(joint.child_link for joint in robot.all_joints)]
     of_links = [inertias.get(link, empty) for link in links]
-    return KinematicTree(
+    return RigidTree(
         links=tuple(links),
         parent=np.array([-1, *(links.index(joint.parent_link) for joint in robot.all_joints)]),
         joint_types=("fixed", *(_KIND.get(joint.type, "fixed") for joint in robot.all_joints)),

@@ -20,9 +20,9 @@ from batchpid.errors import MissingDependencyError
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.meshes import find_mesh, mesh_problem
-from batchpid.sim.robot.rotations import from_rpy, rotate
 from batchpid.sim.robot.source import is_mjcf
 from batchpid.sim.robot.xml import numbers, parse_xml
+from batchpid.task_space.rotations import from_rpy, rotate
 
 Rgba = tuple[float, ...]
 

@@ -102,13 +102,13 @@ class OperationalSpace:
         wrench: bool = False,
         joints: Sequence[str] = (),
         posture: ArrayLike | None = None,
-        tree: ts.KinematicTree | None = None,
+        tree: ts.RigidTree | None = None,
         params: ts.OSCParams | None = None,
         **options: Any,
     ) -> None:
         robot = instance("robot", robot, Robot, "pass Robot.load(...)")
         tree = robot.kinematic_tree() if tree is None else tree
-        self.tree = instance("tree", tree, ts.KinematicTree, "pass robot.kinematic_tree()")
+        self.tree = instance("tree", tree, ts.RigidTree, "pass robot.kinematic_tree()")
         """Model of the robot."""
         self.link = link
         """Link that carries the tool."""
@@ -282,12 +282,12 @@ def default_tool(robot: Robot) -> str:
     return kinematics.links[kinematics.tool]
 
 
-def tool_pose(tree: ts.KinematicTree, link: str, point: Any, qpos: Any) -> NDArray[np.float32]:
+def tool_pose(tree: ts.RigidTree, link: str, point: Any, qpos: Any) -> NDArray[np.float32]:
     """Return the poses of a tool (..., 7) at ``qpos`` (..., dof), as they are observed."""
     return ts.link_poses(tree, qpos, [link], point=point)[..., 0, :].astype(np.float32)
 
 
-def _check_coupling(tree: ts.KinematicTree, robot: Robot) -> None:
+def _check_coupling(tree: ts.RigidTree, robot: Robot) -> None:
     """Raise InvalidArgumentError if ``tree`` has another coupling of the joints than ``robot``."""
     ours, theirs = (
         () if each is None else (each.leader, each.multiplier, each.offset) for each in (robot.coupling, tree.coupling)

@@ -19,8 +19,8 @@ from batchpid.errors import BatchPIDError
 from batchpid.sim.engine.native.library import import_sapien
 from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.rotations import from_rpy
 from batchpid.sim.view.layout import FIELD_OF_VIEW, TILE, RobotLayout, arrange_robots
+from batchpid.task_space.rotations import from_rpy
 
 sapien: Any = import_sapien()
 

@@ -243,9 +243,7 @@ def test_every_field_of_osc_params_changes_the_efforts_or_is_refused():
     tree = planar((1.0, 0.8, 0.5, 0.4))
     options = {"integral_gain": 300.0, "integral_limit": 0.2, "limit_margin": 0.5}
     options |= {name: [axis in chosen for axis in ts.osc_params.AXES] for name, chosen in AXES.items()}
-    tree = ts.KinematicTree(
-        **{**tree_fields(tree), "lower": [-3.0, -3.0, -3.0, -np.inf], "upper": [3.0] * 3 + [np.inf]}
-    )
+    tree = ts.RigidTree(**{**tree_fields(tree), "lower": [-3.0, -3.0, -3.0, -np.inf], "upper": [3.0] * 3 + [np.inf]})
     q = np.array([[2.9, -2.8, 0.7, 9.0], [0.3, 0.4, 2.8, -9.0], [0.3, 0.4, 0.8, 9.0]])
     pose = ts.link_poses(tree, np.add(q, [[0.02], [0.3], [-0.3]]), ["tip"])[:, 0]
     base = ts.make_osc_params(

@@ -11,7 +11,7 @@ from robots import load_bundled
 from tiny_urdf import random_tree, robot, write
 
 from batchpid.sim import Robot
-from batchpid.task_space import KinematicTree
+from batchpid.task_space import RigidTree
 
 NAMES = ["panda", "jaco2", 0, 1, 2]
 """Bundled robots, and seeds of random trees with branches, fixed and prismatic joints."""
@@ -26,7 +26,7 @@ def robot_of(name: str | int) -> Robot:
 
 
 @functools.cache
-def tree_of(name: str | int) -> KinematicTree:
+def tree_of(name: str | int) -> RigidTree:
     return robot_of(name).kinematic_tree()
 
 
@@ -39,13 +39,13 @@ def tool_of(name: str | int) -> str:
 TOOLS = {"panda": "panda_hand", "jaco2": "j2s7s300_link_7"}
 
 
-def states(tree: KinematicTree, rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def states(tree: RigidTree, rows: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     low, high = np.maximum(tree.lower, -2.5), np.minimum(tree.upper, 2.5)
     return rng.uniform(low, high, (rows, tree.dof)), rng.normal(size=(rows, tree.dof))
 
 
-def planar(lengths: tuple[float, ...] = (1.0, 1.0), gravity: tuple[float, ...] = (0.0, 0.0, 0.0)) -> KinematicTree:
+def planar(lengths: tuple[float, ...] = (1.0, 1.0), gravity: tuple[float, ...] = (0.0, 0.0, 0.0)) -> RigidTree:
     """Return an arm in the plane: links along x with their mass of 1 kg in the middle, joints about z."""
     count = len(lengths) + 2
     at = np.zeros((count, 3))
@@ -54,7 +54,7 @@ def planar(lengths: tuple[float, ...] = (1.0, 1.0), gravity: tuple[float, ...] =
     center[1:-1, 0] = np.array(lengths) / 2
     inertia = np.zeros((count, 3, 3))
     inertia[1:-1, 2, 2] = np.array(lengths) ** 2 / 12
-    return KinematicTree(
+    return RigidTree(
         links=("base", *(f"link{n}" for n in range(1, count - 1)), "tip"),
         parent=np.arange(-1, count - 1),
         joint_types=("fixed", *("revolute" for _ in lengths), "fixed"),
@@ -69,11 +69,11 @@ def planar(lengths: tuple[float, ...] = (1.0, 1.0), gravity: tuple[float, ...] =
     )
 
 
-def serial() -> KinematicTree:
+def serial() -> RigidTree:
     """Return an arm of six joints, yaw, pitch, pitch, roll, pitch, roll, with links of 0.3 m and 2 kg along z."""
     axes = np.array([[0, 0, 1], [0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1], [0, 0, 1]], float)
     mass = np.array([0.0, *[2.0] * 6, 0.0])
-    return KinematicTree(
+    return RigidTree(
         links=("base", *(f"link{n}" for n in range(1, 7)), "tip"),
         parent=np.arange(-1, 7),
         joint_types=("fixed", *["revolute"] * 6, "fixed"),
@@ -89,9 +89,9 @@ def serial() -> KinematicTree:
     )
 
 
-def offset_wrist() -> KinematicTree:
+def offset_wrist() -> RigidTree:
     """Return a massless arm of six joints with three parallel axes, an offset wrist, and a full turn of each joint."""
-    return KinematicTree(
+    return RigidTree(
         links=("base", *(f"link{n}" for n in range(1, 7)), "tip"),
         parent=np.arange(-1, 7),
         joint_types=("fixed", *["revolute"] * 6, "fixed"),

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.sim.engine.mujoco.model_builder import RobotMj, principal_inertia
-from batchpid.sim.robot.spatial_inertia import SpatialInertia
+from batchpid.task_space.spatial_inertia import SpatialInertia
 
 Float64 = NDArray[np.float64]
 FLOATING = 6

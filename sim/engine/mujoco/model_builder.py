@@ -29,9 +29,9 @@ from batchpid.sim.engine.sapien.building import merged
 from batchpid.sim.engine.sapien.link_shapes import LinkShape, link_shapes
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.parts import MOVING_TYPES
-from batchpid.sim.robot.rotations import from_rpy, multiply
-from batchpid.sim.robot.spatial_inertia import SpatialInertia
 from batchpid.sim.robot.xml import numbers
+from batchpid.task_space.rotations import from_rpy, multiply
+from batchpid.task_space.spatial_inertia import SpatialInertia
 
 ALONG_X = np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0])
 """Rotation of MuJoCo's capsules and cylinders, which lie along z, to lie along x (w, x, y, z)."""

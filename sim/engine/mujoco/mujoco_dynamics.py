@@ -17,7 +17,7 @@ from batchpid.sim.engine.protocol import RobotModel
 from batchpid.sim.engine.rigid_body import RigidBodies, mass_matrix
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.spatial_inertia import SpatialInertia, rotation_matrix, total
+from batchpid.task_space.spatial_inertia import SpatialInertia, rotation_matrix, total
 
 Float64 = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ from batchpid.sim.engine.protocol import FAILED
 from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.spatial_inertia import spatial_matrix, total
+from batchpid.task_space.spatial_inertia import spatial_matrix, total
 
 Float64 = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.rigid_body import RigidBodies
-from batchpid.sim.robot.rotations import from_rpy, rotate
-from batchpid.sim.robot.spatial_inertia import SpatialInertia, total
+from batchpid.task_space.rotations import from_rpy, rotate
+from batchpid.task_space.spatial_inertia import SpatialInertia, total
 
 
 def bodies_of(robot: Any) -> RigidBodies:

@@ -12,7 +12,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.sapien.building import center_of_mass, merged
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.merging import place_links
-from batchpid.sim.robot.spatial_inertia import SpatialInertia, rotation_matrix, total
+from batchpid.task_space.spatial_inertia import SpatialInertia, rotation_matrix, total
 
 NO_MASS = 1e-6
 """Mass [kg] that SAPIEN gives a link without mass."""

@@ -23,7 +23,7 @@ from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.merging import Merged, merge_fixed_links, place_links
 from batchpid.sim.robot.meshes import note_meshes
-from batchpid.sim.robot.spatial_inertia import SpatialInertia, total
+from batchpid.task_space.spatial_inertia import SpatialInertia, total
 
 _building = RLock()
 """Lock of the thread that builds a robot: SAPIEN's settings are process-wide, and builders are shared."""

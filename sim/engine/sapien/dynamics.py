@@ -101,7 +101,7 @@ class Dynamics:
 
         There it is the Schur complement M_jj - M_jb M_bb^-1 M_bj of the matrix with six more joints, for the base.
         ``added`` are spatial inertias (n, 6, 6) that links have in addition, by name
-        (:func:`batchpid.sim.robot.spatial_inertia.spatial_matrix`).
+        (:func:`batchpid.task_space.spatial_inertia.spatial_matrix`).
         """
         if self._spec.fixed_base:
             return self.mass_matrix(qpos) + self._added_mass_matrix(qpos, added or {})

@@ -13,7 +13,7 @@ from batchpid.sim.engine.sapien.building import link_inertia, unmerged_links
 from batchpid.sim.engine.sapien.extents import shape_box
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.parts import LinkMass
-from batchpid.sim.robot.spatial_inertia import SpatialInertia
+from batchpid.task_space.spatial_inertia import SpatialInertia
 
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 

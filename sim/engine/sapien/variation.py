@@ -25,7 +25,7 @@ from batchpid.sim.engine.sapien.building import set_inertia
 from batchpid.sim.engine.sapien.dynamics import Dynamics, scene_dynamics
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.robot.spatial_inertia import spatial_matrix, total
+from batchpid.task_space.spatial_inertia import spatial_matrix, total
 
 
 class VariedPack(Pack):

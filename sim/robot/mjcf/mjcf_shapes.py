@@ -22,8 +22,8 @@ from batchpid.errors import RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.mjcf.mjcf_names import Names, label
-from batchpid.sim.robot.rotations import to_rpy
 from batchpid.sim.robot.self_collision import DisabledPair
+from batchpid.task_space.rotations import to_rpy
 
 _KIND = mujoco.mjtGeom
 PLANE = _KIND.mjGEOM_PLANE

@@ -26,8 +26,8 @@ from batchpid.sim.robot.link_repair import MOMENTS
 from batchpid.sim.robot.mjcf.mjcf_motors import Couplings, Motors
 from batchpid.sim.robot.mjcf.mjcf_names import Names
 from batchpid.sim.robot.mjcf.mjcf_shapes import PLANE, ShapeWriter, can_collide, text_of
-from batchpid.sim.robot.rotations import about, multiply, rotate, to_rpy
-from batchpid.sim.robot.spatial_inertia import rotation_matrix
+from batchpid.task_space.rotations import about, multiply, rotate, to_rpy
+from batchpid.task_space.spatial_inertia import rotation_matrix
 
 NO_MASS = 1e-9
 """Mass [kg] of a link with shapes and without mass: a URDF reader would give it the mass of its shapes."""

@@ -222,5 +222,5 @@ def test_inputs_of_a_step_are_checked():
 def test_options_are_checked(options, message):
     with pytest.raises(InvalidArgumentError, match=message):
         ts.make_osc_params(planar(), **options)
-    with pytest.raises(InvalidArgumentError, match="tree: must be a KinematicTree"):
+    with pytest.raises(InvalidArgumentError, match="tree: must be a RigidTree"):
         ts.make_osc_params("panda")

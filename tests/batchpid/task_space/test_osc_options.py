@@ -169,7 +169,7 @@ def test_native_numpy_and_jax_compute_the_same(x64):
     tree, rows, dt = planar((1.0, 0.8, 0.5)), 5, 1 / 300
     qpos, qvel = states(tree, rows)
     qpos[0, 0] = 2.99
-    tree = ts.KinematicTree(**{**vars_of(tree), "lower": -3.0, "upper": 3.0})
+    tree = ts.RigidTree(**{**vars_of(tree), "lower": -3.0, "upper": 3.0})
     goal = ts.link_poses(tree, qpos + 0.1, ["tip"])[:, 0]
     for how in ("explicit", "implicit"):
         params = ts.make_osc_params(

@@ -15,7 +15,7 @@ from batchpid.sim.engine.sapien.building import build_scene, new_system
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.kinematics import Kinematics
-from batchpid.sim.robot.rotations import about, from_rpy, multiply, rotate
+from batchpid.task_space.rotations import about, from_rpy, multiply, rotate
 
 ODD = """<robot name="odd">
   <link name="tip"/><link name="base"/><link name="mid"/><link name="side"/><link name="bracket"/>

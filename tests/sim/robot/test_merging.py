@@ -10,8 +10,8 @@ from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 from batchpid.sim import Robot
 from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.merging import merge_fixed_links, place_links
-from batchpid.sim.robot.rotations import from_rpy, multiply, rotate
-from batchpid.sim.robot.spatial_inertia import SpatialInertia, total
+from batchpid.task_space.rotations import from_rpy, multiply, rotate
+from batchpid.task_space.spatial_inertia import SpatialInertia, total
 
 BOX = '<collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
 

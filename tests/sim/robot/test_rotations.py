@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from batchpid.sim.robot.rotations import from_rpy, to_rpy
+from batchpid.task_space.rotations import from_rpy, to_rpy
 
 angles = st.one_of(st.floats(-math.pi, math.pi), st.sampled_from([0.0, math.pi / 2, -math.pi / 2, math.pi, 1.5707963]))
 

@@ -1,14 +1,16 @@
-"""Kinematic tree of one robot: links, joints, inertias, as float64 arrays.
+"""Rigid tree of one robot: its links, joints and inertias, as float64 arrays.
 
 Links are listed parents first. A joint's frame is placed in the frame of its parent link; its child link's frame is
 that frame, turned about the axis by q (revolute) or shifted along it by q (prismatic). Links that fixed joints connect
 are one rigid body: each link keeps its name and its frame, and the bodies have the sums of the inertias (Huygens and
-Steiner). There is one body for each degree of freedom, and the base, whose motion and inertia play no part.
+Steiner). There is one body for each degree of freedom, whose frame is that of its joint, with the axis along x; and the
+base, which is held or floats.
 """
 
 from __future__ import annotations
 
 import difflib
+from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,10 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.display import summary
+from batchpid.arrays.read_only import read_only
 from batchpid.checks.validate import choice, entries, names, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.task_space.frames import matrix_of, turned
+from batchpid.task_space.spatial_inertia import SpatialInertia, inertia_rows, moved_matrix, spatial_matrix
 
 Float64 = NDArray[np.float64]
 
@@ -31,15 +35,14 @@ class Bodies(NamedTuple):
     """Bodies of a tree, one for each degree of freedom, and the frames of its links in them.
 
     The frame of body j in its parent's is ``at_zero + sin(q) sine + (1 - cos(q)) cosine + q slide``, each (3, 4):
-    rotation and position. This is Rodrigues' formula with the placement of the joint multiplied in.
+    rotation and position. This is Rodrigues' formula with the placement of the joint multiplied in. Inertias may differ
+    from robot to robot: mass, center and tensor then have a leading axis (robots, ...).
     """
 
     at_zero: Any
     sine: Any
     cosine: Any
     slide: Any
-    axis: Any
-    """Axis of the joint in the body's frame (dof, 3)."""
     slides: Any
     """1.0 for a prismatic joint, else 0.0 (dof, 1)."""
     mass: Any
@@ -54,12 +57,16 @@ class Bodies(NamedTuple):
     """Frames of the links in their bodies (links, 3, 4)."""
     armature: Any
     gravity: Any
+    base_mass: Any
+    """Mass of the base (1,) [kg], with all that is fixed to it; center (3,) and tensor (3, 3) as of the bodies."""
+    base_center: Any
+    base_tensor: Any
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class KinematicTree:
-    """Kinematic tree of a robot on a fixed base. Arrays are copied and read-only; the degrees of freedom are the
-    joints that move, in the order of their links.
+class RigidTree:
+    """Rigid tree of a robot. Arrays are copied and read-only; the degrees of freedom are the joints that move, in the
+    order of their links.
 
     :meth:`batchpid.sim.Robot.kinematic_tree` makes one from a robot.
 
@@ -101,6 +108,9 @@ class KinematicTree:
     """Coupling of the joints; None if all are independent. Jacobians, mass matrices and efforts are then reduced to the
     leaders, J G, G^T M G and G^T u: columns and efforts of followers are 0, their rows in a mass matrix the identity's.
     """
+    fixed_base: bool = True
+    """False if the base floats. Mass matrices and biases are then the Schur complements that the joints show
+    (:mod:`batchpid.task_space.tree_dynamics`); poses and Jacobians stay those in the frame of the base."""
 
     def __post_init__(self) -> None:
         links = tuple(names("links", list(self.links)))
@@ -218,7 +228,6 @@ class KinematicTree:
         frames = np.zeros((len(self.links), 3, 4))
         local = np.zeros((4, self.dof, 3, 4))  # at_zero, sine, cosine, slide
         moves, slides = np.zeros((self.dof, self.dof)), np.zeros((self.dof, 1))
-        axes = np.zeros((self.dof, 3))
         for link, above in enumerate(self.parent):
             frames[link] = np.column_stack([matrix_of(self.wxyz[link]), self.position[link]])
             if link:
@@ -228,31 +237,68 @@ class KinematicTree:
                 if body[-1] >= 0:
                     links_of[body[-1]].append(link)
                 continue
-            joint, place, axis = len(parents), frames[link].copy(), self.axis[link]
-            x, y, z = axis
-            across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-            local[0, joint], axes[joint] = place, axis
+            joint, turn = len(parents), _along_x(self.axis[link])
+            place = np.column_stack([frames[link][:, :3] @ turn, frames[link][:, 3]])
+            local[0, joint] = place
             if self.joint_types[link] == "revolute":
-                local[1, joint, :, :3] = place[:, :3] @ across
-                local[2, joint, :, :3] = place[:, :3] @ across @ across
+                local[1, joint, :, :3] = place[:, :3] @ _ABOUT_X
+                local[2, joint, :, :3] = place[:, :3] @ _ABOUT_X @ _ABOUT_X
             else:
-                local[3, joint, :, 3], slides[joint] = place[:, :3] @ axis, 1.0
+                local[3, joint, :, 3], slides[joint] = place[:, 0], 1.0
             parents.append(body[above])
             moves[joint, joint] = 1.0
             if parents[-1] >= 0:
                 moves[joint] += moves[parents[-1]]
             body.append(joint)
             links_of.append([link])
-            frames[link] = np.eye(3, 4)
-        mass, center, tensor = self._inertias(links_of, frames)
-        leaves = *local, axes, slides, mass, center, tensor, moves, frames, self.armature, self.gravity
+            frames[link] = np.column_stack([turn.T, np.zeros(3)])
+        on_base = [link for link, of in enumerate(body) if of < 0]
+        mass, center, tensor = self._inertias([*links_of, on_base], frames)
+        own = mass[:-1], center[:-1], tensor[:-1]
+        leaves = *local, slides, *own, moves, frames, self.armature, self.gravity, mass[-1], center[-1], tensor[-1]
         for leaf in leaves:
             leaf.setflags(write=False)
         return tuple(body), tuple(parents), Bodies(*leaves)
 
+    @cached_property
+    def tables(self) -> tuple[NDArray[np.int32], Float64]:
+        """The bodies for native code: the joint above each, or -1, and 1 if it slides (dof, 2); and rows of numbers
+        (dof, 25), :data:`batchpid.native.task_space_extension.BODY`.
+        """
+        bodies = self.bodies
+        slides = bodies.slides[:, 0].astype(np.int32)
+        parts = bodies.at_zero[:, :, :3], bodies.at_zero[:, :, 3], bodies.mass, bodies.center, bodies.tensor
+        rows = np.hstack([part.reshape(self.dof, -1) for part in parts])
+        return read_only(np.column_stack([np.array(self.body_parents, np.int32), slides])), read_only(rows)
+
+    def inertias(self, bodies: Bodies | None = None) -> Float64:
+        """Return mass, center of mass and inertia tensor of each body, the last the base (..., dof + 1, 13)."""
+        of = self.bodies if bodies is None else bodies
+        parts = of.mass, of.center, of.tensor.reshape(*of.center.shape[:-1], 9)
+        rows = np.concatenate(parts, axis=-1)
+        base = np.concatenate([of.base_mass, of.base_center, of.base_tensor.reshape(*of.base_center.shape[:-1], 9)], -1)
+        return np.concatenate([rows, base[..., None, :]], axis=-2)
+
+    def varied(self, added: Mapping[str, Float64]) -> Bodies:
+        """Return the bodies of n robots with spatial inertias (n, 6, 6) added to links, in the axes of the links."""
+        rows = np.tile(self.inertias(), (len(next(iter(added.values()))), 1, 1))
+        of_bodies = dict[int, Float64]()
+        for name, matrices in added.items():
+            link = self.index(name)
+            moved = moved_matrix(matrices, self.bodies.link_frames[link])
+            of_bodies[self.link_bodies[link]] = of_bodies.get(self.link_bodies[link], 0.0) + moved
+        for body, matrices in of_bodies.items():
+            mass, center, tensor = np.split(rows[0, body], [1, 4])
+            own = SpatialInertia(float(mass[0]), center, tensor.reshape(3, 3))
+            rows[:, body] = inertia_rows(spatial_matrix(own) + matrices)
+        mass, center, tensor = rows[..., :1], rows[..., 1:4], rows[..., 4:].reshape(*rows.shape[:-1], 3, 3)
+        base = {"base_mass": mass[:, -1], "base_center": center[:, -1], "base_tensor": tensor[:, -1]}
+        return self.bodies._replace(mass=mass[:, :-1], center=center[:, :-1], tensor=tensor[:, :-1], **base)
+
     def _inertias(self, links_of: list[list[int]], frames: Float64) -> tuple[Float64, Float64, Float64]:
-        """Return mass, center of mass and inertia tensor of the bodies, in their frames."""
-        masses, centers, tensors = np.zeros((self.dof, 1)), np.zeros((self.dof, 3)), np.zeros((self.dof, 3, 3))
+        """Return mass, center of mass and inertia tensor of the bodies with these links, in their frames."""
+        count = len(links_of)
+        masses, centers, tensors = np.zeros((count, 1)), np.zeros((count, 3)), np.zeros((count, 3, 3))
         for joint, links in enumerate(links_of):
             turn, shift, mass = frames[links, :, :3], frames[links, :, 3], self.mass[links]
             at = shift + (turn @ self.center[links][..., None])[..., 0]
@@ -263,6 +309,17 @@ class KinematicTree:
             own = turn @ self.inertia[links] @ turn.transpose(0, 2, 1)
             tensors[joint] = (own + mass[:, None, None] * spread).sum(0)
         return masses, centers, tensors
+
+
+_ABOUT_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Matrix of the cross product with the x axis."""
+
+
+def _along_x(axis: Float64) -> Float64:
+    """Return a rotation matrix (3, 3) whose first column is the unit vector ``axis``."""
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across /= np.linalg.norm(across)
+    return np.column_stack([axis, across, np.cross(axis, across)])
 
 
 def _array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.robot.rotations import rotate
+from batchpid.task_space.rotations import rotate
 
 
 class SpatialInertia(NamedTuple):
