@@ -18,7 +18,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.motors.coupling import Coupling
 from batchpid.native.availability import SWITCH
 from batchpid.native.extensions import StaleExtensionError, load
 from batchpid.native.task_space_extension import BODY, KINEMATICS, TASK_SPACE
@@ -134,7 +133,7 @@ def native_tree(native: Any, tree: KinematicTree) -> _NativeTree:
     tools = np.stack([turns[body].T @ own for body, own in zip(tree.link_bodies, bodies.link_frames, strict=True)])
     table = np.array(rows, np.float64).reshape(tree.dof, sum(BODY.values()))
     arguments = np.array(kinds, np.int32), table, np.array(bodies.armature), tuple(bodies.gravity.tolist())
-    coupling = Coupling(tree.dof, []) if tree.coupling is None else tree.coupling
+    coupling = tree.coupling
     laws = coupling.leader.astype(np.int32), coupling.multiplier, coupling.offset
     _trees[tree] = own = _NativeTree(native.tree(tree.dof, *arguments, *laws), tools)
     return own

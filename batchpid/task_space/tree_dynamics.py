@@ -118,8 +118,7 @@ def forward_dynamics(tree: KinematicTree, qpos: Any, qvel: Any, effort: Any) -> 
 def check_masses(tree: KinematicTree) -> None:
     """Raise InvalidArgumentError for a joint that moves no mass and has no armature: its mass matrix is singular."""
     moved = tree.bodies.moves.T @ tree.bodies.mass[:, 0] + tree.bodies.armature
-    if tree.coupling is not None:
-        moved = tree.coupling.of_all(tree.coupling.reduced_damping(moved))
+    moved = tree.coupling.of_all(tree.coupling.reduced_damping(moved))
     for joint, kg in zip(tree.joint_names, moved, strict=True):
         if not kg > 0:
             problem = "has a joint that moves no mass and has no armature"
@@ -146,7 +145,7 @@ def mass_matrix_of(tree: KinematicTree, bodies: Bodies, motions: Motions, xp: An
     rest = xp.where(bodies.moves > 0, xp.swapaxes(table, -1, -2), xp.zeros_like(table))
     matrix = xp.where(above, table, rest)
     matrix = matrix + bodies.armature * xp.eye(tree.dof, dtype=matrix.dtype)
-    return matrix if tree.coupling is None else tree.coupling.arrays.mass_matrix(matrix).astype(matrix.dtype)
+    return xp.asarray(tree.coupling.mass_matrix(matrix), dtype=matrix.dtype)
 
 
 def effort_of(tree: KinematicTree, bodies: Bodies, motions: Motions, rates: Velocities, xp: Any) -> Any:
