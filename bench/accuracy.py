@@ -166,11 +166,13 @@ def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, re
     params = robot.tuned()
     law, damping = PIDLaw.of(params), robot.damping if robot.damping.any() else None
     model = Model(robot.dynamics().mass_matrix, plant.joint_mass_matrix if isinstance(plant, Pack) else None)
-    layout = Layout("pid", law, robot.coupling, model=model)
+    layout = Layout("pid", law, model=model)
     k = bp.discretise(acting_gains(params, robot.coupling), TIMESTEP, len(moves.start))
     limits = params.effort_min, params.effort_max
-    control = Constants(TIMESTEP, limits, k, damping=damping if law.whole else None)
-    joints = Constants(finer.timestep, limits, friction=plant.friction if isinstance(plant, Pack) else Friction())
+    control = Constants(TIMESTEP, limits, robot.coupling, k, damping=damping if law.whole else None)
+    joints = Constants(
+        finer.timestep, limits, robot.coupling, friction=plant.friction if isinstance(plant, Pack) else Friction()
+    )
     state, command = StepState(bp.init(params, moves.start)), Command(moves.target)
     if isinstance(plant, Pack):
         state = reset_friction(layout, joints, state, plant, np.ones(plant.size, bool))

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.checks.validate import AxisKind, array, env_mask, integer, read_array, within
 from batchpid.errors import InvalidArgumentError
+from batchpid.motors.coupling import Coupling
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FARTHEST
 from batchpid.sim.options import RunnerOptions
@@ -29,7 +30,7 @@ class Arguments:
         entries: _Axis = ("joint" if own is None else "entry", options.command.names)
         self._axes: tuple[_Axis, ...] = (entries, entries, entries, ("joint", robot.joint_names))
         """Last axis of each array of a command: its kind, and the names of its columns."""
-        self._coupling = robot.coupling if options.sets_positions else None
+        self._coupling = robot.coupling if options.sets_positions else Coupling.of(robot.dof)
         self._limits = SetpointCheck(robot)
         self._checks_setpoints = options.sets_positions and options.guard is None
 
@@ -110,7 +111,6 @@ class Arguments:
                 continue
             own = array(name, value, (*table, len(names)), names, finite=self._finite, kind=kind).copy()
             rows.append(own[None] if ticks is None else own)
-        if self._coupling is not None:
-            rows[0] = self._coupling.positions(rows[0])
-            rows[1:3] = [None if each is None else self._coupling.rates(each) for each in rows[1:3]]
+        rows[0] = self._coupling.positions(rows[0])
+        rows[1:3] = [None if each is None else self._coupling.rates(each) for each in rows[1:3]]
         return Command._make(rows)

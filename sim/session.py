@@ -144,8 +144,7 @@ class Session:
             position, velocity = randomization.start(position, velocity, draws, robot)
         elif seed is not None:
             raise InvalidArgumentError("seed", "has no effect without a randomization", remedy="leave it out")
-        if (coupling := robot.coupling) is not None:
-            position, velocity = coupling.positions(position), coupling.rates(velocity)
+        position, velocity = robot.coupling.positions(position), robot.coupling.rates(velocity)
 
         def commit(state: RunnerState, _: list[Any]) -> tuple[RunnerState, Observation]:
             faults, targets = state.faults.without(chosen).with_faults(self.pool.present), None

@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from batchpid.export.c_step import Dialect
-from batchpid.motors.coupling import Coupling
 from batchpid.task_space.rigid_tree import RigidTree
 
 
@@ -163,10 +162,8 @@ static inline void {p}_gravity(const {t} qpos[{n}], {t} bias[{n}]) {{
 
 def _folded_matrix(c: Dialect, tree: RigidTree) -> str:
     """Return the lines that reduce ``matrix`` to the leaders of coupled joints: :meth:`Coupling.mass_matrix`."""
-    if tree.coupling is None:
-        return ""
     n = c.size
-    return f"""{_laws(c, tree.coupling)}  for (int j = 0; j < {n}; ++j) {{
+    lines = f"""  for (int j = 0; j < {n}; ++j) {{
     for (int i = 0; i < {n} && leader[j] != j; ++i) matrix[{n} * leader[j] + i] += multiplier[j] * matrix[{n} * j + i];
   }}
   for (int j = 0; j < {n}; ++j) {{
@@ -178,22 +175,25 @@ def _folded_matrix(c: Dialect, tree: RigidTree) -> str:
     matrix[{n} * j + j] = {c.number(1.0)};
   }}
 """
+    return _folded(c, tree, lines)
 
 
 def _folded_bias(c: Dialect, tree: RigidTree) -> str:
     """Return the lines that reduce ``bias`` to the leaders of coupled joints: :meth:`Coupling.efforts`."""
-    if tree.coupling is None:
-        return ""
-    return f"""{_laws(c, tree.coupling)}  for (int j = 0; j < {c.size}; ++j) {{
+    lines = f"""  for (int j = 0; j < {c.size}; ++j) {{
     if (leader[j] == j) continue;
     bias[leader[j]] += multiplier[j] * bias[j];
     bias[j] = {c.number(0.0)};
   }}
 """
+    return _folded(c, tree, lines)
 
 
-def _laws(c: Dialect, coupling: Coupling) -> str:
-    return _integers(c, "leader", coupling.leader) + c.table("multiplier", coupling.multiplier)
+def _folded(c: Dialect, tree: KinematicTree, lines: str) -> str:
+    """Return ``lines`` after the tables of the coupling that they need; no lines without followers."""
+    if tree.coupling.is_identity:
+        return ""
+    return _integers(c, "leader", tree.coupling.leader) + c.table("multiplier", tree.coupling.multiplier) + lines
 
 
 def _integers(c: Dialect, name: str, values: object) -> str:

@@ -28,6 +28,7 @@ from batchpid.arrays.choices import CHOICES
 from batchpid.checks.validate import choice, number, positive, time_step
 from batchpid.gains.stability import stability_bound
 from batchpid.law.params import PIDParams
+from batchpid.motors.coupling import Coupling
 
 FILTER_STEPS = 4.0
 """Least filter time of the derivative, in sampling steps: against quantisation noise."""
@@ -154,9 +155,8 @@ def design_gains(
     choice("gain_units", gain_units, CHOICES["gain_units"])
     is_explicit = choice("discretization", discretization, CHOICES["discretization"]) == "explicit"
     mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
-    viscous, coupling = robot.damping, getattr(robot, "coupling", None)
-    if coupling is not None:
-        mass, viscous = coupling.reduced(mass), coupling.reduced_damping(viscous)
+    coupling = getattr(robot, "coupling", Coupling.of(mass.shape[-1]))
+    mass, viscous = coupling.reduced(mass), coupling.reduced_damping(robot.damping)
     own = np.diagonal(mass, axis1=1, axis2=2)
     inertia = {"effort": own.max(0), "inertia": np.ones(own.shape[1]), "mass_matrix": np.ones(own.shape[1])}[gain_units]
     # The loop with the whole mass matrix compensates the joints' damping.
@@ -167,10 +167,8 @@ def design_gains(
         if filter_time <= max(FILTER_SHARE / (2 * np.pi * bandwidth), FILTER_STEPS * dt) or bandwidth < 1e-3:
             break
         bandwidth *= BACK_OFF
-    if coupling is not None:
-        gains = {name: coupling.of_all(gain) for name, gain in gains.items()}
     designed = {
-        **gains,
+        **{name: coupling.of_all(gain) for name, gain in gains.items()},
         "setpoint_weight": setpoint_weight if integrates else 1.0,
         "derivative_filter_time": filter_time,
         "weight_origin": "start",

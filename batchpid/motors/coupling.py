@@ -11,12 +11,12 @@ coupling on its leader, multiplied by m_i.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from functools import wraps
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import namespace
@@ -42,67 +42,41 @@ class Share(NamedTuple):
     multiplier: Any
 
 
-class CouplingArrays(NamedTuple):
-    """Arrays of a :class:`Coupling` (joints,), for functions of NumPy arrays, or of symbols in a trace."""
+def _of_followers(method: Callable[[Coupling, Any], Any]) -> Callable[[Coupling, Any], Any]:
+    """Return a method that returns its argument if no joint follows."""
 
-    leader: Any
-    multiplier: Any
-    offset: Any
-    independent: Any
-    shares: tuple[Share, ...]
-    """The first followers of all leaders, the second ones, and so on."""
+    @wraps(method)
+    def call(self: Coupling, given: Any) -> Any:
+        return given if self.is_identity else method(self, given)
 
-    def positions(self, qpos: Any) -> Any:
-        """Return ``qpos`` (..., joints) with the followers where their leaders have them."""
-        return self.rates(qpos) + self.offset
-
-    def rates(self, qvel: Any) -> Any:
-        """Return ``qvel`` (..., joints) with the rates that the followers have by their leaders'."""
-        return self.multiplier * self.of_leaders(qvel)
-
-    def efforts(self, effort: Any) -> Any:
-        """Return the efforts G^T u on the independent joints for u (..., joints); zero for followers."""
-        xp = namespace(effort)
-        acting = xp.where(self.independent, effort, 0.0)
-        for share in self.shares:  # the order of the sum is the same for any number of rows
-            added = share.multiplier * xp.take(effort, share.joint, axis=-1)
-            acting = xp.where(share.exists, acting + added, acting)
-        return acting
-
-    def of_leaders(self, figures: Any) -> Any:
-        """Return ``figures`` (..., joints) in which followers take the figures of their leaders."""
-        return namespace(figures).take(figures, self.leader, axis=-1)
-
-    def mass_matrix(self, matrix: Any) -> Any:
-        """Return G^T M G for M (..., joints, joints) in the rows and columns of the independent joints.
-
-        Rows and columns of followers are the identity's. ``fold`` in coupling.h is the same function.
-        """
-        xp = namespace(matrix)
-        rows = xp.swapaxes(self.efforts(xp.swapaxes(matrix, -1, -2)), -1, -2)
-        return self.efforts(rows) + xp.diag(xp.where(self.independent, 0.0, 1.0).astype(matrix.dtype))
+    return call
 
 
-class Coupling:
-    """Coupling of a robot's joints. Arrays are (joints,) unless said otherwise, and read-only.
+class Coupling(NamedTuple):
+    """Coupling of a robot's joints; the identity if no joint follows. Arrays are (joints,), and read-only.
 
-    Attributes
-    ----------
-    leader
-        Index of the independent joint that each joint moves with: its own index if it is independent.
-    multiplier, offset
-        ``q = multiplier * q[leader] + offset``: 1 and 0 for an independent joint.
-    independent
-        True for the joints that are not followers.
+    Methods take and return arrays (..., joints) unless said otherwise, of NumPy or JAX, or symbols of a trace. Those of
+    the identity return their argument.
     """
 
-    def __init__(self, joints: int, followers: Sequence[Follower]) -> None:
-        """Couple ``followers``, one entry for each; a chain of followers ends at its last leader.
+    leader: Any
+    """Index of the independent joint that each joint moves with: its own index if it is independent."""
+    multiplier: Any
+    """Multiplier in ``q = multiplier * q[leader] + offset``: 1 for an independent joint."""
+    offset: Any
+    """Offset there: 0 for an independent joint."""
+    independent: Any
+    """True for the joints that are not followers."""
+    shares: tuple[Share, ...] = ()
+    """The first followers of all leaders, the second ones, and so on."""
+
+    @classmethod
+    def of(cls, joints: int, followers: Sequence[Follower] = ()) -> Coupling:
+        """Return the coupling of ``followers``, one entry for each; a chain of followers ends at its last leader.
 
         Raises ValueError if a joint follows itself, through others or directly.
         """
-        self.leader, self.multiplier, self.offset = np.arange(joints), np.ones(joints), np.zeros(joints)
-        self.independent = np.ones(joints, bool)
+        leaders, multipliers, offsets = np.arange(joints), np.ones(joints), np.zeros(joints)
         direct = {follower.joint: follower for follower in followers}
         for joint in direct:
             multiplier, offset, leader, passed = 1.0, 0.0, joint, set[int]()
@@ -112,74 +86,101 @@ class Coupling:
                 passed.add(leader)
                 _, leader, factor, shift = direct[leader]
                 multiplier, offset = multiplier * factor, offset + multiplier * shift
-            self.leader[joint], self.multiplier[joint], self.offset[joint] = leader, multiplier, offset
-            self.independent[joint] = False
-        for name, array in vars(self).items():
-            vars(self)[name] = read_only(array)
-
-    @cached_property
-    def arrays(self) -> CouplingArrays:
-        """Arrays of the coupling, for a control step."""
+            leaders[joint], multipliers[joint], offsets[joint] = leader, multiplier, offset
+        independent = np.array([joint not in direct for joint in range(joints)], bool)
+        of_leader = [[each for each in sorted(direct) if leaders[each] == joint] for joint in range(joints)]
         shares = list[Share]()
-        of_leader = [self.followers[self.leader[self.followers] == joint] for joint in range(len(self.leader))]
         for number in range(max(map(len, of_leader), default=0)):
-            exists = np.array([len(followers) > number for followers in of_leader])
-            joint = np.array([followers[number] if len(followers) > number else 0 for followers in of_leader])
-            shares.append(Share(*map(read_only, (exists, joint, np.where(exists, self.multiplier[joint], 0.0)))))
-        return CouplingArrays(self.leader, self.multiplier, self.offset, self.independent, tuple(shares))
+            exists = np.array([len(each) > number for each in of_leader])
+            chosen = np.array([each[number] if len(each) > number else 0 for each in of_leader])
+            shares.append(Share(*map(read_only, (exists, chosen, np.where(exists, multipliers[chosen], 0.0)))))
+        leaders, multipliers, offsets, independent = map(read_only, (leaders, multipliers, offsets, independent))
+        return cls(leaders, multipliers, offsets, independent, tuple(shares))
 
-    @cached_property
+    @property
+    def is_identity(self) -> bool:
+        """Whether all joints are independent; also known in a trace."""
+        return not self.shares
+
+    @property
+    def followers(self) -> NDArray[np.intp]:
+        """Indices of the followers (followers,)."""
+        return read_only(np.flatnonzero(~self.independent))
+
+    @property
     def matrix(self) -> Float64:
         """G (joints, independent joints)."""
         matrix = np.zeros((len(self.leader), len(self.leader)))
         matrix[np.arange(len(self.leader)), self.leader] = self.multiplier
         return read_only(matrix[:, self.independent])
 
-    @cached_property
+    @property
     def jacobian(self) -> Float64:
         """J (followers, joints) of the constraint J q = o of every follower, q_f - m q_l = o."""
         whole = np.eye(len(self.leader))
         whole[np.arange(len(self.leader)), self.leader] -= self.multiplier
         return read_only(whole[self.followers])
 
-    @cached_property
-    def followers(self) -> NDArray[np.intp]:
-        """Indices of the followers (followers,)."""
-        return read_only(np.flatnonzero(~self.independent))
+    @_of_followers
+    def positions(self, qpos: Any) -> Any:
+        """Return ``qpos`` with the followers where their leaders have them."""
+        return self.rates(qpos) + self.offset
 
-    def positions(self, qpos: ArrayLike) -> Float64:
-        """Return ``qpos`` (..., joints) with the followers where their leaders have them."""
-        return self.arrays.positions(np.asarray(qpos, np.float64))
+    @_of_followers
+    def rates(self, qvel: Any) -> Any:
+        """Return ``qvel`` with the rates that the followers have by their leaders'."""
+        return self.multiplier * self.of_leaders(qvel)
 
-    def rates(self, qvel: ArrayLike) -> Float64:
-        """Return ``qvel`` (..., joints) with the rates that the followers have by their leaders'."""
-        return self.arrays.rates(np.asarray(qvel, np.float64))
+    @_of_followers
+    def efforts(self, effort: Any) -> Any:
+        """Return the efforts G^T u on the independent joints for u = ``effort``; zero for followers."""
+        xp, acting = namespace(effort), self.of_independent(effort)
+        for share in self.shares:  # the order of the sum is the same for any number of rows
+            added = share.multiplier * xp.take(effort, share.joint, axis=-1)
+            acting = xp.where(share.exists, acting + added, acting)
+        return acting
 
-    def efforts(self, effort: ArrayLike) -> Float64:
-        """Return the efforts G^T u on the independent joints for u (..., joints); zero for followers."""
-        return self.arrays.efforts(np.asarray(effort, np.float64))
+    @_of_followers
+    def of_independent(self, figures: Any) -> Any:
+        """Return ``figures`` with 0 for followers."""
+        return namespace(figures).where(self.independent, figures, 0.0)
 
-    def reduced(self, mass_matrix: ArrayLike) -> Float64:
-        """Return M_r (..., independent, independent) of a mass matrix M (..., joints, joints)."""
-        return self.mass_matrix(mass_matrix)[..., self.independent, :][..., self.independent]
+    @_of_followers
+    def of_leaders(self, figures: Any) -> Any:
+        """Return ``figures`` in which followers take the figures of their leaders."""
+        return namespace(figures).take(figures, self.leader, axis=-1)
 
-    def mass_matrix(self, mass_matrix: ArrayLike) -> Float64:
-        """Return M_r in the rows and columns of the independent joints (..., joints, joints), else the identity."""
-        reduced: Float64 = self.arrays.mass_matrix(np.asarray(mass_matrix, np.float64))
-        return reduced
-
-    def reduced_damping(self, damping: ArrayLike) -> Float64:
-        """Return the diagonal of G^T B G (independent,) for viscous damping B = diag(damping) (joints,)."""
-        return self.matrix.T**2 @ np.asarray(damping, np.float64)
-
-    def of_all(self, figures: ArrayLike) -> NDArray[Any]:
+    @_of_followers
+    def of_all(self, figures: Any) -> Any:
         """Return ``figures`` (..., independent) for all joints (..., joints); followers have their leaders' values."""
-        return np.asarray(figures)[..., (np.cumsum(self.independent) - 1)[self.leader]]
+        return figures[..., (np.cumsum(self.independent) - 1)[self.leader]]
 
-    def of_leaders(self, figures: ArrayLike) -> NDArray[Any]:
-        """Return ``figures`` (..., joints) in which followers take the figures of their leaders."""
-        return np.asarray(self.arrays.of_leaders(np.asarray(figures)))
+    @_of_followers
+    def mass_matrix(self, matrix: Any) -> Any:
+        """Return G^T M G for M (..., joints, joints) in the rows and columns of the independent joints.
+
+        Rows and columns of followers are the identity's. ``fold`` in coupling.h is the same function.
+        """
+        xp = namespace(matrix)
+        rows = xp.swapaxes(self.efforts(xp.swapaxes(matrix, -1, -2)), -1, -2)
+        return self.efforts(rows) + xp.diag(xp.where(self.independent, 0.0, 1.0).astype(matrix.dtype))
+
+    @_of_followers
+    def reduced(self, matrix: Any) -> Any:
+        """Return M_r = G^T M G (..., independent, independent) of a mass matrix M (..., joints, joints)."""
+        return self.mass_matrix(matrix)[..., self.independent, :][..., self.independent]
+
+    @_of_followers
+    def reduced_damping(self, damping: Any) -> Any:
+        """Return the diagonal of G^T B G (independent,) for viscous damping B = diag(damping) (joints,)."""
+        return self.matrix.T**2 @ damping
+
+    def native(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays for coupling.h; none for the identity."""
+        if self.is_identity:
+            return {}
+        return {"leader": self.leader.astype(np.int32), "multiplier": np.array(self.multiplier)}
 
     def __repr__(self) -> str:
-        laws = (f"q{i} = {self.multiplier[i]:g} q{self.leader[i]} + {self.offset[i]:g}" for i in self.followers)
-        return f"Coupling({len(self.leader)} joints: {', '.join(laws)})"
+        laws = [f"q{i} = {self.multiplier[i]:g} q{self.leader[i]} + {self.offset[i]:g}" for i in self.followers]
+        return f"Coupling({len(self.leader)} joints: {', '.join(laws) or 'no followers'})"

@@ -262,8 +262,6 @@ def _goals_and_starts(tree: RigidTree, pose: ArrayLike, start: ArrayLike) -> tup
 def _wholly_turning(tree: RigidTree) -> NDArray[np.bool_]:
     """Return the joints (dof,) that a whole turn brings back to the same pose of all links."""
     turning = tree.bodies.slides[:, 0] == 0
-    if tree.coupling is None:
-        return turning
     pitch = np.where(turning, tree.coupling.multiplier % 1, tree.coupling.multiplier)  # 0 if the follower is back, too
     back = np.bincount(tree.coupling.leader, pitch != 0, minlength=tree.dof) == 0
     return turning & back & tree.independent

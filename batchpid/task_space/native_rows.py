@@ -18,7 +18,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.motors.coupling import Coupling
 from batchpid.native.availability import SWITCH
 from batchpid.native.extensions import StaleExtensionError, load
 from batchpid.native.task_space_extension import KINEMATICS, TASK_SPACE
@@ -126,7 +125,7 @@ def native_tree(native: Any, tree: RigidTree) -> _NativeTree:
         return own
     bodies, (kinds, rows) = tree.bodies, tree.tables
     arguments = kinds, rows, np.array(bodies.armature), tuple(bodies.gravity.tolist())
-    coupling = Coupling(tree.dof, []) if tree.coupling is None else tree.coupling
+    coupling = tree.coupling
     laws = coupling.leader.astype(np.int32), coupling.multiplier, coupling.offset
     _trees[tree] = own = _NativeTree(native.tree(tree.dof, *arguments, *laws), bodies.link_frames)
     return own

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.display import summary
 from batchpid.arrays.read_only import read_only
+from batchpid.arrays.elementwise import namespace
 from batchpid.checks.validate import choice, entries, names, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
@@ -104,8 +105,8 @@ class RigidTree:
     upper: ArrayLike = np.inf
     gravity: ArrayLike = (0.0, 0.0, -9.81)
     """Acceleration of free fall in the world (3,) [m/s^2]."""
-    coupling: Coupling | None = None
-    """Coupling of the joints; None if all are independent. Jacobians, mass matrices and efforts are then reduced to the
+    coupling: Coupling = None  # type: ignore[assignment]
+    """Coupling of the joints; None: all are independent. Jacobians, mass matrices and efforts are reduced to the
     leaders, J G, G^T M G and G^T u: columns and efforts of followers are 0, their rows in a mass matrix the identity's.
     """
     fixed_base: bool = True
@@ -143,12 +144,13 @@ class RigidTree:
         entries("axis", lengths["axis"], pointing, "has no direction", links)
         tables["wxyz"] /= lengths["wxyz"][:, None]
         tables["axis"] /= np.where(lengths["axis"] > 0, lengths["axis"], 1.0)[:, None]
-        if self.coupling is not None and len(self.coupling.leader) != len(moving):
-            problem = f"couples {len(self.coupling.leader)} joints, but {len(moving)} move"
+        coupling = Coupling.of(len(moving)) if self.coupling is None else self.coupling
+        if len(coupling.leader) != len(moving):
+            problem = f"couples {len(coupling.leader)} joints, but {len(moving)} move"
             raise InvalidArgumentError("coupling", problem, remedy="give one entry for each joint that moves")
         for table in (parent, *tables.values()):
             table.setflags(write=False)
-        vars(self).update(tables, links=links, joint_types=types, joint_names=moving, parent=parent)
+        vars(self).update(tables, links=links, joint_types=types, joint_names=moving, parent=parent, coupling=coupling)
 
     def __repr__(self) -> str:
         parts = [f"{len(self.links)} links", f"{self.dof} joints", f"{self.mass.sum():.4g} kg"]
@@ -173,22 +175,22 @@ class RigidTree:
         remedy = f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(self.links)}"
         raise InvalidArgumentError("link", "unknown link", value=link, remedy=remedy)
 
-    @cached_property
+    @property
     def independent(self) -> NDArray[np.bool_]:
         """Mask (dof,) of the joints that are not followers."""
-        return np.ones(self.dof, bool) if self.coupling is None else self.coupling.independent
+        return self.coupling.independent
 
     def positions(self, qpos: Float64) -> Float64:
         """Return ``qpos`` (..., dof) with the followers where their leaders have them."""
-        return qpos if self.coupling is None else self.coupling.positions(qpos)
+        return self.coupling.positions(qpos)
 
     def rates(self, qvel: Any) -> Any:
         """Return ``qvel`` (..., dof) with the rates of the followers by their leaders'."""
-        return qvel if self.coupling is None else self.coupling.arrays.rates(qvel).astype(qvel.dtype)
+        return namespace(qvel).asarray(self.coupling.rates(qvel), dtype=qvel.dtype)
 
     def efforts(self, effort: Any) -> Any:
         """Return G^T u for u (..., dof), or J G for J (..., dof)."""
-        return effort if self.coupling is None else self.coupling.arrays.efforts(effort).astype(effort.dtype)
+        return namespace(effort).asarray(self.coupling.efforts(effort), dtype=effort.dtype)
 
     def chain(self, link: str) -> NDArray[np.bool_]:
         """Return the mask (dof,) of the joints between the base and ``link``, and of all that move with these."""
@@ -201,9 +203,7 @@ class RigidTree:
         The last row, body -1, is the base.
         """
         rows = np.concatenate([self.bodies.moves, np.zeros((1, self.dof))])
-        if self.coupling is not None:
-            together = self.coupling.leader[:, None] == self.coupling.leader
-            rows = (rows @ together > 0).astype(np.float64)
+        rows = (rows @ (self.coupling.leader[:, None] == self.coupling.leader) > 0).astype(np.float64)
         rows.setflags(write=False)
         return rows
 

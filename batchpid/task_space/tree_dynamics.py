@@ -127,8 +127,7 @@ def forward_dynamics(tree: RigidTree, qpos: Any, qvel: Any, effort: Any) -> Any:
 def check_masses(tree: RigidTree) -> None:
     """Raise InvalidArgumentError for a joint that moves no mass and has no armature: its mass matrix is singular."""
     moved = tree.bodies.moves.T @ tree.bodies.mass[:, 0] + tree.bodies.armature
-    if tree.coupling is not None:
-        moved = tree.coupling.of_all(tree.coupling.reduced_damping(moved))
+    moved = tree.coupling.of_all(tree.coupling.reduced_damping(moved))
     for joint, kg in zip(tree.joint_names, moved, strict=True):
         if not kg > 0:
             problem = "has a joint that moves no mass and has no armature"
@@ -195,7 +194,7 @@ def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: Any) -
         falls = solve(_of_base(tree, bodies, all_, xp), xp.swapaxes(all_.momenta, -1, -2))
         matrix = matrix - (all_.momenta[..., :, None, :] * xp.swapaxes(falls, -1, -2)[..., None, :, :]).sum(-1)
     matrix = matrix + bodies.armature * xp.eye(tree.dof, dtype=matrix.dtype)
-    return matrix if tree.coupling is None else tree.coupling.arrays.mass_matrix(matrix).astype(matrix.dtype)
+    return xp.asarray(tree.coupling.mass_matrix(matrix), dtype=matrix.dtype)
 
 
 def effort_of(

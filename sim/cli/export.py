@@ -200,6 +200,5 @@ def _motors(robot: Robot) -> bp.Actuators:
 def _inertia(robot: Robot) -> np.ndarray:
     """Return the inertia of the joints (poses, dof), 1 for followers, at the start pose, then at sampled poses."""
     matrices = robot.mass_matrix(np.vstack([robot.start, robot.sample(POSES)]))
-    if robot.coupling is not None:
-        matrices = robot.coupling.mass_matrix(matrices)
+    matrices = robot.coupling.mass_matrix(matrices)
     return np.diagonal(matrices, axis1=1, axis2=2)

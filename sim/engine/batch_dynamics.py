@@ -104,15 +104,10 @@ class MovingJoints(NamedTuple):
     @classmethod
     def of(cls, robot: RobotDescription, joints: tuple[int, ...]) -> MovingJoints:
         """Return ``joints`` of ``robot``; others rest where it starts, or follow."""
-        leader, multiplier = np.full(robot.dof, -1, np.int32), np.zeros(robot.dof)
-        rest = robot.start.copy()
-        rest[list(joints)] = 0.0
-        leader[list(joints)], multiplier[list(joints)] = np.arange(len(joints)), 1.0
-        if (coupling := robot.coupling) is not None:
-            followers = coupling.followers
-            leader[followers] = leader[coupling.leader[followers]]
-            multiplier[followers] = coupling.multiplier[followers] * multiplier[coupling.leader[followers]]
-            rest = np.where(robot.independent, rest, coupling.multiplier * rest[coupling.leader] + coupling.offset)
+        number, rest, coupling = np.full(robot.dof, -1, np.int32), robot.start.copy(), robot.coupling
+        number[list(joints)], rest[list(joints)] = np.arange(len(joints)), 0.0
+        leader = number[coupling.leader]
+        multiplier, rest = np.where(leader < 0, 0.0, coupling.multiplier), coupling.positions(rest)
         free = robot.continuous[list(joints)]
         low = np.where(free, -np.inf, robot.lower[list(joints)])
         high = np.where(free, np.inf, robot.upper[list(joints)])

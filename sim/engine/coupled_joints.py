@@ -66,7 +66,8 @@ class ConstraintEfforts:
         asked: NDArray[np.float32] | None = None,
     ) -> None:
         joints, followers = len(coupling.leader), coupling.followers
-        self._coupling, self.wraps, self.unwrapped = coupling, wraps, np.zeros((robots, joints))
+        self._coupling, self._followers, self._jacobian = coupling, followers, coupling.jacobian
+        self.wraps, self.unwrapped = wraps, np.zeros((robots, joints))
         self._rate_gain, self._position_gain = RATE_GAIN / timestep, POSITION_GAIN / timestep**2
         self._response = np.zeros((robots, len(followers), joints))
         self._push, self._passive = np.zeros((robots, joints, len(followers))), np.zeros((robots, joints))
@@ -124,7 +125,7 @@ class ConstraintEfforts:
         numbers = np.concatenate([matrices, passive[rows][:, :, None]], axis=2)
         sound = np.isfinite(numbers).all((1, 2), keepdims=True)  # a robot may have failed
         matrix = np.where(sound, matrices, np.eye(qpos.shape[1]))
-        jacobian = self._coupling.jacobian
+        jacobian = self._jacobian
         response = np.linalg.solve(matrix, jacobian.T).swapaxes(1, 2)
         self._response[rows], self._passive[rows] = response, np.where(sound[:, 0], passive[rows], 0.0)
         self._push[rows] = jacobian.T @ np.linalg.inv(response @ jacobian.T)
@@ -135,7 +136,7 @@ class ConstraintEfforts:
 
     def apply(self, effort: NDArray[np.floating], qpos: Float64, qvel: Float64) -> Float64:
         """Return ``effort`` with the constraint efforts added."""
-        coupling, followers = self._coupling, self._coupling.followers
+        coupling, followers = self._coupling, self._followers
         self.unwrapped[...] = np.where(self.wraps, qpos + WRAP * np.rint((self.unwrapped - qpos) / WRAP), qpos)
         error = (self.unwrapped - coupling.positions(self.unwrapped))[:, followers]
         rate = (qvel - coupling.rates(qvel))[:, followers]

@@ -18,9 +18,8 @@ def own_friction(spec: SceneSpec, variation: Variation | None = None) -> Frictio
         rows = (np.array([[getattr(joint, name) for joint in spec.joints]]) for name in ("friction", "damping"))
         model = Friction(*(row if row.any() else None for row in rows))
     if variation is not None and variation.friction is not None:
-        coupling = coupling_of(spec.joints)
-        where = 1.0 if coupling is None else coupling.independent  # the coupling moves the others
-        model = model._replace(coulomb=variation.friction * where)
+        # The coupling moves the others.
+        model = model._replace(coulomb=coupling_of(spec.joints).of_independent(variation.friction))
     if variation is not None and variation.damping is not None:
         model = model._replace(viscous=variation.damping.copy())
     return model

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
-from batchpid.motors.coupling import CouplingArrays
+from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
 from batchpid.sim.engine.engines import scene_dynamics
@@ -103,7 +103,7 @@ class NativeRefresh:
     friction, drive
         Friction, and damping and stiffness of the engine's drives, each (1 | M, dof).
     coupling
-        Coupling of joints, or None.
+        Coupling of the joints.
     timestep
         [s]
     steps
@@ -117,7 +117,7 @@ class NativeRefresh:
         armature: Float64,
         friction: Friction,
         drive: tuple[Any, Any],
-        coupling: CouplingArrays | None,
+        coupling: Coupling,
         timestep: float,
         steps: int,
     ) -> None:
@@ -127,8 +127,7 @@ class NativeRefresh:
         named = {"armature": armature, "coulomb": friction.coulomb, "viscous": viscous}
         named |= dict(zip(("damping", "stiffness"), drive, strict=True))
         arrays = {name: np.array(np.broadcast_to(rows, shape), np.float64, order="C") for name, rows in named.items()}
-        if coupling is not None:
-            arrays |= {"leader": coupling.leader.astype(np.int32), "multiplier": np.array(coupling.multiplier)}
+        arrays |= coupling.native()
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
         self._structure = Refresh(model=model.address, timestep=timestep, share=SHARE, steps=steps, **addresses)
         self._kept = model, arrays

@@ -13,7 +13,7 @@ from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     """Return why backend "jax" cannot run the sim steps of a tick as one program of XLA; "" if it can."""
-    if options.robot.coupling is not None:
+    if not options.robot.coupling.is_identity:
         return "coupled joints take constraint efforts of NumPy"
     if options.randomization is not None or actuators is not None or options.robot.actuators is not None:
         return "actuators and randomizations are in NumPy"

@@ -28,7 +28,7 @@ from batchpid.law.coefficients import Coefficients
 from batchpid.motors import STAGES, ActuatorState, Stages, advance_effort, advance_measurement
 from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
-from batchpid.motors.coupling import CouplingArrays
+from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction, FrictionState
 from batchpid.motors.guard import GuardState
 from batchpid.sim.loop.arrays import Command
@@ -124,6 +124,7 @@ class Constants(NamedTuple):
     """[s]"""
     limits: tuple[Any, Any]
     """Least and largest effort of the params [N m or N]."""
+    coupling: Coupling
     k: Coefficients | None = None
     """Coefficients of the PID law."""
     armature: Any = None
@@ -142,7 +143,6 @@ class Constants(NamedTuple):
     """Params of the integral that moves the targets of drives."""
     turns: Any = None
     """1 / (2 pi) on continuous joints with drives, 0 elsewhere; None without such joints."""
-    coupling: CouplingArrays | None = None
 
 
 def when(due: Any, function: Callable[[], Any], otherwise: Any) -> Any:
@@ -235,16 +235,14 @@ def mass_matrix(layout: Layout, constants: Constants, qpos: Any) -> Any:
         matrix = matrix + xp.diag(constants.armature)
     if constants.damping is not None:
         matrix = matrix + constants.timestep * xp.diag(constants.damping)
-    return matrix if constants.coupling is None else constants.coupling.mass_matrix(matrix)
+    return constants.coupling.mass_matrix(matrix)
 
 
 def refreshed(layout: Layout, constants: Constants, friction: FrictionState, qpos: Any) -> FrictionState:
     """Return the state of the friction model with the inertia at ``qpos``, for the leaders only."""
     if layout.model.refresh is not None:
         return layout.model.refresh(friction, qpos)
-    matrix = layout.model.joint_mass_matrix(qpos)
-    if constants.coupling is not None:
-        matrix = constants.coupling.mass_matrix(matrix)
+    matrix = constants.coupling.mass_matrix(layout.model.joint_mass_matrix(qpos))
     return friction_model.refresh(constants.friction, friction, matrix, constants.timestep, *constants.drive)
 
 
@@ -277,9 +275,9 @@ def _guarded(constants: Constants, state: GuardState, command: Command) -> tuple
         rate = xp.where(changed, state.rate, rate)
     if acceleration is not None:
         acceleration = xp.where(changed, 0.0, acceleration)
-    if (coupling := constants.coupling) is not None:
-        setpoint, changed = coupling.positions(setpoint), coupling.of_leaders(changed)
-        rate, acceleration = (None if each is None else coupling.rates(each) for each in (rate, acceleration))
+    coupling = constants.coupling
+    setpoint, changed = coupling.positions(setpoint), coupling.of_leaders(changed)
+    rate, acceleration = (None if each is None else coupling.rates(each) for each in (rate, acceleration))
     moved = {"setpoint": setpoint, "setpoint_rate": rate, "setpoint_acceleration": acceleration}
     return state, command._replace(**moved), changed
 
@@ -287,8 +285,7 @@ def _guarded(constants: Constants, state: GuardState, command: Command) -> tuple
 def feedforward(constants: Constants, command: Command, qpos: Any, passive: Any) -> Any:
     """Return the passive force plus the caller's feedforward and known friction, for the leaders; None for zero."""
     forward = _sum(passive, command.feedforward)
-    if forward is not None and constants.coupling is not None:
-        forward = constants.coupling.efforts(forward)
+    forward = None if forward is None else constants.coupling.efforts(forward)
     if (known := constants.known) is None:
         return forward
     error = wrap(command.setpoint - qpos, known.turns, namespace(qpos))
@@ -309,12 +306,10 @@ def _pid(layout: Layout, constants: Constants, state: StepState, given: Inputs) 
 
     if law.needs_matrix:
         matrix = layout.model.when(step.index % law.matrix_steps == 0, fresh, matrix)
-    viscous = None if constants.damping is None else constants.damping * qvel
-    if viscous is not None and constants.coupling is not None:
-        viscous = constants.coupling.efforts(viscous)
+    viscous = None if constants.damping is None else constants.coupling.efforts(constants.damping * qvel)
     setpoint, rate, acceleration, _ = command
-    if acceleration is not None and constants.coupling is not None:  # the leaders' mass matrix has the followers' share
-        acceleration = namespace(acceleration).where(constants.coupling.independent, acceleration, 0.0)
+    if acceleration is not None:  # the leaders' mass matrix has the followers' share
+        acceleration = constants.coupling.of_independent(acceleration)
     inputs = ((setpoint, rate, acceleration), seen.qpos, qvel, seen.passive, matrix, viscous, *limits)
     new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs, observed=step.observed)
     return state._replace(law=new, matrix=matrix), Outputs(effort, effort, saturated)
@@ -340,9 +335,8 @@ def _drive(layout: Layout, constants: Constants, state: StepState, given: Inputs
 
 def _effort(layout: Layout, constants: Constants, state: StepState, given: Inputs) -> tuple[StepState, Outputs]:
     """qf = sat(the caller's effort + feedforward); the setpoint is the effort, and a follower's acts on its leader."""
-    asked = given.command.setpoint
-    total = asked if constants.coupling is None else constants.coupling.efforts(asked)
-    return state, _saturated(constants, _sum(total, given.seen.passive), given)
+    asked = constants.coupling.efforts(given.command.setpoint)
+    return state, _saturated(constants, _sum(asked, given.seen.passive), given)
 
 
 def _custom(layout: Layout, constants: Constants, state: StepState, given: Inputs) -> tuple[StepState, Outputs]:
@@ -350,8 +344,7 @@ def _custom(layout: Layout, constants: Constants, state: StepState, given: Input
     seen = given.seen
     passive = namespace(seen.qpos).zeros_like(seen.qpos) if seen.passive is None else seen.passive
     law, returned, *limited = layout.model.controller(state.law, given.command.setpoint, seen.qpos, seen.qvel, passive)
-    total = returned if constants.coupling is None else constants.coupling.efforts(returned)
-    outputs = _saturated(constants, total, given)._replace(returned=returned)
+    outputs = _saturated(constants, constants.coupling.efforts(returned), given)._replace(returned=returned)
     if limited and outputs.saturated is not None:
         outputs = outputs._replace(saturated=outputs.saturated | limited[0])
     return state._replace(law=law), outputs

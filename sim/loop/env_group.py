@@ -336,9 +336,7 @@ class EnvGroup:
         if self._actuators is not None and state.motors is not None:
             self._episode[mask] += 1
             gravity, coriolis = passive_forces(self._options)
-            holding = pack.passive_force(gravity, coriolis) if gravity else None
-            if holding is not None and self._constants.coupling is not None:
-                holding = self._constants.coupling.efforts(holding)
+            holding = self._constants.coupling.efforts(pack.passive_force(gravity, coriolis)) if gravity else None
             qvel = pack.read_qvel()
             fresh = init_motors(self._actuators, pack, qpos, self._episode, qvel=qvel, effort=holding)
             motors = bp.motors.reset(state.motors, fresh, mask)

@@ -97,7 +97,7 @@ class NativeExecutor(NumPyExecutor):
 
     def _advance(self, qf: Float64, index: int) -> tuple[Measured, bool]:
         """Do a sim step by one native call; arguments and results as in :meth:`NumPyExecutor._advance`."""
-        if self._constants.coupling is not None and index % COUPLING_STEPS == 0:
+        if index % COUPLING_STEPS == 0:
             self._pack.update_constraint()
         qpos, qvel, passive = np.empty((3, *qf.shape))
         status = self._prepared()(np.ascontiguousarray(qf, np.float64), qpos, qvel, passive)

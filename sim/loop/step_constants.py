@@ -53,7 +53,7 @@ def make_constants(
         friction=pack.friction,
         known=_known_friction(options, pack),
         guard=guard,
-        coupling=None if coupling is None else coupling.arrays,
+        coupling=coupling,
         motors=None
         if actuators is None or motors is None
         else actuator_model.discretise(actuators, motors, scene.timestep, pack.size),
@@ -72,12 +72,11 @@ def make_constants(
     return constants
 
 
-def acting_gains(params: bp.PIDParams, coupling: Coupling | None) -> bp.PIDParams:
+def acting_gains(params: bp.PIDParams, coupling: Coupling) -> bp.PIDParams:
     """Return ``params`` with zero gains for followers, which move with their leaders."""
-    if coupling is None:
-        return params
     gains = {"kp": params.kp, "ki": params.ki, "kd": params.kd}
-    return params.replace(**{name: gain * coupling.independent for name, gain in gains.items() if gain is not None})
+    own = {name: coupling.of_independent(gain) for name, gain in gains.items() if gain is not None}
+    return params._replace(**own)
 
 
 def _known_friction(options: RunnerOptions, pack: EnginePack) -> KnownFriction | None:

@@ -32,9 +32,7 @@ def reset_friction(layout: Layout, constants: Constants, state: StepState, pack:
     model = constants.friction
     if model.coulomb is None:
         return state._replace(friction=FrictionState(), age=None)
-    velocity, load = pack.read_qvel(), pack.passive_force(True, True)
-    if constants.coupling is not None:
-        load = constants.coupling.efforts(load)
+    velocity, load = pack.read_qvel(), constants.coupling.efforts(pack.passive_force(True, True))
     fresh = refreshed(layout, constants, friction_model.started(velocity, load), pack.read_qpos())
     age = np.zeros(pack.size, np.int64)
     if state.age is not None:

@@ -111,8 +111,7 @@ class TickProgram:
             tree = np.ascontiguousarray(bodies.tree, np.int32)
             arrays |= {"matrix": self.state.matrix, "tree": tree, "bodies": np.ascontiguousarray(bodies.table())}
             arrays |= {"armature": constants.armature, "damping": constants.damping}
-            if (coupling := constants.coupling) is not None:
-                arrays |= {"leader": coupling.leader.astype(np.int32), "multiplier": coupling.multiplier}
+            arrays |= constants.coupling.native()
         whole, steps = (False, 1) if law is None else (law.whole, law.matrix_steps)
         self._tick = NativeTick(
             program,
@@ -179,7 +178,7 @@ class TickProgram:
     def _make_forward(self) -> tuple[ArrayProgram, list[Float64], list[Float64]] | None:
         """Return the program of a controller's feedforward, its inputs and its output; None for the passive force."""
         command, passive = self.command, self.measured.passive
-        if command.feedforward is None and (passive is None or self._constants.coupling is None):
+        if command.feedforward is None and (passive is None or self._constants.coupling.is_identity):
             return None
         inputs, k = leaves((command, passive)), self._constants
         traced = _trace_forward(*map(structure, (k, command, passive)))

@@ -24,6 +24,7 @@ from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.effort import POSES, suggested_effort_limit
 from batchpid.sim.robot.joint_rows import HEADERS, joint_rows
 from batchpid.sim.robot.meshes import content_of
+from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import FileDefaults, Joint, LinkMass, Placement, Settings, Urdf
 from batchpid.sim.robot.self_collision import SelfContact, Srdf
 from batchpid.sim.robot.setpoint_limits import setpoint_guard
@@ -88,7 +89,6 @@ class RobotDescription(Urdf):
     merge_fixed: bool
     bodies: Mapping[str, Placement]
     settings: Settings | None
-    coupling: Coupling | None = None
     package_dirs: tuple[Path, ...] = ()
     actuators: bp.Actuators | None = None
     defaults: FileDefaults | None = None
@@ -148,9 +148,7 @@ class RobotDescription(Urdf):
         if np.isfinite(given).all():
             return read_only(given)
         qpos = self.sample(POSES)
-        mass_matrix = self.dynamics().mass_matrix(qpos)
-        if self.coupling is not None:
-            mass_matrix = self.coupling.mass_matrix(mass_matrix)
+        mass_matrix = self.coupling.mass_matrix(self.dynamics().mass_matrix(qpos))
         suggested = suggested_effort_limit(self.holding_efforts(qpos), mass_matrix, self.friction, self.damping)
         return read_only(np.where(np.isfinite(given), given, suggested))
 
@@ -193,14 +191,19 @@ class RobotDescription(Urdf):
         """
         return setpoint_guard(self, rate, acceleration)
 
+    @cached_property
+    def coupling(self) -> Coupling:
+        """Coupling of the mimic joints; the identity without mimic joints."""
+        return coupling_of(self.joints)
+
     @property
     def independent(self) -> Bool:
         """Mask (dof,) of the joints that are not followers."""
-        return np.ones(self.dof, bool) if self.coupling is None else self.coupling.independent
+        return self.coupling.independent
 
     def coupled(self, qpos: ArrayLike) -> Float64:
         """Return ``qpos`` (..., dof) with the followers where their leaders have them."""
-        return np.asarray(qpos, np.float64) if self.coupling is None else self.coupling.positions(qpos)
+        return self.coupling.positions(np.asarray(qpos, np.float64))
 
     @property
     def start(self) -> Float64:
@@ -249,8 +252,7 @@ class RobotDescription(Urdf):
     def holding_efforts(self, qpos: Float64) -> Float64:
         """Return the efforts (n, dof) [N m or N] that hold ``qpos`` against gravity; leaders bear followers."""
         still = np.zeros_like(qpos)
-        efforts = self.dynamics().inverse_dynamics(qpos, still, still)
-        return efforts if self.coupling is None else self.coupling.efforts(efforts)
+        return self.coupling.efforts(self.dynamics().inverse_dynamics(qpos, still, still))
 
     def dynamics(self, ground: bool | None = None) -> Dynamics:
         """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed base. Loads SAPIEN.

@@ -72,14 +72,12 @@ def gains_at(
     leaves = params.kp, params.ki, params.kd, params.derivative_filter_time
     columns = [np.zeros((1, robot.dof)) if leaf is None else np.asarray(leaf, np.float64) for leaf in leaves]
     coupling, damping = robot.coupling, robot.damping
-    if coupling is not None:
-        columns = [np.broadcast_to(leaf, (len(leaf), robot.dof))[:, coupling.independent] for leaf in columns]
+    columns = [np.broadcast_to(leaf, (len(leaf), robot.dof))[:, coupling.independent] for leaf in columns]
     if isinstance(params.gain_units, PerMassMatrix):
         joints = columns[0].shape[1]
         return Gains(np.eye(joints), np.zeros(joints), *columns)
     matrix = robot.mass_matrix(qpos) + np.diag(np.broadcast_to(armature, robot.dof))
-    if coupling is not None:
-        matrix, damping = coupling.reduced(matrix), coupling.reduced_damping(damping)
+    matrix, damping = coupling.reduced(matrix), coupling.reduced_damping(damping)
     if isinstance(params.gain_units, PerInertia):
         columns[:3] = [leaf * np.diagonal(matrix[0]) for leaf in columns[:3]]
     return Gains(matrix[0], damping, *columns)
@@ -108,10 +106,8 @@ def stability_report(
     kp, kd, tau = kp[worst], kd[worst], tau[worst]
     kd_dt, kp_dt2 = kd * dt / inertia * dt / (dt + 2 * tau), kp * dt**2 / inertia
     joint_ratio = 0.5 * (kd_dt + 0.5 * kp_dt2)
-    figures = [inertia, kd_dt, kp_dt2, joint_ratio, bound.participation[worst]]
-    if robot.coupling is not None:
-        figures = [robot.coupling.of_all(figure) for figure in figures]
-    inertia, kd_dt, kp_dt2, joint_ratio, participation = figures
+    figures = inertia, kd_dt, kp_dt2, joint_ratio, bound.participation[worst]
+    inertia, kd_dt, kp_dt2, joint_ratio, participation = map(robot.coupling.of_all, figures)
     return StabilityReport(inertia, kd_dt, kp_dt2, joint_ratio, float(bound.ratio[worst]), participation, worst)
 
 
@@ -122,9 +118,7 @@ def slow_oscillation(
     gains = gains_at(robot, params.for_envs(slice(env, env + 1)), qpos, timestep)
     kp, ki, kd, tau = (leaf[0] for leaf in gains[2:])
     found = oscillation(gains.matrix, kp, ki, kd, timestep, filter_time=tau, damping=gains.damping)
-    if robot.coupling is not None:
-        found = found._replace(participation=robot.coupling.of_all(found.participation))
-    return found
+    return found._replace(participation=robot.coupling.of_all(found.participation))
 
 
 def implicit_remedy(params: bp.PIDParams) -> str:

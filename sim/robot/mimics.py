@@ -13,15 +13,15 @@ from batchpid.sim.robot.parts import Joint
 
 
 @lru_cache(maxsize=32)
-def coupling_of(joints: tuple[Joint, ...]) -> Coupling | None:
-    """Return the coupling of the degrees of freedom ``joints``; None without mimic joints."""
+def coupling_of(joints: tuple[Joint, ...]) -> Coupling:
+    """Return the coupling of the degrees of freedom ``joints``; the identity without mimic joints."""
     indices = {joint.name: index for index, joint in enumerate(joints)}
     followers = [
         Follower(index, indices[joint.mimic.joint], joint.mimic.multiplier, joint.mimic.offset)
         for index, joint in enumerate(joints)
         if joint.mimic is not None
     ]
-    return Coupling(len(joints), followers) if followers else None
+    return Coupling.of(len(joints), followers)
 
 
 def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
@@ -33,8 +33,6 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
     """
     joints = tuple(joints)
     coupling = coupling_of(joints)
-    if coupling is None:
-        return joints
     limits = [(joint.lower, joint.upper) for joint in joints]
     for index in coupling.followers.tolist():
         leader, multiplier, offset = (each[index] for each in (coupling.leader, coupling.multiplier, coupling.offset))

@@ -23,7 +23,7 @@ from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.findings import Findings
 from batchpid.sim.robot.merging import place_links
-from batchpid.sim.robot.mimics import couple, coupling_of
+from batchpid.sim.robot.mimics import couple
 from batchpid.sim.robot.parts import FileDefaults, Joint, Settings
 from batchpid.sim.robot.preflight import check
 from batchpid.sim.robot.robot_tree import kinematic_tree
@@ -131,7 +131,6 @@ class Robot(RobotDescription):
             srdf=srdf,
             self_collision=self_collision,
             joints=joints,
-            coupling=coupling_of(joints),
             dissipation=dissipation,
             fixed_base=fixed_base,
             merge_fixed=merge_fixed,

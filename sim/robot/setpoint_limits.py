@@ -32,8 +32,8 @@ class GuardedRobot(Protocol):
         """Joints whose positions wrap."""
 
     @property
-    def coupling(self) -> Coupling | None:
-        """Coupling of the joints; None without followers."""
+    def coupling(self) -> Coupling:
+        """Coupling of the joints."""
 
 
 def setpoint_guard(robot: GuardedRobot, rate: ArrayLike | None, acceleration: ArrayLike | None) -> bp.Guard:
@@ -63,7 +63,7 @@ def _of_leaders(guard: bp.Guard, robot: GuardedRobot) -> bp.Guard:
     Position limits of a follower that leave its leader no range are left out, as in a robot's own limits.
     """
     coupling = robot.coupling
-    if coupling is None:
+    if coupling.is_identity:  # its limits keep their shapes
         return guard
     shape = max((np.shape(leaf) for leaf in guard if leaf is not None), default=(1, len(robot.joints)))
     free = guard._replace(lower=-np.inf, upper=np.inf, rate=np.inf, acceleration=np.inf)

@@ -289,11 +289,9 @@ def tool_pose(tree: ts.RigidTree, link: str, point: Any, qpos: Any) -> NDArray[n
 
 def _check_coupling(tree: ts.RigidTree, robot: Robot) -> None:
     """Raise InvalidArgumentError if ``tree`` has another coupling of the joints than ``robot``."""
-    ours, theirs = (
-        () if each is None else (each.leader, each.multiplier, each.offset) for each in (robot.coupling, tree.coupling)
-    )
-    if len(ours) != len(theirs) or not all(map(np.array_equal, ours, theirs)):
-        problem = f"has {tree.coupling or 'no coupling'}, but the robot {robot.coupling or 'none'}"
+    ours, theirs = ((each.leader, each.multiplier, each.offset) for each in (robot.coupling, tree.coupling))
+    if not all(map(np.array_equal, ours, theirs)):
+        problem = f"has {tree.coupling}, but the robot {robot.coupling}"
         raise InvalidArgumentError("tree", problem, remedy="pass robot.kinematic_tree(...)")
 
 

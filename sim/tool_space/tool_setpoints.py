@@ -53,7 +53,7 @@ class ToolSetpoints:
         """
         moving = self._tree.chains[self._tree.link_bodies[self._tree.index(self.link)]] > 0
         for index, joint in enumerate(robot.joints):
-            if robot.coupling is None or not moving[index] or robot.independent[index]:
+            if not moving[index] or robot.independent[index]:
                 continue
             leader, multiplier = robot.joints[robot.coupling.leader[index]], robot.coupling.multiplier[index]
             if leader.continuous and (multiplier % 1 if joint.unit == "rad" else multiplier):

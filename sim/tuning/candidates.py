@@ -124,8 +124,8 @@ class Candidates:
             self._mass, self._damping = np.eye(joints)[None], np.zeros(joints)
         else:
             self._mass, self._damping = robot.mass_matrix(robot.sample(50, seed=0)), robot.damping
-            if (coupling := robot.coupling) is not None:
-                self._mass, self._damping = coupling.reduced(self._mass), coupling.reduced_damping(self._damping)
+            coupling = robot.coupling
+            self._mass, self._damping = coupling.reduced(self._mass), coupling.reduced_damping(self._damping)
         inertia = gain_units == "inertia"
         self._unit = np.diagonal(self._mass, axis1=1, axis2=2) if inertia else np.ones(joints)
 
@@ -151,9 +151,9 @@ class Candidates:
         """Return params with one row for each of ``points`` (n, dimension)."""
         shared = np.exp(np.array(list(FACTORS.values())) * points[:, : len(FACTORS)])
         bandwidth, stiffness, damping, weight, filter_time = shared.T[..., None]
-        joints: Any = np.exp(points[:, len(FACTORS) :]) if self.dimension > len(FACTORS) else 1.0
-        if self.dimension > len(FACTORS) and self.robot.coupling is not None:
-            joints = self.robot.coupling.of_all(joints)
+        joints: Any = 1.0
+        if self.dimension > len(FACTORS):
+            joints = self.robot.coupling.of_all(np.exp(points[:, len(FACTORS) :]))
         d = self.designed
         return d.replace(
             kp=d.kp * bandwidth**2 * stiffness * joints,

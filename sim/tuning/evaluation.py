@@ -134,7 +134,7 @@ def step_response_metrics(
         absolute_band=absolute_band(robot),
         continuous=robot.continuous,
     )
-    return metrics if robot.coupling is None else StepMetrics(*map(robot.coupling.of_leaders, metrics))
+    return StepMetrics(*map(robot.coupling.of_leaders, metrics))
 
 
 def following_error(robot: Robot, rollout: Rollout) -> Float64:
@@ -145,8 +145,7 @@ def following_error(robot: Robot, rollout: Rollout) -> Float64:
     """
     error = rollout.qpos - rollout.setpoint
     error = np.abs(np.where(robot.continuous, error - TURN * np.rint(error / TURN), error))
-    largest: Float64 = np.where(rollout.ok[..., None], error, np.inf).max(0)
-    return largest if robot.coupling is None else robot.coupling.of_leaders(largest)
+    return robot.coupling.of_leaders(np.where(rollout.ok[..., None], error, np.inf).max(0))
 
 
 def arm_joints(robot: Robot) -> NDArray[np.bool_]:

@@ -74,8 +74,6 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
         return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])
     for each in found.differences:
         warnings.warn(f"{path}: {each}", stacklevel=2)
-    if robot.coupling is None:
-        return GainSet(path.name, found.params)
     return GainSet(path.name, found.params.for_joints(robot.coupling.of_all(np.arange(len(own)))))
 
 

@@ -139,8 +139,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
         if kind == "all alike":
             fraction[:] = fraction[0]
         if kind == "one joint":
-            if robot.coupling is not None:
-                joint = robot.coupling.leader[joint]
+            joint = robot.coupling.leader[joint]
             fraction[np.arange(robot.dof) != joint] = 0.0
             kind = f"{robot.joint_names[joint]} alone"
         step = movable * share * fraction * np.minimum(size, reach) * (0.1 if kind == "small" else 1.0)
@@ -259,8 +258,7 @@ def _durations(
 
 def motion_effort(robot: Robot, qpos: Float64, qvel: Float64, qacc: Float64) -> Float64:
     """Return the efforts (n, dof) [N m or N] of a motion, gravity included; followers have none, their leaders more."""
-    effort = robot.dynamics().inverse_dynamics(qpos, qvel, qacc)
-    return effort if robot.coupling is None else robot.coupling.efforts(effort)
+    return robot.coupling.efforts(robot.dynamics().inverse_dynamics(qpos, qvel, qacc))
 
 
 def smooth_effort(robot: Robot, start: Float64, target: Float64, duration: float, samples: int = 200) -> Float64:
@@ -286,5 +284,4 @@ def smooth_variation(robot: Robot, moves: Moves, durations: Float64 | float) -> 
     """
     rows = zip(moves.start, moves.target, np.broadcast_to(durations, len(moves.start)), strict=True)
     variation = [np.abs(np.diff(smooth_effort(robot, *row), axis=0)).sum(0) for row in rows]
-    floored = np.maximum(variation, 1e-3 * robot.design_effort_limit)
-    return floored if robot.coupling is None else robot.coupling.of_leaders(floored)
+    return robot.coupling.of_leaders(np.maximum(variation, 1e-3 * robot.design_effort_limit))

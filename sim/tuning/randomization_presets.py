@@ -97,7 +97,7 @@ def payload_capacity(robot: Robot) -> float:
     kinematics, qpos = Kinematics(robot), robot.sample(200, seed=0)
     own = np.abs(robot.holding_efforts(qpos))
     per_kg = kinematics.efforts_of_force(kinematics.poses(qpos), kinematics.tool, [0.0, 0.0, GRAVITY])
-    per_kg = np.abs(per_kg if robot.coupling is None else robot.coupling.efforts(per_kg))
+    per_kg = np.abs(robot.coupling.efforts(per_kg))
     with np.errstate(divide="ignore", invalid="ignore"):
         carried = np.where(per_kg > 1e-9, PAYLOAD_SHARE * (robot.design_effort_limit - own) / per_kg, np.inf)
     return float(max(np.quantile(carried.min(1), 0.05, method="lower"), 0.0))

@@ -20,7 +20,7 @@ def couplings(draw):
         for place, joint in enumerate(order)
         if place and draw(st.booleans())
     ]
-    return Coupling(joints, followers), followers
+    return Coupling.of(joints, followers), followers
 
 
 def arrays(joints: int, seed: int = 0) -> tuple[np.ndarray, ...]:
@@ -77,13 +77,35 @@ def test_figures_of_followers_are_those_of_their_leaders(case):
     np.testing.assert_array_equal(coupling.of_all(figures[coupling.independent]), coupling.leader)
 
 
+def test_the_identity_returns_its_arguments():
+    coupling, given = Coupling.of(3), object()
+    assert coupling.is_identity
+    for name in [
+        "positions",
+        "rates",
+        "efforts",
+        "of_independent",
+        "of_leaders",
+        "of_all",
+        "mass_matrix",
+        "reduced",
+        "reduced_damping",
+    ]:
+        assert getattr(coupling, name)(given) is given
+    assert coupling.native() == {}
+    assert not len(coupling.followers)
+    np.testing.assert_array_equal(coupling.matrix, np.eye(3))
+    assert not Coupling.of(3, [Follower(2, 0)]).is_identity
+
+
 def test_a_loop_of_followers_is_refused():
     with pytest.raises(ValueError, match="follows itself"):
-        Coupling(3, [Follower(0, 1), Follower(1, 0)])
+        Coupling.of(3, [Follower(0, 1), Follower(1, 0)])
 
 
 def test_repr_shows_the_laws():
-    assert repr(Coupling(2, [Follower(1, 0, -0.5, 0.1)])) == "Coupling(2 joints: q1 = -0.5 q0 + 0.1)"
+    assert repr(Coupling.of(2)) == "Coupling(2 joints: no followers)"
+    assert repr(Coupling.of(2, [Follower(1, 0, -0.5, 0.1)])) == "Coupling(2 joints: q1 = -0.5 q0 + 0.1)"
 
 
 @settings(max_examples=25)

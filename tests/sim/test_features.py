@@ -124,13 +124,12 @@ def reach(robot: Robot, control: str, space: str, engine: str) -> None:
         left = last - goal
         left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
         np.testing.assert_allclose(left[robot.independent], 0.0, atol=0.02)
-    if robot.coupling is not None:
-        followers = robot.coupling.followers
-        rates = robot.coupling.rates(seen.qvel[-20:])[..., followers]
-        np.testing.assert_allclose(seen.qvel[-20:, :, followers], rates, atol=0.02)
-        turning = robot.continuous[robot.coupling.leader] | robot.continuous
-        still = [joint for joint in followers if not turning[joint]]
-        np.testing.assert_allclose(last[still], robot.coupling.positions(last)[still], atol=1e-4)
+    followers = robot.coupling.followers
+    rates = robot.coupling.rates(seen.qvel[-20:])[..., followers]
+    np.testing.assert_allclose(seen.qvel[-20:, :, followers], rates, atol=0.02)
+    turning = robot.continuous[robot.coupling.leader] | robot.continuous
+    still = [joint for joint in followers if not turning[joint]]
+    np.testing.assert_allclose(last[still], robot.coupling.positions(last)[still], atol=1e-4)
 
 
 def check(features: tuple[str, ...], command: tuple[str, str], engine: str) -> None:

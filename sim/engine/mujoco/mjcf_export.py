@@ -139,9 +139,8 @@ def _set_joints(scene: Any, robot: RobotDescription, found: Drive, friction: Any
             if leaf is not None:
                 value = float(np.broadcast_to(leaf, (1, robot.dof))[0, at])
                 setattr(joint, field, [value, 0, 0] if np.ndim(getattr(joint, field)) else value)
-    if (coupling := robot.coupling) is None:
-        return
-    for follower in np.flatnonzero(~coupling.independent):
+    coupling = robot.coupling
+    for follower in coupling.followers:
         tie = scene.add_equality(type=mujoco.mjtEq.mjEQ_JOINT)
         tie.objtype = mujoco.mjtObj.mjOBJ_JOINT
         tie.name1, tie.name2 = robot.joint_names[follower], robot.joint_names[coupling.leader[follower]]
@@ -163,8 +162,7 @@ def _add_keyframe(root: Any, model: Any, robot: RobotDescription, motors: MjcfAc
         data.qpos[model.joint(name).qposadr] = robot.start[at]
     mujoco.mj_forward(model, data)
     holding = np.array([[data.qfrc_bias[model.joint(name).dofadr[0]] for name in robot.joint_names]])
-    if robot.coupling is not None:
-        holding = robot.coupling.efforts(holding)
+    holding = robot.coupling.efforts(holding)
     ctrl, act = np.zeros(model.nu), np.zeros(model.na)
     for actuator in range(model.nactuator):
         at = robot.joint_names.index(model.actuator(actuator).name)
@@ -185,8 +183,7 @@ def _compare(found: Drive, robot: RobotDescription, friction: Any) -> None:
     """Add the differences of MuJoCo's friction and constraints."""
     if friction.coulomb is not None and np.any(friction.coulomb):
         found.append("friction: a soft constraint in MuJoCo, in which a joint creeps below its friction")
-    if robot.coupling is not None:
-        names = [name for name, own in zip(robot.joint_names, robot.independent, strict=True) if not own]
+    if names := [robot.joint_names[joint] for joint in robot.coupling.followers]:
         found.append(f"followers: soft constraints in MuJoCo: {', '.join(names)}")
 
 

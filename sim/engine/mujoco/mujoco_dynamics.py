@@ -27,7 +27,6 @@ class MujocoDynamics:
 
     def __init__(self, spec: SceneSpec) -> None:
         self._spec, self._robot, self._lock = spec, robot_model(spec), RLock()
-        self._coupling = coupling_of(spec.joints)
 
     def __reduce__(self) -> Any:  # a controller that keeps it can be sent to worker processes
         return scene_dynamics, (self._spec,)
@@ -66,11 +65,9 @@ class MujocoDynamics:
         with self._lock:
             batch = self._computed(qpos, qvel)
             acting, matrix = np.asarray(effort) - batch.bias(), batch.mass_matrix()
-        if (coupling := self._coupling) is None:
-            free = np.linalg.solve(matrix, acting[..., None])
-            return np.asarray(free[..., 0], np.float64)
-        reduced = np.linalg.solve(coupling.reduced(matrix), (acting @ coupling.matrix)[..., None])
-        return np.asarray(reduced[..., 0] @ coupling.matrix.T, np.float64)
+        coupling = coupling_of(self._spec.joints)
+        qacc = np.linalg.solve(coupling.mass_matrix(matrix), coupling.efforts(acting)[..., None])[..., 0]
+        return np.asarray(coupling.rates(qacc), np.float64)
 
     def _computed(self, qpos: NDArray[Any], qvel: Any) -> BatchModel:
         batch = self._batch(len(qpos))

@@ -74,7 +74,7 @@ class MujocoPack(SingleOwner):
         self._implicit = spec.timestep * np.array([[joint.damping for joint in spec.joints]])
         self._actuators: Actuators | None = None
         coupling, self._constraint = coupling_of(spec.joints), None
-        if coupling is not None:
+        if not coupling.is_identity:
             self._constraint = ConstraintEfforts(size, coupling, np.zeros(self.dof, bool), spec.timestep)
             self._constraint.implicit[...] = self._implicit
             if self.steps_natively:

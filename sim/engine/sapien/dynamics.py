@@ -65,7 +65,6 @@ class Dynamics:
             add_point_mass(next(each for each in self._robot.links if each.name == body), payload, center)
         self._model = self._robot.create_pinocchio_model()
         self._links = {link: number for number, link in enumerate(self._robot.links)}
-        self._coupling = coupling_of(spec.joints)
         owners, bodies = shape_owners(spec), rigid_bodies(parse(spec))
         self._owners = {
             shape: owner
@@ -140,12 +139,12 @@ class Dynamics:
 
         Followers keep to their leaders: q'' = G M_r^-1 G^T (u - passive force).
         """
-        if (coupling := self._coupling) is not None:
-            free = self.inverse_dynamics(qpos, qvel, np.zeros_like(np.asarray(qpos, np.float64)))
-            acting = (np.asarray(effort) - free) @ coupling.matrix
-            reduced = coupling.reduced(self.mass_matrix(qpos))
-            return np.linalg.solve(reduced, acting[..., None])[..., 0] @ coupling.matrix.T
-        return _rowwise(self._model.compute_forward_dynamics, qpos, qvel, effort)
+        coupling = coupling_of(self._spec.joints)
+        if coupling.is_identity:
+            return _rowwise(self._model.compute_forward_dynamics, qpos, qvel, effort)
+        free = self.inverse_dynamics(qpos, qvel, np.zeros_like(np.asarray(qpos, np.float64)))
+        matrix, acting = coupling.mass_matrix(self.mass_matrix(qpos)), coupling.efforts(np.asarray(effort) - free)
+        return coupling.rates(np.linalg.solve(matrix, acting[..., None])[..., 0])
 
     @_one_at_a_time
     def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> NDArray[np.bool_]:

@@ -103,7 +103,7 @@ class Pack(SingleOwner):
         coupling = coupling_of(spec.joints)
         self._constraint, self._joint_qf = None, self.qf
         self._turning = np.array([], np.intp)
-        if coupling is not None:
+        if not coupling.is_identity:
             self._joint_qf = np.zeros_like(self.qf)
             continuous = np.array([joint.continuous for joint in spec.joints])
             self._turning = np.flatnonzero(continuous)

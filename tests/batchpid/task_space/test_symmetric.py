@@ -1,4 +1,4 @@
-"""Inverses and eigenvalues of small symmetric matrices against numpy.linalg, row by row."""
+"""Solutions, bounded inverses and eigenvalues of small symmetric matrices against numpy.linalg, row by row."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space.symmetric import bounded_inverse, eigen, gram, inverse, solve, whitened
+from batchpid.task_space.symmetric import bounded_inverse, eigen, gram, solve, whitened
 
 
 def matrices(seed, rows, size, spread=1.0):
@@ -21,9 +21,8 @@ def matrices(seed, rows, size, spread=1.0):
 
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), size=st.integers(1, 9))
-def test_inverse_and_solution_are_those_of_linalg(seed, size):
+def test_solutions_are_those_of_linalg(seed, size):
     matrix, _ = matrices(seed, 5, size)
-    np.testing.assert_allclose(inverse(matrix), np.linalg.inv(matrix), rtol=1e-8, atol=1e-10)
     right = np.random.default_rng(seed).normal(size=(5, size, 3))
     np.testing.assert_allclose(solve(matrix, right), np.linalg.solve(matrix, right), rtol=1e-8, atol=1e-8)
     factor = whitened(matrix, right)
@@ -84,19 +83,42 @@ def test_the_smooth_bounded_inverse_has_a_continuous_derivative(seed):
     np.testing.assert_allclose(np.diff(along) / (s1 * step), -1 / s1**2, rtol=1e-3)
 
 
-def test_a_row_does_not_depend_on_the_others_and_nan_stays_alone():
+@pytest.mark.parametrize("size", range(2, 10))
+def test_a_row_has_the_same_bits_alone_and_in_any_batch(size):
+    matrix, _ = matrices(size, 64, size, spread=3.0)
+    right = np.random.default_rng(size).normal(size=(64, size, 3))
+    for function in (
+        lambda rows: whitened(matrix[rows], right[rows]),
+        lambda rows: solve(matrix[rows], right[rows]),
+        lambda rows: np.concatenate(bounded_inverse(matrix[rows], 0.1, 0.05)[:2], axis=-1),
+    ):
+        whole = function(slice(None))
+        for row in range(64):
+            np.testing.assert_array_equal(function(row), whole[row])
+        for count in (1, 2, 3, 7, 16, 33):
+            for first in range(0, 64 - count, 5):
+                rows = slice(first, first + count)
+                np.testing.assert_array_equal(function(rows), whole[rows])
+
+
+def test_rows_without_a_result_are_nan_and_leave_the_others_their_bits():
     matrix, _ = matrices(0, 30, 6, spread=3.0)
-    matrix[4], matrix[5, 0, 0] = np.nan, np.inf
-    found, near = bounded_inverse(matrix, 0.1)
-    assert near.any()
-    assert not near.all()
-    assert np.isfinite(np.delete(found, [4, 5], 0)).all()
-    assert np.isnan(found[4]).all()
-    for rows in (slice(0, 1), slice(6, 7), slice(7, 29)):
-        np.testing.assert_array_equal(bounded_inverse(matrix[rows], 0.1)[0], found[rows])
-        np.testing.assert_array_equal(bounded_inverse(matrix[rows], 0.1)[1], near[rows])
+    right = np.random.default_rng(0).normal(size=(30, 6, 2))
+    good = np.delete(np.arange(30), [4, 5, 6])
+    wanted = whitened(matrix, right)[good], *(each[good] for each in bounded_inverse(matrix, 0.1))
+    matrix[4], matrix[5, 0, 0], matrix[6] = np.nan, np.inf, np.diag([1.0, 1.0, -1.0, 1.0, 0.0, 1.0])
+    factor, (found, near) = whitened(matrix, right), bounded_inverse(matrix, 0.1)
+    for each, rows in zip((factor, found, near), wanted, strict=True):
+        np.testing.assert_array_equal(each[good], rows)
+    assert np.isnan(factor[4:7]).all()
+    assert np.isnan(found[4:6]).all()
+    np.testing.assert_array_equal(found[6], np.diag([1.0, 1.0, 0.0, 1.0, 0.0, 1.0]))
+    assert near[4:7].all()
+    assert near[good].any()
+    assert not near[good].all()
+    assert np.isnan(whitened(matrix[4], right[4])).all()
 
 
 def test_a_matrix_that_is_not_square_is_refused():
     with pytest.raises(InvalidArgumentError, match="square"):
-        inverse(np.zeros((2, 3)))
+        solve(np.zeros((2, 3)), np.zeros((2, 1)))

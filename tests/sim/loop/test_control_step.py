@@ -53,7 +53,7 @@ def a_step(control, units, effects, seed, coupled=False):
     model = Model(mass_matrix, mass_matrix)
     layout = Layout(control, PIDLaw.of(params) if control == "pid" else None, model=model)
     qpos, qvel, passive = table(rng), table(rng), table(rng, 3.0)
-    coupling = Coupling(JOINTS, [Follower(2, 0, 0.5, 0.1)]).arrays if coupled else None
+    coupling = Coupling.of(JOINTS, [Follower(2, 0, 0.5, 0.1)] if coupled else [])
     constants = Constants(DT, (params.effort_min, params.effort_max), coupling=coupling)
     state = StepState(bp.init(params, qpos), matrix=mass_matrix(qpos) if units == "mass_matrix" else None)
     if units == "inertia":

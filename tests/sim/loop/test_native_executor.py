@@ -426,16 +426,14 @@ def test_the_refresh_of_friction_is_that_of_the_friction_model(panda, tmp_path, 
     spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["fast"])
     rng, shape = np.random.default_rng(0), (7, robot.dof)
     model, qpos, coupling = NativeModel(spec), robot.sample(7, seed=0), robot.coupling
-    arrays = None if coupling is None else coupling.arrays
     armature, drive = rng.uniform(0, 0.1, shape), tuple(rng.uniform(0, 100.0, (2, *shape)))
     state = friction_model.started(np.zeros(shape), np.zeros(shape))
     matrix = model.mass_matrix(qpos) + armature[:, None] * np.eye(robot.dof)
-    if arrays is not None:
-        matrix = arrays.mass_matrix(matrix)
+    matrix = coupling.mass_matrix(matrix)
     coulomb = rng.uniform(0, 1, shape) * (rng.random(shape) < 0.7)
     for friction in (Friction(coulomb), Friction(coulomb[:1], rng.uniform(0, 1, shape))):
         for given in ((0.0, 0.0), drive):
-            ours = NativeRefresh(model, 7, armature, friction, given, arrays, 1e-3, 64)(state, qpos)
+            ours = NativeRefresh(model, 7, armature, friction, given, coupling, 1e-3, 64)(state, qpos)
             theirs = friction_model.refresh(friction, state, matrix, 1e-3, *given)
             np.testing.assert_allclose(ours.gain, theirs.gain, rtol=1e-10, atol=1e-12)
             np.testing.assert_allclose(ours.memory, theirs.memory, rtol=1e-10, atol=1e-12)
