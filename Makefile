@@ -80,7 +80,7 @@ figures: $(VENV)/.dev
 	$(call bench_case,panda,fast)
 	$(call bench_case,jaco2,accurate)
 	$(call bench_case,jaco2,fast)
-	@$(RUN) bench/motions.py --no-isolation --ticks 20 --rounds 2 --json $(MEASURED)/motions.json
+	@$(RUN) bench/motions.py --ticks 20 --rounds 2 --json $(MEASURED)/motions.json
 	@$(RUN) -m pytest bench/test_few_robots.py bench/test_scaling.py bench/test_resources.py \
 		--benchmark-json $(MEASURED)/pytest.json
 	@$(RUN) bench/draw.py $(MEASURED)

@@ -161,7 +161,7 @@ def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, re
     if solver is None:
         plant = EquationOfMotion(robot.dynamics(), robot.damping, moves.start, finer.timestep)
     else:
-        plant = Pack(finer, len(moves.start), system_size=4)
+        plant = Pack(finer, len(moves.start))
         plant.write_state(range(plant.size), moves.start, np.zeros_like(moves.start))
     params = robot.tuned()
     law, damping = PIDLaw.of(params), robot.damping if robot.damping.any() else None

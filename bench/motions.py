@@ -1,12 +1,10 @@
 """Time the closed loop over several motions: the tutorial's, holding the start pose, and seeded moves.
 
-    python bench/motions.py [--no-isolation] [--json FILE]
+    python bench/motions.py [--json FILE]
 
-The speed depends on the motion: if shapes are near each other, as in a closed gripper, the engine is slower, and the
-loop must check their contacts. Everything runs in this process, in interleaved rounds: the tutorial's loop, the closed
-loop, and the closed loop without isolation of robots that are about to be touched
-(:mod:`batchpid.sim.engine.sapien.contact_prediction`), which shows the cost of the isolation. Times are processor
-times, which another program disturbs less.
+The speed depends on the motion: if shapes are near each other, as in a closed gripper, the engine is slower. Everything
+runs in this process, in interleaved rounds: the tutorial's loop, and the closed loop. Times are processor times, which
+another program disturbs less.
 """
 
 from __future__ import annotations
@@ -15,7 +13,6 @@ import json
 import statistics
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,36 +24,18 @@ from batchpid.io.files import write_atomically
 from batchpid.sim import Robot, Runner
 from batchpid.sim.benchmark.tutorial import TutorialLoop
 from batchpid.sim.engine.native import status
-from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
 SUBSTEPS = 20
 REPEATS = 4
 """Runs of the tutorial's loop in a round: one robot alone is soon done."""
 HOLD = "start pose held"
-CASES = "tutorial's loop", "isolating", "not isolating"
 VARIANTS: dict[str, dict[str, Any]] = {
     "accurate": {"physics": "accurate"},
     "fast": {"physics": "fast"},
     "free, no shapes": {"physics": "free", "collisions": False},
 }
 """Options of the runner; the moves touch nothing."""
-
-
-@contextmanager
-def isolation(enabled: bool) -> Iterator[None]:
-    """Build packs whose robots move to a system to themselves before something touches them, or do not."""
-    init = Pack.__init__
-
-    def without(pack: Pack, *arguments: object) -> None:
-        init(pack, *arguments, isolates=False)  # type: ignore[arg-type, misc]
-
-    if not enabled:
-        Pack.__init__ = without  # type: ignore[assignment, method-assign]
-    try:
-        yield
-    finally:
-        Pack.__init__ = init  # type: ignore[method-assign]
 
 
 def motions(robot: Robot, count: int) -> Moves:
@@ -70,8 +49,8 @@ def motions(robot: Robot, count: int) -> Moves:
 class Options:
     """Time the closed loop over several motions.
 
-    Prints the distance that a joint moved [rad or m], the time of an env step [us], and two ratios, per process: the
-    speed relative to the tutorial's loop, and the time relative to the loop without isolation.
+    Prints the distance that a joint moved [rad or m], the time of an env step [us], and the speed relative to the
+    tutorial's loop, per process.
     """
 
     robots: tuple[str, ...] = ("panda", "jaco2")
@@ -79,15 +58,13 @@ class Options:
     moves: int = 20
     ticks: int = 50
     rounds: int = 3
-    isolation: bool = True
-    """Measure without isolation, too."""
     json: Path | None = None
     """File for the figures."""
 
 
 def main(options: Options) -> None:
     """Print the table and write the figures."""
-    print(f"{status()}\n\n| robot, solver, motion | moved | us | tutorial's loop | isolation |\n{'| --- ' * 5}|")
+    print(f"{status()}\n\n| robot, solver, motion | moved | us | tutorial's loop |\n{'| --- ' * 4}|")
     figures: dict[str, dict[str, dict[str, float]]] = {}
     for name in options.robots:
         robot = Robot.load(name, dissipation="sapien")
@@ -96,14 +73,13 @@ def main(options: Options) -> None:
         for variant, ours in VARIANTS.items():
             rows = [*measure(robot, chosen, tutorials, ours, options)]
             for motion, row in zip(chosen.names, rows, strict=True):
-                cost = "" if row.cost is None else f"{row.cost:.3f}"
-                cells = f"{name}, {variant}, {motion}", f"{row.moved:.2g}", f"{row.us:.1f}", f"{row.over:.2f}", cost
+                cells = f"{name}, {variant}, {motion}", f"{row.moved:.2g}", f"{row.us:.1f}", f"{row.over:.2f}"
                 print(f"| {' | '.join(cells)} |", flush=True)
             over = [row.over for row in rows]
             found = dict(zip(chosen.names[:2], over, strict=False))
             found |= {"median": statistics.median(over), "slowest": min(over)}
             for case in ("median", "slowest"):
-                print(f"| **{name}, {variant}, {case}** | | | **{found[case]:.2f}** | |")
+                print(f"| **{name}, {variant}, {case}** | | | **{found[case]:.2f}** |")
             figures.setdefault(name, {})[variant] = {motion: round(ratio, 2) for motion, ratio in found.items()}
     if options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)
@@ -117,42 +93,32 @@ class Row(NamedTuple):
     us: float
     over: float
     """Speed relative to the tutorial's loop, both in one process."""
-    cost: float | None
-    """Time over that without isolation."""
 
 
 def measure(
     robot: Robot, chosen: Moves, tutorials: list[TutorialLoop], ours: dict[str, Any], options: Options
 ) -> Iterator[Row]:
     """Yield the figures of each of the motions, with its tutorial's loop, under the options ``ours`` of the runner."""
-    runners = {}
-    for case, enabled in zip(CASES[1 : 3 if options.isolation else 2], (True, False), strict=False):
-        with isolation(enabled):
-            runners[case] = Runner(robot, options.num_envs, params=robot.params(), workers=0, **ours)
-    for start, target, motion, tutorial in zip(*chosen, tutorials, strict=True):
-        seconds: dict[str, list[float]] = {case: [] for case in (CASES[0], *runners)}
-        for _ in range(options.rounds):
-            began = time.process_time()
-            for _ in range(REPEATS):
-                tutorial.reset()
-                tutorial.run(options.ticks * SUBSTEPS)
-            seconds[CASES[0]].append(options.num_envs / REPEATS * (time.process_time() - began))
-            for case, runner in runners.items():
+    size = options.num_envs
+    with Runner(robot, size, params=robot.params(), workers=0, **ours) as runner:
+        for start, target, motion, tutorial in zip(*chosen, tutorials, strict=True):
+            times: list[tuple[float, float]] = []
+            for _ in range(options.rounds):
+                began = time.process_time()
+                for _ in range(REPEATS):
+                    tutorial.reset()
+                    tutorial.run(options.ticks * SUBSTEPS)
+                theirs = size / REPEATS * (time.process_time() - began)
                 runner.reset(start)
                 began = time.process_time()
                 qpos = runner.rollout(np.broadcast_to(target, (options.ticks, robot.dof))).qpos
-                seconds[case].append(time.process_time() - began)
+                times.append((theirs, time.process_time() - began))
                 moved = float(np.abs(qpos[-1] - start).max())
                 # Friction holds some short moves: they are timed, too, and the table tells.
                 if motion in (HOLD, "tutorial"):
                     assert (moved > 0.01) == (motion != HOLD), f"{motion}: the robots moved by {moved:g} rad"
-        times = list(zip(*seconds.values(), strict=True))
-        us = statistics.median(seconds[CASES[1]]) / (options.num_envs * options.ticks * SUBSTEPS) * 1e6
-        over = statistics.median(each[0] / each[1] for each in times)
-        cost = statistics.median(each[1] / each[2] for each in times) if options.isolation else None
-        yield Row(moved, us, over, cost)
-    for runner in runners.values():
-        runner.close()
+            us = statistics.median(each for _, each in times) / (size * options.ticks * SUBSTEPS) * 1e6
+            yield Row(moved, us, statistics.median(theirs / each for theirs, each in times))
 
 
 if __name__ == "__main__":

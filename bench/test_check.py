@@ -34,7 +34,7 @@ class Floor(NamedTuple):
 
 FLOORS = [
     Floor(
-        OURS, "bare engine, pack by pack", 0.76, 0.68, "control and calls may take a quarter; of a fast step a third"
+        OURS, "bare engine, robot by robot", 0.76, 0.68, "control and calls may take a quarter; of a fast step a third"
     ),
     Floor(OURS, "tutorial", 2.4, 3.4, "gain of a user of SAPIEN's tutorial, on 2 cores"),
     Floor(OURS, PYTHON, 1.0, 1.05, "purpose of the native extension"),

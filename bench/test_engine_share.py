@@ -1,7 +1,7 @@
 """Speed of the closed loop relative to the bare engine, in this process: the engine's share of the time.
 
 Pandas under their default gains (mass matrix) and the URDF's friction, held at several poses. The bare engine steps the
-same robots at the same poses under PhysX's drives, pack by pack. Processor times: other programs disturb them less.
+same robots at the same poses under PhysX's drives, robot by robot. Processor times: other programs disturb them less.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from batchpid.sim.benchmark.tutorial import tutorial_settings
 from batchpid.sim.benchmark.workload import Workload
 from batchpid.sim.engine.sapien.pack import Pack
 
-ENVS, TICKS, ROUNDS, POSES, PACK = 32, 10, 5, 6, 4
+ENVS, TICKS, ROUNDS, POSES = 32, 10, 5, 6
 
 
 class BareEngine:
@@ -25,9 +25,8 @@ class BareEngine:
 
     def __init__(self, workload: Workload, pose: np.ndarray) -> None:
         settings, self._substeps = tutorial_settings(workload.robot), workload.substeps
-        sizes = [min(PACK, workload.num_envs - first) for first in range(0, workload.num_envs, PACK)]
         spec = workload.scene(gravity=False)
-        self._packs = [Pack(spec, size, system_size=PACK, isolates=False) for size in sizes]
+        self._packs = [Pack(spec, 1) for _ in range(workload.num_envs)]
         for pack in self._packs:
             rows = np.tile(pose, (pack.size, 1))
             pack.write_drive(np.array(settings.drive_stiffness), np.array(settings.drive_damping), np.array(np.inf))

@@ -66,10 +66,6 @@ Role = Literal["restored", "processes", "last bits", "next commands"]
 """
 IDEAL = bp.Actuators()
 """Actuators without any effect."""
-PACK_SIZE = {True: 4, False: 64}
-"""Default of ``pack_size``, with collisions and without, where packs need no isolation (docs/performance.md)."""
-
-
 _DERIVED: Any = None
 """Default that depends on the robot or on other options."""
 
@@ -129,7 +125,6 @@ class RunnerOptions:
     collisions: bool = field(default=True, metadata=_in("snapshot", "recording", "scene"))
     ground: bool = field(default=_DERIVED, metadata=_in("snapshot", "recording", "scene"))
     build: Callable[[Any, int], Any] | None = field(default=None, metadata=_in("scene", snapshot="build_digest"))
-    pack_size: int = field(default=_DERIVED, metadata=_apart("processes"))
     on_fault: FaultAction = field(default="hold", metadata=_in("snapshot"))
     speed_limit: NDArray[np.float64] | None = field(default=None, metadata=_in(snapshot="speed_limits"))
     actuators: bp.Actuators | None = field(default=None, metadata=_apart("restored"))
@@ -169,7 +164,6 @@ class RunnerOptions:
             own["control"], own["tool"] = self.control.in_runner(self.timestep, self.compensate), self.control.link
         if self.tool_setpoints is not None:
             own["tool"] = self.tool_setpoints.link
-        own["pack_size"] = self._checked_pack_size(given["pack_size"])
         own["workers"], own["cluster"] = _places(given["workers"], given["cluster"])
         if self.backend == "numpy" and self.dtype != "float64":
             raise InvalidArgumentError(
@@ -195,16 +189,6 @@ class RunnerOptions:
         self._check_collisions()
         for name in ("controller_digest", "build_digest"):  # of the objects as they are now
             getattr(self, name)
-
-    def _checked_pack_size(self, given: Any) -> int:
-        """Return the number of scenes that may share a system, by default the engine's; 1 where none is shared."""
-        engine = self.load_engine()
-        if not engine.shares_systems and given not in (None, 1):
-            problem = f"has no meaning for the engine {engine.name!r}, whose robots share nothing"
-            raise InvalidArgumentError("pack_size", problem, value=given, remedy="leave it out")
-        if given is not None:
-            return integer("pack_size", given, 1, 65535)
-        return PACK_SIZE[self.collisions] if engine.shares_systems else 1
 
     def _check_engine(self) -> None:
         """Raise InvalidArgumentError for options that the physics engine does not have."""
@@ -282,21 +266,6 @@ class RunnerOptions:
         if self.setpoint_space == "joints":
             return None
         return ToolSetpoints(self.robot, default_tool(self.robot) if self.tool is None else self.tool)
-
-    @property
-    def scenes_per_system(self) -> int:
-        """Largest number of scenes in a PhysX system: ``pack_size``, or less, so that 8 packs or more remain to share.
-
-        Workers get whole packs, and their number does not enter here: so results could not depend on that number even
-        where :mod:`batchpid.sim.engine.sapien.contact_prediction` missed a contact. Without collisions nothing can
-        be missed: any number of workers get equal shares, and pack these.
-        """
-        return min(self.pack_size, max(1, self.num_envs // 8)) if self.collisions else self.pack_size
-
-    @property
-    def inseparable_envs(self) -> int:
-        """Number of successive envs that stay on one worker: a whole pack, if they can touch anything."""
-        return self.scenes_per_system if self.collisions else 1
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""

@@ -33,7 +33,7 @@ class Ray:
     CPUs that Ray counts."""
     placement: Placement = "SPREAD"
     """``"SPREAD"`` the envs over all machines, in proportion to their workers; ``"PACK"`` them on the fewest machines
-    that have a worker for every pack of scenes."""
+    that have a worker for every env."""
     accept_differences: bool = False
     """Accept machines whose processors or libraries round differently, with a warning. Results then depend on the
     machine that runs an env."""

@@ -250,7 +250,7 @@ class Runner(SingleOwner):
 
         The snapshot is from this runner, or from one with the same options, except for:
 
-        - ``workers``, ``cluster``, ``pack_size``, ``recover`` and ``timeout``, which change no result, and
+        - ``workers``, ``cluster``, ``recover`` and ``timeout``, which change no result, and
           ``checkpoint_steps``, which changes the last bits;
         - ``substeps`` and ``on_invalid_input``, which apply to the commands that follow.
 

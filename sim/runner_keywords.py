@@ -112,10 +112,6 @@ class RunnerKeywords(TypedDict, total=False):
     """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
     that code written for a screen runs unchanged. It may return the entities that :meth:`batchpid.sim.Runner.poses`
     reports. A reset puts the content back to where ``build`` left it."""
-    pack_size: int | None
-    """Largest number of scenes that share a PhysX system; affects speed alone. Default: 4, or 64 without collisions. A
-    robot gets its own system before something touches it, so that results do not depend on the other envs
-    (docs/reliability.md)."""
     on_fault: FaultAction
     """``"hold"`` (the default) an env that fails at rest in its last valid state, with ``ok`` False until it is reset;
     or ``"reset"`` it to its last start, with ``ok`` False for that tick. An env fails when its state is not finite,

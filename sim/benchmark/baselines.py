@@ -26,12 +26,10 @@ from batchpid.sim.workers.placement import pinned_cores
 
 TUTORIALS = ("tutorial", "tutorial, a process a core")
 ENGINES = {
-    # case: (scenes per PhysX system, whether each sim step visits all systems in turn, with collisions)
-    "drive, a scene a robot": (1, True, True),
-    "bare engine, packs of 8": (8, True, True),
-    "bare engine": (4, True, True),  # as in the Runner: the fastest of 1, 2, 4, 8 and 16
-    "bare engine, pack by pack": (4, False, True),
-    "bare engine, no shapes": (64, False, False),
+    # case: (whether each sim step visits all robots in turn, with collisions)
+    "bare engine": (True, True),
+    "bare engine, robot by robot": (False, True),
+    "bare engine, no shapes": (False, False),
 }
 
 
@@ -127,11 +125,10 @@ class _DriveLoop:
     """Scenes under PhysX's drive, without control. They have no gravity, so that it reaches the target, as the PID."""
 
     def __init__(self, name: str, workload: Workload, share: int) -> None:
-        size, self._in_turn, collisions = ENGINES[name]
+        self._in_turn, collisions = ENGINES[name]
         spec, settings = workload.scene(gravity=False, collisions=collisions), tutorial_settings(workload.robot)
         self._start, self._substeps = workload.start, workload.substeps
-        sizes = [min(size, share - first) for first in range(0, share, size)]
-        self._packs = [Pack(spec, count, system_size=size, isolates=False) for count in sizes]
+        self._packs = [Pack(spec, 1) for _ in range(share)]
         for pack in self._packs:
             pack.write_drive(np.array(settings.drive_stiffness), np.array(settings.drive_damping), np.array(np.inf))
             pack.write_drive_target(np.tile(workload.target, (pack.size, 1)))

@@ -153,9 +153,6 @@ class CompiledStep(Protocol):
     def __call__(self, *arrays: Float64) -> int:
         """Do one sim step on the arrays effort, qpos, qvel and passive force (envs, dof); return the status."""
 
-    def left(self) -> list[int]:
-        """Return the envs to pass to :meth:`CompiledPack.look` after the last sim step."""
-
     @property
     def message(self) -> str:
         """Message of the engine's exception, after the status FAILED."""
@@ -206,9 +203,6 @@ class CompiledPack(EnginePack, Protocol):
 
     def force_model(self) -> CompiledModel:
         """Return the model of :meth:`passive_force`, where compiled steps do not read it."""
-
-    def look(self, left: list[int]) -> None:
-        """Handle a non-zero status of a compiled step, with the envs ``left`` from :meth:`CompiledStep.left`."""
 
 
 class RobotModel(description.Dynamics, Protocol):
@@ -261,8 +255,6 @@ class Engine(description.RobotFunctions, Protocol):
     group_size
         Envs that the loop steps together: enough to share the overhead of NumPy calls, few enough for the working set
         to stay in the cache. It changes no result.
-    shares_systems
-        Whether robots of a pack share worlds of the engine, so that ``system_size`` matters.
     """
 
     name: str
@@ -270,17 +262,18 @@ class Engine(description.RobotFunctions, Protocol):
     capabilities: frozenset[Capability]
     physics: Mapping[str, Any]
     group_size: int
-    shares_systems: bool
 
     def is_physics(self, settings: object) -> bool:
         """Return whether these are settings of its solver."""
+
+    def least_memory(self, num_envs: int, dof: int) -> int:
+        """Return a lower estimate of the bytes that ``num_envs`` robots of ``dof`` joints take."""
 
     def make_pack(
         self,
         spec: SceneSpec,
         size: int,
         first_env: int = 0,
-        system_size: int = 8,
         variation: Variation | None = None,
         carrier: str = "",
         links: Sequence[str] = (),
@@ -290,8 +283,6 @@ class Engine(description.RobotFunctions, Protocol):
 
         Parameters
         ----------
-        system_size
-            Largest number of robots that may share a world of the engine. It changes no result.
         variation
             Differences of the robots from the model; None for robots that :meth:`EnginePack.vary` never changes.
         carrier, links

@@ -23,12 +23,12 @@ def make_pack(
     workspace: dict[Any, Any],
 ) -> EnginePack:
     """Return the pack of ``size`` envs; without ``draws`` all robots equal the model."""
-    randomization, robot, packed = options.randomization, options.robot, options.scenes_per_system
+    randomization, robot = options.randomization, options.robot
     make = options.load_engine().make_pack
     if randomization is None or not randomization.changes_robot:
-        return make(scene, size, first_env, packed, workspace=workspace)
+        return make(scene, size, first_env, workspace=workspace)
     varied, links = variation(options, size, draws), elements("link_mass", robot)
-    return make(scene, size, first_env, packed, varied, randomization.carrier(robot), links, workspace)
+    return make(scene, size, first_env, varied, randomization.carrier(robot), links, workspace)
 
 
 def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variation:

@@ -59,8 +59,7 @@ class Loop:
         )
         self._steps = 0
         self._workspace: dict[Any, Any] = {}
-        count, pack_size = envs.stop - envs.start, options.scenes_per_system
-        size = max(options.load_engine().group_size // pack_size, 1) * pack_size
+        count, size = envs.stop - envs.start, options.load_engine().group_size
         slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
         controller = None if isinstance(options.control, str) else OwnController(options)
         self.groups = [
@@ -148,8 +147,8 @@ class Loop:
             group.observe(ticks[0])
 
     def _place(self, states: EnvStates) -> None:
-        # The engine's contact caches, and the order in which it solves contacts, depend on its past. A new
-        # world has no past.
+        # The engine's contact caches, and the order in which it solves contacts, depend on its past. A new world has no
+        # past.
         for group in self.groups:
             group.pack.close()
             group.write(self._build(group.envs, group.draws), states.for_envs(group.envs))

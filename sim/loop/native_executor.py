@@ -18,7 +18,6 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.native.operations import MOST_SUMMED
 from batchpid.native.trees import leaves, mapped
-from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.protocol import FAILED, CompiledModel, CompiledPack, CompiledStep, DrivenPack
 from batchpid.sim.loop.arrays import Arrays, Command
@@ -28,9 +27,6 @@ from batchpid.sim.loop.quiet_ticks import QuietTicks, Shown
 from batchpid.sim.loop.tick_program import TickProgram
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
-
-LOOK = 1 << STATUS.index("not_finite") | 1 << STATUS.index("too_fast")
-"""Bits of a sim step's status that report a possible failure of an env."""
 
 
 class NativeExecutor(NumPyExecutor):
@@ -55,7 +51,7 @@ class NativeExecutor(NumPyExecutor):
         self._compiles = has_own_law and is_compiled(constants, pack.dof)
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
-        """Run the sim steps of a tick from ``begin`` to ``end``, or until a possible contact or a failed env."""
+        """Run the sim steps of a tick from ``begin`` to ``end``, or until an env may have failed."""
         if not self._compiles:
             return super().run(state, measured, command, begin, end)
         program = self._program(state, command)
@@ -69,9 +65,9 @@ class NativeExecutor(NumPyExecutor):
         return self._ran(program, done, status)
 
     def _ran(self, program: TickProgram, done: int, status: int) -> Ran:
-        """Return the result of ``done`` sim steps of a tick, after the event in ``status`` was handled."""
-        measured = self._look(status, program.measured) if status else program.measured
-        return Ran(program.state, program.outputs, measured, program.before, done, bool(status & LOOK))
+        """Return the result of ``done`` sim steps of a tick, of which the last had this status."""
+        failed = self._may_have_failed(status)
+        return Ran(program.state, program.outputs, program.measured, program.before, done, failed)
 
     def quiet_ticks(self, state: StepState, command: Command, arrays: Arrays, shown: Shown) -> QuietTicks | None:
         """Return ticks in one call, for commands with the entries of ``command``; None if each tick needs Python."""
@@ -105,16 +101,13 @@ class NativeExecutor(NumPyExecutor):
             passive = None
         elif not self._steps_read_force:
             passive = self._pack.passive_force(self._gravity, self._coriolis)
-        measured = Measured(qpos, qvel, passive)
-        return (self._look(status, measured) if status else measured), bool(status & LOOK)
+        return Measured(qpos, qvel, passive), self._may_have_failed(status)
 
-    def _look(self, status: int, measured: Measured) -> Measured:
-        """Handle the event that a sim step reported in ``status``; return the reading."""
-        assert self._step is not None
+    def _may_have_failed(self, status: int) -> bool:
+        """Return whether an env may have failed in a sim step; RuntimeError if the engine has."""
         if status & FAILED:
-            raise RuntimeError(self._step.message)
-        self._pack.look(self._step.left())
-        return measured if self._bound is self._pack.calls else self.measure()
+            raise RuntimeError(self._prepared().message)
+        return bool(status)
 
     def _prepared(self) -> CompiledStep:
         """Return the compiled sim step of the present robots and systems."""

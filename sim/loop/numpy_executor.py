@@ -48,7 +48,7 @@ class Ran(NamedTuple):
     before: Any
     """qpos before the last step."""
     done: int
-    """Sim steps of the tick that are done; fewer than requested after an event: a possible contact or a failed env."""
+    """Sim steps of the tick that are done; fewer than requested if an env may have failed."""
     failed: bool
     """Whether an env may have failed."""
 

@@ -1,7 +1,7 @@
 """Sim steps of a tick as one program of XLA, which reaches the engine by a call of the extension.
 
 The program is a loop over the sim steps, ``lax.while_loop``: :func:`batchpid.sim.loop.control_step.control_step`,
-traced, then :func:`batchpid.sim.engine.native.xla.sim_step`. It stops early at a possible contact or a failed env,
+traced, then :func:`batchpid.sim.engine.native.xla.sim_step`. It stops early where an env may have failed,
 which Python handles. All groups of envs have the same number of rows (:mod:`batchpid.sim.loop.jitted`), so that one
 program serves them all.
 """
@@ -23,7 +23,6 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.jitted import padded, put
-from batchpid.sim.loop.native_executor import LOOK
 from batchpid.sim.loop.numpy_executor import Ran, passive_forces
 from batchpid.sim.loop.step_constants import needs_qvel
 from batchpid.sim.options import RunnerOptions
@@ -95,8 +94,7 @@ class XLAExecutor:
             return put(Measured(padded(qpos), padded(qvel), None if passive is None else padded(passive)))
 
     def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
-        """Run the sim steps of a tick from ``begin`` to ``end``, or until a possible contact or a failed env."""
-        pack = self._pack
+        """Run the sim steps of a tick from ``begin`` to ``end``, or until an env may have failed."""
         native = self._bind()
         with own_settings(self._options.dtype):
             span = np.array([begin, end, 0, 0], np.int32)
@@ -112,12 +110,7 @@ class XLAExecutor:
             done, status = np.asarray(carry.progress).tolist()
         if status & FAILED:
             raise RuntimeError(native.message)
-        measured = carry.measured
-        if status:
-            pack.look(native.left())
-            if self._bound is not pack.calls:
-                measured = self.measure()
-        return Ran(carry.state, carry.outputs, measured, carry.before, done, bool(status & LOOK))
+        return Ran(carry.state, carry.outputs, carry.measured, carry.before, done, bool(status))
 
     def rows(self, array: Any) -> NDArray[Any]:
         """Return an array of the executor as a new NumPy array."""

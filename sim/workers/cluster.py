@@ -74,11 +74,11 @@ class Cluster:
                 f"has no machine of {least} CPUs",
                 remedy="lower cpus_per_node, or add larger machines",
             )
-        packs = -(-options.num_envs // options.inseparable_envs)
         if self.options.placement == "PACK":
-            enough = [sum(machine.workers for machine in machines[:count]) >= packs for count in range(len(machines))]
+            needed = options.num_envs
+            enough = [sum(machine.workers for machine in machines[:count]) >= needed for count in range(len(machines))]
             machines = machines[: max(1, enough.index(True))] if True in enough else machines
-        parts = split_in_shares(options.num_envs, [machine.workers for machine in machines], options.inseparable_envs)
+        parts = split_in_shares(options.num_envs, [machine.workers for machine in machines])
         used = [(envs, machine) for envs, machine in zip(parts, machines, strict=True) if envs.stop > envs.start]
         self.slices = [envs for envs, _ in used]
         """Envs of each node."""

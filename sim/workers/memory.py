@@ -9,12 +9,6 @@ from pathlib import Path
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.options import RunnerOptions
 
-ENV_BYTES, JOINT_BYTES, SYSTEM_BYTES = 5_000, 6_000, 400_000
-"""Resident bytes of an env, for each of its joints, and of a PhysX system, at least: chains of 1 to 30 boxes and jaco2
-take 15 to 35 % more. Large collision meshes come on top: a panda takes 2.7 times as much."""
-STATE_BYTES, JOINT_STATE_BYTES, DATA_BYTES = 1_000, 300, 300_000
-"""Resident bytes of an env, and for each of its joints, in an engine without such systems, at least. As many envs as a
-group has take DATA_BYTES each, too, which all groups share (:mod:`batchpid.sim.engine.mujoco.data_pool`)."""
 WORKER_BYTES = 130_000_000
 """Resident bytes of a worker process without envs: SAPIEN and NumPy."""
 WORKER_ADDRESS_SPACE = 470_000_000
@@ -25,12 +19,7 @@ _CGROUPS = Path("/sys/fs/cgroup")
 
 def estimate_memory(options: RunnerOptions, num_envs: int) -> int:
     """Return a lower estimate of the bytes that ``num_envs`` of a runner's envs take."""
-    engine, dof = options.load_engine(), options.robot.dof
-    if not engine.shares_systems:
-        return num_envs * (STATE_BYTES + JOINT_STATE_BYTES * dof) + min(num_envs, engine.group_size) * DATA_BYTES
-    shares = options.robot.fixed_base and options.build is None
-    systems = num_envs / (options.scenes_per_system if shares else 1)
-    return round(num_envs * (ENV_BYTES + JOINT_BYTES * dof) + systems * SYSTEM_BYTES)
+    return options.load_engine().least_memory(num_envs, options.robot.dof)
 
 
 def check_memory(options: RunnerOptions, num_envs: int, workers: int, is_local: bool) -> None:

@@ -7,16 +7,14 @@ from collections.abc import Sequence
 from itertools import accumulate, pairwise
 
 
-def split_envs(num_envs: int, workers: int, pack_size: int) -> list[slice]:
-    """Return contiguous slices of envs, one for each worker, that do not split a pack."""
-    packs = -(-num_envs // pack_size)
-    return split_in_shares(num_envs, [1] * max(1, min(workers, packs)), pack_size)
+def split_envs(num_envs: int, workers: int) -> list[slice]:
+    """Return contiguous slices of envs, one for each worker; none is empty."""
+    return split_in_shares(num_envs, [1] * max(1, min(workers, num_envs)))
 
 
-def split_in_shares(num_envs: int, shares: Sequence[int], pack_size: int) -> list[slice]:
-    """Return contiguous slices of envs in proportion to ``shares`` that do not split a pack; some can be empty."""
-    packs, total = -(-num_envs // pack_size), sum(shares)
-    cuts = [min(num_envs, pack_size * (packs * part // total)) for part in accumulate(shares, initial=0)]
+def split_in_shares(num_envs: int, shares: Sequence[int]) -> list[slice]:
+    """Return contiguous slices of envs in proportion to ``shares``; some can be empty."""
+    cuts = [num_envs * part // sum(shares) for part in accumulate(shares, initial=0)]
     return [slice(low, high) for low, high in pairwise(cuts)]
 
 

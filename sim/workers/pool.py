@@ -88,7 +88,7 @@ class WorkerPool(SingleOwner):
         self.is_local = not count
         """True if the loop runs in this process."""
         self._make_worker: Callable[[Start, SharedArrays], Worker] = ProcessWorker if count else LocalWorker
-        self._slices = split_envs(num_envs, count, options.inseparable_envs)
+        self._slices = split_envs(num_envs, count)
         self._cores = pinned_cores(len(self._slices))
         widest, most_steps = max(envs.stop - envs.start for envs in self._slices), _MAX_STEPS
         if options.cluster is not None:  # the pools of its machines execute the requests

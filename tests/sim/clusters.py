@@ -69,7 +69,7 @@ def setpoints(ticks, seed=1):
 
 
 def make_runner(**options):
-    return Runner(ROBOT, N, **{"params": ROBOT.params(), "checkpoint_steps": 300, "pack_size": 1, **options})
+    return Runner(ROBOT, N, **{"params": ROBOT.params(), "checkpoint_steps": 300, **options})
 
 
 def pids_of(runner):

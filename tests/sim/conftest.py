@@ -15,7 +15,7 @@ from batchpid.sim.engine.engines import load_engine
 def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Engine of the runners that this test makes without naming one.
 
-    In MuJoCo they have no ``pack_size``, and in this process small groups, which share their working memory.
+    In MuJoCo they have small groups in this process, which share their working memory.
     """
     name: str = request.param
     if name == "mujoco":
@@ -24,8 +24,6 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     original = RunnerOptions.__init__
 
     def init(options: RunnerOptions, *args: Any, **given: Any) -> None:
-        if name == "mujoco":
-            given.pop("pack_size", None)
         original(options, *args, **{"engine": name, **given})
 
     monkeypatch.setattr(RunnerOptions, "__init__", init)

@@ -69,9 +69,7 @@ def run(runner, way):
 
 def outcome(workers, controller, *, kill=False, way="rollout", **options):
     """Return the error of a run, and the remaining state of the runner."""
-    with Runner(
-        ROBOT, ENVS, workers=workers, control=controller, substeps=SUBSTEPS, pack_size=1, timeout=20.0, **options
-    ) as runner:
+    with Runner(ROBOT, ENVS, workers=workers, control=controller, substeps=SUBSTEPS, timeout=20.0, **options) as runner:
         recorder = runner.recorder = ListRecorder()
         if kill and workers:
             runner.step(MARKS)
@@ -158,7 +156,7 @@ def test_an_error_in_a_reset_closes_the_runner(workers):
                 raise BatchPIDError("no more")
             return super().init(robot, num_envs)
 
-    with Runner(ROBOT, 4, workers=workers, control=FailsAtReset(), pack_size=1) as runner:
+    with Runner(ROBOT, 4, workers=workers, control=FailsAtReset()) as runner:
         with pytest.raises(ControllerError, match="no more"):
             reset_often(runner)
         assert runner.closed

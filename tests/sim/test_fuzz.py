@@ -164,7 +164,6 @@ GOOD_RUNNER = {
     "physics": "fast",
     "ground": True,
     "build": None,
-    "pack_size": 1,
     "on_fault": "hold",
     "speed_limit": 100.0,
     "randomization": Randomization(payload=Uniform(0, 1)),

@@ -1,4 +1,4 @@
-"""Results are bit-identical for any number of workers, packing and number of envs, in every rerun, in each engine."""
+"""Results are bit-identical for any number of workers and of envs, in every rerun, in each engine."""
 
 import functools
 
@@ -52,12 +52,6 @@ def test_any_number_of_workers(workers, reference):
 
 
 @pytest.mark.quick_rows(1)
-@pytest.mark.parametrize("pack_size", [1, 8])
-def test_any_pack_size(pack_size):
-    assert_identical(run(workers=0, pack_size=pack_size), in_this_process("sapien"))
-
-
-@pytest.mark.quick_rows(1)
 def test_any_number_of_envs(reference):
     many = run(num_envs=24, workers=0)
     assert_identical(run(num_envs=1, workers=0), many, slice(0, 1))
@@ -68,20 +62,20 @@ def test_any_number_of_envs(reference):
 @pytest.mark.parametrize("control", ["drive", "effort"])
 def test_other_controls(control):
     expected = in_this_process("sapien", control=control)
-    assert_identical(run(workers=2, pack_size=8, control=control), expected)
+    assert_identical(run(workers=2, control=control), expected)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def test_another_robot():
-    assert_identical(run("jaco2", workers=2, pack_size=3), in_this_process("sapien", "jaco2"))
+    assert_identical(run("jaco2", workers=2), in_this_process("sapien", "jaco2"))
 
 
 @pytest.mark.quick_rows(2)
 @pytest.mark.parametrize("control", ["pid", "drive"])
 def test_a_robot_with_friction_and_damping(control, reference):
     expected = reference(RUBBING, control=control)
-    assert_identical(run(RUBBING, workers=1, pack_size=3, control=control), expected)
+    assert_identical(run(RUBBING, workers=1, control=control), expected)
     alone = run(RUBBING, num_envs=1, workers=0, control=control)
     assert_identical(alone, expected, slice(0, 1))
 

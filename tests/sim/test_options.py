@@ -60,9 +60,9 @@ def test_options_are_plain_values_of_their_documented_type():
 def test_defaults_are_resolved():
     options = RunnerOptions(PANDA, 2)
     assert isinstance(options.workers, int)
-    assert (options.ground, options.pack_size, options.guard) == (PANDA.has_ground, 4, None)
+    assert (options.ground, options.guard) == (PANDA.has_ground, None)
     guarded = RunnerOptions(PANDA, 2, guard=True, collisions=False)
-    assert (guarded.ground, guarded.pack_size) == (False, 64)
+    assert guarded.ground is False
     np.testing.assert_array_equal(guarded.guard.upper, PANDA.guard().upper)
     assert RunnerOptions(PANDA, 2, guard=False).guard is RunnerOptions(PANDA, 2, guard=None).guard is None
 

@@ -72,8 +72,8 @@ def episodes(runner, num_envs=N):
 @pytest.mark.parametrize("name", ["panda", pytest.param("jaco2", marks=pytest.mark.slow)])
 def test_an_env_is_the_same_in_any_company_and_for_any_workers(name):
     robot, runs = load_bundled(name), []
-    cases = ((N, {}), (N, {"workers": 2}), (N, {"pack_size": 1}), (2, {}))
-    for num_envs, options in cases if name == "panda" else cases[1:3]:
+    cases = ((N, {}), (N, {"workers": 2}), (2, {}))
+    for num_envs, options in cases if name == "panda" else cases[:2]:
         with make(robot, num_envs, **options) as runner:
             runs.append(episodes(runner, num_envs))
     for run in runs[1:]:
@@ -88,7 +88,7 @@ def test_limits_by_position_are_drawn_for_each_joint_of_each_env():
     actuators = bp.make_actuators(PANDA.dof, position_limit=(points, np.tile([5.0, 8.0, 4.0], (PANDA.dof, 1))))
     scale = Randomization(seed=1, actuators={"limit_efforts": Uniform(0.1, 1, operation="scale")})
     runs = []
-    for options in ({}, {"workers": 2, "pack_size": 1}):
+    for options in ({}, {"workers": 2}):
         with make(actuators=actuators, randomization=scale, **options) as runner:
             draws = runner.draws["actuators.limit_efforts"]
             runs.append(episodes(runner))
@@ -97,7 +97,7 @@ def test_limits_by_position_are_drawn_for_each_joint_of_each_env():
             assert_identical(ours, expected)
     assert draws.shape == (N, PANDA.dof)
     drawn = actuators._replace(limit_efforts=actuators.limit_efforts * draws[..., None])
-    with make(actuators=drawn, randomization=None, pack_size=1) as runner:
+    with make(actuators=drawn, randomization=None) as runner:
         assert_identical(runner.rollout(setpoints()), runs[0][0])
 
 
@@ -163,7 +163,7 @@ def test_a_snapshot_holds_the_draws(tmp_path):
         assert_identical(runner.rollout(command), expected)
         runner.reset(mask=np.ones(N, bool))
         last = runner.episodes
-    with make(actuators=bp.make_actuators(PANDA.dof, lag=0.002), pack_size=1) as other:
+    with make(actuators=bp.make_actuators(PANDA.dof, lag=0.002)) as other:
         other.restore(Snapshot.load(tmp_path / "s.npz"))
         assert_identical(other.rollout(command), expected)
         other.reset()

@@ -19,7 +19,7 @@ SETPOINTS = np.clip(
 
 
 def make(workers=1, **options):
-    return Runner(ROBOT, 6, workers=workers, params=ROBOT.params(), substeps=5, pack_size=1, **options)
+    return Runner(ROBOT, 6, workers=workers, params=ROBOT.params(), substeps=5, **options)
 
 
 def exchange(runner, setpoint, **arguments):

@@ -27,24 +27,29 @@ class MujocoEngine:
     capabilities: frozenset[Capability] = frozenset({"drive", "missed_contacts", "compiled_steps"})
     physics: Mapping[str, Any] = SOLVERS
     group_size = 64
-    shares_systems = False
 
     def is_physics(self, settings: object) -> bool:
         """Return whether these are :class:`batchpid.sim.MujocoSolver`."""
         return isinstance(settings, MujocoSolver)
+
+    def least_memory(self, num_envs: int, dof: int) -> int:
+        """Return a lower estimate of the bytes of ``num_envs`` robots, and of the working memory of their groups.
+
+        The groups share the working memory (:mod:`batchpid.sim.engine.mujoco.data_pool`).
+        """
+        return num_envs * (1_000 + 300 * dof) + min(num_envs, self.group_size) * 300_000
 
     def make_pack(
         self,
         spec: SceneSpec,
         size: int,
         first_env: int = 0,
-        system_size: int = 8,
         variation: Variation | None = None,
         carrier: str = "",
         links: Sequence[str] = (),
         workspace: dict[Any, Any] | None = None,
     ) -> MujocoPack:
-        """Return a new pack; its robots share nothing, for any ``system_size``."""
+        """Return a new pack."""
         return MujocoPack(spec, size, first_env, variation, carrier, links, workspace)
 
     def scene_dynamics(self, spec: SceneSpec) -> MujocoDynamics:

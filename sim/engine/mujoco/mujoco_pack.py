@@ -261,9 +261,6 @@ class MujocoPack(SingleOwner):
         if self._constraint is not None:
             self._constraint.update(self.joint_mass_matrix, self.read_qpos(), self.passive_force(True, True), rows)
 
-    def look(self, left: list[int]) -> None:
-        """Do nothing: MuJoCo needs no care before a contact."""
-
     # -- changes -----------------------------------------------------------------------------------------------
 
     def write_state(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:

@@ -125,10 +125,6 @@ class MujocoStep:
         self._take_data()
         return ctypes.addressof(self._group)
 
-    def left(self) -> list[int]:
-        """Return an empty list: nothing is watched."""
-        return []
-
     def __call__(self, *arrays: NDArray[np.float64]) -> int:
         """Do one sim step: (effort, qpos, qvel, passive force), each (robots, dof); return the status."""
         status: int = self._native.sim_step(self.prepare(), *arrays)

@@ -14,19 +14,19 @@ using namespace batchpid;
 
 namespace {
 
-// type_info("robot" | "system" | "body" | "joint"): capsule with the C++ type, as pybind11's conduit expects it.
+// type_info("robot" | "system" | "joint"): capsule with the C++ type, as pybind11's conduit expects it.
 PyObject *type_info(PyObject *, PyObject *argument) {
   Py_ssize_t size = 0;
   char const *kind = PyUnicode_AsUTF8AndSize(argument, &size);
   if (kind == nullptr) return nullptr;
   auto const *info = std::strcmp(kind, "robot") == 0    ? &typeid(Articulation)
                      : std::strcmp(kind, "system") == 0 ? &typeid(System)
-                     : std::strcmp(kind, "joint") == 0  ? &typeid(Joint)
-                                                        : &typeid(Body);
+                                                        : &typeid(Joint);
   return PyCapsule_New(const_cast<std::type_info *>(info), typeid(std::type_info).name(), nullptr);
 }
 
-// gateway(functions, robots, systems, dof): addresses and pointers as integers; the caller keeps the objects alive.
+// gateway(functions, robots, systems, dof): addresses and pointers as integers, one system for each robot; the caller
+// keeps the objects alive.
 PyObject *make_gateway(PyObject *, PyObject *arguments) {
   PyObject *functions, *robots, *systems;
   Py_ssize_t dof;
@@ -39,9 +39,9 @@ PyObject *make_gateway(PyObject *, PyObject *arguments) {
     return nullptr;
   }
   static_assert(sizeof(Functions) == 7 * sizeof(void *));
-  if (addresses.size() != 7) {
+  if (addresses.size() != 7 || gateway->systems.size() != gateway->robots.size()) {
     delete gateway;
-    PyErr_SetString(PyExc_ValueError, "needs seven functions");
+    PyErr_SetString(PyExc_ValueError, "needs seven functions, and a system for each robot");
     return nullptr;
   }
   std::memcpy(&gateway->functions, addresses.data(), sizeof(Functions));
@@ -117,26 +117,6 @@ PyObject *step(PyObject *, PyObject *capsule) {
   return without_gil([&] {
     for (System *system : gateway->systems) gateway->functions.step(system);
   });
-}
-
-// contacts(gateway, vtable): addresses of the maps of contacts that the systems list; 0 where one is not found.
-//
-// A system holds the callback that collects its contacts; it is found by its vtable, and the map follows that.
-PyObject *contacts(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  Gateway *gateway = gateway_of(arguments[0]);
-  if (gateway == nullptr) return nullptr;
-  auto const vtable = reinterpret_cast<std::uintptr_t>(PyLong_AsVoidPtr(arguments[1])) + 2 * sizeof(void *);
-  constexpr std::size_t MOST_WORDS = 64;
-  PyObject *list = PyList_New(0);
-  for (System *system : gateway->systems) {
-    auto *words = reinterpret_cast<std::uintptr_t *>(system);
-    std::size_t at = 0;
-    while (at < MOST_WORDS && words[at] != vtable) ++at;
-    PyObject *address = PyLong_FromVoidPtr(at < MOST_WORDS ? words + at + 1 : nullptr);
-    PyList_Append(list, address);
-    Py_DECREF(address);
-  }
-  return list;
 }
 
 // sim_step(address of a Group, effort, qpos, qvel, passive) -> Status, on arrays (rows, dof) of double.
@@ -342,7 +322,6 @@ PyMethodDef METHODS[] = {
     {"passive_force", method(passive_force), METH_FASTCALL, nullptr},
     {"write_qf", method(write_qf), METH_FASTCALL, nullptr},
     {"step", step, METH_O, nullptr},
-    {"contacts", method(contacts), METH_FASTCALL, nullptr},
     {"sim_step", method(step_group), METH_FASTCALL, nullptr},
     {"bind", method(bind), METH_FASTCALL, nullptr},
     {"tick", method(tick), METH_FASTCALL, nullptr},

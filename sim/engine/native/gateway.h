@@ -15,7 +15,6 @@
 namespace sapien::physx {
 class PhysxArticulation {};  // never defined here; their type_info, which pybind11 compares by name, is all that is used
 class PhysxSystemCpu {};
-class PhysxRigidBaseComponent {};
 class PhysxArticulationJoint {};
 }  // namespace sapien::physx
 
@@ -25,7 +24,6 @@ namespace batchpid {
 
 using Articulation = sapien::physx::PhysxArticulation;
 using System = sapien::physx::PhysxSystemCpu;
-using Body = sapien::physx::PhysxRigidBaseComponent;
 using Joint = sapien::physx::PhysxArticulationJoint;
 
 // Layout of Eigen::VectorXf. Its destructor makes the compiler return it as it returns Eigen's.
@@ -49,7 +47,7 @@ struct Functions {
 struct Gateway {
   Functions functions;
   std::vector<Articulation *> robots;
-  std::vector<System *> systems;
+  std::vector<System *> systems;  // one for each robot
   std::ptrdiff_t dof;
 };
 

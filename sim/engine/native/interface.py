@@ -23,7 +23,7 @@ SYMBOLS = (
     "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetVelocityEf",
 )
 """Functions of SAPIEN, in the order of Functions in gateway.h."""
-STATUS = ("left_region", "contacts", "not_finite", "too_fast", "failed")
+STATUS = ("not_finite", "too_fast", "failed")
 """Bits of the status of a sim step: reasons to stop a loop over sim steps, as Status in sim_step.h."""
 DYNAMICS = ("qpos", "qvel", "payload", "matrix", "force", "payload_force")
 """Arrays of ``dynamics`` in batch_dynamics.cpp, after the tree."""
@@ -37,14 +37,10 @@ class Group(ctypes.Structure):
     """Group of robots, as Group in sim_step.h."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("gateway", "qf", "skip", "system_of", "contacts", "watched")),
-        *((name, ctypes.c_void_p) for name in ("bodies", "robot_of")),
-        *((name, ctypes.c_void_p) for name in ("known", "places", "arms", "sizes", "used", "outside", "speed_limit")),
+        *((name, ctypes.c_void_p) for name in ("gateway", "qf", "skip", "speed_limit")),
         *((name, ctypes.c_void_p) for name in ("mujoco", "constraint", "joints")),
         ("robots", ctypes.c_int64),
         ("dof", ctypes.c_int64),
-        ("pairs", ctypes.c_int64),
-        ("bodies_size", ctypes.c_int64),
         ("gravity", ctypes.c_int32),
         ("coriolis", ctypes.c_int32),
         ("velocities", ctypes.c_int32),

@@ -10,8 +10,6 @@ from typing import Any
 
 from batchpid.sim.engine.native.interface import SYMBOLS
 
-_CALLBACK = "_ZTVN6sapien5physx20DefaultEventCallbackE"
-
 
 def import_sapien() -> Any:
     """Return the module ``sapien``, imported without its warnings about things that are not used here."""
@@ -39,8 +37,3 @@ def functions() -> tuple[int, ...]:
     """Return the addresses of the exported functions; AttributeError names one that is missing."""
     library = ctypes.CDLL(str(sapien_library()))
     return tuple(ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value or 0 for symbol in SYMBOLS)
-
-
-def callback_table() -> int:
-    """Return the address of the virtual table of SAPIEN's callback for contacts."""
-    return ctypes.addressof(ctypes.c_char.in_dll(ctypes.CDLL(str(sapien_library())), _CALLBACK))

@@ -1,4 +1,4 @@
-// One sim step of a group of robots in one call: apply efforts, step, read, and judge whether Python has to look.
+// One sim step of a group of robots in one call: apply efforts, step, read, and check whether a robot has failed.
 
 #pragma once
 
@@ -8,8 +8,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <map>
-#include <utility>
 #include <vector>
 
 #pragma GCC visibility push(hidden)
@@ -20,69 +18,22 @@ namespace batchpid {
 constexpr double FARTHEST = 1e6;
 
 // Reasons for which a loop over sim steps has to stop, as bits: STATUS in interface.py.
-enum Status : std::int32_t { LEFT_REGION = 1, CONTACTS = 2, NOT_FINITE = 4, TOO_FAST = 8, FAILED = 16 };
-
-// Layout of the map in which SAPIEN keeps the contacts of a system, by the pair of shapes; a contact begins with its bodies.
-using Contacts = std::map<std::pair<void *, void *>, Body *const *>;
+enum Status : std::int32_t { NOT_FINITE = 1, TOO_FAST = 2, FAILED = 4 };
 
 // Group of robots; Python fills in the fields (Group in interface.py) and owns what they point to.
 struct Group {
   Gateway *gateway;
   float *qf;                         // (robots, dof), constraint efforts included
   char const *skip;                  // (robots,): efforts are not applied
-  std::int64_t const *system_of;     // (robots,)
-  Contacts const *const *contacts;   // (systems,)
-  char const *watched;               // (systems,): systems in which a contact may be a reason to stop
-  Body const *const *bodies;         // (bodies,): those of the robots that share systems, sorted
-  std::int64_t const *robot_of;      // (bodies,)
-  char const *known;                 // (robots,): robots with a region, as in batchpid.sim.engine.sapien.contact_prediction.SafeRegions
-  double *places;                    // (robots, 2, dof)
-  double const *arms;                // (2 dof, pairs)
-  double const *sizes;               // (robots, pairs)
-  double *used;                      // (pairs,): work space
-  char *outside;                     // (robots,): robots that have left their region, an output
   double const *speed_limit;         // (dof,), or null
-  Mujoco const *mujoco;              // robots in MuJoCo, or null; then there is no gateway, and nothing to watch
+  Mujoco const *mujoco;              // robots in MuJoCo, or null; then there is no gateway
   Constraint const *constraint;      // of coupled joints, or null
   Joint *const *joints;              // (robots, dof): in SAPIEN, or null without targets of drives that move
   std::int64_t robots, dof;
-  std::int64_t pairs, bodies_size;
   std::int32_t gravity, coriolis;    // parts of the passive force; without both it is zero
   std::int32_t velocities, unused;   // whether to read velocities; otherwise they are zero
   char message[256];                 // of an exception of the engine
 };
-
-// Return whether a system lists a contact of a robot that shares it and has no region.
-inline bool lists_contacts(Group const &group, std::size_t system) {
-  auto const **first = const_cast<Body const **>(group.bodies), **last = first + group.bodies_size;
-  for (auto const &entry : *group.contacts[system]) {
-    for (int side = 0; side < 2; ++side) {
-      auto const **found = std::lower_bound(first, last, entry.second[side]);
-      if (found == last || *found != entry.second[side]) continue;
-      if (!group.known[group.robot_of[found - first]]) return true;
-      break;
-    }
-  }
-  return false;
-}
-
-// Return whether a robot has left its region: arms^T (|q - q0|, |q - q'|) >= sizes anywhere; q replaces q'.
-inline bool leaves_region(Group const &group, std::size_t row, float const *qpos) {
-  std::ptrdiff_t const dof = group.gateway->dof;
-  double *before = group.places + static_cast<std::ptrdiff_t>(row) * 2 * dof, *center = before + dof;
-  for (std::int64_t pair = 0; pair < group.pairs; ++pair) group.used[pair] = 0.0;
-  for (std::ptrdiff_t joint = 0; joint < dof; ++joint) {
-    double const step = std::fabs(qpos[joint] - before[joint]), moved = std::fabs(qpos[joint] - center[joint]);
-    double const *fast = group.arms + joint * group.pairs, *slow = fast + dof * group.pairs;
-    for (std::int64_t pair = 0; pair < group.pairs; ++pair) group.used[pair] += step * fast[pair] + moved * slow[pair];
-    before[joint] = qpos[joint];
-  }
-  double const *sizes = group.sizes + static_cast<std::int64_t>(row) * group.pairs;
-  for (std::int64_t pair = 0; pair < group.pairs; ++pair) {
-    if (group.used[pair] >= sizes[pair]) return true;
-  }
-  return false;
-}
 
 template <class T>
 void copy_row(VectorXf const &from, T *to, std::ptrdiff_t dof) {
@@ -107,7 +58,7 @@ inline void constrain_row(Group const &group, std::size_t row, float *qf) {
 }
 
 // Apply efforts (rows, dof), do one sim step, read (rows, dof) each; rows beyond the robots repeat the first one.
-// System by system, each while it is in the cache.
+// Robot by robot, each while it is in the cache.
 template <class T>
 std::int32_t sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
   Gateway const &gateway = *group.gateway;
@@ -115,34 +66,23 @@ std::int32_t sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos,
   std::ptrdiff_t const dof = gateway.dof;
   auto const robots = gateway.robots.size();
   std::int32_t status = 0;
-  for (std::size_t system = 0; system < gateway.systems.size(); ++system) {
-    for (std::size_t row = 0; row < robots; ++row) {
-      if (group.system_of[row] != static_cast<std::int64_t>(system)) continue;
-      float *qf = group.qf + static_cast<std::ptrdiff_t>(row) * dof;
-      for (std::ptrdiff_t joint = 0; joint < dof; ++joint) {
-        qf[joint] = static_cast<float>(effort[static_cast<std::ptrdiff_t>(row) * dof + joint]);
-      }
-      if (group.constraint != nullptr) constrain_row(group, row, qf);
-      if (!group.skip[row]) apply(call, gateway.robots[row], qf, dof);
+  for (std::size_t row = 0; row < robots; ++row) {
+    Articulation *robot = gateway.robots[row];
+    std::ptrdiff_t const at = static_cast<std::ptrdiff_t>(row) * dof;
+    float *qf = group.qf + at;
+    for (std::ptrdiff_t joint = 0; joint < dof; ++joint) qf[joint] = static_cast<float>(effort[at + joint]);
+    if (group.constraint != nullptr) constrain_row(group, row, qf);
+    if (!group.skip[row]) apply(call, robot, qf, dof);
+    call.step(gateway.systems[row]);
+    VectorXf const position = call.get_qpos(robot);
+    copy_row(position, qpos + at, dof);
+    if (group.velocities || group.speed_limit) copy_row(call.get_qvel(robot), qvel + at, dof);
+    if (group.gravity || group.coriolis) {
+      copy_row(call.compute_passive_force(robot, group.gravity != 0, group.coriolis != 0), passive + at, dof);
     }
-    call.step(gateway.systems[system]);
-    if (group.watched[system] && lists_contacts(group, system)) status |= CONTACTS;
-    for (std::size_t row = 0; row < robots; ++row) {
-      if (group.system_of[row] != static_cast<std::int64_t>(system)) continue;
-      Articulation *robot = gateway.robots[row];
-      std::ptrdiff_t const at = static_cast<std::ptrdiff_t>(row) * dof;
-      VectorXf const position = call.get_qpos(robot);
-      copy_row(position, qpos + at, dof);
-      if (group.velocities || group.speed_limit) copy_row(call.get_qvel(robot), qvel + at, dof);
-      if (group.gravity || group.coriolis) {
-        copy_row(call.compute_passive_force(robot, group.gravity != 0, group.coriolis != 0), passive + at, dof);
-      }
-      for (std::ptrdiff_t joint = 0; joint < dof; ++joint) {
-        if (!(std::fabs(position.data[joint]) <= FARTHEST)) status |= NOT_FINITE;
-        if (group.speed_limit && !(std::fabs(qvel[at + joint]) <= group.speed_limit[joint])) status |= TOO_FAST;
-      }
-      group.outside[row] = group.known[row] && leaves_region(group, row, position.data);
-      if (group.outside[row]) status |= LEFT_REGION;
+    for (std::ptrdiff_t joint = 0; joint < dof; ++joint) {
+      if (!(std::fabs(position.data[joint]) <= FARTHEST)) status |= NOT_FINITE;
+      if (group.speed_limit && !(std::fabs(qvel[at + joint]) <= group.speed_limit[joint])) status |= TOO_FAST;
     }
   }
   auto const size = static_cast<std::size_t>(dof) * sizeof(T), all = static_cast<std::size_t>(rows) * size;

@@ -258,17 +258,3 @@ def link_frames(spec: SceneSpec, robot: Any) -> Frames:
         name: (entities[at.link], None if at.link == name else Pose(at.position, at.wxyz))
         for name, at in place_links(spec.urdf, spec.merge_fixed).items()
     }
-
-
-def set_collision_group(scene: HeadlessScene, group: int) -> None:
-    """Put every shape of ``scene`` into collision group ``group``: shapes of different groups never touch.
-
-    PhysX's filter, as SAPIEN sets it up, compares the upper 16 bits of the fourth word.
-    """
-    for entity in scene.entities:
-        for component in entity.components:
-            if isinstance(component, physx.PhysxRigidBaseComponent):
-                for shape in component.collision_shapes:
-                    words = list(shape.get_collision_groups())
-                    words[3] = (words[3] & 0xFFFF) | (group << 16)
-                    shape.set_collision_groups(words)

@@ -1,7 +1,7 @@
 """Collision groups: words for PhysX's filter, by which pairs of bodies are ignored.
 
 Each shape has four words of 32 bits. As SAPIEN sets the filter up, two shapes are ignored if the upper halves of word 3
-differ (scenes of one pack), or if they share a bit of word 2 and the lower half of word 3. Else they may touch if word
+differ, or if they share a bit of word 2 and the lower half of word 3. Else they may touch if word
 0 of one shares a bit with word 1 of the other.
 
 The pairs to ignore are the edges of a graph of bodies. Each bit of word 2 ignores all pairs within a clique, so that it

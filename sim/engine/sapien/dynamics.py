@@ -25,8 +25,7 @@ from batchpid.sim.engine.sapien.building import (
     shape_owners,
 )
 from batchpid.sim.engine.sapien.collision_groups import Pair
-from batchpid.sim.engine.sapien.contact_prediction import WORLD, ContactPredictor, NearPair
-from batchpid.sim.engine.sapien.extents import link_extents, touching_pairs
+from batchpid.sim.engine.sapien.extents import WORLD, NearPair
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.description import RobotDescription
@@ -184,12 +183,6 @@ class Dynamics:
             if first != second:
                 names = tuple(self._owners[shape] for shape in contact.shapes if shape in self._owners)
                 yield names, min(point.separation for point in contact.points)
-
-    @cached_property
-    def contact_predictor(self) -> ContactPredictor:
-        """Predictor of contacts, for the spec's time step."""
-        pairs = touching_pairs(self._robot, self._spec.ground)
-        return ContactPredictor(link_extents(self._robot), pairs, self._robot.dof, self._spec.timestep)
 
     @_one_at_a_time
     def height(self, qpos: NDArray[Any], base_too: bool = False) -> float:

@@ -1,9 +1,9 @@
-"""Extents of a robot's links, and the pairs of links that may touch, for the prediction of contact."""
+"""Extents of a robot's links, and the pairs of links that may touch."""
 
 from __future__ import annotations
 
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from sapien import physx
@@ -11,10 +11,19 @@ from sapien import physx
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.link_reach import LinkExtent
 from batchpid.sim.engine.sapien.collision_groups import may_touch
-from batchpid.sim.engine.sapien.contact_prediction import WORLD
 
 MAX_BALLS = 8
 """Largest number of balls that cover one shape."""
+WORLD = -1
+"""Link number of the ground."""
+
+
+class NearPair(NamedTuple):
+    """Two shapes near each other: the numbers of their links, or WORLD, and their distance [m]."""
+
+    first: int
+    second: int
+    distance: float
 
 
 def link_extents(robot: Any) -> list[LinkExtent]:

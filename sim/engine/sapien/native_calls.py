@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.sim.engine.native import extension
-from batchpid.sim.engine.native.library import callback_table, functions
+from batchpid.sim.engine.native.library import functions
 from batchpid.sim.engine.sapien.calls import EngineCalls, PythonCalls
 
 _ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
@@ -43,7 +43,7 @@ class NativeCalls:
         pointers = [[pointer(item, kind) for item in items] for kind, items in (("robot", robots), ("system", systems))]
         self._native = extension("_gateway")
         self.gateway = self._native.gateway(functions(), *pointers, qf.shape[1])
-        self.systems, self.qf, self.skip = self._objects[1], qf, skip
+        self.qf, self.skip = qf, skip
 
     def qpos(self, dtype: Any) -> NDArray[Any]:
         """Return the joint positions, a new array."""
@@ -73,7 +73,7 @@ class NativeCalls:
 
 
 def pointer(wrapper: Any, kind: str) -> int:
-    """Return the address of the C++ object in ``wrapper``, a "robot", "system", "body" or "joint".
+    """Return the address of the C++ object in ``wrapper``, a "robot", "system" or "joint".
 
     It comes by pybind11's conduit, which checks type and ABI.
     """
@@ -91,8 +91,3 @@ def gateway_address(gateway: Any) -> int:
 def gateway_sim_step(address: int, *arrays: NDArray[np.float64]) -> int:
     """Do a sim step of the group at ``address``: see :class:`batchpid.sim.engine.sapien.sim_step.NativeStep`."""
     return extension("_gateway").sim_step(address, *arrays)
-
-
-def contact_maps(gateway: Any) -> list[int]:
-    """Return the address of the map of contacts of each system of a gateway; 0 if it is not found."""
-    return extension("_gateway").contacts(gateway, callback_table())

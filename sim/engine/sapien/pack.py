@@ -1,9 +1,7 @@
 """Pack of scenes in one process, read and written as arrays.
 
-A pack is M scenes with one robot each, stepped together, several of them in one PhysX system. All stand at the origin;
-the shapes of each scene are in a collision group to themselves, so that scenes never meet. That is bit-identical to one
-system per scene, and 20 to 33 % cheaper. A robot moves to a system to itself before something touches it
-(:mod:`batchpid.sim.engine.sapien.contact_prediction`).
+A pack is M scenes, each with one robot and a PhysX system. PhysX solves the contacts of a system in an order that
+depends on everything in the system, so robots that share one would not move bit-identically to a robot alone.
 
 The loop uses only the members of :class:`batchpid.sim.engine.protocol.EnginePack` and its capabilities. Longer than 300
 lines because that is the whole interface between loop and engine.
@@ -11,7 +9,7 @@ lines because that is the whole interface between loop and engine.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -26,15 +24,8 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.native_model import NativeModel
-from batchpid.sim.engine.sapien.building import (
-    build_scene,
-    engine_settings,
-    link_frames,
-    new_system,
-    set_collision_group,
-)
+from batchpid.sim.engine.sapien.building import build_scene, engine_settings, link_frames, new_system
 from batchpid.sim.engine.sapien.calls import EngineCalls
-from batchpid.sim.engine.sapien.contact_watch import ContactWatch
 from batchpid.sim.engine.sapien.dynamics import scene_dynamics
 from batchpid.sim.engine.sapien.native_calls import engine_calls
 from batchpid.sim.engine.sapien.sim_step import NativeStep
@@ -46,39 +37,29 @@ _ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
 
 
 class Pack(SingleOwner):
-    """M scenes of ``spec``, ``system_size`` to a PhysX system. Arrays are (M, dof), in SAPIEN's order, SI units.
+    """M scenes of ``spec``. Arrays are (M, dof), in SAPIEN's order, SI units.
 
     Attributes
     ----------
     robots, systems
-        SAPIEN's articulation and PhysX system of each scene; a robot that changes its system is rebuilt.
-    isolated
-        Robots that have a system to themselves because contact was predicted (M,); none with ``isolates`` False.
+        SAPIEN's articulation and PhysX system of each scene; a robot that is placed may be rebuilt in a new system.
     qf
         Efforts last written, in the engine's precision, without the efforts of a coupling.
     friction
         Friction and damping that the loop has to apply to the joints.
-    watch
-        Watch over the contacts.
     armature
         Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg].
     steps_natively
         Whether the calls into the engine are native.
     """
 
-    def __init__(
-        self, spec: SceneSpec, size: int, first_env: int = 0, system_size: int = 8, isolates: bool = True
-    ) -> None:
+    def __init__(self, spec: SceneSpec, size: int, first_env: int = 0) -> None:
         self.spec, self.first_env, self.steps_natively = spec, first_env, native.status().active
-        # A robot that stands on the ground is touched from the start, and so are free bodies.
-        shares = spec.fixed_base and spec.build is None
-        shared, self._isolates = system_size if shares else 1, shares and isolates and spec.collisions
-        systems = [new_system(spec) for _ in range(-(-size // shared))]
-        self._shared_systems = [systems[row // shared] for row in range(size)]
-        self.systems = list(self._shared_systems)
+        self.systems = [new_system(spec) for _ in range(size)]
         built = [self._build(row, system) for row, system in enumerate(self.systems)]
         # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.
         self._scenes, self.robots = map(list, zip(*built, strict=True))
+        self._stepped = np.zeros(size, bool)  # robots that did a sim step since they were built
         self._contents = []
         if spec.build is not None:
             with engine_settings(spec):
@@ -88,12 +69,7 @@ class Pack(SingleOwner):
                 if not spec.collisions:
                     for env, scene in enumerate(self._scenes, start=first_env):
                         refuse_shapes(scene, env)
-        for row, scene in enumerate(self._scenes):
-            set_collision_group(scene, row + 1)
         self.size, self.dof = size, self.robots[0].dof
-        self.isolated = np.zeros(size, bool)
-        self.watch = ContactWatch(spec, self.robots[0], size)
-        self._stepped_qpos: NDArray[Any] | None = None  # of the last sim step, where they were read
         self.friction = self._friction()
         self._implicit = np.array([[joint.armature[0] for joint in self.robots[0].active_joints]])
         self.armature = self._motors = np.zeros((1, self.dof))
@@ -126,15 +102,8 @@ class Pack(SingleOwner):
         robots = self.robots
         self._joints = [joint for robot in robots for joint in robot.active_joints]
         self._calls = engine_calls(
-            robots,
-            list(dict.fromkeys(self.systems)),
-            self._joint_qf[: len(robots)],
-            self._suspended[: len(robots)],
-            self.steps_natively,
+            robots, self.systems, self._joint_qf[: len(robots)], self._suspended[: len(robots)], self.steps_natively
         )
-        self._stepped_qpos = None
-        watched = ~(self.isolated | self._suspended)[: len(robots)]
-        self.watch.bind(robots, self.systems, np.flatnonzero(watched).tolist() if self._isolates else [])
 
     def step(self, update: bool = True) -> None:
         """Do one sim step of every scene, with constraint efforts on coupled joints.
@@ -147,10 +116,8 @@ class Pack(SingleOwner):
             qpos, qvel = self._calls.qpos(np.float64), self._calls.qvel(np.float64)
             self._joint_qf[...] = self._constraint.apply(self.qf, qpos, qvel)
             self._calls.write_qf()
+        self._stepped[...] = True
         self._calls.step()
-        predicted, self._stepped_qpos = self.watch.step(self._read_float64_qpos)
-        if predicted:
-            self.isolate(predicted)
 
     @property
     def calls(self) -> EngineCalls:
@@ -172,13 +139,7 @@ class Pack(SingleOwner):
         """Return the sim step as one native call, which holds for the present :attr:`calls`."""
         constraint = None if self._constraint is None else self._constraint.address
         reads, joints = (gravity, coriolis, velocities), self._joints if drives else None
-        return NativeStep(self.calls, self.systems, self.watch, *reads, speed_limit, constraint, joints)
-
-    def look(self, left: list[int]) -> None:
-        """Look for contacts after a :meth:`compiled_step` that led ``left`` out of regions."""
-        self._stepped_qpos = None
-        if predicted := self.watch.look(left):
-            self.isolate(predicted)
+        return NativeStep(self.calls, self._stepped, *reads, speed_limit, constraint, joints)
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
         """Give the constraint efforts of robots ``rows`` the present mass matrix and passive force."""
@@ -198,32 +159,19 @@ class Pack(SingleOwner):
         """Return the model of the passive force where compiled steps do not read it."""
         return NativeModel(self.spec)
 
-    def isolate(self, rows: Iterable[int]) -> None:
-        """Move each robot of ``rows`` that shares a system to a new one, in its present state."""
-        self._rebuild({row: new_system(self.spec) for row in rows if self._isolates and not self.isolated[row]})
+    def _renew(self, rows: Sequence[int]) -> None:
+        """Rebuild the robots ``rows`` in new systems, in which earlier contacts have no influence on the next ones.
 
-    def _assign_systems(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
-        """Assign systems to robots that were placed: the shared one, or a new one where contact is predicted.
-
-        No contact before the placement then has any influence.
+        Robots without shapes have no contacts. Scenes with user content stay, because ``build`` is called only once.
         """
-        systems = {}
-        for row, predicted in zip(rows, self.watch.place(rows, qpos, qvel), strict=True):
-            if predicted:
-                systems[row] = new_system(self.spec)
-            elif self.isolated[row]:
-                systems[row] = self._shared_systems[row]
-        self._rebuild(systems)
-
-    def _rebuild(self, systems: dict[int, Any]) -> None:
-        """Rebuild the robots of some rows in these systems, in their present state."""
-        for row, system in systems.items():
+        if not self.spec.collisions or self._contents or not self._stepped[rows].any():
+            return
+        for row in rows:
+            if not self._stepped[row]:
+                continue
             old, old_scene = self.robots[row], self._scenes[row]
-            scene, new = self._build(row, system)
-            set_collision_group(scene, row + 1)
-            new.set_qpos(old.get_qpos())
-            new.set_qvel(old.get_qvel())
-            new.set_qf(self.qf[row])
+            self.systems[row] = new_system(self.spec)
+            self._scenes[row], new = self._build(row, self.systems[row])
             for joint, before in zip(new.active_joints, old.active_joints, strict=True):
                 joint.set_drive_properties(before.stiffness, before.damping, before.force_limit, before.drive_mode)
                 joint.set_drive_target(before.drive_target)
@@ -231,17 +179,12 @@ class Pack(SingleOwner):
                 joint.set_armature(before.armature)
             _disable_gravity(new, bool(self._suspended[row]))
             old_scene.clear()
-            self.systems[row], self._scenes[row], self.robots[row] = system, scene, new
-            self.isolated[row] = system is not self._shared_systems[row]
-        if systems:
-            self._bind()
+            self.robots[row] = new
+        self._stepped[rows] = False
+        self._bind()
 
     def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
-        stepped, self._stepped_qpos = self._stepped_qpos, None
-        return stepped if stepped is not None and dtype is np.float64 else self._calls.qpos(dtype)
-
-    def _read_float64_qpos(self) -> NDArray[np.float64]:
-        return self._calls.qpos(np.float64)
+        return self._calls.qpos(dtype)
 
     def read_qvel(self, dtype: Any = np.float64) -> NDArray[Any]:
         return self._calls.qvel(dtype)
@@ -272,7 +215,7 @@ class Pack(SingleOwner):
 
         They are always set, since a robot whose state is NaN has lost its root, too.
         """
-        self._stepped_qpos = None
+        self._renew(rows)
         for row, position, velocity, base in zip(rows, qpos, qvel, roots, strict=True):
             robot = self.robots[row]
             write_root(robot, base)
@@ -284,8 +227,6 @@ class Pack(SingleOwner):
                 self._contents[row].reset()
         if self._constraint is not None:
             self._constraint.place(rows, qpos)
-        if self._isolates:
-            self._assign_systems(rows, qpos, qvel)
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
         """Raise TypeError: the robots of this pack equal the model; see :mod:`batchpid.sim.engine.sapien.variation`."""
@@ -293,31 +234,30 @@ class Pack(SingleOwner):
 
     def state_sizes(self) -> list[int]:
         """Return the number of values in the state of each scene: of the robot, and of its content."""
-        robot = 2 * self.dof + ROOT_SIZE + 1 + self._turning.size
+        robot = 2 * self.dof + ROOT_SIZE + self._turning.size
         return [robot + content.size for content in self._contents] or [robot] * self.size
 
     def read_state(self) -> NDArray[np.float64]:
-        """Return the state of each scene (M, values): qpos, qvel, root, whether it is isolated, positions without jumps
-        of coupled continuous joints, content, then NaN.
+        """Return the state of each scene (M, values): qpos, qvel, root, positions without jumps of coupled
+        continuous joints, content, then NaN.
         """
         sizes = self.state_sizes()
         states = np.full((self.size, max(sizes)), np.nan)
-        for row, (robot, isolated) in enumerate(zip(self.robots, self.isolated, strict=True)):
+        for row, robot in enumerate(self.robots):
             content = [scene.read() for scene in self._contents[row : row + 1]]
             turned = [] if self._constraint is None else self._constraint.unwrapped[row, self._turning]
-            parts = robot.get_qpos(), robot.get_qvel(), read_root(robot), [isolated], turned, *content
+            parts = robot.get_qpos(), robot.get_qvel(), read_root(robot), turned, *content
             states[row, : sizes[row]] = np.concatenate(parts)
         return states
 
     def write_state_rows(self, states: NDArray[np.float64]) -> None:
-        ends = np.cumsum([self.dof, self.dof, ROOT_SIZE, 1, self._turning.size])
-        qpos, qvel, roots, isolated, turned, contents = np.split(states.astype(np.float32), ends, axis=1)
+        ends = np.cumsum([self.dof, self.dof, ROOT_SIZE, self._turning.size])
+        qpos, qvel, roots, turned, contents = np.split(states.astype(np.float32), ends, axis=1)
         self._place(range(self.size), qpos, qvel, roots)
         if self._constraint is not None:
             self._constraint.unwrapped[:, self._turning] = turned
         for content, row in zip(self._contents, contents, strict=False):
             content.write(row)
-        self.isolate(np.flatnonzero(isolated).tolist())
 
     def suspend(self, mask: NDArray[np.bool_]) -> None:
         if (mask == self._suspended).all():
@@ -361,7 +301,7 @@ class Pack(SingleOwner):
                 joint.set_drive_velocity_target(target)
 
     def close(self) -> None:
-        self.robots, self.systems, self._contents, self._scenes, self._shared_systems = [], [], [], [], []
+        self.robots, self.systems, self._contents, self._scenes = [], [], [], []
         self._bind()
 
 

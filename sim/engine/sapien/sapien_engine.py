@@ -23,27 +23,32 @@ class SapienEngine:
     capabilities: frozenset[Capability] = frozenset(get_args(Capability))
     physics: Mapping[str, Any] = PHYSICS
     group_size = 16
-    shares_systems = True
 
     def is_physics(self, settings: object) -> bool:
         """Return whether these are :class:`batchpid.sim.Physics`."""
         return isinstance(settings, Physics)
+
+    def least_memory(self, num_envs: int, dof: int) -> int:
+        """Return a lower estimate of the bytes of ``num_envs`` robots, each with a PhysX system.
+
+        Chains of 1 to 30 boxes and jaco2 take up to 35 % more; a panda, with large collision meshes, 2.7 times as much.
+        """
+        return num_envs * (405_000 + 6_000 * dof)
 
     def make_pack(
         self,
         spec: SceneSpec,
         size: int,
         first_env: int = 0,
-        system_size: int = 8,
         variation: Variation | None = None,
         carrier: str = "",
         links: Sequence[str] = (),
         workspace: dict[Any, Any] | None = None,
     ) -> Pack:
-        """Return a new pack, with at most ``system_size`` scenes to a PhysX system."""
+        """Return a new pack, with a PhysX system for each scene."""
         if variation is None:
-            return Pack(spec, size, first_env, system_size)
-        return VariedPack(spec, size, first_env, system_size, variation, carrier, links)
+            return Pack(spec, size, first_env)
+        return VariedPack(spec, size, first_env, variation, carrier, links)
 
     scene_dynamics = staticmethod(scene_dynamics)
     robot_dynamics = staticmethod(robot_dynamics)

@@ -39,7 +39,6 @@ class VariedPack(Pack):
         spec: SceneSpec,
         size: int,
         first_env: int,
-        system_size: int,
         variation: Variation,
         carrier: str,
         links: Sequence[str],
@@ -51,7 +50,7 @@ class VariedPack(Pack):
         self._models = {name: total([part.inertia for part in body.parts]) for name, body in self._bodies.items()}
         self._added = {name: np.zeros((size, 6, 6)) for name in self._bodies}  # spatial inertias, to the models'
         self._frames: list[tuple[Pose, Pose] | None] = []
-        super().__init__(spec, size, first_env, system_size)
+        super().__init__(spec, size, first_env)
         if variation.armature is not None:
             self._motors = variation.armature  # vary() changes its rows
         self.write_joints(None)

@@ -29,7 +29,7 @@ def test_every_case_moves_and_has_a_rate(workload, engine):
     places = {case: result.final for case, result in results.items()}
     if engine == "sapien":  # with the friction of the tutorial's loop
         assert np.abs(places["tutorial"] - places["closed loop"])[workload.moving].max() < 0.06
-        assert np.abs(places["bare engine"] - places["bare engine, pack by pack"]).max() < 1e-6
+        assert np.abs(places["bare engine"] - places["bare engine, robot by robot"]).max() < 1e-6
     np.testing.assert_array_equal(places["closed loop"], places["closed loop, tick by tick"])
 
 

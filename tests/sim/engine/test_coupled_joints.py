@@ -142,7 +142,7 @@ def test_free_motion_is_that_of_the_reduced_equations(physics, tmp_path):
 
 @pytest.mark.quick_rows(1)
 @pytest.mark.parametrize("control", ["pid", "drive", "effort"])
-def test_results_do_not_depend_on_packs_workers_or_snapshots(control, tmp_path):
+def test_results_do_not_depend_on_workers_or_snapshots(control, tmp_path):
     robot = arm(tmp_path, joints=2)
     start = robot.sample(9, seed=1)
     setpoints = np.zeros((6, 9, robot.dof)) if control == "effort" else np.tile(robot.sample(9, seed=2), (6, 1, 1))
@@ -161,7 +161,7 @@ def test_results_do_not_depend_on_packs_workers_or_snapshots(control, tmp_path):
             return runner.rollout(setpoints[3:, envs])
 
     reference = run()
-    for options in ({"pack_size": 1}, {"workers": 2}, {"again": True}):
+    for options in ({"workers": 2}, {"again": True}):
         assert_identical(reference, run(**options), skip={"time"})
     few = run(slice(3, 5))
     for name in ("qpos", "qvel", "effort"):

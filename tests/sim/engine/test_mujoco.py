@@ -358,7 +358,6 @@ def test_a_state_that_is_not_finite_is_contained(panda, tmp_path, monkeypatch):
     ("options", "message"),
     [
         ({"physics": Physics("PGS", 4)}, "physics.*'accurate'"),
-        ({"pack_size": 4}, "pack_size.*leave it out"),
         ({"build": lambda scene, env: None}, "build.*'sapien'"),
         ({"engine": "mujocoo"}, "engine.*'mujoco'"),
     ],

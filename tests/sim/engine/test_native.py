@@ -51,7 +51,7 @@ CASES = {
     "drive": {"control": "drive"},
     "efforts, in contact": {"control": "effort"},
     "fast": {"physics": "fast"},
-    "without compensation": {"compensate": "none", "pack_size": 2},
+    "without compensation": {"compensate": "none"},
     "a speed limit, which stops envs": {"control": "effort", "speed_limit": 60.0},
 }
 

@@ -154,12 +154,15 @@ class ToyEngine:
     """Engine without any capability."""
 
     name, title, capabilities, physics = "toy", "Toy", frozenset(), {"accurate": Solver(1)}
-    group_size, shares_systems = 4, False
+    group_size = 4
 
     def is_physics(self, settings):
         return False
 
-    def make_pack(self, spec, size, first_env=0, system_size=8, variation=None, carrier="", links=(), workspace=None):
+    def least_memory(self, num_envs, dof):
+        return num_envs * dof
+
+    def make_pack(self, spec, size, first_env=0, variation=None, carrier="", links=(), workspace=None):
         return DoubleIntegrators(spec, size, first_env)
 
     def robot_dynamics(self, robot, ground=None):

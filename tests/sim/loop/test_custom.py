@@ -64,8 +64,8 @@ def test_the_law_as_a_controller_is_the_pid(panda):
     assert np.ptp(ours.qpos, axis=0).max() > 0.01
 
 
-@pytest.mark.parametrize("options", [{"workers": 2}, {"pack_size": 1}, {"num_envs": 3}], ids=str)
-def test_any_workers_and_packing_are_bit_identical(panda, options):
+@pytest.mark.parametrize("options", [{"workers": 2}, {"num_envs": 3}], ids=str)
+def test_any_workers_and_envs_are_bit_identical(panda, options):
     if "num_envs" in options:
         with Runner(panda, 3, control=Counter(), workers=0, substeps=10) as runner:
             few = runner.rollout(np.ones((TICKS, 3, panda.dof)))
@@ -282,7 +282,7 @@ class Reuses(Counter):
 
 def test_arrays_of_the_controller_may_be_used_again(panda):
     def run(reuse):
-        options = {"workers": 0, "substeps": 3, "control": Reuses(reuse), "collisions": False, "pack_size": 2}
+        options = {"workers": 0, "substeps": 3, "control": Reuses(reuse), "collisions": False}
         with Runner(panda, 32, **options) as runner:
             return [runner.step(np.outer(np.linspace(0, 0.03, 32), np.ones(9))) for _ in range(3)][-1]
 

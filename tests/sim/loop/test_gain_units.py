@@ -49,9 +49,9 @@ def test_any_packing_and_workers_are_bit_identical(units, panda):
     start = robot.start + rng.uniform(-0.2, 0.0, (5, robot.dof)) * [1, 1, 1, 1, 1, 0, 1, 0, 0]
     goal = np.clip(start + rng.uniform(-0.5, 0.5, start.shape), robot.lower, robot.upper)
     outcome = []
-    for workers, pack_size in ((0, 8), (2, 2)):
+    for workers in (0, 2):
         params = acceleration_params(robot, units)
-        with Runner(robot, 5, params=params, workers=workers, pack_size=pack_size) as runner:
+        with Runner(robot, 5, params=params, workers=workers) as runner:
             runner.reset(start)
             outcome.append(runner.rollout(np.broadcast_to(goal, (10, 5, robot.dof))))
     assert np.abs(outcome[0].qpos[-1] - start).max() > 0.05

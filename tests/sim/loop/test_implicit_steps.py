@@ -99,11 +99,11 @@ def test_setpoint_steps_in_long_ticks_settle():
 def test_any_packing_and_backend_gives_the_same_motion(panda):
     start = np.broadcast_to(panda.start, (3, panda.dof)) - [[0.0], [0.1], [0.2]] * np.arange(9).clip(0, 1)
     goal, outcome = panda.settings.target, []
-    options = {"timestep": 1 / 200, "workers": 0, "params": params_of(panda, 50.0, ki=1e4, effort_limit=80.0)}
-    for more in ({"pack_size": 3}, {"pack_size": 2}, {"backend": "jax"}):
+    options = {"timestep": 1 / 200, "params": params_of(panda, 50.0, ki=1e4, effort_limit=80.0)}
+    for more in ({}, {"workers": 2}, {"backend": "jax"}):
         if "backend" in more:
             pytest.importorskip("jax")
-        with Runner(panda, 3, **options, **more) as runner:
+        with Runner(panda, 3, **options, **{"workers": 0, **more}) as runner:
             runner.reset(np.clip(start, panda.lower, panda.upper))
             outcome.append(runner.rollout(np.broadcast_to(goal, (4, 3, panda.dof))))
     assert_identical(outcome[1], outcome[0])

@@ -70,7 +70,7 @@ def test_neither_workers_nor_a_restore_nor_company_show(panda, tmp_path):
 
 
 @pytest.mark.slow
-def test_delays_that_differ_from_group_to_group_are_independent_of_workers_and_packs(panda):
+def test_delays_that_differ_from_group_to_group_are_independent_of_workers(panda):
     """In flight too: a history is as long as the largest delay of all envs, in every group."""
     envs, table = 20, np.tile(panda.settings.target, (4, 1))
     delays = np.zeros((envs, panda.dof))
@@ -88,7 +88,7 @@ def test_delays_that_differ_from_group_to_group_are_independent_of_workers_and_p
             assert runner.actuators.command_delay.max() == 0.003
             return [*rollouts, runner.rollout(table)]
 
-    for ours, theirs in zip(run(workers=0), run(workers=2, pack_size=1), strict=True):
+    for ours, theirs in zip(run(workers=0), run(workers=2), strict=True):
         assert_identical(ours, theirs)
 
 
@@ -178,7 +178,7 @@ def test_joints_alone_leave_signals_alone_and_are_in_snapshots(panda, tmp_path):
         second = runner.rollout(table[4:])
     snapshot.save(tmp_path / "worn.npz")
     assert snapshot.states.actuators == {}
-    with Runner(panda, N, workers=0, pack_size=1) as runner:
+    with Runner(panda, N, workers=0) as runner:
         runner.actuators = worn
         runner.reset()
         assert_identical(first, runner.rollout(table[:4]))

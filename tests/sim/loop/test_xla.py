@@ -78,11 +78,11 @@ def test_two_seconds_of_motion(name, physics, dtype):
 @pytest.mark.parametrize("options", [{}, {"speed_limit": 60.0, "on_fault": "reset"}, {"compensate": "none"}], ids=str)
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 def test_contacts_and_faults_are_those_of_the_loop_in_numpy(panda, engine, options):
-    """Sums of efforts are exact, so that the results are: in contact, with robots isolated on the way and faults."""
+    """Sums of efforts are exact, so that the results are: in contact, and with faults."""
     pytest.importorskip("mujoco.batch" if engine == "mujoco" else "sapien")
     rng = np.random.default_rng(3)
     efforts = rng.normal(size=(20, N, panda.dof)) * np.minimum(panda.effort_limit, 50)
-    options = {"engine": engine, **({"pack_size": 3} if engine == "sapien" else {}), **options}
+    options = {"engine": engine, **options}
     results = []
     for backend in ("jax", "numpy"):
         with Runner(panda, N, control="effort", backend=backend, workers=0, substeps=10, **options) as runner:
@@ -94,9 +94,8 @@ def test_contacts_and_faults_are_those_of_the_loop_in_numpy(panda, engine, optio
 
 
 @pytest.mark.slow
-def test_any_groups_and_packs_are_bit_identical(panda):
+def test_any_groups_are_bit_identical(panda):
     expected = rollout(panda, envs=20, ticks=6)
-    assert_identical(rollout(panda, envs=20, ticks=6, pack_size=1), expected)
     assert_identical(rollout(panda, envs=2, ticks=6, workers=1), expected.for_envs(slice(0, 2)))
 
 
@@ -289,7 +288,6 @@ def test_random_efforts_resets_snapshots_and_faults_are_those_of_the_loop_in_num
     options = {
         "control": "effort",
         "substeps": int(rng.integers(1, 12)),
-        "pack_size": int(rng.integers(1, 9)),
         "on_fault": rng.choice(["hold", "reset"]),
         "speed_limit": rng.choice([20.0, 1000.0]),
         "on_invalid_input": "contain",
