@@ -36,7 +36,7 @@ from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import ClusterWarning, Ray
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
-from batchpid.sim.robot.description import RobotFunctions, register_engine
+from batchpid.sim.robot.description import Dynamics, RobotDescription, RobotFunctions, register_engine
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.limits import MovingSetpointWarning, SetpointWarning
 from batchpid.sim.robot.loop_stability import StabilityWarning
@@ -107,11 +107,17 @@ def _engine() -> RobotFunctions:
     return load_engine()
 
 
+def _dynamics(robot: RobotDescription, ground: bool | None) -> Dynamics:
+    from batchpid.sim.engine.robot_model import robot_model
+
+    return robot_model(robot, ground)
+
+
 def _plot() -> Callable[..., Any]:
     from batchpid.sim.plots import step_responses
 
     return step_responses
 
 
-register_engine(_engine)
+register_engine(_engine, _dynamics)
 register_plot(_plot)

@@ -22,6 +22,7 @@ from batchpid.checks.validate import instance
 from batchpid.errors import BatchPIDError, CallOrderError, InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.sim.arguments import Arguments
+from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.custom import initial_state
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
@@ -87,9 +88,8 @@ class Session:
         faults = FaultLog(options.num_envs, robot.joint_names, options.timestep, options.on_fault, entry_names)
         contacts = None
         if not options.collisions:
-            engine = options.load_engine()
             contacts = MissedContactLog(
-                options.num_envs, options.timestep, lambda qpos: engine.robot_dynamics(robot).nearest_links(qpos)
+                options.num_envs, options.timestep, lambda qpos: robot_model(robot).nearest_links(qpos)
             )
         randomization = options.randomization
         draws = NOTHING if randomization is None else randomization.first(robot, options.num_envs)

@@ -189,7 +189,7 @@ def _folded_bias(c: Dialect, tree: RigidTree) -> str:
     return _folded(c, tree, lines)
 
 
-def _folded(c: Dialect, tree: KinematicTree, lines: str) -> str:
+def _folded(c: Dialect, tree: RigidTree, lines: str) -> str:
     """Return ``lines`` after the tables of the coupling that they need; no lines without followers."""
     if tree.coupling.is_identity:
         return ""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.display import summary
-from batchpid.arrays.read_only import read_only
 from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.read_only import read_only
 from batchpid.checks.validate import choice, entries, names, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
@@ -175,6 +175,27 @@ class RigidTree:
         remedy = f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(self.links)}"
         raise InvalidArgumentError("link", "unknown link", value=link, remedy=remedy)
 
+    @cached_property
+    def tool(self) -> str:
+        """Name of the link at the end of the longest chain of joints, or of the hand if that chain ends in fingers."""
+        moves = [kind != "fixed" for kind in self.joint_types]
+        depth, branches = [0] * len(self.links), [0] * len(self.links)
+        for child, above in enumerate(self.parent[1:].tolist(), start=1):
+            depth[child] = depth[above] + moves[child]
+        for child, above in reversed(list(enumerate(self.parent.tolist()))[1:]):
+            branches[above] += moves[child] or branches[child] > 0
+        link = tip = int(np.argmax(depth))
+        while link > 0 and depth[tip] - depth[link] <= 2:
+            if branches[link] > 1:
+                return self.links[link]
+            link = int(self.parent[link])
+        return self.links[tip]
+
+    @cached_property
+    def held(self) -> RigidTree:
+        """Same tree on a fixed base, with all joints independent."""
+        return replace(self, fixed_base=True, coupling=Coupling.of(self.dof))
+
     @property
     def independent(self) -> NDArray[np.bool_]:
         """Mask (dof,) of the joints that are not followers."""
@@ -281,13 +302,17 @@ class RigidTree:
 
     def varied(self, added: Mapping[str, Float64]) -> Bodies:
         """Return the bodies of n robots with spatial inertias (n, 6, 6) added to links, in the axes of the links."""
-        rows = np.tile(self.inertias(), (len(next(iter(added.values()))), 1, 1))
         of_bodies = dict[int, Float64]()
         for name, matrices in added.items():
             link = self.index(name)
             moved = moved_matrix(matrices, self.bodies.link_frames[link])
             of_bodies[self.link_bodies[link]] = of_bodies.get(self.link_bodies[link], 0.0) + moved
-        for body, matrices in of_bodies.items():
+        return self.with_added(of_bodies)
+
+    def with_added(self, added: Mapping[int, Float64]) -> Bodies:
+        """Return the bodies of n robots with spatial inertias (n, 6, 6) added, by number, in the axes of the bodies."""
+        rows = np.tile(self.inertias(), (len(next(iter(added.values()))), 1, 1))
+        for body, matrices in added.items():
             mass, center, tensor = np.split(rows[0, body], [1, 4])
             own = SpatialInertia(float(mass[0]), center, tensor.reshape(3, 3))
             rows[:, body] = inertia_rows(spatial_matrix(own) + matrices)

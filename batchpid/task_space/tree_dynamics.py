@@ -43,37 +43,42 @@ from batchpid.task_space.tree_kinematics import (
 )
 
 
-def mass_matrix(tree: RigidTree, qpos: Any) -> Any:
+def mass_matrix(tree: RigidTree, qpos: Any, bodies: Bodies | None = None) -> Any:
     """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof), armature included.
+
+    ``bodies`` are those of robots that differ from the tree, one for each row: :meth:`RigidTree.varied`.
 
     Raises
     ------
     InvalidArgumentError
         The shape is wrong.
     """
-    (q,), bodies, xp = prepared(tree, qpos=qpos)
-    if (found := native_rows.kinematics(tree, ("mass_matrix",), q)) is not None:
+    (q,), own, xp = prepared(tree, qpos=qpos)
+    found = native_rows.kinematics(tree, ("mass_matrix",), q) if bodies is None else None
+    if found is not None:
         return found[0]
     with quiet():
-        return mass_matrix_of(tree, bodies, motions_of(tree, bodies, q, xp), xp)
+        return mass_matrix_of(tree, bodies or own, motions_of(tree, own, q, xp), xp)
 
 
-def bias(tree: RigidTree, qpos: Any, qvel: Any, turning: Any = None) -> Any:
+def bias(tree: RigidTree, qpos: Any, qvel: Any, turning: Any = None, *, bodies: Bodies | None = None) -> Any:
     """Return h(q, q') (..., dof) [N m or N]: the efforts that cancel gravity and Coriolis and centrifugal forces.
 
-    A floating base turns at ``turning`` (..., 3) [rad/s], in its own axes; default 0.
+    A floating base turns at ``turning`` (..., 3) [rad/s], in its own axes; default 0. ``bodies`` are as in
+    :func:`mass_matrix`.
 
     Raises
     ------
     InvalidArgumentError
         A shape is wrong.
     """
-    (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
-    if (found := native_rows.kinematics(tree, ("bias",), q, v)) is not None:
+    (q, v), own, xp = prepared(tree, qpos=qpos, qvel=qvel)
+    found = native_rows.kinematics(tree, ("bias",), q, v) if bodies is None else None
+    if found is not None:
         return found[0]
     with quiet():
-        motions = motions_of(tree, bodies, q, xp)
-        return effort_of(tree, bodies, motions, velocities_of(tree, motions, v, xp, turning), xp, turning)
+        motions = motions_of(tree, own, q, xp)
+        return effort_of(tree, bodies or own, motions, velocities_of(tree, motions, v, xp, turning), xp, turning)
 
 
 def gravity(tree: RigidTree, qpos: Any) -> Any:
@@ -177,9 +182,9 @@ def _of_base(tree: RigidTree, bodies: Bodies, all_: _Composite, xp: Any) -> Any:
     tensor = all_.tensor[..., roots, :, :].sum(-3) + bodies.base_tensor + _about_origin(own, bodies.base_center, xp)
     eye = xp.eye(3, dtype=moment.dtype)
     crossed = xp.stack([cross(moment, eye[axis] + xp.zeros_like(moment)) for axis in range(3)], axis=-1)  # c x
-    upper = xp.concatenate([mass[..., None] * eye, -crossed], axis=-1)
-    lower = xp.concatenate([crossed, tensor + xp.zeros_like(crossed)], axis=-1)
-    return xp.concatenate([upper + xp.zeros_like(lower), lower], axis=-2)
+    zero = xp.zeros_like(crossed)
+    upper = xp.concatenate([mass[..., None] * eye + zero, -crossed], axis=-1)
+    return xp.concatenate([upper, xp.concatenate([crossed, tensor + zero], axis=-1)], axis=-2)
 
 
 def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: Any) -> Any:

@@ -35,7 +35,7 @@ class ExciteCommand:
     """File to write: .csv. Default: out/ROBOT.excite.csv."""
     force: flags.Force = False
 
-    imports = ("batchpid.sim.engine.sapien.dynamics", "batchpid.sim.identification.excitation")
+    imports = ("batchpid.sim.engine.robot_model", "batchpid.sim.identification.excitation")
 
     def run(self) -> None:
         """Run the command."""

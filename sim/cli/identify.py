@@ -71,7 +71,7 @@ class IdentifyCommand:
 
     imports = (
         "batchpid.sim.plots",
-        "batchpid.sim.engine.sapien.dynamics",
+        "batchpid.sim.engine.robot_model",
         "batchpid.sim.identification.identification",
     )
 

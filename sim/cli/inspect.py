@@ -41,7 +41,7 @@ class InspectCommand:
     engine: flags.Switch = False
     """Print the kind of the calls into the engine too, and the reason if they are not native."""
 
-    imports = ("batchpid.sim.engine.sapien.dynamics",)
+    imports = ("batchpid.sim.engine.robot_model",)
 
     def run(self) -> int:
         """Run the command and return its exit status."""

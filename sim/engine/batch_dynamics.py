@@ -4,15 +4,7 @@ Some joints move (``joints``), others rest or follow one of them: q_whole = rest
 G. With the mass matrix M and the passive forces h (gravity, Coriolis and centrifugal forces) of all joints, the
 joints that move have G^T M G and G^T h.
 
-The extension computes M by composite rigid bodies (:mod:`batchpid.sim.engine.rigid_body`) and h by the recursive
-Newton-Euler algorithm without acceleration of the joints (R. Featherstone, Rigid Body Dynamics Algorithms, Springer,
-2008, section 5.3), in the axes of the base and about its origin. With the motions s_j of the joints, the velocity V and
-acceleration A of a body, and its inertia I, from the base to the tips::
-
-    V_j = V_above + s_j q'_j       A_j = A_above + V_j x s_j q'_j       F_j = I_j A_j + V_j x* I_j V_j
-
-and back, h_j = s_j . (sum of the F of all that joint j moves). The base has the acceleration -g. Without the extension
-Pinocchio computes both, on SAPIEN's model: they agree to 1e-9, with a payload to the rounding of SAPIEN's masses.
+M and h are those of :mod:`batchpid.task_space.tree_dynamics`, for all robots in native code where it is used.
 
 A step of length dt under efforts tau and Coulomb friction of at most F, with D = M + added inertia (diagonal)::
 
@@ -26,24 +18,19 @@ limits.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine import native
-from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.native.interface import DYNAMICS, STEP
-from batchpid.sim.engine.protocol import RobotModel
-from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.robot.description import RobotDescription
-
-Models = Callable[[float], RobotModel]
-"""Model of a robot with a payload [kg]."""
-_MOST_PAYLOADS = 64
-"""Most models of robots with a payload that are kept."""
+from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.spatial_inertia import SpatialInertia, spatial_matrix
 
 
 class Passive(NamedTuple):
@@ -72,20 +59,30 @@ SWEEPS = 2
 """Sweeps over the joints in a step, begun with the friction of the step before."""
 
 
-def batch_dynamics(robot: RobotDescription, joints: tuple[int, ...]) -> NativeBatchDynamics | PinocchioBatchDynamics:
+def batch_dynamics(robot: RobotDescription, joints: tuple[int, ...]) -> NativeBatchDynamics | NumpyBatchDynamics:
     """Return the dynamics of ``joints`` of ``robot`` on a fixed base: native ones where the extension is used."""
-    moving = MovingJoints.of(robot, joints)
-    if native.status().active:
-        return NativeBatchDynamics(models_of(robot), moving)
-    return PinocchioBatchDynamics(models_of(robot), moving)
+    kind = NativeBatchDynamics if native.status().active else NumpyBatchDynamics
+    return kind(Loaded.of(robot), MovingJoints.of(robot, joints))
 
 
-def models_of(robot: RobotDescription) -> Models:
-    """Return the models of ``robot`` on a fixed base."""
-    engine = load_engine()
-    return lambda payload: (
-        engine.loaded_dynamics(robot, payload) if payload else engine.robot_dynamics(robot, ground=False)
-    )
+class Loaded(NamedTuple):
+    """Tree of a robot on a fixed base, and the place of a payload: the center of mass of its tool."""
+
+    tree: RigidTree
+    body: int
+    """Body that carries it, -1 for the base."""
+    point: Float64
+    """Place in the frame of the body (3,) [m]."""
+
+    @classmethod
+    def of(cls, robot: RobotDescription) -> Loaded:
+        """Return the tree of ``robot``."""
+        whole = robot.rigid_tree
+        tool = whole.index(whole.tool)
+        at = whole.bodies.link_frames[tool]
+        return cls(
+            robot_model(robot, False).tree.held, whole.link_bodies[tool], at[:, :3] @ whole.center[tool] + at[:, 3]
+        )
 
 
 class MovingJoints(NamedTuple):
@@ -120,30 +117,25 @@ class MovingJoints(NamedTuple):
 
 
 class NativeBatchDynamics:
-    """Dynamics as of :class:`PinocchioBatchDynamics`, computed by the extension."""
+    """Dynamics as of :class:`NumpyBatchDynamics`, computed by the extension."""
 
-    def __init__(self, models: Models, joints: MovingJoints) -> None:
-        bodies, loaded = models(0.0).bodies, models(1.0).bodies
-        gained = loaded.mass - bodies.mass
-        carrier = int(np.argmax(gained))
-        moment = loaded.mass[carrier] * loaded.center[carrier] - bodies.mass[carrier] * bodies.center[carrier]
-        self._joints, self._carries = joints, float(gained[carrier] > 0.5)  # 0 where the tool is part of the base
+    def __init__(self, loaded: Loaded, joints: MovingJoints) -> None:
+        self._joints, self._carries = joints, float(loaded.body >= 0)
         self._native = native.extension("_batch_dynamics")
         self._tree = self._native.tree(
-            bodies.tree,
-            bodies.table(),
+            *loaded.tree.tables,
             joints.leader,
             joints.multiplier,
             joints.rest,
-            len(bodies.tree),
+            loaded.tree.dof,
             len(joints.low),
-            carrier,
-            tuple(moment / max(gained[carrier], 0.5)),
-            SceneSpec.gravity,
+            max(loaded.body, 0),
+            tuple(loaded.point.tolist()),
+            tuple(loaded.tree.bodies.gravity.tolist()),
         )
 
     def at(self, qpos: Float64, qvel: Float64, payload: Float64) -> Passive:
-        """See :meth:`PinocchioBatchDynamics.at`."""
+        """See :meth:`NumpyBatchDynamics.at`."""
         count, joints = qpos.shape
         found = Passive(np.empty((count, joints, joints)), np.empty((count, joints)), np.empty((count, joints)))
         inputs = {"qpos": qpos, "qvel": qvel, "payload": self._carries * payload}
@@ -160,7 +152,7 @@ class NativeBatchDynamics:
         friction: Friction,
         dt: float,
     ) -> tuple[Float64, Float64, Float64]:
-        """See :meth:`PinocchioBatchDynamics.step`."""
+        """See :meth:`NumpyBatchDynamics.step`."""
         q, v, f = (leaf.copy() for leaf in state)
         arrays = {"qpos": q, "qvel": v, "friction": f, "matrix": matrix, "effort": effort, "added": added}
         arrays |= friction._asdict() | {"low": self._joints.low, "high": self._joints.high}
@@ -168,35 +160,24 @@ class NativeBatchDynamics:
         return q, v, f
 
 
-class PinocchioBatchDynamics:
-    """Dynamics of the joints that move, of many robots: by Pinocchio, and steps by NumPy."""
+class NumpyBatchDynamics:
+    """Dynamics of the joints that move, of many robots, by NumPy."""
 
-    def __init__(self, models: Models, joints: MovingJoints) -> None:
-        self._models, self._joints, self._spread = models, joints, joints.matrix
-        self._empty = models(0.0)
-        self._loaded: dict[float, RobotModel] = {}
+    def __init__(self, loaded: Loaded, joints: MovingJoints) -> None:
+        self._loaded, self._joints, self._spread = loaded, joints, joints.matrix
 
     def at(self, qpos: Float64, qvel: Float64, payload: Float64) -> Passive:
         """Return the dynamics at ``qpos`` and ``qvel`` (n, joints) with ``payload`` (n, 1) [kg] at the tool."""
         q, v = self._joints.rest + qpos @ self._spread.T, qvel @ self._spread.T
-        still, column = np.zeros_like(q), payload[:, 0]
-        force = self._empty.inverse_dynamics(q, v, still)
-        matrix, loaded = np.empty((*q.shape, q.shape[1])), np.zeros_like(force)
-        for kg in np.unique(column):
-            rows, model = column == kg, self._model(float(kg))
-            matrix[rows] = model.mass_matrix(q[rows])
-            if kg:
-                loaded[rows] = model.inverse_dynamics(q[rows], v[rows], still[rows]) - force[rows]
+        tree, body, point = self._loaded
+        bodies = tree.bodies
+        if body >= 0:
+            point_mass = spatial_matrix(SpatialInertia(1.0, point, np.zeros((3, 3))))
+            bodies = tree.with_added({body: payload[:, :, None] * point_mass})
+        force = ts.bias(tree, q, v)
+        loaded = ts.bias(tree, q, v, bodies=bodies) - force
+        matrix = ts.mass_matrix(tree, q, bodies)
         return Passive(self._spread.T @ matrix @ self._spread, force @ self._spread, loaded @ self._spread)
-
-    def _model(self, payload: float) -> RobotModel:
-        if not payload:
-            return self._empty
-        if payload not in self._loaded:
-            if len(self._loaded) >= _MOST_PAYLOADS:
-                self._loaded.clear()
-            self._loaded[payload] = self._models(payload)
-        return self._loaded[payload]
 
     def step(
         self,

@@ -7,8 +7,7 @@ from sys import modules
 
 from batchpid.checks.validate import choice
 from batchpid.errors import MissingDependencyError
-from batchpid.sim.engine.protocol import Engine, RobotModel
-from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.engine.protocol import Engine
 
 MODULES = {
     "sapien": "batchpid.sim.engine.sapien.sapien_engine",
@@ -39,8 +38,3 @@ def _require_mujoco() -> None:
         import_module("mujoco.batch")
     except ImportError as error:
         raise MissingDependencyError("mujoco>=3.17", "the engine 'mujoco'", "mujoco") from error
-
-
-def scene_dynamics(spec: SceneSpec) -> RobotModel:
-    """Return the model of the robot of ``spec``, by its engine: the same object for equal specs."""
-    return load_engine(spec.engine).scene_dynamics(spec)

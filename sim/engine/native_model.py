@@ -1,13 +1,6 @@
 r"""Rigid-body model of robots in native code: mass matrices and passive forces, also within the sim steps of a tick.
 
-Mass matrices come from composite rigid bodies (:mod:`batchpid.sim.engine.rigid_body`), passive forces from the
-recursive Newton-Euler algorithm (:mod:`batchpid.sim.engine.batch_dynamics`). On a floating base (b; j are the joints)
-the joints show the Schur complements::
-
-    M = M_jj - M_jb M_bb^-1 M_bj        h = h_j - M_jb M_bb^-1 h_b
-
-in which gravity, and the velocity and acceleration of the base's origin, cancel: h depends on the rate at which the
-base turns.
+The equations are those of :mod:`batchpid.task_space.tree_dynamics`, on a base that is held or floats.
 """
 
 from __future__ import annotations
@@ -20,15 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.engines import scene_dynamics
 from batchpid.sim.engine.native.interface import Model, Refresh
-from batchpid.sim.engine.protocol import CompiledModel, RobotModel
-from batchpid.sim.engine.rigid_body import RigidBodies
+from batchpid.sim.engine.protocol import CompiledModel
+from batchpid.sim.engine.robot_model import passive_force, scene_tree
 from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.task_space.rigid_tree import RigidTree
 
 
 class NativeModel:
@@ -39,15 +33,13 @@ class NativeModel:
         self._inertias: Float64 | None = None
 
     @cached_property
-    def bodies(self) -> RigidBodies:
-        """Bodies of the robot, without differences of the masses."""
-        return scene_dynamics(self._spec).bodies
+    def _tree(self) -> RigidTree:
+        return scene_tree(self._spec)
 
     @cached_property
     def _structure(self) -> tuple[Model, Any]:
-        bodies = self.bodies
-        tree, rows = np.ascontiguousarray(bodies.tree, np.int32), np.ascontiguousarray(bodies.table())
-        inertias = bodies.inertias()[None] if self._inertias is None else self._inertias
+        tree, rows = self._tree.tables
+        inertias = self._tree.inertias()[None] if self._inertias is None else self._inertias
         arrays: dict[str, NDArray[Any]] = {"tree": tree, "rows": rows, "inertias": inertias}
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
         numbers = {"dof": len(tree), "varies": self._inertias is not None, "floats": self._floats}
@@ -65,9 +57,10 @@ class NativeModel:
         """
         if self._inertias is None:
             self.__dict__.pop("_structure", None)
-            self._inertias = np.tile(self.bodies.inertias(), (size, 1, 1))
+            self._inertias = np.tile(self._tree.inertias(), (size, 1, 1))
         picked = np.asarray(rows, np.intp)
-        self._inertias[picked] = self.bodies.varied({name: each[picked] for name, each in added.items()})
+        varied = self._tree.varied({name: each[picked] for name, each in added.items()})
+        self._inertias[picked] = self._tree.inertias(varied)
 
     def mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         """Return the mass matrices (n, dof, dof) [kg m^2 or kg] that the joints show at ``qpos`` (n, dof)."""
@@ -147,27 +140,22 @@ class NativeRefresh:
 def mass_matrix_of(spec: SceneSpec, natively: bool) -> Callable[[Float64], Float64]:
     """Return the function of positions that computes the mass matrices of a robot's description, on a fixed base.
 
-    ``natively`` says whether the extension is used; then every executor takes them from it, since Pinocchio's differ in
-    the last bits.
+    ``natively`` says whether the extension is used; then every executor takes them from it, since NumPy's differ in the
+    last bits.
     """
     if natively:
         return NativeModel(spec).mass_matrix
-    model = _model_of(spec)
-    return lambda qpos: model().mass_matrix(qpos)
+    tree = cache(lambda: scene_tree(spec).held)  # looked up once: the hash of a spec takes many calls
+    return lambda qpos: ts.mass_matrix(tree(), qpos)
 
 
 def passive_force_of(spec: SceneSpec, natively: bool) -> Callable[[Float64, Float64, bool, bool], Float64]:
     """Return the function of positions, velocities, gravity and coriolis that computes a robot's passive forces.
 
     The base is held. ``natively`` says whether the extension is used; then every executor takes them from it, since the
-    engines' differ in the last bits.
+    engines' and NumPy's differ in the last bits.
     """
     if natively:
         return NativeModel(spec).passive_force
-    model = _model_of(spec)
-    return lambda qpos, qvel, gravity, coriolis: model().passive_force(qpos, qvel, gravity, coriolis)
-
-
-def _model_of(spec: SceneSpec) -> Callable[[], RobotModel]:
-    """Return a function that returns the model of ``spec``, looked up once: the hash of a spec takes many calls."""
-    return cache(lambda: scene_dynamics(spec))
+    tree = cache(lambda: scene_tree(spec).held)
+    return lambda *state: passive_force(tree(), *state)

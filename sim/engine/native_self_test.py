@@ -1,7 +1,7 @@
 """Self-test of the native extensions, in a separate process: a result that differs from Python's is a failure.
 
 Calls into SAPIEN, sim steps, ticks and programs are compared bit by bit. The dynamics of many robots are compared with
-Pinocchio, which rounds differently, within a tolerance.
+NumPy's, which rounds differently, within a tolerance.
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ from batchpid.native.availability import first_difference
 from batchpid.native.tracing import trace
 from batchpid.sim.engine.batch_dynamics import (
     Friction,
+    Loaded,
     MovingJoints,
     NativeBatchDynamics,
-    PinocchioBatchDynamics,
+    NumpyBatchDynamics,
 )
 from batchpid.sim.engine.native import python_calls
 from batchpid.sim.engine.native.native_tick import NativeTick
 from batchpid.sim.engine.native_model import NativeModel
+from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.engine.sapien.building import build_scene, new_system
 from batchpid.sim.engine.sapien.calls import PythonCalls
-from batchpid.sim.engine.sapien.dynamics import Dynamics
 from batchpid.sim.engine.sapien.native_calls import NativeCalls
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.sapien.physics import PHYSICS
@@ -65,12 +66,8 @@ def _compare_programs() -> None:
 
 
 def _compare_dynamics() -> None:
-    """Compare the dynamics and a step of robots with payloads: with Pinocchio, and with a call for each robot alone."""
-    spec = replace(_spec(), ground=False)
-
-    def models(payload: float) -> Dynamics:
-        return Dynamics(spec, payload, "hand" if payload else None)
-
+    """Compare the dynamics and a step of robots with payloads: with NumPy's, and with a call for each robot alone."""
+    loaded = Loaded(scene_tree(replace(_spec(), ground=False)).held, 1, np.array([0.1, 0.0, 0.05]))
     limit = np.array([np.inf, 1.0])
     joints = MovingJoints(np.array([0, 1], np.int32), np.ones(2), np.zeros(2), -limit, limit)
     rng, count = np.random.default_rng(0), 6
@@ -78,11 +75,11 @@ def _compare_dynamics() -> None:
     payload, added = np.linspace(0.0, 2.0, count)[:, None], np.full((count, 2), 0.1)
     friction = Friction(np.full((count, 2), 0.3), np.full((count, 1), 0.01), np.full((count, 2), 0.02))
     results = []
-    ours = NativeBatchDynamics(models, joints)
+    ours = NativeBatchDynamics(loaded, joints)
     for model, groups in (
         (ours, [slice(0, count)]),
         (ours, [slice(row, row + 1) for row in range(count)]),
-        (PinocchioBatchDynamics(models, joints), [slice(0, count)]),
+        (NumpyBatchDynamics(loaded, joints), [slice(0, count)]),
     ):
         parts = []
         for rows in groups:
@@ -95,8 +92,8 @@ def _compare_dynamics() -> None:
     for mine, alone, theirs in zip(*results, strict=True):
         if mine.tobytes() != alone.tobytes():
             raise AssertionError("the native dynamics of a robot depend on the others")
-        if not np.allclose(mine, theirs, rtol=1e-6, atol=1e-6):
-            raise AssertionError("native dynamics and Pinocchio's give different results")
+        if not np.allclose(mine, theirs, rtol=1e-9, atol=1e-9):
+            raise AssertionError("native dynamics and NumPy's give different results")
 
 
 def _compare_steps() -> None:
@@ -132,7 +129,7 @@ def _compare_ticks() -> None:
         return [(matrix * wanted[:, None, :]).sum(axis=-1)]
 
     model, armature = NativeModel(replace(_spec(), ground=False)), np.array([0.1, 0.2])
-    tree, table = np.ascontiguousarray(model.bodies.tree, np.int32), model.bodies.table()
+    tree, table = scene_tree(_spec()).tables
     results = []
     for in_ticks in (True, False):
         pack = Pack(_spec(), 4)

@@ -1,7 +1,8 @@
 """Interface between a physics engine and loop, robots and tuning.
 
 The loop holds the M envs of a group as one :class:`EnginePack`. Robots, controls and tuning compute with a
-:class:`RobotModel`. :func:`batchpid.sim.engine.engines.load_engine` returns an :class:`Engine`, which makes both.
+:class:`batchpid.sim.engine.robot_model.RobotModel`. :func:`batchpid.sim.engine.engines.load_engine` returns an
+:class:`Engine`, which makes packs.
 
 A feature of only some engines is a capability. :func:`require` raises an error if the engine lacks it.
 """
@@ -19,10 +20,8 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.native.interface import STATUS
-from batchpid.sim.engine.rigid_body import RigidBodies
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot import description
-from batchpid.sim.robot.description import RobotDescription
 
 Capability = Literal["drive", "build", "missed_contacts", "compiled_steps", "partial_force", "sapien_dissipation"]
 """
@@ -205,32 +204,6 @@ class CompiledPack(EnginePack, Protocol):
         """Return the model of :meth:`passive_force`, where compiled steps do not read it."""
 
 
-class RobotModel(description.Dynamics, Protocol):
-    """Dynamics and contact of one robot at given poses (n, dof), without friction, damping and variation."""
-
-    @property
-    def bodies(self) -> RigidBodies:
-        """Bodies of the robot on a fixed base."""
-
-    def passive_force(self, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool) -> Float64:
-        """Return the efforts (n, dof) [N m or N] that cancel gravity and Coriolis and centrifugal forces."""
-
-    def link_poses(self, qpos: NDArray[Any]) -> Float64:
-        """Return the poses of the simulated links (links, 4, 4), homogeneous [m], at one pose (dof,)."""
-
-    def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
-        """Return the two links of the URDF that are nearest to each other, or overlap most, at one pose (dof,).
-
-        One if the other is the ground; none if no links are near each other.
-        """
-
-    def height(self, qpos: NDArray[Any], base_too: bool = False) -> float:
-        """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes.
-
-        With ``base_too`` the links that are fixed to the base count as well.
-        """
-
-
 class ContactRecord(Protocol):
     """Contacts that the M robots of a pack without shapes would have had."""
 
@@ -298,15 +271,6 @@ class Engine(description.RobotFunctions, Protocol):
         InvalidArgumentError
             The function ``build`` of the spec is wrong.
         """
-
-    def scene_dynamics(self, spec: SceneSpec) -> RobotModel:
-        """Return the model of the robot of ``spec``, the same object for equal specs."""
-
-    def robot_dynamics(self, robot: RobotDescription, ground: bool | None = None) -> RobotModel:
-        """Return the model of ``robot`` on a fixed base, with or without a ground at height 0; by default its own."""
-
-    def loaded_dynamics(self, robot: RobotDescription, payload: float) -> RobotModel:
-        """Return the model of ``robot`` on a fixed base with ``payload`` [kg] at the center of mass of its tool."""
 
     def missed_contacts(self, spec: SceneSpec, size: int, ground: bool) -> ContactRecord:
         """Return the record of ``size`` robots of ``spec``, with a ground at height 0 or without."""

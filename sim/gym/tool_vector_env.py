@@ -16,7 +16,6 @@ from batchpid.sim.gym.joint_space import JointSpace
 from batchpid.sim.gym.reach import ACTIONS
 from batchpid.sim.gym.robot_vector_env import Float32, Float64, RobotVectorEnv
 from batchpid.sim.observation import Observation
-from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.task_space.frames import rotation_error
@@ -112,10 +111,8 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
                 raise InvalidArgumentError("posture", f"is needed for the robot {robot.name!r}", remedy=remedy)
             posture = self.panda_posture
         self.posture = robot.coupled(array("posture", posture, (1, robot.dof), robot.joint_names)[0])
-        kinematics = Kinematics(robot)
-        self.tool = kinematics.links[kinematics.tool]
-        if self._tool is not None:
-            self.tool = choice("tool", self._tool, kinematics.links)
+        tree = robot.rigid_tree
+        self.tool = tree.tool if self._tool is None else choice("tool", self._tool, tree.links)
         options = {"twist": self.actions == "increment"} | self._osc
         self._control = OperationalSpace(robot, self.tool, posture=self.posture, **options)
         self._home = np.array(self._control.command.neutral)[:7]

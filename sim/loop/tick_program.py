@@ -13,9 +13,9 @@ from batchpid.native.array_program import ArrayProgram
 from batchpid.native.symbols import Stack, Symbol
 from batchpid.native.tracing import Trace, trace
 from batchpid.native.trees import filled, leaves, mapped, structure
-from batchpid.sim.engine.engines import scene_dynamics
 from batchpid.sim.engine.native.native_tick import NativeTick
 from batchpid.sim.engine.protocol import CompiledModel, CompiledPack, CompiledStep
+from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import (
     Constants,
@@ -107,9 +107,8 @@ class TickProgram:
         if (age := self.state.age) is not None:
             arrays |= {"age": age, "gain": self.state.friction.gain, "memory": self.state.friction.memory}
         if matrix is not None:
-            bodies = scene_dynamics(pack.spec).bodies
-            tree = np.ascontiguousarray(bodies.tree, np.int32)
-            arrays |= {"matrix": self.state.matrix, "tree": tree, "bodies": np.ascontiguousarray(bodies.table())}
+            tree, bodies = scene_tree(pack.spec).tables
+            arrays |= {"matrix": self.state.matrix, "tree": tree, "bodies": bodies}
             arrays |= {"armature": constants.armature, "damping": constants.damping}
             arrays |= constants.coupling.native()
         whole, steps = (False, 1) if law is None else (law.whole, law.matrix_steps)

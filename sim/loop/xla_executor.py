@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.native.trees import mapped
-from batchpid.sim.engine.engines import scene_dynamics
 from batchpid.sim.engine.native import xla
 from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep
+from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
 from batchpid.sim.loop.custom import OwnController, controller_errors
@@ -71,7 +71,7 @@ class XLAExecutor:
         self._no_matrix: Any = None
         law = layout.law
         needs_bodies = (law is not None and law.needs_matrix) or constants.friction.coulomb is not None
-        bodies = scene_dynamics(pack.spec).bodies if needs_bodies else None
+        tables = scene_tree(pack.spec).tables if needs_bodies else None
 
         def spread(part: Any) -> Any:
             return mapped(lambda array: padded(np.broadcast_to(array, (pack.size, pack.dof))), part)
@@ -82,7 +82,7 @@ class XLAExecutor:
         rows = (pack.size, pack.dof)
         with own_settings(options.dtype):
             self._constants = put(arrays)
-            self._bodies = put(Bodies() if bodies is None else Bodies(bodies.tree, bodies.table()))
+            self._bodies = put(Bodies() if tables is None else Bodies(*tables))
             self._zero = put(padded(np.zeros(rows)))
 
     def measure(self) -> Measured:

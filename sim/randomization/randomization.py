@@ -23,7 +23,6 @@ from batchpid.motors import JOINT_SIDE
 from batchpid.sim.randomization.distributions import Distribution
 from batchpid.sim.randomization.draws import Draws, generators
 from batchpid.sim.randomization.fields import GROUPS, PHYSICAL, START, Field, elements, mapping, parts, read_field
-from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 
 LARGEST = 2**63 - 1
@@ -107,8 +106,7 @@ class Randomization:
 
     def carrier(self, robot: Robot) -> str:
         """Return the name of the link that carries the payload."""
-        kinematics = Kinematics(robot)
-        return self.payload_link or kinematics.links[kinematics.tool]
+        return self.payload_link or robot.rigid_tree.tool
 
     # -- draws -------------------------------------------------------------------------------------------------------
 

@@ -23,11 +23,15 @@ from batchpid.sim.observation import RunInfo
 from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.effort import POSES, suggested_effort_limit
 from batchpid.sim.robot.joint_rows import HEADERS, joint_rows
+from batchpid.sim.robot.merging import merge_fixed_links
 from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import FileDefaults, Joint, LinkMass, Placement, Settings, Urdf
+from batchpid.sim.robot.robot_tree import rigid_tree
 from batchpid.sim.robot.self_collision import SelfContact, Srdf
 from batchpid.sim.robot.setpoint_limits import setpoint_guard
+from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.spatial_inertia import SpatialInertia
 
 LIMIT_TOLERANCE = 1e-6  # rad or m
 
@@ -51,9 +55,6 @@ class Dynamics(Protocol):
 class RobotFunctions(Protocol):
     """Functions of an engine that a robot needs; :class:`batchpid.sim.engine.protocol.Engine` has them."""
 
-    def robot_dynamics(self, robot: RobotDescription, ground: bool | None = None) -> Dynamics:
-        """Return the dynamics of ``robot`` on a fixed base; ``ground`` as in :meth:`RobotDescription.dynamics`."""
-
     def self_contact(self, robot: RobotDescription) -> SelfContact:
         """Return the pairs of links that do not collide. Raises RobotError if the engine cannot build the robot."""
 
@@ -62,11 +63,17 @@ class RobotFunctions(Protocol):
 
 
 _load_engine: list[Callable[[], RobotFunctions]] = []
+_load_dynamics: list[Callable[[RobotDescription, bool | None], Dynamics]] = []
 
 
-def register_engine(load: Callable[[], RobotFunctions]) -> None:
-    """Set the function that returns the engine. :mod:`sim` calls it, because robots must not import engines."""
-    _load_engine[:] = [load]
+def register_engine(
+    load: Callable[[], RobotFunctions], dynamics: Callable[[RobotDescription, bool | None], Dynamics]
+) -> None:
+    """Set the functions that return the engine, and the dynamics of a robot with or without a ground.
+
+    :mod:`sim` calls it, because robots must not import engines.
+    """
+    _load_engine[:], _load_dynamics[:] = [load], [dynamics]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -245,6 +252,18 @@ class RobotDescription(Urdf):
         low, high = np.maximum(self.lower, self.start - np.pi), np.minimum(self.upper, self.start + np.pi)
         return self.coupled(np.random.default_rng(seed).uniform(low, high, (count, self.dof)))
 
+    @cached_property
+    def rigid_tree(self) -> RigidTree:
+        """Tree of every link of the URDF, merged ones included, with the coupling and limits of the joints.
+
+        Raises RobotError if the engine cannot build a link whose mass comes from its shapes.
+        """
+        empty = SpatialInertia(0.0, np.zeros(3), np.zeros((3, 3)))
+        inertias = merge_fixed_links(self.urdf, lambda link: self.link_masses[link].inertia or empty).inertias
+        low, high = np.where(self.continuous, [[-np.inf], [np.inf]], [self.lower, self.upper])
+        limits = {"lower": low, "upper": high}
+        return rigid_tree(self.urdf, inertias, coupling=self.coupling, fixed_base=self.fixed_base, **limits)
+
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof), on a fixed base."""
         return self.dynamics().mass_matrix(np.atleast_2d(np.asarray(qpos, np.float64)))
@@ -259,7 +278,7 @@ class RobotDescription(Urdf):
 
         ``ground`` says whether there is one at height 0, by default :attr:`has_ground`.
         """
-        return _load_engine[0]().robot_dynamics(self, ground)
+        return _load_dynamics[0](self, ground)
 
     @cached_property
     def self_contact(self) -> SelfContact:

@@ -39,7 +39,7 @@ class Merged(NamedTuple):
     owners: dict[str, list[str]]
 
 
-class _Edge(NamedTuple):
+class Edge(NamedTuple):
     """Joint of the tree."""
 
     name: str
@@ -52,7 +52,7 @@ class _Edge(NamedTuple):
 def place_links(urdf: str, merge_fixed: bool = True) -> dict[str, Placement]:
     """Return the placement of every link of a sanitised URDF, in its body if ``merge_fixed``, else each in itself."""
     root = etree.fromstring(urdf.encode())
-    return _place(root, _merged_joints(_edges(root)) if merge_fixed else set())
+    return _place(root, _merged_joints(edges_of(root)) if merge_fixed else set())
 
 
 def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInertia]) -> Merged:
@@ -62,7 +62,7 @@ def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInert
     ``<inertial>``, in the frame of that link.
     """
     root = etree.fromstring(urdf.encode())
-    edges = _edges(root)
+    edges = edges_of(root)
     merged = _merged_joints(edges)
     bodies = _place(root, merged)
     links = {link.get("name", ""): link for link in root.findall("link")}
@@ -91,12 +91,12 @@ def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInert
     return Merged(etree.tostring(root, encoding="unicode"), bodies, inertias, owners)
 
 
-def _edges(root: etree._Element) -> list[_Edge]:
+def edges_of(root: etree._Element) -> list[Edge]:
     """Return the joints breadth first, siblings in the order of the file."""
     below, children = defaultdict(list), set()
     for element in root.findall("joint"):
         parent, child = element.find("parent").get("link", ""), element.find("child").get("link", "")
-        edge = _Edge(element.get("name", ""), parent, child, element.get("type") in MOVING_TYPES, element)
+        edge = Edge(element.get("name", ""), parent, child, element.get("type") in MOVING_TYPES, element)
         below[parent].append(edge)
         children.add(child)
     edges = [edge for parent in below if parent not in children for edge in below[parent]]
@@ -105,7 +105,7 @@ def _edges(root: etree._Element) -> list[_Edge]:
     return edges
 
 
-def _merged_joints(edges: Sequence[_Edge]) -> set[str]:
+def _merged_joints(edges: Sequence[Edge]) -> set[str]:
     """Return the fixed joints to merge: all except those whose merge would change the order of joints below them."""
     wanted = [edge.name for edge in edges if edge.moves]
     carriers: set[str] = set()  # links with a joint that moves below them
@@ -123,10 +123,10 @@ def _merged_joints(edges: Sequence[_Edge]) -> set[str]:
     return merged
 
 
-def _moving_order(edges: Sequence[_Edge], merged: Collection[str]) -> list[str]:
+def _moving_order(edges: Sequence[Edge], merged: Collection[str]) -> list[str]:
     """Return the names of the joints that move, breadth first, with some joints merged."""
     body: dict[str, str] = {}
-    below: dict[str, list[_Edge]] = defaultdict(list)
+    below: dict[str, list[Edge]] = defaultdict(list)
     for edge in edges:
         parent = body.setdefault(edge.parent, edge.parent)
         body[edge.child] = parent if edge.name in merged else edge.child
@@ -140,7 +140,7 @@ def _moving_order(edges: Sequence[_Edge], merged: Collection[str]) -> list[str]:
 
 def _place(root: etree._Element, merged: Collection[str]) -> dict[str, Placement]:
     """Return the placement of every link, parents first."""
-    edges = _edges(root)
+    edges = edges_of(root)
     children = {edge.child for edge in edges}
     names = [link.get("name", "") for link in root.findall("link")]
     bodies = {name: _IDENTITY._replace(link=name) for name in names if name not in children}

@@ -26,7 +26,6 @@ from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.mimics import couple
 from batchpid.sim.robot.parts import FileDefaults, Joint, Settings
 from batchpid.sim.robot.preflight import check
-from batchpid.sim.robot.robot_tree import kinematic_tree
 from batchpid.sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
 from batchpid.sim.robot.source import read_source
 from batchpid.sim.robot.urdf import read_urdf
@@ -228,7 +227,10 @@ class Robot(RobotDescription):
         known = {}
         if self.actuators is not None and self.actuators.armature is not None:
             known["armature"] = np.asarray(self.actuators.armature, float)[0]
-        return kinematic_tree(self, **(known | options))
+        if not self.fixed_base:
+            problem = "operational space and inverse kinematics need a kinematic tree, which has a fixed base"
+            raise RobotError(f"{self.path}: {problem}; load the robot with fixed_base=True, or control its joints")
+        return replace(self.rigid_tree, **(known | options))
 
     @property
     def has_tuned(self) -> bool:

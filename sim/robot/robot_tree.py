@@ -1,55 +1,49 @@
-"""Kinematic tree of a robot, for :mod:`batchpid.task_space`."""
+"""Rigid tree of a robot, for :mod:`batchpid.task_space`."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from lxml import etree
 
-from batchpid.errors import RobotError
-from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.merging import merge_fixed_links
+from batchpid.sim.robot.merging import edges_of
+from batchpid.sim.robot.xml import numbers
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.rotations import from_rpy
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
+_EMPTY = SpatialInertia(0.0, np.zeros(3), np.zeros((3, 3)))
+_KIND = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 
-def kinematic_tree(robot: RobotDescription, **options: Any) -> RigidTree:
-    """Return the tree of ``robot``; ``options`` are its armature and gravity.
 
-    Masses are from the URDF, or from SAPIEN for links without ``<inertial>`` but with collision shapes.
+def rigid_tree(urdf: str, inertias: Mapping[str, SpatialInertia], **options: Any) -> RigidTree:
+    """Return the tree of a sanitised URDF; ``inertias`` are those of its links, by name, in their own frames.
 
-    Raises RobotError if the base is not fixed, or SAPIEN cannot build a link whose mass comes from its shapes.
+    Links come breadth first, as SAPIEN has them. ``options`` are those of :class:`RigidTree`.
     """
-    if not robot.fixed_base:
-        problem = "operational space and inverse kinematics need a kinematic tree, which has a fixed base"
-        raise RobotError(f"{robot.path}: {problem}; load the robot with fixed_base=True, or control its joints")
-
-    def of_shapes(link: str) -> SpatialInertia:
-        return robot.link_masses[link].inertia or empty
-
-    empty = SpatialInertia(0.0, np.zeros(3), np.zeros((3, 3)))
-    inertias = merge_fixed_links(robot.urdf, of_shapes).inertias
-    children = {joint.child_link for joint in robot.all_joints}
-    (root,) = (link.name for link in robot.links if link.name not in children)
-    links = [root, *(joint.child_link for joint in robot.all_joints)]
-    of_links = [inertias.get(link, empty) for link in links]
+    root = etree.fromstring(urdf.encode())
+    joints = edges_of(root)
+    (base,) = {link.get("name", "") for link in root.findall("link")} - {joint.child for joint in joints}
+    links = [base, *(joint.child for joint in joints)]
+    of_links = [inertias.get(link, _EMPTY) for link in links]
+    elements = [joint.element for joint in joints]
+    kinds = [_KIND.get(element.get("type"), "fixed") for element in elements]
     return RigidTree(
         links=tuple(links),
-        parent=np.array([-1, *(links.index(joint.parent_link) for joint in robot.all_joints)]),
-        joint_types=("fixed", *(_KIND.get(joint.type, "fixed") for joint in robot.all_joints)),
-        joint_names=robot.joint_names,
-        position=np.array([(0.0, 0.0, 0.0), *(joint.origin for joint in robot.all_joints)]),
-        wxyz=np.array([(1.0, 0.0, 0.0, 0.0), *(from_rpy(joint.rpy) for joint in robot.all_joints)]),
-        axis=np.array([(1.0, 0.0, 0.0), *(joint.axis for joint in robot.all_joints)]),
+        parent=np.array([-1, *(links.index(joint.parent) for joint in joints)]),
+        joint_types=("fixed", *kinds),
+        joint_names=tuple(joint.name for joint, kind in zip(joints, kinds, strict=True) if kind != "fixed"),
+        position=np.array([_numbers(each, "origin", "xyz", "0 0 0") for each in (root, *elements)]),
+        wxyz=np.array([from_rpy(_numbers(each, "origin", "rpy", "0 0 0")) for each in (root, *elements)]),
+        axis=np.array([_numbers(each, "axis", "xyz", "1 0 0") for each in (root, *elements)]),
         mass=np.array([inertia.mass for inertia in of_links]),
         center=np.array([inertia.center for inertia in of_links]),
         inertia=np.array([inertia.tensor for inertia in of_links]),
-        lower=np.where(robot.continuous, -np.inf, robot.lower),
-        upper=np.where(robot.continuous, np.inf, robot.upper),
-        coupling=robot.coupling,
         **options,
     )
 
 
-_KIND = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+def _numbers(element: etree._Element, tag: str, name: str, default: str) -> tuple[float, ...]:
+    return numbers(element.find(tag), name, default, f"joint {element.get('name')!r}")

@@ -20,7 +20,6 @@ from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.command import POSE_UNITS, CommandSpec
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.dissipation import DISSIPATION
-from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tool_space.bound_osc import BoundOSC
@@ -278,8 +277,7 @@ class OperationalSpace:
 
 def default_tool(robot: Robot) -> str:
     """Return the last link of the robot's longest chain, or the hand if that chain ends in fingers."""
-    kinematics = Kinematics(robot)
-    return kinematics.links[kinematics.tool]
+    return robot.rigid_tree.tool
 
 
 def tool_pose(tree: ts.RigidTree, link: str, point: Any, qpos: Any) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 import batchpid as bp
+import batchpid.task_space as ts
 from batchpid.checks.validate import file_path, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
@@ -17,7 +18,6 @@ from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.checks import check_robot
 from batchpid.sim.randomization.distributions import Uniform
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 
 GRAVITY = 9.81
@@ -94,10 +94,9 @@ def at_the_joints(randomization: Randomization | None) -> Randomization | None:
 
 def payload_capacity(robot: Robot) -> float:
     """Return the payload [kg] that the robot holds in 95 % of seeded poses with half of the effort it has left."""
-    kinematics, qpos = Kinematics(robot), robot.sample(200, seed=0)
+    tree, qpos = robot.rigid_tree, robot.sample(200, seed=0)
     own = np.abs(robot.holding_efforts(qpos))
-    per_kg = kinematics.efforts_of_force(kinematics.poses(qpos), kinematics.tool, [0.0, 0.0, GRAVITY])
-    per_kg = np.abs(robot.coupling.efforts(per_kg))
+    per_kg = GRAVITY * np.abs(ts.jacobian(tree, qpos, tree.tool)[:, 2])
     with np.errstate(divide="ignore", invalid="ignore"):
         carried = np.where(per_kg > 1e-9, PAYLOAD_SHARE * (robot.design_effort_limit - own) / per_kg, np.inf)
     return float(max(np.quantile(carried.min(1), 0.05, method="lower"), 0.0))

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.sim.engine.engines import load_engine
-from batchpid.sim.robot.kinematics import Kinematics
+import batchpid.task_space as ts
+from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.robot.robot import Robot
 
 Float64 = NDArray[np.float64]
@@ -46,25 +46,26 @@ class RobotLayout(NamedTuple):
         return TILE * low, TILE * high
 
 
-def arrange_robots(kinematics: Kinematics, robot: Robot, groups: int, per_group: int, ground: bool) -> RobotLayout:
+def arrange_robots(robot: Robot, groups: int, per_group: int, ground: bool) -> RobotLayout:
     """Return a layout of ``groups`` adjacent blocks of ``per_group`` robots around the origin, roughly square.
 
     The floor is at height 0 if physics has a ``ground``, otherwise at the height of the lowest link.
     """
     # The 95th percentile over seeded poses: a single stretched pose should not push all robots apart.
-    distance = np.linalg.norm(kinematics.poses(robot.sample(200, seed=0)).position[..., :2], axis=-1).max(1)
+    poses = ts.link_poses(robot.rigid_tree, robot.sample(200, seed=0))
+    distance = np.linalg.norm(poses[..., :2], axis=-1).max(1)
     reach = max(0.3, float(np.quantile(distance, 0.95)))
     columns = max(1, round(math.sqrt(per_group / groups)))
     group, index = np.divmod(np.arange(groups * per_group), per_group)
     grid = np.stack([index % columns + group * (columns + _GAP), index // columns, 0 * index], axis=1)
     positions = _PITCH * reach * (grid - (grid.min(0) + grid.max(0)) / 2)
     size = float(np.hypot(*np.ptp(positions, axis=0)[:2])) + 2.0 * reach
-    floor = 0.0 if ground else lowest_point(kinematics, robot)
+    floor = 0.0 if ground else lowest_point(robot)
     camera = 1.16 * size * _CAMERA_DIRECTION + [0.0, 0.0, floor]
     return RobotLayout(positions, camera, np.array([0.0, 0.0, floor + 0.35 * reach]), reach, floor)
 
 
-def lowest_point(kinematics: Kinematics, robot: Robot) -> float:
+def lowest_point(robot: Robot) -> float:
     """Return the height [m] of the lowest collision shape or link frame at the start pose."""
-    frames = kinematics.poses(robot.start).position[:, 2].min()
-    return min(float(frames), load_engine().robot_dynamics(robot).height(robot.start, base_too=True))
+    frames = ts.link_poses(robot.rigid_tree, robot.start)[:, 2].min()
+    return min(float(frames), robot_model(robot).height(robot.start, base_too=True))

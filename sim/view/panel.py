@@ -221,9 +221,9 @@ class Panel:
         update()
 
     def _add_disturbances(self, live: LiveSimulation) -> None:
-        gui, links = self._gui, live.kinematics.links
-        link = self._control(gui.add_dropdown("On link", links, initial_value=links[live.load_link]))
-        link.on_change(lambda name: setattr(live, "load_link", live.kinematics.index(name)))
+        gui, links = self._gui, live.robot.rigid_tree.links
+        link = self._control(gui.add_dropdown("On link", links, initial_value=live.load_link))
+        link.on_change(lambda name: setattr(live, "load_link", name))
         payload = self._control(gui.add_slider("Payload [kg]", 0.0, 5.0, 0.1, 0.0))
         payload.on_change(partial(setattr, live, "payload"))
         force = self._control(gui.add_slider("Push [N]", 0.0, 200.0, 5.0, 60.0))

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from batchpid.errors import BatchPIDError
 from batchpid.sim.engine.native.library import import_sapien
-from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.view.layout import FIELD_OF_VIEW, TILE, RobotLayout, arrange_robots
 from batchpid.task_space.rotations import from_rpy
@@ -107,7 +106,7 @@ class RenderScene:
     """Lit SAPIEN scene with ``count`` robots, which are placed and not simulated, on a floor: see :func:`add_floor`."""
 
     def __init__(self, robot: Robot, count: int, ground: bool) -> None:
-        layout = arrange_robots(Kinematics(robot), robot, 1, count, ground)
+        layout = arrange_robots(robot, 1, count, ground)
         eye = layout.target + _CLOSER * (layout.camera - layout.target)
         x, y, z = layout.target - eye  # a camera looks along its x axis
         self.camera_pose = sapien.Pose(eye, from_rpy([0.0, math.atan2(-z, math.hypot(x, y)), math.atan2(y, x)]))

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import batchpid.task_space as ts
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.kinematics import Kinematics, Poses
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.shapes import Surface, surfaces
 from batchpid.sim.view.layout import FIELD_OF_VIEW, TILE, RobotLayout, arrange_robots
@@ -38,8 +38,8 @@ class RobotScene:
     """
 
     def __init__(self, server: Any, robot: Robot, groups: tuple[str, ...], per_group: int, ground: bool) -> None:
-        self._server, self._kinematics = server, Kinematics(robot)
-        self.layout = arrange_robots(self._kinematics, robot, len(groups), per_group, ground)
+        self._server, self._tree = server, robot.rigid_tree
+        self.layout = arrange_robots(robot, len(groups), per_group, ground)
         count = len(self.layout.positions)
         self.findings: list[Finding] = []
         """Meshes that cannot be read. Their links are drawn by the collision shapes, or not at all."""
@@ -55,7 +55,7 @@ class RobotScene:
             node = self._add_surface(f"/robots/{index}", surface, count, batched_colors=colours, opacity=opacity)
             self._robots.append(node)
             self._setpoints.append(self._add_surface(f"/setpoint/{index}", surface, 1, **_SETPOINT_STYLE))
-            self._links.append(self._kinematics.index(surface.link))
+            self._links.append(self._tree.index(surface.link))
             self._colours.append(colours)
         self._shown_setpoint: tuple[Any, ...] | None = None
         self._ok = np.ones(count, bool)
@@ -65,7 +65,7 @@ class RobotScene:
         """Place every robot, the ring under the selected one, and its setpoint if that is shown and is a pose."""
         positions, ok = self.layout.positions, frame.ok[0]
         with self._server.atomic():
-            self._place(self._robots, self._kinematics.poses(frame.qpos[0]), positions)
+            self._place(self._robots, frame.qpos[0], positions)
             if (ok != self._ok).any():
                 self._ok = ok
                 for node, colours in zip(self._robots, self._colours, strict=True):
@@ -78,7 +78,7 @@ class RobotScene:
                 for node in self._setpoints:
                     node.visible = show_setpoint
                 if show_setpoint:
-                    self._place(self._setpoints, self._kinematics.poses(setpoint[None]), positions[selected][None])
+                    self._place(self._setpoints, setpoint[None], positions[selected][None])
 
     def on_click(self, select: Callable[[Any], None]) -> None:
         """Call ``select(robot)`` when a robot is clicked, with the number that the page sent."""
@@ -100,9 +100,9 @@ class RobotScene:
             **options,
         )
 
-    def _place(self, nodes: list[Any], poses: Poses, positions: Float64) -> None:
-        position = (poses.position + positions[:, None]).astype(np.float32)
-        wxyz = poses.wxyz.astype(np.float32)
+    def _place(self, nodes: list[Any], qpos: NDArray[Any], positions: Float64) -> None:
+        poses = ts.link_poses(self._tree, qpos)
+        position, wxyz = (poses[..., :3] + positions[:, None]).astype(np.float32), poses[..., 3:].astype(np.float32)
         for node, link in zip(nodes, self._links, strict=True):
             node.batched_positions = np.ascontiguousarray(position[:, link])
             node.batched_wxyzs = np.ascontiguousarray(wxyz[:, link])

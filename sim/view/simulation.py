@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+import batchpid.task_space as ts
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import array, choice, integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.observation import Observation, Rollout
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
 from batchpid.sim.runner_keywords import ControlMode
@@ -90,7 +90,6 @@ class LiveSimulation(SingleOwner):
         timestep = options.get("timestep", RunnerOptions.timestep)
         substeps = max(1, round(number("period", period, timestep, 1.0, "seconds between frames") / timestep))
         self.period = substeps * timestep
-        self.kinematics = Kinematics(robot)
         self._random = np.random.default_rng(seed)
         offsets = self._random.uniform(-spread, spread, (self.per_group, robot.dof))
         osc = self._operational_space(tool)
@@ -111,8 +110,8 @@ class LiveSimulation(SingleOwner):
         self._rate: Float64 | None = None
         self.payload = 0.0
         """Mass at the load link, a weight without inertia [kg]."""
-        self.load_link = self.kinematics.tool
-        """Index of the link that payload and pushes act on."""
+        self.load_link = robot.rigid_tree.tool
+        """Link that payload and pushes act on."""
         self._push: Float64 = np.zeros(3)
         self._count = self._push_frames = 0
         self._frames: deque[Rollout] = deque(maxlen=round(HISTORY_SECONDS / self.period))
@@ -232,8 +231,8 @@ class LiveSimulation(SingleOwner):
         force = np.array([0.0, 0.0, -GRAVITY * self.payload]) + self._push * (self._push_frames > 0)
         if not force.any():
             return np.zeros(frame.qpos.shape[1:])
-        poses = self.kinematics.poses(frame.qpos[0])
-        return np.where(frame.ok[0, :, None], self.kinematics.efforts_of_force(poses, self.load_link, force), 0.0)
+        jacobian = ts.jacobian(self.robot.rigid_tree, frame.qpos[0], self.load_link)[:, :3]
+        return np.where(frame.ok[0, :, None], (jacobian * force[..., :, None]).sum(-2), 0.0)
 
     def _observe(self, disturbance: Float64) -> None:
         """Append the present state to the frames; a robot that diverged keeps its last finite position."""
@@ -261,8 +260,8 @@ class LiveSimulation(SingleOwner):
         if len(self.groups) > 1:
             problem = "take different setpoints, joint positions and poses"
             raise InvalidArgumentError("controls", problem, value=self.groups, remedy="show 'osc' alone")
-        link = self.kinematics.links[self.kinematics.tool] if tool is None else tool
-        link = choice("tool", link, self.kinematics.links)
+        tree = self.robot.rigid_tree
+        link = tree.tool if tool is None else choice("tool", tool, tree.links)
         return OperationalSpace(self.robot, link, posture=self._home())
 
     def _setpoints(self) -> Float64:

@@ -37,6 +37,8 @@ ALONG_X = np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0])
 """Rotation of MuJoCo's capsules and cylinders, which lie along z, to lie along x (w, x, y, z)."""
 _FRICTION = 0.3
 """Coefficient of sliding friction of every shape, as in SAPIEN's default material."""
+FLOATING = 6
+"""Degrees of freedom of a floating base, which come first in MuJoCo's arrays."""
 LARGEST_FORCE = 1e10
 """Limit of a drive without a limit [N m or N]."""
 _NARROWEST = 1e-9
@@ -245,3 +247,13 @@ def _add_shape(scene: Any, body: Any, shape: LinkShape, meshes: dict[bytes, str]
 
 def _contact(spec: SceneSpec) -> dict[str, Any]:
     return {"friction": [_FRICTION, 0.005, 0.0001], "solref": [spec.physics.contact_time, 1.0]}
+
+
+def set_inertia(model: Any, body: int, inertia: SpatialInertia) -> None:
+    """Give a body of a ``mujoco.MjModel`` this inertia, in the frame of the body; ``mj_setConst`` comes next."""
+    moments, wxyz = principal_inertia(inertia)
+    model.body_mass[body], model.body_ipos[body] = inertia.mass, inertia.center
+    model.body_iquat[body], model.body_inertia[body] = wxyz, moments
+    # Without the compiler's shortcuts for centers of mass at the body's origin, and bodies that are moved by one joint.
+    model.body_sameframe[body], model.body_simple[body] = 0, 0
+    model.dof_simplenum[:] = 0

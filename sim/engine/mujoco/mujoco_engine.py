@@ -10,10 +10,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from batchpid.sim.engine.engines import load_engine
-from batchpid.sim.engine.mujoco.mujoco_dynamics import MujocoDynamics, in_sapien, scene_dynamics
 from batchpid.sim.engine.mujoco.mujoco_pack import MujocoPack
 from batchpid.sim.engine.mujoco.solver import SOLVERS, MujocoSolver
-from batchpid.sim.engine.protocol import Capability, ContactRecord, Engine, RobotModel
+from batchpid.sim.engine.protocol import Capability, ContactRecord, Engine
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.parts import LinkMass
@@ -52,21 +51,9 @@ class MujocoEngine:
         """Return a new pack."""
         return MujocoPack(spec, size, first_env, variation, carrier, links, workspace)
 
-    def scene_dynamics(self, spec: SceneSpec) -> MujocoDynamics:
-        """Return the model of the robot of ``spec``, in double precision."""
-        return scene_dynamics(spec)
-
-    def robot_dynamics(self, robot: RobotDescription, ground: bool | None = None) -> RobotModel:
-        """Return the model of ``robot`` on a fixed base, by SAPIEN."""
-        return load_engine("sapien").robot_dynamics(robot, ground)
-
-    def loaded_dynamics(self, robot: RobotDescription, payload: float) -> RobotModel:
-        """Return the model with a payload [kg] at the tool, by SAPIEN."""
-        return load_engine("sapien").loaded_dynamics(robot, payload)
-
     def missed_contacts(self, spec: SceneSpec, size: int, ground: bool) -> ContactRecord:
         """Return the record of contacts of robots without shapes, by SAPIEN."""
-        return load_engine("sapien").missed_contacts(in_sapien(spec), size, ground)
+        return load_engine("sapien").missed_contacts(spec, size, ground)
 
     def self_contact(self, robot: RobotDescription) -> SelfContact:
         """Return the pairs of links that do not collide, by SAPIEN."""

@@ -6,7 +6,7 @@ Longer than 300 lines because that is the whole interface between loop and engin
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -14,21 +14,23 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+import batchpid.task_space as ts
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine import native
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
-from batchpid.sim.engine.mujoco.batch_model import FLOATING, BatchModel, set_inertia
 from batchpid.sim.engine.mujoco.data_pool import DataPool
-from batchpid.sim.engine.mujoco.model_builder import LARGEST_FORCE, RobotMj, robot_model
+from batchpid.sim.engine.mujoco.model_builder import FLOATING, LARGEST_FORCE, RobotMj, robot_model, set_inertia
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, functions
 from batchpid.sim.engine.native.interface import FARTHEST
-from batchpid.sim.engine.native_model import NativeModel, passive_force_of
+from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.protocol import FAILED
+from batchpid.sim.engine.robot_model import passive_force, scene_tree
 from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
+from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.spatial_inertia import spatial_matrix, total
 
 Float64 = NDArray[np.float64]
@@ -134,27 +136,15 @@ class MujocoPack(SingleOwner):
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N], by the model."""
         if self.steps_read_force(gravity, coriolis):
             return np.array([data.qfrc_bias[self._moves] for data in self._data], dtype)
+        turning = None if self.spec.fixed_base else np.array([data.qvel[3:FLOATING] for data in self._data])
+        state = self.read_qpos(), self.read_qvel(), gravity, coriolis, turning
         if self.steps_natively:
-            state = self.read_qpos(), self.read_qvel()
-            turning = None if self.spec.fixed_base else np.array([data.qvel[3:FLOATING] for data in self._data])
-            return self._force_model.passive_force(*state, gravity, coriolis, turning).astype(dtype)
-        if self.spec.fixed_base:
-            return self._passive_force(self.read_qpos(), self.read_qvel(), gravity, coriolis).astype(dtype)
-        force = np.zeros((self.size, self.dof))
-        rows = [(data.qpos[: FLOATING + 1], data.qvel[:FLOATING]) for data in self._data]
-        base = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
-        still = base[0], np.zeros_like(base[1])
-        if coriolis:
-            self._model.compute(self.read_qpos(), self.read_qvel(), base)
-            force += self._model.joint_bias()
-        if not (coriolis and gravity):
-            self._model.compute(self.read_qpos(), 0.0, still)
-            force += self._model.joint_bias() if gravity else -self._model.joint_bias()
-        return force.astype(dtype) if gravity or coriolis else np.zeros_like(force, dtype)
+            return self._force_model.passive_force(*state).astype(dtype)
+        return passive_force(self._tree, *state).astype(dtype)
 
     @cached_property
-    def _passive_force(self) -> Callable[..., Float64]:
-        return passive_force_of(self.spec, False)
+    def _tree(self) -> RigidTree:
+        return scene_tree(self.spec)
 
     def force_model(self) -> NativeModel:
         """Return the model of the passive force where compiled steps do not read it."""
@@ -175,22 +165,11 @@ class MujocoPack(SingleOwner):
             model.vary(range(self.size), self.size, self._added)
         return model
 
-    @cached_property
-    def _model(self) -> BatchModel:
-        """Dynamics of the robots as the controller knows them."""
-        return BatchModel(self._robot, self.size)
-
-    @cached_property
-    def _varied_model(self) -> BatchModel:
-        """Dynamics of the robots with their variation."""
-        return BatchModel(self._robot, self.size, self.models) if self._masses_vary else self._model
-
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
         if self.steps_natively:
             return self._joint_model.mass_matrix(qpos)
-        self._varied_model.compute(qpos)
-        return self._varied_model.joint_mass_matrix()
+        return ts.mass_matrix(self._tree, qpos, self._tree.varied(self._added) if self._added else None)
 
     # -- stepping ----------------------------------------------------------------------------------------------
 
@@ -334,7 +313,6 @@ class MujocoPack(SingleOwner):
                 set_inertia(model, self._robot.bodies[name], inertia)
                 self._added[name][row] = spatial_matrix(inertia) - spatial_matrix(self._nominal[name])
             mujoco.mj_setConst(model, self._scratch)
-        self.__dict__.pop("_varied_model", None)
         if "_joint_model" in self.__dict__:
             self._joint_model.vary(list(rows), self.size, self._added)
 
@@ -408,7 +386,7 @@ class MujocoPack(SingleOwner):
         """Give back all that fits the present kind of model alone: working memory, and data made for its size."""
         self._pool.leave(self)
         self._own_step = None
-        for name in ("_model", "_varied_model", "_scratch"):
+        for name in ("_scratch",):
             self.__dict__.pop(name, None)
 
 

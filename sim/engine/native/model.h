@@ -1,4 +1,4 @@
-// Mass matrices and passive forces of many robots of one kind: sim/engine/rigid_body.py and sim/engine/native_model.py,
+// Mass matrices and passive forces of many robots of one kind: batchpid/task_space/tree_dynamics.py,
 // which have the equations.
 
 #pragma once

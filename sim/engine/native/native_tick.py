@@ -54,7 +54,7 @@ class NativeTick:
     arrays
         Arrays by field of :class:`batchpid.sim.engine.native.interface.Tick`: reading ``qpos``, ``qvel`` and
         ``passive``, positions ``before`` the last sim step, the efforts ``qf``; and for a mass matrix ``matrix``,
-        ``tree`` and ``bodies`` (:class:`batchpid.sim.engine.rigid_body.RigidBodies`), ``armature`` and ``damping``
+        ``tree`` and ``bodies`` (:attr:`batchpid.task_space.RigidTree.tables`), ``armature`` and ``damping``
         (dof,), ``leader`` and ``multiplier`` of coupled joints (dof,), and ``pose`` and ``rate`` if sensors measure
         others than the reading; ``gain``, ``memory`` and ``age`` (envs,) of the friction model; ``target`` and
         ``target_rate`` of drives, if they move within a tick.

@@ -68,7 +68,7 @@ def sim_step(address: Any, step: Any, effort: Any) -> tuple[Any, Any, Any, Any]:
 def mass_matrix(tree: Any, bodies: Any, qpos: Any) -> Any:
     """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof) in a program of JAX.
 
-    ``tree`` (dof, 2) and ``bodies`` (dof, 25) are arrays of :class:`batchpid.sim.engine.rigid_body.RigidBodies`.
+    ``tree`` (dof, 2) and ``bodies`` (dof, 25) are arrays of :attr:`batchpid.task_space.RigidTree.tables`.
 
     Raises
     ------

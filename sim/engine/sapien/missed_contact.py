@@ -12,17 +12,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.read_only import read_only
 from batchpid.sim.engine.link_reach import LinkExtent, closing_arms, link_reach
+from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.engine.sapien.building import build_scene, new_system
-from batchpid.sim.engine.sapien.dynamics import scene_dynamics
+from batchpid.sim.engine.sapien.contacts import scene_contacts
 from batchpid.sim.engine.sapien.extents import NearPair, link_extents, touching_pairs
+from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.task_space.frames import matrix_of, rotate
 
 DEPTH = 1e-3
 """Depth [m] from which an overlap counts as a contact: bodies at rest on each other may overlap by less."""
@@ -57,9 +62,9 @@ class PairDistances:
         return self._index.get(frozenset((pair.first, pair.second)))
 
     def lower_bounds(self, poses: Float64) -> Float64:
-        """Return lower bounds of the distances (pairs,) [m], by the balls of links at these poses (links, 4, 4)."""
+        """Return lower bounds of the distances (pairs,) [m], by the balls of links at these poses (links, 7)."""
         at, radii = poses[self._owner], self._balls[:, 3]
-        centers = np.einsum("bij,bj->bi", at[:, :3, :3], self._balls[:, :3]) + at[:, :3, 3]
+        centers = rotate(matrix_of(at[:, 3:]), self._balls[:, :3]) + at[:, :3]
         squares = np.einsum("bi,bi->b", centers, centers)
         between = np.sqrt(np.maximum(squares[:, None] + squares - 2 * (centers @ centers.T), 0.0))
         table = np.column_stack([between - radii, centers[:, 2]]) - radii[:, None]
@@ -79,8 +84,10 @@ class MissedContacts:
     """Contacts that ``size`` robots of ``spec`` would have had, with a ground at height 0 or without."""
 
     def __init__(self, spec: SceneSpec, size: int, ground: bool) -> None:
-        shaped = replace(spec, collisions=True, ground=ground, build=None)
-        self._model, self._distances = scene_dynamics(shaped), pair_distances(shaped)
+        like_sapien: dict[str, Any] = {"physics": PHYSICS["fast"], "engine": "sapien"}
+        shaped = replace(spec, collisions=True, ground=ground, build=None, **like_sapien)
+        self._contacts, self._distances = scene_contacts(shaped), pair_distances(shaped)
+        self._tree = scene_tree(shaped)
         pairs, dof = self._distances.arms.shape
         self._centers, self._sizes = np.zeros((size, dof)), np.zeros((size, pairs))
 
@@ -99,8 +106,9 @@ class MissedContacts:
 
     def _region(self, qpos: Float64) -> tuple[Float64, bool]:
         """Return how far the links of each pair may close from ``qpos`` (dof,) until one touches, and if one does."""
-        sizes = np.maximum(self._distances.lower_bounds(self._model.link_poses(qpos)), LISTED_DISTANCE)
-        for pair in self._model.near_pairs(qpos):
+        poses = ts.link_poses(self._tree, qpos, self._contacts.links)
+        sizes = np.maximum(self._distances.lower_bounds(poses), LISTED_DISTANCE)
+        for pair in self._contacts.near_pairs(qpos):
             index = self._distances.index(pair)
             if index is not None:
                 sizes[index] = min(sizes[index], pair.distance)

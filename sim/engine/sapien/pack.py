@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float32, Float64
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
@@ -24,9 +25,9 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.native_model import NativeModel
+from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.engine.sapien.building import build_scene, engine_settings, link_frames, new_system
 from batchpid.sim.engine.sapien.calls import EngineCalls
-from batchpid.sim.engine.sapien.dynamics import scene_dynamics
 from batchpid.sim.engine.sapien.native_calls import engine_calls
 from batchpid.sim.engine.sapien.sim_step import NativeStep
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, refuse_shapes, write_root
@@ -193,7 +194,7 @@ class Pack(SingleOwner):
         return self._joint_model.mass_matrix(qpos) if self.steps_natively else self._joint_mass_matrix(qpos)
 
     def _joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
-        return scene_dynamics(self.spec).joint_mass_matrix(qpos)
+        return ts.mass_matrix(scene_tree(self.spec), qpos)
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
         return self._calls.passive_force(gravity, coriolis, dtype)

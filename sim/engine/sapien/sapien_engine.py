@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 from batchpid.sim.engine.protocol import Capability, Engine
-from batchpid.sim.engine.sapien.dynamics import loaded_dynamics, robot_dynamics, scene_dynamics
 from batchpid.sim.engine.sapien.link_masses import link_masses
 from batchpid.sim.engine.sapien.missed_contact import MissedContacts
 from batchpid.sim.engine.sapien.pack import Pack
@@ -50,9 +49,6 @@ class SapienEngine:
             return Pack(spec, size, first_env)
         return VariedPack(spec, size, first_env, variation, carrier, links)
 
-    scene_dynamics = staticmethod(scene_dynamics)
-    robot_dynamics = staticmethod(robot_dynamics)
-    loaded_dynamics = staticmethod(loaded_dynamics)
     missed_contacts = staticmethod(MissedContacts)
     self_contact = staticmethod(self_contact)
     link_masses = staticmethod(link_masses)

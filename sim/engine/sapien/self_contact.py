@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from batchpid.sim.engine.sapien.building import link_groups
 from batchpid.sim.engine.sapien.collision_groups import Pair
-from batchpid.sim.engine.sapien.dynamics import Dynamics
+from batchpid.sim.engine.sapien.contacts import Contacts
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.sapien.trial import in_child
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -71,9 +71,9 @@ def self_contact(robot: RobotDescription) -> SelfContact:
 
 def _measure(spec: SceneSpec, rest: NDArray[np.float64], poses: NDArray[np.float64]) -> _Measured:
     """Return the distances at ``rest`` and at ``poses``, none without poses."""
-    dynamics = Dynamics(spec)
-    distances = [dynamics.link_distances(qpos) for qpos in (rest, *poses)] if len(poses) else []
-    return _Measured(distances, dynamics.height(rest))
+    contacts = Contacts(spec)
+    distances = [contacts.link_distances(qpos) for qpos in (rest, *poses)] if len(poses) else []
+    return _Measured(distances, contacts.height(rest))
 
 
 def _rigid_bodies(joints: Iterable[Joint]) -> dict[str, str]:

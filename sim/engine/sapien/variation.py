@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from sapien import Pose
 
+import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.joint_friction import own_friction
 from batchpid.sim.engine.native_model import NativeModel, passive_force_of
+from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
 from batchpid.sim.engine.sapien.building import set_inertia
-from batchpid.sim.engine.sapien.dynamics import Dynamics, scene_dynamics
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.task_space.spatial_inertia import spatial_matrix, total
@@ -99,15 +100,12 @@ class VariedPack(Pack):
         return own_friction(self.spec, self._variation)
 
     @cached_property
-    def _dynamics(self) -> Dynamics:
-        return scene_dynamics(self.spec)
-
-    @cached_property
     def _passive_force(self) -> Callable[..., Float64]:
         return passive_force_of(self.spec, self.steps_natively)
 
     def _joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
-        return self._dynamics.joint_mass_matrix(qpos, self._added)
+        tree = scene_tree(self.spec)
+        return ts.mass_matrix(tree, qpos, tree.varied(self._added) if self._added else None)
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether compiled steps read the force of the model: not where a mass differs from it."""

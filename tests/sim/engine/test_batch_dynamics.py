@@ -1,4 +1,4 @@
-"""Dynamics of many robots at once: the extension's are Pinocchio's, and its steps NumPy's."""
+"""Dynamics of many robots at once: the extension's are NumPy's."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from batchpid.sim import Robot
 from batchpid.sim.engine import native
 from batchpid.sim.engine.batch_dynamics import (
     Friction,
+    Loaded,
     MovingJoints,
     NativeBatchDynamics,
-    PinocchioBatchDynamics,
+    NumpyBatchDynamics,
     batch_dynamics,
-    models_of,
 )
 
 DT = 5e-4
@@ -46,16 +46,16 @@ CASES = [("panda", range(7)), ("panda", (1, 3, 8)), ("jaco2", None), (0, None), 
 
 @needs_extension
 @pytest.mark.parametrize(("name", "joints"), CASES)
-def test_the_extension_gives_what_pinocchio_gives(name, joints, tmp_path):
+def test_the_extension_gives_what_numpy_gives(name, joints, tmp_path):
     arm = load(name, tmp_path)
     joints = tuple(np.flatnonzero(arm.independent)) if joints is None else tuple(joints)
     moving = MovingJoints.of(arm, joints)
-    fast, slow = NativeBatchDynamics(models_of(arm), moving), PinocchioBatchDynamics(models_of(arm), moving)
+    fast, slow = NativeBatchDynamics(Loaded.of(arm), moving), NumpyBatchDynamics(Loaded.of(arm), moving)
     qpos, qvel, payload = state_of(arm, joints)
     found, expected = fast.at(qpos, qvel, payload), slow.at(qpos, qvel, payload)
     for leaf, wanted in zip(found, expected, strict=True):
         scale = np.abs(wanted).max() + 1e-9
-        np.testing.assert_allclose(leaf / scale, wanted / scale, rtol=0, atol=1e-4)  # SAPIEN rounds masses to float32
+        np.testing.assert_allclose(leaf / scale, wanted / scale, rtol=0, atol=1e-12)
     empty = np.zeros_like(payload)
     for leaf, wanted in zip(fast.at(qpos, qvel, empty)[:2], slow.at(qpos, qvel, empty)[:2], strict=True):
         np.testing.assert_allclose(leaf, wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
@@ -68,7 +68,7 @@ def test_the_extension_gives_what_pinocchio_gives(name, joints, tmp_path):
 
 
 @pytest.mark.parametrize("moves", [(0, 1), (1,)], ids=str)
-@pytest.mark.parametrize("kind", [pytest.param(NativeBatchDynamics, marks=needs_extension), PinocchioBatchDynamics])
+@pytest.mark.parametrize("kind", [pytest.param(NativeBatchDynamics, marks=needs_extension), NumpyBatchDynamics])
 def test_followers_move_with_their_leaders(kind, moves, tmp_path):
     mimics = ('<mimic joint="two" multiplier="-0.5" offset="0.2"/>', '<mimic joint="three" multiplier="3"/>')
     joints = [joint("one", "a", "b"), joint("two", "b", "c")]
@@ -80,17 +80,17 @@ def test_followers_move_with_their_leaders(kind, moves, tmp_path):
     qpos[:, places], qvel[:, places] = rng.uniform(-1, 1, (2, 5, len(moves)))
     whole, rates, still = coupling.positions(qpos), coupling.rates(qvel), np.zeros((5, arm.dof))
     columns = coupling.matrix[:, places]
-    found = kind(models_of(arm), MovingJoints.of(arm, moves)).at(qpos[:, places], qvel[:, places], np.zeros((5, 1)))
+    found = kind(Loaded.of(arm), MovingJoints.of(arm, moves)).at(qpos[:, places], qvel[:, places], np.zeros((5, 1)))
     np.testing.assert_allclose(found.matrix, columns.T @ model.mass_matrix(whole) @ columns, rtol=1e-6)
     np.testing.assert_allclose(found.force, model.inverse_dynamics(whole, rates, still) @ columns, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("kind", [NativeBatchDynamics, PinocchioBatchDynamics])
+@pytest.mark.parametrize("kind", [NativeBatchDynamics, NumpyBatchDynamics])
 def test_a_row_does_not_depend_on_the_others(kind, panda):
     if kind is NativeBatchDynamics and not native.status().active:
         pytest.skip("the extension was not built")
     joints = tuple(range(7))
-    batch = kind(models_of(panda), MovingJoints.of(panda, joints))
+    batch = kind(Loaded.of(panda), MovingJoints.of(panda, joints))
     qpos, qvel, payload = state_of(panda, joints)
     whole, friction = batch.at(qpos, qvel, payload), friction_of(qpos.shape)
     stepped = batch.step((qpos, qvel, 0 * qpos), whole.matrix, qvel, 0 * qpos + 0.1, friction, DT)
@@ -116,7 +116,7 @@ def test_a_tool_that_is_part_of_the_base_weighs_nothing(tmp_path):
     moving = MovingJoints.of(arm, (0, 1))
     qpos, kg = np.full((3, 2), 0.05), np.array([[0.0], [0.5], [1.0]])
     found, expected = (
-        kind(models_of(arm), moving).at(qpos, 0 * qpos, kg) for kind in (NativeBatchDynamics, PinocchioBatchDynamics)
+        kind(Loaded.of(arm), moving).at(qpos, 0 * qpos, kg) for kind in (NativeBatchDynamics, NumpyBatchDynamics)
     )
     for leaf, wanted in zip(found, expected, strict=True):
         np.testing.assert_allclose(leaf, wanted, atol=1e-7)
@@ -138,4 +138,4 @@ def test_strong_friction_stops_and_limits_hold(panda):
 
 def test_it_works_without_the_extension(panda, monkeypatch):
     monkeypatch.setenv(native.SWITCH, "0")
-    assert isinstance(batch_dynamics(panda, (0,)), PinocchioBatchDynamics)
+    assert isinstance(batch_dynamics(panda, (0,)), NumpyBatchDynamics)

@@ -14,7 +14,7 @@ from robots import RUBBING, load_bundled
 import batchpid
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import MissedContactWarning, Randomization, Robot, Runner, Uniform
-from batchpid.sim.engine.sapien.dynamics import scene_dynamics
+from batchpid.sim.engine.robot_model import scene_model
 from batchpid.sim.engine.sapien.missed_contact import DEPTH
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -111,7 +111,7 @@ def test_masses_and_inertias_stay(falling):
         SceneSpec(falling.urdf, (), falling.joints, 1e-3, PHYSICS["fast"], collisions=collisions)
         for collisions in (True, False)
     ]
-    shaped, bare = (scene_dynamics(spec).mass_matrix(np.array([[0.5]])) for spec in specs)
+    shaped, bare = (scene_model(spec).mass_matrix(np.array([[0.5]])) for spec in specs)
     np.testing.assert_allclose(bare, shaped, rtol=1e-6)
     assert 1.0 < bare[0, 0, 0] < 2.0  # 4 kg (1000 kg/m^3) at 0.5 m, not the 1e-6 kg of a link without shapes
 
@@ -123,7 +123,7 @@ def test_missed_contacts_are_those_found_by_looking_at_every_tick(name):
     with pytest.warns(MissedContactWarning, match="env .* at .* s"):
         rollout, missed = roll_out(robot, start, target, ticks=30, collisions=False)
     spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["fast"], ground=robot.has_ground)
-    model, expected = scene_dynamics(spec), {}
+    model, expected = scene_model(spec), {}
     for time, poses in zip(rollout.time, rollout.qpos, strict=True):
         for env in np.flatnonzero(model.in_contact(poses, -DEPTH)).tolist():
             expected.setdefault(env, (time, model.nearest_links(poses[env])))

@@ -16,12 +16,12 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors import actuator_dynamics as motor_model
 from batchpid.motors import guard as guard_model
 from batchpid.sim import Robot, Runner
+from batchpid.sim.engine.robot_model import scene_model
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.tuning.moves import random_moves
 
 mujoco = pytest.importorskip("mujoco", "3.17")
 from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf  # noqa: E402
-from batchpid.sim.engine.mujoco.mujoco_dynamics import scene_dynamics  # noqa: E402
 from batchpid.sim.engine.mujoco.solver import SOLVERS  # noqa: E402
 
 DT = 1 / 2000
@@ -48,7 +48,7 @@ def test_the_loaded_model_has_the_dynamics_of_the_robot(name):
         ground=loaded.has_ground,
         engine="mujoco",
     )
-    oracle = scene_dynamics(spec)
+    oracle = scene_model(spec)
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     columns = [model.joint(each).dofadr[0] for each in loaded.joint_names]
     for qpos in loaded.sample(3):

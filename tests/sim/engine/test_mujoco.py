@@ -31,6 +31,7 @@ from batchpid.sim.engine.engines import load_engine  # noqa: E402
 from batchpid.sim.engine.mujoco import model_builder  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import _set_options, robot_model  # noqa: E402
 from batchpid.sim.engine.mujoco.mujoco_step import CLOCK, mujoco_library  # noqa: E402
+from batchpid.sim.engine.robot_model import scene_model
 from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 from batchpid.sim.observation import OBSERVED  # noqa: E402
 from batchpid.sim.tuning.evaluation import arm_joints, run_moves  # noqa: E402
@@ -74,7 +75,7 @@ def test_dynamics_are_those_of_mujocos_own_reading_of_the_urdf(tmp_path, seed):
     model = mujoco.MjModel.from_xml_path(str(path))
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     qpos, qvel, qacc = rng.normal(size=(3, 20, arm.dof))
-    ours = load_engine("mujoco").scene_dynamics(spec_of(arm))
+    ours = scene_model(spec_of(arm))
     order = [model.joint(name).dofadr[0] for name in arm.joint_names]
     for row in range(20):
         data.qpos[order], data.qvel[order], data.qacc[order] = qpos[row], qvel[row], qacc[row]
@@ -83,26 +84,11 @@ def test_dynamics_are_those_of_mujocos_own_reading_of_the_urdf(tmp_path, seed):
         mujoco.mj_fullM(model, data, full)
         one = slice(row, row + 1)
         scale = np.abs(full).max()
-        np.testing.assert_allclose(ours.joint_mass_matrix(qpos[one])[0], full[np.ix_(order, order)], atol=1e-12 * scale)
+        np.testing.assert_allclose(ours.mass_matrix(qpos[one])[0], full[np.ix_(order, order)], atol=1e-12 * scale)
         expected = data.qfrc_inverse[order]
         effort = ours.inverse_dynamics(qpos[one], qvel[one], qacc[one])
         np.testing.assert_allclose(effort[0], expected, atol=1e-12 * np.abs(expected).max())
         np.testing.assert_allclose(ours.forward_dynamics(qpos[one], qvel[one], effort)[0], qacc[row], atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["panda", "jaco2"])
-@pytest.mark.parametrize("fixed_base", [True, False])
-def test_dynamics_are_those_of_sapien_up_to_single_precision(name, fixed_base):
-    arm = Robot.load(name, fixed_base=fixed_base)
-    mine, other = (load_engine(engine).scene_dynamics(spec_of(arm, engine)) for engine in ("mujoco", "sapien"))
-    qpos, qvel = arm.sample(20, seed=1), np.random.default_rng(0).normal(size=(20, arm.dof))
-    expected = other.joint_mass_matrix(qpos)
-    np.testing.assert_allclose(mine.joint_mass_matrix(qpos), expected, atol=2e-5 * np.abs(expected).max())
-    if fixed_base:
-        for gravity, coriolis in ((True, True), (True, False), (False, True)):
-            force = other.passive_force(qpos, qvel, gravity, coriolis)
-            ours = mine.passive_force(qpos, qvel, gravity, coriolis)
-            np.testing.assert_allclose(ours, force, atol=2e-5 * np.abs(force).max())
 
 
 def test_the_native_mass_matrix_is_that_of_the_model(tmp_path):
@@ -111,7 +97,7 @@ def test_the_native_mass_matrix_is_that_of_the_model(tmp_path):
     tree = Robot.load(write(tmp_path, robot(*random_tree(np.random.default_rng(5), 12))))
     for arm in (load_bundled("panda"), load_bundled("jaco2"), tree):
         spec, qpos = spec_of(arm), arm.sample(20, seed=1)
-        expected = load_engine("mujoco").scene_dynamics(spec).mass_matrix(qpos)
+        expected = scene_model(spec).mass_matrix(qpos)
         np.testing.assert_allclose(NativeModel(spec).mass_matrix(qpos), expected, atol=1e-12 * np.abs(expected).max())
 
 

@@ -18,7 +18,7 @@ from batchpid.native import extensions
 from batchpid.native.operations import PROGRAM
 from batchpid.sim import Runner
 from batchpid.sim.engine import native
-from batchpid.sim.engine.batch_dynamics import PinocchioBatchDynamics, batch_dynamics
+from batchpid.sim.engine.batch_dynamics import NumpyBatchDynamics, batch_dynamics
 from batchpid.sim.engine.native import interface, verdict
 from batchpid.sim.engine.native.interface import EXTENSIONS
 
@@ -81,7 +81,7 @@ def test_a_stale_extension_is_one_warning_and_python_does_the_work(monkeypatch, 
     assert len(caught) == 1
     assert backend.startswith(f"law in NumPy, Python calls into SAPIEN ({reason}")
     assert_identical(expected, found)
-    assert isinstance(batch_dynamics(panda, (0, 1)), PinocchioBatchDynamics)
+    assert isinstance(batch_dynamics(panda, (0, 1)), NumpyBatchDynamics)
     (variable, told), *others = native.environment().items()
     assert (variable, others) == ("BATCHPID_NATIVE_REFUSED", [])
     assert told in backend

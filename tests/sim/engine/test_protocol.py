@@ -22,9 +22,7 @@ from batchpid.sim.engine.protocol import (
     DrivenPack,
     Engine,
     EnginePack,
-    RobotModel,
 )
-from batchpid.sim.engine.sapien.dynamics import Dynamics
 from batchpid.sim.engine.sapien.missed_contact import MissedContacts
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.sapien.sapien_engine import SapienEngine
@@ -56,7 +54,6 @@ def check_members(protocol, kind):
         (DrivenPack, Pack),
         (CompiledPack, VariedPack),
         (CompiledStep, NativeStep),
-        (RobotModel, Dynamics),
         (ContactRecord, MissedContacts),
         (Engine, SapienEngine),
     ],
@@ -67,23 +64,12 @@ def test_sapien_has_the_members_of_each_protocol(protocol, kind):
 
 def test_mujoco_has_the_members_of_each_protocol():
     pytest.importorskip("mujoco.batch")
-    from batchpid.sim.engine.mujoco import mujoco_dynamics, mujoco_engine, mujoco_pack, mujoco_step
+    from batchpid.sim.engine.mujoco import mujoco_engine, mujoco_pack, mujoco_step
 
     for protocol in (EnginePack, DrivenPack, CompiledPack):
         check_members(protocol, mujoco_pack.MujocoPack)
     check_members(CompiledStep, mujoco_step.MujocoStep)
-    check_members(RobotModel, mujoco_dynamics.MujocoDynamics)
     check_members(Engine, mujoco_engine.MujocoEngine)
-
-
-class UnitInertia:
-    """Model of joints of 1 kg m^2 that nothing couples or loads."""
-
-    def mass_matrix(self, qpos):
-        return np.tile(np.eye(qpos.shape[1]), (len(qpos), 1, 1))
-
-    def inverse_dynamics(self, qpos, qvel, qacc):
-        return np.array(qacc)
 
 
 class DoubleIntegrators:
@@ -105,7 +91,7 @@ class DoubleIntegrators:
         return np.zeros_like(self.qf, dtype)
 
     def joint_mass_matrix(self, qpos):
-        return UnitInertia().mass_matrix(qpos)
+        return np.tile(np.eye(qpos.shape[1]), (len(qpos), 1, 1))
 
     def write_qf(self, effort):
         self.qf[...] = effort
@@ -164,9 +150,6 @@ class ToyEngine:
 
     def make_pack(self, spec, size, first_env=0, variation=None, carrier="", links=(), workspace=None):
         return DoubleIntegrators(spec, size, first_env)
-
-    def robot_dynamics(self, robot, ground=None):
-        return UnitInertia()
 
 
 ENGINE = ToyEngine()

@@ -32,8 +32,7 @@ def test_dynamics_give_every_thread_its_own_results(panda, many_switches):
 
     def figures(qpos):
         heights = [dynamics.height(pose) for pose in qpos]
-        frames = [dynamics.link_poses(pose) for pose in qpos]
-        return dynamics.in_contact(qpos), dynamics.mass_matrix(qpos), np.array(heights), np.array(frames)
+        return dynamics.in_contact(qpos), dynamics.mass_matrix(qpos), np.array(heights)
 
     parts = np.array_split(poses, 4)
     for alone, shared in zip(map(figures, parts), in_threads(figures, parts), strict=True):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from robots import load_bundled
 
-from batchpid.sim.engine.sapien.dynamics import Dynamics
+from batchpid.sim.engine.robot_model import RobotModel
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.sapien.variation import VariedPack
@@ -109,7 +109,7 @@ def test_centers_of_mass_are_displaced_along_the_axes_of_their_links(name, fixed
             center = np.array(origin.get("xyz", "0 0 0").split(), float) + displacement
             origin.set("xyz", " ".join(map(repr, center.tolist())))
     spec = dataclasses.replace(spec_of(robot), fixed_base=fixed_base)
-    edited = Dynamics(dataclasses.replace(spec, urdf=ElementTree.tostring(urdf, encoding="unicode")))
+    edited = RobotModel(dataclasses.replace(spec, urdf=ElementTree.tostring(urdf, encoding="unicode")))
     pack = make(robot, Variation(center_of_mass=moved.reshape(1, -1)), spec=spec)
     model, still = pack.robots[0].create_pinocchio_model(), np.zeros((1, robot.dof))
     for qpos in rng.uniform(robot.lower.clip(-3), robot.upper.clip(None, 3), (5, 1, robot.dof)):

@@ -7,8 +7,9 @@ import pytest
 from tiny_urdf import joint, link, one_joint, robot, write
 
 import batchpid as bp
+import batchpid.task_space as ts
 from batchpid.sim import Randomization, Robot, Runner, Uniform
-from batchpid.sim.engine.sapien.dynamics import scene_dynamics
+from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
 
@@ -228,5 +229,5 @@ def test_the_mass_matrix_of_the_joints_is_the_engines(fixed_base, tmp_path):
         runner.reset(pose)
         velocity = runner.step(efforts).qvel - fall
     spec = SceneSpec(robot.urdf, (), robot.joints, DT, PHYSICS["fast"], ground=False, fixed_base=fixed_base)
-    matrix = scene_dynamics(spec).joint_mass_matrix(pose[None])[0]
+    matrix = ts.mass_matrix(scene_tree(spec), pose[None])[0]
     np.testing.assert_allclose(velocity @ matrix / DT, efforts, atol=2e-3)

@@ -1,4 +1,4 @@
-"""Forward kinematics against SAPIEN's link poses, and J^T F against the work that a force does."""
+"""Forward kinematics against SAPIEN's link poses."""
 
 import re
 
@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 from robots import load_bundled
 from tiny_urdf import link, write
 
-from batchpid.errors import InvalidArgumentError
+import batchpid.task_space as ts
 from batchpid.sim import Robot
 from batchpid.sim.engine.sapien.building import build_scene, new_system
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.task_space.rotations import about, from_rpy, multiply, rotate
 
 ODD = """<robot name="odd">
@@ -48,46 +47,20 @@ def random_qpos(robot, count):
 def test_link_poses_are_those_of_sapien(robot):
     spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["accurate"], ground=False)
     _scene, reference = build_scene(spec, new_system(spec))
-    kinematics = Kinematics(robot)
-    qpos = random_qpos(robot, 20)
-    ours = kinematics.poses(qpos)
-    assert ours.position.shape == (20, len(kinematics.links), 3)
+    tree, qpos = robot.rigid_tree, random_qpos(robot, 20)
+    ours = ts.link_poses(tree, qpos)
+    assert ours.shape == (20, len(tree.links), 7)
     for k, row in enumerate(qpos):
         reference.set_qpos(row.astype(np.float32))
         for body in reference.links:
-            pose, index = body.entity_pose, kinematics.index(body.name)
-            np.testing.assert_allclose(ours.position[k, index], pose.p, atol=2e-6)
-            assert np.abs(ours.wxyz[k, index] @ pose.q) == pytest.approx(1, abs=2e-6)
-
-
-def test_poses_of_any_batch_shape_are_those_of_single_rows(robot):
-    kinematics = Kinematics(robot)
-    qpos = random_qpos(robot, 6)
-    flat = kinematics.poses(qpos)
-    for part, whole in zip(kinematics.poses(qpos.reshape(2, 3, -1)), flat, strict=True):
-        np.testing.assert_array_equal(part.reshape(whole.shape), whole)
-    np.testing.assert_array_equal(kinematics.poses(qpos[0]).position, flat.position[0])
-
-
-def test_efforts_of_a_force_are_the_gradient_of_its_work(robot):
-    kinematics = Kinematics(robot)
-    qpos = random_qpos(robot, 5)
-    poses = kinematics.poses(qpos)
-    force, step = np.array([3.0, -2.0, 5.0]), 1e-6
-    for index in range(len(kinematics.links)):
-        efforts = kinematics.efforts_of_force(poses, index, force)
-        for joint in range(robot.dof):
-            nudge = step * np.eye(robot.dof)[joint]
-            ahead, behind = (kinematics.poses(qpos + sign * nudge).position[:, index] for sign in (1, -1))
-            np.testing.assert_allclose(efforts[:, joint], (ahead - behind) @ force / (2 * step), atol=1e-7)
+            pose, index = body.entity_pose, tree.index(body.name)
+            np.testing.assert_allclose(ours[k, index, :3], pose.p, atol=2e-6)
+            assert np.abs(ours[k, index, 3:] @ pose.q) == pytest.approx(1, abs=2e-6)
 
 
 def test_the_tool_is_the_hand_or_the_end_of_the_chain(panda, jaco2, tmp_path):
     for robot, tool in ((panda, "panda_hand"), (jaco2, "j2s7s300_link_7"), (odd_robot(tmp_path), "mid")):
-        kinematics = Kinematics(robot)
-        assert kinematics.links[kinematics.tool] == tool
-    with pytest.raises(InvalidArgumentError, match="unknown option"):
-        kinematics.index("elbow")
+        assert robot.rigid_tree.tool == tool
 
 
 angles = st.floats(-7, 7)

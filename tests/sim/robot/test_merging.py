@@ -7,8 +7,8 @@ import pytest
 from lxml import etree
 from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 
+import batchpid.task_space as ts
 from batchpid.sim import Robot
-from batchpid.sim.robot.kinematics import Kinematics
 from batchpid.sim.robot.merging import merge_fixed_links, place_links
 from batchpid.task_space.rotations import from_rpy, multiply, rotate
 from batchpid.task_space.spatial_inertia import SpatialInertia, total
@@ -98,23 +98,20 @@ def test_poses_inertia_and_order_of_random_trees_stay(seed, tmp_path):
     again = Robot.load(tmp_path / "merged.urdf")
     assert again.joint_names == original.joint_names
     qpos = rng.uniform(-2, 2, original.dof)
-    kinematics, reduced = Kinematics(original), Kinematics(again)
-    poses, bodies = kinematics.poses(qpos), reduced.poses(qpos)
+    tree, reduced = original.rigid_tree, again.rigid_tree
+    poses, bodies = ts.link_poses(tree, qpos), ts.link_poses(reduced, qpos)
 
-    def world(inertias, kinematics, poses):
+    def world(inertias, tree, poses):
         """Total inertia in the world, of bodies that move together."""
-        index = [kinematics.index(name) for name in inertias]
-        return total([i.moved(poses.position[k], poses.wxyz[k]) for i, k in zip(inertias.values(), index, strict=True)])
+        index = [tree.index(name) for name in inertias]
+        return total([i.moved(poses[k, :3], poses[k, 3:]) for i, k in zip(inertias.values(), index, strict=True)])
 
     for name, at in merged.bodies.items():
-        body, link_ = reduced.index(at.link), kinematics.index(name)
-        np.testing.assert_allclose(
-            bodies.position[body] + rotate(bodies.wxyz[body], at.position), poses.position[link_], atol=1e-12
-        )
-        turn = multiply(bodies.wxyz[body], at.wxyz)
-        assert abs(turn @ poses.wxyz[link_]) == pytest.approx(1, abs=1e-12)
+        body, own = bodies[reduced.index(at.link)], poses[tree.index(name)]
+        np.testing.assert_allclose(body[:3] + rotate(body[3:], at.position), own[:3], atol=1e-12)
+        assert abs(multiply(body[3:], at.wxyz) @ own[3:]) == pytest.approx(1, abs=1e-12)
     inertias = merge_fixed_links(merged.urdf, none_asked).inertias
-    before, after = world(merged.inertias, kinematics, poses), world(inertias, reduced, bodies)
+    before, after = world(merged.inertias, tree, poses), world(inertias, reduced, bodies)
     for ours, theirs in zip(before, after, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
 
@@ -150,11 +147,11 @@ def test_siblings_of_a_merged_link_stay_in_order(tmp_path):
 
 
 def test_placements_of_a_robot_are_those_of_its_kinematics(panda):
-    poses, kinematics = Kinematics(panda).poses(np.zeros(panda.dof)), Kinematics(panda)
+    tree = panda.rigid_tree
+    poses = ts.link_poses(tree, np.zeros(panda.dof))
     for name, at in place_links(panda.urdf).items():
-        body, own = (kinematics.index(each) for each in (at.link, name))
-        position = poses.position[body] + rotate(poses.wxyz[body], at.position)
-        np.testing.assert_allclose(position, poses.position[own], atol=1e-12)
+        body, own = (poses[tree.index(each)] for each in (at.link, name))
+        np.testing.assert_allclose(body[:3] + rotate(body[3:], at.position), own[:3], atol=1e-12)
 
 
 def test_total_of_two_masses_is_that_of_a_dumbbell():

@@ -16,9 +16,9 @@ pytest.importorskip("mujoco.batch")
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, RobotError  # noqa: E402
 from batchpid.sim import Robot, Runner  # noqa: E402
-from batchpid.sim.engine.engines import load_engine  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.mujoco.solver import SOLVERS  # noqa: E402
+from batchpid.sim.engine.robot_model import scene_model  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 from batchpid.sim.robot.shapes import surfaces  # noqa: E402
 from batchpid.sim.robot.xml import numbers  # noqa: E402
@@ -134,7 +134,7 @@ def test_mass_matrix_and_bias_are_those_of_the_file(load, name, merge_fixed):
         biases.append(data.qfrc_bias[dofs].copy())
     massless = 1e-4 if name == "chain" or not merge_fixed else 1e-9  # links that both engines give 1e-6 kg
     for dynamics, tolerance in (
-        (load_engine("mujoco").scene_dynamics(spec_of(robot, collisions=False)), massless),
+        (scene_model(spec_of(robot, collisions=False)), massless),
         (robot.dynamics(), 1e-4),
     ):
         bias = dynamics.inverse_dynamics(qpos, qvel, np.zeros_like(qpos))

@@ -15,7 +15,7 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
-from batchpid.sim.engine.sapien.dynamics import robot_dynamics
+from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.robot.self_collision import disabled_pairs, read_srdf
 
 BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
@@ -153,7 +153,7 @@ def test_physx_reports_contact_of_all_pairs_but_the_disabled_and_the_neighbours(
         lines = (f'<disable_collisions link1="{a}" link2="{b}"/>' for a, b in disabled)
         write(Path(folder), robot(*lines), "test.srdf")
         loaded = Robot.load(path, self_collision="urdf", merge_fixed=merge_fixed)
-        seen = robot_dynamics(loaded, ground=False).link_distances(loaded.start)
+        seen = robot_model(loaded, False)._contacts.link_distances(loaded.start)
     far = {pair for pair in map(frozenset, pairs) if len({body[name] for name in pair}) == 2}
     neighbours = {frozenset((a, b)) for a, b in pairs if {body[a], body[b]} == {"arm0", "arm4"}}
     assert set(seen) - neighbours == far - neighbours - set(map(frozenset, disabled))

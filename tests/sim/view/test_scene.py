@@ -69,11 +69,9 @@ def test_an_older_recording_has_the_default_ground(panda, hanging):
 
 
 def test_a_film_has_the_same_floor(hanging):
-    from batchpid.sim.robot.kinematics import Kinematics
-
     for ground, height in ((True, 0.0), (False, -0.5)):
         scene = MagicMock()
-        layout = arrange_robots(Kinematics(hanging), hanging, 1, 2, ground)
+        layout = arrange_robots(hanging, 1, 2, ground)
         add_floor(scene, layout, ground, None)
         assert scene.add_ground.called == ground
         lines = scene.create_actor_builder.return_value.add_box_visual.call_args_list

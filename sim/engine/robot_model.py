@@ -1,0 +1,133 @@
+"""Model of one robot at given poses: its dynamics by :mod:`batchpid.task_space`, its contacts by its shapes.
+
+The rigid tree is made of the simulated bodies, so that every engine moves the robot by the same masses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid.task_space as ts
+from batchpid.arrays.array_types import Bool, Float64
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.description import RobotDescription
+from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.robot_tree import rigid_tree
+from batchpid.task_space.rigid_tree import RigidTree
+
+
+class RobotModel:
+    """Dynamics and contacts of the robot of ``spec`` on a fixed base, at poses qpos (n, dof).
+
+    Friction, damping and motors are left out. Several threads may use one object.
+    """
+
+    def __init__(self, spec: SceneSpec) -> None:
+        self._spec, self.tree = spec, scene_tree(spec)
+
+    def __reduce__(self) -> Any:  # a controller that keeps it can be sent to worker processes
+        return scene_model, (self._spec,)
+
+    def mass_matrix(self, qpos: Any) -> Any:
+        """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg], in NumPy or JAX as ``qpos``."""
+        return ts.mass_matrix(self.tree.held, qpos)
+
+    def inverse_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]) -> Float64:
+        """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
+        return np.asarray(ts.inverse_dynamics(self.tree.held, qpos, qvel, qacc), np.float64)
+
+    def passive_force(self, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool) -> Float64:
+        """Return the efforts (n, dof) [N m or N] that cancel gravity and Coriolis and centrifugal forces."""
+        return passive_force(self.tree.held, qpos, qvel, gravity, coriolis)
+
+    def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> Float64:
+        """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity included.
+
+        Followers keep to their leaders.
+        """
+        return np.asarray(ts.forward_dynamics(self._coupled, qpos, qvel, effort), np.float64)
+
+    @cached_property
+    def _coupled(self) -> RigidTree:
+        return replace(self.tree.held, coupling=coupling_of(self._spec.joints))
+
+    @cached_property
+    def _contacts(self) -> Any:
+        from batchpid.sim.engine.sapien.contacts import scene_contacts
+
+        return scene_contacts(self._spec)
+
+    def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> Bool:
+        """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,).
+
+        Links joined by fixed joints do not count, nor the base and the links fixed to it with the ground.
+        """
+        return np.asarray(self._contacts.in_contact(qpos, clearance))
+
+    def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
+        """Return the two links of the URDF that are nearest to each other, or overlap most, at one pose (dof,).
+
+        One if the other is the ground; none if no links are near each other.
+        """
+        nearest: tuple[str, ...] = self._contacts.nearest_links(qpos)
+        return nearest
+
+    def height(self, qpos: NDArray[Any], base_too: bool = False) -> float:
+        """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes.
+
+        With ``base_too`` the links that are fixed to the base count as well.
+        """
+        return float(self._contacts.height(qpos, base_too))
+
+
+def passive_force(
+    tree: RigidTree, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool, turning: Any = None
+) -> Float64:
+    """Return the part of :func:`batchpid.task_space.bias` (n, dof) that is of gravity, or of velocities.
+
+    On a floating base, which turns at ``turning`` (n, 3) [rad/s], there is no gravity in it.
+    """
+    zero = np.zeros_like(np.asarray(qpos, np.float64))
+    force = zero
+    if coriolis or (gravity and tree.fixed_base):
+        force = ts.bias(tree, qpos, qvel if coriolis else zero, turning if coriolis else None)
+    if coriolis and not gravity and tree.fixed_base:
+        force = force - ts.bias(tree, qpos, zero)
+    return np.asarray(force, np.float64)
+
+
+@lru_cache(maxsize=16)
+def scene_tree(spec: SceneSpec) -> RigidTree:
+    """Return the rigid tree of the simulated bodies of ``spec``, all joints independent; the same for equal specs."""
+    from batchpid.sim.engine.sapien.body_inertias import body_inertias
+    from batchpid.sim.engine.sapien.building import merged
+
+    text = merged(spec).urdf if spec.merge_fixed else spec.urdf
+    return rigid_tree(text, body_inertias(spec), gravity=spec.gravity, fixed_base=spec.fixed_base)
+
+
+@lru_cache(maxsize=8)
+def scene_model(spec: SceneSpec) -> RobotModel:
+    """Return the model of the robot of ``spec``, the same object for equal specs."""
+    return RobotModel(spec)
+
+
+def robot_model(robot: RobotDescription, ground: bool | None = None) -> RobotModel:
+    """Return the model of ``robot`` on a fixed base, with or without a ground at height 0, by default its own."""
+    has_ground = robot.has_ground if ground is None else ground
+    return scene_model(
+        SceneSpec(
+            robot.urdf,
+            robot.ignored_pairs,
+            robot.joints,
+            1e-3,
+            None,
+            merge_fixed=robot.merge_fixed,
+            ground=has_ground,
+        )
+    )
