@@ -44,13 +44,13 @@ FLOORS = [
     ),
     Floor("closed loop, no shapes", OURS, 1.08, 1.25, "purpose of collisions=False"),
     Floor(
-        "closed loop, no shapes, free", OURS, 2.2, 1.45, "purpose of physics='free', against that of the closed loop"
+        "closed loop, no shapes, free", OURS, 1.85, 1.25, "purpose of physics='free', against that of the closed loop"
     ),
 ]
 FEW_FLOORS = {
     # robots in the caller's process over the tutorial's own loop: (accurate, fast)
     1: (0.75, 0.95),  # one robot cannot share the cost of a NumPy call
-    4: (0.95, 1.35),  # they share a PhysX system and the calls
+    4: (0.95, 1.35),  # they share the calls
     16: (1.05, 1.7),  # a whole group of envs
 }
 ACTUATOR_FLOORS = {

@@ -9,7 +9,7 @@ from clusters import FILTERS
 from robots import load_bundled
 from scripts import ROOT, load_script
 
-TESTED = {"accuracy", "circles", "cluster", "contact", "draw", "motions", "newcomer", "scale", "view"}
+TESTED = {"accuracy", "circles", "cluster", "draw", "motions", "newcomer", "scale", "view"}
 TESTED |= {"trajectories"}
 
 
@@ -40,13 +40,6 @@ def test_circles(monkeypatch):
     tool, wanted, center = circles.measure(panda, "panda_hand", "sapien", twist=True, acceleration=True)
     assert np.linalg.norm(tool - wanted, axis=1).max() < 0.05
     np.testing.assert_allclose(np.linalg.norm(wanted - center, axis=1), circles.RADIUS)
-
-
-def test_contact(capsys):
-    load_script("contact").main(robots=("jaco2",), num_envs=2, seconds=0.2)
-    found = rows(capsys.readouterr().out)
-    assert len(found) == 4
-    assert all(with_prediction == "0" for _, _, _, with_prediction, _ in found)
 
 
 def test_newcomer(tmp_path, capfd):

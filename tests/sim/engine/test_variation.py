@@ -40,7 +40,7 @@ def random_variation(robot, seed, rows=1):
 
 def make(robot, variation, rows=1, spec=None):
     carrier = "panda_hand" if "panda" in robot.name else "j2s7s300_link_7"
-    return VariedPack(spec or spec_of(robot), rows, 0, rows, variation, carrier, links_of(robot))
+    return VariedPack(spec or spec_of(robot), rows, 0, variation, carrier, links_of(robot))
 
 
 def swing(pack, robot, steps=STEPS, seed=0):

@@ -398,7 +398,7 @@ def varied_pack(robot, engine):
         ground=False,
     )
     variation = Variation(payload=rng.uniform(0.5, 3.0, 5), link_mass=rng.uniform(0.5, 2.0, (5, 2)))
-    return chosen.make_pack(spec, 5, 0, 8, variation, "panda_hand", ["panda_link2", "panda_link7"]), variation
+    return chosen.make_pack(spec, 5, 0, variation, "panda_hand", ["panda_link2", "panda_link7"]), variation
 
 
 @pytest.mark.parametrize("fixed_base", [True, False])
