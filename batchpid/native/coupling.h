@@ -14,7 +14,7 @@ struct Coupling {
   std::int32_t const *leader;  // (dof,)
   double const *multiplier;    // (dof,)
 
-  // Write G^T M G of coupled joints in place of M (n, n): CouplingArrays.mass_matrix.
+  // Write G^T M G of coupled joints in place of M (n, n): Coupling.mass_matrix.
   template <class N>
   void fold(std::size_t n, N *matrix) const {
     auto const above = [&](std::size_t i) { return static_cast<std::size_t>(leader[i]); };
@@ -34,7 +34,7 @@ struct Coupling {
     }
   }
 
-  // Write G^T u in place of u, whose entry for a joint is at u[i]: CouplingArrays.efforts.
+  // Write G^T u in place of u, whose entry for a joint is at u[i]: Coupling.efforts.
   template <class N>
   void fold_vector(std::size_t n, N *u) const {
     for (std::size_t i = 0; i < n && leader != nullptr; ++i) {

@@ -31,7 +31,9 @@ def whitened(matrix: Any, right: Any) -> Any:
     matrix, sound = _sound(matrix)
     factor = _cholesky(matrix)
     positive = sound & ~np.isnan(factor[..., :1, :1])
-    return np.where(positive, np.linalg.solve(np.where(positive, factor, _identity(matrix)), right), np.nan)
+    # With rows and columns in reverse the factor is upper triangular, and its solution a substitution, without pivots.
+    reverse = np.where(positive, factor, _identity(matrix))[..., ::-1, ::-1]
+    return np.where(positive, np.linalg.solve(reverse, right[..., ::-1, :])[..., ::-1, :], np.nan)
 
 
 def _cholesky(matrix: Any) -> Any:

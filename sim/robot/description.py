@@ -80,11 +80,10 @@ def register_engine(
 class RobotDescription(Urdf):
     """Robot as its URDF describes it; every array is in the order of ``joint_names``.
 
-    ``joints`` are the degrees of freedom, the moving joints of ``all_joints``; ``coupling`` couples the mimic joints
-    among them to their leaders, and is None without mimic joints. ``bodies`` is the placement of every link, by name,
-    in its simulated link: links joined by fixed joints are simulated as one, unless ``merge_fixed`` is False.
-    ``settings`` are a bundled robot's and ``defaults`` an MJCF file's, else None. ``package_dirs`` are the folders in
-    which meshes are looked up first. ``actuators`` are its motors and sensors, None for ideal ones.
+    ``joints`` are the degrees of freedom, the moving joints of ``all_joints``. ``bodies`` is the placement of every
+    link, by name, in its simulated link: links joined by fixed joints are simulated as one, unless ``merge_fixed`` is
+    False. ``settings`` are a bundled robot's and ``defaults`` an MJCF file's, else None. ``package_dirs`` are the
+    folders in which meshes are looked up first. ``actuators`` are its motors and sensors, None for ideal ones.
     """
 
     path: Path
@@ -200,7 +199,7 @@ class RobotDescription(Urdf):
 
     @cached_property
     def coupling(self) -> Coupling:
-        """Coupling of the mimic joints; the identity without mimic joints."""
+        """Coupling of the mimic joints to their leaders; the identity without mimic joints."""
         return coupling_of(self.joints)
 
     @property

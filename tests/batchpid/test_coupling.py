@@ -80,17 +80,8 @@ def test_figures_of_followers_are_those_of_their_leaders(case):
 def test_the_identity_returns_its_arguments():
     coupling, given = Coupling.of(3), object()
     assert coupling.is_identity
-    for name in [
-        "positions",
-        "rates",
-        "efforts",
-        "of_independent",
-        "of_leaders",
-        "of_all",
-        "mass_matrix",
-        "reduced",
-        "reduced_damping",
-    ]:
+    of_figures, of_matrices = ["of_independent", "of_leaders", "of_all"], ["mass_matrix", "reduced", "reduced_damping"]
+    for name in ["positions", "rates", "efforts", *of_figures, *of_matrices]:
         assert getattr(coupling, name)(given) is given
     assert coupling.native() == {}
     assert not len(coupling.followers)
