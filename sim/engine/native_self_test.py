@@ -26,8 +26,8 @@ from batchpid.sim.engine.batch_dynamics import (
 from batchpid.sim.engine.native import python_calls
 from batchpid.sim.engine.native.native_tick import NativeTick
 from batchpid.sim.engine.native_model import NativeModel
-from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.engine.sapien.building import build_scene, new_system
+from batchpid.sim.engine.sapien.built_tree import scene_tree
 from batchpid.sim.engine.sapien.calls import PythonCalls
 from batchpid.sim.engine.sapien.native_calls import NativeCalls
 from batchpid.sim.engine.sapien.pack import Pack

@@ -22,6 +22,8 @@ from batchpid.motors.friction import Friction
 from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot import description
+from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.spatial_inertia import SpatialInertia
 
 Capability = Literal["drive", "build", "missed_contacts", "compiled_steps", "partial_force", "sapien_dissipation"]
 """
@@ -271,6 +273,15 @@ class Engine(description.RobotFunctions, Protocol):
         InvalidArgumentError
             The function ``build`` of the spec is wrong.
         """
+
+    def bodies(self, spec: SceneSpec) -> tuple[str, Mapping[str, SpatialInertia]]:
+        """Return the URDF of the simulated links of ``spec``, and their inertias, by name, in their frames."""
+
+    def contacts(self, spec: SceneSpec) -> Any:
+        """Return the contacts of the robot of ``spec`` at given poses."""
+
+    def scene_tree(self, spec: SceneSpec) -> RigidTree:
+        """Return the rigid tree of the robot of ``spec`` as the engine has it, the same object for equal specs."""
 
     def missed_contacts(self, spec: SceneSpec, size: int, ground: bool) -> ContactRecord:
         """Return the record of ``size`` robots of ``spec``, with a ground at height 0 or without."""

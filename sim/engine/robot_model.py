@@ -1,6 +1,6 @@
 """Model of one robot at given poses: its dynamics by :mod:`batchpid.task_space`, its contacts by its shapes.
 
-The rigid tree is made of the simulated bodies, so that every engine moves the robot by the same masses.
+The rigid tree is made of the simulated bodies, in double precision; SAPIEN rounds them (:func:`scene_tree`).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64
+from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.mimics import coupling_of
@@ -28,7 +29,7 @@ class RobotModel:
     """
 
     def __init__(self, spec: SceneSpec) -> None:
-        self._spec, self.tree = spec, scene_tree(spec)
+        self._spec, self.tree = spec, description_tree(spec)
 
     def __reduce__(self) -> Any:  # a controller that keeps it can be sent to worker processes
         return scene_model, (self._spec,)
@@ -58,9 +59,7 @@ class RobotModel:
 
     @cached_property
     def _contacts(self) -> Any:
-        from batchpid.sim.engine.sapien.contacts import scene_contacts
-
-        return scene_contacts(self._spec)
+        return load_engine("sapien").contacts(self._spec)
 
     def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> Bool:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,).
@@ -102,13 +101,15 @@ def passive_force(
 
 
 @lru_cache(maxsize=16)
-def scene_tree(spec: SceneSpec) -> RigidTree:
+def description_tree(spec: SceneSpec) -> RigidTree:
     """Return the rigid tree of the simulated bodies of ``spec``, all joints independent; the same for equal specs."""
-    from batchpid.sim.engine.sapien.body_inertias import body_inertias
-    from batchpid.sim.engine.sapien.building import merged
+    text, inertias = load_engine("sapien").bodies(spec)
+    return rigid_tree(text, inertias, gravity=spec.gravity, fixed_base=spec.fixed_base)
 
-    text = merged(spec).urdf if spec.merge_fixed else spec.urdf
-    return rigid_tree(text, body_inertias(spec), gravity=spec.gravity, fixed_base=spec.fixed_base)
+
+def scene_tree(spec: SceneSpec) -> RigidTree:
+    """Return the rigid tree of the robot of ``spec`` as its engine has it, the same object for equal specs."""
+    return load_engine(spec.engine).scene_tree(spec)
 
 
 @lru_cache(maxsize=8)

@@ -13,10 +13,13 @@ from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.mujoco.mujoco_pack import MujocoPack
 from batchpid.sim.engine.mujoco.solver import SOLVERS, MujocoSolver
 from batchpid.sim.engine.protocol import Capability, ContactRecord, Engine
+from batchpid.sim.engine.robot_model import description_tree
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.parts import LinkMass
 from batchpid.sim.robot.self_collision import SelfContact
+from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.spatial_inertia import SpatialInertia
 
 
 class MujocoEngine:
@@ -50,6 +53,18 @@ class MujocoEngine:
     ) -> MujocoPack:
         """Return a new pack."""
         return MujocoPack(spec, size, first_env, variation, carrier, links, workspace)
+
+    def bodies(self, spec: SceneSpec) -> tuple[str, Mapping[str, SpatialInertia]]:
+        """Return the simulated links, by SAPIEN."""
+        return load_engine("sapien").bodies(spec)
+
+    def contacts(self, spec: SceneSpec) -> Any:
+        """Return the contacts at given poses, by SAPIEN."""
+        return load_engine("sapien").contacts(spec)
+
+    def scene_tree(self, spec: SceneSpec) -> RigidTree:
+        """Return the rigid tree of the robot of ``spec``."""
+        return description_tree(spec)
 
     def missed_contacts(self, spec: SceneSpec, size: int, ground: bool) -> ContactRecord:
         """Return the record of contacts of robots without shapes, by SAPIEN."""

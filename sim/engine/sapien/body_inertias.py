@@ -42,6 +42,11 @@ def body_inertias(spec: SceneSpec) -> dict[str, SpatialInertia]:
     return {name: total([part.inertia for part in members]) for name, members in parts.items()}
 
 
+def simulated_bodies(spec: SceneSpec) -> tuple[str, dict[str, SpatialInertia]]:
+    """Return the URDF of the simulated bodies of ``spec``, and their inertias."""
+    return merged(spec).urdf if spec.merge_fixed else spec.urdf, body_inertias(spec)
+
+
 def varied_bodies(spec: SceneSpec, carrier: str, links: Sequence[str]) -> dict[str, Body]:
     """Return the simulated bodies with varying mass, by name: the bodies of ``links`` and of ``carrier``."""
     loaded, place = center_of_mass(spec, carrier)

@@ -21,8 +21,8 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.read_only import read_only
 from batchpid.sim.engine.link_reach import LinkExtent, closing_arms, link_reach
-from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.engine.sapien.building import build_scene, new_system
+from batchpid.sim.engine.sapien.built_tree import scene_tree
 from batchpid.sim.engine.sapien.contacts import scene_contacts
 from batchpid.sim.engine.sapien.extents import NearPair, link_extents, touching_pairs
 from batchpid.sim.engine.sapien.physics import PHYSICS

@@ -25,8 +25,8 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.native_model import NativeModel
-from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.engine.sapien.building import build_scene, engine_settings, link_frames, new_system
+from batchpid.sim.engine.sapien.built_tree import scene_tree
 from batchpid.sim.engine.sapien.calls import EngineCalls
 from batchpid.sim.engine.sapien.native_calls import engine_calls
 from batchpid.sim.engine.sapien.sim_step import NativeStep

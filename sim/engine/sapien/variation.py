@@ -21,9 +21,9 @@ from batchpid.arrays.array_types import Float64
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.joint_friction import own_friction
 from batchpid.sim.engine.native_model import NativeModel, passive_force_of
-from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
 from batchpid.sim.engine.sapien.building import set_inertia
+from batchpid.sim.engine.sapien.built_tree import scene_tree
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.task_space.spatial_inertia import spatial_matrix, total

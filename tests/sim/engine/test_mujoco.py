@@ -31,7 +31,7 @@ from batchpid.sim.engine.engines import load_engine  # noqa: E402
 from batchpid.sim.engine.mujoco import model_builder  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import _set_options, robot_model  # noqa: E402
 from batchpid.sim.engine.mujoco.mujoco_step import CLOCK, mujoco_library  # noqa: E402
-from batchpid.sim.engine.robot_model import scene_model
+from batchpid.sim.engine.robot_model import scene_model  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 from batchpid.sim.observation import OBSERVED  # noqa: E402
 from batchpid.sim.tuning.evaluation import arm_joints, run_moves  # noqa: E402
