@@ -27,6 +27,9 @@ class EngineCalls(Protocol):
     def step(self) -> None:
         """Do one sim step of every system."""
 
+    def close(self) -> None:
+        """Release robots and systems, so that they can be freed; no other call follows."""
+
 
 class PythonCalls:
     """One Python call for each robot and quantity. ``qf`` (M, dof) of float32; ``skip`` (M,): efforts are not applied.
@@ -68,3 +71,7 @@ class PythonCalls:
         """Do one sim step of every system."""
         for step in self._steps:
             step()
+
+    def close(self) -> None:
+        """Release robots and systems."""
+        self._get_qpos, self._get_qvel, self._passive_force, self._set_qf, self._steps = [], [], [], [], []

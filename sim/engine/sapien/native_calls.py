@@ -71,6 +71,10 @@ class NativeCalls:
         """Do one sim step of every system."""
         self._native.step(self.gateway)
 
+    def close(self) -> None:
+        """Release robots and systems."""
+        self._objects = [], []
+
 
 def pointer(wrapper: Any, kind: str) -> int:
     """Return the address of the C++ object in ``wrapper``, a "robot", "system" or "joint".
