@@ -1,6 +1,6 @@
 """Model of one robot at given poses: its dynamics by :mod:`batchpid.task_space`, its contacts by its shapes.
 
-The rigid tree is made of the simulated bodies, in double precision; SAPIEN rounds them (:func:`scene_tree`).
+The rigid tree is the engine's: of the simulated bodies in double precision, or as SAPIEN rounds them to single.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class RobotModel:
     """
 
     def __init__(self, spec: SceneSpec) -> None:
-        self._spec, self.tree = spec, description_tree(spec)
+        self._spec, self.tree = spec, scene_tree(spec)
 
     def __reduce__(self) -> Any:  # a controller that keeps it can be sent to worker processes
         return scene_model, (self._spec,)
@@ -120,15 +120,8 @@ def scene_model(spec: SceneSpec) -> RobotModel:
 
 def robot_model(robot: RobotDescription, ground: bool | None = None) -> RobotModel:
     """Return the model of ``robot`` on a fixed base, with or without a ground at height 0, by default its own."""
-    has_ground = robot.has_ground if ground is None else ground
+    engine, has_ground = load_engine(), robot.has_ground if ground is None else ground
+    options: dict[str, Any] = {"merge_fixed": robot.merge_fixed, "ground": has_ground, "engine": engine.name}
     return scene_model(
-        SceneSpec(
-            robot.urdf,
-            robot.ignored_pairs,
-            robot.joints,
-            1e-3,
-            None,
-            merge_fixed=robot.merge_fixed,
-            ground=has_ground,
-        )
+        SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, engine.physics["fast"], **options)
     )

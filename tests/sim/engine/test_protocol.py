@@ -29,6 +29,7 @@ from batchpid.sim.engine.sapien.sapien_engine import SapienEngine
 from batchpid.sim.engine.sapien.sim_step import NativeStep
 from batchpid.sim.engine.sapien.variation import VariedPack
 from batchpid.sim.loop.backend import describe
+from batchpid.task_space.rigid_tree import RigidTree
 
 PANDA = load_bundled("panda")
 PANDA.has_ground  # noqa: B018 - by SAPIEN, before a test replaces it
@@ -150,6 +151,23 @@ class ToyEngine:
 
     def make_pack(self, spec, size, first_env=0, variation=None, carrier="", links=(), workspace=None):
         return DoubleIntegrators(spec, size, first_env)
+
+    def scene_tree(self, spec):
+        """Return joints of 1 kg that nothing couples or loads, as sliders side by side."""
+        count = len(spec.joints)
+        names = tuple(joint.name for joint in spec.joints)
+        return RigidTree(
+            links=("base", *names),
+            parent=np.array([-1, *np.zeros(count)]),
+            joint_types=("fixed", *["prismatic"] * count),
+            joint_names=names,
+            position=np.zeros((count + 1, 3)),
+            wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (count + 1, 1)),
+            axis=np.tile([1.0, 0.0, 0.0], (count + 1, 1)),
+            mass=np.ones(count + 1),
+            center=np.zeros((count + 1, 3)),
+            inertia=np.zeros((count + 1, 3, 3)),
+        )
 
 
 ENGINE = ToyEngine()

@@ -49,17 +49,17 @@ def test_the_dynamics_are_pinocchios(name, tmp_path):
     theirs = built.create_pinocchio_model()
     model = arm.dynamics()
     matrices = [theirs.compute_generalized_mass_matrix(row) for row in qpos]
-    close(model.mass_matrix(qpos), matrices, 1e-5)  # SAPIEN keeps masses in single precision
+    close(model.mass_matrix(qpos), matrices, 1e-12)
     efforts = [theirs.compute_inverse_dynamics(*rows) for rows in zip(qpos, qvel, qacc, strict=True)]
-    close(model.inverse_dynamics(qpos, qvel, qacc), efforts, 1e-5)
-    close(ts.forward_dynamics(scene_tree(spec), qpos, qvel, np.array(efforts)), qacc, 1e-2)
+    close(model.inverse_dynamics(qpos, qvel, qacc), efforts, 1e-12)
+    close(ts.forward_dynamics(scene_tree(spec), qpos, qvel, np.array(efforts)), qacc, 1e-6)
     poses = ts.link_poses(scene_tree(spec), qpos, [link.name for link in built.links])
     for row, ours in zip(qpos, poses, strict=True):
         theirs.compute_forward_kinematics(row)
         for number, pose in enumerate(ours):
             at = theirs.get_link_pose(number)
-            np.testing.assert_allclose(pose[:3], at.p, atol=1e-5)
-            assert abs(pose[3:] @ at.q) == pytest.approx(1, abs=1e-5)
+            np.testing.assert_allclose(pose[:3], at.p, atol=1e-6)
+            assert abs(pose[3:] @ at.q) == pytest.approx(1, abs=1e-6)
 
 
 @pytest.mark.parametrize("native", ["0", "1"])
