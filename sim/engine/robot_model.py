@@ -121,7 +121,6 @@ def scene_model(spec: SceneSpec) -> RobotModel:
 def robot_model(robot: RobotDescription, ground: bool | None = None) -> RobotModel:
     """Return the model of ``robot`` on a fixed base, with or without a ground at height 0, by default its own."""
     engine, has_ground = load_engine(), robot.has_ground if ground is None else ground
+    physics = engine.physics.get("fast", next(iter(engine.physics.values())))
     options: dict[str, Any] = {"merge_fixed": robot.merge_fixed, "ground": has_ground, "engine": engine.name}
-    return scene_model(
-        SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, engine.physics["fast"], **options)
-    )
+    return scene_model(SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, physics, **options))
