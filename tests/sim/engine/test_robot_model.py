@@ -7,13 +7,16 @@ import pytest
 from robots import load_bundled
 from tiny_urdf import random_tree, robot, write
 
+import batchpid as bp
 import batchpid.task_space as ts
-from batchpid.sim import Robot
+from batchpid.sim import OperationalSpace, Robot, Runner
+from batchpid.sim.engine.batch_dynamics import batch_dynamics
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.robot_model import passive_force, scene_tree
 from batchpid.sim.engine.sapien.building import build_scene, new_system
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.task_space import osc_state, tree_dynamics
 
 NAMES = ["panda", "jaco2", 0, 1, 2, 3]
 
@@ -130,3 +133,38 @@ def test_jax_computes_the_same(panda):
     with jax.enable_x64(True):
         found = np.asarray(jax.jit(model.mass_matrix)(jax.numpy.asarray(qpos)))
     close(found, model.mass_matrix(qpos), 1e-12)
+
+
+def uses(engine, panda):
+    """Yield a name and a call for each user of the mass matrix."""
+
+    def run(**options):
+        with Runner(panda, 1, workers=0, engine=engine, ground=False, **options) as runner:
+            control = options.get("control")
+            runner.step(panda.start if control is None else control.command.neutral)
+
+    yield "law", lambda: run(compensate="gravity+coriolis")
+    yield "friction", lambda: run(params=panda.params(), actuators=bp.make_actuators(panda.dof, coulomb=0.5))
+    yield "task space", lambda: run(control=OperationalSpace(panda, "panda_hand", posture=panda.settings.target))
+    yield "design", lambda: panda.designed("effort")
+    yield "identification", lambda: batch_dynamics(panda, (0, 1)).at(*np.zeros((2, 1, 2)), np.zeros((1, 1)))
+
+
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+def test_there_is_one_mass_matrix(engine, panda, monkeypatch):
+    """Law, friction, task space, design and identification take it from the rigid tree."""
+    if engine == "mujoco":
+        pytest.importorskip("mujoco", "3.17")
+    monkeypatch.setenv("BATCHPID_NATIVE", "0")
+    calls, compute = [], tree_dynamics.mass_matrix_of
+
+    def recorded(*arguments):
+        calls.append(arguments)
+        return compute(*arguments)
+
+    for module in (tree_dynamics, osc_state):
+        monkeypatch.setattr(module, "mass_matrix_of", recorded)
+    for name, use in uses(engine, panda):
+        calls.clear()
+        use()
+        assert calls, name
