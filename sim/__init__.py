@@ -36,7 +36,7 @@ from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import ClusterWarning, Ray
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
-from batchpid.sim.robot.description import Dynamics, RobotDescription, RobotFunctions, register_engine
+from batchpid.sim.robot.description import Dynamics, RobotDescription, register_dynamics
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.limits import MovingSetpointWarning, SetpointWarning
 from batchpid.sim.robot.loop_stability import StabilityWarning
@@ -101,12 +101,6 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(_LOADED_LATE[name]), name)
 
 
-def _engine() -> RobotFunctions:
-    from batchpid.sim.engine.engines import load_engine
-
-    return load_engine()
-
-
 def _dynamics(robot: RobotDescription, ground: bool | None) -> Dynamics:
     from batchpid.sim.engine.robot_model import robot_model
 
@@ -119,5 +113,5 @@ def _plot() -> Callable[..., Any]:
     return step_responses
 
 
-register_engine(_engine, _dynamics)
+register_dynamics(_dynamics)
 register_plot(_plot)

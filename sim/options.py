@@ -198,7 +198,6 @@ class RunnerOptions:
         needed: dict[Capability, tuple[str, bool]] = {
             "drive": ("control", self.control == "drive"),
             "build": ("build", self.build is not None),
-            "missed_contacts": ("collisions", not self.collisions),
             "sapien_dissipation": ("robot", self.robot.dissipation == "sapien"),
         }
         for capability, (argument, needs) in needed.items():

@@ -21,15 +21,12 @@ from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.robot import description
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.spatial_inertia import SpatialInertia
 
-Capability = Literal["drive", "build", "missed_contacts", "compiled_steps", "partial_force", "sapien_dissipation"]
+Capability = Literal["drive", "build", "compiled_steps", "partial_force", "sapien_dissipation"]
 """
 - ``"drive"``: packs are :class:`DrivenPack`, for the control "drive";
 - ``"build"``: the user's function ``build`` adds content to scenes;
-- ``"missed_contacts"``: robots without shapes report contacts that they would have had;
 - ``"compiled_steps"``: packs are :class:`CompiledPack`, for programs of XLA;
 - ``"partial_force"``: compiled steps read gravity or Coriolis forces alone, and forces of floating bases;
 - ``"sapien_dissipation"``: SAPIEN's own friction and damping in place of the URDF's.
@@ -206,17 +203,7 @@ class CompiledPack(EnginePack, Protocol):
         """Return the model of :meth:`passive_force`, where compiled steps do not read it."""
 
 
-class ContactRecord(Protocol):
-    """Contacts that the M robots of a pack without shapes would have had."""
-
-    def place(self, mask: Bool) -> None:
-        """Note that the robots of ``mask`` (M,) were placed."""
-
-    def look(self, qpos: Float64, step: int, first: NDArray[np.int64]) -> None:
-        """Write ``step`` into zero entries of ``first`` (M,), for robots with overlaps at ``qpos`` (M, dof)."""
-
-
-class Engine(description.RobotFunctions, Protocol):
+class Engine(Protocol):
     """Physics engine: it makes packs, and models of robots.
 
     Attributes
@@ -274,17 +261,8 @@ class Engine(description.RobotFunctions, Protocol):
             The function ``build`` of the spec is wrong.
         """
 
-    def bodies(self, spec: SceneSpec) -> tuple[str, Mapping[str, SpatialInertia]]:
-        """Return the URDF of the simulated links of ``spec``, and their inertias, by name, in their frames."""
-
-    def contacts(self, spec: SceneSpec) -> Any:
-        """Return the contacts of the robot of ``spec`` at given poses."""
-
     def scene_tree(self, spec: SceneSpec) -> RigidTree:
         """Return the rigid tree of the robot of ``spec`` as the engine has it, the same object for equal specs."""
-
-    def missed_contacts(self, spec: SceneSpec, size: int, ground: bool) -> ContactRecord:
-        """Return the record of ``size`` robots of ``spec``, with a ground at height 0 or without."""
 
 
 def require(engine: Engine, capability: Capability, argument: str) -> None:

@@ -1,6 +1,6 @@
 """Model of one robot at given poses: its dynamics by :mod:`batchpid.task_space`, its contacts by its shapes.
 
-The rigid tree is the engine's: of the simulated bodies in double precision, or as SAPIEN rounds them to single.
+The rigid tree is made of the simulated bodies, in double precision; SAPIEN rounds them (:func:`scene_tree`).
 """
 
 from __future__ import annotations
@@ -16,9 +16,12 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.collision_shapes import link_shapes
+from batchpid.sim.robot.contacts import Contacts
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.robot_tree import rigid_tree
+from batchpid.sim.robot.simulated_links import body_inertias, simulated
 from batchpid.task_space.rigid_tree import RigidTree
 
 
@@ -29,7 +32,7 @@ class RobotModel:
     """
 
     def __init__(self, spec: SceneSpec) -> None:
-        self._spec, self.tree = spec, scene_tree(spec)
+        self._spec, self.tree = spec, description_tree(spec)
 
     def __reduce__(self) -> Any:  # a controller that keeps it can be sent to worker processes
         return scene_model, (self._spec,)
@@ -58,30 +61,29 @@ class RobotModel:
         return replace(self.tree.held, coupling=coupling_of(self._spec.joints))
 
     @cached_property
-    def _contacts(self) -> Any:
-        return load_engine("sapien").contacts(self._spec)
+    def _contacts(self) -> Contacts:
+        return contacts_of(self._spec, self._spec.ground)
 
     def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> Bool:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,).
 
         Links joined by fixed joints do not count, nor the base and the links fixed to it with the ground.
         """
-        return np.asarray(self._contacts.in_contact(qpos, clearance))
+        return self._contacts.in_contact(qpos, clearance)
 
     def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
         """Return the two links of the URDF that are nearest to each other, or overlap most, at one pose (dof,).
 
         One if the other is the ground; none if no links are near each other.
         """
-        nearest: tuple[str, ...] = self._contacts.nearest_links(qpos)
-        return nearest
+        return self._contacts.nearest_links(qpos)
 
     def height(self, qpos: NDArray[Any], base_too: bool = False) -> float:
         """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes.
 
         With ``base_too`` the links that are fixed to the base count as well.
         """
-        return float(self._contacts.height(qpos, base_too))
+        return self._contacts.height(qpos, base_too)
 
 
 def passive_force(
@@ -103,8 +105,15 @@ def passive_force(
 @lru_cache(maxsize=16)
 def description_tree(spec: SceneSpec) -> RigidTree:
     """Return the rigid tree of the simulated bodies of ``spec``, all joints independent; the same for equal specs."""
-    text, inertias = load_engine("sapien").bodies(spec)
+    text = simulated(spec.urdf, spec.merge_fixed).urdf
+    inertias = body_inertias(spec.urdf, spec.merge_fixed)
     return rigid_tree(text, inertias, gravity=spec.gravity, fixed_base=spec.fixed_base)
+
+
+def contacts_of(spec: SceneSpec, ground: bool) -> Contacts:
+    """Return the contacts of the robot of ``spec``, with shapes, and with a ground at height 0 or without."""
+    ignored = {frozenset(pair) for pair in spec.ignored}
+    return Contacts(description_tree(spec), link_shapes(spec.urdf, spec.merge_fixed), ignored, ground)
 
 
 def scene_tree(spec: SceneSpec) -> RigidTree:
@@ -120,7 +129,6 @@ def scene_model(spec: SceneSpec) -> RobotModel:
 
 def robot_model(robot: RobotDescription, ground: bool | None = None) -> RobotModel:
     """Return the model of ``robot`` on a fixed base, with or without a ground at height 0, by default its own."""
-    engine, has_ground = load_engine(), robot.has_ground if ground is None else ground
-    physics = engine.physics.get("fast", next(iter(engine.physics.values())))
-    options: dict[str, Any] = {"merge_fixed": robot.merge_fixed, "ground": has_ground, "engine": engine.name}
-    return scene_model(SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, physics, **options))
+    has_ground = robot.has_ground if ground is None else ground
+    options: dict[str, Any] = {"merge_fixed": robot.merge_fixed, "ground": has_ground}
+    return scene_model(SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, None, **options))

@@ -6,8 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.robot.parts import Joint
+from batchpid.sim.robot.simulated_links import Body
+from batchpid.task_space.spatial_inertia import SpatialInertia, total
 
 Build = Callable[[Any, int], Any]
 """``build(scene, env)`` adds content to the engine's scene of env ``env``; returns the objects whose poses to read.
@@ -58,3 +62,19 @@ class Variation(NamedTuple):
     """Viscous damping of the joints (envs, dof) [N m s/rad or N s/m]."""
     armature: Float64 | None = None
     """Reflected inertia of the motors (envs, dof) [kg m^2 or kg]."""
+
+
+def varied_inertia(body: Body, variation: Variation, row: int) -> SpatialInertia:
+    """Return the inertia of a body with its links scaled, and with the payload."""
+    parts = []
+    for part in body.parts:
+        (mass, center, tensor), column, share = part.inertia, part.column, 1.0
+        if variation.link_mass is not None and column is not None:
+            share = float(np.nan_to_num(variation.link_mass[row, column], nan=1.0))
+        if variation.center_of_mass is not None and column is not None:
+            displacement = variation.center_of_mass[row, 3 * column : 3 * column + 3]
+            center = center + part.axes @ np.nan_to_num(displacement)
+        parts.append(SpatialInertia(share * mass, center, share * tensor))
+    if body.payload is not None and variation.payload is not None:
+        parts.append(SpatialInertia(float(variation.payload[row]), body.payload, np.zeros((3, 3))))
+    return total(parts)

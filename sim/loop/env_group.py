@@ -14,6 +14,7 @@ from batchpid.arrays.elementwise import clip
 from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.motors.friction import FrictionState
 from batchpid.motors.guard import GuardState
+from batchpid.sim.engine.missed_contact import MissedContacts
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.acting_draws import acting_actuators, acting_params, variation
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
@@ -60,7 +61,7 @@ class EnvGroup:
         self._saturated, self._guarded = (np.zeros((pack.size, pack.dof), bool) for _ in range(2))
         self._steps = 0
         collides, ground = options.collisions, options.robot.has_ground
-        self._contacts = None if collides else options.load_engine().missed_contacts(pack.spec, pack.size, ground)
+        self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
         qpos = pack.read_qpos()
         self._state = StepState(bp.init(params, qpos) if controller is None else controller.init(pack.size))
         self._prepare()

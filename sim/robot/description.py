@@ -23,15 +23,16 @@ from batchpid.sim.observation import RunInfo
 from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.effort import POSES, suggested_effort_limit
 from batchpid.sim.robot.joint_rows import HEADERS, joint_rows
-from batchpid.sim.robot.merging import merge_fixed_links
+from batchpid.sim.robot.link_masses import link_masses
 from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import FileDefaults, Joint, LinkMass, Placement, Settings, Urdf
 from batchpid.sim.robot.robot_tree import rigid_tree
 from batchpid.sim.robot.self_collision import SelfContact, Srdf
+from batchpid.sim.robot.self_contact import self_contact
 from batchpid.sim.robot.setpoint_limits import setpoint_guard
+from batchpid.sim.robot.simulated_links import body_inertias, simulated
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.spatial_inertia import SpatialInertia
 
 LIMIT_TOLERANCE = 1e-6  # rad or m
 
@@ -52,28 +53,15 @@ class Dynamics(Protocol):
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,)."""
 
 
-class RobotFunctions(Protocol):
-    """Functions of an engine that a robot needs; :class:`batchpid.sim.engine.protocol.Engine` has them."""
-
-    def self_contact(self, robot: RobotDescription) -> SelfContact:
-        """Return the pairs of links that do not collide. Raises RobotError if the engine cannot build the robot."""
-
-    def link_masses(self, robot: RobotDescription) -> Mapping[str, LinkMass]:
-        """Return the simulated mass of every link. Raises RobotError if the engine cannot build the robot."""
-
-
-_load_engine: list[Callable[[], RobotFunctions]] = []
 _load_dynamics: list[Callable[[RobotDescription, bool | None], Dynamics]] = []
 
 
-def register_engine(
-    load: Callable[[], RobotFunctions], dynamics: Callable[[RobotDescription, bool | None], Dynamics]
-) -> None:
-    """Set the functions that return the engine, and the dynamics of a robot with or without a ground.
+def register_dynamics(dynamics: Callable[[RobotDescription, bool | None], Dynamics]) -> None:
+    """Set the function that returns the dynamics of a robot with or without a ground.
 
     :mod:`sim` calls it, because robots must not import engines.
     """
-    _load_engine[:], _load_dynamics[:] = [load], [dynamics]
+    _load_dynamics[:] = [dynamics]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -257,11 +245,16 @@ class RobotDescription(Urdf):
 
         Raises RobotError if the engine cannot build a link whose mass comes from its shapes.
         """
-        empty = SpatialInertia(0.0, np.zeros(3), np.zeros((3, 3)))
-        inertias = merge_fixed_links(self.urdf, lambda link: self.link_masses[link].inertia or empty).inertias
+        inertias = simulated(self.urdf, True).inertias
         low, high = np.where(self.continuous, [[-np.inf], [np.inf]], [self.lower, self.upper])
         limits = {"lower": low, "upper": high}
         return rigid_tree(self.urdf, inertias, coupling=self.coupling, fixed_base=self.fixed_base, **limits)
+
+    @cached_property
+    def simulated_tree(self) -> RigidTree:
+        """Tree of the simulated links, without coupling."""
+        merge = self.merge_fixed
+        return rigid_tree(simulated(self.urdf, merge).urdf, body_inertias(self.urdf, merge), fixed_base=self.fixed_base)
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof), on a fixed base."""
@@ -281,13 +274,13 @@ class RobotDescription(Urdf):
 
     @cached_property
     def self_contact(self) -> SelfContact:
-        """Pairs of links that do not collide, and contact with the ground. Loads SAPIEN at the first use."""
-        return _load_engine[0]().self_contact(self)
+        """Pairs of links that do not collide, and contact with the ground, computed at the first use."""
+        return self_contact(self)
 
     @cached_property
     def link_masses(self) -> Mapping[str, LinkMass]:
-        """Simulated mass of every link of the URDF, by name. Loads SAPIEN at the first use."""
-        return _load_engine[0]().link_masses(self)
+        """Simulated mass of every link of the URDF, by name, computed at the first use."""
+        return link_masses(self)
 
     @property
     def ignored_pairs(self) -> tuple[tuple[str, str], ...]:

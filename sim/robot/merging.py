@@ -55,15 +55,15 @@ def place_links(urdf: str, merge_fixed: bool = True) -> dict[str, Placement]:
     return _place(root, _merged_joints(edges_of(root)) if merge_fixed else set())
 
 
-def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInertia]) -> Merged:
-    """Return the robot of a sanitised URDF with its fixed joints merged.
+def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInertia], merge: bool = True) -> Merged:
+    """Return the robot of a sanitised URDF with its fixed joints merged, or as it is, and with all inertias written.
 
-    ``inertia_of_shapes(link)`` is the inertia that the engine computes for a link with collision shapes but without
+    ``inertia_of_shapes(link)`` is the inertia of a link with collision shapes but without
     ``<inertial>``, in the frame of that link.
     """
     root = etree.fromstring(urdf.encode())
     edges = edges_of(root)
-    merged = _merged_joints(edges)
+    merged = _merged_joints(edges) if merge else set[str]()
     bodies = _place(root, merged)
     links = {link.get("name", ""): link for link in root.findall("link")}
     inertias = {name: inertia for name, link in links.items() if (inertia := _inertial(link)) is not None}
@@ -78,6 +78,8 @@ def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInert
             inertias[name] = inertia_of_shapes(name)
         if len(names) > 1:
             _join([links[name] for name in names], [bodies[name] for name in names], inertias)
+        elif kept in inertias and links[kept].find("inertial") is None:
+            links[kept].append(_write_inertial(inertias[kept]))
     for edge in edges:  # breadth first, which orders the joints of a merged link as before
         root.remove(edge.element)
         if edge.name in merged:
@@ -89,6 +91,11 @@ def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInert
             _set_origin(edge.element, placement)
             edge.element.find("parent").set("link", placement.link)
     return Merged(etree.tostring(root, encoding="unicode"), bodies, inertias, owners)
+
+
+def fixed_edges(urdf: str) -> list[tuple[str, str]]:
+    """Return parent and child of every fixed joint, breadth first."""
+    return [(edge.parent, edge.child) for edge in edges_of(etree.fromstring(urdf.encode())) if not edge.moves]
 
 
 def edges_of(root: etree._Element) -> list[Edge]:
@@ -155,14 +162,12 @@ def _join(
 ) -> None:
     """Move the inertia and the collision elements of ``links`` to the first of them."""
     kept, names = links[0], [link.get("name", "") for link in links]
-    given = any(link.find("inertial") is not None for link in links)
     for link in links:
         for inertial in link.findall("inertial"):
             link.remove(inertial)
-    if given:  # otherwise the engine takes the mass of all shapes
-        pairs = [(inertias[name], at) for name, at in zip(names, placements, strict=True) if name in inertias]
-        body = total([inertia.moved(at.position, at.wxyz) for inertia, at in pairs])
-        kept.append(_write_inertial(body))
+    pairs = [(inertias[name], at) for name, at in zip(names, placements, strict=True) if name in inertias]
+    if pairs:
+        kept.append(_write_inertial(total([inertia.moved(at.position, at.wxyz) for inertia, at in pairs])))
     for link, placement in zip(links[1:], placements[1:], strict=True):
         for collision in link.findall("collision"):
             _set_origin(collision, placement)

@@ -25,10 +25,10 @@ from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.mjcf_actuators import FAR, MjcfActuators
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
 from batchpid.sim.engine.mujoco.solver import SOLVERS
-from batchpid.sim.engine.sapien.body_inertias import body_inertias
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.inertia import nearest_physical
+from batchpid.sim.robot.simulated_links import body_inertias
 
 
 def to_mjcf(
@@ -90,7 +90,7 @@ def to_mjcf(
         merge_fixed=robot.merge_fixed,
         engine="mujoco",
     )
-    inertias = body_inertias(spec)
+    inertias = body_inertias(spec.urdf, spec.merge_fixed)
     scene, names = robot_spec(spec, inertias)
     scene.modelname, scene.option.disableflags = robot.name, 0
     for link, name in names.items():

@@ -1,9 +1,8 @@
 r"""Robots as MuJoCo's models.
 
 Each simulated link of the robot (rigid bodies, with fixed joints merged) is a body in the frame of its joint. Masses
-and inertias come from the URDF, in double precision; shapes are the convex ones that SAPIEN builds, so that both
-engines collide the same geometry. A body whose links collide with another body in part has one body without mass for
-each link with shapes, since MuJoCo excludes pairs of bodies.
+and inertias come from the URDF, in double precision; meshes are convex hulls, as in SAPIEN. A body whose links collide
+with another body in part has one body without mass for each link with shapes, since MuJoCo excludes pairs of bodies.
 
 MuJoCo does not compute damping and Coulomb friction: the loop applies them as efforts, in the same way for every
 engine, with the damping's share dt d in the armature, which makes it implicit (:mod:`batchpid.motors.friction`).
@@ -24,17 +23,14 @@ from numpy.typing import NDArray
 
 from batchpid.errors import RobotError
 from batchpid.sim.engine.mujoco.solver import MujocoSolver
-from batchpid.sim.engine.sapien.body_inertias import body_inertias
-from batchpid.sim.engine.sapien.building import merged
-from batchpid.sim.engine.sapien.link_shapes import LinkShape, link_shapes
 from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.collision_shapes import add_geom, link_shapes
 from batchpid.sim.robot.parts import MOVING_TYPES
+from batchpid.sim.robot.simulated_links import body_inertias, simulated
 from batchpid.sim.robot.xml import numbers
-from batchpid.task_space.rotations import from_rpy, multiply
+from batchpid.task_space.rotations import from_rpy
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
-ALONG_X = np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0])
-"""Rotation of MuJoCo's capsules and cylinders, which lie along z, to lie along x (w, x, y, z)."""
 _FRICTION = 0.3
 """Coefficient of sliding friction of every shape, as in SAPIEN's default material."""
 FLOATING = 6
@@ -72,7 +68,7 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     RobotError
         SAPIEN's loader or MuJoCo's compiler refuses the description.
     """
-    inertias = body_inertias(spec)
+    inertias = body_inertias(spec.urdf, spec.merge_fixed)
     scene, names = robot_spec(spec, inertias)
     if drives:
         _add_drives(scene, spec)
@@ -139,7 +135,7 @@ def _set_options(scene: Any, spec: SceneSpec) -> None:
 
 def _add_links(scene: Any, spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> dict[str, str]:
     """Add the simulated links of ``spec`` as bodies; return the name of the body of each."""
-    root = etree.fromstring((merged(spec).urdf if spec.merge_fixed else spec.urdf).encode())
+    root = etree.fromstring(simulated(spec.urdf, spec.merge_fixed).urdf.encode())
     above = {joint.find("child").get("link"): joint for joint in root.findall("joint")}
     names = {link: _unused("world_link", inertias) if link == "world" else link for link in inertias}
     limits = {joint.name: (joint.lower, joint.upper) for joint in spec.joints}
@@ -192,7 +188,7 @@ def _add_links(scene: Any, spec: SceneSpec, inertias: dict[str, SpatialInertia])
 
 def _add_shapes(scene: Any, spec: SceneSpec, names: dict[str, str]) -> None:
     """Add the collision shapes, the pairs of bodies that do not collide, and the ground."""
-    shapes = link_shapes(spec)
+    shapes = link_shapes(spec.urdf, spec.merge_fixed)
     owners = {link: list(dict.fromkeys(shape.owner for shape in of_link)) for link, of_link in shapes.items()}
     ignored = {frozenset(pair) for pair in spec.ignored}
     solid, split = [link for link in owners if owners[link]], set[str]()
@@ -210,10 +206,9 @@ def _add_shapes(scene: Any, spec: SceneSpec, names: dict[str, str]) -> None:
     pairs_of_bodies = {frozenset(bodies[owner] for owner in pair) for pair in ignored if pair <= set(bodies)}
     for first, second in sorted(sorted(pair) for pair in pairs_of_bodies if len(pair) == 2):
         scene.add_exclude(bodyname1=first, bodyname2=second)
-    meshes: dict[bytes, str] = {}
     for of_link in shapes.values():
         for shape in of_link:
-            _add_shape(scene, scene.body(bodies[shape.owner]), shape, meshes, spec)
+            add_geom(scene, scene.body(bodies[shape.owner]), shape, mass=0.0, **_contact(spec))
     if spec.ground:
         scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **_contact(spec))
 
@@ -226,23 +221,6 @@ def _add_drives(scene: Any, spec: SceneSpec) -> None:
         actuator = scene.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         actuator.forcelimited, actuator.forcerange = True, [-LARGEST_FORCE, LARGEST_FORCE]
-
-
-def _add_shape(scene: Any, body: Any, shape: LinkShape, meshes: dict[bytes, str], spec: SceneSpec) -> None:
-    kinds, wxyz = mujoco.mjtGeom, shape.wxyz
-    place = {"pos": shape.position, "mass": 0.0, **_contact(spec)}
-    if shape.vertices is not None:
-        key = shape.vertices.tobytes()
-        if key not in meshes:
-            meshes[key] = f"hull{len(meshes)}"
-            shell = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # of flat hulls as well; it is not used
-            scene.add_mesh(name=meshes[key], uservert=shape.vertices.ravel(), inertia=shell)
-        body.add_geom(type=kinds.mjGEOM_MESH, meshname=meshes[key], quat=wxyz, **place)
-        return
-    kind = getattr(kinds, f"mjGEOM_{shape.kind.upper()}")
-    if shape.kind in ("capsule", "cylinder"):
-        wxyz = multiply(wxyz, ALONG_X)
-    body.add_geom(type=kind, size=np.pad(shape.size, (0, 3 - len(shape.size))), quat=wxyz, **place)
 
 
 def _contact(spec: SceneSpec) -> dict[str, Any]:

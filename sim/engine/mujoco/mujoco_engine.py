@@ -1,32 +1,23 @@
-"""MuJoCo as an :class:`batchpid.sim.engine.protocol.Engine`.
-
-What a robot's description says, whichever engine simulates it (masses of links, pairs of links that do not collide,
-contacts at a pose), comes from SAPIEN, which is always installed.
-"""
+"""MuJoCo as an :class:`batchpid.sim.engine.protocol.Engine`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.mujoco.mujoco_pack import MujocoPack
 from batchpid.sim.engine.mujoco.solver import SOLVERS, MujocoSolver
-from batchpid.sim.engine.protocol import Capability, ContactRecord, Engine
+from batchpid.sim.engine.protocol import Capability, Engine
 from batchpid.sim.engine.robot_model import description_tree
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.parts import LinkMass
-from batchpid.sim.robot.self_collision import SelfContact
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.spatial_inertia import SpatialInertia
 
 
 class MujocoEngine:
     """MuJoCo on the CPU. Implements :class:`batchpid.sim.engine.protocol.Engine`."""
 
     name, title = "mujoco", "MuJoCo"
-    capabilities: frozenset[Capability] = frozenset({"drive", "missed_contacts", "compiled_steps"})
+    capabilities: frozenset[Capability] = frozenset({"drive", "compiled_steps"})
     physics: Mapping[str, Any] = SOLVERS
     group_size = 64
 
@@ -54,29 +45,9 @@ class MujocoEngine:
         """Return a new pack."""
         return MujocoPack(spec, size, first_env, variation, carrier, links, workspace)
 
-    def bodies(self, spec: SceneSpec) -> tuple[str, Mapping[str, SpatialInertia]]:
-        """Return the simulated links, by SAPIEN."""
-        return load_engine("sapien").bodies(spec)
-
-    def contacts(self, spec: SceneSpec) -> Any:
-        """Return the contacts at given poses, by SAPIEN."""
-        return load_engine("sapien").contacts(spec)
-
     def scene_tree(self, spec: SceneSpec) -> RigidTree:
         """Return the rigid tree of the robot of ``spec``."""
         return description_tree(spec)
-
-    def missed_contacts(self, spec: SceneSpec, size: int, ground: bool) -> ContactRecord:
-        """Return the record of contacts of robots without shapes, by SAPIEN."""
-        return load_engine("sapien").missed_contacts(spec, size, ground)
-
-    def self_contact(self, robot: RobotDescription) -> SelfContact:
-        """Return the pairs of links that do not collide, by SAPIEN."""
-        return load_engine("sapien").self_contact(robot)
-
-    def link_masses(self, robot: RobotDescription) -> Mapping[str, LinkMass]:
-        """Return the mass of every link of the URDF, by SAPIEN."""
-        return load_engine("sapien").link_masses(robot)
 
 
 ENGINE: Engine = MujocoEngine()

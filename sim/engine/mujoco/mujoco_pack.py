@@ -27,9 +27,9 @@ from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.protocol import FAILED
 from batchpid.sim.engine.robot_model import passive_force, scene_tree
-from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation, varied_inertia
 from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.simulated_links import varied_bodies
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.spatial_inertia import spatial_matrix, total
 
@@ -66,7 +66,11 @@ class MujocoPack(SingleOwner):
         varied = self._variation
         self._masses_vary = any(each is not None for each in (varied.payload, varied.link_mass, varied.center_of_mass))
         varies_links = varied.link_mass is not None or varied.center_of_mass is not None
-        self._bodies = varied_bodies(spec, carrier, links if varies_links else []) if self._masses_vary else {}
+        self._bodies = (
+            varied_bodies(spec.urdf, spec.merge_fixed, carrier, links if varies_links else [])
+            if self._masses_vary
+            else {}
+        )
         self._nominal = {name: total([part.inertia for part in body.parts]) for name, body in self._bodies.items()}
         self._added = {name: np.zeros((size, 6, 6)) for name in self._bodies}  # spatial inertias, to the nominal
         self.qf = np.zeros((size, self.dof))

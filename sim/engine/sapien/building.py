@@ -5,25 +5,24 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache, lru_cache
-from itertools import combinations
+from functools import lru_cache
 from threading import RLock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
 from batchpid.errors import RobotError
 from batchpid.sim.engine.lazy_module import imported_lazily
-from batchpid.sim.engine.sapien.collision_groups import CollisionGroups, Pair, collision_groups
 from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.collision_groups import link_groups
 from batchpid.sim.robot.dissipation import DISSIPATION
-from batchpid.sim.robot.merging import Merged, merge_fixed_links, place_links
+from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.meshes import note_meshes
-from batchpid.task_space.spatial_inertia import SpatialInertia, total
+from batchpid.sim.robot.simulated_links import simulated
+from batchpid.task_space.spatial_inertia import SpatialInertia
 
 _building = RLock()
 """Lock of the thread that builds a robot: SAPIEN's settings are process-wide, and builders are shared."""
@@ -40,48 +39,11 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
     Raises RobotError if SAPIEN's loader refuses the description, or finds other than one articulated robot in it.
     """
     with _building:
-        builder = _load(merged(spec).urdf if spec.merge_fixed else spec.urdf, spec.fixed_base)
+        builder = _load(simulated(spec.urdf, spec.merge_fixed).urdf, spec.fixed_base)
         if not spec.collisions:
             for link in builder.link_builders:
-                if link._auto_inertial:  # a link without <inertial> has the inertia of its shapes
-                    shaped = link.build_physx_component()
-                    link.set_mass_and_inertia(shaped.mass, shaped.cmass_local_pose, shaped.inertia)
                 link.collision_records = []
         return builder
-
-
-@lru_cache(maxsize=8)
-def merged(spec: SceneSpec) -> Merged:
-    """Return the robot of ``spec`` with its fixed joints merged, the same object for equal specs."""
-
-    @cache
-    def unmerged() -> dict[str, Any]:
-        return unmerged_links(spec.urdf, spec.fixed_base)
-
-    def inertia_of_shapes(link: str) -> SpatialInertia:
-        return link_inertia(unmerged()[link].build_physx_component())
-
-    with _building:
-        return merge_fixed_links(spec.urdf, inertia_of_shapes)
-
-
-def unmerged_links(urdf: str, fixed_base: bool) -> dict[str, Any]:
-    """Return SAPIEN's builder of every link of a sanitised URDF, by name, fixed joints not merged."""
-    return {link.name: link for link in _load(urdf, fixed_base).link_builders}
-
-
-def center_of_mass(spec: SceneSpec, link: str) -> tuple[str, NDArray[np.float64]]:
-    """Return the simulated link that a link of the URDF is part of, and the center of mass of the latter in its frame.
-
-    That of a link without mass is its origin.
-    """
-    at, inertia = place_links(spec.urdf, spec.merge_fixed)[link], merged(spec).inertias.get(link)
-    return at.link, at.position if inertia is None else inertia.moved(at.position, at.wxyz).center
-
-
-def add_point_mass(link: Any, mass: float, position: NDArray[np.float64]) -> None:
-    """Add ``mass`` [kg] at ``position`` (3,) [m] in the frame of one of SAPIEN's links."""
-    set_inertia(link, total([link_inertia(link), SpatialInertia(mass, position, np.zeros((3, 3)))]))
 
 
 def set_inertia(link: Any, inertia: SpatialInertia) -> None:
@@ -94,43 +56,11 @@ def set_inertia(link: Any, inertia: SpatialInertia) -> None:
     link.set_inertia(principal)
 
 
-@lru_cache(maxsize=8)
-def link_groups(spec: SceneSpec) -> CollisionGroups:
-    """Return the words by which PhysX ignores the pairs of ``spec``, for each link of the URDF that has shapes.
-
-    Links of one rigid body are ignored, too: they cannot move apart, and the solver would shake them. PhysX ignores
-    contacts within a simulated link, and with its parent, unless that is the root of a fixed base.
-    """
-    builder = parse(spec)
-    simulated = {name: at.link for name, at in place_links(spec.urdf, spec.merge_fixed).items()}
-    bodies = {name: rigid_bodies(builder)[link] for name, link in simulated.items()}
-    root = builder.link_builders[0].name if spec.fixed_base else None
-    joined = [(simulated[joint.parent_link], simulated[joint.child_link]) for joint in spec.joints]
-    neighbours = {frozenset(pair) for pair in joined if root not in pair}
-    links = list(dict.fromkeys(owner for owners in shape_owners(spec).values() for owner in owners))
-    ignored, free = {frozenset(pair) for pair in spec.ignored}, set[Pair]()
-    for first, second in combinations(links, 2):
-        pair = frozenset((simulated[first], simulated[second]))
-        if len(pair) == 1 or pair in neighbours:
-            free.add(frozenset((first, second)))
-        elif bodies[first] == bodies[second]:
-            ignored.add(frozenset((first, second)))
-    return collision_groups(links, {pair for pair in ignored if pair <= set(links)} - free, free)
-
-
 def shape_owners(spec: SceneSpec) -> dict[str, list[str]]:
     """Return the link of the URDF that owns each collision shape of each simulated link, in the engine's order."""
     if not spec.collisions:
         return {link.name: [] for link in parse(spec).link_builders}
-    if spec.merge_fixed:
-        return merged(spec).owners
-    return {link.name: [link.name] * len(link.collision_records) for link in parse(spec).link_builders}
-
-
-def link_inertia(link: Any) -> SpatialInertia:
-    """Return the inertia of one of SAPIEN's links, in the link's frame."""
-    at, principal = link.cmass_local_pose, np.diag(np.asarray(link.inertia, float))
-    return SpatialInertia(link.mass, np.zeros(3), principal).moved(np.asarray(at.p, float), np.asarray(at.q, float))
+    return simulated(spec.urdf, spec.merge_fixed).owners
 
 
 def _load(urdf: str, fixed_base: bool) -> ArticulationBuilder:
@@ -146,15 +76,6 @@ def _load(urdf: str, fixed_base: bool) -> ArticulationBuilder:
     records = (record for link in builders[0].link_builders for record in link.collision_records)
     note_meshes(record.filename for record in records if record.filename)
     return builders[0]
-
-
-def rigid_bodies(builder: ArticulationBuilder) -> dict[str, str]:
-    """Return the rigid body of each link: links joined by fixed joints are one, named after the first of them."""
-    bodies: dict[str, str] = {}
-    for link in builder.link_builders:
-        fixed = link.parent is not None and link.joint_record.joint_type == "fixed"
-        bodies[link.name] = bodies[link.parent.name] if fixed else link.name
-    return bodies
 
 
 @contextmanager
@@ -227,7 +148,9 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
             files = ", ".join(record.filename for record in records if record.filename)
             remedy = "repair the file, or remove that <collision>"
             raise RobotError(f"link {link.name!r}: SAPIEN cannot build a collision shape from {files}; {remedy}")
-    words, owners = link_groups(spec).words, shape_owners(spec)
+    ignored = {frozenset(pair) for pair in spec.ignored}
+    groups = link_groups(spec.urdf, spec.merge_fixed, spec.fixed_base, spec.joints, ignored)
+    words, owners = groups.words, shape_owners(spec)
     for link in robot.links:
         for shape, owner in zip(link.collision_shapes, owners[link.name], strict=True):
             shape.set_collision_groups(words[owner])

@@ -6,14 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 from batchpid.sim.engine.protocol import Capability, Engine
-from batchpid.sim.engine.sapien.body_inertias import simulated_bodies
 from batchpid.sim.engine.sapien.built_tree import scene_tree
-from batchpid.sim.engine.sapien.contacts import scene_contacts
-from batchpid.sim.engine.sapien.link_masses import link_masses
-from batchpid.sim.engine.sapien.missed_contact import MissedContacts
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.sapien.physics import PHYSICS, Physics
-from batchpid.sim.engine.sapien.self_contact import self_contact
 from batchpid.sim.engine.sapien.variation import VariedPack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 
@@ -52,12 +47,7 @@ class SapienEngine:
             return Pack(spec, size, first_env)
         return VariedPack(spec, size, first_env, variation, carrier, links)
 
-    bodies = staticmethod(simulated_bodies)
-    contacts = staticmethod(scene_contacts)
     scene_tree = staticmethod(scene_tree)
-    missed_contacts = staticmethod(MissedContacts)
-    self_contact = staticmethod(self_contact)
-    link_masses = staticmethod(link_masses)
 
 
 ENGINE: Engine = SapienEngine()

@@ -21,11 +21,11 @@ from batchpid.arrays.array_types import Float64
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.joint_friction import own_friction
 from batchpid.sim.engine.native_model import NativeModel, passive_force_of
-from batchpid.sim.engine.sapien.body_inertias import varied_bodies, varied_inertia
 from batchpid.sim.engine.sapien.building import set_inertia
 from batchpid.sim.engine.sapien.built_tree import scene_tree
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation, varied_inertia
+from batchpid.sim.robot.simulated_links import varied_bodies
 from batchpid.task_space.spatial_inertia import spatial_matrix, total
 
 
@@ -47,7 +47,9 @@ class VariedPack(Pack):
         self._variation = variation
         varies_links = variation.link_mass is not None or variation.center_of_mass is not None
         varies_mass = varies_links or variation.payload is not None
-        self._bodies = varied_bodies(spec, carrier, links if varies_links else []) if varies_mass else {}
+        self._bodies = (
+            varied_bodies(spec.urdf, spec.merge_fixed, carrier, links if varies_links else []) if varies_mass else {}
+        )
         self._models = {name: total([part.inertia for part in body.parts]) for name, body in self._bodies.items()}
         self._added = {name: np.zeros((size, 6, 6)) for name in self._bodies}  # spatial inertias, to the models'
         self._frames: list[tuple[Pose, Pose] | None] = []

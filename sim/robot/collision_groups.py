@@ -17,6 +17,10 @@ from collections.abc import Collection, Iterable, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
+from batchpid.sim.robot.collision_shapes import link_shapes
+from batchpid.sim.robot.merging import fixed_edges, place_links
+from batchpid.sim.robot.parts import Joint
+
 Words = tuple[int, int, int, int]
 Pair = frozenset[str]
 """Names of two bodies."""
@@ -66,13 +70,31 @@ def collision_groups(
     return CollisionGroups(words, frozenset(left))
 
 
-def may_touch(first: Words, second: Words) -> bool:
-    """Return whether PhysX's filter, as SAPIEN sets it up, lets two shapes of different bodies touch."""
-    if first[3] >> 16 != second[3] >> 16:
-        return False
-    if first[2] & second[2] and first[3] & 0xFFFF == second[3] & 0xFFFF:
-        return False
-    return bool(first[0] & second[1] or second[0] & first[1])
+def link_groups(
+    urdf: str, merge_fixed: bool, fixed_base: bool, joints: Sequence[Joint], ignored: Collection[Pair]
+) -> CollisionGroups:
+    """Return the words by which PhysX ignores the pairs ``ignored``, for each link of the URDF that has shapes.
+
+    Links of one rigid body are ignored, too: they cannot move apart, and the solver would shake them. PhysX ignores
+    contacts within a simulated link, and with its parent, unless that is the root of a fixed base.
+    """
+    placements = place_links(urdf, merge_fixed)
+    bodies = {name: at.link for name, at in place_links(urdf, True).items()}
+    for first, second in fixed_edges(urdf):  # a fixed joint that is not merged joins two links of one body
+        bodies = {name: bodies[first] if body == bodies[second] else body for name, body in bodies.items()}
+    root = next(at.link for at in placements.values()) if fixed_base else None
+    joined = [(placements[joint.parent_link].link, placements[joint.child_link].link) for joint in joints]
+    neighbours = {frozenset(pair) for pair in joined if root not in pair}
+    links = [shape.owner for shapes in link_shapes(urdf, merge_fixed).values() for shape in shapes]
+    links = list(dict.fromkeys(links))
+    ignored, free = set(ignored), set[Pair]()
+    for first, second in combinations(links, 2):
+        pair = frozenset((placements[first].link, placements[second].link))
+        if len(pair) == 1 or pair in neighbours:
+            free.add(frozenset((first, second)))
+        elif bodies[first] == bodies[second]:
+            ignored.add(frozenset((first, second)))
+    return collision_groups(links, {pair for pair in ignored if pair <= set(links)} - free, free)
 
 
 def _cliques(bodies: Sequence[str], ignored: Collection[Pair], free: Collection[Pair]) -> list[list[str]]:

@@ -1,0 +1,170 @@
+"""Distances between the links of one robot, and to the ground, at given poses: MuJoCo's, of convex shapes.
+
+The distance of two shapes that overlap is negative: the depth by which they penetrate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from itertools import combinations
+from threading import RLock
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid.task_space as ts
+from batchpid.arrays.array_types import Float64
+from batchpid.sim.robot.collision_shapes import LinkShape, add_geom
+from batchpid.task_space.frames import matrix_of
+from batchpid.task_space.rigid_tree import RigidTree
+
+NEAR = 0.02
+"""Distance [m] from which two shapes are near each other."""
+GROUND = ""
+"""Name of the ground."""
+
+
+class Near(NamedTuple):
+    """Two shapes near each other: their links in the URDF, or GROUND, and their distance [m]."""
+
+    first: str
+    second: str
+    distance: float
+
+
+class Contacts:
+    """Distances of the links of a robot at poses qpos (n, dof). Several threads may use one object.
+
+    Parameters
+    ----------
+    tree
+        Of the simulated links. Links do not collide with their parents, unless that is the root of a fixed base.
+    shapes
+        Of each simulated link, by name.
+    ignored
+        Pairs of links of the URDF that do not collide.
+    ground
+        Whether there is a ground at height 0, for all links but the base and those fixed to it.
+    """
+
+    def __init__(
+        self,
+        tree: RigidTree,
+        shapes: Mapping[str, list[LinkShape]],
+        ignored: Collection[frozenset[str]],
+        ground: bool,
+    ) -> None:
+        self._tree, self._lock = tree, RLock()
+        placed = [(link, shape) for link, of_link in shapes.items() for shape in of_link]
+        self._shapes = [shape for _, shape in placed]
+        self.links = tuple(dict.fromkeys(link for link, _ in placed))
+        self._link = np.array([self.links.index(link) for link, _ in placed], np.intp)
+        bodies = [tree.link_bodies[tree.index(link)] for link in self.links]
+        self._body = np.array([bodies[link] for link in self._link], np.intp)
+        spec = mujoco.MjSpec()
+        for shape in self._shapes:
+            add_geom(spec, spec.worldbody, shape)
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+        mujoco.mj_kinematics(self._model, self._data)  # on the world, shapes are where they are in their links
+        self._place = self._data.geom_xpos.copy()
+        self._turn = self._data.geom_xmat.reshape(-1, 3, 3).copy()
+        first = 1 if tree.fixed_base else 0
+        above = zip(tree.links[1:], tree.parent[1:].tolist(), strict=True)
+        free = {frozenset((link, tree.links[parent])) for link, parent in above if parent >= first}
+        pairs = [
+            (a, b)
+            for a, b in combinations(range(len(placed)), 2)
+            if self._body[a] != self._body[b]
+            and frozenset((placed[a][0], placed[b][0])) not in free
+            and frozenset((self._shapes[a].owner, self._shapes[b].owner)) not in ignored
+        ]
+        self._pairs = np.array(pairs, np.intp).reshape(-1, 2)
+        self._grounded = np.flatnonzero(self._body >= 0) if ground else np.empty(0, np.intp)
+
+    def near(self, qpos: NDArray[Any], within: float = NEAR) -> Iterator[Near]:
+        """Yield the pairs of shapes that are closer than ``within`` [m], at one pose (dof,)."""
+        with self._lock:
+            centers = self._move(qpos)
+            radii, (first, second) = self._model.geom_rbound[: len(centers)], self._pairs.T
+            apart = np.linalg.norm(centers[first] - centers[second], axis=1) - radii[first] - radii[second]
+            found = []
+            for a, b in self._pairs[apart < within].tolist():
+                distance = mujoco.mj_geomDistance(self._model, self._data, a, b, within, None)
+                found.append(Near(self._shapes[a].owner, self._shapes[b].owner, distance))
+            low = self._grounded[centers[self._grounded, 2] - radii[self._grounded] < within].tolist()
+            found += [Near(self._shapes[index].owner, GROUND, self._lowest(index)) for index in low]
+        yield from (each for each in found if each.distance < within)
+
+    @property
+    def balls(self) -> tuple[NDArray[np.intp], Float64]:
+        """Bodies of the tree that carry the shapes (shapes,), -1 for the base, and balls around the shapes (shapes, 4):
+        centers in the frame of the body [m], and radii.
+        """
+        tree, at = self._tree, [self._tree.index(self.links[link]) for link in self._link]
+        frames = tree.bodies.link_frames[at].reshape(-1, 3, 4)
+        centers = np.einsum("sij,sj->si", frames[:, :, :3], self._place) + frames[:, :, 3]
+        return self._body, np.column_stack([centers, self._model.geom_rbound[: len(centers)]])
+
+    def least_distances(self, qpos: NDArray[Any]) -> dict[tuple[int, int], float]:
+        """Return lower bounds of the distances [m] of two bodies that may touch, at one pose (dof,).
+
+        They are exact where bodies are near each other. The ground counts as the base, body -1.
+        """
+        with self._lock:
+            centers = self._move(qpos)
+            radii, (first, second) = self._model.geom_rbound[: len(centers)], self._pairs.T
+            apart = np.linalg.norm(centers[first] - centers[second], axis=1) - radii[first] - radii[second]
+            for row in np.flatnonzero(apart < NEAR).tolist():
+                a, b = self._pairs[row].tolist()
+                apart[row] = mujoco.mj_geomDistance(self._model, self._data, a, b, NEAR, None)
+            low = [(self._lowest(index), (-1, int(self._body[index]))) for index in self._grounded.tolist()]
+        bodies = np.sort(self._body[self._pairs], axis=1).tolist()
+        found: dict[tuple[int, int], float] = {}
+        for distance, pair in (*zip(apart.tolist(), map(tuple, bodies), strict=True), *low):
+            found[pair] = min(distance, found.get(pair, np.inf))
+        return found
+
+    def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> NDArray[np.bool_]:
+        """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,)."""
+        return np.array([any(True for _ in self.near(row, clearance)) for row in np.asarray(qpos)])
+
+    def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
+        """Return the two links that are nearest to each other, one if the other is the ground; none if none is near."""
+        nearest = min(self.near(qpos), key=lambda each: each.distance, default=Near("", "", np.inf))
+        return tuple(name for name in nearest[:2] if name)
+
+    def height(self, qpos: NDArray[Any], base_too: bool = False) -> float:
+        """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes."""
+        with self._lock:
+            self._move(qpos)
+            of = range(len(self._shapes)) if base_too else np.flatnonzero(self._body >= 0).tolist()
+            return min((self._lowest(index) for index in of), default=np.inf)
+
+    def _move(self, qpos: NDArray[Any]) -> Float64:
+        """Place the shapes; return their centers (shapes, 3)."""
+        if not self._shapes:
+            return np.zeros((0, 3))
+        poses = ts.link_poses(self._tree, np.asarray(qpos, np.float64), self.links)[self._link]
+        turns = matrix_of(poses[:, 3:])
+        centers = poses[:, :3] + np.einsum("sij,sj->si", turns, self._place)
+        self._data.geom_xpos[:] = centers
+        self._data.geom_xmat[:] = (turns @ self._turn).reshape(-1, 9)
+        return np.asarray(centers)
+
+    def _lowest(self, index: int) -> float:
+        """Return the height [m] of the lowest point of a shape, as placed."""
+        shape, place = self._shapes[index], self._data.geom_xpos[index]
+        x, y, z = self._data.geom_xmat[index].reshape(3, 3)[2]  # the shape's axes along the vertical
+        if shape.vertices is not None:
+            mesh = self._model.geom_dataid[index]
+            start = self._model.mesh_vertadr[mesh]
+            vertices = self._model.mesh_vert[start : start + self._model.mesh_vertnum[mesh]]
+            return float(place[2] + (vertices @ np.array([x, y, z])).min())
+        size = shape.size
+        if shape.kind == "box":
+            return float(place[2] - np.abs([x, y, z]) @ np.array(size))
+        round_ = size[0] * np.hypot(x, y) if shape.kind == "cylinder" else size[0]
+        return float(place[2] - round_ - (abs(z) * size[1] if len(size) > 1 else 0.0))
