@@ -19,7 +19,6 @@ import numpy as np
 import batchpid as bp
 from batchpid.sim import Robot
 from batchpid.sim.identification.excitation import excite
-from batchpid.sim.robot.kinematics import Kinematics
 
 
 class Truth(NamedTuple):
@@ -137,8 +136,7 @@ def _model(robot: Robot, truth: Truth, names: tuple[str, ...], timestep: float) 
         geom.contype = geom.conaffinity = 0
     model = spec.compile()
     if truth.payload:
-        kinematics = Kinematics(robot)
-        model.body(kinematics.links[kinematics.tool]).mass[:] += truth.payload
+        model.body(robot.rigid_tree.tool).mass[:] += truth.payload
     return model
 
 

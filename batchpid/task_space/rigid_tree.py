@@ -191,9 +191,13 @@ class RigidTree:
             link = int(self.parent[link])
         return self.links[tip]
 
-    @cached_property
+    @property
     def held(self) -> RigidTree:
         """Same tree on a fixed base, with all joints independent."""
+        return self if self.fixed_base and self.coupling.is_identity else self._held
+
+    @cached_property
+    def _held(self) -> RigidTree:
         return replace(self, fixed_base=True, coupling=Coupling.of(self.dof))
 
     @property

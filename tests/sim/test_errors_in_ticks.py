@@ -52,7 +52,7 @@ class ListRecorder:
     def __init__(self):
         self.rows = []
 
-    def append(self, time_, setpoint, observation):
+    def append(self, time_, setpoint, observation, has_rates):
         self.rows.append((time_, setpoint, observation))
 
 

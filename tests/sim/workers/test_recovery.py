@@ -360,7 +360,7 @@ def test_a_tick_whose_recording_was_interrupted_is_recorded_by_the_next_call():
     class Tape:
         times, interrupts = (), 1
 
-        def append(self, time_, setpoint, observation):
+        def append(self, time_, setpoint, observation, has_rates):
             if self.interrupts:
                 self.interrupts = 0
                 raise KeyboardInterrupt
