@@ -25,7 +25,8 @@ from batchpid.sim.robot.self_collision import (
 
 
 def self_contact(robot: Any) -> SelfContact:
-    """Return the pairs of links of a ``robot`` (:class:`.description.RobotDescription`) that do not collide under its option ``self_collision`` and its .srdf.
+    """Return the pairs of links of a :class:`.description.RobotDescription` that do not collide, under its option
+    ``self_collision`` and its .srdf.
 
     Deterministic: the poses are seeded. Raises RobotError for a mesh that cannot be read.
     """

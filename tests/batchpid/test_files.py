@@ -66,7 +66,6 @@ def test_a_trial_leaves_nothing_and_names_what_is_no_file(tmp_path):
 NOT_FILES = {
     "batchpid/io/files.py": "the atomic writer",
     "sim/engine/sapien/building.py": "text in memory",
-    "sim/engine/sapien/trial.py": "a pipe",
     "sim/recording/partial_file.py": "space for a growing recording",
     "sim/view/film.py": "messages in memory",
 }

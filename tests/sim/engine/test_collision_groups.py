@@ -6,9 +6,10 @@ import numpy as np
 import sapien
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from physx_filter import may_touch
 
-from batchpid.sim.engine.sapien.collision_groups import collision_groups, may_touch
 from batchpid.sim.engine.sapien.user_content import HeadlessScene
+from batchpid.sim.robot.collision_groups import collision_groups
 
 DEFAULT = (1, 1, 0, 0)
 

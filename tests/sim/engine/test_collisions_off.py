@@ -14,8 +14,8 @@ from robots import RUBBING, load_bundled
 import batchpid
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import MissedContactWarning, Randomization, Robot, Runner, Uniform
+from batchpid.sim.engine.missed_contact import DEPTH
 from batchpid.sim.engine.robot_model import scene_model
-from batchpid.sim.engine.sapien.missed_contact import DEPTH
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.options import default_params

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from physx_filter import may_touch
 from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
 from batchpid.sim.engine.sapien.building import parse
-from batchpid.sim.engine.sapien.collision_groups import may_touch
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.sapien.variation import VariedPack

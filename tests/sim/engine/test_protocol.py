@@ -18,12 +18,10 @@ from batchpid.sim.engine import engines
 from batchpid.sim.engine.protocol import (
     CompiledPack,
     CompiledStep,
-    ContactRecord,
     DrivenPack,
     Engine,
     EnginePack,
 )
-from batchpid.sim.engine.sapien.missed_contact import MissedContacts
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.sapien.sapien_engine import SapienEngine
 from batchpid.sim.engine.sapien.sim_step import NativeStep
@@ -55,7 +53,6 @@ def check_members(protocol, kind):
         (DrivenPack, Pack),
         (CompiledPack, VariedPack),
         (CompiledStep, NativeStep),
-        (ContactRecord, MissedContacts),
         (Engine, SapienEngine),
     ],
 )
@@ -240,7 +237,6 @@ def test_a_snapshot_of_another_engine_is_refused(toy, monkeypatch):
     [
         ({"control": "drive"}, "control", "drive"),
         ({"build": print}, "build", "build"),
-        ({"collisions": False}, "collisions", "missed_contacts"),
     ],
 )
 def test_what_it_cannot_do_is_an_error_with_a_remedy(options, argument, capability):

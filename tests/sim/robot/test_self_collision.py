@@ -15,7 +15,8 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
-from batchpid.sim.engine.robot_model import robot_model
+from batchpid.sim.engine.robot_model import contacts_of
+from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.self_collision import disabled_pairs, read_srdf
 
 BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
@@ -136,9 +137,14 @@ def test_an_effortless_robot_that_overlaps_at_rest_stays_there(tmp_path):
         np.testing.assert_allclose(runner.step(np.zeros((1, 2))).qpos, 0.0, atol=1e-6)
 
 
+def spec_of(loaded):
+    merge = loaded.merge_fixed
+    return SceneSpec(loaded.urdf, loaded.ignored_pairs, loaded.joints, 1e-3, None, ground=False, merge_fixed=merge)
+
+
 @given(st.integers(0, 2**32), st.booleans())
 @settings(deadline=None, max_examples=8)
-def test_physx_reports_contact_of_all_pairs_but_the_disabled_and_the_neighbours(seed, merge_fixed):
+def test_contacts_are_of_all_pairs_but_the_disabled_and_the_neighbours(seed, merge_fixed):
     rng = np.random.default_rng(seed)
     parts, body = [link("base", INERTIAL)], {}
     for arm in range(5):  # all at one place, each with a tool; the last on the first
@@ -153,7 +159,8 @@ def test_physx_reports_contact_of_all_pairs_but_the_disabled_and_the_neighbours(
         lines = (f'<disable_collisions link1="{a}" link2="{b}"/>' for a, b in disabled)
         write(Path(folder), robot(*lines), "test.srdf")
         loaded = Robot.load(path, self_collision="urdf", merge_fixed=merge_fixed)
-        seen = robot_model(loaded, False)._contacts.link_distances(loaded.start)
+        near = contacts_of(spec_of(loaded), False).near(loaded.start)
+        seen = {frozenset((first, second)) for first, second, _ in near}
     far = {pair for pair in map(frozenset, pairs) if len({body[name] for name in pair}) == 2}
     neighbours = {frozenset((a, b)) for a, b in pairs if {body[a], body[b]} == {"arm0", "arm4"}}
     assert set(seen) - neighbours == far - neighbours - set(map(frozenset, disabled))
