@@ -36,6 +36,7 @@ from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 from batchpid.sim.runner_keywords import (
+    DEFAULT_ENGINE,
     Backend,
     Compensation,
     Controller,
@@ -117,7 +118,9 @@ class RunnerOptions:
     backend: Backend = field(default="numpy", metadata=_in("snapshot"))
     dtype: Precision = field(default="float64", metadata=_in("snapshot"))
     compensate: Compensation = field(default="gravity+coriolis+friction", metadata=_in("snapshot", "recording"))
-    engine: EngineName = field(default="sapien", metadata=_in("scene", snapshot="engine_name", recording="engine_name"))
+    engine: EngineName = field(
+        default=DEFAULT_ENGINE, metadata=_in("scene", snapshot="engine_name", recording="engine_name")
+    )
     physics: PhysicsPreset | Physics | MujocoSolver = field(
         default="accurate",
         metadata=_in(snapshot="solver_settings", recording="physics_name", scene="solver"),

@@ -5,6 +5,7 @@ Longer than 300 lines because the public signatures and their documentation are 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from inspect import Parameter, Signature, signature
 from typing import ClassVar, Unpack
@@ -21,7 +22,7 @@ from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo
 from batchpid.sim.options import RunnerOptions, default_params, keyword_parameters
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner_keywords import RunnerKeywords
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE, RunnerKeywords
 from batchpid.sim.session import Session, TickRecorder
 from batchpid.sim.workers.contact_log import MissedContact
 from batchpid.sim.workers.node import NodeInfo
@@ -58,6 +59,8 @@ class Runner(SingleOwner):
         params: bp.PIDParams | None = None,
         **options: Unpack[RunnerKeywords],
     ) -> None:
+        if "engine" not in options and DEFAULT_ENGINE != "sapien":
+            warnings.warn(f"SAPIEN is not installed: the engine is {DEFAULT_ENGINE!r}", stacklevel=2)
         self.options = checked = RunnerOptions(robot, num_envs, **options)
         """Options, checked."""
         self.robot, self.num_envs, self.control = checked.robot, checked.num_envs, checked.control

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict
 
 from numpy.typing import ArrayLike, NDArray
@@ -57,6 +58,8 @@ SetpointSpace = Literal["joints", "tool"]
 Backend = Literal["numpy", "jax"]
 Precision = Literal["float64", "float32"]
 EngineName = Literal["sapien", "mujoco"]
+DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
+"""SAPIEN where it is installed, which is on Linux with x86-64; elsewhere MuJoCo."""
 PhysicsPreset = Literal["accurate", "fast", "free"]
 FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]

@@ -17,6 +17,7 @@ from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import Outputs
 from batchpid.sim.cli.progress import bar
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class BenchCommand:
 
     robot: flags.RobotName = "panda"
     num_envs: flags.NumEnvs = 64
-    engine: flags.Engine = "sapien"
+    engine: flags.Engine = DEFAULT_ENGINE
     """Engine of the closed loops and of the bare engine; the tutorial's loop is in SAPIEN."""
     physics: flags.Physics = "accurate"
     substeps: int = 20

@@ -11,6 +11,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import Outputs, beside
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import gain_set
 
 
@@ -29,7 +30,7 @@ class DemoCommand:
     seed: int = 0
     """Seed of the start poses."""
     workers: flags.Workers = None
-    engine: flags.Engine = "sapien"
+    engine: flags.Engine = DEFAULT_ENGINE
     backend: flags.Backend = "numpy"
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     picture: flags.OptionalPath = None

@@ -63,10 +63,12 @@ class InspectCommand:
         print("\n" + mass_table(robot, light_too=self.all))
         print("\n" + contact_lines(robot, pairs_too=self.all))
         if self.engine:
+            from batchpid.sim.engine.engines import load_engine
             from batchpid.sim.engine.native import status
+            from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 
-            version = package_versions(["sapien"])["sapien"]
-            print(f"\nEngine: {status().describe(f'SAPIEN {version}')}.")
+            version = package_versions([DEFAULT_ENGINE])[DEFAULT_ENGINE]
+            print(f"\nEngine: {status().describe(f'{load_engine(DEFAULT_ENGINE).title} {version}')}.")
         return int(self.strict and any(finding.severity != "note" for finding in findings))
 
 

@@ -14,6 +14,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Recorder, Robot, write_recording
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tool_space.tool_goals import default_goal
 from batchpid.sim.tuning.gain_sets import gain_set
@@ -59,7 +60,7 @@ class RolloutCommand:
     """Largest distance of a start pose from the robot's own, with --control osc from the bundled robot's target, with
     --trajectory from its first row at time 0 [rad or m]; env 0 starts at that itself."""
     compensate: flags.Compensate = "gravity+coriolis+friction"
-    engine: flags.Engine = "sapien"
+    engine: flags.Engine = DEFAULT_ENGINE
     physics: flags.Physics = "accurate"
     backend: flags.Backend = "numpy"
     collisions: flags.Collisions = True

@@ -21,6 +21,7 @@ from batchpid.sim.cli.report import run_report, tool_report, trajectory_report
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.identification.setpoint_files import Setpoints
 from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.evaluation import Evaluation, evaluate_gains, run_moves
 from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
@@ -82,7 +83,7 @@ def evaluate_sets(
     moves: int,
     seed: int,
     randomization: Randomization | None,
-    engines: Sequence[str] = ("sapien",),
+    engines: Sequence[str] = (DEFAULT_ENGINE,),
     **options: Any,
 ) -> list[Evaluation]:
     """Evaluate ``sets`` in ``engines``, on the tutorial's move and random ``moves`` that no search with ``seed`` sees.

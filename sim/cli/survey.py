@@ -14,6 +14,7 @@ import tyro
 from batchpid.io.files import write_atomically
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
     from batchpid.sim.tuning.robot_survey import RobotReport
@@ -41,7 +42,7 @@ class SurveyCommand:
     seconds: flags.Seconds = 2.0
     bandwidth: float = 2.0
     """Bandwidth of the designed gains [Hz]."""
-    engine: flags.Engine = "sapien"
+    engine: flags.Engine = DEFAULT_ENGINE
     physics: flags.Physics = "accurate"
     time_limit: float = 300.0
     """Wall-clock time for each robot [s]."""

@@ -15,6 +15,7 @@ from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import Outputs, beside
 from batchpid.sim.cli.progress import bar
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.weights import Weights
 from batchpid.task_space import save_osc_options
@@ -53,7 +54,7 @@ class TuneCommand:
     variation: flags.Variation = False
     payload: flags.Payload = 2.0
     friction: flags.Friction = 0.1
-    engine: flags.Engine = "sapien"
+    engine: flags.Engine = DEFAULT_ENGINE
     physics: flags.Physics = "accurate"
     collisions: flags.Collisions = True
     workers: flags.Workers = None

@@ -13,6 +13,7 @@ from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import gain_set
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ class ViewCommand:
     """With --control osc: link of the tool. Default: the last link of the robot's longest chain."""
     gains: flags.Gains = None
     compensate: flags.Compensate = "gravity+coriolis+friction"
-    engine: flags.Engine = "sapien"
+    engine: flags.Engine = DEFAULT_ENGINE
     physics: flags.Physics = "accurate"
     workers: flags.Workers = None
     actuators: flags.Actuators = None

@@ -14,6 +14,7 @@ from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 from batchpid.io.versions import package_versions
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 
 
 class HistoryFile:
@@ -68,7 +69,7 @@ def plain_options(options: Mapping[str, Any], resumes: bool) -> dict[str, Any]:
 
     Raises InvalidArgumentError for a function if the search ``resumes`` from a history.
     """
-    libraries = options.get("engine", "sapien"), *(("jax",) if options.get("backend") == "jax" else ())
+    libraries = options.get("engine", DEFAULT_ENGINE), *(("jax",) if options.get("backend") == "jax" else ())
     versions = package_versions(("batchpid", *libraries, "numpy", "cmaes"))
     return {name: _plain(name, value, resumes) for name, value in options.items()} | {"versions": versions}
 

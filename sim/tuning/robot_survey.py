@@ -30,6 +30,7 @@ from batchpid.sim.processes.fork_server import ONE_THREAD
 from batchpid.sim.robot.parts import MOVING_TYPES
 from batchpid.sim.robot.source import is_mjcf
 from batchpid.sim.robot.xml import SIZE_LIMIT, parse_xml
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 
 STAGES = ("reading the description", "building it in the engine", "checking it", "drawing moves", "moving it")
 """Stages of a survey of one robot, named in :attr:`RobotReport.error`."""
@@ -139,7 +140,7 @@ def survey(
     seed: int = 0,
     seconds: float = 2.0,
     bandwidth_hz: float = 2.0,
-    engine: str = "sapien",
+    engine: str = DEFAULT_ENGINE,
     physics: str = "accurate",
     dissipation: str = "urdf",
     package_dirs: Sequence[Path] = (),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import warnings
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +24,19 @@ def import_sapien() -> Any:
 
 @cache
 def sapien_library() -> Path:
-    """Return the path of SAPIEN's shared library, which is loaded with its Python package."""
-    import_sapien()
-    with open("/proc/self/maps", encoding="utf-8", errors="replace") as maps:
-        paths = {line.split(maxsplit=5)[-1].strip() for line in maps if "libsapien" in line}
+    """Return the path of SAPIEN's shared library, which comes with its Python package; that is not imported."""
+    spec = find_spec("sapien")
+    packages = [] if spec is None else [Path(folder) for folder in spec.submodule_search_locations or ()]
+    folders = [folder for package in packages for folder in (package, package.parent / "sapien.libs")]
+    paths = [path for folder in folders for path in folder.glob("libsapien*.so*")]
     if len(paths) != 1:
-        raise OSError("SAPIEN's shared library is not loaded, or more than once")
-    return Path(paths.pop())
+        raise OSError("SAPIEN's shared library is not installed, or more than once")
+    return paths[0]
 
 
 @cache
 def functions() -> tuple[int, ...]:
     """Return the addresses of the exported functions; AttributeError names one that is missing."""
+    import_sapien()
     library = ctypes.CDLL(str(sapien_library()))
     return tuple(ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value or 0 for symbol in SYMBOLS)

@@ -20,6 +20,7 @@ import warnings
 from collections.abc import Iterator
 from contextvars import ContextVar
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +30,7 @@ from batchpid.native.availability import SWITCH
 from batchpid.native.extensions import ROOT, StaleExtensionError, load, load_all
 from batchpid.native.operations import PROGRAM
 from batchpid.sim.engine.native.interface import EXTENSIONS
-from batchpid.sim.engine.native.library import functions, sapien_library
+from batchpid.sim.engine.native.library import sapien_library
 
 _VERIFIED, _REFUSED = "BATCHPID_NATIVE_VERIFIED", "BATCHPID_NATIVE_REFUSED"
 """Environment variables of child processes: fingerprint of a verdict to use the extensions, or reason not to."""
@@ -110,11 +111,10 @@ def verify(folder: Path, program: str = SELF_TEST) -> NativeStatus:
         return NativeStatus(False, str(error))
     try:
         fingerprint = _fingerprint()
-        functions()
         kept = folder / f"native-{fingerprint}"
         known = os.environ.get(_VERIFIED) == fingerprint or kept.is_file()
         problem = None if known else _run(program, fingerprint)
-    except (OSError, AttributeError) as error:  # the latter for a function that is not exported
+    except OSError as error:
         known, problem = False, str(error)
     if problem is not None:
         warning = f"native calls do not work with this SAPIEN: {problem}"
@@ -131,7 +131,8 @@ def _fingerprint() -> str:
     """Return a hash of the inputs of the self-test: libraries, Python code, versions and the processor."""
     digest = hashlib.blake2b(digest_size=16)
     code = [file for package in ("batchpid", "sim/engine", "sim/robot") for file in (ROOT / package).rglob("*.py")]
-    for path in (sapien_library(), *(module.__file__ for module in extensions()), *sorted(code)):
+    library = [sapien_library()] if find_spec("sapien") else []
+    for path in (*library, *(module.__file__ for module in extensions()), *sorted(code)):
         content = Path(path).read_bytes()
         digest.update(len(content).to_bytes(8, "little") + content)
     digest.update(repr((sys.version, np.__version__, platform.platform(), _processor())).encode())
