@@ -91,11 +91,11 @@ GainSets = Annotated[
 ]
 Engine = Annotated[
     Literal["sapien", "mujoco"],
-    _flag("Physics engine; mujoco is several times as fast, and its contacts differ (extra mujoco)."),
+    _flag("Physics engine; mujoco is several times as fast, and its contacts differ."),
 ]
 Engines = Annotated[
     tuple[Literal["sapien", "mujoco"], ...],
-    _flag("Physics engines, one or both (mujoco: extra mujoco)."),
+    _flag("Physics engines, one or both."),
 ]
 Physics = Annotated[
     Literal["accurate", "fast", "free"],

@@ -135,8 +135,7 @@ class RobotDescription(Urdf):
     def design_effort_limit(self) -> Float64:
         """Effort limits (dof,) [N m or N] of designed and tuned gains.
 
-        They are the URDF's; where it gives none, :func:`batchpid.sim.robot.effort.suggested_effort_limit`, which loads
-        SAPIEN.
+        They are the URDF's; where it gives none, :func:`batchpid.sim.robot.effort.suggested_effort_limit`.
         """
         given = self.effort_limit
         if np.isfinite(given).all():
@@ -266,7 +265,7 @@ class RobotDescription(Urdf):
         return self.coupling.efforts(self.dynamics().inverse_dynamics(qpos, still, still))
 
     def dynamics(self, ground: bool | None = None) -> Dynamics:
-        """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed base. Loads SAPIEN.
+        """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed base.
 
         ``ground`` says whether there is one at height 0, by default :attr:`has_ground`.
         """

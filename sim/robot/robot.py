@@ -58,7 +58,7 @@ class Robot(RobotDescription):
         actuators: bp.Actuators | str | Path | None = None,
         strict: bool = False,
     ) -> Robot:
-        """Load a bundled robot by name (``Robot.bundled()``), or any URDF or MJCF file (extra ``mujoco``) by path.
+        """Load a bundled robot by name (``Robot.bundled()``), or any URDF or MJCF file by path.
 
         Parameters
         ----------
@@ -206,7 +206,7 @@ class Robot(RobotDescription):
     def kinematic_tree(self, **options: Any) -> RigidTree:
         """Return the kinematic tree of this robot, for :mod:`batchpid.task_space`, in float64.
 
-        No engine is needed, unless a link has collision shapes and no ``<inertial>``: SAPIEN computes its inertia.
+        No engine is needed.
 
         It knows every link of the URDF by name, merged ones included. Followers move with their leaders
         (:attr:`coupling`). It has no friction and damping.
@@ -219,7 +219,7 @@ class Robot(RobotDescription):
         Raises
         ------
         RobotError
-            The base is not fixed, or SAPIEN cannot build a link whose mass comes from its collision shapes.
+            The base is not fixed, or a mesh cannot be read of a link whose mass comes from its collision shapes.
         InvalidArgumentError
             An option is not one of those above, or has a wrong shape or sign.
         """

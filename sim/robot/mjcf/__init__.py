@@ -1,1 +1,1 @@
-"""MJCF files as robots (extra ``mujoco``), compiled by MuJoCo and written as the equivalent URDF."""
+"""MJCF files as robots, compiled by MuJoCo and written as the equivalent URDF."""
