@@ -112,5 +112,7 @@ class Arguments:
             own = array(name, value, (*table, len(names)), names, finite=self._finite, kind=kind).copy()
             rows.append(own[None] if ticks is None else own)
         rows[0] = self._coupling.positions(rows[0])
-        rows[1:3] = [None if each is None else self._coupling.rates(each) for each in rows[1:3]]
+        for index in (1, 2):
+            if rows[index] is not None:
+                rows[index] = self._coupling.rates(rows[index])
         return Command._make(rows)

@@ -99,8 +99,8 @@ class RunnerKeywords(TypedDict, total=False):
     ``"gravity+coriolis+friction"``, the default, or a part of it; under control "effort" friction is not
     compensated."""
     engine: EngineName
-    """Physics engine: ``"sapien"``, the default and the reference, or ``"mujoco"``, several times as fast (extra
-    ``mujoco``; docs/two-engines.md)."""
+    """Physics engine: ``"sapien"``, the reference and the default where it is installed, or ``"mujoco"``, several times
+    as fast (docs/two-engines.md)."""
     physics: PhysicsPreset | Physics | MujocoSolver
     """``"accurate"`` (the default: SAPIEN's solver settings), ``"fast"``, ``"free"`` (for motion without contact), or a
     :class:`batchpid.sim.Physics`, with the engine MuJoCo a :class:`batchpid.sim.MujocoSolver`."""

@@ -177,7 +177,7 @@ class Session:
         command = self._arguments.tick(self._transactions.state.params, *given)
         self._transactions.run(*self._ticks(command, count))
         self._warn(stacklevel=4)
-        return self._observation()
+        return self._seen(self.pool.present.observation)
 
     def send(
         self,

@@ -47,7 +47,7 @@ def _of_followers(method: Callable[[Coupling, Any], Any]) -> Callable[[Coupling,
 
     @wraps(method)
     def call(self: Coupling, given: Any) -> Any:
-        return given if self.is_identity else method(self, given)
+        return method(self, given) if self.shares else given
 
     return call
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
 from sys import modules
 
 from batchpid.checks.validate import choice
-from batchpid.errors import MissingDependencyError
+from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.engine.protocol import Engine
 
 MODULES = {
@@ -22,13 +23,16 @@ def load_engine(name: str = "sapien") -> Engine:
     Raises
     ------
     InvalidArgumentError
-        No engine has this name.
+        No engine has this name, or SAPIEN is not installed.
     MissingDependencyError
-        The engine's package is not installed, or is too old.
+        MuJoCo is too old.
     """
     module = MODULES[choice("engine", name, MODULES)]
     if name == "mujoco" and module not in modules:
         _require_mujoco()
+    if name == "sapien" and module not in modules and find_spec("sapien") is None:
+        problem = "is not installed: SAPIEN is for Linux on x86-64"
+        raise InvalidArgumentError("engine", problem, value=name, remedy="use 'mujoco'")
     engine: Engine = import_module(module).ENGINE
     return engine
 
