@@ -83,11 +83,12 @@ class RobotNotFoundError(RobotError, FileNotFoundError):
 
 
 class MissingDependencyError(BatchPIDError, ImportError):
-    """An optional package is missing; the message names the extra that installs it."""
+    """A package is missing or too old; the message names the extra that installs it, if one does."""
 
-    def __init__(self, package: str, purpose: str, extra: str) -> None:
+    def __init__(self, package: str, purpose: str, extra: str | None = None) -> None:
         self.package, self.purpose, self.extra = package, purpose, extra
-        super().__init__(f"{purpose} needs the package {package!r}; install it with: pip install 'batchpid[{extra}]'")
+        wanted = package if extra is None else f"batchpid[{extra}]"
+        super().__init__(f"{purpose} needs the package {package!r}; install it with: pip install '{wanted}'")
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (type(self), (self.package, self.purpose, self.extra))

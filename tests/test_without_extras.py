@@ -19,7 +19,7 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["option
 FOR_USERS = set(re.findall(r"\[(.*)\]", EXTRAS["all"][0])[0].split(","))
 MODULES = {"pycollada": "collada", "imageio-ffmpeg": "imageio_ffmpeg"}
 """Name of a package's module, where it is another than the package's."""
-NEEDED = {"parity": "mujoco", "tune": "tune", "identify": "tune", "view": "view"}
+NEEDED = {"tune": "tune", "identify": "tune", "view": "view"}
 """Commands of the README that need an extra."""
 TOO_LONG = ("bench",)
 SIZES = SHORTER | {"survey": ["--workers", "0"]}

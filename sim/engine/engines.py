@@ -41,4 +41,4 @@ def _require_mujoco() -> None:
     try:
         import_module("mujoco.batch")
     except ImportError as error:
-        raise MissingDependencyError("mujoco>=3.17", "the engine 'mujoco'", "mujoco") from error
+        raise MissingDependencyError("mujoco>=3.17", "the engine 'mujoco'") from error

@@ -39,7 +39,7 @@ def read_source(path: Path, fixed_base: bool, missing_meshes: str) -> tuple[etre
     try:
         import mujoco  # noqa: F401
     except ImportError as error:
-        raise MissingDependencyError("mujoco>=3.17", "reading an MJCF file", "mujoco") from error
+        raise MissingDependencyError("mujoco>=3.17", "reading an MJCF file") from error
     from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
 
     mjcf = read_mjcf(path, root.get("model") or path.stem, fixed_base, missing_meshes)

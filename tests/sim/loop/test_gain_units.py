@@ -67,7 +67,7 @@ def test_inertia_means_gains_times_the_diagonal_of_the_mass_matrix(jaco2):
         params = bp.make_params(robot.dof, 80.0 * inertia, 10.0 * inertia, 18.0 * inertia, gain_units=units)
         with Runner(robot, 1, params=params, workers=0, substeps=1) as runner:
             efforts.append(runner.step(robot.settings.target).effort)
-    np.testing.assert_allclose(*efforts, rtol=1e-6)
+    np.testing.assert_allclose(*efforts, rtol=1e-5)  # SAPIEN keeps masses in single precision
 
 
 @pytest.mark.slow
