@@ -380,8 +380,8 @@ def test_sapiens_own_friction_is_refused():
         Runner(Robot.load("panda", dissipation="sapien"), 1, workers=0, engine="mujoco")
 
 
-def test_without_mujoco_the_message_names_the_extra(panda, monkeypatch):
+def test_without_mujoco_the_message_names_the_remedy(panda, monkeypatch):
     monkeypatch.delitem(sys.modules, engines.MODULES["mujoco"], raising=False)
     monkeypatch.setitem(sys.modules, "mujoco.batch", None)
-    with pytest.raises(MissingDependencyError, match=r"batchpid\[mujoco\]"):
+    with pytest.raises(MissingDependencyError, match=r"pip install 'mujoco>=3.17'"):
         load_engine("mujoco")

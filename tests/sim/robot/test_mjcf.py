@@ -704,9 +704,9 @@ def test_a_damaged_file_is_a_robot_or_an_error(load, seed, tmp_path, monkeypatch
             load(text[:begin] + part + text[begin + rng.randrange(8) :])
 
 
-def test_needs_the_extra(load, monkeypatch):
+def test_needs_mujoco(load, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(MissingDependencyError, match=r"reading an MJCF file.*batchpid\[mujoco\]"):
+    with pytest.raises(MissingDependencyError, match=r"reading an MJCF file.*pip install 'mujoco>=3.17'"):
         load(ARM)
 
 
