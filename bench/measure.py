@@ -235,9 +235,8 @@ def main(options: Options) -> None:
         "phases": _rounded(measure_phases(workload)),
         "free_phases": _rounded(measure_phases(replace(workload, physics="free"), collisions=False)),
     }
-    print(
-        f"{workload.robot.name}, {workload.num_envs} envs, {workload.processes} processes, {native.status().describe('SAPIEN')}\n"
-    )
+    calls = native.status().describe("SAPIEN")
+    print(f"{options.robot}, {options.num_envs} envs, {workload.processes} processes, {calls}\n")
     columns = figures["rates"], figures["ratios"], figures["per_process"]
     rows = [
         [case, f"{rate / 1e3:,.1f}", *(f"{each[case]:.2f}" for each in columns[1:])]

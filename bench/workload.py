@@ -23,7 +23,7 @@ MOVED = 0.01
 
 @dataclass(frozen=True)
 class Workload:
-    """Bundled robots that move from ``start`` to ``target`` in ``ticks`` of ``substeps`` sim steps, ``rounds`` times."""
+    """Bundled robots that move from ``start`` to ``target`` in ``ticks`` of ``substeps`` sim steps, in ``rounds``."""
 
     robot: Robot
     num_envs: int = 64

@@ -30,7 +30,7 @@ def test_every_case_moves_and_has_a_rate(workload):
 
 
 def test_robots_that_rest_are_refused(workload):
-    with pytest.raises(RuntimeError, match="did not move.*run more ticks"):
+    with pytest.raises(RuntimeError, match=r"did not move.*run more ticks"):
         measure_rates(dataclasses.replace(workload, ticks=1), [OURS])
 
 

@@ -68,9 +68,8 @@ def test_measure(tmp_path, capsys):
     assert set(figures["rates"]) == set(measure.CASES)
     ours, tutorial = (figures["rates"][case] for case in ("closed loop", "tutorial"))
     assert figures["ratios"]["closed loop"] == 1.0
-    assert (
-        figures["ratios"]["tutorial"] == figures["per_process"]["tutorial"] == pytest.approx(ours / tutorial, abs=1e-3)
-    )
+    assert figures["ratios"]["tutorial"] == pytest.approx(ours / tutorial, abs=2e-3)
+    assert figures["per_process"]["tutorial"] == figures["ratios"]["tutorial"]
     assert figures["machine"]["sapien"]
     assert f"{ours / 1e3:.1f}" in out
     assert "passive" in out
