@@ -72,8 +72,8 @@ bench-check: $(VENV)/.dev
 	@$(RUN) -m pytest bench -m check -s --timeout 1200 $(ARGS)
 
 MEASURED := out/bench
-bench_case = $(RUN) -m batchpid bench $(1) --physics $(2) --out $(MEASURED)/$(1)-$(2).json \
-	--ticks 60 --rounds 3 --xla --force $(3)
+bench_case = $(RUN) bench/measure.py $(1) --physics $(2) --json $(MEASURED)/$(1)-$(2).json \
+	--ticks 60 --rounds 3 --xla $(3)
 
 figures: $(VENV)/.dev
 	$(call bench_case,panda,accurate,--peers)

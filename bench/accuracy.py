@@ -1,7 +1,7 @@
 r"""Table of each physics preset's errors: ``python bench/accuracy.py [--json FILE]`` (two minutes).
 
 The errors are of the engine at the runner's timestep, against references that step 20 times as often. They do not
-depend on the machine's speed. ``batchpid bench`` measures the speed of the presets.
+depend on the machine's speed. measure.py measures the speed of the presets.
 
 Engine and reference are under the same controller at the runner's rate: between two of its efforts the reference makes
 20 steps. So the error is the engine's, as it remains under feedback.
@@ -24,12 +24,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import tyro
 from numpy.typing import NDArray
+from workload import TIMESTEP
 
 import batchpid as bp
 from batchpid.checks.validate import choice, integer, number
 from batchpid.io.files import write_atomically
 from batchpid.motors.friction import Friction
-from batchpid.sim.benchmark.workload import TIMESTEP
 from batchpid.sim.cli.report import table
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.sapien.physics import PHYSICS, Physics

@@ -97,18 +97,8 @@ def gather(folder: Path, old: dict[str, Any]) -> dict[str, Any]:
     for name in SETUPS:
         if (path := folder / f"{name}.json").is_file():
             measured = json.loads(path.read_text())
-            new["machine"] = measured["machine"]
-            new["cases"][name] = {
-                "rates": {case: round(row["median"]) for case, row in measured["cases"].items()},
-                "ratios": {case: round(row["closed_loop_over_case"], 3) for case, row in measured["cases"].items()},
-                "per_process": {
-                    case: round(row["closed_loop_over_case_per_process"], 3) for case, row in measured["cases"].items()
-                },
-                "phases": {phase: round(us, 2) for phase, us in measured["microseconds_per_env_step"].items()},
-                "free_phases": {
-                    phase: round(us, 2) for phase, us in measured["microseconds_per_env_step_free"].items()
-                },
-            }
+            new["machine"] = measured.pop("machine")
+            new["cases"][name] = measured
     if (path := folder / "pytest.json").is_file():
         benchmarks = json.loads(path.read_text())["benchmarks"]
         new["scaling"] = {

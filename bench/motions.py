@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import tyro
+from tutorial import TutorialLoop
 
 from batchpid.io.files import write_atomically
 from batchpid.sim import Robot, Runner
-from batchpid.sim.benchmark.tutorial import TutorialLoop
 from batchpid.sim.engine.native import status
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 

@@ -8,12 +8,12 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
+from workload import Workload
 
 import batchpid as bp
 from batchpid.motors import advance_effort, advance_measurement, discretise
 from batchpid.native.compiled_stages import compiled_stages
 from batchpid.sim import Robot
-from batchpid.sim.benchmark.workload import Workload
 from batchpid.sim.loop.numpy_executor import NoiseBlocks
 
 ENVS, JOINTS, STEPS, TICKS = 16, 9, 512, 10

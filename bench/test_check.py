@@ -11,12 +11,12 @@ import statistics
 from typing import NamedTuple
 
 import pytest
+from measure import BY_TICKS, OURS, PYTHON, measure_rates
 from test_actuator_cost import speeds_over_ideal
 from test_few_robots import COUNTS, few_robots
+from workload import Workload
 
 from batchpid.sim import Robot
-from batchpid.sim.benchmark.benchmark import BY_TICKS, OURS, PYTHON, measure_rates
-from batchpid.sim.benchmark.workload import Workload
 from batchpid.sim.engine import native
 
 ATTEMPTS = 3
@@ -83,7 +83,7 @@ def check(most):
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_ratios_keep_their_floors(check, most, name, physics):
     floors = [floor for floor in FLOORS if native.status().active or floor.over != PYTHON]
-    names = {case for floor in floors for case in (floor.case, floor.over)}
+    names = dict.fromkeys(case for floor in floors for case in (floor.case, floor.over))
 
     def measure():
         envs, workers, rounds = min(48, most.envs), min(2, most.workers), min(3, most.rounds)

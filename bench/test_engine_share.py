@@ -11,40 +11,19 @@ import time
 
 import numpy as np
 import pytest
+from baselines import DriveLoop
+from workload import Workload
 
 from batchpid.sim import Robot, Runner
-from batchpid.sim.benchmark.tutorial import tutorial_settings
-from batchpid.sim.benchmark.workload import Workload
-from batchpid.sim.engine.sapien.pack import Pack
 
 ENVS, TICKS, ROUNDS, POSES = 32, 10, 5, 6
-
-
-class BareEngine:
-    """Robots at ``pose`` under PhysX's drives, without gravity and control."""
-
-    def __init__(self, workload: Workload, pose: np.ndarray) -> None:
-        settings, self._substeps = tutorial_settings(workload.robot), workload.substeps
-        spec = workload.scene(gravity=False)
-        self._packs = [Pack(spec, 1) for _ in range(workload.num_envs)]
-        for pack in self._packs:
-            rows = np.tile(pose, (pack.size, 1))
-            pack.write_drive(np.array(settings.drive_stiffness), np.array(settings.drive_damping), np.array(np.inf))
-            pack.write_state(range(pack.size), rows, np.zeros_like(rows))
-            pack.write_drive_target(rows + 0.01)
-
-    def run(self, ticks: int) -> None:
-        for _ in range(ticks):
-            for pack in self._packs:
-                for _ in range(self._substeps):
-                    pack.step()
 
 
 def engine_share(pose, physics, most):
     """Return the speed of the closed loop relative to the bare engine at one pose, for each round."""
     envs, ticks, rounds = min(ENVS, most.envs), min(TICKS, most.ticks), min(ROUNDS, most.rounds)
     workload = Workload(Robot.load("panda"), envs, workers=0, physics=physics, ticks=ticks)
-    bare, found = BareEngine(workload, pose), []
+    bare, found = DriveLoop(workload, envs, pose, pose + 0.01), []
     setpoints = np.broadcast_to(pose, (ticks, envs, len(pose)))
     with Runner(workload.robot, envs, workers=0, physics=physics, substeps=workload.substeps) as runner:
         for _ in range(rounds + 1):
@@ -52,7 +31,7 @@ def engine_share(pose, physics, most):
             began = time.process_time()
             qpos = runner.rollout(setpoints).qpos
             between = time.process_time()
-            bare.run(ticks)
+            bare.run(workload.steps)
             found.append((time.process_time() - between) / (between - began))
             assert np.abs(qpos[-1] - (pose + 0.01)).max() > 2e-4, "the robots did not move"
     return found[1:]

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+from workload import Workload
 
 pytest.importorskip("mujoco")
 mujoco_batch = pytest.importorskip("mujoco.batch")
 
 from batchpid.sim import MujocoSolver, Robot, Runner  # noqa: E402
-from batchpid.sim.benchmark.workload import Workload  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 from batchpid.sim.options import default_params  # noqa: E402

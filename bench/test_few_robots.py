@@ -8,10 +8,10 @@ import time
 
 import numpy as np
 import pytest
+from tutorial import TutorialLoop
+from workload import Workload
 
 from batchpid.sim import Robot
-from batchpid.sim.benchmark.tutorial import TutorialLoop
-from batchpid.sim.benchmark.workload import Workload
 
 TICKS, ROUNDS = 50, 3
 COUNTS = (1, 4, 16)

@@ -8,9 +8,9 @@ from statistics import median
 
 import numpy as np
 import pytest
+from workload import Workload
 
 from batchpid.sim import Robot, Runner
-from batchpid.sim.benchmark.workload import Workload
 
 FEW, MANY, MOST = 64, 1024, 2048
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")  # the tutorial's gains on the jaco2

@@ -4,9 +4,9 @@ import time
 
 import numpy as np
 import pytest
+from workload import Workload
 
 from batchpid.sim import Robot, Runner
-from batchpid.sim.benchmark.workload import Workload
 
 ROUNDS = 2
 

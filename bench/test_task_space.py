@@ -16,11 +16,11 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from workload import Workload
 
 import batchpid.task_space as ts
 from batchpid.native.availability import SWITCH
 from batchpid.sim import OperationalSpace, Robot, Runner
-from batchpid.sim.benchmark.workload import Workload
 from batchpid.task_space import native_rows
 
 LINK = "panda_hand"

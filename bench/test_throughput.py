@@ -1,17 +1,15 @@
 """Rates of the closed loop, the tutorial's loop, the bare engine and third-party peers, measured in turn.
 
-``batchpid bench`` prints the same. A row is the time of an env step, and the column OPS is env-steps per second, which
+measure.py prints the same. A row is the time of an env step, and the column OPS is env-steps per second, which
 ``extra_info`` has as well.
 """
 
-import importlib.util
-
 import pytest
+from measure import CASES, MUJOCO_LOOPS, OURS, XLA_LOOPS, measure_rates
+from peers import PEERS, installed_peers
+from workload import Workload
 
 from batchpid.sim import Robot
-from batchpid.sim.benchmark.benchmark import CASES, IN_MUJOCO, OURS, XLA_CASES, cases_in, measure_rates
-from batchpid.sim.benchmark.peers import PEERS
-from batchpid.sim.benchmark.workload import Workload
 
 ENVS, TICKS, ROUNDS = 32, 50, 3  # two groups of envs
 
@@ -28,12 +26,14 @@ def setup(request, most):
         request.getfixturevalue("quick_smoke")
     envs, workers, rounds = min(ENVS, most.envs), min(2, most.workers), min(ROUNDS, most.rounds)
     workload = Workload(Robot.load(name), envs, workers, physics, ticks=TICKS, rounds=rounds)
-    peers = [each for each in PEERS if physics == "accurate" and importlib.util.find_spec(PEERS[each].package)]
-    names = cases_in(xla=True, mujoco="mujoco" in peers) if physics == "accurate" else CASES
-    return ", ".join(request.param), measure_rates(workload, peers=peers, names=names)
+    names = [*CASES]
+    if physics == "accurate":
+        peers = installed_peers()
+        names += [*XLA_LOOPS, *(MUJOCO_LOOPS if "mujoco" in peers else ()), *peers]
+    return ", ".join(request.param), measure_rates(workload, names)
 
 
-@pytest.mark.parametrize("case", CASES | XLA_CASES | IN_MUJOCO | PEERS)
+@pytest.mark.parametrize("case", [*CASES, *XLA_LOOPS, *MUJOCO_LOOPS, *PEERS])
 def test_case(benchmark, report, compare, setup, case):
     benchmark.group, results = setup
     if case not in results:

@@ -56,7 +56,7 @@ RARE = {
     "python": ("docs/sim-to-real.md", "docs/runner.md", "docs/controllers.md", "docs/view.md", "docs/task-space.md"),
     "sh": ("docs/two-engines.md", "docs/view.md", "docs/deploy.md", "docs/sim-to-real.md", "docs/gallery.md"),
 }
-ONLY_PARSED = ("bench", "tune", "identify", "render", "survey")
+ONLY_PARSED = ("tune", "identify", "render", "survey")
 
 
 def name(page: Path) -> str:

@@ -21,7 +21,6 @@ MODULES = {"pycollada": "collada", "imageio-ffmpeg": "imageio_ffmpeg"}
 """Name of a package's module, where it is another than the package's."""
 NEEDED = {"tune": "tune", "identify": "tune", "view": "view"}
 """Commands of the README that need an extra."""
-TOO_LONG = ("bench",)
 SIZES = SHORTER | {"survey": ["--workers", "0"]}
 PROGRAM = """
 import contextlib, io, json, sys, warnings
@@ -70,7 +69,7 @@ def test_the_base_contains_no_package_of_an_extra():
 @pytest.mark.slow
 def test_each_command_and_program_runs_or_names_its_extra(tmp_path: Path):
     lines = [words[1:] for words in shell_lines(README) if words[0] == "batchpid"]
-    commands = [[*words, *SIZES.get(words[0], [])] for words in lines if words[0] not in TOO_LONG]
+    commands = [[*words, *SIZES.get(words[0], [])] for words in lines]
     commands.append(["rollout", "panda", "--backend", "jax", "--out", "jax.npz"])
     (tmp_path / "robots").mkdir()
     write(tmp_path / "robots", TWO_JOINTS, "two.urdf")

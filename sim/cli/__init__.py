@@ -22,7 +22,6 @@ import tyro
 
 import batchpid
 from batchpid.errors import BatchPIDError
-from batchpid.sim.cli.bench import BenchCommand
 from batchpid.sim.cli.compare import CompareCommand
 from batchpid.sim.cli.demo import DemoCommand
 from batchpid.sim.cli.excite import ExciteCommand
@@ -42,7 +41,6 @@ from batchpid.startup import exit_at_once
 COMMANDS: dict[str, type[Any]] = {
     "demo": DemoCommand,
     "rollout": RolloutCommand,
-    "bench": BenchCommand,
     "tune": TuneCommand,
     "compare": CompareCommand,
     "excite": ExciteCommand,

@@ -9,8 +9,7 @@ from clusters import FILTERS
 from robots import load_bundled
 from scripts import ROOT, load_script
 
-TESTED = {"accuracy", "circles", "cluster", "draw", "motions", "newcomer", "scale", "view"}
-TESTED |= {"trajectories"}
+TESTED = {"accuracy", "circles", "cluster", "draw", "measure", "motions", "newcomer", "scale", "trajectories", "view"}
 
 
 def rows(text):
@@ -20,8 +19,8 @@ def rows(text):
 
 
 def test_every_script_has_a_test():
-    scripts = {path.stem for path in (ROOT / "bench").glob("*.py")} - {"conftest"}
-    assert {name for name in scripts if not name.startswith("test_")} == TESTED
+    scripts = (path for path in (ROOT / "bench").glob("*.py") if '__name__ == "__main__"' in path.read_text())
+    assert {path.stem for path in scripts} == TESTED
 
 
 def test_accuracy(tmp_path, capsys):
@@ -61,6 +60,21 @@ def test_newcomer(tmp_path, capfd):
     assert (tmp_path / "got").read_text() == ".[tune]\n"
 
 
+@pytest.mark.slow
+def test_measure(tmp_path, capsys):
+    measure, path = load_script("measure"), tmp_path / "new" / "panda.json"
+    measure.main(measure.Options(num_envs=1, workers=0, ticks=50, rounds=1, json=path))
+    figures, out = json.loads(path.read_text()), capsys.readouterr().out
+    assert set(figures["rates"]) == set(measure.CASES)
+    ours, tutorial = (figures["rates"][case] for case in ("closed loop", "tutorial"))
+    assert figures["ratios"]["closed loop"] == 1.0
+    assert figures["ratios"]["tutorial"] == pytest.approx(ours / tutorial, abs=2e-3)
+    assert figures["per_process"]["tutorial"] == figures["ratios"]["tutorial"]
+    assert figures["machine"]["sapien"]
+    assert f"{ours / 1e3:.1f}" in out
+    assert "passive" in out
+
+
 def test_motions(tmp_path, capsys):
     motions = load_script("motions")
     path = tmp_path / "motions.json"
@@ -87,12 +101,14 @@ def test_draw(tmp_path):
     for robot, resources in figures["resources"].items():
         for name, value in resources.items():
             benchmarks.append({"group": "resources", "params": {"workload": robot}, "extra_info": {name: value}})
+    new = tmp_path / "new"
+    new.mkdir()
+    for name, case in figures["cases"].items():
+        (new / f"{name}.json").write_text(json.dumps({"machine": figures["machine"]} | case))
     for case, ratios in figures["few"].items():
         for count, ratio in ratios.items():
             params = dict(zip(("name", "physics"), case.split(", "), strict=True), num_envs=int(count))
             benchmarks.append({"group": "few", "params": params, "extra_info": {"over_tutorial": ratio}})
-    new = tmp_path / "new"
-    new.mkdir()
     (new / "pytest.json").write_text(json.dumps({"benchmarks": benchmarks}))
     (new / "motions.json").write_text(json.dumps(figures["motions"]))
     (new / "accuracy.json").write_text(json.dumps({"accuracy": figures["accuracy"]}))

@@ -14,7 +14,6 @@ from tiny_urdf import one_joint, write
 import batchpid as bp
 from batchpid.io.files import try_writing
 from batchpid.sim import Recorder, Runner, Snapshot, plots, write_recording
-from batchpid.sim.benchmark import benchmark
 from batchpid.sim.cli import run as cli_run
 from batchpid.sim.tuning import robot_survey as surveying
 from batchpid.sim.view import film, renderer
@@ -29,7 +28,6 @@ COMMANDS = {
     "plot": (("plot", "RUN", "--picture"), "a.png"),
     "render": (("render", "RUN", "--fps", "120", "--width", "64", "--height", "64", "--out"), "a.mp4"),
     "compare": (("compare", "--moves", "1", "--workers", "0", "--seconds", "0.02", "--picture"), "a.png"),
-    "bench": (("bench", "--num-envs", "1", "--workers", "0", "--ticks", "100", "--rounds", "1", "--out"), "a.json"),
     "survey json": (("survey", "URDF", "--workers", "1", "--out", "OTHER.md", "--json"), "a.json"),
     "survey": (("survey", "URDF", "--workers", "1", "--json", "OTHER.json", "--out"), "a.md"),
     "tune": ((*TUNE, "--picture", "OTHER.png", "--out"), "a.yaml"),
@@ -182,9 +180,8 @@ def simulated_once(monkeypatch):
 
         return remember
 
-    for module, name in ((cli_run, "evaluate_sets"), (benchmark, "measure_rates"), (benchmark, "measure_phases")):
+    for module, name in ((cli_run, "evaluate_sets"), (surveying, "survey")):
         monkeypatch.setattr(module, name, once(getattr(module, name)))
-    monkeypatch.setattr(surveying, "survey", once(surveying.survey))
 
 
 @pytest.mark.slow

@@ -19,7 +19,6 @@ SHORT = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02)
 WORDS = {
     "demo": ("demo", *SHORT),
     "rollout": ("rollout", *SHORT),
-    "bench": ("bench",),
     "tune": ("tune", "arm.urdf"),
     "compare": ("compare", "arm.urdf"),
     "parity": ("parity", "arm.urdf"),
@@ -32,7 +31,7 @@ WORDS = {
 }
 """Words of each command that writes, without its outputs."""
 SUFFIXES = {"picture": ".png", "json": ".json", "out": ".yaml"}
-OUT = {"rollout": ".npz", "bench": ".json", "excite": ".csv", "export": ".h", "survey": ".md", "render": ".mp4"}
+OUT = {"rollout": ".npz", "excite": ".csv", "export": ".h", "survey": ".md", "render": ".mp4"}
 
 
 def output_flags() -> list[tuple[str, str]]:
@@ -154,7 +153,7 @@ def test_gains_of_the_user_are_kept_by_tune(files, batchpid, tmp_path):
 def test_make_can_repeat_its_runs():
     makefile = (Path(__file__).parents[3] / "Makefile").read_text().replace("\\\n", "")
     runs = [line.partition(" -m batchpid ")[2].split() for line in makefile.splitlines() if " -m batchpid " in line]
-    assert {words[0] for words in runs} == {"demo", "bench"}
+    assert {words[0] for words in runs} == {"demo"}
     assert all("--force" in words for words in runs)
     demo = next(words for words in runs if words[0] == "demo")
     assert demo.pop() == "$(ARGS)"  # last, so that they win

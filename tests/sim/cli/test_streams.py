@@ -25,7 +25,6 @@ SHORT = "--num-envs 2 --workers 1 --seconds 0.3"
 RUNS = {
     "demo": f"demo {SHORT} --force --picture out/a.png",
     "rollout": f"rollout {SHORT} --force --out out/a.npz --picture out/b.png",
-    "bench": "bench --num-envs 1 --workers 1 --ticks 100 --rounds 1 --force --out out/a.json",
     "tune": "tune arm.urdf --generations 1 --population 4 --search-seconds 0.05 --workers 1 --force --out out/a.yaml",
     "compare": "compare arm.urdf --moves 1 --workers 1 --seconds 0.3 --force --picture out/a.png",
     "parity": "parity arm.urdf --moves 1 --seconds 0.3 --workers 0 --force --json out/a.json --picture out/a.png",

@@ -1,4 +1,4 @@
-"""User-defined controller for the benchmark: a policy network that is evaluated at every sim step."""
+"""Controller of one's own, for the benchmark: a policy network that is evaluated at every sim step."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from batchpid.arrays.elementwise import namespace
-from batchpid.sim.benchmark.tutorial import tutorial_settings
-from batchpid.sim.robot.robot import Robot
+from batchpid.sim import Robot
 
 HIDDEN = 64
 """Units of each of the two hidden layers."""
@@ -26,7 +24,7 @@ class ResidualPolicy:
     """
 
     def __init__(self, robot: Robot) -> None:
-        settings, rng, dof = tutorial_settings(robot), np.random.default_rng(0), robot.dof
+        settings, rng, dof = robot.settings, np.random.default_rng(0), robot.dof
         self._kp, self._kd = 2 * settings.kp, settings.kd  # kp is doubled to make up for the missing integral
         self._scale = (RESIDUAL * robot.effort_limit).astype(np.float32)
         sizes = (3 * dof, HIDDEN, HIDDEN, dof)
@@ -35,13 +33,11 @@ class ResidualPolicy:
     def init(self, robot: Robot, num_envs: int) -> None:
         """Return no state."""
 
-    def __call__(
-        self, state: None, setpoint: NDArray[Any], qpos: NDArray[Any], qvel: NDArray[Any], passive: NDArray[Any]
-    ) -> tuple[None, NDArray[Any]]:
+    def __call__(self, state: None, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> tuple[None, Any]:
         """Return the state, None, and the efforts (envs, dof) [N m or N]."""
         error = setpoint - qpos
         xp = namespace(error)
-        units: Any = xp.concatenate([error, qpos, qvel], axis=1).astype(np.float32)
+        units = xp.concatenate([error, qpos, qvel], axis=1).astype(np.float32)
         for layer in self._layers:
             units = xp.tanh(units @ layer)
         return None, passive + self._kp * error - self._kd * qvel + self._scale * units

@@ -1,45 +1,30 @@
-"""Third-party baselines of the benchmark: MuJoCo, Gymnasium.
-
-Their packages are in the extra ``peers``.
-"""
+"""Third-party baselines of the benchmark: Gymnasium's AsyncVectorEnv, and MuJoCo (extra ``peers``)."""
 
 from __future__ import annotations
 
 import importlib.util
 import multiprocessing
-from collections.abc import Callable, Collection
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-
-from batchpid.arrays.array_types import Float64
-from batchpid.errors import MissingDependencyError
-from batchpid.sim.benchmark.baselines import single_threaded
-from batchpid.sim.benchmark.tutorial import TutorialLoop, tutorial_settings
-from batchpid.sim.benchmark.workload import TIMESTEP, Case, Workload
-
-
-class Peer(NamedTuple):
-    """Third-party baseline: a description, the package that it needs, and its constructor."""
-
-    description: str
-    package: str
-    make: Callable[[Workload], Case]
+from baselines import single_threaded
+from tutorial import TutorialLoop
+from workload import TIMESTEP, Case, Workload
 
 
 def _async_vector(workload: Workload, count: int) -> Case:
     """Return Gymnasium's AsyncVectorEnv around the tutorial's loop, with one process for each of ``count`` envs."""
     import gymnasium
 
-    # Fork the processes from one that has loaded all packages; otherwise many of them would take a minute to start.
-    multiprocessing.set_forkserver_preload([__name__, "gymnasium", "sapien.wrapper.urdf_loader"])
+    # Fork the processes from one that has loaded the packages; otherwise many of them would take a minute to start.
+    packages = ["gymnasium", "batchpid.sim.engine.sapien.user_content", "sapien.wrapper.urdf_loader"]
+    multiprocessing.set_forkserver_preload(packages)
     make_envs = [lambda: _tutorial_env(workload)] * count
     with single_threaded():
         envs = gymnasium.vector.AsyncVectorEnv(make_envs, context="forkserver")
     actions = np.tile(workload.target, (count, 1))
 
-    def run() -> NDArray[np.float32]:
+    def run() -> np.ndarray:
         for _ in range(workload.ticks):
             qpos = envs.step(actions)[0]
         return qpos[0]
@@ -63,7 +48,7 @@ def _tutorial_env(workload: Workload) -> Any:
             self._loop.reset()
             return self._loop.robot.get_qpos(), {}
 
-        def step(self, action: Float64) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
             self._loop.target = action
             return self._loop.run(workload.substeps), 0.0, False, False, {}
 
@@ -80,7 +65,7 @@ def _mujoco_batch(workload: Workload) -> Case:
     import mujoco
     import mujoco.batch
 
-    robot, settings = workload.robot, tutorial_settings(workload.robot)
+    robot, settings = workload.robot, workload.robot.settings
     spec = mujoco.MjSpec.from_string(robot.urdf)
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -102,7 +87,7 @@ def _mujoco_batch(workload: Workload) -> Case:
     def reset() -> None:
         batch.state[:] = start
 
-    def run() -> Float64:
+    def run() -> np.ndarray:
         for _ in range(workload.ticks):
             batch.step(nstep=workload.substeps)
         return np.array(batch.qpos[0, columns])
@@ -111,32 +96,13 @@ def _mujoco_batch(workload: Workload) -> Case:
 
 
 PEERS = {
-    "gymnasium, an env a core": Peer(
-        "AsyncVectorEnv around the tutorial's loop, one env per core",
-        "gymnasium",
-        lambda workload: _async_vector(workload, workload.processes),
-    ),
-    "gymnasium, all envs": Peer(
-        "the same with all envs, one process per env",
-        "gymnasium",
-        lambda workload: _async_vector(workload, workload.num_envs),
-    ),
-    "mujoco": Peer(
-        "mujoco.batch on the same URDF, one thread per core: its PID actuators, gravity compensation and solver",
-        "mujoco",
-        _mujoco_batch,
-    ),
+    # name: (package, constructor of the case)
+    "gymnasium, an env a core": ("gymnasium", lambda workload: _async_vector(workload, workload.processes)),
+    "gymnasium, all envs": ("gymnasium", lambda workload: _async_vector(workload, workload.num_envs)),
+    "mujoco": ("mujoco", _mujoco_batch),
 }
 
 
-def installed_peers() -> tuple[str, ...]:
+def installed_peers() -> list[str]:
     """Return the names of the peers whose package is installed."""
-    return tuple(name for name, peer in PEERS.items() if importlib.util.find_spec(peer.package) is not None)
-
-
-def make_peers(workload: Workload, names: Collection[str]) -> dict[str, Case]:
-    """Return the peers of these names, ready to run; raise MissingDependencyError where a package is missing."""
-    for name in names:
-        if importlib.util.find_spec(PEERS[name].package) is None:
-            raise MissingDependencyError(PEERS[name].package, f"peer {name!r}", "peers")
-    return {name: PEERS[name].make(workload) for name in names}
+    return [name for name, (package, _) in PEERS.items() if importlib.util.find_spec(package) is not None]

@@ -1,4 +1,4 @@
-"""Workload of the benchmark: robots and motion, the same in every case; and the interface of a case."""
+"""Workload of the benchmarks: robots and motion, the same in every case; and the interface of a case."""
 
 from __future__ import annotations
 
@@ -8,16 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64
-from batchpid.errors import BatchPIDError
-from batchpid.sim.benchmark.tutorial import tutorial_settings
-from batchpid.sim.engine.engines import load_engine
+from batchpid.sim import Robot, Runner
+from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner import Runner
-from batchpid.sim.runner_keywords import EngineName, PhysicsPreset
 
 TIMESTEP = 1 / 2000
 """Time step of simulation and control [s]."""
@@ -29,38 +23,31 @@ MOVED = 0.01
 
 @dataclass(frozen=True)
 class Workload:
-    """Bundled robots that move from ``start`` to ``target`` in ``ticks`` of ``substeps`` sim steps, ``rounds`` times.
-
-    Raises InvalidArgumentError for a robot that is not bundled: it carries no gains and target.
-    """
+    """Bundled robots that move from ``start`` to ``target`` in ``ticks`` of ``substeps`` sim steps, in ``rounds``."""
 
     robot: Robot
     num_envs: int = 64
     workers: int = 2
-    physics: PhysicsPreset = "accurate"
-    engine: EngineName = "sapien"
+    physics: str = "accurate"
     substeps: int = 20
     ticks: int = 100
     rounds: int = 5
 
-    def __post_init__(self) -> None:
-        tutorial_settings(self.robot)
-
     @property
-    def target(self) -> Float64:
+    def target(self) -> np.ndarray:
         """Setpoint of every case (dof,) [rad or m]."""
-        return tutorial_settings(self.robot).target
+        return self.robot.settings.target
 
     @property
-    def start(self) -> Float64:
+    def start(self) -> np.ndarray:
         """Start of every case (dof,) [rad or m]: ``DISTANCE`` below the target, on joints whose limits allow it."""
         away = self.target - DISTANCE
         roomy = (self.robot.upper - self.robot.lower > 1.0) & (away > self.robot.lower)
         return np.where(roomy, away, self.target)
 
     @property
-    def moving(self) -> NDArray[np.bool_]:
-        """Joints that start away from their target (dof,)."""
+    def moving(self) -> np.ndarray:
+        """Joints that start away from their target (dof,), bool."""
         return self.start != self.target
 
     @property
@@ -73,31 +60,28 @@ class Workload:
         """Number of stepping processes: the workers, or this process."""
         return max(self.workers, 1)
 
-    @property
-    def simulated_robot(self) -> Robot:
-        """The robot: in SAPIEN with SAPIEN's own friction and damping, as in the tutorial's loop."""
-        return Robot.load(self.robot.path, dissipation="sapien" if self.engine == "sapien" else "urdf")
+    def simulated_robot(self, engine: str = "sapien") -> Robot:
+        """Return the robot: in SAPIEN with SAPIEN's own friction and damping, as in the tutorial's loop."""
+        return Robot.load(self.robot.path, dissipation="sapien" if engine == "sapien" else "urdf")
 
-    def scene(self, gravity: bool, collisions: bool = True) -> SceneSpec:
-        """Return the scene of every case. Without gravity a drive reaches the target without compensation."""
-        robot, physics = self.simulated_robot, load_engine(self.engine).physics[self.physics]
+    def weightless_scene(self, collisions: bool = True) -> SceneSpec:
+        """Return the scene in SAPIEN without gravity: a drive reaches the target without compensation."""
+        robot = self.simulated_robot()
         options: dict[str, Any] = {"dissipation": robot.dissipation, "collisions": collisions, "ground": collisions}
-        options["engine"] = self.engine
-        spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, TIMESTEP, physics, **options)
-        return spec if gravity else replace(spec, gravity=(0.0, 0.0, 0.0))
+        spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, TIMESTEP, PHYSICS[self.physics], **options)
+        return replace(spec, gravity=(0.0, 0.0, 0.0))
 
     def runner(self, **options: Any) -> Runner:
         """Return a runner of the robots with the tutorial's gains."""
-        robot = self.simulated_robot
-        ours: dict[str, Any] = {"physics": self.physics, "substeps": self.substeps, "timestep": TIMESTEP}
-        ours["engine"] = self.engine
-        return Runner(robot, self.num_envs, params=robot.params(), workers=self.workers, **ours | options)
+        robot = self.simulated_robot(options.get("engine", "sapien"))
+        ours = {"physics": self.physics, "substeps": self.substeps, "timestep": TIMESTEP, "workers": self.workers}
+        return Runner(robot, self.num_envs, params=robot.params(), **ours | options)
 
-    def check_motion(self, case: str, final: Float64) -> None:
-        """Raise BatchPIDError unless the robot at ``final`` (dof,) has moved from the start towards the target."""
+    def check_motion(self, case: str, final: np.ndarray) -> None:
+        """Raise RuntimeError unless the robot at ``final`` (dof,) has moved from the start towards the target."""
         moved, left = (np.abs(final - place)[self.moving] for place in (self.start, self.target))
         if not np.isfinite(final).all() or moved.min() < MOVED or left.max() > DISTANCE:
-            raise BatchPIDError(
+            raise RuntimeError(
                 f"case {case!r}: the robots did not move as they should (moved {moved.round(3)}, left "
                 f"{left.round(3)}); its speed would mean nothing: run more ticks"
             )
@@ -110,7 +94,7 @@ class Case(NamedTuple):
     """Env-steps of one round."""
     reset: Callable[[], object]
     """Puts the robots at the start."""
-    run: Callable[[], NDArray[Any]]
+    run: Callable[[], np.ndarray]
     """Steps one round; returns the final positions of the first env (dof,) [rad or m]."""
     close: Callable[[], None]
     """Ends processes and frees scenes; may be called again."""
@@ -118,7 +102,7 @@ class Case(NamedTuple):
     """Number of stepping processes, or threads."""
 
 
-def run_round(case: Case) -> tuple[float, Float64]:
+def run_round(case: Case) -> tuple[float, np.ndarray]:
     """Run one round of ``case``; return the seconds of stepping and the final positions of the first env (dof,)."""
     case.reset()
     began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""SAPIEN's tutorial "Drive Robot with PID Controller", as written: reference of tests, baseline of the benchmark.
+"""SAPIEN's tutorial "Drive Robot with PID Controller", as written: reference of tests, baseline of the benchmarks.
 
 It has one robot in one scene, one Python object per joint, and one call after another. Only the parts that need a
 display are left out. The objects are SAPIEN's, with its default settings. The Runner does not use this module.
@@ -10,23 +10,10 @@ import tempfile
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64
-from batchpid.errors import InvalidArgumentError
 from batchpid.law.reference import SimplePID
+from batchpid.sim import Robot
 from batchpid.sim.engine.sapien.user_content import HeadlessScene
-from batchpid.sim.robot.parts import Settings
-from batchpid.sim.robot.robot import Robot
-
-
-def tutorial_settings(robot: Robot) -> Settings:
-    """Return the tutorial's gains, start and target; raise InvalidArgumentError for a robot that is not bundled."""
-    if robot.settings is None:
-        raise InvalidArgumentError(
-            "robot", f"{robot.name!r} carries no gains and target", remedy=f"use one of {', '.join(Robot.bundled())}"
-        )
-    return robot.settings
 
 
 class TutorialLoop:
@@ -39,13 +26,13 @@ class TutorialLoop:
     def __init__(
         self,
         robot: Robot,
-        target: Float64,
+        target: np.ndarray,
         *,
         external_pid: bool = True,
         internal_drive: bool = False,
-        start: Float64 | None = None,
+        start: np.ndarray | None = None,
     ) -> None:
-        settings = tutorial_settings(robot)
+        settings = robot.settings
         self.scene = HeadlessScene()
         self.scene.set_timestep(1 / settings.rate_hz)
         self.scene.add_ground(0, render=False)
@@ -78,7 +65,7 @@ class TutorialLoop:
         self.robot.set_qf(qf)
         self.scene.step()
 
-    def run(self, steps: int) -> NDArray[np.float32]:
+    def run(self, steps: int) -> np.ndarray:
         """Make ``steps`` sim steps; return the last qpos (dof,) [rad or m]."""
         for _ in range(steps):
             self.step()

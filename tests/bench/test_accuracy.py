@@ -11,6 +11,11 @@ from batchpid.sim.engine.sapien.physics import PHYSICS
 accuracy = load_script("accuracy")
 
 
+@pytest.fixture(scope="module")
+def panda():
+    return load_bundled("panda")
+
+
 def falling(robot, qpos, timestep, seconds):
     """Return the robot without effort, after ``seconds``."""
     plant = accuracy.EquationOfMotion(robot.dynamics(), np.zeros(robot.dof), qpos, timestep)

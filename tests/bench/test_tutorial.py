@@ -1,10 +1,10 @@
 """The Runner follows SAPIEN's tutorial as written: one scene, one Python object a joint, float64."""
 
 import numpy as np
+from tutorial import TutorialLoop
 
 import batchpid as bp
 from batchpid.sim import Robot, Runner
-from batchpid.sim.benchmark.tutorial import TutorialLoop
 
 ARM = slice(0, 7)
 

@@ -1,0 +1,270 @@
+"""Speed of the runner and of its baselines in one run.
+
+    python bench/measure.py panda --physics fast [--peers] [--xla] [--json FILE]
+
+Every case moves the same robots from ``start`` to ``target`` with the tutorial's gains and, in SAPIEN, with SAPIEN's
+friction and damping. So the cases differ in the way of stepping and not in the motion. Baselines run in separate worker
+processes, as many as the runner has. docs/performance.md describes the cases.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+import statistics
+import time
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from baselines import ENGINES, TUTORIALS, make_baselines
+from peers import PEERS, installed_peers
+from policy import ResidualPolicy
+from workload import Case, Workload, run_round
+
+from batchpid.io.files import write_atomically
+from batchpid.io.versions import package_versions
+from batchpid.sim import Robot
+from batchpid.sim.cli.report import table
+from batchpid.sim.engine import native
+from batchpid.sim.engine.protocol import EnginePack
+from batchpid.sim.loop.arrays import Arrays, Command
+from batchpid.sim.loop.loop import Loop
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.workers.shared_memory import SharedArrays
+
+OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"
+POLICY, FREE = "closed loop, policy network", "closed loop, no shapes, free"
+LOOPS = {
+    # case of the Runner: its options
+    PYTHON: {},
+    BY_TICKS: {},
+    OURS: {},
+    POLICY: {},
+    "closed loop, no shapes": {"collisions": False},
+    FREE: {"collisions": False, "physics": "free"},
+}
+XLA_LOOPS = {f"{name}, XLA": LOOPS[name] | {"backend": "jax"} for name in (OURS, POLICY, FREE)}
+MUJOCO_LOOPS = {"closed loop, MuJoCo": {"engine": "mujoco"}}
+CASES = (*TUTORIALS, *ENGINES, *LOOPS)
+"""Cases without JAX, MuJoCo and peers."""
+PHASES = {
+    # phase of a sim step: methods of the pack that it calls
+    "read": ("read_qpos", "read_qvel"),
+    "passive": ("passive_force",),
+    "write": ("write_qf",),
+    "step": ("step",),
+}
+
+
+@dataclass(frozen=True)
+class Result:
+    """Figures of one case: env-steps per second of every round, final positions of the first env (dof,), and number of
+    stepping processes.
+    """
+
+    rates: tuple[float, ...]
+    final: np.ndarray
+    processes: int
+
+    @property
+    def rate(self) -> float:
+        """Median env-steps per second."""
+        return statistics.median(self.rates)
+
+    def over(self, other: Result) -> float:
+        """Return this rate divided by the other's: the median of the ratios within each round."""
+        return statistics.median(ours / theirs for ours, theirs in zip(self.rates, other.rates, strict=True))
+
+
+def make_loop(workload: Workload, name: str) -> Case:
+    """Return a case of the Runner."""
+    options = dict((LOOPS | XLA_LOOPS | MUJOCO_LOOPS)[name])
+    if name.startswith(POLICY):
+        options["control"] = ResidualPolicy(workload.robot)
+    with native.python_calls() if name == PYTHON else nullcontext():
+        runner = workload.runner(**options)
+    setpoints = np.broadcast_to(workload.target, (workload.ticks, *workload.target.shape))
+
+    def run() -> np.ndarray:
+        if name != BY_TICKS:
+            return runner.rollout(setpoints).qpos[-1, 0]
+        for setpoint in setpoints:
+            final = runner.step(setpoint).qpos[0]
+        return final
+
+    env_steps = workload.num_envs * workload.steps
+    return Case(env_steps, lambda: runner.reset(workload.start), run, runner.close, workload.processes)
+
+
+def measure_rates(workload: Workload, names: Iterable[str] = CASES) -> dict[str, Result]:
+    """Measure the cases ``names`` ``workload.rounds`` times in turn, so that their rounds are paired.
+
+    Raises RuntimeError if the robots of a case did not move or ended far from the target.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in names}
+    final = {}
+    with ExitStack() as stack:
+        cases = {name: make(workload) for name, (_, make) in PEERS.items() if name in seconds}
+        cases |= make_baselines(workload)
+        cases |= {name: make_loop(workload, name) for name in LOOPS | XLA_LOOPS | MUJOCO_LOOPS if name in seconds}
+        for case in cases.values():
+            stack.callback(case.close)
+        for name in XLA_LOOPS.keys() & cases.keys():
+            run_round(cases[name])  # compiles
+        for _ in range(workload.rounds):
+            for name, rounds in seconds.items():
+                took, final[name] = run_round(cases[name])
+                rounds.append(took)
+    for name, place in final.items():
+        workload.check_motion(name, place)
+    return {
+        name: Result(tuple(cases[name].env_steps / took for took in rounds), final[name], cases[name].processes)
+        for name, rounds in seconds.items()
+    }
+
+
+def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, float]:
+    """Return the microseconds per env step that each phase of the closed loop takes in a worker.
+
+    Measured in this process with a worker's share of the envs. The control step runs in NumPy, with native calls into
+    the engine if available, because the phases of a native tick cannot be separated. "control" is everything except
+    calls into the engine; it takes a fraction of that time in a native tick. The clock calls add about one percent.
+    "waiting" is the mean time of a tick of :meth:`Runner.step` beyond the work of a worker.
+    """
+    share = max(1, workload.num_envs // workload.processes)
+    robot = workload.simulated_robot()
+    shared = SharedArrays(Arrays.layout(1, share, robot.dof))
+    options = RunnerOptions(robot, share, physics=workload.physics, collisions=collisions)
+    loop = Loop(options, robot.params(), slice(0, share), Arrays.from_fields(shared.arrays))
+    loop.reset(np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, robot.dof)))
+    loop.ticks[0].command.setpoint[...] = workload.target
+    spent = dict.fromkeys(("read", "control", "passive", "write", "step", "waiting"), 0.0)
+    for group in loop.groups:
+        group.execute_in_numpy()
+        _time_calls(group.pack, spent)
+    given = Command(workload.target).given
+    total = sum(loop.run(1, workload.substeps, given) for _ in range(workload.ticks))
+    loop.close()
+    shared.close()
+    env_steps = workload.steps * share
+    spent["control"] = total - sum(spent.values())
+    spent["waiting"] = _waiting(workload, collisions) * env_steps
+    return {phase: seconds / env_steps * 1e6 for phase, seconds in spent.items()}
+
+
+def _time_calls(pack: EnginePack, spent: dict[str, float]) -> None:
+    """Replace the methods of each phase of ``pack`` by ones that add their seconds to ``spent``."""
+
+    def timed(phase: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*args: Any) -> Any:
+            began = time.perf_counter()
+            result = call(*args)
+            spent[phase] += time.perf_counter() - began
+            return result
+
+        return run
+
+    for phase, names in PHASES.items():
+        for name in names:
+            setattr(pack, name, timed(phase, getattr(pack, name)))
+
+
+def _waiting(workload: Workload, collisions: bool) -> float:
+    """Return the mean seconds per env step of a tick beyond the work of a worker."""
+    with workload.runner(collisions=collisions) as runner:
+        runner.step(workload.target)
+        idle = 0.0
+        for _ in range(workload.ticks):
+            began = time.perf_counter()
+            runner.step(workload.target)
+            idle += time.perf_counter() - began - float(np.mean(runner.work_seconds))
+    return idle / (workload.steps * workload.num_envs / workload.processes)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure the speed of the closed loop and its phases, of the tutorial's loop and of the bare engine.
+
+    Rates are medians over the rounds. Ratios are medians of the rounds' ratios, of all processes together and per
+    process.
+    """
+
+    robot: tyro.conf.Positional[Literal["panda", "jaco2"]] = "panda"
+    num_envs: int = 64
+    workers: int | None = None
+    """Default: one for each available core."""
+    physics: Literal["accurate", "fast", "free"] = "accurate"
+    ticks: int = 100
+    rounds: int = 5
+    peers: bool = False
+    """Measure MuJoCo, with the closed loop and alone, and Gymnasium's AsyncVectorEnv, too, where installed."""
+    xla: bool = False
+    """Measure the closed loop in XLA, too."""
+    json: Path | None = None
+    """File for the figures, for draw.py."""
+
+
+def main(options: Options) -> None:
+    """Print the tables and write the figures."""
+    cores = len(os.sched_getaffinity(0))
+    workload = Workload(
+        Robot.load(options.robot),
+        options.num_envs,
+        workers=cores if options.workers is None else options.workers,
+        physics=options.physics,
+        ticks=options.ticks,
+        rounds=options.rounds,
+    )
+    peers = installed_peers() if options.peers else []
+    names = [*CASES, *(XLA_LOOPS if options.xla else ()), *(MUJOCO_LOOPS if "mujoco" in peers else ()), *peers]
+    results = measure_rates(workload, names)
+    ratios = {case: results[OURS].over(result) for case, result in results.items()}
+    figures = {
+        "rates": {case: round(result.rate) for case, result in results.items()},
+        "ratios": {case: round(ratio, 3) for case, ratio in ratios.items()},
+        "per_process": {
+            case: round(ratios[case] * result.processes / workload.processes, 3) for case, result in results.items()
+        },
+        "phases": _rounded(measure_phases(workload)),
+        "free_phases": _rounded(measure_phases(replace(workload, physics="free"), collisions=False)),
+    }
+    calls = native.status().describe("SAPIEN")
+    print(f"{options.robot}, {options.num_envs} envs, {workload.processes} processes, {calls}\n")
+    columns = figures["rates"], figures["ratios"], figures["per_process"]
+    rows = [
+        [case, f"{rate / 1e3:,.1f}", *(f"{each[case]:.2f}" for each in columns[1:])]
+        for case, rate in columns[0].items()
+    ]
+    print(table(rows, ["case", "thousand env-steps/s", f"{OURS} / case", "per process"], "lrrr"))
+    print("\nmicroseconds per env step in a worker:")
+    rows = [[name, *map(str, figures[key].values())] for name, key in ((OURS, "phases"), (FREE, "free_phases"))]
+    print(table(rows, ["", *figures["phases"]], "lrrrrrr"))
+    if options.json is not None:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(options.json, json.dumps({"machine": machine()} | figures) + "\n")
+
+
+def _rounded(phases: dict[str, float]) -> dict[str, float]:
+    return {phase: round(us, 2) for phase, us in phases.items()}
+
+
+def machine() -> dict[str, Any]:
+    """Return the hardware and the versions that figures depend on."""
+    model = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    return {
+        "processor": model[1] if model else platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)),
+        "system": platform.platform(),
+        **package_versions(),
+    }
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,1 +1,0 @@
-"""Speed and accuracy of the runner, against baselines: ``batchpid bench``."""
