@@ -17,9 +17,9 @@ from collections.abc import Collection, Iterable, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
-from batchpid.sim.robot.collision_shapes import link_shapes
 from batchpid.sim.robot.merging import fixed_edges, place_links
 from batchpid.sim.robot.parts import Joint
+from batchpid.sim.robot.simulated_links import simulated
 
 Words = tuple[int, int, int, int]
 Pair = frozenset[str]
@@ -85,8 +85,7 @@ def link_groups(
     root = next(at.link for at in placements.values()) if fixed_base else None
     joined = [(placements[joint.parent_link].link, placements[joint.child_link].link) for joint in joints]
     neighbours = {frozenset(pair) for pair in joined if root not in pair}
-    links = [shape.owner for shapes in link_shapes(urdf, merge_fixed).values() for shape in shapes]
-    links = list(dict.fromkeys(links))
+    links = list(dict.fromkeys(owner for owners in simulated(urdf, merge_fixed).owners.values() for owner in owners))
     ignored, free = set(ignored), set[Pair]()
     for first, second in combinations(links, 2):
         pair = frozenset((placements[first].link, placements[second].link))
