@@ -3,12 +3,11 @@
 from itertools import combinations
 
 import numpy as np
-import sapien
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from physx_filter import may_touch
 
-from batchpid.sim.engine.sapien.user_content import HeadlessScene
+from batchpid.sim.engine.sapien.user_content import HeadlessScene, sapien
 from batchpid.sim.robot.collision_groups import collision_groups
 
 DEFAULT = (1, 1, 0, 0)
