@@ -7,11 +7,11 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
-from sapien import physx
 from tiny_urdf import joint, link, robot, write
 
 import batchpid as bp
 from batchpid.export import to_maniskill
+from batchpid.sim.engine.sapien.building import physx
 from batchpid.sim.engine.sapien.user_content import HeadlessScene
 
 JOINTS, DT = ["shoulder", "elbow", "wrist"], 1 / 100
