@@ -86,17 +86,13 @@ class Contacts:
 
     def near(self, qpos: NDArray[Any], within: float = NEAR) -> Iterator[Near]:
         """Yield the pairs of shapes that are closer than ``within`` [m], at one pose (dof,)."""
-        with self._lock:
-            centers = self._move(qpos)
-            radii, (first, second) = self._model.geom_rbound[: len(centers)], self._pairs.T
-            apart = np.linalg.norm(centers[first] - centers[second], axis=1) - radii[first] - radii[second]
-            found = []
-            for a, b in self._pairs[apart < within].tolist():
-                distance = mujoco.mj_geomDistance(self._model, self._data, a, b, within, None)
-                found.append(Near(self._shapes[a].owner, self._shapes[b].owner, distance))
-            low = self._grounded[centers[self._grounded, 2] - radii[self._grounded] < within].tolist()
-            found += [Near(self._shapes[index].owner, GROUND, self._lowest(index)) for index in low]
-        yield from (each for each in found if each.distance < within)
+        apart, heights = self._apart(qpos, max(within, NEAR))
+        owners = [shape.owner for shape in self._shapes]
+        for row in np.flatnonzero(apart < within).tolist():
+            first, second = self._pairs[row].tolist()
+            yield Near(owners[first], owners[second], float(apart[row]))
+        for row in np.flatnonzero(heights < within).tolist():
+            yield Near(owners[self._grounded[row]], GROUND, float(heights[row]))
 
     @property
     def balls(self) -> tuple[NDArray[np.intp], Float64]:
@@ -113,19 +109,28 @@ class Contacts:
 
         They are exact where bodies are near each other. The ground counts as the base, body -1.
         """
+        apart, heights = self._apart(qpos, NEAR)
+        bodies = [
+            *np.sort(self._body[self._pairs], axis=1).tolist(),
+            *([-1, body] for body in self._body[self._grounded]),
+        ]
+        found: dict[tuple[int, int], float] = {}
+        for distance, (first, second) in zip([*apart.tolist(), *heights.tolist()], bodies, strict=True):
+            found[first, second] = min(distance, found.get((first, second), np.inf))
+        return found
+
+    def _apart(self, qpos: NDArray[Any], within: float) -> tuple[Float64, Float64]:
+        """Return lower bounds of the distances of the pairs (pairs,) [m], exact below ``within``, and the heights of
+        the lowest points of the shapes that may touch the ground.
+        """
         with self._lock:
             centers = self._move(qpos)
             radii, (first, second) = self._model.geom_rbound[: len(centers)], self._pairs.T
             apart = np.linalg.norm(centers[first] - centers[second], axis=1) - radii[first] - radii[second]
-            for row in np.flatnonzero(apart < NEAR).tolist():
+            for row in np.flatnonzero(apart < within).tolist():
                 a, b = self._pairs[row].tolist()
-                apart[row] = mujoco.mj_geomDistance(self._model, self._data, a, b, NEAR, None)
-            low = [(self._lowest(index), (-1, int(self._body[index]))) for index in self._grounded.tolist()]
-        bodies = np.sort(self._body[self._pairs], axis=1).tolist()
-        found: dict[tuple[int, int], float] = {}
-        for distance, pair in (*zip(apart.tolist(), map(tuple, bodies), strict=True), *low):
-            found[pair] = min(distance, found.get(pair, np.inf))
-        return found
+                apart[row] = mujoco.mj_geomDistance(self._model, self._data, a, b, within, None)
+            return apart, np.array([self._lowest(index) for index in self._grounded.tolist()])
 
     def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> NDArray[np.bool_]:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,)."""
