@@ -136,7 +136,7 @@ class DrivenPack(EnginePack, Protocol):
     """Pack whose joints have drives: PD control that the engine integrates implicitly."""
 
     def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
-        """Set the drive of every joint; each argument broadcasts to (M, dof) [N m/rad or N/m, ...]."""
+        """Set the drive of every joint; each argument broadcasts to (M, dof) [N m/rad, N m s/rad, N m, or N/m, ...]."""
 
     def write_drive_target(self, position: NDArray[Any], velocity: NDArray[Any] | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
