@@ -15,14 +15,14 @@ With setpoint r, measurement y and step dt, per env and joint::
     I     <- min(max(I, integral_min), integral_max)            clamp
 
 A prime is the value of the step before. I is in effort units, so a change of ki is bumpless. ``integration`` says
-whether the effort is computed before I takes in the present error or after. Saturation is on the total effort, which
+whether the effort is computed before or after I includes the present error. Saturation is on the total effort, which
 the motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13;
 conditional integration and the order of the two stages as in ros-controls/control_toolbox, src/pid.cpp. With
 discretization "implicit" the law is this one with other coefficients: :mod:`batchpid.law.implicit`.
 
-The moving origin is our own. With r = o + s, P = kp (o + b s - y): the motion that a rate describes is followed with
-full weight, and the rest s, a step, is approached with weight b. Without a rate every setpoint is all step, and a
-moving one is followed with a lag of kp (1 - b) / ki.
+The moving origin is our own addition. With r = o + s, P = kp (o + b s - y): o, the motion that a rate describes, is
+followed with full weight, and the rest s, a step, is approached with weight b. Without a rate all motion counts as
+steps, and a moving setpoint is followed with a lag of kp (1 - b) / ki.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ def step(
     measurement_rate
         dy/dt, if measured [rad/s or m/s]; None: the difference quotient of the measurement.
     setpoint_rate
-        dr/dt, if known, at the moment of the setpoint. It moves the origin o, and enters the derivative with weight c,
-        or 1 without one. None: the difference quotient of the setpoint with a weight c, else 0.
+        dr/dt at the time of the setpoint, if known. It moves the origin o, and enters the derivative with weight c, or
+        1 if c is off. None: the difference quotient of the setpoint, or 0 if c is off.
     feedforward
         Effort added before saturation [N m or N]: passive force, acceleration feedforward, ...
 
@@ -163,7 +163,7 @@ def _advance(
     setpoint_rate: Any = None,
     feedforward: Any = None,
 ) -> tuple[PIDState, Any, Any, tuple[Any, ...], Any]:
-    """Return state, effort, unsaturated effort, its four parts, and the mask of finite inputs; None is off."""
+    """Return state, effort, unsaturated effort, its four parts, and the mask of finite inputs; None: off."""
     check_alone(k, measurement_rate)
     xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
     r, y, r_rate, y_rate, ff = setpoint, measurement, setpoint_rate, measurement_rate, feedforward
@@ -259,7 +259,7 @@ def weighted_rate(k: Coefficients, r_rate: Any) -> Any:
 
 
 def origins(k: Coefficients, state: PIDState, y: Any, r_rate: Any, xp: Any) -> tuple[Any, Any]:
-    """Return the origin of setpoint weighting, moved by the whole turns that y jumped: for this step and for the next.
+    """Return the origins of setpoint weighting for this step and the next, moved by the whole turns that y jumped.
 
     A given rate moves it. The implicit law takes the setpoint, and so its origin, at the end of the step.
     """

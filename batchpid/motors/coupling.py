@@ -33,7 +33,7 @@ class Follower(NamedTuple):
 
 
 class Share(NamedTuple):
-    """Followers of the leaders, one of each leader at most; arrays (joints,)."""
+    """Followers of the leaders, at most one for each leader; arrays (joints,)."""
 
     exists: Any
     """Whether the joint has this follower."""
@@ -55,8 +55,8 @@ def _of_followers(method: Callable[[Coupling, Any], Any]) -> Callable[[Coupling,
 class Coupling(NamedTuple):
     """Coupling of a robot's joints; the identity if no joint follows. Arrays are (joints,), and read-only.
 
-    Methods take and return arrays (..., joints) unless said otherwise, of NumPy or JAX, or symbols of a trace. Those of
-    the identity return their argument.
+    Methods take and return arrays (..., joints) unless said otherwise, of NumPy or JAX, or symbols of a trace. For
+    the identity they return their argument.
     """
 
     leader: Any
@@ -123,12 +123,12 @@ class Coupling(NamedTuple):
 
     @_of_followers
     def positions(self, qpos: Any) -> Any:
-        """Return ``qpos`` with the followers where their leaders have them."""
+        """Return ``qpos`` with the followers moved to match their leaders."""
         return self.rates(qpos) + self.offset
 
     @_of_followers
     def rates(self, qvel: Any) -> Any:
-        """Return ``qvel`` with the rates that the followers have by their leaders'."""
+        """Return ``qvel`` with the rates of followers computed from their leaders'."""
         return self.multiplier * self.of_leaders(qvel)
 
     @_of_followers
@@ -159,7 +159,7 @@ class Coupling(NamedTuple):
     def mass_matrix(self, matrix: Any) -> Any:
         """Return G^T M G for M (..., joints, joints) in the rows and columns of the independent joints.
 
-        Rows and columns of followers are the identity's. ``fold`` in coupling.h is the same function.
+        Rows and columns of followers are rows and columns of the identity. ``fold`` in coupling.h is the same function.
         """
         xp = namespace(matrix)
         rows = xp.swapaxes(self.efforts(xp.swapaxes(matrix, -1, -2)), -1, -2)

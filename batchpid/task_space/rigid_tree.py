@@ -1,10 +1,10 @@
 """Rigid tree of one robot: its links, joints and inertias, as float64 arrays.
 
-Links are listed parents first. A joint's frame is placed in the frame of its parent link; its child link's frame is
-that frame, turned about the axis by q (revolute) or shifted along it by q (prismatic). Links that fixed joints connect
-are one rigid body: each link keeps its name and its frame, and the bodies have the sums of the inertias (Huygens and
-Steiner). There is one body for each degree of freedom, whose frame is that of its joint, with the axis along x; and the
-base, which is held or floats.
+Links are listed parents first. The frame of a joint has a fixed place in the frame of its parent link. The frame of its
+child link is the joint's frame, turned about the axis by q (revolute) or shifted along it by q (prismatic). Links that
+fixed joints connect are one rigid body: each link keeps its name and its frame, and the body has the sum of the
+inertias (Huygens and Steiner). There is one body for each degree of freedom, in the frame of its joint with the axis
+along x, and one for the base, which is fixed or floats.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Bodies(NamedTuple):
     center: Any
     """Center of mass in the body's frame (dof, 3) [m]."""
     tensor: Any
-    """Inertia tensor about it, in the body's axes (dof, 3, 3) [kg m^2]."""
+    """Inertia tensor about the center of mass, in the body's axes (dof, 3, 3) [kg m^2]."""
     moves: Any
     """1.0 where joint i moves body j (dof j, dof i)."""
     link_frames: Any
@@ -59,7 +59,7 @@ class Bodies(NamedTuple):
     armature: Any
     gravity: Any
     base_mass: Any
-    """Mass of the base (1,) [kg], with all that is fixed to it; center (3,) and tensor (3, 3) as of the bodies."""
+    """Mass of the base and the links fixed to it (1,) [kg]; center (3,) and tensor (3, 3) as for the bodies."""
     base_center: Any
     base_tensor: Any
 
@@ -86,9 +86,9 @@ class RigidTree:
     joint_names: tuple[str, ...]
     """Names of the joints that move (dof,)."""
     position: Float64
-    """Position of each joint in its parent link's frame (links, 3) [m]; of the base in the world."""
+    """Position of each joint in its parent link's frame (links, 3) [m]; for the base, in the world."""
     wxyz: Float64
-    """Orientation there, unit quaternions (links, 4)."""
+    """Orientation of each joint there, unit quaternions (links, 4)."""
     axis: Float64
     """Axes in the joint's frame (links, 3), normalised here; unused for fixed joints."""
     mass: Float64
@@ -96,7 +96,7 @@ class RigidTree:
     center: Float64
     """Centers of mass in the link's frame (links, 3) [m]."""
     inertia: Float64
-    """Inertia tensors about them, in the link's axes (links, 3, 3) [kg m^2]."""
+    """Inertia tensors about the centers of mass, in the link's axes (links, 3, 3) [kg m^2]."""
     _: KW_ONLY
     armature: ArrayLike = 0.0
     """Reflected inertia of the motors (dof,) [kg m^2 or kg], added to the diagonal of the mass matrix."""
@@ -107,11 +107,12 @@ class RigidTree:
     """Acceleration of free fall in the world (3,) [m/s^2]."""
     coupling: Coupling = None  # type: ignore[assignment]
     """Coupling of the joints; None: all are independent. Jacobians, mass matrices and efforts are reduced to the
-    leaders, J G, G^T M G and G^T u: columns and efforts of followers are 0, their rows in a mass matrix the identity's.
+    leaders, J G, G^T M G and G^T u: columns and efforts of followers are 0, and their rows in a mass matrix are rows of
+    the identity.
     """
     fixed_base: bool = True
-    """False if the base floats. Mass matrices and biases are then the Schur complements that the joints show
-    (:mod:`batchpid.task_space.tree_dynamics`); poses and Jacobians stay those in the frame of the base."""
+    """False if the base floats. Mass matrices and biases of the joints are then Schur complements
+    (:mod:`batchpid.task_space.tree_dynamics`); poses and Jacobians are still in the frame of the base."""
 
     def __post_init__(self) -> None:
         links = tuple(names("links", list(self.links)))
@@ -206,11 +207,11 @@ class RigidTree:
         return self.coupling.independent
 
     def positions(self, qpos: Float64) -> Float64:
-        """Return ``qpos`` (..., dof) with the followers where their leaders have them."""
+        """Return ``qpos`` (..., dof) with the followers moved to match their leaders."""
         return self.coupling.positions(qpos)
 
     def rates(self, qvel: Any) -> Any:
-        """Return ``qvel`` (..., dof) with the rates of the followers by their leaders'."""
+        """Return ``qvel`` (..., dof) with the rates of followers computed from their leaders'."""
         return namespace(qvel).asarray(self.coupling.rates(qvel), dtype=qvel.dtype)
 
     def efforts(self, effort: Any) -> Any:
@@ -218,12 +219,12 @@ class RigidTree:
         return namespace(effort).asarray(self.coupling.efforts(effort), dtype=effort.dtype)
 
     def chain(self, link: str) -> NDArray[np.bool_]:
-        """Return the mask (dof,) of the joints between the base and ``link``, and of all that move with these."""
+        """Return the mask (dof,) of the joints between the base and ``link``, and of joints coupled to them."""
         return self.chains[self.link_bodies[self.index(link)]] > 0
 
     @cached_property
     def chains(self) -> Float64:
-        """1.0 for the joints between the base and each body, and for all that move with these (dof + 1, dof).
+        """1.0 for the joints between the base and each body, and for joints coupled to them (dof + 1, dof).
 
         The last row, body -1, is the base.
         """
@@ -297,7 +298,7 @@ class RigidTree:
         return read_only(np.column_stack([np.array(self.body_parents, np.int32), slides])), read_only(rows)
 
     def inertias(self, bodies: Bodies | None = None) -> Float64:
-        """Return mass, center of mass and inertia tensor of each body, the last the base (..., dof + 1, 13)."""
+        """Return mass, center of mass and inertia tensor of each body, then of the base (..., dof + 1, 13)."""
         of = self.bodies if bodies is None else bodies
         parts = of.mass, of.center, of.tensor.reshape(*of.center.shape[:-1], 9)
         rows = np.concatenate(parts, axis=-1)
@@ -314,7 +315,7 @@ class RigidTree:
         return self.with_added(of_bodies)
 
     def with_added(self, added: Mapping[int, Float64]) -> Bodies:
-        """Return the bodies of n robots with spatial inertias (n, 6, 6) added, by number, in the axes of the bodies."""
+        """Return the bodies of n robots with spatial inertias (n, 6, 6) added, by index, in the axes of the bodies."""
         rows = np.tile(self.inertias(), (len(next(iter(added.values()))), 1, 1))
         for body, matrices in added.items():
             mass, center, tensor = np.split(rows[0, body], [1, 4])

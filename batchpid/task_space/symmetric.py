@@ -1,8 +1,8 @@
-r"""Symmetric positive matrices of a few rows: Cholesky's factor, solutions, bounded inverses, eigenvalues.
+r"""Small symmetric positive matrices: Cholesky's factor, solutions, bounded inverses, eigenvalues.
 
-Matrices are (..., n, n), and their linear algebra is NumPy's or JAX's. The result of a row does not depend on the
-others: NumPy solves each matrix of a batch by itself, and raises for a batch if one of its matrices is not finite, so
-that those are replaced by the identity, and their results by NaN.
+Matrices are (..., n, n), and their linear algebra is NumPy's or JAX's. The result of a matrix does not depend on the
+others in a batch. NumPy solves them separately, but raises for the whole batch if one is not finite. So such a matrix
+is replaced by the identity, and its result by NaN.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _cholesky(matrix: Any) -> Any:
 
 
 def _sound(matrix: Any) -> tuple[Any, Any]:
-    """Return ``matrix`` with the identity where a matrix is not finite, and where it is (..., 1, 1)."""
+    """Return ``matrix`` with the identity for non-finite matrices, and the mask of finite ones (..., 1, 1)."""
     sound = np.isfinite(matrix).all((-2, -1), keepdims=True)
     return (matrix if sound.all() else np.where(sound, matrix, _identity(matrix))), sound
 
@@ -70,13 +70,13 @@ def solve(matrix: Any, right: Any) -> Any:
 
 
 def bounded_inverse(matrix: Any, smallest: Any, *smooth: Any) -> tuple[Any, ...]:
-    """Return the bounded inverses (..., n, n) of positive semidefinite matrices, and where they differ from inverses.
+    """Return the bounded inverses (..., n, n) of positive semidefinite matrices, and the mask of those that differ.
 
     An eigenvalue s becomes 1/s if s >= s0 = ``smallest`` (a number or (...)), else s/s0^2: continuous, at most 1/s0,
     and 0 where s is 0.
 
-    For each further bound s1 <= s0 of ``smooth``, an inverse follows the first in which s becomes s (2 - s^2/s1^2) /
-    s1^2 below s1, with a continuous derivative. It has the bits of the first where no eigenvalue is below s0.
+    Each bound s1 <= s0 in ``smooth`` gives a further inverse: below s1, s becomes s (2 - s^2/s1^2) / s1^2, with a
+    continuous derivative. It is bit-identical to the first inverse if no eigenvalue is below s0.
     """
     xp = namespace(matrix)
     s0, *bounds = [xp.asarray(bound, dtype=matrix.dtype)[..., None] for bound in (smallest, *smooth)]

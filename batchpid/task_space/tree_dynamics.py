@@ -1,24 +1,24 @@
 r"""Dynamics of a rigid tree: M(q) q'' + h(q, q') = tau, without friction and damping.
 
-All quantities are in the axes of the world and about its origin. With the motions s_j = (v_j, w_j) of the joints, and
-for all that joint j moves the mass m, the first moment c and the inertia tensor I, the momenta under s_j and the mass
-matrix are (composite rigid bodies; R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section 6.2)::
+All quantities are in the axes of the world and about its origin. Joint j has the motion s_j = (v_j, w_j). All bodies
+that it moves together have the mass m, the first moment c and the inertia tensor I. Momenta under s_j and mass matrix
+are (composite rigid bodies; R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section 6.2)::
 
     linear  l_j = m v_j + w_j x c        angular  k_j = I w_j + c x v_j
     M_ij = M_ji = s_i . (l_j, k_j)   for a joint i that moves joint j, or is joint j; else 0;   M_jj += armature
 
-and the bias h, gravity and the Coriolis and centrifugal forces, is the sum of the rates of momentum of the bodies at
-q'' = 0, less their weight (recursive Newton-Euler algorithm, section 5.3). With the acceleration a of the center of
-mass r of a body, its inertia tensor I about it, its angular velocity w and its angular acceleration w'::
+The bias h (gravity, Coriolis and centrifugal forces) is the sum of the rates of momentum of the bodies at q'' = 0, less
+their weight (recursive Newton-Euler algorithm, section 5.3). For a body with the center of mass r, a is the
+acceleration of r, I the inertia tensor about r, w the angular velocity and w' the angular acceleration::
 
-    f = m (a - g)      n = I w' + w x I w + r x f      h_j = s_j . (sum of (f, n) of all that joint j moves)
+    f = m (a - g)      n = I w' + w x I w + r x f      h_j = s_j . (sum of (f, n) of the bodies that j moves)
 
-On a floating base (b; j are the joints) the joints show the Schur complements::
+On a floating base (index b; index j for the joints) M and h of the joints are Schur complements::
 
     M = M_jj - M_jb M_bb^-1 M_bj        h = h_j - M_jb M_bb^-1 h_b
 
-where the columns of M_bj are the momenta (l_j, k_j), and M_bb, h_b are those of all bodies together. Gravity, and the
-velocity and acceleration of the base's origin, cancel: h depends on the rate at which the base turns.
+where the columns of M_bj are the momenta (l_j, k_j), and M_bb and h_b belong to all bodies together. Gravity, and the
+velocity and acceleration of the base's origin, cancel. The rate at which the base turns remains in h.
 
 The results for coupled joints are reduced to their leaders, G^T M G and G^T h (:mod:`batchpid.motors.coupling`).
 """
@@ -46,7 +46,7 @@ from batchpid.task_space.tree_kinematics import (
 def mass_matrix(tree: RigidTree, qpos: Any, bodies: Bodies | None = None) -> Any:
     """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof), armature included.
 
-    ``bodies`` are those of robots that differ from the tree, one for each row: :meth:`RigidTree.varied`.
+    ``bodies`` belong to robots that differ from the tree, one for each row: :meth:`RigidTree.varied`.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def check_masses(tree: RigidTree) -> None:
 
 
 class _Composite(NamedTuple):
-    """All that each joint moves, as one rigid body, and the momenta under the motions of the joints."""
+    """The bodies that each joint moves, as one rigid body, and the momenta under the motions of the joints."""
 
     mass: Any
     """(..., dof, 1)"""
@@ -205,9 +205,9 @@ def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: Any) -
 def effort_of(
     tree: RigidTree, bodies: Bodies, motions: Motions, rates: Velocities, xp: Any, turning: Any = None
 ) -> Any:
-    """Return the efforts (..., dof) of given velocities and accelerations of the bodies, armature left out.
+    """Return the efforts (..., dof) of given velocities and accelerations of the bodies, without armature.
 
-    A floating base turns at ``turning`` (..., 3) [rad/s], with which the velocities were made.
+    A floating base turns at ``turning`` (..., 3) [rad/s]; ``rates`` must include this rotation.
     """
     turn = motions.frames[..., :3]
     center = rotate(turn, bodies.center) + motions.frames[..., 3]

@@ -1,17 +1,17 @@
-r"""Dynamics of many robots of one kind, each with its payload, and steps of their joints with friction.
+r"""Dynamics of many copies of a robot, each with its payload, and time steps of their joints with friction.
 
-Some joints move (``joints``), others rest or follow one of them: q_whole = rest + G q, with one leader for each row of
-G. With the mass matrix M and the passive forces h (gravity, Coriolis and centrifugal forces) of all joints, the
-joints that move have G^T M G and G^T h.
+Some joints move (``joints``). Each of the others rests, or follows one of them: q_whole = rest + G q, with one entry at
+most in a row of G. M is the mass matrix of all joints, and h are their gravity, Coriolis and centrifugal forces. For
+the joints that move these are G^T M G and G^T h.
 
-M and h are those of :mod:`batchpid.task_space.tree_dynamics`, for all robots in native code where it is used.
+M and h are computed as in :mod:`batchpid.task_space.tree_dynamics`, or by the native extension for all robots at once.
 
 A step of length dt under efforts tau and Coulomb friction of at most F, with D = M + added inertia (diagonal)::
 
     D (v+ - v) = dt (tau - f),     f in F Sgn(v+ - keep v - creep f),     q+ = q + dt v+
 
 With keep = creep = 0 friction stops a joint at once. The complementarity problem is solved by projected Jacobi sweeps,
-begun with the friction of the step before (M. Anitescu and F. A. Potra, "Formulating dynamic multi-rigid-body contact
+from the friction of the step before (M. Anitescu and F. A. Potra, "Formulating dynamic multi-rigid-body contact
 problems with friction as solvable linear complementarity problems", Nonlinear Dynamics 14, 1997). Joints stop at their
 limits.
 """
@@ -41,7 +41,7 @@ class Passive(NamedTuple):
     force: Float64
     """Gravity, Coriolis and centrifugal forces without the payload (n, joints) [N m or N]."""
     payload_force: Float64
-    """Those of the payload (n, joints)."""
+    """The same forces of the payload (n, joints)."""
 
 
 class Friction(NamedTuple):
@@ -52,11 +52,11 @@ class Friction(NamedTuple):
     keep: Float64
     """Share of its velocity that a joint keeps in a step if friction suffices to stop it (n, 1)."""
     creep: Float64
-    """Velocity that it has besides, per effort of friction (n, joints)."""
+    """Additional velocity of the joint per effort of friction (n, joints)."""
 
 
 SWEEPS = 2
-"""Sweeps over the joints in a step, begun with the friction of the step before."""
+"""Number of sweeps over the joints in a step."""
 
 
 def batch_dynamics(robot: RobotDescription, joints: tuple[int, ...]) -> NativeBatchDynamics | NumpyBatchDynamics:
@@ -86,21 +86,21 @@ class Loaded(NamedTuple):
 
 
 class MovingJoints(NamedTuple):
-    """Joints of a robot that move, and those that rest or follow them."""
+    """Joints of a robot that move, and joints that rest or follow them."""
 
     leader: NDArray[np.int32]
-    """Number among the joints that move, of each joint of the robot (dof,); -1 for a joint that rests."""
+    """Index of each joint's leader (or of itself) among the joints that move (dof,); -1 for a joint that rests."""
     multiplier: Float64
-    """Ratio of its speed to its leader's speed (dof,)."""
+    """Ratio of each joint's speed to its leader's speed (dof,)."""
     rest: Float64
-    """Its position where its leader is at 0 (dof,)."""
+    """Position of each joint when its leader is at 0 (dof,)."""
     low: Float64
     """Lower limits of the joints that move (joints,), -inf for none."""
     high: Float64
 
     @classmethod
     def of(cls, robot: RobotDescription, joints: tuple[int, ...]) -> MovingJoints:
-        """Return ``joints`` of ``robot``; others rest where it starts, or follow."""
+        """Return ``joints`` of ``robot``; the others rest at the start pose, or follow."""
         number, rest, coupling = np.full(robot.dof, -1, np.int32), robot.start.copy(), robot.coupling
         number[list(joints)], rest[list(joints)] = np.arange(len(joints)), 0.0
         leader = number[coupling.leader]

@@ -1,10 +1,10 @@
-"""Contacts that robots without collision shapes would have had, by the model of the robot that has them.
+"""Contacts that robots simulated without collision shapes would have had, from the shapes of their description.
 
-A robot is checked where it leaves a region of joint positions in which nothing touches: with the distance d of two
-links, and the largest speed r_j of one towards the other per unit of joint j's speed, nothing touches while ``sum_j r_j
-|q_j - q0_j| < d``. That is conservative advancement (B. Mirtich, Impulse-based Dynamic Simulation of Rigid Body
-Systems, PhD thesis, University of California, Berkeley, 1996, section 2.3). A robot in motion is checked at about every
-twentieth tick.
+A robot is checked when it leaves a region of joint positions, around q0, in which no links can touch. Two links have
+the distance d at q0, and unit speed of joint j brings them together at the speed r_j at most. They cannot touch while
+``sum_j r_j |q_j - q0_j| < d``. That is conservative advancement (B. Mirtich, Impulse-based Dynamic Simulation of Rigid
+Body Systems, PhD thesis, University of California, Berkeley, 1996, section 2.3). A robot in motion is checked at about
+every twentieth tick.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class MissedContacts:
         self._centers, self._sizes = np.zeros((size, tree.dof)), np.zeros((size, len(self._pairs)))
 
     def place(self, mask: NDArray[np.bool_]) -> None:
-        """Drop the regions of the robots of ``mask`` (size,), which were placed."""
+        """Drop the regions of the robots of ``mask`` (size,), which are now in other states."""
         self._sizes[mask] = 0.0
 
     def look(self, qpos: Float64, step: int, first: NDArray[np.int64]) -> None:
-        """Write ``step`` into the zeros of ``first`` (size,) for robots that overlap at ``qpos`` (size, dof)."""
+        """Write ``step`` into ``first`` (size,), if it is 0, for robots with overlaps at ``qpos`` (size, dof)."""
         closed = np.abs(qpos - self._centers) @ self._arms.T
         for row in np.flatnonzero((closed >= self._sizes).any(1) & (first == 0)):
             found = self._contacts.least_distances(qpos[row])

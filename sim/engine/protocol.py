@@ -1,6 +1,6 @@
-"""Interface between a physics engine and loop, robots and tuning.
+"""Interface of the physics engines to the loop, the robots and the tuning.
 
-The loop holds the M envs of a group as one :class:`EnginePack`. Robots, controls and tuning compute with a
+The loop holds the M envs of a group as one :class:`EnginePack`. Robots, controls and tuning use a
 :class:`batchpid.sim.engine.robot_model.RobotModel`. :func:`batchpid.sim.engine.engines.load_engine` returns an
 :class:`Engine`, which makes packs.
 
@@ -79,7 +79,7 @@ class EnginePack(Protocol):
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         """Return the joints' effective mass matrices at ``qpos`` (M, dof, dof) [kg m^2 or kg], variation included.
 
-        On a floating base they are the Schur complement by the base's six degrees of freedom.
+        On a floating base they are Schur complements: the base's six degrees of freedom are eliminated.
         """
 
     def write_qf(self, effort: NDArray[Any]) -> None:
@@ -92,9 +92,9 @@ class EnginePack(Protocol):
         """
 
     def write_state(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
-        """Place the envs ``rows``: positions and velocities (len(rows), dof); zero efforts, the root at the origin.
+        """Set positions and velocities (len(rows), dof) of the envs ``rows``, zero efforts, and the root at the origin.
 
-        Content of these envs returns to its start. The call recovers an env whose state is not finite.
+        Content of these envs returns to its start. An env whose state was not finite can be used again.
         """
 
     def suspend(self, mask: Bool) -> None:
@@ -104,7 +104,7 @@ class EnginePack(Protocol):
         """Add friction, damping and reflected inertia of ``actuators`` to the description's, for ``rows`` or all."""
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
-        """Change the robots ``rows`` to ``variation``, one row for each; the pack was made with a variation.
+        """Change the robots ``rows`` to ``variation``, one row for each, in a pack that was made with a variation.
 
         Next the loop calls :meth:`write_joints` and :meth:`write_state` for them.
         """
@@ -121,7 +121,7 @@ class EnginePack(Protocol):
     def write_state_rows(self, states: Float64) -> None:
         """Put all envs of this new pack into the states that :meth:`read_state` returned.
 
-        Rows may be longer, with more NaN at the end. Efforts and suspension are written afterwards.
+        Rows may be longer, with more NaN at the end. The loop writes efforts and suspension afterwards.
         """
 
     def read_poses(self) -> list[NDArray[np.float32]]:
@@ -136,7 +136,7 @@ class DrivenPack(EnginePack, Protocol):
     """Pack whose joints have drives: PD control that the engine integrates implicitly."""
 
     def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
-        """Set the drive of every joint; each argument broadcasts to (M, dof) [N m/rad, N m s/rad, N m, or for m]."""
+        """Set the drive of every joint; each argument broadcasts to (M, dof) [N m/rad, N m s/rad, N m, or N/m, ...]."""
 
     def write_drive_target(self, position: NDArray[Any], velocity: NDArray[Any] | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
@@ -194,22 +194,22 @@ class CompiledPack(EnginePack, Protocol):
         """
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
-        """Give the constraint efforts of robots ``rows`` the present mass matrix, if joints are coupled."""
+        """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are coupled."""
 
     def joint_model(self) -> CompiledModel:
-        """Return the model of :meth:`joint_mass_matrix`, the same object for the life of the pack."""
+        """Return the native model of :meth:`joint_mass_matrix`, the same object for the life of the pack."""
 
     def force_model(self) -> CompiledModel:
-        """Return the model of :meth:`passive_force`, where compiled steps do not read it."""
+        """Return the native model of :meth:`passive_force`, for compiled steps that do not read this force."""
 
 
 class Engine(Protocol):
-    """Physics engine: it makes packs, and models of robots.
+    """Physics engine: it makes packs, and the rigid trees of its robots.
 
     Attributes
     ----------
     name, title
-        Value of the option ``engine``, and name of the library in texts.
+        Value of the option ``engine``, and name of the library in messages.
     capabilities
         Its optional features.
     physics
@@ -226,7 +226,7 @@ class Engine(Protocol):
     group_size: int
 
     def is_physics(self, settings: object) -> bool:
-        """Return whether these are settings of its solver."""
+        """Return whether ``settings`` are settings of its solver."""
 
     def least_memory(self, num_envs: int, dof: int) -> int:
         """Return a lower estimate of the bytes that ``num_envs`` robots of ``dof`` joints take."""
@@ -250,8 +250,8 @@ class Engine(Protocol):
         carrier, links
             Link of the URDF that carries the payload, and links whose mass or center of mass varies.
         workspace
-            Working memory, shared by packs that never step at the same time, as the packs of a loop. Only the engine
-            knows its content. None: the pack allocates its memory.
+            Working memory, shared by packs that never step at the same time, such as the packs of a loop. Only the
+            engine knows its content. None: the pack allocates its memory.
 
         Raises
         ------
@@ -262,7 +262,7 @@ class Engine(Protocol):
         """
 
     def scene_tree(self, spec: SceneSpec) -> RigidTree:
-        """Return the rigid tree of the robot of ``spec`` as the engine has it, the same object for equal specs."""
+        """Return the rigid tree of the robot of ``spec`` as the engine has it: the same object for equal specs."""
 
 
 def require(engine: Engine, capability: Capability, argument: str) -> None:

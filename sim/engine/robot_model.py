@@ -1,6 +1,6 @@
-"""Model of one robot at given poses: its dynamics by :mod:`batchpid.task_space`, its contacts by its shapes.
+"""Model of one robot at given poses: dynamics by :mod:`batchpid.task_space`, contacts from its collision shapes.
 
-The rigid tree is made of the simulated bodies, in double precision; SAPIEN rounds them (:func:`scene_tree`).
+The rigid tree has the simulated bodies in double precision. SAPIEN's tree has single precision (:func:`scene_tree`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class RobotModel:
     def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> Float64:
         """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity included.
 
-        Followers keep to their leaders.
+        Followers move with their leaders.
         """
         return np.asarray(ts.forward_dynamics(self._coupled, qpos, qvel, effort), np.float64)
 
@@ -67,14 +67,14 @@ class RobotModel:
     def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> Bool:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,).
 
-        Links joined by fixed joints do not count, nor the base and the links fixed to it with the ground.
+        Links that a fixed joint connects may touch, and the base and the links fixed to it may touch the ground.
         """
         return self._contacts.in_contact(qpos, clearance)
 
     def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
         """Return the two links of the URDF that are nearest to each other, or overlap most, at one pose (dof,).
 
-        One if the other is the ground; none if no links are near each other.
+        One link if the other is the ground; no link if none are near each other.
         """
         return self._contacts.nearest_links(qpos)
 
@@ -89,9 +89,9 @@ class RobotModel:
 def passive_force(
     tree: RigidTree, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool, turning: Any = None
 ) -> Float64:
-    """Return the part of :func:`batchpid.task_space.bias` (n, dof) that is of gravity, or of velocities.
+    """Return the gravity part of :func:`batchpid.task_space.bias` (n, dof), its velocity part, or both.
 
-    On a floating base, which turns at ``turning`` (n, 3) [rad/s], there is no gravity in it.
+    A floating base turns at ``turning`` (n, 3) [rad/s]; its gravity part is 0.
     """
     zero = np.zeros_like(np.asarray(qpos, np.float64))
     force = zero
@@ -104,20 +104,20 @@ def passive_force(
 
 @lru_cache(maxsize=16)
 def description_tree(spec: SceneSpec) -> RigidTree:
-    """Return the rigid tree of the simulated bodies of ``spec``, all joints independent; the same for equal specs."""
+    """Return the rigid tree of the simulated bodies of ``spec``, not coupled; the same object for equal specs."""
     text = simulated(spec.urdf, spec.merge_fixed).urdf
     inertias = body_inertias(spec.urdf, spec.merge_fixed)
     return rigid_tree(text, inertias, gravity=spec.gravity, fixed_base=spec.fixed_base)
 
 
 def contacts_of(spec: SceneSpec, ground: bool) -> Contacts:
-    """Return the contacts of the robot of ``spec``, with shapes, and with a ground at height 0 or without."""
+    """Return the contacts of the robot of ``spec``, even without ``collisions``; ``ground`` is at height 0."""
     ignored = {frozenset(pair) for pair in spec.ignored}
     return Contacts(description_tree(spec), link_shapes(spec.urdf, spec.merge_fixed), ignored, ground)
 
 
 def scene_tree(spec: SceneSpec) -> RigidTree:
-    """Return the rigid tree of the robot of ``spec`` as its engine has it, the same object for equal specs."""
+    """Return the rigid tree of the robot of ``spec`` as its engine simulates it, the same object for equal specs."""
     return load_engine(spec.engine).scene_tree(spec)
 
 
@@ -128,7 +128,7 @@ def scene_model(spec: SceneSpec) -> RobotModel:
 
 
 def robot_model(robot: RobotDescription, ground: bool | None = None) -> RobotModel:
-    """Return the model of ``robot`` on a fixed base, with or without a ground at height 0, by default its own."""
+    """Return the model of ``robot`` on a fixed base; ``ground`` at height 0, by default ``robot.has_ground``."""
     has_ground = robot.has_ground if ground is None else ground
     options: dict[str, Any] = {"merge_fixed": robot.merge_fixed, "ground": has_ground}
     return scene_model(SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, None, **options))

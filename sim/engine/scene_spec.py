@@ -14,9 +14,9 @@ from batchpid.sim.robot.simulated_links import Body
 from batchpid.task_space.spatial_inertia import SpatialInertia, total
 
 Build = Callable[[Any, int], Any]
-"""``build(scene, env)`` adds content to the engine's scene of env ``env``; returns the objects whose poses to read.
+"""``build(scene, env)`` adds content to the engine's scene of env ``env``; returns objects whose poses are read.
 
-Objects are entities, and names of the robot's links, merged links included. None: no poses.
+An object is an entity or the name of a link of the robot, merged links included. None: no poses.
 """
 
 
@@ -25,10 +25,10 @@ class SceneSpec:
     """Everything that a scene is built from, picklable.
 
     ``urdf`` is sanitised text (see :mod:`batchpid.sim.robot.urdf`); ``ignored`` are pairs of its links that do not
-    collide; ``joints`` are the degrees of freedom, in the order of all arrays. ``physics`` are settings of the solver
-    of ``engine``, of the engine's type. With ``merge_fixed`` each rigid body is one link
-    (:mod:`batchpid.sim.robot.merging`). Without ``collisions`` the robot has no shapes and there is no ground; masses
-    and inertias stay. Specs that differ in ``build`` alone are equal.
+    collide; ``joints`` are the degrees of freedom, in the order of all arrays. ``physics`` are the solver
+    settings of ``engine``, in the engine's type. With ``merge_fixed`` each rigid body is one link
+    (:mod:`batchpid.sim.robot.merging`). Without ``collisions`` scenes have no collision shapes and no ground, but the
+    same masses and inertias. Specs that differ in ``build`` alone are equal.
     """
 
     urdf: str
@@ -47,7 +47,7 @@ class SceneSpec:
 
 
 class Variation(NamedTuple):
-    """Differences of some robots from the model, one row each; None for no difference."""
+    """Differences of some robots from the model, one row for each; None: no difference."""
 
     payload: Float64 | None = None
     """Mass added at the center of mass of a link (envs,) [kg]."""
@@ -65,7 +65,7 @@ class Variation(NamedTuple):
 
 
 def varied_inertia(body: Body, variation: Variation, row: int) -> SpatialInertia:
-    """Return the inertia of a body with its links scaled, and with the payload."""
+    """Return the inertia of a body with its links as in ``row`` of ``variation``, and with the payload."""
     parts = []
     for part in body.parts:
         (mass, center, tensor), column, share = part.inertia, part.column, 1.0

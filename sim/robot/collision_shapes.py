@@ -1,6 +1,6 @@
 """Collision shapes of a robot's links, read from its URDF: plain values for engines, distances and masses.
 
-Meshes count as their convex hulls, as in SAPIEN.
+A mesh counts as its convex hull, in both engines.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from batchpid.task_space.rotations import from_rpy, multiply, rotate
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
 ALONG_Z = np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0])
-"""Rotation (w, x, y, z) of shapes along x, which makes them lie along z, as a URDF's capsules and cylinders do."""
+"""Rotation (w, x, y, z) from a shape along x to a shape along z, as the capsules and cylinders of a URDF are."""
 ALONG_X = np.array([np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0])
-"""Rotation of MuJoCo's capsules and cylinders, which lie along z, to lie along x."""
+"""Rotation from a shape along z, as MuJoCo's capsules and cylinders are, to a shape along x."""
 
 
 class LinkShape(NamedTuple):
@@ -35,13 +35,13 @@ class LinkShape(NamedTuple):
     kind: Literal["sphere", "box", "capsule", "cylinder", "hull"]
     """Capsules and cylinders lie along x."""
     size: tuple[float, ...]
-    """Radius, half lengths of the sides, or radius and half length (without the ends of a capsule) [m]."""
+    """Radius; half lengths of a box's sides; or radius and half length, without the ends of a capsule [m]."""
     vertices: Float64 | None
     """Vertices of a convex hull (n, 3) [m]."""
     position: Float64
     """Place of the shape in the link (3,) [m]."""
     wxyz: Float64
-    """Orientation there (4,)."""
+    """Orientation of the shape in the link (4,)."""
     owner: str
     """Link of the URDF that the shape belongs to."""
 
@@ -59,7 +59,7 @@ class LinkShape(NamedTuple):
 
 @lru_cache(maxsize=16)
 def link_shapes(urdf: str, merge_fixed: bool) -> dict[str, list[LinkShape]]:
-    """Return the shapes of every simulated link of a sanitised URDF, by its name; a link without shapes has none.
+    """Return the shapes of every simulated link of a sanitised URDF, by name; an empty list without shapes.
 
     Raises RobotError for a mesh that cannot be read.
     """
@@ -116,7 +116,7 @@ def mesh_vertices(filename: str) -> Float64:
 
 
 def vertices_in_file(model: Any, indices: Any) -> Float64:
-    """Return vertices of the only mesh of a model in the frame of its file: MuJoCo turns it to its principal axes."""
+    """Return vertices of the only mesh of a model in the frame of its file; MuJoCo's are in principal axes."""
     import mujoco
 
     turned, place = np.zeros(9), model.mesh_pos[0]
@@ -125,7 +125,7 @@ def vertices_in_file(model: Any, indices: Any) -> Float64:
 
 
 def inertia_of(shapes: Sequence[LinkShape]) -> SpatialInertia:
-    """Return the inertia of shapes of DENSITY, each on its own, in the frame of their link, by MuJoCo's compiler."""
+    """Return the sum of the inertias of shapes of DENSITY, in the frame of their link, by MuJoCo's compiler."""
     import mujoco
 
     spec = mujoco.MjSpec()

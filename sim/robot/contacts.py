@@ -1,4 +1,4 @@
-"""Distances between the links of one robot, and to the ground, at given poses: MuJoCo's, of convex shapes.
+"""Distances between the links of one robot, and to the ground, at given poses, from MuJoCo, for convex shapes.
 
 The distance of two shapes that overlap is negative: the depth by which they penetrate.
 """
@@ -21,7 +21,7 @@ from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 
 NEAR = 0.02
-"""Distance [m] from which two shapes are near each other."""
+"""Distance [m] below which two shapes are near each other."""
 GROUND = ""
 """Name of the ground."""
 
@@ -40,13 +40,13 @@ class Contacts:
     Parameters
     ----------
     tree
-        Of the simulated links. Links do not collide with their parents, unless that is the root of a fixed base.
+        Tree of the simulated links. A link does not collide with its parent, except with the root of a fixed base.
     shapes
-        Of each simulated link, by name.
+        Shapes of each simulated link, by name.
     ignored
         Pairs of links of the URDF that do not collide.
     ground
-        Whether there is a ground at height 0, for all links but the base and those fixed to it.
+        Whether there is a ground at height 0. The base and the links fixed to it do not collide with it.
     """
 
     def __init__(
@@ -96,8 +96,8 @@ class Contacts:
 
     @property
     def balls(self) -> tuple[NDArray[np.intp], Float64]:
-        """Bodies of the tree that carry the shapes (shapes,), -1 for the base, and balls around the shapes (shapes, 4):
-        centers in the frame of the body [m], and radii.
+        """Body of the tree that has each shape (shapes,), -1 for the base, and a ball around each shape (shapes, 4):
+        center in the frame of the body, and radius [m].
         """
         tree, at = self._tree, [self._tree.index(self.links[link]) for link in self._link]
         frames = tree.bodies.link_frames[at].reshape(-1, 3, 4)
@@ -105,9 +105,9 @@ class Contacts:
         return self._body, np.column_stack([centers, self._model.geom_rbound[: len(centers)]])
 
     def least_distances(self, qpos: NDArray[Any]) -> dict[tuple[int, int], float]:
-        """Return lower bounds of the distances [m] of two bodies that may touch, at one pose (dof,).
+        """Return a lower bound of the distance [m] of each pair of bodies that may touch, at one pose (dof,).
 
-        They are exact where bodies are near each other. The ground counts as the base, body -1.
+        It is exact where the bodies are near each other. The ground counts as the base, body -1.
         """
         apart, heights = self._apart(qpos, NEAR)
         bodies = [
@@ -137,7 +137,7 @@ class Contacts:
         return np.array([any(True for _ in self.near(row, clearance)) for row in np.asarray(qpos)])
 
     def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
-        """Return the two links that are nearest to each other, one if the other is the ground; none if none is near."""
+        """Return the two links nearest to each other; one if the other is the ground, none if none are near."""
         nearest = min(self.near(qpos), key=lambda each: each.distance, default=Near("", "", np.inf))
         return tuple(name for name in nearest[:2] if name)
 

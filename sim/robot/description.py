@@ -1,4 +1,4 @@
-"""Description of a robot: its joints, limits and defaults. Everything here is independent of SAPIEN."""
+"""Description of a robot: its joints, limits and defaults. Nothing here depends on an engine."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ LIMIT_TOLERANCE = 1e-6  # rad or m
 
 
 class Dynamics(Protocol):
-    """Dynamics and contact of one robot at given poses (n, dof), of the engine."""
+    """Dynamics and contacts of one robot at given poses (n, dof)."""
 
     def mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
@@ -70,7 +70,7 @@ class RobotDescription(Urdf):
 
     ``joints`` are the degrees of freedom, the moving joints of ``all_joints``. ``bodies`` is the placement of every
     link, by name, in its simulated link: links joined by fixed joints are simulated as one, unless ``merge_fixed`` is
-    False. ``settings`` are a bundled robot's and ``defaults`` an MJCF file's, else None. ``package_dirs`` are the
+    False. ``settings`` come from a bundled robot, ``defaults`` from an MJCF file, else None. ``package_dirs`` are the
     folders in which meshes are looked up first. ``actuators`` are its motors and sensors, None for ideal ones.
     """
 
@@ -108,7 +108,7 @@ class RobotDescription(Urdf):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the degrees of freedom, in SAPIEN's order."""
+        """Names of the degrees of freedom, in breadth-first order, as in SAPIEN."""
         return tuple(joint.name for joint in self.joints)
 
     @property
@@ -135,7 +135,7 @@ class RobotDescription(Urdf):
     def design_effort_limit(self) -> Float64:
         """Effort limits (dof,) [N m or N] of designed and tuned gains.
 
-        They are the URDF's; where it gives none, :func:`batchpid.sim.robot.effort.suggested_effort_limit`.
+        They are the URDF's, or :func:`batchpid.sim.robot.effort.suggested_effort_limit` where it gives none.
         """
         given = self.effort_limit
         if np.isfinite(given).all():
@@ -147,7 +147,7 @@ class RobotDescription(Urdf):
 
     @property
     def velocity_limit(self) -> Float64:
-        """Velocity limits (dof,) [rad/s or m/s], infinite where the URDF gives none. SAPIEN does not enforce them."""
+        """Velocity limits (dof,) [rad/s or m/s], infinite where the URDF gives none. No engine enforces them."""
         return np.array([joint.velocity_limit for joint in self.joints])
 
     @property
@@ -162,7 +162,7 @@ class RobotDescription(Urdf):
 
     @property
     def friction(self) -> Float64:
-        """Coulomb friction of the joints (dof,) [N m or N]; 0 with ``dissipation`` "sapien", which has PhysX's own."""
+        """Coulomb friction of the joints (dof,) [N m or N]; 0 with ``dissipation`` "sapien": PhysX has its own."""
         return np.array([joint.friction for joint in self.joints]) * DISSIPATION[self.dissipation].modelled
 
     def guard(self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None) -> bp.Guard:
@@ -195,7 +195,7 @@ class RobotDescription(Urdf):
         return self.coupling.independent
 
     def coupled(self, qpos: ArrayLike) -> Float64:
-        """Return ``qpos`` (..., dof) with the followers where their leaders have them."""
+        """Return ``qpos`` (..., dof) with the followers moved to match their leaders."""
         return self.coupling.positions(np.asarray(qpos, np.float64))
 
     @property
@@ -234,7 +234,7 @@ class RobotDescription(Urdf):
         return RunInfo(robot=self.name, **{name: getattr(self, name) for name in shared}, **options)
 
     def sample(self, count: int, seed: int = 0) -> Float64:
-        """Return seeded poses (count, dof), uniform within the limits and half a turn of the start, and coupled."""
+        """Return seeded poses (count, dof), uniform within the limits and half a turn of the start; followers match."""
         low, high = np.maximum(self.lower, self.start - np.pi), np.minimum(self.upper, self.start + np.pi)
         return self.coupled(np.random.default_rng(seed).uniform(low, high, (count, self.dof)))
 
@@ -242,7 +242,7 @@ class RobotDescription(Urdf):
     def rigid_tree(self) -> RigidTree:
         """Tree of every link of the URDF, merged ones included, with the coupling and limits of the joints.
 
-        Raises RobotError if the engine cannot build a link whose mass comes from its shapes.
+        Raises RobotError if a link's mass comes from its shapes, and a mesh cannot be read.
         """
         inertias = simulated(self.urdf, True).inertias
         low, high = np.where(self.continuous, [[-np.inf], [np.inf]], [self.lower, self.upper])
@@ -260,14 +260,14 @@ class RobotDescription(Urdf):
         return self.dynamics().mass_matrix(np.atleast_2d(np.asarray(qpos, np.float64)))
 
     def holding_efforts(self, qpos: Float64) -> Float64:
-        """Return the efforts (n, dof) [N m or N] that hold ``qpos`` against gravity; leaders bear followers."""
+        """Return the efforts (n, dof) [N m or N] that hold ``qpos`` against gravity; leaders hold followers."""
         still = np.zeros_like(qpos)
         return self.coupling.efforts(self.dynamics().inverse_dynamics(qpos, still, still))
 
     def dynamics(self, ground: bool | None = None) -> Dynamics:
         """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed base.
 
-        ``ground`` says whether there is one at height 0, by default :attr:`has_ground`.
+        ``ground``: whether there is a ground at height 0; default :attr:`has_ground`.
         """
         return _load_dynamics[0](self, ground)
 
@@ -288,7 +288,7 @@ class RobotDescription(Urdf):
 
     @property
     def has_ground(self) -> bool:
-        """True if scenes have a ground by default; False if the base is fixed so low that links dip into it at rest."""
+        """True if scenes have a ground by default; False if a fixed base is so low that links start in it."""
         return not self.self_contact.reaches_ground
 
     def describe(self) -> dict[str, Any]:

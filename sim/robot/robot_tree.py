@@ -19,9 +19,9 @@ _KIND = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismat
 
 
 def rigid_tree(urdf: str, inertias: Mapping[str, SpatialInertia], **options: Any) -> RigidTree:
-    """Return the tree of a sanitised URDF; ``inertias`` are those of its links, by name, in their own frames.
+    """Return the tree of a sanitised URDF with ``inertias`` of its links, by name, in the frames of the links.
 
-    Links come breadth first, as SAPIEN has them. ``options`` are those of :class:`RigidTree`.
+    Links are in breadth-first order, as in SAPIEN. ``options`` are passed to :class:`RigidTree`.
     """
     root = etree.fromstring(urdf.encode())
     joints = edges_of(root)

@@ -1,4 +1,4 @@
-"""Simulated links of a robot: those of the URDF, merged where fixed joints join them, and their inertias.
+"""Simulated links of a robot, and their inertias: links of the URDF that fixed joints connect may be merged.
 
 A link without ``<inertial>`` has the inertia of its collision shapes. Functions take the text of a sanitised URDF.
 """
@@ -18,22 +18,22 @@ from batchpid.sim.robot.merging import Merged, merge_fixed_links, place_links
 from batchpid.task_space.spatial_inertia import SpatialInertia, rotation_matrix, total
 
 NO_MASS = 1e-6
-"""Mass [kg] that SAPIEN gives a link without mass."""
+"""Mass [kg] and moments of inertia [kg m^2] of a simulated link without mass, in both engines."""
 
 
 class Part(NamedTuple):
-    """Link of the URDF in the simulated body that it is part of."""
+    """Link of the URDF, as a part of a simulated body."""
 
     inertia: SpatialInertia
-    """In the frame of the body."""
+    """Inertia of the link in the frame of the body."""
     axes: Float64
     """Axes of the link's frame in the body's frame, as columns (3, 3)."""
     column: int | None
-    """Number among the links that vary; None for a link that does not."""
+    """Index among the links that vary; None for a link that does not vary."""
 
 
 class Body(NamedTuple):
-    """Links of a simulated body, and the place of the payload in its frame (3,) [m]; None without."""
+    """Links of a simulated body, and the place of the payload in its frame (3,) [m]; None without payload."""
 
     parts: list[Part]
     payload: Float64 | None
@@ -41,7 +41,7 @@ class Body(NamedTuple):
 
 @lru_cache(maxsize=16)
 def simulated(urdf: str, merge_fixed: bool) -> Merged:
-    """Return the robot as it is simulated, with its fixed joints merged or not, and every inertia in the text."""
+    """Return the simulated robot, with its fixed joints merged or not; its text has the inertia of every link."""
 
     def of_shapes(link: str) -> SpatialInertia:
         return inertia_of(link_shapes(urdf, False)[link])
@@ -56,16 +56,16 @@ def body_inertias(urdf: str, merge_fixed: bool) -> dict[str, SpatialInertia]:
 
 
 def center_of_mass(urdf: str, merge_fixed: bool, link: str) -> tuple[str, Float64]:
-    """Return the simulated link that a link of the URDF is part of, and the center of mass of the latter in its frame.
+    """Return the simulated link that contains ``link`` of the URDF, and in its frame the center of mass of ``link``.
 
-    That of a link without mass is its origin.
+    For a link without mass that is its origin.
     """
     at, inertia = place_links(urdf, merge_fixed)[link], simulated(urdf, merge_fixed).inertias.get(link)
     return at.link, at.position if inertia is None else inertia.moved(at.position, at.wxyz).center
 
 
 def varied_bodies(urdf: str, merge_fixed: bool, carrier: str, links: Sequence[str]) -> dict[str, Body]:
-    """Return the simulated links with varying mass, by name: those of ``links`` and of ``carrier``."""
+    """Return the simulated links with varying mass, by name: they contain ``links`` or ``carrier``."""
     loaded, place = center_of_mass(urdf, merge_fixed, carrier)
     return {
         body: Body(members, place if body == loaded else None)
@@ -75,7 +75,7 @@ def varied_bodies(urdf: str, merge_fixed: bool, carrier: str, links: Sequence[st
 
 
 def _parts(urdf: str, merge_fixed: bool, links: Sequence[str]) -> dict[str, list[Part]]:
-    """Return the links with mass of every simulated body; bodies without get one part of ``NO_MASS``."""
+    """Return the links with mass of every simulated body; a body without any gets one part of ``NO_MASS``."""
     placements, inertias = place_links(urdf, merge_fixed), simulated(urdf, merge_fixed).inertias
     parts: dict[str, list[Part]] = defaultdict(list)
     for name, at in placements.items():

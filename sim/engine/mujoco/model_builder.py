@@ -66,7 +66,7 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     Raises
     ------
     RobotError
-        SAPIEN's loader or MuJoCo's compiler refuses the description.
+        MuJoCo's compiler refuses the description, or a mesh cannot be read.
     """
     inertias = body_inertias(spec.urdf, spec.merge_fixed)
     scene, names = robot_spec(spec, inertias)

@@ -1,4 +1,4 @@
-"""Rigid tree of a robot as SAPIEN builds it: places, masses and inertias are those of PhysX, in single precision."""
+"""Rigid tree of a robot as SAPIEN builds it, with PhysX's places, masses and inertias in single precision."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from batchpid.task_space.rotations import from_rpy
 def scene_tree(spec: SceneSpec) -> RigidTree:
     """Return the tree of the robot of ``spec``, all joints independent, the same object for equal specs.
 
-    Each link of SAPIEN comes after a link without mass in the frame of the joint above it, "LINK (joint)".
+    Before each link but the base comes a link without mass, "LINK (joint)", in the frame of the joint above.
     """
     _scene, robot = build_scene(spec, new_system(spec))
     rows: list[dict[str, Any]] = []
@@ -59,5 +59,5 @@ def _place(pose: Any) -> tuple[Float64, Float64]:
 
 
 def _wxyz(pose: Any) -> Float64:
-    """Return the rotation of one of SAPIEN's poses, by roll, pitch and yaw, as SAPIEN gives it to Pinocchio."""
+    """Return the rotation of one of SAPIEN's poses, from its roll, pitch and yaw."""
     return from_rpy(np.asarray(pose.rpy, float))
