@@ -88,11 +88,11 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
         if link.collisions:
             effect = f"mass and inertia are those of the collision shapes, at {DENSITY:g} kg/m^3"
         elif fixed:
-            effect = "SAPIEN makes a link of 1e-6 kg, which costs time in every step"
+            effect = "it becomes a link of 1e-6 kg, which costs time in every step"
         elif bodies[link.name] in loaded:
-            effect = "SAPIEN makes a link of 1e-6 kg; only the links that it carries have mass"
+            effect = "it becomes a link of 1e-6 kg; only the links that it carries have mass"
         else:
-            effect = "SAPIEN makes a link of 1e-6 kg, without load: gains per unit of effort cannot control it"
+            effect = "it becomes a link of 1e-6 kg, without load: gains per unit of effort cannot control it"
         light = not link.collisions and bodies[link.name] in loaded
         severity, text = "note" if fixed or light else "warning", f"no <inertial>: {effect}"
         detail = f"{robot.link_masses[link.name].mass:.3g} kg" if link.collisions else ""

@@ -59,5 +59,5 @@ def _place(pose: Any) -> tuple[Float64, Float64]:
 
 
 def _wxyz(pose: Any) -> Float64:
-    """Return the rotation of one of SAPIEN's poses, from its roll, pitch and yaw."""
+    """Return the rotation of one of SAPIEN's poses, by roll, pitch and yaw, as SAPIEN's own dynamics take it."""
     return from_rpy(np.asarray(pose.rpy, float))
