@@ -95,7 +95,6 @@ def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
         "meshes",
         "seed",
         "seconds",
-        "substeps",
         "variation",
         "randomize",
         "fps",
