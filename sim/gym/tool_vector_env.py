@@ -144,30 +144,41 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
 
     def first_setpoint(self, qpos: Float64) -> Float64:
         """Return the poses of the tool."""
-        return self._setpoint_at(self._near_home(self._control.tool_pose(qpos)))
+        return self._near_home(self._control.tool_pose(qpos))
+
+    def setpoint_sizes(self) -> tuple[int, int]:
+        """Return the numbers of entries of a pose and of a twist."""
+        return 7, 6
 
     def command(self, action: Float64, setpoint: Float64) -> Float64:
-        """Return the target for actions in [-1, 1]: poses (envs, 7), and for increments also the twist (envs, 13)."""
+        """Return the target for actions in [-1, 1]: poses (envs, 7)."""
         limits = np.concatenate([self._half, np.full(3, self.rotation)])[: action.shape[1]]
         if self.actions == "setpoint":
-            return self._setpoint_at(self.pose_at(action * limits))
-        last = setpoint[:, :7]
-        turn = rotation_error(last[:, 3:], self._home[3:])
-        asked = np.concatenate([last[:, :3] - self.center, turn], axis=1)[:, : action.shape[1]]
-        asked = asked + action * self.max_increment
+            return self.pose_at(action * limits)
+        turn = rotation_error(setpoint[:, 3:], self._home[3:])
+        last = np.concatenate([setpoint[:, :3] - self.center, turn], axis=1)[:, : action.shape[1]]
+        asked = last + action * self.max_increment
         place = np.clip(asked, -limits, limits)
-        pose, is_inside, change = self.pose_at(place), place == asked, np.zeros((len(action), 6))
-        change[:, :3] = (pose - last)[:, :3] * is_inside[:, :3]
-        if self.rotation:
-            change[:, 3:] = rotation_error(pose[:, 3:], last[:, 3:]) * is_inside[:, 3:].all(1, keepdims=True)
-        return self._setpoint_at(pose, change / self.step_seconds)
+        self._is_inside = place == asked
+        return self.pose_at(place)
 
-    def _setpoint_at(self, pose: Float64, twist: Float64 | None = None) -> Float64:
-        """Return setpoints of the control at poses (envs, 7), with ``twist`` (envs, 6) if it takes one, or at rest."""
-        rest = np.zeros((len(pose), self._control.command.size - 7))
-        if twist is not None and rest.shape[1] == 6:
-            rest = twist
-        return np.concatenate([pose, rest], axis=1)
+    def rate(self, setpoint: Float64, last: Float64) -> Float64 | None:
+        """Return the twists (envs, 6) of increments, 0 along axes whose target is clipped; None for other actions."""
+        if self.actions == "setpoint" or self._control.command.size != 13:
+            return None
+        change, is_inside = np.zeros((len(setpoint), 6)), self._is_inside
+        change[:, :3] = (setpoint - last)[:, :3] * is_inside[:, :3]
+        if self.rotation:
+            turn = rotation_error(setpoint[:, 3:], last[:, 3:])
+            change[:, 3:] = turn * is_inside[:, 3:].all(1, keepdims=True)
+        return change / self.step_seconds
+
+    def send(self, setpoint: Float64, rate: Float64 | None) -> None:
+        """Begin a step of the runner; the twist is a part of the control's setpoint, 0 where there is none."""
+        parts = [setpoint]
+        if self._control.command.size > setpoint.shape[1]:
+            parts.append(self._rate)
+        self.runner.send(np.concatenate(parts, axis=1))
 
     def pose_at(self, place: Float64) -> Float64:
         """Return the poses (..., 7) at places in the workspace (..., 3) or (..., 6).

@@ -246,16 +246,16 @@ def test_increments_move_the_target_within_the_workspace():
     observation, _ = envs.reset(seed=0)
     tool = observation[:, -14:-7]
     envs.step(np.array([[0, 0.5, 0, 0, 0, 0]] * 2))
-    moved = envs._setpoint[:, :7] - tool
+    moved = envs._setpoint - tool
     np.testing.assert_allclose(moved[:, :3], [[0, 0.01, 0]] * 2, atol=2e-7)
     np.testing.assert_allclose(moved[:, 3:], 0, atol=2e-7)  # the orientation is the one drawn at the start
-    np.testing.assert_allclose(envs._setpoint[:, 7:], [[0, 0.5, 0, 0, 0, 0]] * 2, atol=1e-5)  # 0.01 m in 20 ms
+    np.testing.assert_allclose(envs._rate, [[0, 0.5, 0, 0, 0, 0]] * 2, atol=1e-5)  # 0.01 m in 20 ms
     for _ in range(12):
         observation, *_ = envs.step(np.array([[1.0, -1, 0, 1, 0, 0]] * 2))
     np.testing.assert_allclose(envs._setpoint[:, :2] - envs.center[:2], [[0.05, -0.1]] * 2, atol=1e-12)
     turn = rotation_error(envs._setpoint[:, 3:7], envs.pose_at(np.zeros(6))[3:])
     np.testing.assert_allclose(turn[:, 0], 0.2, atol=1e-12)
-    assert np.abs(envs._setpoint[:, 7:]).max() < 1e-9  # at rest at the limits
+    assert np.abs(envs._rate).max() < 1e-9  # at rest at the limits
     assert envs.observation_space.contains(observation)
     envs.close()
 
@@ -279,24 +279,25 @@ def tool_after_increments(action, steps, **osc):
 
 def test_a_tool_follows_increments_with_less_lag_than_without_twist():
     action = [0.0, -0.1, 0.0, 0.0, 0.0, 0.2]
-    setpoint, error, rate = tool_after_increments(action, 20)
-    np.testing.assert_allclose(setpoint[0, 7:], rate, atol=1e-12)
+    _, error, rate = tool_after_increments(action, 20)
     assert np.abs(rate)[[1, 5]] == pytest.approx([0.1, 1.0], rel=0.01)
-    setpoint, late, _ = tool_after_increments(action, 20, twist=False)
-    assert setpoint.shape == (1, 7)
+    _, late, _ = tool_after_increments(action, 20, twist=False)
     lag, lag_without = error[[1, 5]] / rate[[1, 5]], late[[1, 5]] / rate[[1, 5]]
     assert (lag_without > 0.08).all()
     assert (np.abs(lag) < 0.015).all()  # the pose is held for a step of 20 ms, half of which the tool is ahead
 
 
 def test_a_target_that_returns_to_the_workspace_is_a_step_without_twist():
-    setpoint, *_ = tool_after_increments([0.0, 0.1, 0.0], 1)
+    envs = ToolReachVectorEnv(1, workers=0, actions="increment")
+    envs.reset(seed=0)
+    envs.step(np.array([[0.0, 0.1, 0.0]]))
+    assert envs._rate[0].tolist() == pytest.approx([0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
+    envs.close()
     envs = ToolReachVectorEnv(1, workers=0, actions="increment", workspace=0.0)
     envs.reset(seed=0)
     envs.step(np.array([[0.0, 0.1, 0.0]]))
-    assert setpoint[0, 7:].tolist() == pytest.approx([0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
     assert (envs._setpoint[0, :3] == envs.center).all()
-    np.testing.assert_array_equal(envs._setpoint[0, 7:], 0.0)
+    np.testing.assert_array_equal(envs._rate[0], 0.0)
     envs.close()
 
 
@@ -305,8 +306,8 @@ def test_targets_in_the_workspace_are_steps_of_the_pose():
         envs = ToolReachVectorEnv(1, workers=0, osc=osc)
         envs.reset(seed=0)
         envs.step(np.full((1, 3), 0.5))
-        assert envs._setpoint.shape == (1, size)
-        np.testing.assert_array_equal(envs._setpoint[0, 7:], 0.0)
+        assert (envs._setpoint.shape, envs.runner.command.size) == ((1, 7), size)
+        np.testing.assert_array_equal(envs._rate[0], 0.0)
         envs.close()
 
 
