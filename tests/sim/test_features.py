@@ -235,7 +235,7 @@ def test_every_feature_is_identified_or_refused(feature, tmp_path):
     """The motors found explain the held-out part of a run ten times as well as ideal ones."""
     robot = robot_with(feature)
     start, _ = poses(robot)
-    time = 0.01 * np.arange(200)[:, None]
+    time = 0.01 * np.arange(300)[:, None]
     swing = 0.25 * np.sin(2 * np.pi * (0.5 + 0.13 * np.arange(robot.dof)) * time)
     params = robot.params(kp=200.0, ki=0.0, kd=20.0)
     motors = bp.make_actuators(robot.dof, armature=0.05, coulomb=1.0, viscous=2.0)
@@ -245,7 +245,7 @@ def test_every_feature_is_identified_or_refused(feature, tmp_path):
     assert run.ok.all()
     path = write_recording(run, tmp_path / "run.npz")
     try:
-        found = identify(robot, [path], params=params, evaluations=4, workers=0)
+        found = identify(robot, [path], params=params, evaluations=6, workers=0)
     except BatchPIDError:
         if feature != "floating base":
             raise
