@@ -103,7 +103,8 @@ def mesh_vertices(filename: str) -> Float64:
     try:
         mesh: Any = load(filename, force="mesh", process=False)
         factor, _, unit = str(mesh.metadata.get("units", "")).partition(" * ")  # of COLLADA: "0.01 * meters"
-        rows = np.ascontiguousarray(mesh.vertices, float) * (float(factor) if unit == "meters" else 1.0) + 0.0  # no -0.0
+        metres = float(factor) if unit == "meters" else 1.0
+        rows = np.ascontiguousarray(mesh.vertices, float) * metres + 0.0  # no -0.0
         vertices = np.unique(rows.view("V24")).view(float)  # by their bytes, which is much faster than along an axis
         spec = mujoco.MjSpec()
         spec.add_mesh(name="mesh", uservert=vertices, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
