@@ -35,19 +35,11 @@ from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.sapien.physics import PHYSICS, Physics
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.control_step import (
-    Constants,
-    Layout,
-    Measured,
-    Model,
-    Step,
-    StepState,
-    apply_friction,
-    control_step,
-)
+from batchpid.sim.loop.control_step import STAGES, control_step
 from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.loop.step_constants import acting_gains
 from batchpid.sim.loop.step_state import reset_friction
+from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
 from batchpid.sim.robot.description import Dynamics
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.moves import Moves, draw_moves, random_moves
@@ -182,9 +174,13 @@ def _simulate(robot: Robot, moves: Moves, steps: int, solver: Physics | None, re
         state, outputs = control_step(layout, control, state, command, measured, Step(index, steps))
         for _ in range(refinement):
             measured = measured._replace(qpos=plant.read_qpos(), qvel=plant.read_qvel())
-            friction, age, qf = apply_friction(layout, joints, state, outputs.motor, measured)
-            state = state._replace(friction=friction, age=age)
-            plant.write_qf(qf)
+            step, effort = Step(index, steps), Outputs(outputs.motor)
+            values = Values(state, command, measured, step, measured, outputs=effort)
+            for stage in STAGES:
+                if stage.function is not None and stage.name in ("inertia", "friction"):
+                    values = stage.function(layout, joints, values)
+            state = values.state
+            plant.write_qf(values.outputs.qf)
             plant.step()
         table[index] = plant.read_qpos()
     return table

@@ -85,6 +85,9 @@ class EnginePack(Protocol):
     def write_qf(self, effort: NDArray[Any]) -> None:
         """Apply joint efforts [N m or N]. They persist until written again."""
 
+    def update_constraint(self, rows: Any = slice(None)) -> None:
+        """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are coupled."""
+
     def step(self, update: bool = True) -> None:
         """Do one sim step of every env. Without ``update`` coupled joints may use the mass matrix of an earlier step.
 
@@ -192,9 +195,6 @@ class CompiledPack(EnginePack, Protocol):
         Without ``velocities`` it reads zero velocities. The status reports speeds above ``speed_limit`` (dof,), if
         given. With ``drives`` the targets of the drives may move within a tick.
         """
-
-    def update_constraint(self, rows: Any = slice(None)) -> None:
-        """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are coupled."""
 
     def joint_model(self) -> CompiledModel:
         """Return the native model of :meth:`joint_mass_matrix`, the same object for the life of the pack."""

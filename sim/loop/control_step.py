@@ -1,231 +1,67 @@
-r"""One sim step of the control of many robots: a pure function of arrays, for NumPy and JAX.
+r"""One sim step of the control of many robots: a table of stages, each a pure function of arrays, for NumPy and JAX.
 
-In this order, with setpoint r, joint positions q and velocities v, and passive force p::
+With setpoint r, joint positions q and velocities v, and passive force p, :data:`STAGES` are in this order::
 
-    setpoint    r    = r at this moment of the tick   where its rate is given: :func:`carried`
-    guard       r    = guard(r)                       limits of position, rate and acceleration
-    sensors     y    = sensors(q), y' = sensors(v)
-    forward     f    = p + feedforward + known friction
-    law         u    = saturated(law(r, r', r'', y, y', f))
-    motors      m    = motors(u)
-    friction    qf   = m - friction(m, v)             applied in the next sim step
+    sensors         y    = sensors(q), y' = sensors(v)
+    passive force   p    = p(y, y')                       where sensors measure
+    inertia         of the friction model                 every 64 sim steps of an env
+    mass matrix     M    = M(y) half way ahead            every 4 sim steps of a tick, 1 with the implicit law
+    setpoint        r    = r at this moment of the tick   where its rate is given: :func:`carried`
+    guard           r    = guard(r)                       limits of position, rate and acceleration
+    feedforward     f    = p + feedforward + known friction
+    controller      u    = the caller's own
+    law             qf   = saturated(law(r, r', r'', y, y', f)), or saturated(u + f)
+    motors          qf   = motors(qf)
+    friction        qf   = qf - friction(qf, v)
+    targets         of the engine's drives
+    constraint      of coupled joints                     every 4 sim steps of a tick
+    engine          applies qf, does its step; q, v and p are read
 
-Executors call :func:`control_step` at every sim step, each with its own kind of arrays:
-:mod:`batchpid.sim.loop.numpy_executor`, :mod:`batchpid.sim.loop.xla_executor`. A :class:`StepState` is the whole state
-of the control between sim steps.
+The executors run this table, each with its own kind of arrays. :mod:`batchpid.sim.loop.numpy_executor` and
+:mod:`batchpid.sim.loop.xla_executor` call its functions. :mod:`batchpid.sim.loop.native_ticks` makes native programs of
+them. The last three stages are the executors' own. A :class:`batchpid.sim.loop.step_values.StepState` is the whole
+state of the control between sim steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
-
-import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.elementwise import clip, namespace, nearest_turn, replace_envs, wrap
-from batchpid.law.coefficients import Coefficients
-from batchpid.motors import STAGES, ActuatorState, Stages, advance_effort, advance_measurement
+from batchpid.motors import advance_effort, advance_measurement
 from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
-from batchpid.motors.coupling import Coupling
-from batchpid.motors.friction import Friction, FrictionState
-from batchpid.motors.guard import GuardState
+from batchpid.motors.friction import FrictionState
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.pid_law import PIDLaw, half_way
+from batchpid.sim.loop.pid_law import half_way
+from batchpid.sim.loop.step_values import Constants, Layout, Measured, Outputs, Step, StepState, Values
 
 REFRESH_STEPS = 64
 """Sim steps of an env between updates of the friction model's inertia."""
-
-
-class StepState(NamedTuple):
-    """State of the control of M envs between sim steps; arrays have the envs as their first axis."""
-
-    law: Any
-    """:class:`batchpid.PIDState`, or the arrays of the caller's own controller by name."""
-    friction: FrictionState = FrictionState()
-    age: Any = None
-    """Sim steps since the last update of the friction model's inertia (M,); None without Coulomb friction."""
-    motors: ActuatorState | None = None
-    """Motors and sensors; None for ideal ones."""
-    guard: GuardState | None = None
-    matrix: Any = None
-    """Mass matrix of the law (M, dof, dof), or its diagonal (M, dof). Each tick begins with a new one."""
-
-
-class Measured(NamedTuple):
-    """Reading of the robots before a sim step, arrays (M, dof)."""
-
-    qpos: Any
-    qvel: Any
-    """None where nothing needs it."""
-    passive: Any
-    """Efforts that cancel gravity, and Coriolis and centrifugal forces; None without compensation."""
-
-
-class Step(NamedTuple):
-    """Place of a sim step in its tick."""
-
-    index: Any
-    """Sim steps of the tick before this one."""
-    end: Any
-    """Sim steps of the tick."""
-    observed: bool = True
-    """Whether :attr:`Outputs.saturated` is wanted."""
-    left: Any = 0.0
-    """:meth:`Layout.left`: time from the moment of the law's setpoint to the end of the tick [s]."""
-
-
-class Inputs(NamedTuple):
-    """Inputs of a law in a sim step."""
-
-    command: Command
-    """Command, with guarded setpoints."""
-    seen: Measured
-    """Measurement by the sensors, with the whole feedforward as its passive force."""
-    limits: tuple[Any, Any]
-    """Least and largest effort that the motors do not clip; None for no limit."""
-    step: Step
-
-
-class Outputs(NamedTuple):
-    """Results of a sim step, arrays (M, dof)."""
-
-    qf: Any
-    """Effort to apply to the joints in the next step of the engine [N m or N]."""
-    motor: Any
-    """Effort of the motors."""
-    saturated: Any
-    """Joints whose effort was limited; None where it is not wanted."""
-    guarded: Any = None
-    """Setpoints that the guard changed; None without guard."""
-    returned: Any = None
-    """Effort that the caller's own controller returned; None for other controls."""
-    target: Any = None
-    """Position target of the engine's drives [rad or m]; None without drives."""
-    target_rate: Any = None
-
-
-class KnownFriction(NamedTuple):
-    """Friction that the compensation cancels, arrays (dof,)."""
-
-    friction: Any
-    """[N m or N]"""
-    band: Any
-    """Half width of the band of small errors in which the compensation is reduced [rad or m]."""
-    turns: Any
-    """1 / (2 pi) on continuous joints, 0 elsewhere; None without such joints."""
-
-
-class Constants(NamedTuple):
-    """Arrays that stay the same for many ticks, (M, dof) or (1, dof); None where they are not needed."""
-
-    timestep: Any
-    """[s]"""
-    limits: tuple[Any, Any]
-    """Least and largest effort of the params [N m or N]."""
-    coupling: Coupling
-    k: Coefficients | None = None
-    """Coefficients of the PID law."""
-    armature: Any = None
-    """Armature of the motors that the law knows (dof,) [kg m^2 or kg]."""
-    damping: Any = None
-    """Viscous damping B that a law with the mass matrix compensates (dof,) [N m s/rad or N s/m]."""
-    friction: Friction = Friction()
-    drive: tuple[Any, Any] = (0.0, 0.0)
-    """Damping and stiffness of the engine's drives [N m s/rad, N m/rad]."""
-    known: KnownFriction | None = None
-    guard: Any = None
-    """:class:`batchpid.Guard`"""
-    motors: Any = None
-    """:class:`batchpid.motors.Coefficients` of motors and sensors."""
-    driven: bp.PIDParams | None = None
-    """Params of the integral that moves the targets of drives."""
-    turns: Any = None
-    """1 / (2 pi) on continuous joints with drives, 0 elsewhere; None without such joints."""
-
-
-def when(due: Any, function: Callable[[], Any], otherwise: Any) -> Any:
-    """Return ``function()`` if ``due``, a bool or an array, has a True entry; else ``otherwise``."""
-    return function() if np.any(due) else otherwise
-
-
-class Model(NamedTuple):
-    """Functions that an executor passes to the control step. Their results do not depend on the executor."""
-
-    mass_matrix: Any = None
-    """qpos (M, dof) -> mass matrix of the description (M, dof, dof), as the law knows it."""
-    joint_mass_matrix: Any = None
-    """qpos -> effective mass matrix of the joints, armature of the motors included."""
-    refresh: Any = None
-    """state of the friction model, qpos -> the state with its inertia there; None: by :attr:`joint_mass_matrix`."""
-    passive_force: Any = None
-    """qpos, qvel -> passive force of the description, for a measured state that differs from the joints' state."""
-    when: Callable[[Any, Callable[[], Any], Any], Any] = when
-    """:func:`when`, or a conditional of JAX."""
-    law: Callable[..., Any] = PIDLaw.advance
-    """:meth:`batchpid.sim.loop.pid_law.PIDLaw.advance`, or its compiled form."""
-    controller: Any = None
-    """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort), and, if it limits efforts
-    itself, the mask of joints with limited efforts."""
-    noise: Any = None
-    """coefficients and state of the sensors, qpos -> their noise, drawn in advance; None to draw it at each step."""
-    stages: Stages = STAGES
-    measure: Callable[..., Any] = advance_measurement
-    """:func:`batchpid.motors.advance_measurement`, or its known results."""
-
-
-class Layout(NamedTuple):
-    """Options of a control step that are not arrays; hashable."""
-
-    control: str
-    """"pid", "drive", "effort" or "custom"."""
-    law: PIDLaw | None = None
-    """Law of control "pid"."""
-    measures: bool = False
-    """Whether the law takes the joints' state from sensors."""
-    model: Model = Model()
-
-    def left(self, index: Any, end: Any, timestep: Any) -> Any:
-        """Return the time from the law's setpoint in sim step ``index`` to the end of a tick of ``end`` steps [s].
-
-        The explicit law takes its setpoint at the beginning of the step, the implicit law and drives at the end.
-        """
-        return (end - index - self.late) * timestep
-
-    @property
-    def late(self) -> int:
-        """1 if the law takes its setpoint at the end of a sim step, else 0."""
-        return int(self.control == "drive" or (self.law is not None and self.law.implicit))
+COUPLING_STEPS = 4
+"""Sim steps for which the constraint efforts of coupled joints keep their mass matrix within a tick."""
 
 
 def control_step(
     layout: Layout, constants: Constants, state: StepState, command: Command, measured: Measured, step: Step
 ) -> tuple[StepState, Outputs]:
     """Advance the control by one sim step; return its state and the efforts to apply. Inputs are not modified."""
-    qpos, qvel, passive = measured
-    guard, motors, guarded, seen, seen_rate = state.guard, state.motors, None, qpos, qvel
-    if layout.control in ("pid", "drive"):
-        command = carried(command, step.left)
-    limits: tuple[Any, Any] = (None, None)
-    if guard is not None:
-        guard, command, guarded = _guarded(constants, guard, command)
-    if motors is not None:
-        noise = None if layout.model.noise is None else layout.model.noise(constants.motors, motors, qpos)
-        stages = layout.model.stages
-        motors, seen, seen_rate = layout.model.measure(constants.motors, motors, qpos, qvel, noise, stages)
-        limits = stages.limits(constants.motors, seen, seen_rate)
-        if layout.measures and layout.model.passive_force is not None:
-            passive = layout.model.passive_force(seen, seen_rate)
-    forward = feedforward(constants, command, seen, passive)
-    given = Inputs(command, Measured(seen, seen_rate, forward), limits, step)
-    state, outputs = _CONTROLS[layout.control](layout, constants, state, given)
-    motor = outputs.motor
-    if motors is not None:
-        motors, motor = advance_effort(constants.motors, motors, motor, qpos, qvel, layout.model.stages)
-    friction, age, qf = apply_friction(layout, constants, state, motor, measured)
-    new = state._replace(friction=friction, age=age, motors=motors, guard=guard)
-    return new, outputs._replace(qf=qf, motor=motor, guarded=guarded)
+    values = sim_step(layout, constants, Values(state, command, measured, step, measured), {})
+    return values.state, values.outputs
+
+
+def sim_step(
+    layout: Layout, constants: Constants, values: Values, engine: Mapping[str, Callable[[Values], Values]]
+) -> Values:
+    """Run the stages of a sim step in the order of the table; ``engine`` has those of the executor, by name."""
+    for stage in STAGES:
+        if stage.function is not None:
+            values = stage.function(layout, constants, values)
+        elif stage.name in engine:
+            values = engine[stage.name](values)
+    return values
 
 
 def mass_matrix(layout: Layout, constants: Constants, qpos: Any) -> Any:
@@ -263,25 +99,6 @@ def carried(command: Command, left: Any) -> Command:
     return command._replace(setpoint=setpoint - left * (rate - 0.5 * change), setpoint_rate=rate - change)
 
 
-def _guarded(constants: Constants, state: GuardState, command: Command) -> tuple[Any, Command, Any]:
-    """Return the guard's state, ``command`` with guarded setpoints and rates (if given), and the mask of changes.
-
-    A given acceleration is 0 where the guard changes the setpoint. Followers move with their leaders.
-    """
-    xp = namespace(command.setpoint)
-    state, changed = guard_model.advance(constants.guard, state, command.setpoint, constants.timestep)
-    setpoint, rate, acceleration = state.setpoint, command.setpoint_rate, command.setpoint_acceleration
-    if rate is not None:
-        rate = xp.where(changed, state.rate, rate)
-    if acceleration is not None:
-        acceleration = xp.where(changed, 0.0, acceleration)
-    coupling = constants.coupling
-    setpoint, changed = coupling.positions(setpoint), coupling.of_leaders(changed)
-    rate, acceleration = (None if each is None else coupling.rates(each) for each in (rate, acceleration))
-    moved = {"setpoint": setpoint, "setpoint_rate": rate, "setpoint_acceleration": acceleration}
-    return state, command._replace(**moved), changed
-
-
 def feedforward(constants: Constants, command: Command, qpos: Any, passive: Any) -> Any:
     """Return the passive force plus the caller's feedforward and known friction, for the leaders; None for zero."""
     forward = _sum(passive, command.feedforward)
@@ -292,37 +109,134 @@ def feedforward(constants: Constants, command: Command, qpos: Any, passive: Any)
     return _sum(friction_model.compensation(known.friction, error, command.setpoint_rate, known.band), forward)
 
 
-def _pid(layout: Layout, constants: Constants, state: StepState, given: Inputs) -> tuple[StepState, Outputs]:
-    """qf = sat(PID(setpoint, qpos) + feedforward). A mass matrix is kept for ``law.matrix_steps``."""
-    command, seen, limits, step = given
-    law, matrix, qvel = layout.law, state.matrix, seen.qvel
-    assert law is not None
+# -- stages ------------------------------------------------------------------------------------------------------
+
+
+def _sensors(layout: Layout, constants: Constants, values: Values) -> Values:
+    motors, (qpos, qvel, passive), model = values.state.motors, values.measured, layout.model
+    if motors is None:
+        return values
+    noise = values.noise if model.noise is None else model.noise(constants.motors, motors, qpos)
+    motors, qpos, qvel = advance_measurement(constants.motors, motors, qpos, qvel, noise, model.stages)
+    seen = Measured(qpos, qvel, passive)
+    return values._replace(state=values.state._replace(motors=motors), seen=seen, noise=None)
+
+
+def _passive_force(layout: Layout, constants: Constants, values: Values) -> Values:
+    """The passive force of the description at the measured state, which the engine does not know."""
+    if not layout.measures or layout.model.passive_force is None:
+        return values
+    qpos, qvel, _ = values.seen
+    return values._replace(seen=values.seen._replace(passive=layout.model.passive_force(qpos, qvel)))
+
+
+def _inertia(layout: Layout, constants: Constants, values: Values) -> Values:
+    """The inertia of the friction model, for the envs where it is ``REFRESH_STEPS`` old."""
+    state, qpos = values.state, values.measured.qpos
+    if constants.friction.coulomb is None:
+        return values
+    xp, due = namespace(state.age), state.age == REFRESH_STEPS
+
+    def fresh() -> FrictionState:
+        return replace_envs(state.friction, refreshed(layout, constants, state.friction, qpos), due)
+
+    friction, age = layout.model.when(due, fresh, state.friction), xp.where(due, 0, state.age) + 1
+    return values._replace(state=state._replace(friction=friction, age=age))
+
+
+def _mass_matrix(layout: Layout, constants: Constants, values: Values) -> Values:
+    """The mass matrix of the law, or its diagonal, which is kept for ``law.matrix_steps``."""
+    (qpos, qvel, _), step, law = values.seen, values.step, layout.law
+    if law is None or not law.needs_matrix:
+        return values
 
     def fresh() -> Any:
-        xp = namespace(seen.qpos)
-        steps = xp.minimum(law.matrix_steps, step.end - step.index).astype(seen.qpos.dtype)
-        found = mass_matrix(layout, constants, half_way(seen.qpos, qvel, steps, constants.timestep))
+        xp = namespace(qpos)
+        steps = xp.minimum(law.matrix_steps, step.end - step.index).astype(qpos.dtype)
+        found = mass_matrix(layout, constants, half_way(qpos, qvel, steps, constants.timestep))
         return found if law.whole else xp.einsum("ejj->ej", found).copy()
 
-    if law.needs_matrix:
-        matrix = layout.model.when(step.index % law.matrix_steps == 0, fresh, matrix)
-    viscous = None if constants.damping is None else constants.coupling.efforts(constants.damping * qvel)
-    setpoint, rate, acceleration, _ = command
+    matrix = layout.model.when(step.index % law.matrix_steps == 0, fresh, values.state.matrix)
+    return values._replace(state=values.state._replace(matrix=matrix))
+
+
+def _setpoint(layout: Layout, constants: Constants, values: Values) -> Values:
+    """The setpoint at the moment of this sim step."""
+    moves = layout.control in ("pid", "drive")
+    return values._replace(command=carried(values.command, values.step.left)) if moves else values
+
+
+def _guard(layout: Layout, constants: Constants, values: Values) -> Values:
+    """Guarded setpoints and rates (if given), and the mask of changes. Followers move with their leaders.
+
+    A given acceleration is 0 where the guard changes the setpoint.
+    """
+    state, command, coupling = values.state.guard, values.command, constants.coupling
+    if state is None:
+        return values
+    xp = namespace(command.setpoint)
+    state, changed = guard_model.advance(constants.guard, state, command.setpoint, constants.timestep)
+    setpoint, rate, acceleration = state.setpoint, command.setpoint_rate, command.setpoint_acceleration
+    if rate is not None:
+        rate = xp.where(changed, state.rate, rate)
+    if acceleration is not None:
+        acceleration = xp.where(changed, 0.0, acceleration)
+    setpoint, changed = coupling.positions(setpoint), coupling.of_leaders(changed)
+    rate, acceleration = (None if each is None else coupling.rates(each) for each in (rate, acceleration))
+    return values._replace(
+        state=values.state._replace(guard=state),
+        command=Command(setpoint, rate, acceleration, command.feedforward),
+        outputs=values.outputs._replace(guarded=changed),
+    )
+
+
+def _feedforward(layout: Layout, constants: Constants, values: Values) -> Values:
+    forward = feedforward(constants, values.command, values.seen.qpos, values.seen.passive)
+    return values._replace(seen=values.seen._replace(passive=forward))
+
+
+def _controller(layout: Layout, constants: Constants, values: Values) -> Values:
+    """The caller's own controller; the feedforward is one of its inputs."""
+    seen, state = values.seen, values.state
+    if layout.control != "custom":
+        return values
+    passive = namespace(seen.qpos).zeros_like(seen.qpos) if seen.passive is None else seen.passive
+    law, returned, *limited = layout.model.controller(state.law, values.command.setpoint, seen.qpos, seen.qvel, passive)
+    outputs = values.outputs._replace(returned=returned)
+    return values._replace(state=state._replace(law=law), limited=limited[0] if limited else None, outputs=outputs)
+
+
+def _law(layout: Layout, constants: Constants, values: Values) -> Values:
+    """Effort within the limits of params and motors."""
+    motors, (qpos, qvel, _), limits = constants.motors, values.seen, (None, None)
+    if values.state.motors is not None:
+        limits = layout.model.stages.limits(motors, qpos, qvel)
+    values = _LAWS[layout.control](layout, constants, values, limits)
+    return values._replace(outputs=values.outputs._replace(motor=values.outputs.qf))
+
+
+def _pid(layout: Layout, constants: Constants, values: Values, limits: tuple[Any, Any]) -> Values:
+    """qf = sat(PID(setpoint, qpos) + feedforward)."""
+    seen, state, law = values.seen, values.state, layout.law
+    assert law is not None
+    viscous = None if constants.damping is None else constants.coupling.efforts(constants.damping * seen.qvel)
+    setpoint, rate, acceleration, _ = values.command
     if acceleration is not None:  # the leaders' mass matrix has the followers' share
         acceleration = constants.coupling.of_independent(acceleration)
-    inputs = ((setpoint, rate, acceleration), seen.qpos, qvel, seen.passive, matrix, viscous, *limits)
-    new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs, observed=step.observed)
-    return state._replace(law=new, matrix=matrix), Outputs(effort, effort, saturated)
+    inputs = ((setpoint, rate, acceleration), seen.qpos, seen.qvel, seen.passive, state.matrix, viscous, *limits)
+    new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs, observed=values.step.observed)
+    outputs = values.outputs._replace(qf=effort, saturated=saturated)
+    return values._replace(state=state._replace(law=new), outputs=outputs)
 
 
-def _drive(layout: Layout, constants: Constants, state: StepState, given: Inputs) -> tuple[StepState, Outputs]:
-    """PhysX's internal drive with stiffness kp and damping kd; qf = feedforward.
+def _drive(layout: Layout, constants: Constants, values: Values, limits: tuple[Any, Any]) -> Values:
+    """The engine's drives with stiffness kp and damping kd; qf = feedforward.
 
     With ki the drive's target moves by the integral over kp (:func:`batchpid.drive_target`), so that the drive acts as
     a PID whose P and D the engine integrates implicitly. The engine's drives do not know whole turns, so the target of
     a continuous joint is the one next to qpos, which may jump at every sim step.
     """
-    (target, rate, *_), seen, *_ = given
+    (target, rate, *_), seen, state = values.command, values.seen, values.state
     xp = namespace(seen.qpos)
     target = nearest_turn(target, seen.qpos, constants.turns, xp)
     if constants.driven is not None:
@@ -330,56 +244,75 @@ def _drive(layout: Layout, constants: Constants, state: StepState, given: Inputs
         law, target = bp.drive_target(constants.driven, state.law, target, seen.qpos, constants.timestep, **rates)
         state = state._replace(law=law)
     effort = xp.zeros_like(seen.qpos) if seen.passive is None else seen.passive
-    return state, Outputs(effort, effort, None, target=target, target_rate=rate)
+    outputs = values.outputs._replace(qf=effort, target=target, target_rate=rate)
+    return values._replace(state=state, outputs=outputs)
 
 
-def _effort(layout: Layout, constants: Constants, state: StepState, given: Inputs) -> tuple[StepState, Outputs]:
+def _effort(layout: Layout, constants: Constants, values: Values, limits: tuple[Any, Any]) -> Values:
     """qf = sat(the caller's effort + feedforward); the setpoint is the effort, and a follower's acts on its leader."""
-    asked = constants.coupling.efforts(given.command.setpoint)
-    return state, _saturated(constants, _sum(asked, given.seen.passive), given)
+    asked = constants.coupling.efforts(values.command.setpoint)
+    return _saturated(constants, _sum(asked, values.seen.passive), values, limits)
 
 
-def _custom(layout: Layout, constants: Constants, state: StepState, given: Inputs) -> tuple[StepState, Outputs]:
-    """qf = sat(effort of the caller's own controller). The feedforward is an input of the controller."""
-    seen = given.seen
-    passive = namespace(seen.qpos).zeros_like(seen.qpos) if seen.passive is None else seen.passive
-    law, returned, *limited = layout.model.controller(state.law, given.command.setpoint, seen.qpos, seen.qvel, passive)
-    outputs = _saturated(constants, constants.coupling.efforts(returned), given)._replace(returned=returned)
-    if limited and outputs.saturated is not None:
-        outputs = outputs._replace(saturated=outputs.saturated | limited[0])
-    return state._replace(law=law), outputs
+def _custom(layout: Layout, constants: Constants, values: Values, limits: tuple[Any, Any]) -> Values:
+    """qf = sat(effort of the caller's own controller)."""
+    values = _saturated(constants, constants.coupling.efforts(values.outputs.returned), values, limits)
+    outputs = values.outputs
+    if values.limited is None or outputs.saturated is None:
+        return values
+    return values._replace(outputs=outputs._replace(saturated=outputs.saturated | (values.limited > 0)))
 
 
-_CONTROLS: dict[str, Callable[..., tuple[StepState, Outputs]]] = {
-    "pid": _pid,
-    "drive": _drive,
-    "effort": _effort,
-    "custom": _custom,
-}
+_LAWS: dict[str, Callable[..., Values]] = {"pid": _pid, "drive": _drive, "effort": _effort, "custom": _custom}
 
 
-def apply_friction(
-    layout: Layout, constants: Constants, state: StepState, motor: Any, measured: Measured
-) -> tuple[FrictionState, Any, Any]:
-    """Return the friction model's state, its age, and the effort to apply for the motors' effort ``motor`` (M, dof)."""
-    model, friction, age = constants.friction, state.friction, state.age
-    if model.coulomb is not None:
-        xp, due = namespace(age), age == REFRESH_STEPS
-
-        def fresh() -> FrictionState:
-            return replace_envs(friction, refreshed(layout, constants, friction, measured.qpos), due)
-
-        friction = layout.model.when(due, fresh, friction)
-        age = xp.where(due, 0, age) + 1
-    friction, qf = friction_model.advance(model, friction, motor, measured.qvel)
-    return friction, age, qf
+def _motors(layout: Layout, constants: Constants, values: Values) -> Values:
+    (qpos, qvel, _), state, outputs = values.measured, values.state, values.outputs
+    if state.motors is None:
+        return values
+    motors, effort = advance_effort(constants.motors, state.motors, outputs.qf, qpos, qvel, layout.model.stages)
+    return values._replace(state=state._replace(motors=motors), outputs=outputs._replace(qf=effort, motor=effort))
 
 
-def _saturated(constants: Constants, total: Any, given: Inputs) -> Outputs:
-    """Return ``total`` clipped to the limits of motors and params."""
-    xp = namespace(total, *given.limits)
-    effort = clip(clip(total, *given.limits, xp), *constants.limits, xp)
-    return Outputs(effort, effort, effort != total if given.step.observed else None)
+def _friction(layout: Layout, constants: Constants, values: Values) -> Values:
+    state, outputs = values.state, values.outputs
+    friction, qf = friction_model.advance(constants.friction, state.friction, outputs.qf, values.measured.qvel)
+    return values._replace(state=state._replace(friction=friction), outputs=outputs._replace(qf=qf))
+
+
+class SimStage(NamedTuple):
+    """Stage of a sim step."""
+
+    name: str
+    function: Callable[[Layout, Constants, Values], Values] | None = None
+    """Pure function of arrays; None for a stage that every executor has its own function for."""
+
+
+STAGES = (
+    SimStage("sensors", _sensors),
+    SimStage("passive force", _passive_force),
+    SimStage("inertia", _inertia),
+    SimStage("mass matrix", _mass_matrix),
+    SimStage("setpoint", _setpoint),
+    SimStage("guard", _guard),
+    SimStage("feedforward", _feedforward),
+    SimStage("controller", _controller),
+    SimStage("law", _law),
+    SimStage("motors", _motors),
+    SimStage("friction", _friction),
+    SimStage("targets"),
+    SimStage("constraint"),
+    SimStage("engine"),
+)
+"""Stages of a sim step, in order."""
+
+
+def _saturated(constants: Constants, total: Any, values: Values, limits: tuple[Any, Any]) -> Values:
+    """Return ``values`` with the effort ``total`` clipped to the limits of motors and params."""
+    xp = namespace(total, *limits)
+    effort = clip(clip(total, *limits, xp), *constants.limits, xp)
+    saturated = effort != total if values.step.observed else None
+    return values._replace(outputs=values.outputs._replace(qf=effort, saturated=saturated))
 
 
 def _sum(first: Any, second: Any) -> Any:

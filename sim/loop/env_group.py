@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,18 +16,18 @@ from batchpid.motors.guard import GuardState
 from batchpid.sim.engine.missed_contact import MissedContacts
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.acting_draws import acting_actuators, acting_params, variation
-from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
+from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays, Ticks
 from batchpid.sim.loop.backend import obstacle
-from batchpid.sim.loop.control_step import StepState
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.faults import FaultContainment, far, finite, near
-from batchpid.sim.loop.native_executor import NativeExecutor
-from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran, Stopped, passive_forces, with_model
+from batchpid.sim.loop.native_executor import NativeExecutor, Table
+from batchpid.sim.loop.native_ticks import Shown
+from batchpid.sim.loop.numpy_executor import NumPyExecutor, Span, passive_forces, with_model
 from batchpid.sim.loop.pid_law import PIDLaw
-from batchpid.sim.loop.quiet_ticks import QuietTicks, Shown
 from batchpid.sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
 from batchpid.sim.loop.step_constants import make_constants, make_layout
 from batchpid.sim.loop.step_state import init_motors, reset_friction, reset_guard, with_friction, with_params
+from batchpid.sim.loop.step_values import StepState
 from batchpid.sim.loop.xla_executor import XLAExecutor
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.draws import Draws
@@ -85,11 +84,10 @@ class EnvGroup:
         else:
             self._executor = NativeExecutor(options, pack, layout, constants)
         self._measured = self._executor.measure()
-        self._quiet: dict[tuple[bool, ...], QuietTicks | None] = {}
 
     def execute_in_numpy(self) -> None:
         """Run sim steps call by call in NumPy until the next change, so that the phases of a step can be timed."""
-        self._executor, self._quiet = NumPyExecutor(self._options, self.pack, self._layout, self._constants), {}
+        self._executor = NumPyExecutor(self._options, self.pack, self._layout, self._constants)
 
     def _write_drives(self) -> None:
         """Set the engine's drives, under control "drive"."""
@@ -156,52 +154,48 @@ class EnvGroup:
             containment.fail(entries, cause, steps, containment.start_qpos)
         self._place_failed()
 
-    def run_quietly(self, arrays: Arrays, given: tuple[bool, ...], first: int, until: int, steps: int) -> Stopped:
-        """Run ticks of ``steps`` sim steps from ``first`` to ``until``, and observe them, while nothing happens.
+    def run(self, ticks: Ticks, given: tuple[bool, ...], first: int, until: int, substeps: int, steps: int) -> int:
+        """Run ticks of ``substeps`` sim steps from ``first`` on, at least one; observe them; return the next one.
 
-        ``arrays`` (ticks, envs, ...) are always the same; ``given`` says which commands are used. Next
-        :meth:`run` runs the first tick that is not complete.
+        It returns before ``until`` after a tick in which something happened. ``given`` says which commands are used,
+        and ``steps`` counts the sim steps before the first tick.
         """
-        executor, containment = self._executor, self._containment
-        if not isinstance(executor, NativeExecutor) or self._contacts is not None or containment.suspended.any():
-            return Stopped(first)
-        if given not in self._quiet:
-            command = arrays.command.with_only(given)
-            fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
-            shown = Shown(self._motor, self._saturated, self._guarded, fault)
-            self._quiet[given] = executor.quiet_ticks(self._state, command, arrays, shown)
-        if (ticks := self._quiet[given]) is None:
-            return Stopped(first)
-        containment.failed[:] = False
-        stopped = executor.run_ticks(ticks, self._state, self._measured, first, until, steps)
-        self._state, self._measured = ticks.program.state, ticks.program.measured
-        return stopped
-
-    def run(self, steps: int, substeps: int, command: Command, finish: Callable[[], Ran] | None = None) -> None:
-        """Run ``substeps`` sim steps under ``command``, after ``steps`` earlier sim steps.
-
-        ``finish`` returns the result of the first of them, if quiet ticks stopped after these.
-        """
-        containment, done = self._containment, 0
-        self._steps, containment.failed = steps, containment.suspended.copy()
+        containment, command = self._containment, ticks[first].command.with_only(given)
+        containment.failed, table = containment.suspended.copy(), None
+        self._steps = steps
         if containment.suspended.any() or not finite(*command):
             command = self._without_faults(command)
-        with np.errstate(all="ignore"):  # overflow and invalid values become faults
-            while done < substeps:
-                begun, finish = finish, None
-                ran = begun() if begun else self._executor.run(self._state, self._measured, command, done, substeps)
-                self._state, outputs, self._measured, before, done, failed = ran
-                rows = self._executor.rows
-                if done == substeps:
-                    self._motor[...] = rows(outputs.motor)
-                    self._saturated[...] = self._mask(outputs.saturated)
-                    self._guarded[...] = self._mask(outputs.guarded)
-                if failed:
-                    self._contain(rows(before), done, outputs.returned)
+        elif self._contacts is None:
+            fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
+            table = Table(ticks.arrays, Shown(self._motor, self._saturated, self._guarded, fault))
+        tick, done = self._execute(command, Span(first, 0, until, substeps), table)
+        if not done:
+            return tick
+        while done < substeps:
+            if table is not None:
+                command = ticks[tick].command.with_only(given)
+            _, done = self._execute(command, Span(tick, done, tick + 1, substeps), None)
+        with np.errstate(all="ignore"):
             if not (near(self._qpos) and finite(self.pack.read_qvel())):
                 self._contain(self._qpos, substeps, None)
         if self._contacts is not None:
-            self._contacts.look(self._qpos, steps + substeps, containment.missed_contact)
+            self._contacts.look(self._qpos, self._steps + substeps, containment.missed_contact)
+        self.observe(ticks[tick])
+        return tick + 1
+
+    def _execute(self, command: Command, span: Span, table: Table | None) -> tuple[int, int]:
+        """Run sim steps and handle an event; return the first tick that is not observed, and its steps done."""
+        with np.errstate(all="ignore"):  # overflow and invalid values become faults
+            ran = self._executor.run(self._state, self._measured, command, span, table)
+            self._state, self._measured, rows = ran.state, ran.measured, self._executor.rows
+            self._steps += (ran.tick - span.tick) * span.steps
+            if ran.done == span.steps:
+                self._motor[...] = rows(ran.outputs.motor)
+                self._saturated[...] = self._mask(ran.outputs.saturated)
+                self._guarded[...] = self._mask(ran.outputs.guarded)
+            if ran.failed:
+                self._contain(rows(ran.before), ran.done, ran.outputs.returned)
+        return ran.tick, ran.done
 
     def _mask(self, array: Any) -> Any:
         return False if array is None else self._executor.rows(array)

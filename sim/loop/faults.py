@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Bool
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.loop.arrays import Arrays
-from batchpid.sim.loop.control_step import Measured
+from batchpid.sim.loop.step_values import Measured
 from batchpid.sim.runner_keywords import FaultAction
 
 CAUSES = (

@@ -108,12 +108,7 @@ class Loop:
             done = 0
             try:
                 while done < ticks:
-                    done, finish = group.run_quietly(group_ticks.arrays, given, done, ticks, substeps)
-                    if done < ticks:
-                        rows = group_ticks[done]
-                        group.run(self._steps + done * substeps, substeps, rows.command.with_only(given), finish)
-                        group.observe(rows)
-                        done += 1
+                    done = group.run(group_ticks, given, done, ticks, substeps, self._steps + done * substeps)
             except Exception as error:
                 failures.append(self._failure(error, group, done, self._steps + done * substeps))
         if failures:

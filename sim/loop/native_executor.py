@@ -1,32 +1,32 @@
-"""Sim steps of a tick in native code: one call of the extension runs control step and engine for all of them.
+"""Ticks in native code: one call of the extension runs them until an event needs Python.
 
-:func:`batchpid.sim.loop.control_step.control_step` is traced (:mod:`batchpid.native.tracing`) and runs as a program, on
-arrays that hold the state between steps. Before and after it, native code updates the inertia of the friction model and
-the constraint of coupled joints, and writes the targets of drives. It also computes the passive force, if the law needs
-another one than the engine's. Sensors have a separate program; Python draws their noise for 64 sim steps at once.
-Operational-space control is a native call before the program, which takes its effort as an input. With a controller in
-Python, or too many joints, the control step runs in NumPy, and one native call applies efforts, steps and reads.
+With a controller in Python, or too many joints, the stages run in NumPy, and one native call applies efforts, steps and
+reads.
 """
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Float64
 from batchpid.native.operations import MOST_SUMMED
 from batchpid.native.trees import leaves, mapped
 from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.protocol import FAILED, CompiledModel, CompiledPack, CompiledStep, DrivenPack
 from batchpid.sim.loop.arrays import Arrays, Command
-from batchpid.sim.loop.control_step import Constants, Layout, Measured, StepState
-from batchpid.sim.loop.numpy_executor import COUPLING_STEPS, NumPyExecutor, Ran, Stopped
-from batchpid.sim.loop.quiet_ticks import QuietTicks, Shown
-from batchpid.sim.loop.tick_program import TickProgram
+from batchpid.sim.loop.native_ticks import NativeTicks, Shown
+from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran, Span
+from batchpid.sim.loop.step_values import Constants, Layout, Measured, StepState, Values
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
+
+
+class Table(NamedTuple):
+    """Tables of the ticks of a run, and the arrays of the last observation."""
+
+    arrays: Arrays
+    shown: Shown
 
 
 class NativeExecutor(NumPyExecutor):
@@ -38,7 +38,8 @@ class NativeExecutor(NumPyExecutor):
         super().__init__(options, pack, layout, constants)
         self._step: CompiledStep | None = None
         self._bound: object = None
-        self._ticks: dict[tuple[bool, ...], TickProgram] = {}
+        self._ticks: dict[tuple[bool, ...], NativeTicks] = {}
+        self._reads_qvel = True  # for the observation
         self._steps_read_force = pack.steps_read_force(self._gravity, self._coriolis)
         self._force: CompiledModel | None = None
         if layout.measures and self._gravity:
@@ -50,58 +51,42 @@ class NativeExecutor(NumPyExecutor):
             has_own_law = options.backend == "numpy" and _is_native(self._controller)
         self._compiles = has_own_law and is_compiled(constants, pack.dof)
 
-    def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
-        """Run the sim steps of a tick from ``begin`` to ``end``, or until an env may have failed."""
+    def run(
+        self, state: StepState, measured: Measured, command: Command, span: Span, table: Table | None = None
+    ) -> Ran:
+        """Run sim steps until an event needs Python: an env may have failed, or a command is not finite.
+
+        With ``table``, commands and observations are those of its ticks; otherwise one tick runs under ``command``.
+        """
         if not self._compiles:
-            return super().run(state, measured, command, begin, end)
-        program = self._program(state, command)
-        program.load(state, measured, command)
-        if self._layout.control == "drive" and isinstance(self._pack, DrivenPack) and program.outputs.target is None:
-            rate = command.setpoint_rate
-            self._pack.write_drive_target(command.setpoint, np.zeros_like(command.setpoint) if rate is None else rate)
-        done, status = begin, 0
-        while done < end and not status:
-            done, status = program.run(self._prepared(), done, end)
-        return self._ran(program, done, status)
-
-    def _ran(self, program: TickProgram, done: int, status: int) -> Ran:
-        """Return the result of ``done`` sim steps of a tick, of which the last had this status."""
+            return super().run(state, measured, command, span)
+        if self._layout.control == "custom":  # a native controller takes setpoints from Python
+            table = None
+        ticks = self._ticks_for(state, command)
+        ticks.load(state, measured, None if table else command)
+        if table:
+            ticks.exchange(*table)
+        until = span.until if table else span.tick + 1
+        tick, done, status = ticks.run(self._prepared(), span.tick, span.begin, until, span.steps, table is not None)
         failed = self._may_have_failed(status)
-        return Ran(program.state, program.outputs, program.measured, program.before, done, failed)
-
-    def quiet_ticks(self, state: StepState, command: Command, arrays: Arrays, shown: Shown) -> QuietTicks | None:
-        """Return ticks in one call, for commands with the entries of ``command``; None if each tick needs Python."""
-        layout = self._layout
-        is_whole = self._compiles and self._reads_qvel and not layout.measures
-        if not (is_whole and layout.control in ("pid", "effort")):
-            return None
-        return QuietTicks(self._program(state, command), arrays, shown)
-
-    def run_ticks(
-        self, ticks: QuietTicks, state: StepState, measured: Measured, first: int, until: int, steps: int
-    ) -> Stopped:
-        """Run ticks of ``steps`` sim steps from ``first`` to ``until``, or until an event needs Python."""
-        program = ticks.program
-        program.load(state, measured, None)
-        tick, done, status = ticks.run(self._prepared(), first, until, steps)
-        return Stopped(tick, partial(self._ran, program, done, status) if done else None)
+        return Ran(ticks.state, ticks.outputs, ticks.measured, ticks.before, tick, done, failed)
 
     def numpy_state(self, state: StepState) -> StepState:
         """Return a copy of ``state``, since the next sim steps overwrite its arrays."""
         own = {name: np.array(leaf) for name, leaf in state.law.items()} if isinstance(state.law, dict) else state.law
         return mapped(np.array, state._replace(law=own))
 
-    def _advance(self, qf: Float64, index: int) -> tuple[Measured, bool]:
-        """Do a sim step by one native call; arguments and results as in :meth:`NumPyExecutor._advance`."""
-        if index % COUPLING_STEPS == 0:
-            self._pack.update_constraint()
+    def _step_engine(self, values: Values) -> Values:
+        """Do a sim step by one native call; see :meth:`NumPyExecutor._step_engine`."""
+        qf = values.outputs.qf
         qpos, qvel, passive = np.empty((3, *qf.shape))
         status = self._prepared()(np.ascontiguousarray(qf, np.float64), qpos, qvel, passive)
         if not self._reads_force:
             passive = None
         elif not self._steps_read_force:
             passive = self._pack.passive_force(self._gravity, self._coriolis)
-        return Measured(qpos, qvel, passive), self._may_have_failed(status)
+        self._failed = self._may_have_failed(status)
+        return values._replace(measured=Measured(qpos, qvel, passive))
 
     def _may_have_failed(self, status: int) -> bool:
         """Return whether an env may have failed in a sim step; RuntimeError if the engine has."""
@@ -120,21 +105,13 @@ class NativeExecutor(NumPyExecutor):
             self._bound, self._step = pack.calls, pack.compiled_step(*force, self._reads_qvel, limit, drives)
         return self._step
 
-    def _program(self, state: StepState, command: Command) -> TickProgram:
-        """Return the program for commands with these arrays."""
+    def _ticks_for(self, state: StepState, command: Command) -> NativeTicks:
+        """Return the ticks for commands with these arrays."""
         key = command.given
         if key not in self._ticks:
-            self._ticks[key] = TickProgram(
-                self._pack,
-                self._layout,
-                self._constants,
-                state,
-                command,
-                (self._gravity, self._coriolis),
-                self._controller,
-                self._force,
-                COUPLING_STEPS,
-            )
+            compensated = self._gravity, self._coriolis
+            given = self._layout, self._constants, state, command, compensated, self._controller, self._force
+            self._ticks[key] = NativeTicks(self._pack, *given)
         return self._ticks[key]
 
 

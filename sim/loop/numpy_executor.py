@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property, partial
 from typing import Any, NamedTuple, TypeGuard
 
@@ -16,29 +15,30 @@ from batchpid.native.compiled_stages import compiled_stages
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.control_step import (
-    REFRESH_STEPS,
-    Constants,
-    Layout,
-    Measured,
-    Model,
-    Outputs,
-    Step,
-    StepState,
-    control_step,
-)
+from batchpid.sim.loop.control_step import COUPLING_STEPS, REFRESH_STEPS, sim_step
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.faults import sound
 from batchpid.sim.loop.jitted import jitted_controller, jitted_law
 from batchpid.sim.loop.step_constants import needs_qvel
+from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
 from batchpid.sim.options import RunnerOptions
 
-COUPLING_STEPS = 4
-"""Sim steps for which the constraint efforts of coupled joints keep their mass matrix within a tick."""
+
+class Span(NamedTuple):
+    """Sim steps to run."""
+
+    tick: int
+    """First tick, a row of the loop's tables."""
+    begin: int
+    """Sim steps of it that are done."""
+    until: int
+    """End of the ticks, for an executor that runs several in one call; others run the first one."""
+    steps: int
+    """Sim steps of a tick."""
 
 
 class Ran(NamedTuple):
-    """Result of some sim steps of a tick, in the arrays of the executor."""
+    """Result of some sim steps, in the arrays of the executor."""
 
     state: StepState
     outputs: Outputs
@@ -47,20 +47,12 @@ class Ran(NamedTuple):
     """Reading after the last step."""
     before: Any
     """qpos before the last step."""
-    done: int
-    """Sim steps of the tick that are done; fewer than requested if an env may have failed."""
-    failed: bool
-    """Whether an env may have failed."""
-
-
-class Stopped(NamedTuple):
-    """End of some quiet ticks."""
-
     tick: int
-    """Number of the first tick that is not complete."""
-    finish: Callable[[], Ran] | None = None
-    """Function that handles the event which stopped that tick, and returns the result of its sim steps; None if it has
-    not begun."""
+    """First tick that is not complete, or not observed."""
+    done: int
+    """Sim steps of that tick that are done; 0 if it has not begun."""
+    failed: bool
+    """Whether an env may have failed in the last step."""
 
 
 def passive_forces(options: RunnerOptions) -> tuple[bool, bool]:
@@ -79,6 +71,7 @@ class NumPyExecutor:
         self._controller = None if isinstance(options.control, str) else options.control
         self._reads_qvel = needs_qvel(layout, constants, options.speed_limit)
         self._reads_force = self._gravity and not layout.measures
+        self._failed = False
 
     @cached_property
     def _spread(self) -> Constants:
@@ -94,34 +87,44 @@ class NumPyExecutor:
             pack.passive_force(self._gravity, self._coriolis) if self._reads_force else None,
         )
 
-    def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
-        """Run the sim steps of a tick from ``begin`` to ``end``, or until an env may have failed."""
-        pack, target, rate = self._pack, None, ()
-        for index in range(begin, end):
-            left = self._layout.left(index, end, self._constants.timestep)
-            step = Step(index, end, index + 1 == end, left)
-            with controller_errors(self._controller, index + 1):
-                state, outputs = control_step(self._layout, self._spread, state, command, measured, step)
+    def run(self, state: StepState, measured: Measured, command: Command, span: Span, table: Any = None) -> Ran:
+        """Run the sim steps of a tick, or until an env may have failed."""
+        constants, end, target = self._spread, span.steps, (None, None)
+
+        def write_targets(values: Values) -> Values:
+            nonlocal target
+            outputs, pack = values.outputs, self._pack
             # Writing the drives' targets costs a call for each joint.
-            if outputs.target is not target and isinstance(pack, DrivenPack):
-                known = outputs.target_rate is rate
-                pack.write_drive_target(outputs.target, None if known else _zeros_for_none(outputs))
-                target, rate = outputs.target, outputs.target_rate
-            before = measured.qpos
-            measured, failed = self._advance(outputs.qf, index)
-            if failed:
+            if outputs.target is not target[0] and isinstance(pack, DrivenPack):
+                is_known = outputs.target_rate is target[1] and target[0] is not None
+                rate = np.zeros_like(outputs.target) if outputs.target_rate is None else outputs.target_rate
+                pack.write_drive_target(outputs.target, None if is_known else rate)
+                target = outputs.target, outputs.target_rate
+            return values
+
+        engine = {"targets": write_targets, "constraint": self._update_constraint, "engine": self._step_engine}
+        for index in range(span.begin, end):
+            left = self._layout.left(index, end, constants.timestep)
+            values = Values(state, command, measured, Step(index, end, index + 1 == end, left), measured)
+            with controller_errors(self._controller, index + 1):
+                values = sim_step(self._layout, constants, values, engine)
+            before, state, measured = measured.qpos, values.state, values.measured
+            if self._failed:
                 break
-        return Ran(state, outputs, measured, before, index + 1, failed)
+        return Ran(state, values.outputs, measured, before, span.tick, index + 1, self._failed)
 
-    def quiet_ticks(self, *_: Any) -> Any:
-        """Return None: each tick needs calls of Python."""
+    def _update_constraint(self, values: Values) -> Values:
+        if values.step.index % COUPLING_STEPS == 0:
+            self._pack.update_constraint()
+        return values
 
-    def _advance(self, qf: Float64, index: int) -> tuple[Measured, bool]:
-        """Do a sim step under efforts ``qf``; return the reading, and whether an env may have failed."""
-        self._pack.write_qf(qf)
-        self._pack.step(index % COUPLING_STEPS == 0)
+    def _step_engine(self, values: Values) -> Values:
+        """Do a sim step; return its reading as the values' ``measured``, and note whether an env may have failed."""
+        self._pack.write_qf(values.outputs.qf)
+        self._pack.step(False)
         measured = self.measure()
-        return measured, not sound(measured, self._speed_limit)
+        self._failed = not sound(measured, self._speed_limit)
+        return values._replace(measured=measured)
 
     def rows(self, array: Any) -> NDArray[Any]:
         """Return an array of the executor as a NumPy array."""
@@ -154,10 +157,6 @@ def with_model(
         force = passive_force_of(pack.spec, _is_native(pack))
         model = model._replace(passive_force=lambda qpos, qvel: force(qpos, qvel, gravity, coriolis))
     return layout._replace(model=model)
-
-
-def _zeros_for_none(outputs: Outputs) -> Float64:
-    return np.zeros_like(outputs.target) if outputs.target_rate is None else outputs.target_rate
 
 
 def _is_native(pack: EnginePack) -> TypeGuard[CompiledPack]:

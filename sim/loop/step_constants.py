@@ -12,8 +12,8 @@ from batchpid.arrays.elementwise import TURN
 from batchpid.motors import ActuatorState
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.loop.control_step import Constants, KnownFriction, Layout
 from batchpid.sim.loop.pid_law import PIDLaw
+from batchpid.sim.loop.step_values import Constants, KnownFriction, Layout
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.dissipation import DISSIPATION

@@ -16,15 +16,9 @@ from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
 from batchpid.motors.friction import FrictionState
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.loop.control_step import (
-    REFRESH_STEPS,
-    Constants,
-    Layout,
-    StepState,
-    mass_matrix,
-    refreshed,
-)
+from batchpid.sim.loop.control_step import REFRESH_STEPS, mass_matrix, refreshed
 from batchpid.sim.loop.pid_law import PIDLaw
+from batchpid.sim.loop.step_values import Constants, Layout, StepState
 
 
 def reset_friction(layout: Layout, constants: Constants, state: StepState, pack: EnginePack, mask: Bool) -> StepState:

@@ -20,11 +20,12 @@ from batchpid.sim.engine.native import xla
 from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep
 from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.control_step import Constants, Layout, Measured, Model, Outputs, Step, StepState, control_step
+from batchpid.sim.loop.control_step import sim_step
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.jitted import padded, put
-from batchpid.sim.loop.numpy_executor import Ran, passive_forces
+from batchpid.sim.loop.numpy_executor import Ran, Span, passive_forces
 from batchpid.sim.loop.step_constants import needs_qvel
+from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
 from batchpid.sim.options import RunnerOptions
 
 
@@ -93,24 +94,24 @@ class XLAExecutor:
         with own_settings(self._options.dtype):
             return put(Measured(padded(qpos), padded(qvel), None if passive is None else padded(passive)))
 
-    def run(self, state: StepState, measured: Measured, command: Command, begin: int, end: int) -> Ran:
-        """Run the sim steps of a tick from ``begin`` to ``end``, or until an env may have failed."""
+    def run(self, state: StepState, measured: Measured, command: Command, span: Span, table: Any = None) -> Ran:
+        """Run the sim steps of a tick, or until an env may have failed."""
         native = self._bind()
         with own_settings(self._options.dtype):
-            span = np.array([begin, end, 0, 0], np.int32)
-            span[2:].view(np.uint64)[0] = native.prepare()
+            steps = np.array([span.begin, span.steps, 0, 0], np.int32)
+            steps[2:].view(np.uint64)[0] = native.prepare()
             command = command.map(padded)
             # Always a JAX array: for another kind the program would be compiled again.
             extra = self._zero if command.feedforward is None else put(command.feedforward)
             command = command._replace(feedforward=extra)
             traced = None if self._controller is None else self._controller.traced
-            with controller_errors(self._controller and self._options.control, begin + 1):
+            with controller_errors(self._controller and self._options.control, span.begin + 1):
                 program = compiled(self._layout, traced, self._gravity)
-                carry = program(span, self._constants, self._bodies, self._started(state), measured, command)
+                carry = program(steps, self._constants, self._bodies, self._started(state), measured, command)
             done, status = np.asarray(carry.progress).tolist()
         if status & FAILED:
             raise RuntimeError(native.message)
-        return Ran(carry.state, carry.outputs, carry.measured, carry.before, done, bool(status))
+        return Ran(carry.state, carry.outputs, carry.measured, carry.before, span.tick, done, bool(status))
 
     def rows(self, array: Any) -> NDArray[Any]:
         """Return an array of the executor as a new NumPy array."""
@@ -184,12 +185,18 @@ def tick(
     whole = layout._replace(model=model)
 
     def body(carry: Carry) -> Carry:
-        index = carry.progress[0]
+        index, status = carry.progress[0], carry.progress[1]
+
+        def engine(values: Values) -> Values:
+            nonlocal status
+            qpos, qvel, passive, status = xla.sim_step(address, index, values.outputs.qf)
+            return values._replace(measured=Measured(qpos, qvel, passive if gravity else None))
+
         step = Step(index, end, left=layout.left(index, end, constants.timestep))
-        state, outputs = control_step(whole, constants, carry.state, command, carry.measured, step)
-        qpos, qvel, passive, status = xla.sim_step(address, carry.progress[0], outputs.qf)
-        new = Measured(qpos, qvel, passive if gravity else None)
-        return Carry(xp.stack([carry.progress[0] + 1, status]), state, new, outputs, carry.measured.qpos)
+        values = Values(carry.state, command, carry.measured, step, carry.measured)
+        values = sim_step(whole, constants, values, {"engine": engine})
+        progress = xp.stack([index + 1, status])
+        return Carry(progress, values.state, values.measured, values.outputs, carry.measured.qpos)
 
     qpos = measured.qpos
     zero, none = xp.zeros_like(qpos), xp.zeros(qpos.shape, bool)

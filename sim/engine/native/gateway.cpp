@@ -7,7 +7,7 @@
 
 #include "batchpid/native/extension.h"
 #include "sim_step.h"
-#include "ticks.h"
+#include "tick.h"
 #include "xla_call.h"
 
 using namespace batchpid;
@@ -174,55 +174,38 @@ PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   });
 }
 
-// Return the programs of a tick, of which the last two may be None; set an exception if they do not fit the group.
-Programs programs_of(Tick const *arrays, Group const *group, PyObject *step, PyObject *sensors, PyObject *forward) {
-  bool fits = arrays != nullptr && group != nullptr && arrays->dof == group->dof && step != Py_None;
-  auto const program = [&](PyObject *object) -> BoundProgram * {
-    if (object == Py_None || !fits) return nullptr;
-    auto *bound = static_cast<BoundProgram *>(PyCapsule_GetPointer(object, BOUND));
+// Return the programs of a tick from a tuple; set an exception if they do not fit the group.
+std::vector<BoundProgram *> programs_of(Tick const *arrays, Group const *group, PyObject *tuple) {
+  std::vector<BoundProgram *> programs;
+  bool fits = arrays != nullptr && group != nullptr && arrays->dof == group->dof;
+  for (Py_ssize_t i = 0; fits && i < PyTuple_Size(tuple); ++i) {
+    auto *bound = static_cast<BoundProgram *>(PyCapsule_GetPointer(PyTuple_GetItem(tuple, i), BOUND));
     fits = bound != nullptr && bound->program->rows == static_cast<Index>(group->robots) &&
            bound->program->columns == static_cast<Index>(group->dof);
-    return bound;
-  };
-  Programs const programs{program(step), program(sensors), program(forward)};
+    programs.push_back(bound);
+  }
   if (!fits && !PyErr_Occurred()) misfit();
   return programs;
 }
 
-// tick(bound program, address of a Tick, address of a Group, begin, until, end, programs of sensors and feedforward)
-//   -> (steps done, Status); a program may be None
-PyObject *tick(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  auto *arrays = static_cast<Tick *>(PyLong_AsVoidPtr(arguments[1]));
-  auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[2]));
-  Programs const programs = programs_of(arrays, group, arguments[0], arguments[6], arguments[7]);
-  std::int64_t step = PyLong_AsLongLong(arguments[3]);
-  std::int64_t const until = PyLong_AsLongLong(arguments[4]), end = PyLong_AsLongLong(arguments[5]);
-  if (PyErr_Occurred()) return nullptr;
-  std::int32_t status = 0;
-  PyObject *done = without_gil([&] { status = run_tick(programs, *arrays, *group, step, until, end); });
-  if (done == nullptr) return nullptr;
-  Py_DECREF(done);
-  return Py_BuildValue("Li", static_cast<long long>(step), static_cast<int>(status));
-}
-
-// ticks(bound program, address of a Tick, address of a Group, address and number of Transfers, first tick, until, steps)
-//   -> (ticks completed, sim steps of the next one, Status)
+// ticks(bound programs, address of a Tick, address of a Group, tick, step, until, steps, drawn, whole)
+//   -> (tick, step, Status); see run_ticks
 PyObject *ticks(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto *arrays = static_cast<Tick *>(PyLong_AsVoidPtr(arguments[1]));
   auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[2]));
-  auto *transfers = static_cast<Transfer const *>(PyLong_AsVoidPtr(arguments[3]));
-  Programs const programs = programs_of(arrays, group, arguments[0], Py_None, Py_None);
-  std::int64_t const count = PyLong_AsLongLong(arguments[4]), until = PyLong_AsLongLong(arguments[6]);
-  std::int64_t const steps = PyLong_AsLongLong(arguments[7]);
-  std::int64_t tick = PyLong_AsLongLong(arguments[5]), step = 0;
+  std::vector<BoundProgram *> const programs = programs_of(arrays, group, arguments[0]);
+  auto const number = [&](int i) { return static_cast<std::int64_t>(PyLong_AsLongLong(arguments[i])); };
+  Place place{number(3), number(4)};
+  std::int64_t const until = number(5), steps = number(6), drawn = number(7), whole = number(8);
   if (PyErr_Occurred()) return nullptr;
   std::int32_t status = 0;
   PyObject *done = without_gil([&] {
-    status = run_ticks(programs, *arrays, *group, transfers, count, tick, until, steps, step);
+    status = run_ticks(programs.data(), *arrays, *group, place, until, steps, drawn, whole != 0);
   });
   if (done == nullptr) return nullptr;
   Py_DECREF(done);
-  return Py_BuildValue("LLi", static_cast<long long>(tick), static_cast<long long>(step), static_cast<int>(status));
+  return Py_BuildValue("LLi", static_cast<long long>(place.tick), static_cast<long long>(place.step),
+                       static_cast<int>(status));
 }
 
 // Return the structure of Python at an address, or null with an exception.
@@ -324,7 +307,6 @@ PyMethodDef METHODS[] = {
     {"step", step, METH_O, nullptr},
     {"sim_step", method(step_group), METH_FASTCALL, nullptr},
     {"bind", method(bind), METH_FASTCALL, nullptr},
-    {"tick", method(tick), METH_FASTCALL, nullptr},
     {"ticks", method(ticks), METH_FASTCALL, nullptr},
     {"joint_matrices", method(joint_matrices), METH_FASTCALL, nullptr},
     {"forces", method(forces), METH_FASTCALL, nullptr},

@@ -23,8 +23,12 @@ SYMBOLS = (
     "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetVelocityEf",
 )
 """Functions of SAPIEN, in the order of Functions in gateway.h."""
-STATUS = ("not_finite", "too_fast", "failed")
+STATUS = ("not_finite", "too_fast", "failed", "no_noise")
 """Bits of the status of a sim step: reasons to stop a loop over sim steps, as Status in sim_step.h."""
+STAGES = ("program", "force", "inertia", "mass_matrix", "controller", "targets", "constraint", "engine")
+"""Kinds of a :class:`Stage`."""
+TRANSFERS = ("read", "write_floats", "write_bytes")
+"""Kinds of a :class:`Transfer`."""
 DYNAMICS = ("qpos", "qvel", "payload", "matrix", "force", "payload_force")
 """Arrays of ``dynamics`` in batch_dynamics.cpp, after the tree."""
 STEP = ("qpos", "qvel", "friction", "matrix", "effort", "added", "limit", "keep", "creep", "low", "high")
@@ -117,10 +121,21 @@ class Refresh(ctypes.Structure):
     ]
 
 
-class Tick(ctypes.Structure):
-    """Arrays of the sim steps of a tick, as Tick in tick.h."""
+class Stage(ctypes.Structure):
+    """Stage of a sim step, as Stage in tick.h."""
 
     _fields_ = [
+        *((name, ctypes.c_int32) for name in ("kind", "program")),
+        ("noise", 2 * ctypes.c_int32),
+        ("every", ctypes.c_int64),
+    ]
+
+
+class Tick(ctypes.Structure):
+    """Stages and arrays of ticks, as Tick in tick.h."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("stages", "transfers")),
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "passive", "before", "pose", "rate", "qf")),
         *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping")),
         *((name, ctypes.c_void_p) for name in ("leader", "multiplier", "matrix", "control")),
@@ -128,18 +143,14 @@ class Tick(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("gain", "memory", "age", "target", "target_rate", "left")),
         ("noise", 2 * ctypes.c_void_p),
         ("timestep", ctypes.c_double),
-        ("dof", ctypes.c_int64),
-        *((name, ctypes.c_int32) for name in ("whole", "matrix_steps", "coupling_steps")),
-        *((name, ctypes.c_int32) for name in ("gravity", "coriolis", "late")),
+        *((name, ctypes.c_int64) for name in ("dof", "stage_count", "transfer_count")),
+        *((name, ctypes.c_int32) for name in ("whole", "matrix_steps")),
+        *((name, ctypes.c_int32) for name in ("gravity", "coriolis", "late", "unused")),
     ]
 
 
-TRANSFERS = ("read", "write_floats", "write_bytes")
-"""Kinds of a :class:`Transfer`."""
-
-
 class Transfer(ctypes.Structure):
-    """Copy between the arrays of a tick and a table with an entry for each tick, as Transfer in ticks.h."""
+    """Copy between the arrays of a tick and a table with an entry for each tick, as Transfer in tick.h."""
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("table", "row")),
@@ -170,6 +181,8 @@ def _gateway_tables() -> tuple[Any, ...]:
         _layout(Constraint),
         _layout(Model),
         _layout(Refresh),
+        STAGES,
+        _layout(Stage),
         _layout(Tick),
         TRANSFERS,
         _layout(Transfer),
@@ -196,7 +209,6 @@ EXTENSIONS = {
                 "refresh.h",
                 "sim_step.h",
                 "tick.h",
-                "ticks.h",
                 "xla_call.h",
             ),
             BUFFER,

@@ -18,7 +18,7 @@ namespace batchpid {
 constexpr double FARTHEST = 1e6;
 
 // Reasons for which a loop over sim steps has to stop, as bits: STATUS in interface.py.
-enum Status : std::int32_t { NOT_FINITE = 1, TOO_FAST = 2, FAILED = 4 };
+enum Status : std::int32_t { NOT_FINITE = 1, TOO_FAST = 2, FAILED = 4, NO_NOISE = 8 };
 
 // Group of robots; Python fills in the fields (Group in interface.py) and owns what they point to.
 struct Group {
@@ -158,18 +158,19 @@ std::int32_t try_sim_step(Group &group, std::int64_t rows, T const *effort, T *q
   return FAILED;
 }
 
-// Set the targets of the drives (robots, dof): write_drive_target of the packs.
+// Set the targets of the drives (robots, dof): write_drive_target of the packs. Without `rate` it is 0.
 inline void write_targets(Group const &group, double const *target, double const *rate) {
   std::int64_t const dof = group.dof;
   for (std::int64_t at = 0; at < group.robots * dof; ++at) {
+    double const speed = rate == nullptr ? 0.0 : rate[at];
     if (group.mujoco == nullptr) {
       Functions const &call = group.gateway->functions;
       call.set_drive_position(group.joints[at], static_cast<float>(target[at]));
-      call.set_drive_velocity(group.joints[at], static_cast<float>(rate[at]));
+      call.set_drive_velocity(group.joints[at], static_cast<float>(speed));
       continue;
     }
     Mujoco const &mujoco = *group.mujoco;
-    mujoco.ctrl[at / dof][at % dof] = mujoco.stiffness[at] * target[at] + mujoco.rate_gain[at] * rate[at];
+    mujoco.ctrl[at / dof][at % dof] = mujoco.stiffness[at] * target[at] + mujoco.rate_gain[at] * speed;
   }
 }
 

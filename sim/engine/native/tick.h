@@ -1,7 +1,7 @@
-// Sim steps of a tick of a group of robots in one call: mass matrices, control step, and the engine, in turn.
+// Ticks of a group of robots in one call, as long as nothing happens that Python has to handle.
 //
-// The control step is a Program, traced from sim/loop/control_step.py. Its state is in the arrays that it reads and
-// writes. The law's mass matrices are computed here, every `matrix_steps` sim steps, since a Program cannot.
+// The stages of a sim step come from Python, in the order of sim/loop/control_step.py. Those that are functions of arrays
+// are Programs, traced from there; their state is in the arrays that they read and write. The others are here.
 
 #pragma once
 
@@ -10,38 +10,72 @@
 #include "refresh.h"
 #include "sim_step.h"
 
+#include <cmath>
+#include <cstring>
+
 #pragma GCC visibility push(hidden)
 
 namespace batchpid {
 
+enum class StageKind : std::int32_t {
+  PROGRAM, FORCE, INERTIA, MASS_MATRIX, CONTROLLER, TARGETS, CONSTRAINT, ENGINE
+};
+
+// Stage of a sim step: Stage in interface.py.
+struct Stage {
+  StageKind kind;
+  std::int32_t program;   // number of a PROGRAM
+  std::int32_t noise[2];  // its inputs that are noise of the sensors, or -1
+  std::int64_t every;     // sim steps of a tick between two of this stage; 0: in the first one only
+};
+
+enum class TransferKind : std::int32_t { READ, WRITE_FLOATS, WRITE_BYTES };
+
+// Copy between a row, which is the same in every tick, and a table with an entry for each tick: Transfer in interface.py.
+struct Transfer {
+  char *table;          // double to READ, float to WRITE_FLOATS
+  char *row;            // double, except to WRITE_BYTES
+  std::int64_t stride;  // of the table's ticks [bytes]; 0: each tick overwrites the one before
+  std::int64_t size;    // numbers, or bytes
+  TransferKind kind;
+  std::int32_t unused;
+};
+
 // Arrays (robots, dof) of double, which Python owns: Tick in interface.py.
 struct Tick {
+  Stage const *stages;
+  Transfer const *transfers;      // of commands and observations
   double *qpos, *qvel, *passive;  // reading, before and after each sim step
   double *before;                 // positions before the last sim step
-  double const *pose, *rate;      // state for the mass matrix: the reading, or as the sensors measure it
-  double const *qf;               // an output of the program
+  double const *pose, *rate;      // state for the mass matrix and FORCE: the reading, or as the sensors measure it
+  double const *qf;               // an output of a program
   std::int32_t const *tree;       // (dof, 2), of the description
   double const *bodies;           // (dof, 25)
   double const *armature;         // (dof,), or null
   double const *damping;          // (dof,), or null
   Coupling coupling;
   double *matrix;                 // (robots, dof, dof), or its diagonal, or null
-  Call const *control;            // native controller, whose effort is an input of the program, or null
+  Call const *control;            // native controller, whose effort is an input of a program, or null
   Model const *measured_force;    // of the passive force at the measured state, or null
   Model const *read_force;        // of the passive force at the reading after a sim step, or null
   Refresh const *refresh;         // of the friction model's inertia, or null
   double *gain, *memory;          // of the friction model
   std::int64_t *age;              // (robots,)
-  double const *target, *target_rate;  // outputs of the program: targets of drives, or null
+  double const *target, *target_rate;  // outputs of a program: targets of drives, or null; the rate may be null for 0
   double *left;                   // time from the moment of the law's setpoint to the end of the tick [s], or null
-  double const *noise[2];         // (steps, robots, dof): last inputs of the sensors in the next steps, or null
+  double const *noise[2];         // (steps, robots, dof): noise of the sensors in the next steps, or null
   double timestep;
-  std::int64_t dof;
+  std::int64_t dof, stage_count, transfer_count;
   std::int32_t whole;             // the law takes the whole matrix
   std::int32_t matrix_steps;
-  std::int32_t coupling_steps;    // sim steps for which constraint efforts keep their mass matrix
   std::int32_t gravity, coriolis;  // parts of the passive force
   std::int32_t late;              // the law takes its setpoint at the end of a sim step
+  std::int32_t unused;
+};
+
+// Place in ticks: a tick, and the sim steps of it that are done.
+struct Place {
+  std::int64_t tick, step;
 };
 
 // A program with its arrays.
@@ -71,53 +105,103 @@ inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t s
   }
 }
 
-// Run the sensors' program, whose last inputs are the noise, in sim step `at` of those that tick.noise is for.
-inline void measure(BoundProgram &sensors, Tick const &tick, std::int64_t robots, std::int64_t at) {
-  auto *place = sensors.inputs.data() + sensors.inputs.size();
-  for (int i = 1; i >= 0; --i) {
-    if (tick.noise[i] != nullptr) (--place)->data = tick.noise[i] + at * robots * tick.dof;
+// Run a stage of sim step `step` in a tick of `end` steps, `at` steps after the first that tick.noise is for. Return the
+// status of the engine.
+inline std::int32_t run_stage(Stage const &stage, BoundProgram *const *programs, Tick const &tick, Group &group,
+                              std::int64_t step, std::int64_t end, std::int64_t at) {
+  auto const robots = group.robots;
+  Parts const parts{tick.gravity != 0, tick.coriolis != 0};
+  switch (stage.kind) {
+    case StageKind::PROGRAM: {
+      BoundProgram &bound = *programs[stage.program];
+      for (int i = 0; i < 2; ++i) {
+        if (stage.noise[i] < 0) continue;
+        bound.inputs[static_cast<std::size_t>(stage.noise[i])].data = tick.noise[i] + at * robots * tick.dof;
+      }
+      run(*bound.program, bound.inputs.data(), bound.outputs.data(), 0, robots);
+      return 0;
+    }
+    case StageKind::FORCE:
+      write_forces(*tick.measured_force, parts, robots, tick.pose, tick.rate, nullptr, tick.passive);
+      return 0;
+    case StageKind::INERTIA:
+      refresh(*tick.refresh, robots, tick.qpos, tick.gain, tick.memory, tick.age);
+      return 0;
+    case StageKind::MASS_MATRIX:
+      write_matrices(tick, robots, std::min<std::int64_t>(tick.matrix_steps, end - step));
+      return 0;
+    case StageKind::CONTROLLER:
+      tick.control->run(*tick.control);
+      return 0;
+    case StageKind::TARGETS:
+      write_targets(group, tick.target, tick.target_rate);
+      return 0;
+    case StageKind::CONSTRAINT:
+      if (group.constraint != nullptr) update_constraint(group, tick.qpos, tick.qvel);
+      return 0;
+    case StageKind::ENGINE: {
+      std::memcpy(tick.before, tick.qpos, static_cast<std::size_t>(robots * tick.dof) * sizeof(double));
+      std::int32_t const status = try_sim_step(group, robots, tick.qf, tick.qpos, tick.qvel, tick.passive);
+      if (tick.read_force != nullptr) write_force(group, *tick.read_force, parts, tick.qpos, tick.qvel, tick.passive);
+      return status;
+    }
   }
-  run(*sensors.program, sensors.inputs.data(), sensors.outputs.data(), 0, robots);
+  return 0;
 }
 
-// Programs of a tick: the control step, and sensors and the feedforward of a native controller, or null.
-struct Programs {
-  BoundProgram *step, *sensors, *forward;
-};
+// Whether all are finite.
+inline bool are_finite(double const *values, std::int64_t size) {
+  double sum = 0.0;
+  for (std::int64_t i = 0; i < size; ++i) sum += 0.0 * values[i];  // NaN for NaN and infinity
+  return sum == 0.0;
+}
 
-// Run the sim steps from `step` to `until` of a tick of `end` steps. Advance `step`; return the status of the last.
-inline std::int32_t run_tick(Programs const &programs, Tick const &tick, Group &group, std::int64_t &step,
-                             std::int64_t until, std::int64_t end) {
-  auto const robots = group.robots, begin = step;
-  auto const bytes = static_cast<std::size_t>(robots * tick.dof) * sizeof(double);
-  auto const run_bound = [&](BoundProgram const &bound) {
-    run(*bound.program, bound.inputs.data(), bound.outputs.data(), 0, robots);
-  };
-  Parts const parts{tick.gravity != 0, tick.coriolis != 0};
-  std::int32_t status = 0;
-  while (step < until && status == 0) {
-    if (programs.sensors != nullptr) measure(*programs.sensors, tick, robots, step - begin);
-    if (tick.measured_force != nullptr) {
-      write_forces(*tick.measured_force, parts, robots, tick.pose, tick.rate, nullptr, tick.passive);
-    }
-    if (tick.refresh != nullptr) refresh(*tick.refresh, robots, tick.qpos, tick.gain, tick.memory, tick.age);
-    if (tick.matrix != nullptr && step % tick.matrix_steps == 0) {
-      write_matrices(tick, robots, std::min<std::int64_t>(tick.matrix_steps, end - step));
-    }
-    if (tick.left != nullptr) *tick.left = static_cast<double>(end - step - tick.late) * tick.timestep;
-    if (programs.forward != nullptr) run_bound(*programs.forward);
-    if (tick.control != nullptr) tick.control->run(*tick.control);
-    run_bound(*programs.step);
-    if (tick.target != nullptr) write_targets(group, tick.target, tick.target_rate);
-    if (group.constraint != nullptr && step % tick.coupling_steps == 0) {
-      update_constraint(group, tick.qpos, tick.qvel);
-    }
-    std::memcpy(tick.before, tick.qpos, bytes);
-    status = try_sim_step(group, robots, tick.qf, tick.qpos, tick.qvel, tick.passive);
-    if (tick.read_force != nullptr) write_force(group, *tick.read_force, parts, tick.qpos, tick.qvel, tick.passive);
-    ++step;
+// Read the commands of a tick. Return whether they are finite.
+inline bool read_commands(Tick const &arrays, std::int64_t tick) {
+  bool finite = true;
+  for (Transfer const *each = arrays.transfers; each != arrays.transfers + arrays.transfer_count; ++each) {
+    if (each->kind != TransferKind::READ) continue;
+    std::memcpy(each->row, each->table + tick * each->stride, static_cast<std::size_t>(each->size) * sizeof(double));
+    finite = finite && are_finite(reinterpret_cast<double const *>(each->row), each->size);
   }
-  return status;
+  return finite;
+}
+
+// Write the observation of a tick.
+inline void write_observation(Tick const &arrays, std::int64_t tick) {
+  for (Transfer const *each = arrays.transfers; each != arrays.transfers + arrays.transfer_count; ++each) {
+    char *table = each->table + tick * each->stride;
+    if (each->kind == TransferKind::WRITE_BYTES) std::memcpy(table, each->row, static_cast<std::size_t>(each->size));
+    if (each->kind != TransferKind::WRITE_FLOATS) continue;
+    for (std::int64_t i = 0; i < each->size; ++i) {
+      reinterpret_cast<float *>(table)[i] = static_cast<float>(reinterpret_cast<double const *>(each->row)[i]);
+    }
+  }
+}
+
+// Run sim steps from `place` on, in ticks of `steps` up to the tick `until`; advance `place`. Stop after a sim step whose
+// status is not 0, or where `drawn` steps have used up the noise of the sensors. With `whole`, commands and observations
+// are those of the tables: stop also in a tick whose command is not finite, before its first step, and in one after which
+// velocities are not finite. Without it, stop at the end of a tick. Return the status.
+inline std::int32_t run_ticks(BoundProgram *const *programs, Tick const &tick, Group &group, Place &place,
+                              std::int64_t until, std::int64_t steps, std::int64_t drawn, bool whole) {
+  for (std::int64_t done = 0; place.tick < until; ++place.tick, place.step = 0) {
+    if (whole && place.step == 0 && !read_commands(tick, place.tick)) return 0;
+    for (std::int64_t const first = place.step; place.step < steps; ++done) {
+      if (done == drawn) return NO_NOISE;
+      if (tick.left != nullptr) *tick.left = static_cast<double>(steps - place.step - tick.late) * tick.timestep;
+      std::int32_t status = 0;
+      for (Stage const *stage = tick.stages; stage != tick.stages + tick.stage_count; ++stage) {
+        bool const due = stage->every > 0 ? place.step % stage->every == 0 : place.step == first;
+        if (due) status |= run_stage(*stage, programs, tick, group, place.step, steps, done);
+      }
+      ++place.step;
+      if (status != 0) return status;
+    }
+    if (!whole || !are_finite(tick.qvel, group.robots * group.dof)) return 0;
+    write_observation(tick, place.tick);
+  }
+  return 0;
 }
 
 }  // namespace batchpid

@@ -9,14 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.native.array_program import ArrayProgram
-from batchpid.native.tracing import trace
 from batchpid.sim.engine.native import python_calls
-from batchpid.sim.engine.native.native_tick import NativeTick
-from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.native_self_test import spec_of_two_joints
 from batchpid.sim.engine.sapien.building import build_scene, new_system
-from batchpid.sim.engine.sapien.built_tree import scene_tree
 from batchpid.sim.engine.sapien.calls import PythonCalls
 from batchpid.sim.engine.sapien.native_calls import NativeCalls
 from batchpid.sim.engine.sapien.pack import Pack
@@ -30,8 +25,6 @@ def main() -> None:
     """Raise an error if a result differs."""
     _compare_calls()
     _compare_steps()
-    _compare_ticks()
-    _compare_drives()
 
 
 def _compare_steps() -> None:
@@ -55,82 +48,6 @@ def _compare_steps() -> None:
         touched |= any(system.get_contacts() for system in ours.systems)
     if not touched:
         raise AssertionError("nothing was touched")
-
-
-def _compare_ticks() -> None:
-    """Compare a native tick with its program and its native sim steps, called from Python one after another."""
-    every, shape = 3, (4, 2)
-    target = np.linspace((0.2, 0.1), (0.8, 0.3), 4)
-
-    def law(goal: Any, matrix: Any, qpos: Any, qvel: Any) -> list[Any]:
-        wanted = 30.0 * (goal - qpos) - 5.0 * qvel
-        return [(matrix * wanted[:, None, :]).sum(axis=-1)]
-
-    model, armature = NativeModel(replace(_spec(), ground=False)), np.array([0.1, 0.2])
-    tree, table = scene_tree(_spec()).tables
-    results = []
-    for in_ticks in (True, False):
-        pack = Pack(_spec(), 4)
-        qpos, qvel, passive, before, qf = np.zeros((5, *shape))
-        matrix, done = np.zeros((4, 2, 2)), 0
-        program = ArrayProgram(trace(law, 1, 3), [target], 3, shape)
-        arrays: dict[str, Any] = {"qpos": qpos, "qvel": qvel, "passive": passive, "before": before, "qf": qf}
-        own: dict[str, Any] = {"matrix": matrix, "tree": tree, "bodies": table, "armature": armature}
-        inputs = (matrix, qpos, qvel)
-        tick = NativeTick(program, inputs, (qf,), timestep=1e-2, matrix_steps=every, whole=True, **arrays, **own)
-        step = pack.compiled_step(True, True, True, None)
-        while done < STEPS:
-            if in_ticks:
-                done, status = tick.run(step.prepare(), done, STEPS, STEPS)
-            else:
-                if done % every == 0:
-                    ahead = 0.5 * (min(every, STEPS - done) - 1) * 1e-2
-                    matrix[...] = model.mass_matrix(qpos + ahead * qvel) + np.diag(armature)
-                program(*inputs, out=(qf,))
-                status, done = step(qf, qpos, qvel, passive), done + 1
-            if status:
-                raise AssertionError("a native tick reports that a robot failed")
-        results.append([qpos, qvel, passive, qf, matrix])
-    for ours, theirs in zip(*results, strict=True):
-        if ours.tobytes() != theirs.tobytes():
-            raise AssertionError("native ticks and their parts give different results")
-    if not np.abs(results[0][0]).max() > 0.1:
-        raise AssertionError("no robot moved in a native tick")
-
-
-def _compare_drives() -> None:
-    """Compare drives whose targets move within a native tick with targets that Python writes."""
-    shape, results = (4, 2), []
-    wanted = np.linspace((0.2, 0.1), (0.8, 0.3), 4)
-
-    def law(goal: Any, qpos: Any) -> list[Any]:
-        return [0.5 * (goal - qpos), qpos + 0.5 * (goal - qpos), 0.1 * (goal - qpos)]
-
-    for in_ticks in (True, False):
-        pack = Pack(_spec(), 4)
-        pack.write_drive(np.array([400.0, 300.0]), np.array([40.0, 30.0]), np.array([np.inf, np.inf]))
-        qpos, qvel, passive, before, qf, target, rate = np.zeros((7, *shape))
-        program = ArrayProgram(trace(law, 1, 1), [wanted], 1, shape)
-        outputs = qf, target, rate
-        arrays: dict[str, Any] = {"qpos": qpos, "qvel": qvel, "passive": passive, "before": before, "qf": qf}
-        moving: dict[str, Any] = {"target": target, "target_rate": rate}
-        tick = NativeTick(program, (qpos,), outputs, timestep=1e-2, **arrays, **moving)
-        step, done = pack.compiled_step(True, True, True, None, True), 0
-        while done < STEPS:
-            if in_ticks:
-                done, status = tick.run(step.prepare(), done, STEPS, STEPS)
-            else:
-                program(qpos, out=outputs)
-                pack.write_drive_target(target, rate)
-                status, done = step(qf, qpos, qvel, passive), done + 1
-            if status:
-                raise AssertionError("a native tick reports that a robot failed")
-        results.append([qpos, qvel, target])
-    for ours, theirs in zip(*results, strict=True):
-        if ours.tobytes() != theirs.tobytes():
-            raise AssertionError("drives move otherwise in native ticks")
-    if not np.abs(results[0][0]).max() > 0.1:
-        raise AssertionError("no robot was driven")
 
 
 def _compare_calls() -> None:

@@ -94,6 +94,9 @@ class DoubleIntegrators:
     def write_qf(self, effort):
         self.qf[...] = effort
 
+    def update_constraint(self, rows=slice(None)):
+        pass
+
     def step(self, update=True):
         qpos, qvel = self._state
         qvel += self.spec.timestep * self._moves * self.qf

@@ -16,19 +16,11 @@ from batchpid.motors.friction import Friction
 from batchpid.motors.friction import init as init_friction
 from batchpid.sim import Runner
 from batchpid.sim.loop import control_step as module
-from batchpid.sim.loop import numpy_executor, xla_executor
+from batchpid.sim.loop import xla_executor
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.control_step import (
-    Constants,
-    KnownFriction,
-    Layout,
-    Measured,
-    Model,
-    Step,
-    StepState,
-    control_step,
-)
+from batchpid.sim.loop.control_step import control_step
 from batchpid.sim.loop.pid_law import PIDLaw
+from batchpid.sim.loop.step_values import Constants, KnownFriction, Layout, Measured, Model, Step, StepState
 
 DT, ENVS, JOINTS = 1e-3, 4, 3
 MATRIX = np.diag([2.0, 1.0, 0.5]) + 0.1
@@ -161,28 +153,52 @@ def test_jax_runs_the_same_function(case):
             np.testing.assert_allclose(np.asarray(ours), theirs, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("backend", ["numpy", "jax"])
-def test_every_executor_calls_it(panda, backend, monkeypatch):
-    """The third, native one: test_native_executor.py."""
-    if backend == "numpy":
-        monkeypatch.setenv("BATCHPID_NATIVE", "0")
-    calls = []
+def final(robot, switch, backend, monkeypatch, **options):
+    """Return the positions after a tick with a feedforward, by the executor of these settings."""
+    monkeypatch.setenv("BATCHPID_NATIVE", switch)
+    with Runner(robot, 2, workers=0, substeps=6, backend=backend, **options) as runner:
+        return runner.step(robot.settings.target, feedforward=np.full(robot.dof, 2.0)).qpos
 
-    def recorded(layout, constants, state, command, measured, step):
-        calls.append((layout.control, step.end))
-        return control_step(layout, constants, state, command, measured, step)
 
-    for each in (numpy_executor, xla_executor):
-        assert each.control_step is module.control_step
-        monkeypatch.setattr(each, "control_step", recorded)
+EXECUTORS = {"numpy": ("0", "numpy"), "native": ("1", "numpy"), "xla": ("1", "jax")}
+
+
+def swap(monkeypatch, first, second):
+    """Exchange two stages of the table."""
+    names = [stage.name for stage in module.STAGES]
+    i, j = names.index(first), names.index(second)
+    table = list(module.STAGES)
+    table[i], table[j] = table[j], table[i]
+    monkeypatch.setattr(module, "STAGES", tuple(table))
+
+
+@pytest.mark.usefixtures("quick_compilation")
+def test_every_executor_runs_the_order_of_the_table(panda, monkeypatch):
+    """A feedforward after the law has no effect in its sim step."""
+    given = {"actuators": bp.make_actuators(panda.dof, strength=0.8, coulomb=0.5)}
+    before = {name: final(panda, *each, monkeypatch) for name, each in EXECUTORS.items()}
+    moving = {name: final(panda, *EXECUTORS[name], monkeypatch, **given) for name in ("numpy", "native")}
     xla_executor.compiled.cache_clear()
-    with Runner(panda, 2, workers=0, substeps=3, backend=backend) as runner:
-        runner.step(panda.start)
-        in_one_program = "in one program" in runner.backend
+    with monkeypatch.context() as patch:
+        swap(patch, "feedforward", "law")
+        after = {name: final(panda, *each, monkeypatch) for name, each in EXECUTORS.items()}
     xla_executor.compiled.cache_clear()
-    assert {control for control, _ in calls} == {"pid"}
-    # A program of XLA is traced, a few times at most.
-    assert (len(calls) < 3) if in_one_program else (len(calls) == 3)
+    for name in EXECUTORS:
+        assert np.abs(after[name] - before[name]).max() > 1e-5, name
+        np.testing.assert_allclose(after[name], after["numpy"], rtol=0, atol=1e-6)
+    swap(monkeypatch, "motors", "friction")
+    changed = {name: final(panda, *EXECUTORS[name], monkeypatch, **given) for name in moving}
+    for name in moving:
+        assert np.abs(changed[name] - moving[name]).max() > 1e-7, name
+        np.testing.assert_allclose(changed[name], changed["numpy"], rtol=0, atol=1e-6)
+
+
+def test_the_documentation_has_the_stages_in_their_order():
+    lines = module.__doc__.split("in this order::")[1].split("The executors")[0].splitlines()
+    named = [line.strip() for line in lines if line.strip()]
+    assert len(named) == len(module.STAGES)
+    for line, stage in zip(named, module.STAGES, strict=True):
+        assert line.startswith(stage.name)
 
 
 @pytest.mark.usefixtures("quick_compilation")

@@ -14,7 +14,7 @@ from robots import load_bundled
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import FaultWarning, Runner
 from batchpid.sim.loop import faults
-from batchpid.sim.loop.control_step import Measured
+from batchpid.sim.loop.step_values import Measured
 
 PANDA = load_bundled("panda")
 N = 6

@@ -17,14 +17,12 @@ from batchpid.sim import Randomization, Robot, Runner, Uniform
 from batchpid.sim.engine import native
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.engines import load_engine
-from batchpid.sim.engine.native.native_tick import NativeTick
 from batchpid.sim.engine.native_model import NativeModel, NativeRefresh
 from batchpid.sim.engine.robot_model import passive_force, scene_tree
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.loop import tick_program
-from batchpid.sim.loop.control_step import control_step
 from batchpid.sim.loop.native_executor import NativeExecutor
+from batchpid.sim.loop.native_ticks import NativeTicks
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
 from tests.sim.engine.test_coupled_joints import arm
 
@@ -114,22 +112,6 @@ def test_an_env_that_is_reset_changes_no_other(panda):
             found.append(runner.rollout(table))
     assert_identical(*found, np.arange(N) != 1)
     assert not np.array_equal(found[0].qpos[:, 1], found[1].qpos[:, 1])
-
-
-def test_the_program_is_a_trace_of_the_control_step(panda, monkeypatch):
-    calls = []
-
-    def recorded(layout, *arguments):
-        calls.append(layout.control)
-        return control_step(layout, *arguments)
-
-    assert tick_program.control_step is control_step
-    monkeypatch.setattr(tick_program, "control_step", recorded)
-    tick_program._trace.cache_clear()
-    with Runner(panda, 2, workers=0, substeps=30) as runner:
-        runner.step(panda.settings.target, substeps=100)  # friction is due in sim step 64
-    tick_program._trace.cache_clear()
-    assert calls == ["pid"], "traced once"
 
 
 EFFECTS = {
@@ -287,10 +269,6 @@ def test_control_steps_that_are_a_program(panda):
             executors.append(self._compiles)
             return super().run(*arguments)
 
-        def run_ticks(self, *arguments):
-            executors.append(self._compiles)
-            return super().run_ticks(*arguments)
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("batchpid.sim.loop.env_group.NativeExecutor", Seen)
         for case, options in cases.items():
@@ -340,28 +318,34 @@ def test_the_backend_says_why_a_tick_is_not_one_native_call(options, reason, pan
     check_calls(panda, options, reason, monkeypatch)
 
 
+def counted_calls(monkeypatch):
+    """Return lists to which native calls append their sim steps, and draws of noise."""
+    spans, draws, run, draw = [], [], NativeTicks.run, NativeTicks._draw
+
+    def counted(self, step, tick, begin, until, steps, whole):
+        end, done, status = run(self, step, tick, begin, until, steps, whole)
+        spans.append((end - tick) * steps + done - begin)
+        return end, done, status
+
+    def drawn(self):
+        draws.append(1)
+        return draw(self)
+
+    monkeypatch.setattr(NativeTicks, "run", counted)
+    monkeypatch.setattr(NativeTicks, "_draw", drawn)
+    return spans, draws
+
+
 def check_calls(robot, options, reason, monkeypatch):
     """Check the number of native calls in a tick of 100 sim steps, and the reason for more of them."""
-    spans, run, run_ticks = [], NativeTick.run, NativeTick.run_ticks
-
-    def counted(self, *arguments):
-        done, status = run(self, *arguments)
-        spans.append(done - arguments[1])
-        return done, status
-
-    def counted_ticks(self, group, transfers, first, until, steps):
-        tick, done, status = run_ticks(self, group, transfers, first, until, steps)
-        spans.append((tick - first) * steps + done)
-        return tick, done, status
-
-    monkeypatch.setattr(NativeTick, "run", counted)
-    monkeypatch.setattr(NativeTick, "run_ticks", counted_ticks)
+    spans, noise = counted_calls(monkeypatch)
     with Runner(robot, 2, workers=0, **options) as runner:
         begin = runner.reset()
         runner.step(begin.qpos if begin.tool_pose is None else begin.tool_pose, substeps=100)
         assert sum(spans) == (0 if reason else 100)
+        assert len(spans) <= 1
         noisy = "actuators" in options and options["actuators"].position_noise is not None
-        assert len(spans) <= 1 + noisy, "the noise of sensors is drawn for 64 sim steps"
+        assert len(noise) <= (4 if noisy else len(spans)), "the noise of sensors is drawn for 64 sim steps"
         assert ("a call each sim step (" in runner.backend) == bool(reason)
         assert reason in runner.backend
 

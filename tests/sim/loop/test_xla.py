@@ -318,6 +318,6 @@ def test_random_efforts_resets_snapshots_and_faults_are_those_of_the_loop_in_num
 
 
 def test_the_law_of_a_guarded_runner_is_in_xla(panda, monkeypatch):
-    monkeypatch.setattr("batchpid.sim.loop.tick_program.TickProgram.run", None)  # the native law
+    monkeypatch.setattr("batchpid.sim.loop.native_ticks.NativeTicks.run", None)  # the native law
     with Runner(panda, 2, backend="jax", guard=True, workers=0, substeps=2) as runner:
         assert runner.step(panda.start).ok.all()

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from robots import load_bundled
 
+import batchpid as bp
 from batchpid.sim import Runner
 from batchpid.sim.engine import native
-from batchpid.sim.loop.tick_program import TickProgram
+from batchpid.sim.loop.native_ticks import NativeTicks
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning", "ignore::batchpid.sim.StabilityWarning"),
@@ -41,14 +42,28 @@ def test_a_rollout_is_its_ticks_one_by_one(panda, engine, options):
         np.testing.assert_array_equal(whole.observe().qpos, rollout.qpos[-1])
 
 
-def test_quiet_ticks_are_one_call(panda, engine, monkeypatch):
-    calls, run_ticks = [], TickProgram.run_ticks
+OPTIONS = {
+    "pid": {},
+    "drive": {"control": "drive"},
+    "guarded drive": {"control": "drive", "guard": True},
+    "sensors": {"actuators": bp.make_actuators(9, sensor_delay=0.002, lag=0.003)},
+    "no measured rate": {"gains": {"measurement_rate": "difference"}},
+}
 
-    def counted(self, step, transfers, first, until, steps):
-        calls.append(until - first)
-        return run_ticks(self, step, transfers, first, until, steps)
 
-    monkeypatch.setattr(TickProgram, "run_ticks", counted)
-    with Runner(panda, 2, workers=0, substeps=2, engine=engine) as runner:
-        runner.rollout(np.broadcast_to(panda.settings.start, (30, panda.dof)))
+@pytest.mark.parametrize("name", OPTIONS)
+def test_ticks_are_one_call_until_an_event(panda, engine, name, monkeypatch):
+    options, calls, run = dict(OPTIONS[name]), [], NativeTicks.run
+    if "gains" in options:
+        options["params"] = panda.params(gain_units="effort", kp=300.0, kd=30.0, **options.pop("gains"))
+
+    def counted(self, step, tick, begin, until, steps, whole):
+        calls.append(until - tick)
+        return run(self, step, tick, begin, until, steps, whole)
+
+    monkeypatch.setattr(NativeTicks, "run", counted)
+    with Runner(panda, 2, workers=0, substeps=2, engine=engine, **options) as runner:
+        rollout = runner.rollout(np.broadcast_to(panda.settings.target, (30, panda.dof)))
     assert calls == [30]
+    assert np.ptp(rollout.qpos, axis=0).max() > 1e-3
+    assert np.abs(rollout.qvel[-1]).max() > 0

@@ -1,0 +1,181 @@
+"""Values of a sim step: state, command and reading of the control, its constants, and the functions of an executor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import batchpid as bp
+from batchpid.law.coefficients import Coefficients
+from batchpid.motors import STAGES, ActuatorState, Stages
+from batchpid.motors.coupling import Coupling
+from batchpid.motors.friction import Friction, FrictionState
+from batchpid.motors.guard import GuardState
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.pid_law import PIDLaw
+
+
+class StepState(NamedTuple):
+    """State of the control of M envs between sim steps; arrays have the envs as their first axis."""
+
+    law: Any
+    """:class:`batchpid.PIDState`, or the arrays of the caller's own controller by name."""
+    friction: FrictionState = FrictionState()
+    age: Any = None
+    """Sim steps since the last update of the friction model's inertia (M,); None without Coulomb friction."""
+    motors: ActuatorState | None = None
+    """Motors and sensors; None for ideal ones."""
+    guard: GuardState | None = None
+    matrix: Any = None
+    """Mass matrix of the law (M, dof, dof), or its diagonal (M, dof). Each tick begins with a new one."""
+
+
+class Measured(NamedTuple):
+    """Reading of the robots before a sim step, arrays (M, dof)."""
+
+    qpos: Any
+    qvel: Any
+    """None where nothing needs it."""
+    passive: Any
+    """Efforts that cancel gravity, and Coriolis and centrifugal forces; None without compensation."""
+
+
+class Step(NamedTuple):
+    """Place of a sim step in its tick."""
+
+    index: Any
+    """Sim steps of the tick before this one."""
+    end: Any
+    """Sim steps of the tick."""
+    observed: bool = True
+    """Whether :attr:`Outputs.saturated` is wanted."""
+    left: Any = 0.0
+    """:meth:`Layout.left`: time from the moment of the law's setpoint to the end of the tick [s]."""
+
+
+class Outputs(NamedTuple):
+    """Results of a sim step, arrays (M, dof)."""
+
+    qf: Any = None
+    """Effort to apply to the joints in the next step of the engine [N m or N]."""
+    motor: Any = None
+    """Effort of the motors."""
+    saturated: Any = None
+    """Joints whose effort was limited; None where it is not wanted."""
+    guarded: Any = None
+    """Setpoints that the guard changed; None without guard."""
+    returned: Any = None
+    """Effort that the caller's own controller returned; None for other controls."""
+    target: Any = None
+    """Position target of the engine's drives [rad or m]; None without drives."""
+    target_rate: Any = None
+
+
+class Values(NamedTuple):
+    """What the stages of a sim step read and replace."""
+
+    state: StepState
+    command: Command
+    measured: Measured
+    """Reading of the robots before the step."""
+    step: Step
+    seen: Measured
+    """Reading as the sensors measure it, with the whole feedforward as its passive force from that stage on."""
+    noise: Any = None
+    """Noise of the sensors in this step, if it is drawn in advance."""
+    limited: Any = None
+    """Joints whose effort the caller's own controller has limited (M, dof); None if it does not say."""
+    outputs: Outputs = Outputs()
+
+
+class KnownFriction(NamedTuple):
+    """Friction that the compensation cancels, arrays (dof,)."""
+
+    friction: Any
+    """[N m or N]"""
+    band: Any
+    """Half width of the band of small errors in which the compensation is reduced [rad or m]."""
+    turns: Any
+    """1 / (2 pi) on continuous joints, 0 elsewhere; None without such joints."""
+
+
+class Constants(NamedTuple):
+    """Arrays that stay the same for many ticks, (M, dof) or (1, dof); None where they are not needed."""
+
+    timestep: Any
+    """[s]"""
+    limits: tuple[Any, Any]
+    """Least and largest effort of the params [N m or N]."""
+    coupling: Coupling
+    k: Coefficients | None = None
+    """Coefficients of the PID law."""
+    armature: Any = None
+    """Armature of the motors that the law knows (dof,) [kg m^2 or kg]."""
+    damping: Any = None
+    """Viscous damping B that a law with the mass matrix compensates (dof,) [N m s/rad or N s/m]."""
+    friction: Friction = Friction()
+    drive: tuple[Any, Any] = (0.0, 0.0)
+    """Damping and stiffness of the engine's drives [N m s/rad, N m/rad]."""
+    known: KnownFriction | None = None
+    guard: Any = None
+    """:class:`batchpid.Guard`"""
+    motors: Any = None
+    """:class:`batchpid.motors.Coefficients` of motors and sensors."""
+    driven: bp.PIDParams | None = None
+    """Params of the integral that moves the targets of drives."""
+    turns: Any = None
+    """1 / (2 pi) on continuous joints with drives, 0 elsewhere; None without such joints."""
+
+
+def when(due: Any, function: Callable[[], Any], otherwise: Any) -> Any:
+    """Return ``function()`` if ``due``, a bool or an array, has a True entry; else ``otherwise``."""
+    return function() if np.any(due) else otherwise
+
+
+class Model(NamedTuple):
+    """Functions that an executor passes to the control step. Their results do not depend on the executor."""
+
+    mass_matrix: Any = None
+    """qpos (M, dof) -> mass matrix of the description (M, dof, dof), as the law knows it."""
+    joint_mass_matrix: Any = None
+    """qpos -> effective mass matrix of the joints, armature of the motors included."""
+    refresh: Any = None
+    """state of the friction model, qpos -> the state with its inertia there; None: by :attr:`joint_mass_matrix`."""
+    passive_force: Any = None
+    """qpos, qvel -> passive force of the description, for a measured state that differs from the joints' state."""
+    when: Callable[[Any, Callable[[], Any], Any], Any] = when
+    """:func:`when`, or a conditional of JAX."""
+    law: Callable[..., Any] = PIDLaw.advance
+    """:meth:`batchpid.sim.loop.pid_law.PIDLaw.advance`, or its compiled form."""
+    controller: Any = None
+    """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort), and, if it limits efforts
+    itself, the mask of joints with limited efforts."""
+    noise: Any = None
+    """coefficients and state of the sensors, qpos -> their noise, drawn in advance; None to draw it at each step."""
+    stages: Stages = STAGES
+
+
+class Layout(NamedTuple):
+    """Options of a control step that are not arrays; hashable."""
+
+    control: str
+    """"pid", "drive", "effort" or "custom"."""
+    law: PIDLaw | None = None
+    """Law of control "pid"."""
+    measures: bool = False
+    """Whether the law takes the joints' state from sensors."""
+    model: Model = Model()
+
+    def left(self, index: Any, end: Any, timestep: Any) -> Any:
+        """Return the time from the law's setpoint in sim step ``index`` to the end of a tick of ``end`` steps [s].
+
+        The explicit law takes its setpoint at the beginning of the step, the implicit law and drives at the end.
+        """
+        return (end - index - self.late) * timestep
+
+    @property
+    def late(self) -> int:
+        """1 if the law takes its setpoint at the end of a sim step, else 0."""
+        return int(self.control == "drive" or (self.law is not None and self.law.implicit))
