@@ -12,8 +12,10 @@ import batchpid as bp
 from batchpid.checks.validate import AxisKind, array, env_mask, integer, read_array, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
+from batchpid.sim.command import POSE_UNITS, TWIST_UNITS
+from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.faults import FARTHEST
+from batchpid.sim.loop.faults import FARTHEST, ORIGIN
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.robot.limits import SetpointCheck
 
@@ -81,6 +83,39 @@ class Arguments:
         chosen = np.ones(num_envs, bool) if mask is None else env_mask("mask", mask, num_envs)
         self._limits.check("qpos", self._robot.coupled(position), chosen, stacklevel=5)
         return position, velocity, chosen
+
+    def base(
+        self, pose: ArrayLike | None, twist: ArrayLike | None, qpos: NDArray[np.float64], mask: NDArray[np.bool_]
+    ) -> NDArray[np.float64] | None:
+        """Return poses and twists (envs, 13) of floating bases to reset to, at joint positions ``qpos``.
+
+        By default a base is at rest, upright, and so high that the robot's lowest point is on the ground.
+        """
+        robot, num_envs = self._robot, self._options.num_envs
+        if robot.fixed_base:
+            for name, value in (("base_pose", pose), ("base_twist", twist)):
+                if value is not None:
+                    remedy = "leave it out, or load the robot with fixed_base=False"
+                    raise InvalidArgumentError(name, "is for a floating base, and this one is fixed", remedy=remedy)
+            return None
+        rows = np.tile(ORIGIN, (num_envs, 1))
+        if twist is not None:
+            rows[:, 7:] = array("base_twist", twist, (num_envs, 6), tuple(TWIST_UNITS), kind="entry")
+        if pose is not None:
+            rows[:, :7] = array("base_pose", pose, (num_envs, 7), tuple(POSE_UNITS), kind="entry")
+            length = np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
+            if not length.all():
+                problem = f"env {int(np.flatnonzero(length == 0)[0])} has a quaternion of length 0"
+                raise InvalidArgumentError("base_pose", problem, remedy="give (w, x, y, z), (1, 0, 0, 0) upright")
+            rows[:, 3:7] /= length
+        elif self._options.ground:
+            heights: dict[bytes, float] = {}
+            for env in np.flatnonzero(mask).tolist():
+                key = qpos[env].tobytes()
+                if key not in heights:
+                    heights[key] = robot_model(robot).height(np.nan_to_num(qpos[env]), base_too=True)
+                rows[env, 2] = -heights[key] if np.isfinite(heights[key]) else 0.0
+        return rows
 
     def _check_acceleration(self, params: bp.PIDParams, given: Mapping[str, Any]) -> None:
         """Raise InvalidArgumentError for an acceleration that the law does not take."""

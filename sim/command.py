@@ -15,6 +15,8 @@ from batchpid.errors import InvalidArgumentError
 
 POSE_UNITS = {"x": "m", "y": "m", "z": "m", "qw": "", "qx": "", "qy": "", "qz": ""}
 """Names and units of the numbers in a pose: position and quaternion (w, x, y, z)."""
+TWIST_UNITS = {"vx": "m/s", "vy": "m/s", "vz": "m/s", "wx": "rad/s", "wy": "rad/s", "wz": "rad/s"}
+"""Names and units of the numbers in a twist: linear and angular velocity."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from batchpid.arrays.display import html_table, span
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
-from batchpid.sim.command import POSE_UNITS, CommandSpec, joint_command
+from batchpid.sim.command import POSE_UNITS, TWIST_UNITS, CommandSpec, joint_command
 
 _load_plot: list[Callable[[], Callable[..., Any]]] = []
 
@@ -38,6 +38,10 @@ class Quantity(NamedTuple):
     per_joint: bool = True
     columns: Mapping[str, str] = MappingProxyType({})
 
+    def shape(self, joints: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the shape of this quantity where that of a quantity per joint is ``joints`` (..., envs, dof)."""
+        return joints if self.per_joint else (*joints[:-1], *([len(self.columns)] if self.columns else ()))
+
     def unit_for(self, position: str) -> str:
         """Return the unit for a joint whose position is in ``position``, "rad" or "m"."""
         rotational, _, linear = self.unit.partition("|")
@@ -51,6 +55,10 @@ class Observation(NamedTuple):
     alone, since PhysX does not report drive efforts. ``ok`` is False for an env that failed in this tick, or that is
     suspended since an earlier one: see :attr:`batchpid.sim.Runner.faults`. ``tool_pose`` (envs, 7) is the pose of the
     tool at ``qpos``, where setpoints are poses: position [m] and unit quaternion (w, x, y, z); else None.
+
+    ``base_pose`` (envs, 7) is the pose of the robot's root link in the world, where the base floats, and ``base_twist``
+    (envs, 6) the velocity of that link's origin and its angular velocity [m/s, rad/s], along the axes of the world;
+    else None.
     """
 
     qpos: Annotated[Float32, Quantity(np.float32, "joint position", "rad|m")]
@@ -60,6 +68,10 @@ class Observation(NamedTuple):
     ok: Annotated[Bool, Quantity(np.bool_, "state is finite", per_joint=False)]
     guarded: Annotated[Bool, Quantity(np.bool_, "setpoint changed by the guard")]
     tool_pose: Annotated[Float32 | None, Quantity(np.float32, "pose of the tool", "m|1", False, POSE_UNITS)] = None
+    base_pose: Annotated[Float32 | None, Quantity(np.float32, "pose of the base", "m|1", False, POSE_UNITS)] = None
+    base_twist: Annotated[
+        Float32 | None, Quantity(np.float32, "twist of the base", "m/s|rad/s", False, TWIST_UNITS)
+    ] = None
 
     def for_envs(self, envs: slice | Any) -> Observation:
         """Return the observation of some envs (a slice or an index array)."""
@@ -81,18 +93,25 @@ class Observation(NamedTuple):
 
 
 _SEEN = {name: hint.__metadata__[0] for name, hint in get_type_hints(Observation, include_extras=True).items()}
-OPTIONAL = ("tool_pose",)
+OPTIONAL = ("tool_pose", "base_pose", "base_twist")
 """Fields of :class:`Observation` that may be None."""
 OBSERVED: dict[str, Quantity] = {name: quantity for name, quantity in _SEEN.items() if name not in OPTIONAL}
 """Quantity of each other field."""
+BASE: dict[str, Quantity] = {name: _SEEN[name] for name in ("base_pose", "base_twist")}
+"""Quantities of a floating base."""
 RECORDED = {"setpoint": Quantity(np.float64, "setpoint", "rad|m")} | _SEEN
 """Quantity of each array of a :class:`Rollout`, ``time`` aside."""
 
 
-def empty_observation(*shape: int) -> Observation:
+def observed_by_loop(fixed_base: bool) -> dict[str, Quantity]:
+    """Return the quantities that a loop observes, by name: :data:`OBSERVED`, and those of a floating base."""
+    return OBSERVED if fixed_base else OBSERVED | BASE
+
+
+def empty_observation(*shape: int, fixed_base: bool = True) -> Observation:
     """Return unset arrays for observations of ``shape`` (..., envs, dof)."""
-    fields = OBSERVED.values()
-    return Observation(*[np.empty(shape if each.per_joint else shape[:-1], each.dtype) for each in fields])
+    fields = observed_by_loop(fixed_base).items()
+    return Observation(**{name: np.empty(each.shape(shape), each.dtype) for name, each in fields})
 
 
 class Redraw(NamedTuple):
@@ -130,6 +149,8 @@ class RunInfo:
     """Source of joint friction and damping: "urdf" or "sapien"."""
     merge_fixed: bool | None = None
     """True if links that fixed joints connect were simulated as one."""
+    fixed_base: bool | None = None
+    """False if the base floats."""
     timestep: float | None = None
     """Time step of simulation and control [s]."""
     substeps: int | None = None
@@ -191,7 +212,8 @@ class RunInfo:
     @property
     def recorded(self) -> dict[str, Quantity]:
         """Quantities of :data:`RECORDED` that this run has."""
-        return {name: each for name, each in RECORDED.items() if name not in OPTIONAL or self.tool is not None}
+        lacking = {*(() if self.tool is not None else ("tool_pose",)), *(() if self.fixed_base is False else BASE)}
+        return {name: each for name, each in RECORDED.items() if name not in lacking}
 
     def units_of(self, name: str) -> tuple[str, ...]:
         """Return the unit of each column of the quantity ``name`` of :data:`RECORDED`; none if it has no columns."""

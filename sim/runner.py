@@ -93,6 +93,8 @@ class Runner(SingleOwner):
         mask: ArrayLike | None = None,
         *,
         seed: int | ArrayLike | None = None,
+        base_pose: ArrayLike | None = None,
+        base_twist: ArrayLike | None = None,
     ) -> Observation:
         """Place robots at ``qpos`` and ``qvel`` with a fresh controller state and zero effort.
 
@@ -106,6 +108,13 @@ class Runner(SingleOwner):
         seed
             Begin with the first episode of another stream of the randomization: an int s for stream s + k in env k, or
             one for each env. Default: draw for the next episode of each env's stream.
+        base_pose
+            Pose of a floating base, its root link, (7,) or (envs, 7): position [m] and quaternion (w, x, y, z). Default
+            upright above the origin, with the lowest point of the robot's collision shapes on the ground; without a
+            ground at the origin.
+        base_twist
+            Velocity of that link's origin and its angular velocity, along the axes of the world, (6,) or (envs, 6)
+            [m/s, rad/s]; default 0.
 
         Raises
         ------
@@ -113,7 +122,7 @@ class Runner(SingleOwner):
             The observation of a tick that was sent has not been received, as for :meth:`step`, :meth:`rollout` and
             :meth:`restore`.
         """
-        return self._session.reset(qpos, qvel, mask, seed)
+        return self._session.reset(qpos, qvel, mask, seed, base_pose, base_twist)
 
     def step(
         self,

@@ -27,7 +27,7 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.custom import initial_state
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
-from batchpid.sim.observation import OBSERVED, Observation, Rollout, RunInfo, empty_observation
+from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation, observed_by_loop
 from batchpid.sim.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.draws import NOTHING
 from batchpid.sim.robot.drive_chatter import DriveChatterCheck
@@ -134,6 +134,8 @@ class Session:
         qvel: ArrayLike | None = None,
         mask: ArrayLike | None = None,
         seed: int | ArrayLike | None = None,
+        base_pose: ArrayLike | None = None,
+        base_twist: ArrayLike | None = None,
     ) -> Observation:
         """Place robots, with a fresh state of the controller."""
         draws = self._transactions.ready("reset").draws
@@ -145,6 +147,7 @@ class Session:
         elif seed is not None:
             raise InvalidArgumentError("seed", "has no effect without a randomization", remedy="leave it out")
         position, velocity = robot.coupling.positions(position), robot.coupling.rates(velocity)
+        base = self._arguments.base(base_pose, base_twist, position, chosen)
 
         def commit(state: RunnerState, _: list[Any]) -> tuple[RunnerState, Observation]:
             faults, targets = state.faults.without(chosen).with_faults(self.pool.present), None
@@ -157,7 +160,7 @@ class Session:
                 motion = tuple(np.where(chosen[:, None], *rows) for rows in zip(motion, kept, strict=True))
             return state._replace(faults=faults, draws=draws, targets=targets, motion=motion), self._observation()
 
-        observation: Observation = self._execute(Reset(chosen, position, velocity, draws), commit)
+        observation: Observation = self._execute(Reset(chosen, position, velocity, draws, base), commit)
         return observation
 
     def step(
@@ -228,7 +231,8 @@ class Session:
             self._transactions.state.params, setpoints, setpoint_rates, setpoint_accelerations, feedforwards
         )
         ticks = len(command.setpoint)
-        seen = empty_observation(ticks, options.num_envs, options.robot.dof)
+        robot = options.robot
+        seen = empty_observation(ticks, options.num_envs, robot.dof, fixed_base=robot.fixed_base)
         times = (steps + options.substeps * np.arange(1.0, ticks + 1)) * options.timestep
         info, done = replace(self.info(), rates=command.setpoint_rate is not None), 0
         shown = iter(range(ticks) if progress is None else progress(range(ticks)))
@@ -240,7 +244,7 @@ class Session:
                 rows_of_part = command.map(lambda rows, part=part: rows[part])
                 self._transactions.run(*self._ticks(rows_of_part, options.substeps))
                 self._warn(stacklevel=4)
-                for name in OBSERVED:
+                for name in observed_by_loop(robot.fixed_base):
                     getattr(seen, name)[part] = getattr(self.pool.arrays.observation, name)[: done - tick]
         next(shown, None)  # the end
         if self._tool_pose is not None:

@@ -24,6 +24,12 @@ def rotate(q: NDArray[Any], v: NDArray[Any]) -> NDArray[Any]:
     return v + w * t + np.cross(u, t)
 
 
+def placed(base: NDArray[Any], poses: NDArray[Any]) -> NDArray[Any]:
+    """Return poses (..., 7) that are given in the frame of ``base`` (..., 7), in the frame of that one."""
+    position = base[..., :3] + rotate(base[..., 3:], poses[..., :3])
+    return np.concatenate([position, multiply(base[..., 3:], poses[..., 3:])], axis=-1)
+
+
 def about(axis: NDArray[Any], angle: NDArray[Any]) -> NDArray[Any]:
     """Return the rotations (..., 4) by ``angle`` (...) [rad] about a unit ``axis`` (3,)."""
     half = np.asarray(angle) / 2

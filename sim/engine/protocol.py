@@ -94,8 +94,18 @@ class EnginePack(Protocol):
         A non-finite state raises no error: the loop detects it in its next reading.
         """
 
-    def write_state(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
-        """Set positions and velocities (len(rows), dof) of the envs ``rows``, zero efforts, and the root at the origin.
+    def read_base(self) -> Float64:
+        """Return pose and twist of floating bases in the world (M, 13), a new array: those of the root link's origin.
+
+        Position [m], quaternion (w, x, y, z), linear and angular velocity [m/s, rad/s].
+        """
+
+    def write_state(
+        self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], base: Float64 | None = None
+    ) -> None:
+        """Set positions and velocities (len(rows), dof) of the envs ``rows``, and zero efforts.
+
+        A floating base is placed at ``base`` (len(rows), 13), as :meth:`read_base` returns it; None is the origin.
 
         Content of these envs returns to its start. An env whose state was not finite can be used again.
         """

@@ -138,8 +138,12 @@ class EnvGroup:
         self._state = self._state._replace(motors=motors)
         return actuators
 
-    def reset(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64, steps: int) -> None:
+    def reset(
+        self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64, steps: int, base: Float64 | None = None
+    ) -> None:
         """Place the envs of ``mask`` (M,), with a fresh controller state, after ``steps`` sim steps.
+
+        Floating bases are placed at ``base`` (M, 13).
 
         An env whose ``qpos`` or ``qvel`` (M, dof) is not finite returns to its last start, and has failed.
         """
@@ -149,6 +153,8 @@ class EnvGroup:
         bad = {cause: mask[:, None] & ~np.isfinite(rows) for cause, rows in (("qpos", qpos), ("qvel", qvel))}
         good = mask & ~(bad["qpos"] | bad["qvel"]).any(1)
         containment.start_qpos[good], containment.start_qvel[good] = qpos[good], qvel[good]
+        if base is not None:
+            containment.start_base[good] = base[good]
         self._place(mask, containment.start_qpos, containment.start_qvel)
         for cause, entries in bad.items():
             containment.fail(entries, cause, steps, containment.start_qpos)
@@ -165,7 +171,7 @@ class EnvGroup:
         self._steps = steps
         if containment.suspended.any() or not finite(*command):
             command = self._without_faults(command)
-        elif self._contacts is None:
+        elif self._contacts is None and self.pack.spec.fixed_base:
             fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
             table = Table(ticks.arrays, Shown(self._motor, self._saturated, self._guarded, fault))
         tick, done = self._execute(command, Span(first, 0, until, substeps), table)
@@ -176,7 +182,7 @@ class EnvGroup:
                 command = ticks[tick].command.with_only(given)
             _, done = self._execute(command, Span(tick, done, tick + 1, substeps), None)
         with np.errstate(all="ignore"):
-            if not (near(self._qpos) and finite(self.pack.read_qvel())):
+            if not (near(self._qpos) and finite(self.pack.read_qvel()) and self._base_is_near()):
                 self._contain(self._qpos, substeps, None)
         if self._contacts is not None:
             self._contacts.look(self._qpos, self._steps + substeps, containment.missed_contact)
@@ -197,6 +203,9 @@ class EnvGroup:
                 self._contain(rows(ran.before), ran.done, ran.outputs.returned)
         return ran.tick, ran.done
 
+    def _base_is_near(self) -> bool:
+        return self.pack.spec.fixed_base or near(self.pack.read_base())
+
     def _mask(self, array: Any) -> Any:
         return False if array is None else self._executor.rows(array)
 
@@ -209,6 +218,8 @@ class EnvGroup:
         observation.saturated[...] = self._saturated
         observation.guarded[...] = self._guarded
         observation.ok[...] = ~containment.failed
+        if observation.base_pose is not None and observation.base_twist is not None:
+            observation.base_pose[...], observation.base_twist[...] = np.split(self.pack.read_base(), [7], axis=1)
         fault = rows.fault
         fault.step[...], fault.joint[...], fault.cause[...] = containment.step, containment.joint, containment.cause
         fault.missed_contact[...] = containment.missed_contact
@@ -217,6 +228,8 @@ class EnvGroup:
             observation.qpos[envs] = containment.suspended_qpos[envs]
             observation.qvel[envs] = observation.effort[envs] = 0
             observation.saturated[envs] = observation.guarded[envs] = False
+            if observation.base_twist is not None:
+                observation.base_twist[envs] = 0
 
     def read(self) -> EnvStates:
         """Return the state of these envs, physics and controller."""
@@ -281,6 +294,8 @@ class EnvGroup:
         containment, step = self._containment, self._steps + done
         qpos, qvel = self.pack.read_qpos(), self.pack.read_qvel()
         bad = far(qpos) | ~np.isfinite(qvel)
+        if not self.pack.spec.fixed_base:
+            bad |= far(self.pack.read_base()).any(1, keepdims=True)
         # One step after a NaN effort at one joint, all joints are NaN. The effort shows the first joint.
         failed = bad.any(1, keepdims=True)
         source = ~np.isfinite(self.pack.qf) & failed
@@ -320,7 +335,8 @@ class EnvGroup:
     def _place(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64) -> None:
         """Place the envs of ``mask`` (M,), and restart their control."""
         rows, pack, state = np.flatnonzero(mask), self.pack, self._take_state()
-        pack.write_state(rows.tolist(), qpos[rows], qvel[rows])
+        base = None if pack.spec.fixed_base else self._containment.start_base[rows]
+        pack.write_state(rows.tolist(), qpos[rows], qvel[rows], base)
         pack.suspend(self._containment.suspended)
         self._motor[mask], self._saturated[mask], self._guarded[mask] = 0.0, False, False
         self._measured = self._executor.measure()

@@ -33,6 +33,8 @@ appended at the end.
 COMMAND_CAUSES = ("setpoint", "setpoint_rate", "setpoint_acceleration")
 """Causes in an entry of the command, which need not be a joint."""
 
+ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
+"""Pose and twist (13,) of a base at rest at the origin."""
 LONGEST = 10_000
 """Largest number of faults in a log."""
 
@@ -127,6 +129,8 @@ class FaultContainment:
         Envs that are suspended, and those that failed in this tick or are suspended (M,).
     start_qpos, start_qvel, suspended_qpos
         State to which each env is reset, and pose in which it is suspended (M, dof).
+    start_base
+        Pose and twist of the base (M, 13) to which each env is reset, and where it is suspended; unused on fixed ones.
     step, joint, cause
         Last fault of each env (M,): sim step (-1: none), joint, and index into :data:`CAUSES`.
     missed_contact
@@ -134,7 +138,7 @@ class FaultContainment:
     """
 
     _STATE = (
-        *("suspended", "failed", "start_qpos", "start_qvel", "suspended_qpos"),
+        *("suspended", "failed", "start_qpos", "start_qvel", "start_base", "suspended_qpos"),
         *("step", "joint", "cause", "missed_contact"),
     )
 
@@ -142,6 +146,7 @@ class FaultContainment:
         self.suspends = action == "hold"
         self.suspended, self.failed, self._unplaced = (np.zeros(size, bool) for _ in range(3))
         self.start_qpos, self.start_qvel, self.suspended_qpos = (np.zeros((size, dof)) for _ in range(3))
+        self.start_base = np.tile(ORIGIN, (size, 1))
         self.step = np.full(size, -1)
         self.joint, self.cause, self.missed_contact = (np.zeros(size, int) for _ in range(3))
 

@@ -74,15 +74,22 @@ class Loop:
         )
 
     def reset(
-        self, mask: NDArray[np.bool_], qpos: NDArray[np.float64], qvel: NDArray[np.float64], draws: Draws = NOTHING
+        self,
+        mask: NDArray[np.bool_],
+        qpos: NDArray[np.float64],
+        qvel: NDArray[np.float64],
+        draws: Draws = NOTHING,
+        base: NDArray[np.float64] | None = None,
     ) -> None:
         """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh controller state.
 
+        Floating bases are placed at ``base`` (envs, 13): pose and twist. None is the origin.
         ``draws`` apply to all envs from now on; they differ from the previous draws in these envs alone.
         """
         for group, ticks in zip(self.groups, self._group_ticks, strict=True):
             group.draws = draws.for_envs(group.envs)
-            group.reset(mask[group.envs], qpos[group.envs], qvel[group.envs], self._steps)
+            own = None if base is None else base[group.envs]
+            group.reset(mask[group.envs], qpos[group.envs], qvel[group.envs], self._steps, own)
             group.observe(ticks[0])
 
     def set_params(self, params: bp.PIDParams) -> None:

@@ -26,7 +26,7 @@ from batchpid.io.files import write_atomically
 from batchpid.io.npz import read_npz
 from batchpid.motors.friction import FrictionState
 from batchpid.motors.guard import GuardState
-from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, FaultContainment
+from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, ORIGIN, FaultContainment
 from batchpid.sim.loop.tables import flatten, nest, widen
 
 EPISODE = "episode"
@@ -35,9 +35,9 @@ CHANGED = "changed"
 """Name of the setpoints that the guard changed in the last sim step."""
 AGE = "age"
 """Name of the sim steps since the friction model of an env took its inertia (envs,)."""
-_FORMAT = 11
-_WITH_ISOLATION = 10
-"""Earlier format, in which the state of a robot in SAPIEN had one more value, after 2 dof + 13 others."""
+_FORMAT = 12
+_AT_ORIGIN, _WITH_ISOLATION = 11, 10
+"""Earlier formats: robots began at the origin; the state of a robot in SAPIEN had one more value, after 2 dof + 13."""
 _DIGITS = 64
 """Length of a digest."""
 _ACTUATORS = "actuator_params"
@@ -234,13 +234,15 @@ class Snapshot:
     def _read(cls, tables: dict[str, NDArray[Any]]) -> Snapshot:
         """Return the snapshot in the arrays of a file, if they agree with each other."""
         head = json.loads(str(tables.pop("head")))
-        if head["format"] not in (_FORMAT, _WITH_ISOLATION):
+        if head["format"] not in (_FORMAT, _AT_ORIGIN, _WITH_ISOLATION):
             raise ValueError(f"format {head['format']}, not {_FORMAT}")
         about, steps, choices = head["about"], head["steps"], head["markers"]
         num_envs = integer("num_envs", about["num_envs"], 1, 2**31)
         dof, steps = len(names("joints", about["joints"])), integer("steps", steps, 0, 2**62)
         if head["format"] == _WITH_ISOLATION and about["engine"] == "sapien":
             tables["engine"] = np.delete(tables["engine"], 2 * dof + 13, axis=1)
+        if head["format"] in (_AT_ORIGIN, _WITH_ISOLATION):
+            tables["containment.start_base"] = np.tile(ORIGIN, (num_envs, 1))
         episodes = tables.pop("episodes", None)
         if (about.get("randomization") is None) != (episodes is None):
             raise ValueError("its episodes do not fit its randomization")

@@ -43,8 +43,10 @@ def to_dataset(rollout: Rollout) -> xarray.Dataset:
         }
     elif info.control == "effort":
         units["setpoint"] = units["effort"]
-    if "tool_pose" in quantities:
-        columns["tool_pose"], entries["pose"] = ("pose",), list(quantities["tool_pose"].columns)
+    for name, quantity in quantities.items():
+        if quantity.columns:
+            part = name.rpartition("_")[2]  # "pose" or "twist"
+            columns[name], entries[part] = (part,), list(quantity.columns)
     return xarray.Dataset(
         {
             name: (

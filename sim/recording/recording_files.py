@@ -152,8 +152,8 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1, max_bytes: i
         raise
     except Exception as error:  # a damaged file can make the libraries raise anything
         raise RecordingError(f"{path}: cannot be read as a recording: {error or type(error).__name__}") from error
-    time, setpoint, *seen = arrays.values()
-    return Rollout(time, setpoint, Observation(*seen), tick * every, info)
+    time, setpoint = (arrays.pop(name) for name in ("time", "setpoint"))
+    return Rollout(time, setpoint, Observation(**arrays), tick * every, info)
 
 
 def check_path(path: str | os.PathLike[str], suffixes: tuple[str, ...], *, overwrite: bool) -> Path:
@@ -272,7 +272,7 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
         **dict.fromkeys(("lower", "upper", "effort_limit", "start", "episodes"), _numbers),
         "timestep": float,
         "substeps": int,
-        **dict.fromkeys(("complete", "merge_fixed", "collisions", "ground", "rates"), bool),
+        **dict.fromkeys(("complete", "merge_fixed", "fixed_base", "collisions", "ground", "rates"), bool),
         "params": lambda text: bp.loads_params(str(text), names)[0],
         "actuators": lambda text: bp.motors.loads_actuators(str(text), names)[0],
         "seed": lambda value: None if str(value) == "none" else int(value),

@@ -230,7 +230,10 @@ class RobotDescription(Urdf):
 
     def run_info(self, **options: Any) -> RunInfo:
         """Return the info of a run of this robot; ``options`` are further fields of :class:`batchpid.sim.RunInfo`."""
-        shared = ("joint_names", "units", "lower", "upper", "effort_limit", "urdf", "dissipation", "merge_fixed")
+        shared = (
+            *("joint_names", "units", "lower", "upper", "effort_limit"),
+            *("urdf", "dissipation", "merge_fixed", "fixed_base"),
+        )
         return RunInfo(robot=self.name, **{name: getattr(self, name) for name in shared}, **options)
 
     def sample(self, count: int, seed: int = 0) -> Float64:

@@ -74,7 +74,7 @@ def write_film(
 
     def pictures() -> Iterable[NDArray[np.uint8]]:
         for row in rows if progress is None else progress(rows):
-            scene.place(rollout.qpos[row])
+            scene.place(rollout.qpos[row], None if rollout.base_pose is None else rollout.base_pose[row])
             yield picture()
 
     try:
@@ -162,7 +162,8 @@ def show_window(rollout: Rollout, *, robot: Robot | None = None, seconds: float 
     began, duration = time.monotonic(), float(rollout.time[-1] - rollout.time[0])
     while not viewer.closed and (seconds is None or time.monotonic() - began < seconds):
         elapsed = (time.monotonic() - began) % (duration + 1.0)  # a pause of 1 s
-        scene.place(rollout.qpos[rows_at(rollout, elapsed)])
+        row = rows_at(rollout, elapsed)
+        scene.place(rollout.qpos[row], None if rollout.base_pose is None else rollout.base_pose[row])
         viewer.render()
     viewer.close()
 

@@ -120,7 +120,7 @@ class RenderScene:
             self._articulations = [loader.load(path) for _ in layout.positions]
         for articulation, position in zip(self._articulations, layout.positions, strict=True):
             articulation.set_root_pose(sapien.Pose(position))
-        self._content: list[Any] = []
+        self._positions, self._content = layout.positions, list[Any]()
 
     def add_camera(self, width: int, height: int) -> Callable[[], NDArray[np.uint8]]:
         """Return a function that returns the present picture (height, width, 3) in RGB."""
@@ -146,9 +146,15 @@ class RenderScene:
             if not isinstance(entity, str) and np.isfinite(pose).all():
                 entity.set_pose(sapien.Pose(pose[:3], pose[3:]))
 
-    def place(self, qpos: NDArray[Any]) -> None:
-        """Set the joint positions (envs, dof) [rad or m]; a robot with a non-finite one keeps its pose."""
-        for articulation, row in zip(self._articulations, qpos, strict=True):
+    def place(self, qpos: NDArray[Any], base_pose: NDArray[Any] | None = None) -> None:
+        """Set the joint positions (envs, dof) [rad or m], and poses of floating bases (envs, 7).
+
+        A robot with a number that is not finite keeps its pose.
+        """
+        for env, (articulation, row) in enumerate(zip(self._articulations, qpos, strict=True)):
             if np.isfinite(row).all():
                 articulation.set_qpos(row)
+            if base_pose is not None and np.isfinite(base_pose[env]).all():
+                pose = base_pose[env]
+                articulation.set_root_pose(sapien.Pose(self._positions[env] + pose[:3], pose[3:]))
         self.scene.update_render()

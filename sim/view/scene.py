@@ -17,6 +17,7 @@ from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.shapes import Surface, surfaces
 from batchpid.sim.view.layout import FIELD_OF_VIEW, TILE, RobotLayout, arrange_robots
+from batchpid.task_space.rotations import placed
 
 Float64 = NDArray[np.float64]
 
@@ -65,7 +66,8 @@ class RobotScene:
         """Place every robot, the ring under the selected one, and its setpoint if that is shown and is a pose."""
         positions, ok = self.layout.positions, frame.ok[0]
         with self._server.atomic():
-            self._place(self._robots, frame.qpos[0], positions)
+            base = None if frame.base_pose is None else frame.base_pose[0]
+            self._place(self._robots, frame.qpos[0], positions, base)
             if (ok != self._ok).any():
                 self._ok = ok
                 for node, colours in zip(self._robots, self._colours, strict=True):
@@ -78,7 +80,8 @@ class RobotScene:
                 for node in self._setpoints:
                     node.visible = show_setpoint
                 if show_setpoint:
-                    self._place(self._setpoints, setpoint[None], positions[selected][None])
+                    own = None if base is None else base[[selected]]
+                    self._place(self._setpoints, setpoint[None], positions[selected][None], own)
 
     def on_click(self, select: Callable[[Any], None]) -> None:
         """Call ``select(robot)`` when a robot is clicked, with the number that the page sent."""
@@ -100,8 +103,10 @@ class RobotScene:
             **options,
         )
 
-    def _place(self, nodes: list[Any], qpos: NDArray[Any], positions: Float64) -> None:
+    def _place(self, nodes: list[Any], qpos: NDArray[Any], positions: Float64, base: NDArray[Any] | None) -> None:
         poses = ts.link_poses(self._tree, qpos)
+        if base is not None:
+            poses = placed(base.astype(np.float64)[:, None], poses)
         position, wxyz = (poses[..., :3] + positions[:, None]).astype(np.float32), poses[..., 3:].astype(np.float32)
         for node, link in zip(nodes, self._links, strict=True):
             node.batched_positions = np.ascontiguousarray(position[:, link])

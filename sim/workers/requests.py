@@ -45,8 +45,13 @@ class Request(ABC):
 
     def for_envs(self, envs: slice) -> Self:
         """Return the part of some envs, of fields that are arrays (envs, ...) or have such a method."""
-        parts = (value.for_envs(envs) if hasattr(value, "for_envs") else value[envs] for value in vars(self).values())
-        return type(self)(*parts)
+
+        def part(value: Any) -> Any:
+            if value is None:
+                return None
+            return value.for_envs(envs) if hasattr(value, "for_envs") else value[envs]
+
+        return type(self)(*map(part, vars(self).values()))
 
     def copy(self) -> Self:
         """Return a copy that later writes to the caller's arrays do not change."""
@@ -108,16 +113,17 @@ class Start(Request):
 
 @dataclass(frozen=True)
 class Reset(Request):
-    """Place the envs of ``mask`` (envs,) at ``qpos`` and ``qvel`` (envs, dof)."""
+    """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), floating bases at ``base`` (envs, 13)."""
 
     mask: NDArray[np.bool_]
     qpos: NDArray[np.float64]
     qvel: NDArray[np.float64]
     draws: Draws = NOTHING
+    base: NDArray[np.float64] | None = None
     observed_tick = 0
 
     def apply(self, loop: Loop) -> None:
-        loop.reset(self.mask, self.qpos, self.qvel, self.draws)
+        loop.reset(self.mask, self.qpos, self.qvel, self.draws, self.base)
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from batchpid.sim.engine.robot_model import passive_force, scene_tree
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation, varied_inertia
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.simulated_links import varied_bodies
+from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.spatial_inertia import spatial_matrix, total
 
@@ -246,15 +247,25 @@ class MujocoPack(SingleOwner):
 
     # -- changes -----------------------------------------------------------------------------------------------
 
-    def write_state(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
-        """Place robots ``rows``: positions and velocities (len(rows), dof), zero efforts, the root at the origin."""
-        everyone = self._data
-        for row, position, velocity in zip(rows, qpos, qvel, strict=True):
+    def read_base(self) -> Float64:
+        """Return pose and twist of floating bases (M, 13), as :class:`batchpid.sim.engine.protocol.EnginePack` says."""
+        rows = np.array([np.concatenate([data.qpos[: FLOATING + 1], data.qvel[:FLOATING]]) for data in self._data])
+        rows[:, 10:] = np.einsum("eij,ej->ei", matrix_of(rows[:, 3:7]), rows[:, 10:])  # MuJoCo's are in the body's axes
+        return rows
+
+    def write_state(
+        self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], base: Float64 | None = None
+    ) -> None:
+        """Place robots ``rows``: positions and velocities (len(rows), dof), zero efforts, the root at ``base``."""
+        everyone, floats = self._data, not self.spec.fixed_base
+        bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else base.copy()
+        bases[:, 10:] = np.einsum("eji,ej->ei", matrix_of(bases[:, 3:7]), bases[:, 10:])
+        for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
             data = everyone[row]
             ctrl = data.ctrl.copy()
             mujoco.mj_resetData(self.models[row], data)
-            if not self.spec.fixed_base:
-                data.qpos[: FLOATING + 1] = _ORIGIN
+            if floats:
+                data.qpos[: FLOATING + 1], data.qvel[:FLOATING] = np.split(root, [FLOATING + 1])
             data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = position, velocity
             data.ctrl[:] = ctrl
             self.qf[row] = 0.0
@@ -394,7 +405,7 @@ class MujocoPack(SingleOwner):
             self.__dict__.pop(name, None)
 
 
-_ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+_ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
 
 
 def _columns(indices: NDArray[np.intp]) -> Any:

@@ -33,6 +33,7 @@ from batchpid.sim.engine.sapien.sim_step import NativeStep
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, refuse_shapes, write_root
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
+from batchpid.task_space.frames import matrix_of
 
 _ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
 
@@ -209,11 +210,27 @@ class Pack(SingleOwner):
         if self._constraint is None:
             self._calls.write_qf()
 
-    def write_state(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any]) -> None:
-        """Place robots ``rows``: positions and velocities (len(rows), dof), the root at the origin; their efforts
-        become zero, and the content of their scenes is reset.
+    def read_base(self) -> Float64:
+        return self._moved_to_origin(np.array([read_root(robot) for robot in self.robots], np.float64), -1.0)
+
+    def _moved_to_origin(self, roots: Float64, sign: float) -> Float64:
+        """Return ``roots`` (n, 13) with the velocity of the link's origin for that of its center of mass, or back.
+
+        PhysX gives the velocity of the center of mass c: v_c = v + w x (R c), subtracted with ``sign`` -1.
         """
-        self._place(rows, qpos, qvel, np.tile(_ORIGIN, (len(rows), 1)))
+        center = np.asarray(self.robots[0].links[0].cmass_local_pose.p, np.float64)
+        arm = matrix_of(roots[:, 3:7]) @ center
+        velocity = roots[:, 7:10] + sign * np.cross(roots[:, 10:], arm)
+        return np.concatenate([roots[:, :7], velocity, roots[:, 10:]], axis=1)
+
+    def write_state(
+        self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], base: Float64 | None = None
+    ) -> None:
+        """Place robots ``rows``: positions and velocities (len(rows), dof), the root at ``base``; their efforts become
+        zero, and the content of their scenes is reset.
+        """
+        bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else self._moved_to_origin(base, 1.0)
+        self._place(rows, qpos, qvel, bases.astype(np.float32))
         self.update_constraint(list(rows))  # within a tick, the robots may have failed
 
     def _place(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], roots: Float32) -> None:

@@ -102,7 +102,7 @@ class DoubleIntegrators:
         qvel += self.spec.timestep * self._moves * self.qf
         qpos += self.spec.timestep * qvel
 
-    def write_state(self, rows, qpos, qvel):
+    def write_state(self, rows, qpos, qvel, base=None):
         self._state[0, rows], self._state[1, rows], self.qf[rows] = qpos, qvel, 0.0
 
     def suspend(self, mask):

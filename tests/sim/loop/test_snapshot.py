@@ -174,7 +174,7 @@ def test_a_snapshot_of_another_build_is_refused(panda, builds):
 
 
 BROKEN = {
-    "an older format": (lambda head, tables: head.update(format=2), "cannot be read as a snapshot: format 2, not 11"),
+    "an older format": (lambda head, tables: head.update(format=2), "cannot be read as a snapshot: format 2, not 12"),
     "about": (lambda head, tables: head.update(about=[]), "cannot be read"),
     "steps": (lambda head, tables: head.update(steps=-1), "cannot be read"),
     "a marker": (lambda head, tables: head.update(markers={"anti_windup": "Evil"}), "cannot be read"),

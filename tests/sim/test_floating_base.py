@@ -1,0 +1,179 @@
+"""Robots with a floating base: its pose and twist in observations, resets, recordings and snapshots."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from identical import assert_identical
+
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim import Randomization, Recorder, Robot, Runner, Uniform, read_recording, write_recording
+
+GRAVITY = 9.81
+LEG = """
+  <link name="foot{0}"><inertial><origin xyz="0 0 -0.15"/><mass value="0.3"/>
+    <inertia ixx="2e-3" iyy="2e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin xyz="0 0 -0.15"/><geometry><box size="0.06 0.06 0.3"/></geometry></collision></link>
+  <joint name="leg{0}" type="prismatic"><parent link="trunk"/><child link="foot{0}"/><origin xyz="{1} {2} -0.05"/>
+    <axis xyz="0 0 1"/><limit lower="-0.1" upper="0.1" effort="200" velocity="5"/></joint>"""
+PLACES = ((0.2, 0.15), (0.2, -0.15), (-0.2, 0.15), (-0.2, -0.15))
+TABLE = f"""<robot name="table">
+  <link name="trunk"><inertial><origin xyz="0.02 0 0.01"/><mass value="10"/>
+    <inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><box size="0.5 0.3 0.1"/></geometry></collision></link>
+  {"".join(LEG.format(number, *place) for number, place in enumerate(PLACES))}
+</robot>"""
+GAINS = {"gain_units": "effort", "kp": 2e4, "ki": 0.0, "kd": 400.0}
+
+
+@pytest.fixture
+def quadruped(tmp_path):
+    """A trunk of 10 kg on four legs that slide, each with a mass of 0.3 kg."""
+    path = tmp_path / "table.urdf"
+    path.write_text(TABLE)
+    return Robot.load(path, fixed_base=False)
+
+
+@pytest.fixture(params=["sapien", "mujoco"])
+def engine(request):
+    return request.param
+
+
+def test_it_starts_on_the_ground_and_stands(quadruped, engine):
+    with Runner(quadruped, 2, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:
+        start = runner.observe()
+        np.testing.assert_allclose(start.base_pose, np.tile([0, 0, 0.35, 1, 0, 0, 0], (2, 1)), atol=1e-6)
+        rollout = runner.rollout(np.tile(quadruped.start, (50, 1)))
+    weight = (10.0 + 4 * 0.3) * GRAVITY
+    pressed = -rollout.effort[-1] + 0.3 * GRAVITY  # of each leg on the ground
+    np.testing.assert_allclose(pressed.sum(1), weight, rtol=0.01)
+    assert np.abs(rollout.base_twist[-1]).max() < 0.01
+    np.testing.assert_allclose(rollout.base_pose[-1, :, 2], 0.35, atol=5e-3)
+
+
+def test_a_pose_of_the_legs_sets_the_height(quadruped, engine):
+    poses = np.stack([np.full(4, -0.05), np.full(4, 0.08)])
+    with Runner(quadruped, 2, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:
+        heights = runner.reset(qpos=poses).base_pose[:, 2]
+        np.testing.assert_allclose(heights, [0.40, 0.27], atol=1e-6)
+        part = runner.reset(qpos=poses[::-1], mask=np.array([True, False])).base_pose[:, 2]
+        np.testing.assert_allclose(part, [0.27, 0.27], atol=1e-6)
+        given = np.array([[0.1, 0.2, 3.0, 2.0, 0, 0, 0], [0, 0, 1.0, 0, 0, 0, -1.0]])
+        found = runner.reset(base_pose=given).base_pose
+        np.testing.assert_allclose(found[:, 3:], [[1, 0, 0, 0], [0, 0, 0, -1]], atol=1e-6)
+        np.testing.assert_allclose(found[:, :3], given[:, :3], atol=1e-6)
+    with Runner(quadruped, 1, params=quadruped.params(**GAINS), workers=0, engine=engine, ground=False) as runner:
+        np.testing.assert_allclose(runner.observe().base_pose[0, :3], 0, atol=1e-7)
+
+
+def test_the_twist_is_that_of_the_root_link_in_the_world(quadruped, engine):
+    """In free flight its center of mass moves on a parabola; the origin of the trunk turns about it."""
+    pose, twist = [0, 0, 0, 0.8, 0.6, 0, 0], [1.0, 0, 0, 2.0, 4.0, 8.0]
+    options = {"workers": 0, "engine": engine, "compensate": "none", "substeps": 1, "control": "effort"}
+    options["ground"] = False
+    with Runner(quadruped, 1, **options) as runner:
+        begin = runner.reset(base_pose=pose, base_twist=twist)
+        np.testing.assert_allclose(begin.base_twist[0], twist, atol=1e-5)
+        flight = runner.rollout(np.zeros((40, 4)))
+    moved = np.diff(flight.base_pose[:, 0, :3].astype(float), axis=0) * 2000
+    middle = 0.5 * (flight.base_twist[1:, 0, :3] + flight.base_twist[:-1, 0, :3])
+    np.testing.assert_allclose(moved, middle, atol=5e-3)
+    assert np.abs(np.ptp(flight.base_twist[:, 0, :3], axis=0)).min() > 0.01
+    rates = np.diff(flight.base_pose[:, 0, 3:].astype(float), axis=0) * 2000  # dq/dt = w q / 2
+    w, x, y, z = flight.base_pose[:-1, 0, 3:].T.astype(float)
+    wx, wy, wz = flight.base_twist[:-1, 0, 3:].T.astype(float)
+    np.testing.assert_allclose(rates[:, 0], -0.5 * (wx * x + wy * y + wz * z), atol=0.01)
+    np.testing.assert_allclose(rates[:, 1], 0.5 * (wx * w + wy * z - wz * y), atol=0.01)
+
+
+def test_the_base_is_that_of_the_engine(quadruped, engine):
+    with Runner(quadruped, 1, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:
+        runner.reset(base_pose=[0, 0, 0.5, 0.9, 0.1, 0.3, 0.2], base_twist=[0.3, 0.1, 0, 0, 1, 0])
+        seen = runner.step(quadruped.start)
+        pack = runner._session.pool.workers[0]._loop.groups[0].pack
+        if engine == "mujoco":
+            data, velocity = pack._data[0], np.zeros(6)
+            mujoco.mj_objectVelocity(pack.models[0], data, mujoco.mjtObj.mjOBJ_XBODY, 1, velocity, 0)
+            pose, twist = data.qpos[:7], [*velocity[3:], *velocity[:3]]
+            np.testing.assert_allclose(seen.base_twist[0, :3], data.qvel[:3], atol=1e-6)
+        else:
+            robot = pack.robots[0]
+            pose, twist = [*robot.get_root_pose().p, *robot.get_root_pose().q], None
+            np.testing.assert_allclose(seen.base_twist[0, 3:], robot.get_root_angular_velocity(), atol=1e-6)
+        np.testing.assert_allclose(seen.base_pose[0], pose, atol=1e-6)
+        if twist is not None:
+            np.testing.assert_allclose(seen.base_twist[0, 3:], twist[3:], atol=1e-6)
+
+
+def test_it_is_recorded_and_goes_on_from_a_snapshot(quadruped, engine, tmp_path):
+    table = quadruped.start + 0.02 * np.sin(np.arange(12.0))[:, None]
+    with Runner(quadruped, 2, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:
+        with Recorder(tmp_path / "run.h5", runner):
+            runner.rollout(table[:6])
+        kept = runner.snapshot()
+        first = runner.rollout(table[6:])
+        runner.restore(kept)
+        assert_identical(first, runner.rollout(table[6:]))
+    assert first.info.fixed_base is False
+    recording = read_recording(tmp_path / "run.h5")
+    assert recording.base_pose.shape == (6, 2, 7)
+    assert np.ptp(recording.base_pose[..., 2]) > 1e-4
+    write_recording(first, tmp_path / "run.npz")
+    again = read_recording(tmp_path / "run.npz")
+    np.testing.assert_array_equal(again.base_twist, first.base_twist)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_falls_are_the_same_for_any_number_of_workers(quadruped, engine, workers):
+    options = {
+        "engine": engine,
+        "params": quadruped.params(**GAINS),
+        "randomization": Randomization(link_mass=Uniform(0.8, 1.2)),
+    }
+    runs = []
+    for count in (0, workers):
+        with Runner(quadruped, 5, workers=count, **options) as runner:
+            runner.reset(base_pose=[0, 0, 0.6, 0.9, 0.3, 0.2, 0.1], base_twist=[0.5, 0, 0, 0, 2.0, 0], seed=3)
+            runs.append(runner.rollout(np.tile(quadruped.start, (40, 1))))
+    assert_identical(*runs)
+    np.testing.assert_array_equal(runs[0].base_pose, runs[1].base_pose)
+    assert np.ptp(runs[0].base_pose[-1], axis=0).max() > 1e-4
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
+def test_an_env_that_fails_is_placed_where_it_began(quadruped, engine):
+    options = {"params": quadruped.params(**GAINS), "workers": 0, "engine": engine, "on_invalid_input": "contain"}
+    with Runner(quadruped, 2, on_fault="reset", **options) as runner:
+        runner.reset(base_pose=[0, 0, 0.36, 1, 0, 0, 0])
+        bad = np.tile(quadruped.start, (2, 1))
+        runner.step(bad)
+        bad[0] = np.nan
+        seen = runner.step(bad)
+    assert seen.ok.tolist() == [False, True]
+    assert abs(seen.base_pose[0, 2] - 0.36) < 5e-3
+    assert np.isfinite(seen.base_twist).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"base_pose": np.zeros(7)}, "base_pose.*quaternion of length 0"),
+        ({"base_pose": np.zeros(3)}, "base_pose"),
+        ({"base_twist": [0, 0, np.nan, 0, 0, 0]}, "base_twist.*'vz'"),
+    ],
+    ids=str,
+)
+def test_a_wrong_base_is_refused(quadruped, options, text):
+    with Runner(quadruped, 1, params=quadruped.params(**GAINS), workers=0, engine="mujoco") as runner:
+        before = runner.observe()
+        with pytest.raises(InvalidArgumentError, match=text):
+            runner.reset(**options)
+        assert_identical(before, runner.observe())
+
+
+def test_a_fixed_base_has_no_pose(panda):
+    with Runner(panda, 1, workers=0, engine="mujoco") as runner:
+        assert runner.observe().base_pose is None
+        with pytest.raises(InvalidArgumentError, match=r"base_twist.*fixed"):
+            runner.reset(base_twist=np.zeros(6))
