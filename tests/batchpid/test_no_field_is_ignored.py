@@ -255,10 +255,10 @@ def test_every_field_of_osc_params_changes_the_efforts_or_is_refused():
     def run(params):
         state, results = ts.init(params, 0.7 * q), []
         for at in range(4):
-            inputs = pose, q + 0.01 * at, 0.3 * q
-            wrench, twist = np.full((3, 6), 0.3), np.full((3, 6), 0.1)
-            state, effort = ts.step(params, state, *inputs, DT, tree=tree, link="tip", wrench=wrench, twist=twist)
-            results += [effort, state.integral]
+            moving = {"wrench": np.full((3, 6), 0.3), "twist": np.full((3, 6), 0.1)}
+            inputs = ts.OSCInputs(pose, q + 0.01 * at, 0.3 * q, **moving)
+            state, terms = ts.osc(ts.discretise(params, DT), state, ts.Tool(tree, "tip"), inputs)
+            results += [terms.effort, state.integral]
         return np.concatenate([each.ravel() for each in results])
 
     plain, ignored = outcome(run, base), []
