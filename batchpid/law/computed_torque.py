@@ -38,7 +38,7 @@ from batchpid.arrays.elementwise import clip, multiply, namespace
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import Coefficients
 from batchpid.law.params import PIDParams
-from batchpid.law.pid import advance, advance_terms
+from batchpid.law.pid import advance
 from batchpid.law.state import PIDState, Terms
 
 
@@ -63,7 +63,7 @@ def advance_with_mass_matrix(
     setpoint_rate: Any = None,
     setpoint_acceleration: Any = None,
     feedforward: Any = None,
-) -> tuple[PIDState, Any]:
+) -> tuple[PIDState, Terms]:
     """Advance the law in accelerations and return efforts; otherwise as :func:`batchpid.advance`.
 
     Parameters
@@ -76,29 +76,11 @@ def advance_with_mass_matrix(
         Effort added to the effort of the law [N m or N]: passive force and more.
     """
     rates = measurement_rate, setpoint_rate, given_acceleration(k, setpoint_acceleration)
-    new, a = advance(_unlimited(k), state, setpoint, measurement, *rates)
-    new, effort, _ = _to_effort(k, state, new, a, mass_matrix, feedforward)
-    return new, effort
-
-
-def advance_terms_with_mass_matrix(
-    k: Coefficients,
-    state: PIDState,
-    setpoint: Any,
-    measurement: Any,
-    mass_matrix: Any,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
-    setpoint_acceleration: Any = None,
-    feedforward: Any = None,
-) -> tuple[PIDState, Terms]:
-    """Advance the law as :func:`advance_with_mass_matrix`; return the state and all terms, effort included."""
-    rates = measurement_rate, setpoint_rate, given_acceleration(k, setpoint_acceleration)
-    new, terms = advance_terms(_unlimited(k), state, setpoint, measurement, *rates)
+    new, terms = advance(_unlimited(k), state, setpoint, measurement, *rates)
     new, effort, unsaturated = _to_effort(k, state, new, terms.effort, mass_matrix, feedforward)
-    p, i, d, given = (multiply(mass_matrix, term) for term in terms[:4])
-    given = given + (0.0 if feedforward is None else feedforward)
-    return new, Terms(p, i, d, given, unsaturated, effort, effort != unsaturated, terms.finite)
+    p, i, d, given = (x if isinstance(x, float) else multiply(mass_matrix, x) for x in terms[:4])
+    given = given if feedforward is None else given + feedforward
+    return new, Terms(p, i, d, given, unsaturated, effort)
 
 
 def given_acceleration(k: Coefficients, setpoint_acceleration: Any) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.law.coefficients import Coefficients
-from batchpid.law.pid import advance, advance_terms
+from batchpid.law.pid import advance
 from batchpid.law.state import PIDState, Terms
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.symbols import Symbol
@@ -32,9 +32,9 @@ def _trace(structures: tuple[tuple[Any, ...], ...], terms: bool, dtype: Any) -> 
     def function(*symbols: Symbol) -> list[Any]:
         rest = iter(symbols)
         k, state, inputs = ([next(rest) if one is ... else one for one in leaves] for leaves in structures)
-        new, given = (advance_terms if terms else advance)(Coefficients(*k), PIDState(*state), *inputs)
+        new, found = advance(Coefficients(*k), PIDState(*state), *inputs)
         kept[:] = [at for at, leaf in enumerate(new) if leaf is not None]
-        return [*(new[at] for at in kept), *([*given, given.effort] if isinstance(given, Terms) else [given])]
+        return [*(new[at] for at in kept), *(found.filled() if terms else ()), found.effort]
 
     counts = [leaves.count(...) for leaves in structures]
     traced = trace(function, counts[0], counts[1] + counts[2], dtype)

@@ -311,7 +311,7 @@ def _pid(layout: Layout, constants: Constants, state: StepState, given: Inputs) 
     if acceleration is not None:  # the leaders' mass matrix has the followers' share
         acceleration = constants.coupling.of_independent(acceleration)
     inputs = ((setpoint, rate, acceleration), seen.qpos, qvel, seen.passive, matrix, viscous, *limits)
-    new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs, observed=step.observed)
+    new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs)
     return state._replace(law=new, matrix=matrix), Outputs(effort, effort, saturated)
 
 
