@@ -15,8 +15,8 @@ from batchpid.motors import STAGES, Coefficients, Stages
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import program_status
 from batchpid.native.operations import OPERATION
-from batchpid.native.tracing import trace
-from batchpid.native.trees import filled, leaves, mapped, structure
+from batchpid.native.tracing import trace_trees
+from batchpid.native.trees import leaves, mapped, structure
 
 LEAST_OPERATIONS = 3
 """Least number of operations for which a call of the extension is faster than NumPy."""
@@ -52,17 +52,11 @@ def _program(
 ) -> ArrayProgram | None:
     """Return the program of ``stage``; None if it cannot be traced, or is faster in NumPy."""
     k = mapped(lambda leaf: tuple(leaf) if leaf.ndim == 3 else leaf, k)
-    form, constants = structure(k), leaves(k)
-
-    def function(*symbols: Any) -> Any:
-        rest = iter(symbols)
-        given = filled(form, rest)
-        return stage(given, *(None if each else next(rest) for each in none))
-
+    inputs = tuple([None if each else ... for each in none])
     try:
-        found = trace(function, len(constants), none.count(False))
+        found = trace_trees(lambda k, given: stage(k, *given), structure(k), inputs)
     except (TypeError, AttributeError):  # it has no limits
         return None
     if len(found.operations) < LEAST_OPERATIONS * len(OPERATION) * np.int32().itemsize:
         return None
-    return ArrayProgram(found, constants, none.count(False), shape)
+    return ArrayProgram(found, leaves(k), none.count(False), shape)

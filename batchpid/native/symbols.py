@@ -57,6 +57,11 @@ class Namespace:
         return self.symbol(1.0)
 
 
+def _operator(name: str) -> Callable[[Symbol, Any], Symbol]:
+    """Return a method that records an operation on the symbol and another operand."""
+    return lambda self, other: self.record(name, self, other)
+
+
 class Symbol:
     """Array (rows, columns) in a trace; a mask holds 1.0 and 0.0.
 
@@ -78,7 +83,7 @@ class Symbol:
     def astype(self, dtype: Any) -> Symbol:
         """Return a mask as numbers; return numbers unchanged."""
         assert np.dtype(dtype) == self._namespace.dtype
-        return self._namespace.apply("add", self, -0.0) if self.is_mask else self
+        return self.record("add", self, -0.0) if self.is_mask else self
 
     def copy(self) -> Symbol:
         """Return the same symbol: the results of a program are new arrays."""
@@ -92,61 +97,29 @@ class Symbol:
         raise TypeError("a function that is traced cannot depend on the entries of an array")
 
     def __abs__(self) -> Symbol:
-        return self._namespace.apply("absolute", self)
+        return self.record("absolute", self)
 
     def __neg__(self) -> Symbol:
-        return self._namespace.apply("negative", self)
+        return self.record("negative", self)
 
     def __invert__(self) -> Symbol:
-        return self._namespace.apply("not", self)
-
-    def __mul__(self, other: Any) -> Symbol:
-        return self._apply("multiply", other)
-
-    def __add__(self, other: Any) -> Symbol:
-        return self._apply("add", other)
-
-    def __sub__(self, other: Any) -> Symbol:
-        return self._apply("subtract", other)
+        return self.record("not", self)
 
     def __rsub__(self, other: Any) -> Symbol:
-        return self._namespace.apply("subtract", other, self)
-
-    def __truediv__(self, other: Any) -> Symbol:
-        return self._apply("divide", other)
+        return self.record("subtract", other, self)
 
     def __rtruediv__(self, other: Any) -> Symbol:
-        return self._namespace.apply("divide", other, self)
-
-    def __gt__(self, other: Any) -> Symbol:
-        return self._apply("greater", other)
-
-    def __ge__(self, other: Any) -> Symbol:
-        return self._apply("greater_equal", other)
-
-    def __lt__(self, other: Any) -> Symbol:
-        return self._apply("less", other)
-
-    def __le__(self, other: Any) -> Symbol:
-        return self._apply("less_equal", other)
-
-    def __and__(self, other: Any) -> Symbol:
-        return self._apply("and", other)
-
-    def __or__(self, other: Any) -> Symbol:
-        return self._apply("or", other)
-
-    def __eq__(self, other: object) -> Symbol:  # type: ignore[override]
-        return self._apply("equal", other)
-
-    def __ne__(self, other: object) -> Symbol:  # type: ignore[override]
-        return self._apply("not_equal", other)
+        return self.record("divide", other, self)
 
     __hash__ = object.__hash__
-    __rmul__, __radd__ = __mul__, __add__
-
-    def _apply(self, name: str, other: Any) -> Symbol:
-        return self._namespace.apply(name, self, other)
+    __add__ = __radd__ = _operator("add")
+    __sub__ = _operator("subtract")
+    __mul__ = __rmul__ = _operator("multiply")
+    __truediv__ = _operator("divide")
+    __gt__, __ge__, __lt__, __le__ = map(_operator, ("greater", "greater_equal", "less", "less_equal"))
+    __eq__ = _operator("equal")  # type: ignore[assignment]
+    __ne__ = _operator("not_equal")  # type: ignore[assignment]
+    __and__, __or__ = map(_operator, ("and", "or"))
 
 
 Stack = tuple
