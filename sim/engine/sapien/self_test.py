@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.elementwise import matrix_vector
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.tracing import trace
 from batchpid.sim.engine.native import python_calls
@@ -64,7 +65,7 @@ def _compare_ticks() -> None:
 
     def law(goal: Any, matrix: Any, qpos: Any, qvel: Any) -> list[Any]:
         wanted = 30.0 * (goal - qpos) - 5.0 * qvel
-        return [(matrix * wanted[:, None, :]).sum(axis=-1)]
+        return [matrix_vector(matrix, wanted)]
 
     model, armature = NativeModel(replace(_spec(), ground=False)), np.array([0.1, 0.2])
     tree, table = scene_tree(_spec()).tables
