@@ -11,7 +11,7 @@ Params say how to control, a state is carried from step to step, and every array
 
 - Control: :class:`BatchPID`, or the pure functions :func:`init`, :func:`step`, :func:`reset` and :func:`track`, which
   take and return a :class:`PIDState`; :func:`discretise` and :func:`advance` for loops with constant params;
-  :func:`step_terms` and :func:`advance_terms`, which return all terms of the effort.
+  :func:`step_terms` returns all terms of the effort, as :func:`advance` does.
 - Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.gains.presets` for other controllers' numerics;
   :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`, :func:`load_about`.
 - Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`, :func:`spectral_radius`.
@@ -42,7 +42,7 @@ from batchpid.io.params_files import dumps_params, load_about, load_params, load
 from batchpid.law.bumpless import track
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams, make_params
-from batchpid.law.pid import advance, advance_terms, drive_target, init, reset, step, step_terms
+from batchpid.law.pid import advance, drive_target, init, reset, step, step_terms
 from batchpid.law.state import PIDState, Terms
 from batchpid.motors import Actuators, load_actuators, make_actuators, save_actuators
 from batchpid.motors.guard import Guard, make_guard
@@ -59,7 +59,6 @@ __all__ = [
     "PIDState",
     "Terms",
     "advance",
-    "advance_terms",
     "design_gains",
     "discretise",
     "drive_target",

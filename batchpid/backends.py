@@ -9,7 +9,7 @@ import numpy as np
 
 from batchpid.arrays.jax_settings import own_settings, require_jax
 from batchpid.law import pid
-from batchpid.law.coefficients import Coefficients, discretise
+from batchpid.law.coefficients import discretise
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
 from batchpid.native.availability import program_status
@@ -17,13 +17,6 @@ from batchpid.native.compiled_law import CompiledLaw
 
 LARGE = 2**18
 """Number of envs from which JAX's CPU backend steps block by block: it maps larger buffers again at every call."""
-
-
-def _advance(k: Coefficients, state: PIDState, inputs: Any, terms: bool) -> tuple[PIDState, Any, Terms | None]:
-    if not terms:
-        return *pid.advance(k, state, *inputs), None
-    new, shown = pid.advance_terms(k, state, *inputs)
-    return new, shown.effort, shown
 
 
 def declined(*_: Any) -> Any:
@@ -74,11 +67,11 @@ class NumPyBackend:
         if self._law is not None:
             state, effort, shown, fast = self._law.step(state, inputs, out)
             return state, effort, shown, fast or declined
-        new, effort, terms = _advance(self.coefficients, state, inputs, self.terms)
+        new, terms = pid.advance(self.coefficients, state, *inputs)
         if out is not None:
-            out[...] = effort
-            effort, terms = out, None if terms is None else terms._replace(effort=out)
-        return new, effort, terms, declined
+            out[...] = terms.effort
+            terms = terms._replace(effort=out)
+        return new, terms.effort, terms.filled() if self.terms else None, declined
 
 
 class JAXBackend:
@@ -101,7 +94,8 @@ class JAXBackend:
         self._spare: PIDState | None = None  # the state before the last, whose buffers may be overwritten
 
         def step(params: PIDParams, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
-            return _advance(discretise(params, dt), state, inputs, terms)
+            new, found = pid.advance(discretise(params, dt), state, *inputs)
+            return new, found.effort, found.filled() if terms else None
 
         def step_in_blocks(params: PIDParams, spare: PIDState, state: PIDState, *inputs: Any) -> Any:
             out = (spare, jax.numpy.zeros_like(inputs[1]))

@@ -56,12 +56,12 @@ def test_osc_step(benchmark, compare, most, num_envs, pose):
     params = ts.make_osc_params(tree, **options)
     k = ts.discretise(params, 1 / 2000)
     state, goal = ts.init(params, qpos), ts.link_poses(tree, qpos, [LINK])[:, 0] + [0.05, 0, 0, 0, 0, 0, 0]
-    d = ts.task_dynamics(tree, qpos, qvel, LINK)
+    d, tool, inputs = ts.task_dynamics(tree, qpos, qvel, LINK), ts.Tool(tree, LINK), ts.OSCInputs(goal, qpos, qvel)
 
-    def step(step=ts.step):
-        return step(params, state, goal, qpos, qvel, 1 / 2000, tree=tree, link=LINK)
+    def step():
+        return ts.osc(k, state, tool, inputs)
 
-    near = step(ts.step_terms)[1].near_singular
+    near = step()[1].near_singular
     assert near.all() if pose == "bounded" else not near.any()
     seconds = min(0.3, most.seconds)
     with mock.patch.dict(os.environ, {SWITCH: "0"}):
@@ -70,7 +70,7 @@ def test_osc_step(benchmark, compare, most, num_envs, pose):
     least = benchmark.stats.stats.min
     parts = {
         "dynamics": best(lambda: ts.task_dynamics(tree, qpos, qvel, LINK), seconds),
-        "law": best(lambda: ts.advance(k, state, goal, qpos, qvel, d), seconds),
+        "law": best(lambda: ts.osc(k, state, d, inputs), seconds),
     }
     for name, time_of_part in {"step": least, **parts, "step in NumPy": in_numpy}.items():
         benchmark.extra_info[f"{name} [us]"] = 1e6 * time_of_part / rows

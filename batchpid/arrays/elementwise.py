@@ -1,9 +1,10 @@
-"""Elementwise operations of the law, for NumPy and JAX arrays."""
+"""Operations on rows of the law, for NumPy and JAX arrays, and for the symbols of a trace."""
 
 from __future__ import annotations
 
 import math
-from functools import cache
+from collections.abc import Callable
+from functools import cache, wraps
 from types import NoneType
 from typing import Any
 
@@ -30,9 +31,50 @@ def clip(x: Any, low: Any, high: Any, xp: Any) -> Any:
     return x if high is None else xp.minimum(x, high)
 
 
-def multiply(matrix: Any, vector: Any) -> Any:
+def _recorded(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return a decorator: a trace (:mod:`batchpid.native.tracing`) records a call as the operation ``name``."""
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(function)
+        def call(*arrays: Any) -> Any:
+            record = getattr(arrays[0], "record", None)
+            return function(*arrays) if record is None else record(name, *arrays)
+
+        return call
+
+    return decorate
+
+
+@_recorded("matrix_vector")
+def matrix_vector(matrix: Any, vector: Any) -> Any:
     """Return matrix @ vector for each env, with sums in one order for any number of envs."""
     return (matrix * vector[:, None, :]).sum(-1)
+
+
+@_recorded("row_minimum")
+def row_minimum(rows: Any) -> Any:
+    """Return the minimum of each row (envs, 1)."""
+    return rows.min(-1, keepdims=True)
+
+
+@_recorded("gather")
+def take_columns(rows: Any, columns: Any) -> Any:
+    """Return the columns of ``rows`` (..., joints) at the indices ``columns`` (joints,)."""
+    return namespace(rows).take(rows, columns, axis=-1)
+
+
+@_recorded("push")
+def push_history(history: Any, *values: Any) -> Any:
+    """Return ``history`` (envs, samples, numbers) with ``values`` (envs, joints), side by side, as latest sample."""
+    xp = namespace(history, *values)
+    sample = values[0] if len(values) == 1 else xp.concatenate(values, axis=1)
+    return xp.concatenate((sample[:, None], history[:, :-1]), axis=1)
+
+
+@_recorded("take")
+def read_history(history: Any, places: Any) -> Any:
+    """Return the numbers of ``history`` at flat indices ``places`` (envs, joints)."""
+    return history.take(places)
 
 
 def replace_envs(state: Any, fresh: Any, mask: Any) -> Any:

@@ -180,11 +180,11 @@ class Header:
         )
         optional = given.get("measurement_rate"), rate, given.get("feedforward")
         if self.matrix == "mass_matrix":
-            law, effort = advance_with_mass_matrix(k, *arguments, given["mass_matrix"], *optional)
+            law, terms = advance_with_mass_matrix(k, *arguments, given["mass_matrix"], *optional)
         else:
             k = k if self.matrix is None else per_inertia(k, given["inertia"])
-            law, effort = pid.advance(k, *arguments, *optional)
-        return {**law.leaves(), **new}, effort
+            law, terms = pid.advance(k, *arguments, *optional)
+        return {**law.leaves(), **new}, terms.effort
 
     def extent(self, name: str) -> str:
         """Return the number of entries of an input."""

@@ -34,7 +34,8 @@ def advance_in_blocks(
     measurement = inputs[1]
     envs, joints = measurement.shape
     if envs <= rows:
-        return advance(k, state, *inputs)
+        state, terms = advance(k, state, *inputs)
+        return state, terms.effort
     if out is None:
         out = (jax.tree.map(jnp.zeros_like, state), jnp.zeros_like(measurement))
     block, total = rows * joints, envs * joints
@@ -51,7 +52,8 @@ def advance_in_blocks(
         def cut(x: Any) -> Any:
             return jax.lax.dynamic_slice_in_dim(x, start, block) if jnp.shape(x) == (total,) else x
 
-        done = advance(*jax.tree.map(cut, given))
+        new, terms = advance(*jax.tree.map(cut, given))
+        done = new, terms.effort
         return jax.tree.map(lambda x, part: jax.lax.dynamic_update_slice_in_dim(x, part, start, 0), out, done)
 
     given = jax.tree.map(flat, (k, state, *inputs))

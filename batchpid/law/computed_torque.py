@@ -34,11 +34,11 @@ from __future__ import annotations
 from typing import Any
 
 from batchpid.arrays.choices import Everywhere, PerMassMatrix
-from batchpid.arrays.elementwise import clip, multiply, namespace
+from batchpid.arrays.elementwise import clip, matrix_vector, namespace, row_minimum
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import Coefficients
 from batchpid.law.params import PIDParams
-from batchpid.law.pid import advance, advance_terms
+from batchpid.law.pid import advance
 from batchpid.law.state import PIDState, Terms
 
 
@@ -63,7 +63,7 @@ def advance_with_mass_matrix(
     setpoint_rate: Any = None,
     setpoint_acceleration: Any = None,
     feedforward: Any = None,
-) -> tuple[PIDState, Any]:
+) -> tuple[PIDState, Terms]:
     """Advance the law in accelerations and return efforts; otherwise as :func:`batchpid.advance`.
 
     Parameters
@@ -76,29 +76,11 @@ def advance_with_mass_matrix(
         Effort added to the effort of the law [N m or N]: passive force and more.
     """
     rates = measurement_rate, setpoint_rate, given_acceleration(k, setpoint_acceleration)
-    new, a = advance(_unlimited(k), state, setpoint, measurement, *rates)
-    new, effort, _ = _to_effort(k, state, new, a, mass_matrix, feedforward)
-    return new, effort
-
-
-def advance_terms_with_mass_matrix(
-    k: Coefficients,
-    state: PIDState,
-    setpoint: Any,
-    measurement: Any,
-    mass_matrix: Any,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
-    setpoint_acceleration: Any = None,
-    feedforward: Any = None,
-) -> tuple[PIDState, Terms]:
-    """Advance the law as :func:`advance_with_mass_matrix`; return the state and all terms, effort included."""
-    rates = measurement_rate, setpoint_rate, given_acceleration(k, setpoint_acceleration)
-    new, terms = advance_terms(_unlimited(k), state, setpoint, measurement, *rates)
+    new, terms = advance(_unlimited(k), state, setpoint, measurement, *rates)
     new, effort, unsaturated = _to_effort(k, state, new, terms.effort, mass_matrix, feedforward)
-    p, i, d, given = (multiply(mass_matrix, term) for term in terms[:4])
-    given = given + (0.0 if feedforward is None else feedforward)
-    return new, Terms(p, i, d, given, unsaturated, effort, effort != unsaturated, terms.finite)
+    p, i, d, given = (x if isinstance(x, float) else matrix_vector(mass_matrix, x) for x in terms[:4])
+    given = given if feedforward is None else given + feedforward
+    return new, Terms(p, i, d, given, unsaturated, effort)
 
 
 def given_acceleration(k: Coefficients, setpoint_acceleration: Any) -> Any:
@@ -141,7 +123,7 @@ def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matri
         return state
     xp = namespace(state.integral, mass_matrix)
     if was:
-        integral = multiply(mass_matrix, state.integral)
+        integral = matrix_vector(mass_matrix, state.integral)
     else:
         integral = xp.linalg.solve(mass_matrix, state.integral[..., None])[..., 0]
     return state._replace(integral=clip(integral, new.integral_min, new.integral_max, xp))
@@ -156,7 +138,7 @@ def _to_effort(
 ) -> tuple[PIDState, Any, Any]:
     """Return the state, the effort of the acceleration ``a`` within the limits of ``k``, and without them."""
     xp, low, high = namespace(*k, a, mass_matrix), k.effort_min, k.effort_max
-    wanted = multiply(mass_matrix, a)
+    wanted = matrix_vector(mass_matrix, a)
     passive = 0.0 if feedforward is None else feedforward
     effort = unsaturated = wanted + passive
     stops = k.ki_dt is not None and k.conditional is not None
@@ -183,7 +165,7 @@ def _towards(effort: Any, last: Any, step: Any, xp: Any) -> Any:
     change = effort - last
     size = xp.abs(change)
     late = size > step
-    part = xp.where(late, step / xp.where(late, size, 1.0), 1.0).min(-1, keepdims=True)
+    part = row_minimum(xp.where(late, step / xp.where(late, size, 1.0), 1.0))
     # Within the limit in spite of rounding, and exactly the effort where nothing is late.
     return clip(xp.where(part < 1, last + part * change, effort), last - step, last + step, xp)
 
@@ -193,4 +175,4 @@ def _share(wanted: Any, passive: Any, low: Any, high: Any, xp: Any) -> Any:
     above, below = (xp.inf if high is None else high - passive), (xp.inf if low is None else passive - low)
     room, size = xp.where(wanted > 0, above, below), xp.abs(wanted)
     limited = (size > room) & (room > 0)
-    return xp.where(limited, room / xp.where(limited, size, 1.0), 1.0).min(-1, keepdims=True)
+    return row_minimum(xp.where(limited, room / xp.where(limited, size, 1.0), 1.0))

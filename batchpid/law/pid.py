@@ -99,24 +99,25 @@ def step(
         params have gain_units other than "effort" or ask for a measured rate that is not given.
     """
     inputs = {"measurement_rate": measurement_rate, "setpoint_rate": setpoint_rate, "feedforward": feedforward}
-    state, setpoint, measurement, rest = _checked(params, state, setpoint, measurement, **inputs)
-    return advance(discretise(params, dt), state, setpoint, measurement, *rest)
+    state, terms = _step(params, state, setpoint, measurement, dt, **inputs)
+    return state, terms.effort
 
 
 def step_terms(
     params: PIDParams, state: PIDState, setpoint: Any, measurement: Any, dt: Any, **inputs: Any
 ) -> tuple[PIDState, Terms]:
     """Advance the law as :func:`step`, with the same arguments; return the state and all terms, effort included."""
-    state, setpoint, measurement, rest = _checked(params, state, setpoint, measurement, **inputs)
-    return advance_terms(discretise(params, dt), state, setpoint, measurement, **dict(zip(inputs, rest, strict=True)))
+    state, terms = _step(params, state, setpoint, measurement, dt, **inputs)
+    return state, terms.filled()
 
 
-def _checked(
-    params: PIDParams, state: PIDState, setpoint: Any, measurement: Any, **inputs: Any
-) -> tuple[PIDState, Any, Any, list[Any]]:
-    """Check the arguments of a step; return them as arrays, JAX arrays unchanged."""
+def _step(
+    params: PIDParams, state: PIDState, setpoint: Any, measurement: Any, dt: Any, **inputs: Any
+) -> tuple[PIDState, Terms]:
+    """Check the arguments of a step and advance the law."""
     y, r, *rest = checked_inputs(params, state, measurement, setpoint=setpoint, **inputs)
-    return checked_state(state, needs(params)), r, y, rest
+    state = checked_state(state, needs(params))
+    return advance(discretise(params, dt), state, r, y, **dict(zip(inputs, rest, strict=True)))
 
 
 def advance(
@@ -127,43 +128,14 @@ def advance(
     measurement_rate: Any = None,
     setpoint_rate: Any = None,
     feedforward: Any = None,
-) -> tuple[PIDState, Any]:
-    """Advance the law with given coefficients, for loops with constant params; otherwise as :func:`step`.
+) -> tuple[PIDState, Terms]:
+    """Advance the law with given coefficients, for loops with constant params; return the state and the terms.
+
+    The arguments are those of :func:`step`, as arrays. A term may be an array of the caller: :meth:`Terms.filled`.
 
     Raises InvalidArgumentError if the coefficients are of gain_units other than "effort", or need a measured rate that
     is not given. Gains per inertia: :mod:`batchpid.law.computed_torque`.
     """
-    new, effort, *_ = _advance(k, state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
-    return new, effort
-
-
-def advance_terms(k: Coefficients, state: PIDState, *inputs: Any, **named: Any) -> tuple[PIDState, Terms]:
-    """Advance the law as :func:`advance`, with the same arguments; return the state and all terms, effort included."""
-    new, effort, u, parts, finite = _advance(k, state, *inputs, **named)
-    xp, changed = namespace(u), effort != u
-    zero = xp.zeros_like(u)
-
-    def shown(term: Any) -> Any:  # a copy, over all envs
-        if term is None:
-            return zero
-        return zero + term if finite is None else xp.where(finite, term, zero)
-
-    p, i, d, given, whole = map(shown, (*parts, u))
-    if finite is None:
-        return new, Terms(p, i, d, given, whole, effort, changed, xp.isfinite(u))
-    return new, Terms(p, i, d, given, whole, effort, finite & changed, finite)
-
-
-def _advance(
-    k: Coefficients,
-    state: PIDState,
-    setpoint: Any,
-    measurement: Any,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
-    feedforward: Any = None,
-) -> tuple[PIDState, Any, Any, tuple[Any, ...], Any]:
-    """Return state, effort, unsaturated effort, its four parts, and the mask of finite inputs; None: off."""
     check_alone(k, measurement_rate)
     xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
     r, y, r_rate, y_rate, ff = setpoint, measurement, setpoint_rate, measurement_rate, feedforward
@@ -179,7 +151,7 @@ def _advance(
     p = proportional(k, error, y, origin)
     u = p
 
-    i, integral = None, state.integral
+    i, integral = 0.0, state.integral
     if k.ki_dt is not None:
         integral = integral + k.ki_dt * error
         if k.ki_dt2 is not None and r_rate is not None:
@@ -189,7 +161,7 @@ def _advance(
         i = state.integral if k.integration is None else integral
         u = u + i
 
-    d = derivative = None
+    d, derivative = 0.0, None
     if k.kd is not None:
         rate = -y_rate if y_rate is not None else wrap(state.measurement - y, k.turns, xp) * k.per_dt
         if r_rate is not None:
@@ -229,7 +201,8 @@ def _advance(
     if finite is not None:
         new = PIDState(*(None if n is None else xp.where(finite, n, o) for n, o in zip(new, state, strict=True)))
         effort = xp.where(finite, effort, state.effort if isinstance(k.non_finite, HoldEffort) else 0)
-    return new, effort, u, (p, i, d, ff), finite
+        u = xp.where(finite, u, effort)  # no limit has changed that
+    return new, Terms(p, i, d, 0.0 if ff is None else ff, u, effort, finite=finite)
 
 
 def reset(params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, keep_integral: bool = False) -> PIDState:
@@ -299,7 +272,7 @@ def drive_target(
     """
     check_drive(params)
     k = discretise(params, dt)
-    state, terms = advance_terms(k, state, setpoint, measurement, **inputs)
+    state, terms = advance(k, state, setpoint, measurement, **inputs)
     xp = namespace(*params, terms.i, setpoint)
     driven, target = params.kp > 0, nearest_turn(setpoint, measurement, k.turns, xp)
-    return state, target + xp.where(driven, terms.i, 0) / xp.where(driven, params.kp, 1)
+    return state, target + xp.where(driven, terms.filled().i, 0) / xp.where(driven, params.kp, 1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from batchpid.arrays.display import array_summary
+from batchpid.arrays.elementwise import namespace
 
 
 class PIDState(NamedTuple):
@@ -43,7 +44,10 @@ class PIDState(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """Terms of the law in one step, each (envs, joints); 0 for a term that is off."""
+    """Terms of the law in one step, each (envs, joints); 0 for a term that is off.
+
+    :func:`batchpid.advance` leaves out what :meth:`filled` computes: 0.0 is a term that is off, and None a mask.
+    """
 
     p: Any
     """Proportional term [N m or N]."""
@@ -57,10 +61,18 @@ class Terms(NamedTuple):
     """Their sum: the computed effort."""
     effort: Any
     """The applied effort, after saturation."""
-    saturated: Any
+    saturated: Any = None
     """Bool: a limit (of the effort or its rate) changed the effort."""
-    finite: Any
+    finite: Any = None
     """Bool: every input of this env and joint was finite."""
+
+    def filled(self) -> Terms:
+        """Return all terms as new arrays (envs, joints), but for the effort."""
+        xp, finite = namespace(*self), self.finite
+        zero = xp.zeros_like(self.effort)
+        p, i, d, given, whole = (zero + x if finite is None else xp.where(finite, x, zero) for x in self[:5])
+        finite = xp.isfinite(self.unsaturated) if finite is None else finite
+        return Terms(p, i, d, given, whole, self.effort, self.effort != self.unsaturated, finite)
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.display import array_summary
-from batchpid.arrays.elementwise import TURN, clip, namespace, wrap
+from batchpid.arrays.elementwise import TURN, clip, namespace, push_history, wrap
 from batchpid.checks.validate import check_time_step
 from batchpid.motors import delay
 from batchpid.motors import sensor_noise as noise
@@ -253,7 +253,7 @@ def advance_effort(
     xp = namespace(effort, qpos, qvel)
     command, behind = state.command, state.effort
     if k.command is not None:
-        command = delay.push(command, effort, xp)
+        command = push_history(command, effort)
         effort = delay.read(command, k.command, None, xp)
     (motor,) = stages.delivered(k, behind, effort, qpos, qvel)
     return ActuatorState(command, behind if k.intake is None else motor, *state[2:]), motor
@@ -277,7 +277,7 @@ def advance_measurement(
         encoder, qvel = stages.play(k, encoder, qpos, qvel)
         qpos = encoder
     if k.position_delay is not None and k.velocity_delay is not None:
-        sensor = delay.push(sensor, xp.concatenate((qpos, qvel), axis=1), xp)
+        sensor = push_history(sensor, qpos, qvel)
         qpos, qvel = delay.read(sensor, k.position_delay, k.turns, xp), delay.read(sensor, k.velocity_delay, None, xp)
     if key is not None:
         drawn = measurement_noise(k, key, step, qpos, xp) if drawn is None else drawn

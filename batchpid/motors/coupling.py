@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.elementwise import namespace, take_columns
 from batchpid.arrays.read_only import read_only
 
 
@@ -136,7 +136,7 @@ class Coupling(NamedTuple):
         """Return the efforts G^T u on the independent joints for u = ``effort``; zero for followers."""
         xp, acting = namespace(effort), self.of_independent(effort)
         for share in self.shares:  # the order of the sum is the same for any number of rows
-            added = share.multiplier * xp.take(effort, share.joint, axis=-1)
+            added = share.multiplier * take_columns(effort, share.joint)
             acting = xp.where(share.exists, acting + added, acting)
         return acting
 
@@ -148,7 +148,7 @@ class Coupling(NamedTuple):
     @_of_followers
     def of_leaders(self, figures: Any) -> Any:
         """Return ``figures`` in which followers take the figures of their leaders."""
-        return namespace(figures).take(figures, self.leader, axis=-1)
+        return take_columns(figures, self.leader)
 
     @_of_followers
     def of_all(self, figures: Any) -> Any:

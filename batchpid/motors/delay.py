@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from batchpid.arrays.elementwise import namespace, wrap
+from batchpid.arrays.elementwise import namespace, read_history, wrap
 from batchpid.checks.validate import is_traced
 from batchpid.errors import InvalidArgumentError
 
@@ -71,13 +71,9 @@ def start(value: Any, samples: int) -> Any:
     return xp.broadcast_to(value[:, None], (value.shape[0], samples, value.shape[1])).copy()
 
 
-def push(history: Any, value: Any, xp: Any) -> Any:
-    """Return ``history`` (envs, samples, numbers) with ``value`` (envs, numbers) as its latest sample."""
-    return xp.concatenate((value[:, None], history[:, :-1]), axis=1)
-
-
 def read(history: Any, k: Delay, turns: Any, xp: Any) -> Any:
     """Return the delayed value (envs, joints); ``turns`` is 1 / (2 pi) where it is an angle, 0 elsewhere, or None."""
-    values = history.take(k.index)
-    later = values[0]
-    return later if k.fraction is None else later + k.fraction * wrap(values[1] - later, turns, xp)
+    later = read_history(history, k.index[0])
+    if k.fraction is None:
+        return later
+    return later + k.fraction * wrap(read_history(history, k.index[1]) - later, turns, xp)

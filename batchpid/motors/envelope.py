@@ -17,6 +17,8 @@ outside, as in RemotizedPDActuator of Isaac Lab and ClampingPositionBased of New
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import add
 from typing import Any, NamedTuple
 
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
@@ -94,7 +96,8 @@ def limits(k: Envelope, qpos: Any, velocity: Any) -> tuple[Any, Any]:
     xp = namespace(qpos, velocity)
     low, high = k.least, k.limit
     if k.offset is not None:
-        change = (k.rise * xp.minimum(xp.maximum(qpos[None], k.left), k.right)).sum(0)
+        parts = (rise * clip(qpos, left, right, xp) for rise, left, right in zip(k.rise, k.left, k.right, strict=True))
+        change = reduce(add, parts)
         low, high = clip(k.least_offset - change, low, None, xp), clip(k.offset + change, None, high, xp)
     if k.stall is None:
         return low, high

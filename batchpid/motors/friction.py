@@ -153,13 +153,12 @@ def compensation(coulomb: Any, error: Any, rate: Any, band: Any) -> Any:
     Parameters
     ----------
     coulomb
-        F, known (joints,) or (envs, joints) [N m or N].
+        F, known (1 | envs, joints) [N m or N].
     error, rate
         e = r - q and r' (envs, joints) [rad or m, and per s]; a rate of None is 0.
     band
-        Half width in which the sign is blurred (joints,) [rad or m].
+        Half width in which the sign is blurred (1 | envs, joints) [rad or m].
     """
     xp = namespace(coulomb, error, rate, band)
-    coulomb, band = xp.atleast_2d(coulomb), xp.atleast_2d(band)
     ahead = error if rate is None else error + LOOKAHEAD * rate
     return clip(ahead * (coulomb / band), -coulomb, coulomb, xp)

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from batchpid.arrays.elementwise import matrix_vector, push_history, read_history, row_minimum, take_columns
 from batchpid.native.array_program import ArrayProgram, interpreter
 from batchpid.native.extensions import StaleExtensionError, load_all
 from batchpid.native.operations import PROGRAM
-from batchpid.native.symbols import Stack
 from batchpid.native.tracing import trace
 
 SWITCH = "BATCHPID_NATIVE"
@@ -60,22 +60,18 @@ def every_operation(a: Any, b: Any, c: Any, matrix: Any) -> list[Any]:
     numbers = a + b, a - b, a * b, a / b, -a, abs(a), xp.rint(a), xp.ceil(a), xp.floor(a), xp.sqrt(a), xp.sign(a)
     pairs = a * b + c, a + b * c, a + b - c, (a - b) * c, xp.minimum(xp.maximum(a, b), c)
     ends = xp.maximum(a, b), xp.minimum(a, b), xp.maximum(b, a), xp.minimum(b, a)
-    least = xp.zeros_like(a) + a.min(axis=-1, keepdims=True)
-    product = (matrix * b[:, None, :]).sum(axis=-1)
-    return [*numbers, *pairs, *ends, xp.where(a > b, b, c), least, product, *masks, *some]
+    across = xp.zeros_like(a) + row_minimum(a), matrix_vector(matrix, b)
+    return [*numbers, *pairs, *ends, xp.where(a > b, b, c), *across, *masks, *some]
 
 
 def history_operations(places: Any, history: Any, a: Any, b: Any) -> list[Any]:
-    """Push ``a`` and ``b``, side by side, to ``history``; return its numbers at ``places`` (1, rows, columns)."""
-    xp = a.__array_namespace__()
-    later = xp.concatenate((xp.concatenate((a, b), axis=1)[:, None], history[:, :-1]), axis=1)
-    return [*later.take(places)]
+    """Push ``a`` and ``b``, side by side, to ``history``; return its numbers at ``places`` (rows, columns)."""
+    return [read_history(push_history(history, a, b), places)]
 
 
 def columns_of(columns: Any, a: Any, b: Any) -> list[Any]:
     """Return the columns ``columns`` (columns,) of ``a``, and of a mask."""
-    xp = a.__array_namespace__()
-    return [xp.take(a, columns, axis=-1), xp.take(a > b, columns, axis=-1)]
+    return [take_columns(a, columns), take_columns(a > b, columns)]
 
 
 def first_difference() -> str | None:
@@ -96,10 +92,9 @@ def first_difference() -> str | None:
             if _bits(pair[0]) != _bits(pair[1]):
                 return f"result {number} of a native program of {np.dtype(dtype)} is not NumPy's"
     a, b, history = *rng.normal(size=(2, *shape)), rng.normal(size=(shape[0], 4, 2 * shape[1]))
-    places = rng.integers(history.size, size=(1, *shape))
+    places = rng.integers(history.size, size=shape)
     (numbers,) = history_operations(places, history, a, b)
-    traced = trace(lambda places, *others: history_operations(Stack([places]), *others), 1, 3)
-    if _bits(ArrayProgram(traced, [*places], 3, shape)(history, a, b)[0]) != _bits(numbers):
+    if _bits(ArrayProgram(trace(history_operations, 1, 3), [places], 3, shape)(history, a, b)[0]) != _bits(numbers):
         return "the history of a native program is not NumPy's"
     columns = rng.integers(shape[1], size=shape[1])
     found = ArrayProgram(trace(columns_of, 1, 2), [columns], 2, shape)(a, b)

@@ -10,35 +10,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.law.coefficients import Coefficients
-from batchpid.law.pid import advance, advance_terms
+from batchpid.law.pid import advance
 from batchpid.law.state import PIDState, Terms
 from batchpid.native.array_program import ArrayProgram
-from batchpid.native.symbols import Symbol
-from batchpid.native.tracing import Trace, trace
+from batchpid.native.tracing import Trace, trace_trees
+from batchpid.native.trees import leaves, structure
 
 _MEASUREMENT = 1
 """Index of the measurement among the inputs: the only input that must be (envs, joints)."""
 
 
 @lru_cache(maxsize=256)
-def _trace(structures: tuple[tuple[Any, ...], ...], terms: bool, dtype: Any) -> tuple[Trace, tuple[int, ...]]:
+def _trace(structures: tuple[Any, ...], terms: bool, dtype: Any) -> tuple[Trace, tuple[int, ...]]:
     """Return the law's trace, and the indices of the state leaves that it returns before its other results.
 
-    ``structures`` describe coefficients, state and inputs: ``...`` for each array, None for a missing one, and the
-    choices of the law, which compare by type.
+    ``structures`` describe coefficients, state and inputs.
     """
     kept: list[int] = []
 
-    def function(*symbols: Symbol) -> list[Any]:
-        rest = iter(symbols)
-        k, state, inputs = ([next(rest) if one is ... else one for one in leaves] for leaves in structures)
-        new, given = (advance_terms if terms else advance)(Coefficients(*k), PIDState(*state), *inputs)
+    def function(k: Coefficients, state: PIDState, inputs: tuple[Any, ...]) -> list[Any]:
+        new, found = advance(k, state, *inputs)
         kept[:] = [at for at, leaf in enumerate(new) if leaf is not None]
-        return [*(new[at] for at in kept), *([*given, given.effort] if isinstance(given, Terms) else [given])]
+        return [*(new[at] for at in kept), *(found.filled() if terms else ()), found.effort]
 
-    counts = [leaves.count(...) for leaves in structures]
-    traced = trace(function, counts[0], counts[1] + counts[2], dtype)
-    return traced, tuple(kept)
+    return trace_trees(function, *structures, dtype=dtype), tuple(kept)
 
 
 class CompiledLaw:
@@ -49,15 +44,13 @@ class CompiledLaw:
         self._shape = num_envs, k.kp.shape[1]
         self._programs: dict[tuple[bool, ...], tuple[ArrayProgram, tuple[int, ...]]] = {}
 
-    def _program(self, leaves: tuple[Any, ...], size: int) -> tuple[ArrayProgram, tuple[int, ...]]:
-        """Return the program for a state of ``size`` leaves and inputs, and the state indices that it returns."""
-        key = tuple([leaf is None for leaf in leaves])
+    def _program(self, state: PIDState, inputs: tuple[Any, ...]) -> tuple[ArrayProgram, tuple[int, ...]]:
+        """Return the program for a state and inputs like these, and the state indices that it returns."""
+        key = tuple([leaf is None for leaf in (*state, *inputs)])
         if key not in self._programs:
-            structures = tuple(map(structure, (self._k, leaves[:size], leaves[size:])))
             dtype = self._k.kp.dtype
-            traced, kept = _trace(structures, self._terms, dtype)
-            constants = [leaf for leaf in self._k if isinstance(leaf, np.ndarray)]
-            program = ArrayProgram(traced, constants, key.count(False), self._shape, dtype, self._threads)
+            traced, kept = _trace(structure((self._k, state, inputs)), self._terms, dtype)
+            program = ArrayProgram(traced, leaves(self._k), key.count(False), self._shape, dtype, self._threads)
             self._programs[key] = program, kept
         return self._programs[key]
 
@@ -71,7 +64,7 @@ class CompiledLaw:
         """
         given = [each for each in inputs if each is not None]
         state = PIDState(*(None if leaf is None else self._whole(leaf) for leaf in state))
-        program, kept = self._program((*state, *inputs), len(state))
+        program, kept = self._program(state, inputs)
         fixed = [leaf for leaf in state if leaf is not None]
         written = [state[at] for at in kept]
         masks = program.masks[len(kept) :]
@@ -87,8 +80,3 @@ class CompiledLaw:
     def _whole(self, leaf: NDArray[Any]) -> NDArray[Any]:
         """Return a leaf of the state as a contiguous array (envs, joints); a row that all envs share is repeated."""
         return np.ascontiguousarray(leaf if leaf.shape == self._shape else np.broadcast_to(leaf, self._shape))
-
-
-def structure(leaves: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the structure of ``leaves`` for :func:`_trace`: ``...`` in place of each array."""
-    return tuple([... if isinstance(leaf, np.ndarray) else leaf for leaf in leaves])

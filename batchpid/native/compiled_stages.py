@@ -7,7 +7,6 @@ whole: those with a controller of the caller's, or of the backend "jax".
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,8 @@ from batchpid.motors import STAGES, Coefficients, Stages
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import program_status
 from batchpid.native.operations import OPERATION
-from batchpid.native.tracing import trace
+from batchpid.native.tracing import trace_trees
+from batchpid.native.trees import leaves, mapped, structure
 
 LEAST_OPERATIONS = 3
 """Least number of operations for which a call of the extension is faster than NumPy."""
@@ -51,40 +51,12 @@ def _program(
     stage: Callable[..., Any], k: Coefficients, shape: tuple[int, int], none: tuple[bool, ...]
 ) -> ArrayProgram | None:
     """Return the program of ``stage``; None if it cannot be traced, or is faster in NumPy."""
-    constants: list[Any] = []
-    numbers = _numbered(k, shape, constants)
-
-    def function(*symbols: Any) -> Any:
-        inputs = iter(symbols[len(constants) :])
-        return stage(_symbolic(numbers, symbols), *(None if each else next(inputs) for each in none))
-
+    k = mapped(lambda leaf: tuple(leaf) if leaf.ndim == 3 else leaf, k)
+    inputs = tuple([None if each else ... for each in none])
     try:
-        found = trace(function, len(constants), none.count(False))
-    except (TypeError, AttributeError, AssertionError):  # it has tables, or no limits
+        found = trace_trees(lambda k, given: stage(k, *given), structure(k), inputs)
+    except (TypeError, AttributeError):  # it has no limits
         return None
     if len(found.operations) < LEAST_OPERATIONS * len(OPERATION) * np.int32().itemsize:
         return None
-    return ArrayProgram(found, constants, none.count(False), shape)
-
-
-class _Place(int):
-    """Index of a constant."""
-
-
-def _numbered(leaf: Any, shape: tuple[int, int], constants: list[Any]) -> Any:
-    """Move the arrays that a program takes from ``leaf`` to ``constants``; return ``leaf`` with their indices."""
-    if isinstance(leaf, np.ndarray) and leaf.dtype == np.float64 and leaf.shape in (shape, (1, shape[1])):
-        constants.append(leaf)
-        return _Place(len(constants) - 1)
-    return _each(leaf, partial(_numbered, shape=shape, constants=constants))
-
-
-def _symbolic(leaf: Any, symbols: tuple[Any, ...]) -> Any:
-    if isinstance(leaf, _Place):
-        return symbols[leaf]
-    return _each(leaf, partial(_symbolic, symbols=symbols))
-
-
-def _each(leaf: Any, change: Callable[[Any], Any]) -> Any:
-    """Apply ``change`` to each field of a named tuple; return any other leaf unchanged."""
-    return type(leaf)(*map(change, leaf)) if isinstance(leaf, tuple) else leaf
+    return ArrayProgram(found, leaves(k), none.count(False), shape)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple, NoReturn
+from collections.abc import Callable
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -36,13 +36,8 @@ class Namespace:
             raise TypeError(f"a program of {self.dtype} cannot hold a scalar of {value.dtype}")
         return self.literals.setdefault(repr(float(value)), (float(value), Symbol(self)))[1]
 
-    def apply(self, name: str, *values: Any) -> Any:
-        """Record an operation; return its result. Stacks take part entry by entry."""
-        if stacks := [value for value in values if isinstance(value, Stack)]:
-            size = max(map(len, stacks))
-            each = (value if isinstance(value, Stack) else Stack([value]) for value in values)
-            spread = [stack * size if len(stack) == 1 else stack for stack in map(tuple, each)]
-            return Stack(self.apply(name, *entries) for entries in zip(*spread, strict=True))
+    def apply(self, name: str, *values: Any) -> Symbol:
+        """Record an operation; return its result."""
         result = Symbol(self, name in MASKS or (name == "gather" and values[0].is_mask))
         self.noted.append((name, tuple(map(self.symbol, values)), result))
         return result
@@ -53,24 +48,6 @@ class Namespace:
             raise AttributeError(f"programs have no operation {name!r}")
         return lambda *values: self.apply(name, *values)
 
-    def concatenate(self, arrays: tuple[Any, Any], axis: int) -> Any:
-        """Return positions and velocities side by side, or a history with a later sample in front."""
-        assert axis == 1
-        first, second = arrays
-        if isinstance(first, _AsRows) and isinstance(second, _WithoutOldest):
-            samples = first.vector if isinstance(first.vector, _Pair) else (first.vector,)
-            return self.apply("push", second.history, *samples)
-        return _Pair(first, second)
-
-    def atleast_2d(self, value: Any) -> Any:
-        """Return ``value``, which already has rows and columns."""
-        return value
-
-    def take(self, rows: Symbol, columns: Symbol, axis: int) -> Symbol:
-        """Return the columns of ``rows`` at the indices ``columns``, which are constants."""
-        assert axis == -1
-        return self.apply("gather", rows, columns)
-
     def zeros_like(self, _: Any) -> Symbol:
         """Return the number 0."""
         return self.symbol(0.0)
@@ -80,21 +57,9 @@ class Namespace:
         return self.symbol(1.0)
 
 
-class Stack(tuple[Any, ...]):
-    """Array (n, rows, columns) in a trace, as n symbols."""
-
-    __slots__ = ()
-
-    def __mul__(self, other: Any) -> Any:
-        return self[0].__array_namespace__().apply("multiply", self, other)
-
-    def sum(self, axis: int) -> Symbol:
-        """Return 0 plus all entries in order, as NumPy sums them."""
-        assert axis == 0
-        total = self[0].__array_namespace__().symbol(0.0)
-        for entry in self:
-            total = total + entry
-        return total
+def _operator(name: str) -> Callable[[Symbol, Any], Symbol]:
+    """Return a method that records an operation on the symbol and another operand."""
+    return lambda self, other: self.record(name, self, other)
 
 
 class Symbol:
@@ -118,125 +83,40 @@ class Symbol:
     def astype(self, dtype: Any) -> Symbol:
         """Return a mask as numbers; return numbers unchanged."""
         assert np.dtype(dtype) == self._namespace.dtype
-        return self._namespace.apply("add", self, -0.0) if self.is_mask else self
+        return self.record("add", self, -0.0) if self.is_mask else self
 
     def copy(self) -> Symbol:
         """Return the same symbol: the results of a program are new arrays."""
         return self
 
-    def min(self, axis: int, keepdims: bool) -> Symbol:
-        """Return the minimum of each row, repeated in all columns."""
-        assert (axis, keepdims) == (-1, True)
-        return self._namespace.apply("row_minimum", self)
+    def record(self, name: str, *arrays: Any) -> Symbol:
+        """Record a function of :mod:`batchpid.arrays.elementwise` as the operation ``name``; return its result."""
+        return self._namespace.apply(name, *arrays)
 
     def __bool__(self) -> NoReturn:
         raise TypeError("a function that is traced cannot depend on the entries of an array")
 
-    def take(self, places: Stack) -> Stack:
-        """Return the numbers of a history at places in the whole of it, which are constants."""
-        return Stack(self._namespace.apply("take", self, each) for each in places)
-
-    def __getitem__(self, index: Any) -> Any:
-        if index is None:
-            return Stack([self])
-        if index == (slice(None), slice(None, -1)):
-            return _WithoutOldest(self)
-        return _as_rows(self, index)
-
     def __abs__(self) -> Symbol:
-        return self._namespace.apply("absolute", self)
+        return self.record("absolute", self)
 
     def __neg__(self) -> Symbol:
-        return self._namespace.apply("negative", self)
+        return self.record("negative", self)
 
     def __invert__(self) -> Symbol:
-        return self._namespace.apply("not", self)
-
-    def __mul__(self, other: Any) -> Any:
-        return _Products(self, other.vector) if isinstance(other, _AsRows) else self._apply("multiply", other)
-
-    def __add__(self, other: Any) -> Symbol:
-        return self._apply("add", other)
-
-    def __sub__(self, other: Any) -> Symbol:
-        return self._apply("subtract", other)
+        return self.record("not", self)
 
     def __rsub__(self, other: Any) -> Symbol:
-        return self._namespace.apply("subtract", other, self)
-
-    def __truediv__(self, other: Any) -> Symbol:
-        return self._apply("divide", other)
+        return self.record("subtract", other, self)
 
     def __rtruediv__(self, other: Any) -> Symbol:
-        return self._namespace.apply("divide", other, self)
-
-    def __gt__(self, other: Any) -> Symbol:
-        return self._apply("greater", other)
-
-    def __ge__(self, other: Any) -> Symbol:
-        return self._apply("greater_equal", other)
-
-    def __lt__(self, other: Any) -> Symbol:
-        return self._apply("less", other)
-
-    def __le__(self, other: Any) -> Symbol:
-        return self._apply("less_equal", other)
-
-    def __and__(self, other: Any) -> Symbol:
-        return self._apply("and", other)
-
-    def __or__(self, other: Any) -> Symbol:
-        return self._apply("or", other)
-
-    def __eq__(self, other: object) -> Symbol:  # type: ignore[override]
-        return self._apply("equal", other)
-
-    def __ne__(self, other: object) -> Symbol:  # type: ignore[override]
-        return self._apply("not_equal", other)
+        return self.record("divide", other, self)
 
     __hash__ = object.__hash__
-    __rmul__, __radd__ = __mul__, __add__
-
-    def _apply(self, name: str, other: Any) -> Symbol:
-        return self._namespace.apply(name, self, other)
-
-
-class _AsRows(NamedTuple):
-    """vector[:, None, :]"""
-
-    vector: Any
-
-
-class _WithoutOldest(NamedTuple):
-    """history[:, :-1]"""
-
-    history: Symbol
-
-
-class _Pair:
-    """concatenate((first, second), axis=1)"""
-
-    def __init__(self, *both: Symbol) -> None:
-        self._both = both
-
-    def __iter__(self) -> Iterator[Symbol]:
-        return iter(self._both)
-
-    def __getitem__(self, index: Any) -> _AsRows:
-        return _as_rows(self, index)
-
-
-def _as_rows(vector: Any, index: Any) -> _AsRows:
-    assert index in ((slice(None), None), (slice(None), None, slice(None)))
-    return _AsRows(vector)
-
-
-class _Products(NamedTuple):
-    """matrix * vector[:, None, :]"""
-
-    matrix: Symbol
-    vector: Symbol
-
-    def sum(self, axis: int) -> Symbol:
-        assert axis == -1
-        return self.matrix.__array_namespace__().apply("matrix_vector", self.matrix, self.vector)
+    __add__ = __radd__ = _operator("add")
+    __sub__ = _operator("subtract")
+    __mul__ = __rmul__ = _operator("multiply")
+    __truediv__ = _operator("divide")
+    __gt__, __ge__, __lt__, __le__ = map(_operator, ("greater", "greater_equal", "less", "less_equal"))
+    __eq__ = _operator("equal")  # type: ignore[assignment]
+    __ne__ = _operator("not_equal")  # type: ignore[assignment]
+    __and__, __or__ = map(_operator, ("and", "or"))

@@ -10,6 +10,7 @@ import numpy as np
 
 from batchpid.native.operations import OPERATIONS
 from batchpid.native.symbols import Namespace, Symbol
+from batchpid.native.trees import filled, leaves
 
 _Operation = tuple[str, tuple[Symbol, ...], Symbol]
 
@@ -56,6 +57,20 @@ def trace(function: Callable[..., Any], constants: int, inputs: int, dtype: Any 
     shared = [result for _, _, result in early if result in used]
     prelude = _assembled(early, first, shared, ()) if shared else None
     return _assembled(late, [*first, *shared, *given[constants:]], results, tuple(literals.values()), prelude)
+
+
+def trace_trees(function: Callable[..., Any], *structures: Any, dtype: Any = np.float64) -> Trace:
+    """Return the trace of a function of nested tuples, as :func:`trace` does.
+
+    ``structures`` (:func:`batchpid.native.trees.structure`) describe its arguments; the first one has the constants.
+    """
+
+    def flat(*symbols: Symbol) -> list[Any]:
+        given = iter(symbols)
+        return list(function(*(filled(each, given) for each in structures)))
+
+    first, *rest = [len(leaves(each)) for each in structures]
+    return trace(flat, first, sum(rest), dtype)
 
 
 def _needed(noted: Iterable[_Operation], results: list[Symbol]) -> list[_Operation]:

@@ -6,11 +6,11 @@ twists, wrenches and Jacobians have linear parts first. NumPy computes in float6
 
 from batchpid.task_space import osc_presets as presets
 from batchpid.task_space.inverse_kinematics import IKResult, InverseKinematicsWarning, inverse_kinematics
-from batchpid.task_space.operational_space import advance, advance_terms, init, reset, step, step_terms
+from batchpid.task_space.operational_space import init, osc, reset
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
 from batchpid.task_space.osc_files import load_osc_options, save_osc_options
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
-from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, task_dynamics
+from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDynamics, Tool, task_dynamics
 from batchpid.task_space.osc_transfer import track
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_dynamics import bias, forward_dynamics, gravity, inverse_dynamics, mass_matrix
@@ -20,13 +20,13 @@ __all__ = [
     "IKResult",
     "InverseKinematicsWarning",
     "OSCCoefficients",
+    "OSCInputs",
     "OSCParams",
     "OSCState",
     "OSCTerms",
     "RigidTree",
     "TaskDynamics",
-    "advance",
-    "advance_terms",
+    "Tool",
     "bias",
     "discretise",
     "forward_dynamics",
@@ -40,11 +40,10 @@ __all__ = [
     "load_osc_options",
     "make_osc_params",
     "mass_matrix",
+    "osc",
     "presets",
     "reset",
     "save_osc_options",
-    "step",
-    "step_terms",
     "task_dynamics",
     "track",
 ]

@@ -12,40 +12,46 @@ from batchpid.native.task_space_extension import DECOUPLING, FRICTION, LAW
 from batchpid.task_space import native_rows
 from batchpid.task_space.osc_coefficients import OSCCoefficients
 from batchpid.task_space.osc_params import NoDecoupling, PartialDecoupling
+from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDynamics, Tool
 from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.tree_kinematics import prepared, read_point
 
 Float64 = NDArray[np.float64]
 
-_RESULTS = LAW[LAW.index("effort") :]
-_SIZES = {"next_integral": 6, "error": 6, "force": 6, "task_share": 1, "posture_share": 1, "near_singular": 1}
+_RESULTS = {
+    **{"effort": 0, "integral": 6, "limited": 0, "error": 6, "wrench": 6, "task": 0, "posture": 0, "unsaturated": 0},
+    **{"task_share": 1, "posture_share": 1, "near_singular": 1},
+}
+"""Terms and state in the order of the results in LAW, and their columns; 0 for one per joint."""
 
 
-def law(k: OSCCoefficients, dynamics: Any, inputs: tuple[Any, ...], wanted: tuple[str, ...]) -> list[Float64] | None:
-    """Return the results ``wanted``, by their names in LAW, of a step of the law of operational_space.py.
+def law(
+    k: OSCCoefficients, state: OSCState, dynamics: TaskDynamics | Tool, inputs: OSCInputs, wanted: tuple[str, ...]
+) -> tuple[OSCState, OSCTerms] | None:
+    """Return the results of :func:`batchpid.task_space.osc`; None where native code is not used.
 
-    ``dynamics`` and ``inputs`` are the arrays that precede the coefficients in LAW, in that order. The result is None
-    where native code is not used.
+    Raises ValueError if an array has a wrong shape.
     """
-    arrays, qpos = (*dynamics, *inputs, *k[:-2]), inputs[1]
-    native = native_rows.for_rows(qpos, *arrays)
-    if native is None:
+    tool, given = None, tuple[Any, ...](dynamics)
+    if isinstance(dynamics, Tool):
+        tool = dynamics
+        (qpos, qvel), *_ = prepared(tool.tree, qpos=inputs.qpos, qvel=inputs.qvel)
+        inputs, given = inputs._replace(qpos=qpos, qvel=qvel), (read_point(qpos, tool.point),)
+    arrays = (*inputs, None, None, *state, *k[:-2])
+    if (native := native_rows.for_rows(inputs.qpos, *given, *arrays)) is None:
         return None
-    found = _empty(qpos.shape, wanted)
-    native_rows.call(native.law, *qpos.shape, *_kind(k), *arrays, *map(found.get, _RESULTS))
-    return list(found.values())
-
-
-def step(
-    tree: RigidTree, link: str, point: Any, k: OSCCoefficients, inputs: tuple[Any, ...], wanted: tuple[str, ...]
-) -> list[Float64] | None:
-    """Return the results of :func:`law` with the dynamics of ``tree``: a ``point`` (3,) of ``link`` is the tool."""
-    qpos = inputs[1]
-    if (native := native_rows.for_rows(qpos, *inputs, *k[:-2], point)) is None:
-        return None
-    found = _empty(qpos.shape, wanted)
-    fixed, chain = _of_tree(native, tree, link, point, len(qpos), k)
-    native_rows.call(native.step, *fixed, *[None] * 5, chain, *inputs, *k[:-2], *map(found.get, _RESULTS))
-    return list(found.values())
+    rows, dof = inputs.qpos.shape
+    wanted = wanted if state.integral is None else (*wanted, "integral")
+    results = [np.empty((rows, size or dof)) if name in wanted else None for name, size in _RESULTS.items()]
+    if tool is None:
+        native_rows.call(native.law, rows, dof, *_kind(k), *given, *arrays, *results)
+    else:
+        fixed, chain = _of_tree(native, tool.tree, tool.link, given[0], rows, k)
+        native_rows.call(native.step, *fixed, *[None] * 5, chain, *arrays, *results)
+    effort, integral, _, *parts, s1, s2, near = results
+    shares = [None if each is None else each[:, 0] for each in (s1, s2)]
+    terms = OSCTerms._make((*parts, effort, *shares, None if near is None else near[:, 0] > 0))
+    return (state if integral is None else state._replace(integral=integral)), terms
 
 
 def friction(arrays: Mapping[str, Any]) -> Float64 | None:
@@ -64,7 +70,7 @@ def friction(arrays: Mapping[str, Any]) -> Float64 | None:
 def bind(
     tree: RigidTree, link: str, point: Any, k: OSCCoefficients, arrays: Mapping[str, Any]
 ) -> tuple[Any, int] | None:
-    """Return an object that keeps ``arrays``, and the address of a Call (call.h) that runs :func:`step` on them.
+    """Return an object that keeps ``arrays``, and the address of a Call (call.h) that runs :func:`law` on them.
 
     ``arrays`` are contiguous float64 arrays by their names in LAW; without ``bias`` it is the tree's. The tool is at a
     ``point`` (3,) of ``link``, by default at its origin. With ``coulomb`` and ``band`` (dof,) the feedforward is
@@ -88,11 +94,6 @@ def _of_tree(
     body = tree.link_bodies[index]
     fixed = own.tree, body, rows, native_rows.tool(own, index, point), *_kind(k)
     return fixed, np.array(tree.chains[body], np.float64)
-
-
-def _empty(shape: tuple[int, int], wanted: tuple[str, ...]) -> dict[str, Float64]:
-    """Return arrays for the results ``wanted``."""
-    return {name: np.empty((shape[0], _SIZES.get(name, shape[1]))) for name in wanted}
 
 
 def _kind(k: OSCCoefficients) -> tuple[int, bool]:

@@ -27,6 +27,7 @@ Float64 = NDArray[np.float64]
 
 _SIZES = {"pose": (7,), "jacobian": (6, -1), "jacobian_rate": (6,), "mass_matrix": (-1, -1), "bias": (-1,)}
 """Shapes of the results of :func:`kinematics`; -1 stands for the degrees of freedom."""
+_PLAIN = frozenset({np.ndarray, type(None)})
 _DYNAMICS = {"mass_matrix", "bias"}
 """Results that the extension computes on a fixed base alone."""
 
@@ -133,7 +134,7 @@ def native_tree(native: Any, tree: RigidTree) -> _NativeTree:
 
 def for_rows(like: Any, *arrays: Any) -> Any:
     """Return the extension if all arrays are NumPy's and ``like`` is (envs, columns), else None."""
-    plain = all([array is None or isinstance(array, np.ndarray) for array in arrays])
+    plain = _PLAIN.issuperset(map(type, arrays)) or all(x is None or isinstance(x, np.ndarray) for x in arrays)
     return in_use() if plain and like.ndim == 2 else None
 
 

@@ -44,8 +44,6 @@ IEEE Journal on Robotics and Automation 3 (1987).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,13 +52,19 @@ from batchpid.arrays.elementwise import clip, namespace, wrap
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_law
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
-from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
+from batchpid.task_space.osc_coefficients import OSCCoefficients
 from batchpid.task_space.osc_params import OSCParams
-from batchpid.task_space.osc_state import OSCState, OSCTerms, TaskDynamics, in_tool_axes, task_dynamics
+from batchpid.task_space.osc_state import (
+    OSCInputs,
+    OSCState,
+    OSCTerms,
+    TaskDynamics,
+    Tool,
+    in_tool_axes,
+    task_dynamics,
+)
 from batchpid.task_space.projections import Projections, projections
-from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.symmetric import product, quiet
-from batchpid.task_space.tree_kinematics import prepared, read_point
 
 
 def init(params: OSCParams, qpos: Any) -> OSCState:
@@ -80,172 +84,75 @@ def reset(params: OSCParams, state: OSCState, qpos: Any, mask: Any) -> OSCState:
     )
 
 
-def step(
-    params: OSCParams,
+def osc(
+    k: OSCCoefficients,
     state: OSCState,
-    setpoint: Any,
-    qpos: Any,
-    qvel: Any,
-    dt: Any,
-    *,
-    tree: RigidTree,
-    link: str,
-    point: Any = None,
-    twist: Any = None,
-    acceleration: Any = None,
-    wrench: Any = None,
-    feedforward: Any = None,
-) -> tuple[OSCState, Any]:
-    """Advance the law by ``dt`` [s]; return the state and the effort.
+    dynamics: TaskDynamics | Tool,
+    inputs: OSCInputs,
+    wanted: tuple[str, ...] = OSCTerms._fields,
+) -> tuple[OSCState, OSCTerms]:
+    """Advance the law by a time step; return the state and the terms, effort included.
 
-    Efforts are (envs, dof) [N m or N]. A row does not depend on the others, to the last bit under NumPy; NaN stays in
-    its env.
+    A row does not depend on the others, to the last bit under NumPy; NaN stays in its env.
 
     Parameters
     ----------
-    setpoint
-        Poses (envs, 7): position [m] and quaternion (w, x, y, z) of any length, in the world.
-    qpos, qvel
-        (envs, dof) [rad or m, rad/s or m/s].
-    tree, link, point
-        Robot, and its tool: a point (3,) [m] of a link, default its origin.
-    twist, acceleration
-        V and V' of the setpoint (envs, 6) [m/s, rad/s, ...], in the axes of the world; None: 0.
-    wrench
-        Wrench of the tool on its surroundings (envs, 6) [N, N m], in the axes of the params' frame; None: 0.
-    feedforward
-        Effort added (envs, dof), such as the effort of viscous damping; None: 0.
+    k
+        Params at the time step: :func:`batchpid.task_space.discretise`.
+    dynamics
+        Dynamics at the present state, such as an engine's, or a tool, with whose tree they are computed.
+    wanted
+        Names of the terms that the caller uses. Others may be None: native code leaves them out.
 
     Raises
     ------
     InvalidArgumentError
-        The link is unknown, an array has a wrong shape, or dt is not positive.
+        The link of the tool is unknown, or an array has a wrong shape.
     """
-    inputs = {"twist": twist, "acceleration": acceleration, "wrench": wrench, "feedforward": feedforward}
-    _check_shapes(params, tree, setpoint, qpos, **inputs)
-    k, tool = discretise(params, dt), (tree, link, point)
-    if (found := _native_step(k, state, tool, setpoint, qpos, qvel, ("effort",), **inputs)) is not None:
-        return found[0], found[1][0]
-    return advance(k, state, setpoint, qpos, qvel, task_dynamics(tree, qpos, qvel, link, point=point), **inputs)
-
-
-def step_terms(
-    params: OSCParams,
-    state: OSCState,
-    setpoint: Any,
-    qpos: Any,
-    qvel: Any,
-    dt: Any,
-    *,
-    tree: RigidTree,
-    link: str,
-    point: Any = None,
-    **inputs: Any,
-) -> tuple[OSCState, OSCTerms]:
-    """Advance the law as :func:`step`, with the same arguments; return the state and all terms, effort included."""
-    _check_shapes(params, tree, setpoint, qpos, **inputs)
-    k, tool = discretise(params, dt), (tree, link, point)
-    if (found := _native_step(k, state, tool, setpoint, qpos, qvel, _TERMS, **inputs)) is not None:
-        return found[0], _terms(found[1])
-    dynamics = task_dynamics(tree, qpos, qvel, link, point=point)
-    return advance_terms(k, state, setpoint, qpos, qvel, dynamics, **inputs)
-
-
-def advance(
-    k: OSCCoefficients,
-    state: OSCState,
-    setpoint: Any,
-    qpos: Any,
-    qvel: Any,
-    dynamics: TaskDynamics,
-    twist: Any = None,
-    acceleration: Any = None,
-    wrench: Any = None,
-    feedforward: Any = None,
-) -> tuple[OSCState, Any]:
-    """Advance the law with given coefficients and dynamics, such as an engine's; otherwise as :func:`step`."""
-    inputs = setpoint, qpos, qvel, twist, acceleration, wrench, feedforward
-    if (found := _native(state, partial(native_law.law, k, dynamics), inputs, ("effort",))) is not None:
-        return found[0], found[1][0]
+    try:
+        if (found := native_law.law(k, state, dynamics, inputs, wanted)) is not None:
+            return found
+        _check_shapes(k, inputs)
+    except ValueError:
+        _check_shapes(k, inputs)
+        raise
+    if isinstance(dynamics, Tool):
+        dynamics = task_dynamics(dynamics.tree, *inputs[1:3], dynamics.link, point=dynamics.point)
     with quiet():
-        sums = _sums(k, state, setpoint, qpos, qvel, dynamics, twist, acceleration, wrench, feedforward)
-        effort, whole, *_ = _saturated(*sums.parts)
-        return _integrated(k, state, sums, effort != whole), effort
-
-
-def advance_terms(
-    k: OSCCoefficients,
-    state: OSCState,
-    setpoint: Any,
-    qpos: Any,
-    qvel: Any,
-    dynamics: TaskDynamics,
-    twist: Any = None,
-    acceleration: Any = None,
-    wrench: Any = None,
-    feedforward: Any = None,
-) -> tuple[OSCState, OSCTerms]:
-    """Advance the law as :func:`advance`, with the same arguments; return the state and all terms, effort included."""
-    inputs = setpoint, qpos, qvel, twist, acceleration, wrench, feedforward
-    if (found := _native(state, partial(native_law.law, k, dynamics), inputs, _TERMS)) is not None:
-        return found[0], _terms(found[1])
-    with quiet():
-        sums = _sums(k, state, setpoint, qpos, qvel, dynamics, twist, acceleration, wrench, feedforward)
-        effort, whole, s1, s2 = _saturated(*sums.parts)
-        state = _integrated(k, state, sums, effort != whole)
-    p = sums.projections
+        task = in_frame(k, dynamics, inputs)
+        a = task_acceleration(k, task)
+        a = a if state.integral is None else a + state.integral
+        a_n, a_s = posture_acceleration(k, dynamics, state.posture, inputs.qpos, inputs.qvel)
+        p = projections(k, task.dynamics, a, a_n, inputs.wrench, inputs.feedforward, a_s)
+        effort, whole, s1, s2 = _saturated(p, k.effort_min, k.effort_max)
+        if state.integral is not None:
+            held = (p.near_singular | (effort != whole).any(-1))[:, None] & (a * task.near > 0)
+            state = state._replace(integral=_integrated(k, state.integral, task, held))
     shares = s1[..., 0], s2[..., 0]
-    return state, OSCTerms(sums.task.error, p.force, p.task, p.posture, whole, effort, *shares, p.near_singular)
+    return state, OSCTerms(task.error, p.force, p.task, p.posture, whole, effort, *shares, p.near_singular)
 
 
-_TERMS = (
-    *("error", "force", "task", "posture_effort", "unsaturated", "effort"),
-    *("task_share", "posture_share", "near_singular"),
-)
+def _check_shapes(k: OSCCoefficients, inputs: OSCInputs) -> None:
+    """Raise InvalidArgumentError for an input that is not (envs, size), and for coefficients of other envs."""
+    if np.ndim(inputs.qpos) != 2:
+        problem = f"has shape {np.shape(inputs.qpos)}, not (envs, dof)"
+        raise InvalidArgumentError("qpos", problem, remedy="give one row for each env")
+    envs, dof = np.shape(inputs.qpos)
+    for name, value, size in zip(inputs._fields, inputs, (7, dof, dof, 6, 6, 6, dof), strict=True):
+        if value is not None and np.shape(value) not in ((envs, size), (1, size)):
+            problem = f"has shape {np.shape(value)}, not ({envs}, {size})"
+            raise InvalidArgumentError(name, problem, remedy="give one row for each env")
+    for name, leaf in zip(k._fields, k[:-2], strict=False):
+        if leaf is not None and leaf.shape[0] not in (1, envs):
+            problem = f"has rows for {leaf.shape[0]} envs, but qpos for {envs}"
+            raise InvalidArgumentError(f"k.{name}", problem, remedy="make params for these envs")
 
 
-def _terms(results: list[Any]) -> OSCTerms:
-    """Return the terms of the results _TERMS of native code."""
-    *arrays, s1, s2, near = results
-    return OSCTerms._make([*arrays, s1[:, 0], s2[:, 0], near[:, 0] > 0])
+class Task(NamedTuple):
+    """Error and motion of the tool, vectors (envs, 6) in the axes of the params' frame."""
 
-
-def _native_step(
-    k: OSCCoefficients,
-    state: OSCState,
-    tool: tuple[RigidTree, str, Any],
-    setpoint: Any,
-    qpos: Any,
-    qvel: Any,
-    wanted: tuple[str, ...],
-    twist: Any = None,
-    acceleration: Any = None,
-    wrench: Any = None,
-    feedforward: Any = None,
-) -> tuple[OSCState, list[Any]] | None:
-    """Return the results of :func:`_native` with the dynamics of a tree, computed in the same call."""
-    tree, link, point = tool
-    (q, v), _, _ = prepared(tree, qpos=qpos, qvel=qvel)
-    native = partial(native_law.step, tree, link, read_point(q, point), k)
-    return _native(state, native, (setpoint, q, v, twist, acceleration, wrench, feedforward), wanted)
-
-
-def _native(
-    state: OSCState,
-    native: Callable[[tuple[Any, ...], tuple[str, ...]], list[Any] | None],
-    inputs: tuple[Any, ...],
-    wanted: tuple[str, ...],
-) -> tuple[OSCState, list[Any]] | None:
-    """Return the state after a step in native code and the results ``wanted``; None where native code is not used."""
-    arrays, wanted = (*inputs, None, None, *state), wanted if state.integral is None else (*wanted, "next_integral")
-    if (found := native(arrays, wanted)) is None:
-        return None
-    return (state, found) if state.integral is None else (state._replace(integral=found.pop()), found)
-
-
-class _Motion(NamedTuple):
-    """Vectors (envs, 6) in the axes of the params' frame."""
-
+    dynamics: TaskDynamics
+    error: Any
     near: Any
     """Error with limited norms."""
     tool_twist: Any
@@ -254,112 +161,34 @@ class _Motion(NamedTuple):
     acceleration: Any
 
 
-class Task(NamedTuple):
-    """Error and motion of the tool, in the axes of the params' frame."""
-
-    dynamics: TaskDynamics
-    error: Any
-    """(envs, 6)"""
-    motion: _Motion
-
-
-def in_frame(
-    k: OSCCoefficients, d: TaskDynamics, setpoint: Any, v: Any, twist: Any, acceleration: Any, xp: Any
-) -> Task:
+def in_frame(k: OSCCoefficients, d: TaskDynamics, inputs: OSCInputs) -> Task:
     """Return the dynamics, error and motion in the axes of the params' frame."""
-    error, near, tool_twist = _errors(k, d, setpoint, v, xp)
-    vectors: tuple[Any, ...] = (error, near, tool_twist, twist, acceleration)
+    xp = namespace(*k, *d, *inputs)
+    error, limits = pose_error(inputs.setpoint, d.pose), (k.position_error_limit, k.rotation_error_limit)
+    near = [_shortened(part, limit, xp) for part, limit in zip((error[..., :3], error[..., 3:]), limits, strict=True)]
+    vectors: tuple[Any, ...] = error, xp.concatenate(near, axis=-1), product(d.jacobian, inputs.qvel)
+    vectors += inputs.twist, inputs.acceleration
     if k.frame is not None:
         turn = matrix_of(d.pose[..., 3:])
         vectors = tuple([None if x is None else in_axes(turn, x[..., None])[..., 0] for x in vectors])
         d = in_tool_axes(d)
-    return Task(d, vectors[0], _Motion(*vectors[1:]))
+    return Task(d, *vectors)
 
 
-class _Sums(NamedTuple):
-    """Efforts before saturation."""
-
-    task: Task
-    a: Any
-    """Acceleration of the task (envs, 6)."""
-    projections: Projections
-    parts: tuple[Any, ...]
-    """Arguments of :func:`_saturated`."""
+def task_acceleration(k: OSCCoefficients, task: Task) -> Any:
+    """Return a (envs, 6) without I."""
+    a = k.kp * task.near - k.kd * task.tool_twist
+    a = a if task.twist is None else a + k.c * task.twist
+    return a if task.acceleration is None else a + k.acceleration_share * task.acceleration
 
 
-def _sums(
-    k: OSCCoefficients,
-    state: OSCState,
-    setpoint: Any,
-    qpos: Any,
-    qvel: Any,
-    dynamics: TaskDynamics,
-    twist: Any = None,
-    acceleration: Any = None,
-    wrench: Any = None,
-    feedforward: Any = None,
-) -> _Sums:
-    """Return the efforts of task and posture before saturation."""
-    xp = namespace(*k, *state, *dynamics, setpoint, qpos, qvel, twist, acceleration, wrench, feedforward)
-    task = in_frame(k, dynamics, setpoint, qvel, twist, acceleration, xp)
-    a = _accelerations(k.kp, k.kd, k.c, k.acceleration_share, *task.motion, state.integral)
-    a_n, a_s = posture_acceleration(k, dynamics, state.posture, qpos, qvel)
-    p = projections(k, task.dynamics, a, a_n, wrench, feedforward, a_s)
-    parts = p.base, p.task, p.posture, p.task_of_others, p.posture_of_others, k.effort_min, k.effort_max
-    return _Sums(task, a, p, parts)
-
-
-def _integrated(k: OSCCoefficients, state: OSCState, sums: _Sums, clipped: Any) -> OSCState:
-    """Return the state after the step; the integral of an env with ``clipped`` efforts (envs, dof) does not grow."""
-    if state.integral is None:
-        return state
-    motion, held = sums.task.motion, (sums.projections.near_singular | clipped.any(-1))[:, None]
-    xp = namespace(state.integral, motion.near)
-    new = state.integral + k.ki_dt * motion.near
-    if k.ki_dt2 is not None and motion.twist is not None:
-        new = new - k.ki_dt2 * motion.twist
-    new = clip(new, -k.integral_limit, k.integral_limit, xp)
-    return state._replace(integral=xp.where(held & (sums.a * motion.near > 0), state.integral, new))
-
-
-def _check_shapes(
-    params: OSCParams,
-    tree: RigidTree,
-    setpoint: Any,
-    qpos: Any,
-    twist: Any = None,
-    acceleration: Any = None,
-    wrench: Any = None,
-    feedforward: Any = None,
-) -> None:
-    """Raise InvalidArgumentError for an array that is not (envs, size), and for params of other envs."""
-    envs = np.shape(qpos)[0]
-    arrays = {
-        "setpoint": (setpoint, 7),
-        "twist": (twist, 6),
-        "acceleration": (acceleration, 6),
-        "wrench": (wrench, 6),
-        "feedforward": (feedforward, tree.dof),
-    }
-    for name, (value, size) in arrays.items():
-        if value is None:
-            continue
-        shape = value.shape if hasattr(value, "shape") else np.shape(value)
-        if shape not in ((envs, size), (1, size)):
-            problem = f"has shape {shape}, not ({envs}, {size})"
-            raise InvalidArgumentError(name, problem, remedy="give one row for each env")
-    for name, leaf in zip(params._fields, params, strict=True):
-        if hasattr(leaf, "shape") and leaf.shape[0] not in (1, envs):
-            problem = f"has rows for {leaf.shape[0]} envs, but qpos for {envs}"
-            raise InvalidArgumentError(f"params.{name}", problem, remedy="make params for these envs")
-
-
-def _errors(k: OSCCoefficients, d: TaskDynamics, setpoint: Any, v: Any, xp: Any) -> Any:
-    """Return the error (envs, 6), the same with limited norms, and the twist of the tool J q', in the world."""
-    limits = k.position_error_limit, k.rotation_error_limit
-    error = pose_error(setpoint, d.pose)
-    near = [_shortened(part, limit, xp) for part, limit in zip((error[..., :3], error[..., 3:]), limits, strict=True)]
-    return error, xp.concatenate(near, axis=-1), product(d.jacobian, v)
+def _integrated(k: OSCCoefficients, integral: Any, task: Task, held: Any) -> Any:
+    """Return the integral after the step; it stays where it is ``held`` (envs, 6)."""
+    xp = namespace(integral, task.near)
+    new = integral + k.ki_dt * task.near
+    if k.ki_dt2 is not None and task.twist is not None:
+        new = new - k.ki_dt2 * task.twist
+    return xp.where(held, integral, clip(new, -k.integral_limit, k.integral_limit, xp))
 
 
 def _shortened(vector: Any, limit: Any, xp: Any) -> Any:
@@ -367,14 +196,6 @@ def _shortened(vector: Any, limit: Any, xp: Any) -> Any:
     length = xp.sqrt((vector * vector).sum(-1, keepdims=True))
     long = length > limit
     return vector * xp.where(long, limit / xp.where(long, length, 1.0), 1.0)
-
-
-def _accelerations(kp: Any, kd: Any, c: Any, share: Any, e: Any, v: Any, twist: Any, given: Any, i: Any) -> Any:
-    """Return a (envs, 6)."""
-    a = kp * e - kd * v
-    a = a if twist is None else a + c * twist
-    a = a if given is None else a + share * given
-    return a if i is None else a + i
 
 
 def posture_acceleration(k: OSCCoefficients, d: TaskDynamics, posture: Any, q: Any, v: Any) -> tuple[Any, Any]:
@@ -389,11 +210,9 @@ def posture_acceleration(k: OSCCoefficients, d: TaskDynamics, posture: Any, q: A
     return a + d.chain * (pushed - k.limit_kd * v * xp.abs(depth) / k.limit_margin), springs + d.chain * pushed
 
 
-def _saturated(
-    base: Any, task: Any, null: Any, task_of_others: Any, null_of_others: Any, low: Any, high: Any
-) -> tuple[Any, ...]:
+def _saturated(p: Projections, low: Any, high: Any) -> tuple[Any, ...]:
     """Return the efforts after and before saturation, s1 and s2, all (envs, dof)."""
-    xp = namespace(base, task, null, task_of_others, null_of_others, low, high)
+    xp, base, task, null = namespace(*p, low, high), p.base, p.task, p.posture
     least, most = -math.inf if low is None else low, math.inf if high is None else high
     able = (base >= least) & (base <= most)
 
@@ -405,6 +224,6 @@ def _saturated(
 
     s1 = share(task, base)
     s2 = share(null, base + s1 * task)
-    others = s1 * task_of_others + s2 * null_of_others
+    others = s1 * p.task_of_others + s2 * p.posture_of_others
     effort = clip(base + s1 * task + s2 * null + others, low, high, xp)
     return effort, base + task + null + others, s1, s2

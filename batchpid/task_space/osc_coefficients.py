@@ -63,7 +63,7 @@ class OSCCoefficients(NamedTuple):
 
 
 def discretise(params: OSCParams, dt: Any) -> OSCCoefficients:
-    """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.task_space.advance`.
+    """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.task_space.osc`.
 
     Raises
     ------

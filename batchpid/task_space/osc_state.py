@@ -21,6 +21,37 @@ from batchpid.task_space.tree_kinematics import (
 )
 
 
+class Tool(NamedTuple):
+    """A point of a robot's link."""
+
+    tree: RigidTree
+    link: str
+    point: Any = None
+    """Point (3,) in the frame of the link [m]; None: its origin."""
+
+
+class OSCInputs(NamedTuple):
+    """Inputs of one step, arrays (envs, ...), or (1, ...) for all envs; None: 0."""
+
+    setpoint: Any
+    """Poses (envs, 7): position [m] and quaternion (w, x, y, z) of any length, in the world."""
+    qpos: Any
+    """(envs, dof) [rad or m]."""
+    qvel: Any
+    """(envs, dof) [rad/s or m/s]."""
+    twist: Any = None
+    """V of the setpoint (envs, 6) [m/s, rad/s], in the axes of the world."""
+    acceleration: Any = None
+    """V' of the setpoint (envs, 6) [m/s^2, rad/s^2], in these axes."""
+    wrench: Any = None
+    """Wrench of the tool on its surroundings (envs, 6) [N, N m], in the axes of the params' frame."""
+    feedforward: Any = None
+    """Effort added (envs, dof), such as the effort of viscous damping [N m or N]."""
+
+    def __repr__(self) -> str:
+        return array_summary(self, "envs", "columns")
+
+
 class TaskDynamics(NamedTuple):
     """Dynamics of a robot and its tool at present positions and velocities, from :func:`task_dynamics` or an engine."""
 

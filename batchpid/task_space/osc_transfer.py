@@ -6,10 +6,10 @@ from typing import Any
 
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space.operational_space import in_frame, posture_acceleration
+from batchpid.task_space.operational_space import in_frame, posture_acceleration, task_acceleration
 from batchpid.task_space.osc_coefficients import discretise
 from batchpid.task_space.osc_params import NoDecoupling, OSCParams, PartialDecoupling
-from batchpid.task_space.osc_state import OSCState, TaskDynamics
+from batchpid.task_space.osc_state import OSCInputs, OSCState, TaskDynamics
 from batchpid.task_space.projections import projections
 from batchpid.task_space.symmetric import product, quiet, solve
 
@@ -51,19 +51,17 @@ def track(
         problem = "'partial' has an inertia that does not move the tool by its acceleration"
         raise InvalidArgumentError("params.decoupling", problem, remedy="use 'full' or 'none'")
     k, mass, bias = discretise(params, dt), dynamics.mass_matrix, dynamics.bias
-    xp = namespace(*k, *dynamics, setpoint, qpos, qvel, effort)
+    inputs = OSCInputs(setpoint, qpos, qvel, twist, acceleration)
+    xp = namespace(*k, *dynamics, *inputs, effort)
     with quiet():
         known = bias if feedforward is None else bias + feedforward
         qacc = solve(mass, (effort - known)[..., None])[..., 0]
         stiff = k.posture_kp > 0
         rest = qacc - posture_acceleration(k, dynamics, qpos, qpos, qvel)[0]
         posture = qpos + xp.where(stiff, rest / xp.where(stiff, k.posture_kp, 1.0), 0.0)
-        task = in_frame(k, dynamics, setpoint, qvel, twist, acceleration, xp)
+        task = in_frame(k, dynamics, inputs)
         wanted = product(task.dynamics.jacobian, qacc) + task.dynamics.jacobian_rate
         if isinstance(k.decoupling, NoDecoupling):
             wanted = projections(k._replace(decoupling=None), task.dynamics, wanted, 0 * qpos).force
-        near, tool_twist, given, given_rate = task.motion
-        integral = wanted - k.kp * near + k.kd * tool_twist
-        integral = integral if given is None else integral - k.c * given
-        integral = integral if given_rate is None else integral - k.acceleration_share * given_rate
+        integral = wanted - task_acceleration(k, task)
         return OSCState(posture, clip(integral, -k.integral_limit, k.integral_limit, xp))

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.elementwise import TURN, multiply
+from batchpid.arrays.elementwise import TURN, matrix_vector
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import Constraint
@@ -140,6 +140,6 @@ class ConstraintEfforts:
         self.unwrapped[...] = np.where(self.wraps, qpos + WRAP * np.rint((self.unwrapped - qpos) / WRAP), qpos)
         error = (self.unwrapped - coupling.positions(self.unwrapped))[:, followers]
         rate = (qvel - coupling.rates(qvel))[:, followers]
-        wrong = multiply(self._response, effort - self._passive)
+        wrong = matrix_vector(self._response, effort - self._passive)
         wrong += self._rate_gain * rate + self._position_gain * error
-        return effort - multiply(self._push, wrong)
+        return effort - matrix_vector(self._push, wrong)

@@ -224,7 +224,7 @@ def _pid(layout: Layout, constants: Constants, values: Values, limits: tuple[Any
     if acceleration is not None:  # the leaders' mass matrix has the followers' share
         acceleration = constants.coupling.of_independent(acceleration)
     inputs = ((setpoint, rate, acceleration), seen.qpos, seen.qvel, seen.passive, state.matrix, viscous, *limits)
-    new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs, observed=values.step.observed)
+    new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs)
     outputs = values.outputs._replace(qf=effort, saturated=saturated)
     return values._replace(state=state._replace(law=new), outputs=outputs)
 
@@ -258,7 +258,7 @@ def _custom(layout: Layout, constants: Constants, values: Values, limits: tuple[
     """qf = sat(effort of the caller's own controller)."""
     values = _saturated(constants, constants.coupling.efforts(values.outputs.returned), values, limits)
     outputs = values.outputs
-    if values.limited is None or outputs.saturated is None:
+    if values.limited is None:
         return values
     return values._replace(outputs=outputs._replace(saturated=outputs.saturated | (values.limited > 0)))
 
@@ -311,8 +311,7 @@ def _saturated(constants: Constants, total: Any, values: Values, limits: tuple[A
     """Return ``values`` with the effort ``total`` clipped to the limits of motors and params."""
     xp = namespace(total, *limits)
     effort = clip(clip(total, *limits, xp), *constants.limits, xp)
-    saturated = effort != total if values.step.observed else None
-    return values._replace(outputs=values.outputs._replace(qf=effort, saturated=saturated))
+    return values._replace(outputs=values.outputs._replace(qf=effort, saturated=effort != total))
 
 
 def _sum(first: Any, second: Any) -> Any:

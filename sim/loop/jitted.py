@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -40,21 +40,14 @@ def put(tree: Any) -> Any:
     return jax.device_put(tree, jax.local_devices(backend="cpu")[0])
 
 
-def jitted_law(dtype: Precision, envs: int, law: PIDLaw, *inputs: Any, observed: bool) -> Any:
+def jitted_law(dtype: Precision, envs: int, law: PIDLaw, *inputs: Any) -> Any:
     """Return the result of :meth:`PIDLaw.advance`, compiled by JAX, for ``envs`` envs."""
-    return _call(_law(law, observed), dtype, envs, *inputs)
+    return _call(_jitted(law.advance), dtype, envs, *inputs)
 
 
 def jitted_controller(dtype: Precision, envs: int, controller: OwnController, *inputs: Any) -> Any:
     """Return the result of :meth:`OwnController.traced`, compiled by JAX, for ``envs`` envs."""
     return _call(_jitted(controller.traced), dtype, envs, *inputs)
-
-
-@lru_cache(maxsize=8)
-def _law(law: PIDLaw, observed: bool) -> Any:
-    import jax
-
-    return jax.jit(partial(law.advance, observed=observed))
 
 
 @lru_cache(maxsize=8)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.native.array_program import ArrayProgram
-from batchpid.native.symbols import Stack, Symbol
+from batchpid.native.symbols import Symbol
 from batchpid.native.tracing import Trace, trace
 from batchpid.native.trees import filled, leaves, mapped, structure
 from batchpid.sim.engine import native
@@ -103,7 +103,7 @@ class NativeTicks:
             state=self._traced_state(),
             command=self.command,
             measured=self.measured,
-            step=Step(0, 1, True, left),
+            step=Step(0, 1, left),
             seen=self.measured,
             noise=noise,
         )
@@ -257,7 +257,7 @@ class NativeTicks:
         before = values.outputs
         masks = [name for name, each in before._asdict().items() if each is not None and each.dtype == bool]
         values = values._replace(outputs=before._replace(**dict.fromkeys(masks)))  # programs take no masks
-        constants, inputs, state = mapped(_stacked, self._constants), leaves(values), leaves(values.state)
+        constants, inputs, state = mapped(_split, self._constants), leaves(values), leaves(values.state)
         layout, histories = self._layout._replace(model=Model()), tuple(array.ndim == 3 for array in state)
         traced = _trace(tuple(stages), is_last, layout, histories, structure(constants), structure(values))
         outputs = [np.zeros(self._shape, bool if is_mask else np.float64) for is_mask in traced.program.masks]
@@ -427,6 +427,6 @@ def _copied(state: StepState) -> StepState:
     return state._replace(matrix=None, motors=motors)
 
 
-def _stacked(array: Any) -> Any:
-    """Return an array (n, envs, dof) as a stack of n arrays, and other arrays unchanged."""
-    return Stack(array) if array.ndim == 3 else array
+def _split(array: Any) -> Any:
+    """Return an array (n, envs, dof) as a tuple of n arrays, and other arrays unchanged."""
+    return tuple(array) if array.ndim == 3 else array

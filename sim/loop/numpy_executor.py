@@ -105,7 +105,7 @@ class NumPyExecutor:
         engine = {"targets": write_targets, "constraint": self._update_constraint, "engine": self._step_engine}
         for index in range(span.begin, end):
             left = self._layout.left(index, end, constants.timestep)
-            values = Values(state, command, measured, Step(index, end, index + 1 == end, left), measured)
+            values = Values(state, command, measured, Step(index, end, left), measured)
             with controller_errors(self._controller, index + 1):
                 values = sim_step(self._layout, constants, values, engine)
             before, state, measured = measured.qpos, values.state, values.measured

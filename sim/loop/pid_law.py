@@ -8,12 +8,7 @@ import batchpid as bp
 from batchpid.arrays.choices import PerInertia, PerMassMatrix
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.law.coefficients import Coefficients
-from batchpid.law.computed_torque import (
-    advance_terms_with_mass_matrix,
-    advance_with_mass_matrix,
-    given_acceleration,
-    per_inertia,
-)
+from batchpid.law.computed_torque import advance_with_mass_matrix, given_acceleration, per_inertia
 
 MASS_MATRIX_STEPS = 4
 """Sim steps for which a mass matrix is kept within a tick.
@@ -63,9 +58,8 @@ class PIDLaw(NamedTuple):
         viscous: Any = None,
         low: Any = None,
         high: Any = None,
-        observed: bool = False,
     ) -> tuple[bp.PIDState, Any, Any]:
-        """Return the new state, the effort, and the mask of saturated joints, or None unless ``observed``.
+        """Return the new state, the effort, and the mask of saturated joints.
 
         Parameters
         ----------
@@ -89,19 +83,15 @@ class PIDLaw(NamedTuple):
         if viscous is not None:
             feedforward = viscous if feedforward is None else feedforward + viscous
         setpoint, setpoint_rate, acceleration = command
-        inputs: tuple[Any, ...] = (qvel if self.measures_rate else None, setpoint_rate)
+        rates = qvel if self.measures_rate else None, setpoint_rate
         if self.whole:
-            inputs = (setpoint, qpos, matrix, *inputs, acceleration)
+            inputs = setpoint, qpos, matrix, *rates, acceleration, feedforward
+            new, terms = advance_with_mass_matrix(k, state, *inputs)
         else:
-            inputs = (setpoint, qpos, *inputs)
             given = given_acceleration(k, acceleration)
             feedforward = feedforward if given is None else given if feedforward is None else feedforward + given
-        advance: Any = advance_with_mass_matrix if self.whole else bp.advance
-        if not observed:
-            return *advance(k, state, *inputs, feedforward=feedforward), None
-        advance = advance_terms_with_mass_matrix if self.whole else bp.advance_terms
-        new, terms = advance(k, state, *inputs, feedforward=feedforward)
-        return new, terms.effort, terms.saturated
+            new, terms = bp.advance(k, state, setpoint, qpos, *rates, feedforward)
+        return new, terms.effort, terms.effort != terms.unsaturated
 
 
 def half_way(qpos: Any, qvel: Any, steps: Any, timestep: float) -> Any:

@@ -49,8 +49,6 @@ class Step(NamedTuple):
     """Sim steps of the tick before this one."""
     end: Any
     """Sim steps of the tick."""
-    observed: bool = True
-    """Whether :attr:`Outputs.saturated` is wanted."""
     left: Any = 0.0
     """:meth:`Layout.left`: time from the moment of the law's setpoint to the end of the tick [s]."""
 
@@ -63,7 +61,7 @@ class Outputs(NamedTuple):
     motor: Any = None
     """Effort of the motors."""
     saturated: Any = None
-    """Joints whose effort was limited; None where it is not wanted."""
+    """Joints whose effort was limited; None under control "drive"."""
     guarded: Any = None
     """Setpoints that the guard changed; None without guard."""
     returned: Any = None

@@ -208,8 +208,8 @@ class OperationalSpace:
         if self._friction is not None:
             friction = self._friction_to(setpoint, parts.get("twist"), aimed.posture, qpos, dynamics)
             feedforward = friction if feedforward is None else feedforward + friction
-        inputs = aimed, setpoint[:, :7], qpos, qvel, dynamics
-        new, terms = ts.advance_terms(self._coefficients(setpoint), *inputs, **parts, feedforward=feedforward)
+        inputs = ts.OSCInputs(setpoint[:, :7], qpos, qvel, **parts, feedforward=feedforward)
+        new, terms = ts.osc(self._coefficients(setpoint), aimed, dynamics, inputs, ("effort", "unsaturated"))
         return new._replace(posture=state.posture), terms.effort, terms.effort != terms.unsaturated
 
     @property

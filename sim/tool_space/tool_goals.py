@@ -33,18 +33,16 @@ def reaches(robot: Robot, control: OperationalSpace, start: Float64, goal: Float
     if not isinstance(params.decoupling, NoDecoupling):
         params = params._replace(discretization=TASK_CHOICES["discretization"]["implicit"])
     k, state = ts.discretise(params, TIMESTEP), control.init(robot, len(start))
+    tool = ts.Tool(tree, control.link, control.point)
     goal = np.broadcast_to(goal, (len(start), 7)).astype(np.float64)
     qpos, qvel, inside = start.astype(np.float64), np.zeros(start.shape), np.ones(len(start), bool)
 
-    def dynamics() -> Any:
-        return ts.task_dynamics(tree, qpos, qvel, control.link, point=control.point)
-
     for _ in range(round(SECONDS / TIMESTEP)):
-        state, effort = ts.advance(k, state, goal, qpos, qvel, dynamics())
-        qvel = qvel + TIMESTEP * ts.forward_dynamics(tree, qpos, qvel, effort)
+        state, terms = ts.osc(k, state, tool, ts.OSCInputs(goal, qpos, qvel), ("effort",))
+        qvel = qvel + TIMESTEP * ts.forward_dynamics(tree, qpos, qvel, terms.effort)
         qpos = qpos + TIMESTEP * qvel
         inside &= ((qpos >= robot.lower - SLACK) & (qpos <= robot.upper + SLACK)).all(1)
-    left: Any = np.abs(pose_error(goal, dynamics().pose)).max(1)
+    left: Any = np.abs(pose_error(goal, ts.link_poses(tree, qpos, [tool.link], point=tool.point)[:, 0])).max(1)
     reached: NDArray[np.bool_] = inside & (left <= ARRIVED)
     return reached
 

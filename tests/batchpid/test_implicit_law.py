@@ -63,7 +63,8 @@ def test_it_solves_the_law_at_the_end_of_the_step(gains, dt, b, c, order, measur
         known |= {"setpoint_rate": np.array([[slope]])} if rated else {}
         known |= {"setpoint_acceleration": np.array([[more]])} if accelerated else {}
         k = bp.discretise(p, dt)
-        state, a = advance_with_mass_matrix(k, state, np.array([[r]]), np.array([[y]]), np.ones((1, 1, 1)), **known)
+        state, terms = advance_with_mass_matrix(k, state, np.array([[r]]), np.array([[y]]), np.ones((1, 1, 1)), **known)
+        a = terms.effort
         scale = abs(expected) + (abs(r) + abs(y) + dt * abs(v)) * (p_ + i_ * dt) + (abs(rate) + abs(v)) * d_
         assert abs(a.item() - expected) <= 1e-7 * (scale + abs(integral) + 1)
         v += dt * a.item()
@@ -77,14 +78,14 @@ def test_each_continuous_pole_s_becomes_1_over_1_minus_s_dt(kp, ki, kd, dt, orde
     columns = []
     for y, v, i in np.eye(3):
         state = bp.init(p, np.zeros((1, 1)))._replace(integral=np.array([[i]]))
-        new, a = bp.advance(
+        new, terms = bp.advance(
             bp.discretise(p, dt)._replace(gain_units=None),
             state,
             np.zeros((1, 1)),
             np.array([[y]]),
             measurement_rate=np.array([[v]]),
         )
-        speed = v + dt * a.item()
+        speed = v + dt * terms.effort.item()
         columns.append([y + dt * speed, speed, new.integral.item()])
     found = np.poly(np.linalg.eigvals(np.array(columns).T))
     expected = np.poly(1 / (1 - dt * np.roots([1, kd, kp, ki])))
@@ -98,8 +99,8 @@ def rollout(p, matrix, dt, steps=400, passive=0.0):
     r = np.ones_like(y)
     with np.errstate(all="ignore"):
         for _ in range(steps):
-            state, u = advance_with_mass_matrix(k, state, r, y, matrix, v)
-            v = v + dt * np.linalg.solve(matrix, (u + passive)[..., None])[..., 0]
+            state, terms = advance_with_mass_matrix(k, state, r, y, matrix, v)
+            v = v + dt * np.linalg.solve(matrix, (terms.effort + passive)[..., None])[..., 0]
             y = y + dt * v
     return y
 

@@ -138,7 +138,7 @@ def test_pure_functions_obey_the_strict_modes(wide):
         model = friction.Friction(*(rows[:1] ** 2 for _ in range(3)))
         rubbing = friction.init(model, rows, rows, mass, 0.01)
         found += [friction.advance(model, rubbing, rows, rows), replace_envs(rubbing, rubbing, mask)]
-        found += [friction.compensation(rows[0] ** 2, rows, rows, rows[0] ** 2)]
+        found += [friction.compensation(rows[:1] ** 2, rows, rows, rows[:1] ** 2)]
         motors = bp.make_actuators(
             3, command_delay=0.02, sensor_delay=0.01, strength=0.9, effort_limit=6.0, velocity_noise=1e-2, seed=1,
             saturation_effort=8.0, no_load_speed=4.0, position_limit=([-1.0, 0.0], [4.0, 7.0]), dtype=dtype,

@@ -91,12 +91,12 @@ def test_sharding_envs_changes_no_bit(case, run, cut, spread):
     shards = (slice(cut), slice(cut, None))
     parts = [bp.init(params.for_envs(rows), run[1][0][rows]) for rows in shards]
     for t in range(len(run[0])):
-        whole, effort = bp.advance(bp.discretise(params, DT), whole, run[0][t], run[1][t], feedforward=run[2][t])
+        whole, terms = bp.advance(bp.discretise(params, DT), whole, run[0][t], run[1][t], feedforward=run[2][t])
         for n, rows in enumerate(shards):
-            k = bp.discretise(params.for_envs(rows), DT, len(effort[rows]) if spread else None)
+            k = bp.discretise(params.for_envs(rows), DT, len(terms.effort[rows]) if spread else None)
             inputs = [x[t][rows] for x in run]
             parts[n], part = bp.advance(k, parts[n], *inputs[:2], feedforward=inputs[2])
-            assert part.tobytes() == effort[rows].tobytes()
+            assert part.effort.tobytes() == terms.effort[rows].tobytes()
             assert equal_bits(parts[n], whole.for_envs(rows))
 
 

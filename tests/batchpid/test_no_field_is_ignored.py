@@ -74,6 +74,11 @@ def effort_of_terms(params, state, setpoint, measurement):
     return state, terms.effort
 
 
+def advanced(params, state, setpoint, measurement):
+    state, terms = bp.advance(bp.discretise(params, DT), state, setpoint, measurement)
+    return state, terms.effort
+
+
 def by_controller(params):
     pid = bp.BatchPID(params, 2, DT)
     return [pid(r, y) for r, y in zip(SETPOINT, MEASURED, strict=True)]
@@ -82,7 +87,7 @@ def by_controller(params):
 LAWS = {
     "step": functools.partial(stepped, lambda p, s, r, y: bp.step(p, s, r, y, DT)),
     "terms": functools.partial(stepped, effort_of_terms),
-    "advance": functools.partial(stepped, lambda p, s, r, y: bp.advance(bp.discretise(p, DT), s, r, y)),
+    "advance": functools.partial(stepped, advanced),
     "controller": by_controller,
     "drive": functools.partial(stepped, lambda p, s, r, y: bp.drive_target(p, s, r, y, DT)),
 }
@@ -118,16 +123,14 @@ def test_a_drives_target_is_next_to_the_measurement_on_continuous_joints():
     np.testing.assert_allclose(target, 3.0 - 2 * np.pi)
 
 
-@pytest.mark.parametrize("terms", [False, True])
 @pytest.mark.parametrize("units", ["inertia", "mass_matrix"])
-def test_coefficients_of_accelerations_need_the_robots_inertia(units, terms):
+def test_coefficients_of_accelerations_need_the_robots_inertia(units):
     params, y = bp.make_params(2, 4.0, 1.0, 1.0, gain_units=units), np.zeros((1, 2))
     k, state = bp.discretise(params, DT), bp.init(params, y)
-    advance = bp.advance_terms if terms else bp.advance
     with pytest.raises(InvalidArgumentError, match=rf"gain_units.*{units}.*designed\('effort'\)"):
-        advance(k, state, y, y)
+        bp.advance(k, state, y, y)
     if units == "inertia":
-        advance(per_inertia(k, np.ones((1, 2))), state, y, y)
+        bp.advance(per_inertia(k, np.ones((1, 2))), state, y, y)
     else:
         advance_with_mass_matrix(k, state, y, y, np.eye(2)[None])
 
@@ -255,10 +258,10 @@ def test_every_field_of_osc_params_changes_the_efforts_or_is_refused():
     def run(params):
         state, results = ts.init(params, 0.7 * q), []
         for at in range(4):
-            inputs = pose, q + 0.01 * at, 0.3 * q
-            wrench, twist = np.full((3, 6), 0.3), np.full((3, 6), 0.1)
-            state, effort = ts.step(params, state, *inputs, DT, tree=tree, link="tip", wrench=wrench, twist=twist)
-            results += [effort, state.integral]
+            moving = {"wrench": np.full((3, 6), 0.3), "twist": np.full((3, 6), 0.1)}
+            inputs = ts.OSCInputs(pose, q + 0.01 * at, 0.3 * q, **moving)
+            state, terms = ts.osc(ts.discretise(params, DT), state, ts.Tool(tree, "tip"), inputs)
+            results += [terms.effort, state.integral]
         return np.concatenate([each.ravel() for each in results])
 
     plain, ignored = outcome(run, base), []

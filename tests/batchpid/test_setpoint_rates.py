@@ -25,8 +25,8 @@ def follow(b, rates=True, steps=2000, **options):
     for step in range(steps):
         t = DT * (step + late)
         r, rate = np.full((1, 1), 0.3 * (1 - np.cos(3 * t))), np.full((1, 1), 0.9 * np.sin(3 * t))
-        state, u = bp.advance(k, state, r, y, v, rate if rates else None)
-        v = v + DT * u
+        state, terms = bp.advance(k, state, r, y, v, rate if rates else None)
+        v = v + DT * terms.effort
         y = y + DT * v
         errors.append(0.3 * (1 - np.cos(3 * DT * (step + 1))) - y.item())
     return np.array(errors)
@@ -50,11 +50,11 @@ def test_to_begin_and_to_end_with_rates_makes_no_bump(b, seed, implicit, turns):
     params = bp.make_params(3, **GAINS, setpoint_weight=b, continuous=turns, **options)
     k, rng = bp.discretise(params, DT)._replace(gain_units=None), np.random.default_rng(seed)
     y, r, rate = rng.normal(size=(3, 2, 3))
-    state, _ = bp.advance_terms(k, bp.init(params, y), r, y, setpoint_rate=rate)
-    (with_rate, given), (without, none) = (bp.advance_terms(k, state, r, y, setpoint_rate=x) for x in (0 * rate, None))
+    state, _ = bp.advance(k, bp.init(params, y), r, y, setpoint_rate=rate)
+    (with_rate, given), (without, none) = (bp.advance(k, state, r, y, setpoint_rate=x) for x in (0 * rate, None))
     for one, other in zip((*with_rate, *given), (*without, *none), strict=True):
         np.testing.assert_array_equal(one, other)
-    _, rated = bp.advance_terms(k, state, r, y, setpoint_rate=rate)
+    _, rated = bp.advance(k, state, r, y, setpoint_rate=rate)
     moved = (1 - b) * np.asarray(k.kp) * DT * np.abs(rate) if implicit else 0.0
     assert (np.abs(rated.p - none.p) <= 1.001 * moved + 1e-12 * np.abs(none.p)).all()
     np.testing.assert_array_equal(rated.i, none.i)
@@ -78,8 +78,8 @@ def test_a_continuous_joint_follows_through_its_turns(b, seed, implicit):
         for at, params in enumerate((wound, wrapped)):
             k = bp.discretise(params, 0.01)._replace(gain_units=None)
             turn = (lambda x: x) if at == 0 else (lambda x: (x + np.pi) % (2 * np.pi) - np.pi)
-            states[at], u = bp.advance(k, states[at], turn(r), turn(r - behind[step]), setpoint_rate=speed)
-            rows.append(u)
+            states[at], terms = bp.advance(k, states[at], turn(r), turn(r - behind[step]), setpoint_rate=speed)
+            rows.append(terms.effort)
         np.testing.assert_allclose(rows[1], rows[0], rtol=1e-9, atol=1e-6)
 
 

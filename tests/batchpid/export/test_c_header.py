@@ -82,11 +82,11 @@ def efforts_in_numpy(params, columns, guard=None):
             r, rate = held.setpoint, None if rate is None else np.where(changed, held.rate, rate)
         optional = now.get("measurement_rate"), rate, now.get("feedforward")
         if "mass_matrix" in now:
-            state, effort = advance_with_mass_matrix(k, state, r, y, now["mass_matrix"], *optional)
+            state, terms = advance_with_mass_matrix(k, state, r, y, now["mass_matrix"], *optional)
         else:
             scaled = per_inertia(k, now["inertia"]) if "inertia" in now else k
-            state, effort = bp.advance(scaled, state, r, y, *optional)
-        efforts.append(effort[0])
+            state, terms = bp.advance(scaled, state, r, y, *optional)
+        efforts.append(terms.effort[0])
     return np.array(efforts)
 
 

@@ -131,8 +131,8 @@ def test_an_implicit_drive_is_the_implicit_law(target):
     for _ in range(100):
         v = (v + DT * k * (r - q) / m) / (1 + DT * c / m + DT**2 * k / m)
         q = q + DT * v
-        state, effort = advance_with_mass_matrix(coefficients, state, r[None], x, np.diag(m)[None], w)
-        w = w + DT * effort / m
+        state, terms = advance_with_mass_matrix(coefficients, state, r[None], x, np.diag(m)[None], w)
+        w = w + DT * terms.effort / m
         x = x + DT * w
         np.testing.assert_allclose(x[0], q, rtol=1e-10, atol=1e-12)
     assert np.abs(q - r).max() < 0.3

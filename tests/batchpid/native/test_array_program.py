@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from test_compiled_law import bits, numbers
 
 import batchpid as bp
+from batchpid.arrays.elementwise import push_history, read_history
 from batchpid.motors import STAGES, delay, friction, guard
 from batchpid.motors import Coefficients as ActuatorCoefficients
 from batchpid.motors.envelope import Envelope
 from batchpid.native import array_program
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import every_operation, program_status
-from batchpid.native.symbols import Stack
 from batchpid.native.tracing import trace
 
 pytestmark = pytest.mark.skipif(not program_status().active, reason="there are no native programs")
@@ -128,10 +128,8 @@ def test_histories_are_changed_in_place(shape, samples, is_pair, seed, threads):
 
     def function(*arrays):
         k, (held, *values) = iter(arrays[: len(constants)]), arrays[len(constants) :]
-        xp = values[0].__array_namespace__()
-        sample = xp.concatenate(tuple(values), axis=1) if is_pair else values[0]
-        held = delay.push(held, sample, xp)
-        given = [delay.Delay(Stack([next(k), next(k)]), next(k)) for _ in late]
+        held, xp = push_history(held, *values), values[0].__array_namespace__()
+        given = [delay.Delay((next(k), next(k)), next(k)) for _ in late]
         return held, [delay.read(held, each, None, xp) for each in given]
 
     with mock.patch.object(array_program, "NUMBERS_PER_THREAD", 64):
@@ -140,15 +138,14 @@ def test_histories_are_changed_in_place(shape, samples, is_pair, seed, threads):
     ours, theirs = history.copy(), history
     for _ in range(3):
         values = rng.normal(size=(1 + is_pair, *shape))
-        theirs = delay.push(theirs, np.concatenate(values, axis=1), np)
+        theirs = push_history(theirs, *values)
         assert_identical(program(ours, *values), [delay.read(theirs, each, None, np) for each in late])
         assert_identical([ours], [theirs])
 
 
 def test_histories_that_do_not_fit_are_refused():
     def function(place, history, value):
-        later = delay.push(history, value, value.__array_namespace__())
-        return [*later.take(Stack([place]))]
+        return [read_history(push_history(history, value), place)]
 
     places, history, value = np.arange(12.0).reshape(4, 3), np.zeros((4, 5, 3)), np.ones((4, 3))
     traced = trace(function, 1, 2)

@@ -75,7 +75,7 @@ def test_programs_of_actuators_are_bit_identical_with_numpy(names, seed):
 @needs_extension
 def test_programs_run_where_they_are_faster_and_only_with_their_coefficients():
     qpos = np.zeros(SHAPE)
-    many = built(EFFECTS.keys() - {"position_limit"}, np.random.default_rng(0))
+    many = built(EFFECTS.keys(), np.random.default_rng(0))
     state = bp.motors.init(many, qpos, DT)
     k = discretise(many, state, DT, SHAPE[0])
     for stage, inputs in (("delivered", 4), ("limits", 2), ("play", 3)):

@@ -25,7 +25,7 @@ from batchpid.native.availability import (
 )
 from batchpid.native.extensions import ROOT, StaleExtensionError, load, load_all
 from batchpid.native.operations import OPERATIONS, PROGRAM
-from batchpid.native.symbols import Namespace, Stack, Symbol
+from batchpid.native.symbols import Namespace, Symbol
 from batchpid.native.task_space_extension import TASK_SPACE
 from batchpid.native.tracing import trace
 from batchpid.sim.engine.native.interface import EXTENSIONS
@@ -201,7 +201,7 @@ def test_the_comparison_with_numpy_makes_every_operation():
     assert first_difference() is None
     namespace = Namespace()
     every_operation(*(Symbol(namespace) for _ in range(4)))
-    history_operations(Stack([Symbol(namespace)]), *(Symbol(namespace) for _ in range(3)))
+    history_operations(*(Symbol(namespace) for _ in range(4)))
     columns_of(*(Symbol(namespace) for _ in range(3)))
     noted = {name for name, _, _ in namespace.noted}
     numbers = np.frombuffer(trace(every_operation, 0, 4).operations, np.int32).reshape(-1, 5)[:, 0]

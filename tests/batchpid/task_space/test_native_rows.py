@@ -104,10 +104,10 @@ def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras, 
         if extras >> bit & 1
     }
     state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape), rng.normal(size=(rows, 6)) if learns else None)
-    inputs = params, state, goal, qpos, qvel, 1e-3
-    (new, found), (plain, wanted) = both(lambda: ts.step_terms(*inputs, tree=tree, link=tool, **given))
-    after, effort = ts.step(*inputs, tree=tree, link=tool, **given)
-    np.testing.assert_array_equal(effort, found.effort)
+    inputs = ts.discretise(params, 1e-3), state, ts.Tool(tree, tool), ts.OSCInputs(goal, qpos, qvel, **given)
+    (new, found), (plain, wanted) = both(lambda: ts.osc(*inputs))
+    after, alone = ts.osc(*inputs, wanted=("effort",))
+    np.testing.assert_array_equal(alone.effort, found.effort)
     if learns:
         np.testing.assert_array_equal(after.integral, new.integral)
         assert_same(new.integral, plain.integral, 1e-12)
@@ -164,14 +164,15 @@ def test_a_row_is_the_same_in_any_company():
     qpos[7, 2] = np.nan
     params = ts.make_osc_params(tree, effort_limit=80.0, smallest_eigenvalue=0.05)
     goal = ts.link_poses(tree, 0.9 * np.nan_to_num(qpos), [tool])[:, 0]
-    _, terms = ts.step_terms(params, ts.init(params, qpos), goal, qpos, qvel, 1e-3, tree=tree, link=tool)
+    k, hand = ts.discretise(params, 1e-3), ts.Tool(tree, tool)
+    _, terms = ts.osc(k, ts.init(params, qpos), hand, ts.OSCInputs(goal, qpos, qvel))
     effort = terms.effort
     assert 0.2 < terms.near_singular.mean() < 0.9
     assert np.flatnonzero(~np.isfinite(effort).all(1)).tolist() == [7]
     for chosen in (slice(0, 1), slice(4, 9), slice(8, 9), slice(9998, 10_000)):
         part = ts.init(params, qpos[chosen])
-        _, alone = ts.step(params, part, goal[chosen], qpos[chosen], qvel[chosen], 1e-3, tree=tree, link=tool)
-        np.testing.assert_array_equal(alone, effort[chosen])
+        _, alone = ts.osc(k, part, hand, ts.OSCInputs(goal[chosen], qpos[chosen], qvel[chosen]))
+        np.testing.assert_array_equal(alone.effort, effort[chosen])
 
 
 def test_a_stale_extension_is_a_warning_and_numpy_computes():
@@ -193,12 +194,11 @@ def test_a_step_with_a_tree_has_the_bytes_of_its_two_parts(seed):
     tree, link, rng = tree_of("panda"), tool_of("panda"), np.random.default_rng(seed)
     qpos, qvel = states(tree, 6, seed)
     params = ts.make_osc_params(tree, effort_limit=60.0, frame=("world", "tool")[seed % 2])
-    state, dt, point = ts.init(params, qpos), 1 / 500, rng.normal(size=3)
+    k, state, point = ts.discretise(params, 1 / 500), ts.init(params, qpos), rng.normal(size=3)
     goal = ts.link_poses(tree, qpos, [link])[:, 0] + 0.1 * rng.normal(size=(6, 7))
-    _, effort = ts.step(params, state, goal, qpos, qvel, dt, tree=tree, link=link, point=point)
-    dynamics = ts.task_dynamics(tree, qpos, qvel, link, point=point)
-    _, terms = ts.advance_terms(ts.discretise(params, dt), state, goal, qpos, qvel, dynamics)
-    np.testing.assert_array_equal(effort, terms.effort)
+    inputs, dynamics = ts.OSCInputs(goal, qpos, qvel), ts.task_dynamics(tree, qpos, qvel, link, point=point)
+    (_, whole), (_, parts) = (ts.osc(k, state, each, inputs) for each in (ts.Tool(tree, link, point), dynamics))
+    np.testing.assert_array_equal(whole.effort, parts.effort)
 
 
 @given(st.lists(st.floats(0.0, np.pi) | st.floats(0.0, 1e-3), min_size=1, max_size=9))
@@ -208,5 +208,6 @@ def test_rotation_errors_are_exact_to_the_last_bits(angles):
     params = ts.make_osc_params(tree)
     goal = np.stack([zero, zero, zero, np.cos(angle / 2), zero, zero, np.sin(angle / 2)], axis=1)
     at = zero[:, None]
-    _, terms = ts.step_terms(params, ts.init(params, at), goal, at, at, 1 / 500, tree=tree, link="tip")
+    inputs = ts.Tool(tree, "tip"), ts.OSCInputs(goal, at, at)
+    _, terms = ts.osc(ts.discretise(params, 1 / 500), ts.init(params, at), *inputs)
     np.testing.assert_allclose(np.abs(terms.error[:, 5]), angle, rtol=2e-15, atol=1e-300)

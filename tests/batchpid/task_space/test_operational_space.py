@@ -10,6 +10,7 @@ from trees import planar, states, tree_of
 
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
+from batchpid.native.availability import SWITCH
 from batchpid.task_space import frames
 
 DT = 1 / 2000
@@ -17,8 +18,8 @@ START = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8, 0.02, 0.02])
 HAND = "panda_hand"
 
 
-def terms_of(params, *inputs, dt=DT, **options):
-    return ts.advance_terms(ts.discretise(params, dt), *inputs, **options)[1]
+def terms_of(params, state, goal, qpos, qvel, dynamics, **options):
+    return ts.osc(ts.discretise(params, DT), state, dynamics, ts.OSCInputs(goal, qpos, qvel, **options))[1]
 
 
 def accelerations(d, effort):
@@ -125,7 +126,7 @@ def test_a_row_does_not_depend_on_the_others_and_nan_stays_alone():
 
         def terms_for(chosen, params=params):
             part = ts.OSCState(state.posture[chosen])
-            return ts.step_terms(params, part, goal[chosen], qpos[chosen], qvel[chosen], DT, tree=tree, link=HAND)[1]
+            return terms_of(params, part, goal[chosen], qpos[chosen], qvel[chosen], ts.Tool(tree, HAND))
 
         terms = terms_for(slice(None))
         effort = terms.effort
@@ -165,7 +166,7 @@ def test_without_decoupling_gains_are_forces():
     d = ts.task_dynamics(tree, qpos, qvel, HAND)
     goal = d.pose.copy()
     goal[:, 0] += 0.05
-    effort = ts.step(params, ts.init(params, qpos), goal, qpos, 0 * qvel, DT, tree=tree, link=HAND)[1]
+    effort = terms_of(params, ts.init(params, qpos), goal, qpos, 0 * qvel, ts.Tool(tree, HAND)).effort
     chain = tree.chain(HAND)
     wanted = ts.gravity(tree, qpos)[:, chain] + 20.0 * d.jacobian[:, 0, chain]
     np.testing.assert_allclose(effort[:, chain], wanted, atol=1e-9)
@@ -181,22 +182,31 @@ def test_the_state_is_the_posture_and_rows_of_it_reset():
     assert "stiffness 150" in repr(params)
 
 
-def test_inputs_of_a_step_are_checked():
+def test_inputs_of_a_step_are_checked(monkeypatch):
     tree, qpos = planar(), np.zeros((2, 2))
     goal, params = ts.link_poses(tree, qpos, ["tip"])[:, 0], ts.make_osc_params(tree)
-    state = ts.init(params, qpos)
+    k, state = ts.discretise(params, DT), ts.init(params, qpos)
     for change, message in (
         ({"setpoint": goal[:, :6]}, r"setpoint: has shape \(2, 6\), not \(2, 7\)"),
         ({"setpoint": goal[0]}, "setpoint: has shape"),
         ({"twist": np.zeros(6)}, "twist: has shape"),
         ({"wrench": np.zeros((3, 6))}, "wrench: has shape"),
         ({"feedforward": np.zeros((2, 6))}, "feedforward: has shape"),
-        ({"params": ts.make_osc_params(tree, stiffness=np.ones((3, 6)))}, "params.stiffness: has rows for 3 envs"),
-        ({"link": "top"}, "did you mean 'tip'"),
+        ({"qpos": qpos[0]}, r"qpos: has shape \(2,\)"),
+        ({"qvel": qpos[:, :1]}, "qvel: has shape"),
     ):
-        inputs = {"params": params, "state": state, "tree": tree, "link": "tip", "setpoint": goal} | change
-        with pytest.raises(InvalidArgumentError, match=message):
-            ts.step(**inputs, qpos=qpos, qvel=qpos, dt=DT)
+        inputs = ts.OSCInputs(**({"setpoint": goal, "qpos": qpos, "qvel": qpos} | change))
+        for dynamics in (ts.task_dynamics(tree, qpos, qpos, "tip"), ts.Tool(tree, "tip")):
+            for switch in "01":
+                monkeypatch.setenv(SWITCH, switch)
+                with pytest.raises(InvalidArgumentError, match=message):
+                    ts.osc(k, state, dynamics, inputs)
+    inputs = ts.OSCInputs(goal, qpos, qpos)
+    with pytest.raises(InvalidArgumentError, match="did you mean 'tip'"):
+        ts.osc(k, state, ts.Tool(tree, "top"), inputs)
+    for_three = ts.discretise(ts.make_osc_params(tree, stiffness=np.ones((3, 6))), DT)
+    with pytest.raises(InvalidArgumentError, match=r"k\.kp: has rows for 3 envs"):
+        ts.osc(for_three, state, ts.Tool(tree, "tip"), inputs)
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def run(tree, link, params, qpos, goal, steps, dt, *, known=lambda d, q: d, chan
     for n in range(steps):
         d = ts.task_dynamics(tree, q, v, link)
         target = goal(n * dt) if callable(goal) else goal
-        state, terms = ts.advance_terms(k, state, target, q, v, known(d, q), **given)
+        state, terms = ts.osc(k, state, known(d, q), ts.OSCInputs(target, q, v, **given))
         effort = terms.effort if change is None else change(terms.effort, terms, d, q, v)
         errors.append(frames.pose_error(target, d.pose))
         efforts.append(effort)

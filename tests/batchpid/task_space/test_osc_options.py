@@ -29,10 +29,10 @@ def run(tree, link, params, qpos, goal, steps, dt, *, load=0.0, state=None, bias
     state = ts.init(params, qpos) if state is None else state
     for _ in range(steps):
         d = ts.task_dynamics(tree, q, v, link)
-        state, effort = ts.advance(k, state, goal, q, v, d)
+        state, terms = ts.osc(k, state, d, ts.OSCInputs(goal, q, v))
         errors.append(frames.pose_error(goal, d.pose))
         outside = (d.jacobian * np.broadcast_to(load, (len(q), 6))[..., None]).sum(1)
-        v = v + dt * np.linalg.solve(d.mass_matrix, (effort - d.bias + outside)[..., None])[..., 0]
+        v = v + dt * np.linalg.solve(d.mass_matrix, (terms.effort - d.bias + outside)[..., None])[..., 0]
         q = q + dt * v
     return np.array(errors), state, q, v
 
@@ -66,15 +66,15 @@ def test_the_integral_does_not_wind_up():
     k, held = ts.discretise(params, 1e-3), ts.init(params, qpos)
     d = ts.task_dynamics(tree, qpos, 0 * qpos, "tip")
     for _ in range(3):
-        held, _ = ts.advance(k, held, far, qpos, 0 * qpos, d)
+        held, _ = ts.osc(k, held, d, ts.OSCInputs(far, qpos, 0 * qpos))
     np.testing.assert_array_equal(held.integral[0], 0.0)
     assert held.integral[1, 0] > 0.1
     back = held._replace(integral=np.full((2, 6), 5.0))
-    free, _ = ts.advance(k, back, near - [0.01, 0, 0, 0, 0, 0, 0], qpos, 0 * qpos, d)
+    free, _ = ts.osc(k, back, d, ts.OSCInputs(near - [0.01, 0, 0, 0, 0, 0, 0], qpos, 0 * qpos))
     assert (free.integral[:, 0] < 5.0).all()
     straight = np.array([[0.3, 1e-3]] * 2)
     d = ts.task_dynamics(tree, straight, 0 * straight, "tip")
-    state, _ = ts.advance(k, ts.init(params, straight), far, straight, 0 * straight, d)
+    state, _ = ts.osc(k, ts.init(params, straight), d, ts.OSCInputs(far, straight, 0 * straight))
     np.testing.assert_array_equal(state.integral, 0.0)
 
 
@@ -126,8 +126,8 @@ def test_implicit_gains_act_on_the_end_of_the_step():
     goal[:, :3] += 0.05 * rng.normal(size=(5, 3))
     state = ts.init(params, qpos)._replace(integral=rng.normal(size=(5, 6)))
     k = ts.discretise(params, dt)
-    new, effort = ts.advance(k, state, goal, qpos, qvel, d, twist, acc)
-    qacc = np.linalg.solve(d.mass_matrix, (effort - d.bias)[..., None])[..., 0]
+    new, terms = ts.osc(k, state, d, ts.OSCInputs(goal, qpos, qvel, twist, acc))
+    qacc = np.linalg.solve(d.mass_matrix, (terms.effort - d.bias)[..., None])[..., 0]
     a = (d.jacobian * qacc[:, None]).sum(-1) + d.jacobian_rate
     e, v = frames.pose_error(goal, d.pose), (d.jacobian * qvel[:, None]).sum(-1)
     share = 1 + dt * kd + dt**2 * kp + dt**3 * ki
@@ -154,14 +154,16 @@ def test_transfer_from_a_joint_pid_and_back_is_bumpless(how, decoupling):
     inputs = np.add(d.pose, [0.03, 0, 0, 0, 0, 0, 0]), qpos, 0.1 * qvel
     twist = np.full((rows, 6), 0.1)
     found = ts.track(params, ts.init(params, qpos), *inputs, effort, dt, d, twist=twist)
-    after, again = ts.advance(ts.discretise(params, dt), found, *inputs, d, twist)
+    after, terms = ts.osc(ts.discretise(params, dt), found, d, ts.OSCInputs(*inputs, twist))
+    again = terms.effort
     np.testing.assert_allclose(again, effort, atol=1e-6)
     joint = bp.track(pid, state, qpos, qpos, again, measurement_rate=0.1 * qvel, feedforward=d.bias)
     _, back = bp.step(pid, joint, qpos, qpos, dt, measurement_rate=0.1 * qvel, feedforward=d.bias)
     np.testing.assert_allclose(back, again, atol=1e-9)
     stiffer = params._replace(stiffness=2 * params.stiffness, posture_stiffness=3 * params.posture_stiffness)
     found = ts.track(stiffer, after, *inputs, again, dt, d)
-    np.testing.assert_allclose(ts.advance(ts.discretise(stiffer, dt), found, *inputs, d)[1], again, atol=1e-6)
+    _, terms = ts.osc(ts.discretise(stiffer, dt), found, d, ts.OSCInputs(*inputs))
+    np.testing.assert_allclose(terms.effort, again, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -185,7 +187,9 @@ def test_native_numpy_and_jax_compute_the_same(x64):
         twist = np.full((rows, 6), 0.2)
 
         def step(params, state, *rest, twist=twist):
-            return ts.step(params, state, *rest, dt, tree=tree, link="tip", twist=twist)
+            k, inputs = ts.discretise(params, dt), ts.OSCInputs(*rest, twist)
+            new, terms = ts.osc(k, state, ts.Tool(tree, "tip"), inputs)
+            return new, terms.effort
 
         inputs = params, state, goal, qpos, qvel
         native = step(*inputs)
@@ -219,10 +223,10 @@ def test_presets_are_params():
     qpos, qvel = states(tree, 3)
     d = ts.task_dynamics(tree, qpos, qvel, HAND)._replace(bias=np.zeros_like(qpos))
     goal = np.add(d.pose, [0.01, 0, 0, 0, 0, 0, 0])
-    _, effort = ts.advance(ts.discretise(isaac, 0.01), ts.init(isaac, qpos), goal, qpos, qvel, d)
+    _, terms = ts.osc(ts.discretise(isaac, 0.01), ts.init(isaac, qpos), d, ts.OSCInputs(goal, qpos, qvel))
     wrench = 100 * frames.pose_error(goal, d.pose) - 20 * (d.jacobian * qvel[:, None]).sum(-1)
     chain = tree.chain(HAND)
-    np.testing.assert_allclose(effort[:, chain], (d.jacobian * wrench[..., None]).sum(1)[:, chain], atol=1e-9)
+    np.testing.assert_allclose(terms.effort[:, chain], (d.jacobian * wrench[..., None]).sum(1)[:, chain], atol=1e-9)
 
 
 def test_options_are_checked():

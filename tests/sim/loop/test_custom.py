@@ -33,7 +33,8 @@ class Law:
 
     def __call__(self, state, setpoint, qpos, qvel, passive):
         k = bp.discretise(self.params, 1 / 2000, len(qpos))
-        return bp.advance(k, state, setpoint, qpos, None, None, passive)
+        state, terms = bp.advance(k, state, setpoint, qpos, None, None, passive)
+        return state, terms.effort
 
 
 class Counter:

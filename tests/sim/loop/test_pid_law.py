@@ -47,7 +47,7 @@ def run_traced(law, k, *arguments):
     def function(*symbols):
         given = iter(symbols)
         k, *inputs = (filled(each, given) for each in structures)
-        return leaves(law.advance(k, *inputs, observed=True))
+        return leaves(law.advance(k, *inputs))
 
     structures, constants, inputs = [structure(each) for each in (k, *arguments)], leaves(k), leaves(arguments)
     program = ArrayProgram(trace(function, len(constants), len(inputs)), constants, len(inputs), arguments[2].shape)
@@ -75,7 +75,7 @@ def test_the_traced_law_is_bit_identical_to_numpy(options, joints, envs, odd, se
     signals = (numbers(rng, shape, odd, float), rate, acceleration), numbers(rng, shape, odd, float), qvel, feedforward
     arguments = (state, *signals, matrix, viscous, *ends)
     with np.errstate(all="ignore"):
-        expected = law.advance(k, *arguments, observed=True)
+        expected = law.advance(k, *arguments)
     found = run_traced(law, k, *arguments)
     assert [bits(leaf) for leaf in found] == [bits(leaf) for leaf in leaves(expected)]
 
