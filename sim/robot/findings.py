@@ -45,7 +45,7 @@ class Finding:
         return summary([self])[0]
 
     @property
-    def _figures(self) -> str:
+    def figures(self) -> str:
         """Detail, envs and time in words."""
         more = f" and {len(self.envs) - 1} more" if len(self.envs) > 1 else ""
         env = f"env {self.envs[0]}{more}" if self.envs else ""
@@ -70,7 +70,7 @@ class Findings(list[Finding]):
 
     def _repr_html_(self) -> str:
         headers = ("", "where", "finding", "remedy")
-        rows = ((each.severity, each.where, " ".join([each.text, each._figures]).strip(), each.remedy) for each in self)
+        rows = ((each.severity, each.where, " ".join([each.text, each.figures]).strip(), each.remedy) for each in self)
         return html_table("Findings" if self else "No findings", headers if self else (), rows)
 
 
@@ -85,7 +85,7 @@ def summary(findings: Iterable[Finding]) -> list[str]:
 def _sentence(same: Sequence[Finding]) -> str:
     """Return the sentence for findings that differ only in joint or link, and detail."""
     first = same[0]
-    names = list(dict.fromkeys(f"{each._name} ({each._figures})" if each._figures else each._name for each in same))
+    names = list(dict.fromkeys(f"{each._name} ({each.figures})" if each.figures else each._name for each in same))
     if len(names) == 1:
         return f"{first.severity}: {f'{first._kind} {names[0]}'.strip()}: {first.text}; {first.remedy}"
     return f"{first.severity}: {first.text}; {first.remedy}. {len(names)} {first._kind}s: {', '.join(names)}"

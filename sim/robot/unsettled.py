@@ -151,9 +151,18 @@ def absolute_band(robot: RobotDescription) -> Float64:
     return np.array([PRISMATIC_BAND if joint.type == "prismatic" else REVOLUTE_BAND for joint in robot.joints])
 
 
-def short_words(findings: Findings) -> str:
-    """Return the words for the first of ``findings`` in a cell of a table; "never" without one."""
-    return CAUSES[findings[0].code].short if findings else "never"
+def short_words(findings: Findings, joint: str | None = None) -> str:
+    """Return the words for a cell of a table: for the first finding of ``joint``, else the first; "never" for none."""
+    of_joint = [each for each in findings if each.joint == joint]
+    first = next(iter([*of_joint, *findings]), None)
+    return "never" if first is None else CAUSES[first.code].short
+
+
+def settled_envs(rollout: Rollout, robot: RobotDescription) -> Bool:
+    """Return the envs of a ``rollout`` of ``robot`` that have not failed and whose joints all settle (envs,)."""
+    run = _Run(rollout, robot)
+    settled: Bool = ~(run.failed | run.unsettled.any(1))
+    return settled
 
 
 def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
@@ -275,12 +284,13 @@ class _Run:
     @cached_property
     def failed(self) -> Bool:
         """Envs that failed (envs,)."""
-        return ~self.rollout.ok.all(0)
+        return np.asarray(~self.rollout.ok.all(0))
 
     @cached_property
     def unsettled(self) -> Bool:
         """Joints that end outside their band (envs, dof); those of failed envs do not count."""
         shape = self.rollout.qpos.shape[1:]
+        outside: Any
         if self.is_pose and self.rollout.tool_pose is not None and self.robot.fixed_base:
             left = pose_error(self.rollout.setpoint[-1, :, :7], self.rollout.tool_pose[-1].astype(float))
             outside = np.broadcast_to((np.abs(left).max(1) > POSE_BAND)[:, None], shape)
@@ -288,7 +298,7 @@ class _Run:
             outside = np.zeros(shape, bool)
         else:
             outside = np.abs(self.error[-1]) > self.band
-        return outside & self.robot.independent & ~self.failed[:, None]
+        return np.where(self.failed[:, None] | ~self.robot.independent, False, outside)
 
     @cached_property
     def examined(self) -> NDArray[np.intp]:
@@ -332,11 +342,11 @@ class _Run:
             yield from self._failure(env)
             return
         if self.is_pose and self.robot.fixed_base and not self._solution.success[row := self._row_of(env)]:
-            left = 1e3 * float(self._solution.position_error[row])
-            detail = f"the nearest is {left:.3g} mm away" if left > 1e3 * POSE_BAND else "its rotation is not reached"
+            away = 1e3 * float(self._solution.position_error[row])
+            detail = f"the nearest is {away:.3g} mm away" if away > 1e3 * POSE_BAND else "its rotation is not reached"
             yield _Cause("out-of-reach", self._rest(env), links=(str(self.rollout.info.tool),), detail=detail)
             return
-        left = np.flatnonzero(self.unsettled[env]).tolist()
+        left: list[int] = np.flatnonzero(self.unsettled[env]).tolist()
         for joint in list(left):
             if (beyond := self._beyond_limits(env, joint)) is not None:
                 yield beyond
@@ -590,7 +600,9 @@ class _Run:
         """Return whether a joint hardly moves at the end, or swings about a position beside the setpoint."""
         error = self.error[self.tail, env, joint]
         drift = abs(error[: len(error) // 2].mean() - error[len(error) // 2 :].mean())
-        return bool(min(np.ptp(error), 3 * drift) < max(0.05 * abs(error[-1]), 0.2 * self.band[env, joint]))
+        speed = abs(self.rollout.qvel[self.tail, env, joint].mean())  # within a second, if the run is shorter
+        small = max(0.05 * abs(error[-1]), 0.2 * self.band[env, joint])
+        return bool(min(np.ptp(error), 3 * drift) < small and (speed < small or len(error) * self.rollout.tick > 0.2))
 
     def _oscillation(self, env: int, joint: int) -> float | None:
         """Return the frequency [Hz] of a joint that oscillates about its setpoint in the last half; else None."""
