@@ -24,6 +24,7 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import BatchPIDError, InvalidArgumentError
+from batchpid.gains.stability import Oscillation
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 from batchpid.sim.robot.findings import Finding, Findings
@@ -44,6 +45,8 @@ STEP = {"rad": 0.02, "m": 0.005}
 """Largest step towards the setpoint that shows whether a joint presses links together."""
 TIMED = 4
 """Envs of a pair of links whose first contact is looked for."""
+RINGING = 0.2
+"""Damping ratio below which a loop rings."""
 POSE_BAND = 2e-3
 """Error [m, rad] within which a tool has reached its pose."""
 
@@ -567,7 +570,8 @@ class _Run:
             share = float(saturated.mean())
             if at_limit or share > 0.5:
                 return _Cause("effort-limit", since, joint, detail=f"{limit:.3g} {unit} for {share:.0%} of the run")
-            return _Cause("slow", float(time[-1]), joint, detail=self._remains(env, joint))
+            swings = self._swings(env, joint)
+            return swings or _Cause("slow", float(time[-1]), joint, detail=self._remains(env, joint))
         rest = self._rest(env, joint)
         unknown = abs(applied - load[0])
         detail = f"{self._remains(env, joint)}, with {applied:.3g} {unit}; {needs}"
@@ -619,24 +623,42 @@ class _Run:
 
     def _ringing(self, env: int, joint: int, frequency: float) -> _Cause:
         """Return the cause of a joint that oscillates, by the damping of its loop with ideal motors."""
-        info, error = self.rollout.info, self.error[:, env, joint]
-        crossed = np.flatnonzero(np.diff(np.sign(error)))
+        crossed = np.flatnonzero(np.diff(np.sign(self.error[:, env, joint])))
         time = float(self.rollout.time[int(crossed[0]) + 1 if crossed.size else 0])
-        detail = f"at {frequency:.3g} Hz, by {np.ptp(error[self.tail]) / 2:.2g} {self.robot.units[joint]}"
-        code = "oscillates"
+        amplitude = np.ptp(self.error[self.tail, env, joint]) / 2
+        detail = f"at {frequency:.3g} Hz, by {amplitude:.2g} {self.robot.units[joint]}"
         if delay := float(self._delay(env)[joint]):
             detail += f", delays of {1e3 * delay:.3g} ms"
-        if info.control == "pid" and info.params is not None and info.timestep is not None:
-            try:
-                qpos = self.rollout.qpos[-1, env].astype(np.float64)
-                found = slow_oscillation(self.robot, _env(info.params, env), qpos, info.timestep, 0)
-            except BatchPIDError:
-                found = None
-            if found is not None and found.damping_ratio < 0.2:
-                code, detail = "ringing", f"{detail}, damping ratio {float(found.damping_ratio):.2g}"
-        elif info.control == "drive":
-            code = "ringing"
-        return _Cause(code, time, joint, detail=detail)
+        slow = self._slow_oscillation(env)
+        if slow is not None and slow.damping_ratio < RINGING:
+            return _Cause("ringing", time, joint, detail=f"{detail}, damping ratio {float(slow.damping_ratio):.2g}")
+        return _Cause("ringing" if self.rollout.info.control == "drive" else "oscillates", time, joint, detail=detail)
+
+    def _slow_oscillation(self, env: int) -> Oscillation | None:
+        """Return the least damped oscillation of an env's loop at its end, with ideal motors; None if unknown."""
+        info = self.rollout.info
+        if info.control != "pid" or info.params is None or info.timestep is None:
+            return None
+        qpos = self.rollout.qpos[-1, env].astype(np.float64)
+        try:
+            return slow_oscillation(self.robot, _env(info.params, env), qpos, info.timestep, 0)
+        except BatchPIDError:  # a mass matrix that is not positive definite
+            return None
+
+    def _swings(self, env: int, joint: int) -> _Cause | None:
+        """Return the cause of a joint that has passed its setpoint and comes back, in a loop that rings."""
+        beyond, slow = np.sign(self.error[:, env, joint]) * self._is_outside(env, joint), self._slow_oscillation(env)
+        if (
+            slow is None
+            or slow.damping_ratio >= RINGING
+            or slow.participation[joint] < 0.05
+            or abs(beyond.sum()) == (np.abs(beyond).sum())
+        ):
+            return None
+        return self._ringing(env, joint, float(slow.frequency))
+
+    def _is_outside(self, env: int, joint: int) -> Bool:
+        return np.asarray(np.abs(self.error[:, env, joint]) > self.band[env, joint])
 
     def _remains(self, env: int, joint: int) -> str:
         return f"{self.error[-1, env, joint]:.2g} {self.robot.units[joint]} remain"
