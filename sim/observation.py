@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple, get_type_hints
@@ -19,11 +19,17 @@ from batchpid.motors import Actuators
 from batchpid.sim.command import POSE_UNITS, TWIST_UNITS, CommandSpec, joint_command
 
 _load_plot: list[Callable[[], Callable[..., Any]]] = []
+_find: list[Callable[..., Any]] = []
 
 
 def register_plot(load: Callable[[], Callable[..., Any]]) -> None:
     """Set the function that returns the drawing function of rollouts; :mod:`batchpid.sim` calls it."""
     _load_plot[:] = [load]
+
+
+def register_findings(find: Callable[..., Any]) -> None:
+    """Set the function (rollout, robot) that returns the findings of rollouts; :mod:`batchpid.sim` calls it."""
+    _find[:] = [find]
 
 
 class Quantity(NamedTuple):
@@ -197,6 +203,8 @@ class RunInfo:
     """Stream and episode of each env at the start (envs, 2)."""
     redraws: tuple[Redraw, ...] = ()
     """Episodes that began after that."""
+    description: Any = field(default=None, repr=False)
+    """Robot (:class:`batchpid.sim.Robot`) of the run, for :meth:`Rollout.findings`; not recorded."""
 
     @property
     def command(self) -> CommandSpec:
@@ -246,7 +254,7 @@ class RunInfo:
 
 
 OWN_OF_PARTS = {"params", "actuators", "start", "seed", "versions", "begun", "draws", "episodes"}
-OWN_OF_PARTS |= {"complete", "faults", "rates", "redraws"}
+OWN_OF_PARTS |= {"complete", "faults", "rates", "redraws", "description"}
 """Fields of :class:`RunInfo` in which parts of a run may differ: state and origin at their start, and events."""
 
 
@@ -350,6 +358,28 @@ class Rollout:
     def _spans(values: NDArray[Any], units: Sequence[str]) -> list[str]:
         """Return the range of values (..., joints) of each joint, with its unit."""
         return [f"{span(values[..., joint])} {unit}" for joint, unit in enumerate(units)]
+
+    def findings(self, robot: Any = None) -> Any:
+        """Return the causes for which joints do not settle, the most likely first; an empty list if all settle.
+
+        Each is a :class:`batchpid.sim.Finding` with ``code``, ``text``, ``remedy``, ``envs``, ``time`` [s], and a joint
+        or a link.
+
+        Parameters
+        ----------
+        robot
+            Robot of the run, a :class:`batchpid.sim.Robot`; needed for a recording, which does not hold its meshes.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The robot is not known, or has other joints than the run.
+        """
+        robot = self.info.description if robot is None else robot
+        if robot is None:
+            problem, remedy = "of this run is not known", "pass it: rollout.findings(Robot.load(...))"
+            raise InvalidArgumentError("robot", problem, remedy=remedy)
+        return _find[0](self, robot)
 
     def plot(self, **options: Any) -> Any:
         """Return a Matplotlib figure of the run, which a notebook shows: positions above efforts for each joint.

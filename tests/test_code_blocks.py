@@ -211,4 +211,4 @@ def command(name: str, *flags: str) -> None:
         shorter = SHORTER.get(name, [])
         if "--trajectory" in flags:  # it lasts as long as its file
             shorter = shorter[: shorter.index("--seconds")]
-        assert main([name, *flags, *shorter]) in (0, None)
+        assert main([name, *flags, *shorter]) in (0, 3, None)  # 3: so short a run does not settle

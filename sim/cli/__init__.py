@@ -58,8 +58,8 @@ COMMANDS: dict[str, type[Any]] = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status.
 
-    0: success. 2: bad input, or a file that cannot be written. 130: Ctrl-C. 141: the reader of stdout closed it, as in
-    ``| head``. All but 0 come with one line on stderr, 141 with none.
+    0: success. 2: bad input, or a file that cannot be written. 3: no env of ``rollout`` or ``demo`` settled. 130:
+    Ctrl-C. 141: the reader of stdout closed it, as in ``| head``. 2 and 130 come with one line on stderr.
     """
     message = None
     try:

@@ -41,9 +41,10 @@ class DemoCommand:
 
     imports = ("batchpid.sim.plots", "batchpid.sim.runner")
 
-    def run(self) -> None:
-        """Run the command."""
+    def run(self) -> int:
+        """Run the command; return the exit status, 3 if no env settles."""
         from batchpid.sim import Runner, plots
+        from batchpid.sim.cli.report import exit_status
         from batchpid.sim.cli.run import hold_setpoint, start_poses
 
         if self.viewer:
@@ -75,3 +76,4 @@ class DemoCommand:
         print(f"\npicture: {plots.save(figure, picture)}")
         if self.viewer:
             show_window(rollout.for_envs(slice(0, 16)))
+        return exit_status(robot, rollout)

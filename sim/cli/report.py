@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,15 @@ from tabulate import tabulate
 from batchpid.metrics import StepMetrics
 from batchpid.sim import Robot, Rollout, Runner
 from batchpid.sim.identification.setpoint_files import Setpoints
+from batchpid.sim.robot.findings import Findings
+from batchpid.sim.robot.unsettled import settled_envs, short_words
 from batchpid.sim.tuning.evaluation import Evaluation, arm_joints, following_error
 from batchpid.task_space.frames import pose_error
+
+NOT_SETTLED = 3
+"""Exit status of `batchpid rollout` and `batchpid demo` where no env settles."""
+LISTED = 5
+"""Causes that a report lists."""
 
 
 def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:
@@ -27,8 +35,14 @@ def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> 
 def run_report(runner: Runner, rollout: Rollout, metrics: StepMetrics, wall: float) -> str:
     """Return the report of a ``rollout`` of ``runner`` that took ``wall`` seconds."""
     speed = speed_line(rollout.num_envs, rollout.tick * len(rollout.time), runner.timestep, wall)
-    outcome = "\n".join(outcome_lines(runner.robot, rollout, metrics))
-    return f"{speed}\n\n{joint_table(runner.robot, metrics)}\n\n{outcome}"
+    findings = rollout.findings(runner.robot)
+    outcome = "\n".join(outcome_lines(runner.robot, rollout, metrics, findings))
+    return f"{speed}\n\n{joint_table(runner.robot, metrics, findings)}\n\n{outcome}"
+
+
+def exit_status(robot: Robot, rollout: Rollout) -> int:
+    """Return the exit status of a command that held a setpoint, :data:`NOT_SETTLED` if no env settled, else 0."""
+    return 0 if settled_envs(rollout, robot).any() else NOT_SETTLED
 
 
 def tool_report(runner: Runner, rollout: Rollout, wall: float) -> str:
@@ -45,7 +59,8 @@ def tool_report(runner: Runner, rollout: Rollout, wall: float) -> str:
     failed = np.flatnonzero(~rollout.ok.all(0))
     outcome = f"FAILED: {len(failed)} of {rollout.num_envs} envs, the first is env {failed[0]}." if len(failed) else ""
     about = f"Tool: {runner.options.tool}. final error: the largest in the last tenth of the run."
-    return f"{speed}\n\n{table(rows, headers, 'lrr')}\n\n{about}\n{outcome}".rstrip()
+    causes = "\n".join(cause_lines(rollout.findings(runner.robot)))
+    return f"{speed}\n\n{table(rows, headers, 'lrr')}\n\n{about}\n{outcome}\n{causes}".rstrip()
 
 
 def trajectory_report(runner: Runner, rollout: Rollout, setpoints: Setpoints | None, wall: float) -> str:
@@ -110,8 +125,12 @@ def speed_line(num_envs: int, simulated: float, timestep: float, wall: float) ->
     )
 
 
-def joint_table(robot: Robot, metrics: StepMetrics) -> str:
-    """Return a table with final error, overshoot, settling time and saturation of each joint over the envs."""
+def joint_table(robot: Robot, metrics: StepMetrics, findings: Findings) -> str:
+    """Return a table with final error, overshoot, settling time and saturation of each joint over the envs.
+
+    In place of the settling time of a joint that does not settle there is the cause in ``findings``.
+    """
+    metrics = _of_settled(metrics)
     median, worst = metrics.median(), metrics.worst()
     settled = np.isfinite(metrics.settling_time).sum(0)
     saturation = metrics.saturation_share.mean(0)
@@ -124,7 +143,7 @@ def joint_table(robot: Robot, metrics: StepMetrics) -> str:
             joint.name,
             f"{both('steady_state_error', j, '.2g')} {joint.unit}",
             both("overshoot", j, ".0%"),
-            both("settling_time", j, ".2f", "never", " s"),
+            both("settling_time", j, ".2f", short_words(findings, joint.name), " s"),
             f"{settled[j]} of {len(metrics.settling_time)}",
             _cell(saturation[j], ".0%"),
         ]
@@ -133,12 +152,12 @@ def joint_table(robot: Robot, metrics: StepMetrics) -> str:
     headers = ["median / worst env", "final error", "overshoot", "settled after", "settled", "saturated"]
     return table(rows, headers, "lrrrrr") + (
         "\nfinal error: the largest in the last tenth of the run; settled: within 2 % of the move for good; "
-        "saturated: share of samples"
+        "saturated: share of samples; overshoot: of joints that settled"
     )
 
 
-def outcome_lines(robot: Robot, rollout: Rollout, metrics: StepMetrics) -> Iterator[str]:
-    """Yield a line on envs that diverged, one on joints that did not settle, and the lines of :func:`limit_lines`."""
+def outcome_lines(robot: Robot, rollout: Rollout, metrics: StepMetrics, findings: Findings) -> Iterator[str]:
+    """Yield a line on envs that diverged, one on joints that did not settle, their causes, and :func:`limit_lines`."""
     seconds, diverged = rollout.tick * len(rollout.time), np.flatnonzero(~rollout.ok.all(0))
     yield from _diverged_lines(rollout)
     never = np.isinf(np.delete(metrics.settling_time, diverged, axis=0)).sum(0) * robot.independent
@@ -147,7 +166,21 @@ def outcome_lines(robot: Robot, rollout: Rollout, metrics: StepMetrics) -> Itera
         yield f"NOT SETTLED within {seconds:g} s to 2 % of the move, with the number of envs: {', '.join(unsettled)}."
     if not diverged.size and not unsettled:
         yield f"Every joint of every env settled within {seconds:g} s to 2 % of its move."
-    yield from limit_lines(robot, rollout.setpoint[-1])
+    yield from cause_lines(findings)
+    if all(each.code != "setpoint-limits" for each in findings):
+        yield from limit_lines(robot, rollout.setpoint[-1])
+
+
+def cause_lines(findings: Findings) -> Iterator[str]:
+    """Yield a sentence for each of the first causes, the most likely first, with the joints or links that have it."""
+    causes: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for each in findings:
+        causes[each.text, each.remedy].append(f"{each.where} ({each.figures})")
+    for number, ((text, remedy), places) in enumerate(list(causes.items())[:LISTED]):
+        more = f" and {len(places) - LISTED} more" if len(places) > LISTED else ""
+        yield f"{'and' if number else 'WHY'}: {text}: {', '.join(places[:LISTED])}{more}; {remedy}."
+    if len(causes) > LISTED:
+        yield f"... and {len(causes) - LISTED} more causes, which rollout.findings() lists."
 
 
 def _diverged_lines(rollout: Rollout) -> Iterator[str]:
@@ -158,7 +191,7 @@ def _diverged_lines(rollout: Rollout) -> Iterator[str]:
         more = f" and {diverged.size - 8} more" if diverged.size > 8 else ""
         yield (
             f"DIVERGED: {diverged.size} of {rollout.num_envs} envs are no longer finite, the first after {first:.3g} "
-            f"s: env {', '.join(map(str, diverged[:8]))}{more}. These gains are unstable on this robot."
+            f"s: env {', '.join(map(str, diverged[:8]))}{more}."
         )
 
 
@@ -179,9 +212,13 @@ def limit_lines(robot: Robot, setpoint: NDArray[Any]) -> Iterator[str]:
 def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
     """Return a table with one row per evaluation: median and worst over the arm's joints and all moves."""
     arm = arm_joints(robot)
-    rows = []
+    rows, causes = [], []
     for evaluation in evaluations:
-        metrics = evaluation.metrics
+        metrics, findings = _of_settled(evaluation.metrics), evaluation.rollout.findings(robot)
+        names = {robot.joint_names[joint] for joint in np.flatnonzero(arm)}
+        findings = Findings(each for each in findings if each.joint is None or each.joint in names)
+        if findings:
+            causes += [f"\nNot settled under {evaluation.name} (each env makes one move):", *cause_lines(findings)]
         settled = np.isfinite(metrics.settling_time[:, arm]).all(axis=1)
         in_time = np.where(arm, metrics.settling_time, 0).max(1) <= evaluation.settling_limit
         diverged = int((~evaluation.rollout.ok.all(0)).sum())
@@ -190,7 +227,7 @@ def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
         rows.append(
             [
                 evaluation.name,
-                _median_and_worst(metrics.settling_time[:, arm], ".2f", " s"),
+                _median_and_worst(metrics.settling_time[:, arm], ".2f", " s", short_words(findings)),
                 _median_and_worst(lost, ".2g"),
                 _median_and_worst(metrics.overshoot[:, arm], ".1%"),
                 _median_and_worst(metrics.steady_state_error[:, arm], ".1e"),
@@ -204,12 +241,14 @@ def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
         rows = [row[:-1] for row in rows]
     else:
         headers.append("diverged")
-    return table(rows, headers, "l" + "r" * (len(headers) - 1)) + (
+    about = (
         "\nMedian / worst over the arm's joints and all moves, made as steps of the setpoint. following error: largest"
-        "\n|qpos - setpoint| of a joint [rad or m] on the same moves as smooth motions, with setpoint rates. chatter:"
-        "\nvariation of the effort over that of the smooth move. settled / in time: moves of which every joint settled,"
-        "\nwithin the run and within a second or 1.2 times the shortest that the effort limits allow."
+        "\n|qpos - setpoint| of a joint [rad or m] on the same moves as smooth motions, with setpoint rates. overshoot:"
+        "\nof joints that settled. chatter: variation of the effort over that of the smooth move. settled / in time:"
+        "\nmoves of which every joint settled, within the run and within a second or 1.2 times the shortest that the"
+        "\neffort limits allow."
     )
+    return table(rows, headers, "l" + "r" * (len(headers) - 1)) + about + "".join(f"\n{line}" for line in causes)
 
 
 def draw_first_move(robot: Robot, evaluations: Sequence[Evaluation], path: Path) -> Path:
@@ -222,11 +261,17 @@ def draw_first_move(robot: Robot, evaluations: Sequence[Evaluation], path: Path)
     return plots.save(plots.comparison(*runs, labels=(first.name, second.name), title=title), path)
 
 
-def _median_and_worst(figure: NDArray[Any], style: str, unit: str = "") -> str:
+def _of_settled(metrics: StepMetrics) -> StepMetrics:
+    """Return metrics whose overshoot is undefined where a joint did not settle, of which it says nothing."""
+    unsettled = np.isinf(metrics.settling_time) & np.isfinite(metrics.overshoot)
+    return metrics._replace(overshoot=np.where(unsettled, np.nan, metrics.overshoot))
+
+
+def _median_and_worst(figure: NDArray[Any], style: str, unit: str = "", infinite: str = "never") -> str:
     if np.isnan(figure).all():
         return "-"
     return " / ".join(
-        _cell(value, style, "never", unit) for value in np.nanquantile(figure, [0.5, 1.0], method="higher")
+        _cell(value, style, infinite, unit) for value in np.nanquantile(figure, [0.5, 1.0], method="higher")
     )
 
 

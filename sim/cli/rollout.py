@@ -30,7 +30,7 @@ class RolloutCommand:
 
     Robots start from seeded poses. The file holds time (ticks,), setpoint, qpos, qvel, effort and saturated (ticks,
     envs, joints), ok (ticks, envs), with --control osc tool_pose (ticks, envs, 7), and the robot's joint names, units
-    and limits.
+    and limits. The exit status is 3 if no robot settles at its setpoint; the report says why.
     """
 
     robot: flags.RobotName = "panda"
@@ -79,9 +79,10 @@ class RolloutCommand:
 
     imports = ("batchpid.sim.plots", "batchpid.sim.runner")
 
-    def run(self) -> None:
-        """Run the command."""
+    def run(self) -> int:
+        """Run the command; return the exit status, 3 if a setpoint was held and no env settles."""
         from batchpid.sim import Runner, plots
+        from batchpid.sim.cli.report import exit_status
         from batchpid.sim.cli.run import follow, hold_pose, hold_setpoint, read_variation, start_poses
 
         outputs = Outputs(force=self.force)
@@ -134,6 +135,7 @@ class RolloutCommand:
         if picture is not None:
             figure = plots.step_responses(rollout, mark=0, title=robot.name)
             print(f"picture: {plots.save(figure, picture)}")
+        return 0 if setpoints is not None else exit_status(robot, rollout)
 
     def _read(self, robot: Robot, path: Path) -> Setpoints:
         """Return the setpoints in a file, if no flag contradicts them."""

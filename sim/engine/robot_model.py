@@ -17,7 +17,7 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import link_shapes
-from batchpid.sim.robot.contacts import Contacts
+from batchpid.sim.robot.contacts import Contacts, Near
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.robot_tree import rigid_tree
@@ -70,6 +70,10 @@ class RobotModel:
         Links that a fixed joint connects may touch, and the base and the links fixed to it may touch the ground.
         """
         return self._contacts.in_contact(qpos, clearance)
+
+    def near(self, qpos: NDArray[Any], within: float) -> list[Near]:
+        """Return the pairs of shapes closer than ``within`` [m] to each other or to the ground, at one pose (dof,)."""
+        return list(self._contacts.near(qpos, within))
 
     def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
         """Return the two links of the URDF that are nearest to each other, or overlap most, at one pose (dof,).

@@ -238,7 +238,7 @@ def redraws_text(redraws: Iterable[Redraw]) -> str:
 
 def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
     """Return the known fields of ``info`` as numbers, texts, and arrays of them."""
-    known = {name: value for name, value in vars(info).items() if value is not None}
+    known = {name: value for name, value in vars(info).items() if value is not None and name != "description"}
     known |= {"joint_names": list(info.joint_names), "units": list(info.units), "faults": faults_text(info.faults)}
     if (command := known.pop("own_command", None)) is not None:
         known |= {_COMMAND_NAMES: list(command.names), _COMMAND_UNITS: list(command.units)}
@@ -259,7 +259,11 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
     """Return the :class:`RunInfo` in the attributes of a recording."""
     if (found := str(attributes.get("format", FORMAT))) != FORMAT:
         raise ValueError(f"its format is {found!r}, not {FORMAT!r}")
-    known = {field.name: attributes[field.name] for field in fields(RunInfo) if field.name in attributes}
+    known = {
+        field.name: attributes[field.name]
+        for field in fields(RunInfo)
+        if field.name in attributes.keys() - {"description"}
+    }
     if lacking := [field.name for field in fields(RunInfo) if field.default is MISSING and field.name not in known]:
         raise ValueError(f"it does not say its {', '.join(lacking)}")
     if "checksum" in attributes and attributes["checksum"] != attribute_checksum(attributes):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +34,9 @@ from batchpid.sim.robot.setpoint_limits import setpoint_guard
 from batchpid.sim.robot.simulated_links import body_inertias, simulated
 from batchpid.task_space.rigid_tree import RigidTree
 
+if TYPE_CHECKING:
+    from batchpid.sim.robot.contacts import Near
+
 LIMIT_TOLERANCE = 1e-6  # rad or m
 
 
@@ -51,6 +54,9 @@ class Dynamics(Protocol):
 
     def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> Bool:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,)."""
+
+    def near(self, qpos: NDArray[Any], within: float) -> list[Near]:
+        """Return the pairs of shapes closer than ``within`` [m] to each other or to the ground, at one pose (dof,)."""
 
 
 _load_dynamics: list[Callable[[RobotDescription, bool | None], Dynamics]] = []
@@ -234,7 +240,8 @@ class RobotDescription(Urdf):
             *("joint_names", "units", "lower", "upper", "effort_limit"),
             *("urdf", "dissipation", "merge_fixed", "fixed_base"),
         )
-        return RunInfo(robot=self.name, **{name: getattr(self, name) for name in shared}, **options)
+        known = {name: getattr(self, name) for name in shared}
+        return RunInfo(robot=self.name, description=self, **known, **options)
 
     def sample(self, count: int, seed: int = 0) -> Float64:
         """Return seeded poses (count, dof), uniform within the limits and half a turn of the start; followers match."""

@@ -21,7 +21,9 @@ class Finding:
     """Oddity of a joint, a link or the robot, and the remedy.
 
     ``severity`` is one of :data:`SEVERITIES`; ``code`` names the kind of finding, for programs. ``text`` and ``remedy``
-    are the same for all joints with one cause; ``detail`` has the figures of this joint or link.
+    are the same for all joints with one cause; ``detail`` has the figures of this joint or link. ``envs`` and ``time``
+    [s] belong to findings of a run (:meth:`batchpid.sim.Rollout.findings`): the envs that have it, the first one first,
+    and when it began there.
     """
 
     severity: str
@@ -31,6 +33,8 @@ class Finding:
     joint: str | None = None
     link: str | None = None
     detail: str = ""
+    envs: tuple[int, ...] = ()
+    time: float | None = None
 
     @property
     def where(self) -> str:
@@ -39,6 +43,14 @@ class Finding:
 
     def __str__(self) -> str:
         return summary([self])[0]
+
+    @property
+    def figures(self) -> str:
+        """Detail, envs and time in words."""
+        more = f" and {len(self.envs) - 1} more" if len(self.envs) > 1 else ""
+        env = f"env {self.envs[0]}{more}" if self.envs else ""
+        time = "" if self.time is None else f"{self.time:.3g} s"
+        return ", ".join(part for part in (self.detail, " at ".join(filter(None, (env, time)))) if part)
 
     @property
     def _kind(self) -> str:
@@ -58,7 +70,7 @@ class Findings(list[Finding]):
 
     def _repr_html_(self) -> str:
         headers = ("", "where", "finding", "remedy")
-        rows = ((each.severity, each.where, " ".join([each.text, each.detail]).strip(), each.remedy) for each in self)
+        rows = ((each.severity, each.where, " ".join([each.text, each.figures]).strip(), each.remedy) for each in self)
         return html_table("Findings" if self else "No findings", headers if self else (), rows)
 
 
@@ -73,7 +85,7 @@ def summary(findings: Iterable[Finding]) -> list[str]:
 def _sentence(same: Sequence[Finding]) -> str:
     """Return the sentence for findings that differ only in joint or link, and detail."""
     first = same[0]
-    names = list(dict.fromkeys(f"{each._name} ({each.detail})" if each.detail else each._name for each in same))
+    names = list(dict.fromkeys(f"{each._name} ({each.figures})" if each.figures else each._name for each in same))
     if len(names) == 1:
         return f"{first.severity}: {f'{first._kind} {names[0]}'.strip()}: {first.text}; {first.remedy}"
     return f"{first.severity}: {first.text}; {first.remedy}. {len(names)} {first._kind}s: {', '.join(names)}"

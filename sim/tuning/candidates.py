@@ -38,9 +38,9 @@ from batchpid.gains.stability import stability_bound
 from batchpid.metrics import StepMetrics
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.unsettled import absolute_band
 from batchpid.sim.runner import Runner
 from batchpid.sim.tuning.evaluation import (
-    absolute_band,
     arm_joints,
     following_error,
     run_moves,

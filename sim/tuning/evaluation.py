@@ -22,6 +22,7 @@ from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.limits import SetpointWarning
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.unsettled import absolute_band
 from batchpid.sim.runner import Runner
 from batchpid.sim.tuning.moves import (
     MAX_OVERSHOOT,
@@ -34,8 +35,6 @@ from batchpid.trajectories import minimum_jerk
 
 SUBSTEPS = 5
 """Sim steps of a tick: an odd number, so that an effort that alternates from step to step shows in the samples."""
-REVOLUTE_BAND, PRISMATIC_BAND = 1e-3, 1e-4
-"""Least half width of the settling band [rad], [m]."""
 SETTLE_SECONDS, SETTLE_SLACK = 1.0, 1.2
 """A move should settle within a second, or within this multiple of the shortest that its effort limits allow."""
 MAX_ERROR, MAX_CHATTER = 1e-3, 2.0
@@ -106,11 +105,6 @@ class Evaluation(NamedTuple):
         demands = self.demands(joints)
         late, excess = demands["settling time"].max(1) > 1, np.max([*demands.values()], axis=(0, 2))
         return int(late.sum()), int((excess > 1).sum()), max(1.0, float(excess.max(initial=0.0)))
-
-
-def absolute_band(robot: Robot) -> Float64:
-    """Return the least half width of the settling band, per joint (dof,) [rad or m]."""
-    return np.array([PRISMATIC_BAND if joint.type == "prismatic" else REVOLUTE_BAND for joint in robot.joints])
 
 
 def step_response_metrics(

@@ -22,11 +22,12 @@ from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.command import CommandSpec
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.unsettled import PRISMATIC_BAND, REVOLUTE_BAND
 from batchpid.sim.runner import Runner
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.tool_space.tool_goals import reaches
 from batchpid.sim.tuning.candidates import DIVERGED_COST, PENALTY_RATIO, bounded, response_cost
-from batchpid.sim.tuning.evaluation import PRISMATIC_BAND, REVOLUTE_BAND, SETTLE_SECONDS
+from batchpid.sim.tuning.evaluation import SETTLE_SECONDS
 from batchpid.sim.tuning.moves import Moves, smooth_variation
 from batchpid.sim.tuning.weights import Weights
 from batchpid.task_space.frames import pose_error

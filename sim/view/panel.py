@@ -17,7 +17,7 @@ from batchpid.sim.command import CommandSpec
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.view.controls import Control, Requests
-from batchpid.sim.view.data import ViewData
+from batchpid.sim.view.data import ViewData, cause
 from batchpid.sim.view.gains import GAINS
 from batchpid.sim.view.playback import Playback
 from batchpid.sim.view.simulation import LiveSimulation
@@ -47,7 +47,7 @@ class Panel:
         """Frames to run before the next pause."""
         self._names = short_names(data.robot)
         gui = self._gui
-        self._status = gui.add_markdown("starting ...")
+        self._status, self._cause = gui.add_markdown("starting ..."), gui.add_html("")
         for finding in findings:  # names from files are text, not markup
             gui.add_html(f'<p style="{_FINDING_STYLE}">{html.escape(finding)}</p>')
         motion = gui.add_button_group("Motion", ("Run", "Pause", "Step", "Reset"))
@@ -125,6 +125,10 @@ class Panel:
         self._status.content = "  \n".join(lines)
         if isinstance(data, Playback):
             self._time.value = time
+        of_group = [(group, cause(data, k * data.per_group + self.env)) for k, group in enumerate(data.groups)]
+        found = [f"{group}: {text}" if len(data.groups) > 1 else text for group, text in of_group if text]
+        text = f"Robot {self.env} has not settled. {' '.join(found)}" if found else ""
+        self._cause.content = f'<p style="{_FINDING_STYLE}">{html.escape(text)}</p>' if text else ""
         if self._entries is not None:
             numbers = _numbers(frame.info.command, frame.setpoint[0, self.env])
             self._entries.content = f'<p style="{_ENTRY_STYLE}">{html.escape(f"setpoint: {numbers}")}</p>'

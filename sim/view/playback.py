@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.observation import Rollout
+from batchpid.sim.observation import Rollout, RunInfo
 from batchpid.sim.robot.robot import Robot
 
 HISTORY_SECONDS = 8.0
@@ -54,6 +54,10 @@ class Playback:
     def history(self) -> Rollout:
         """Return the rows up to the present one, of the last :data:`HISTORY_SECONDS`."""
         return self._since(self._now - HISTORY_SECONDS)
+
+    def info_of(self, robot: int) -> RunInfo:
+        """Return the options of the run of one robot."""
+        return self._rollout.info.for_envs([robot])
 
     def effort_limits(self, robot: int, joint: int) -> tuple[float, float]:
         """Return the effort limits in the URDF [N m or N]."""

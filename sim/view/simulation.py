@@ -18,7 +18,7 @@ import batchpid.task_space as ts
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import array, choice, integer, number
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.observation import Observation, Rollout
+from batchpid.sim.observation import Observation, Rollout, RunInfo
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
@@ -185,6 +185,14 @@ class LiveSimulation(SingleOwner):
     def history(self) -> Rollout:
         """Return the frames of the last :data:`HISTORY_SECONDS`, the present one included."""
         return Rollout.join(list(self._frames))  # a copy: another thread may add a frame
+
+    def info_of(self, robot: int) -> RunInfo:
+        """Return the options of the run of one robot, numbered over all groups."""
+        group, runner = robot // self.per_group, self._runners[robot // self.per_group]
+        options = {name: getattr(runner.options, name) for name in ("timestep", "substeps", "collisions", "tool")}
+        control = self.groups[group]
+        params = self.gains[control].params if control in self.gains else None
+        return replace(self._info, control=control, params=params, actuators=runner.options.actuators, **options)
 
     def effort_limits(self, robot: int, joint: int) -> tuple[float, float]:
         """Return the effort limits of a joint [N m or N]."""

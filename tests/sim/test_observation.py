@@ -7,7 +7,7 @@ import pytest
 from identical import assert_identical
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Rollout, RunInfo, Runner
+from batchpid.sim import Robot, Rollout, RunInfo, Runner
 from batchpid.sim.observation import Redraw
 
 
@@ -55,7 +55,7 @@ def test_unknown_fields_are_named(rollout):
 
 GATHERED = {"rates", "faults", "redraws", "complete"}
 """Fields of RunInfo that all parts of a run contribute to."""
-OF_THE_START = {"params", "actuators", "start", "seed", "versions", "begun", "draws", "episodes"}
+OF_THE_START = {"params", "actuators", "start", "seed", "versions", "begun", "draws", "episodes", "description"}
 """Fields that the joined rollout has from its first part. All others are the same in all parts."""
 
 
@@ -71,6 +71,8 @@ def another(value):
         return value._replace(**{value._fields[0]: another(value[0])})
     if isinstance(value, tuple):
         return (*value, "another")
+    if isinstance(value, Robot):
+        return dataclasses.replace(value)
     return f"{value}+" if isinstance(value, str) else value + 1
 
 

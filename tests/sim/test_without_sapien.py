@@ -45,7 +45,7 @@ assert "sapien" not in sys.modules
 """
 COMMANDS = [
     "inspect panda",
-    "rollout panda --seconds 0.1 --num-envs 2 --workers 0 --out run.npz",
+    "rollout panda --seconds 1 --num-envs 2 --workers 0 --out run.npz",
     "compare panda --moves 1 --workers 0 --seconds 0.2",
     "export panda --to mjcf --out panda.xml",
 ]

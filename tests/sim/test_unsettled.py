@@ -1,0 +1,222 @@
+"""Robots that do not settle, each for another cause: the cause is named, right, and first."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim import FaultWarning, Randomization, Robot, Rollout, Runner, Uniform, read_recording, write_recording
+from tests.sim.tiny_urdf import write
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*outside the joint limits", "ignore:setpoint moves in every tick")
+
+
+def bar(length: float, mass: float = 1.0) -> str:
+    """Return the contents of a link: a bar along x, with its mass and its shape."""
+    moments = f'ixx="0.001" iyy="{mass * length**2 / 12:.6f}" izz="{mass * length**2 / 12:.6f}"'
+    place = f'<origin xyz="{length / 2} 0 0"/>'
+    return (
+        f'<inertial>{place}<mass value="{mass}"/><inertia {moments} ixy="0" ixz="0" iyz="0"/></inertial>'
+        f'<collision>{place}<geometry><box size="{length - 0.06} 0.05 0.05"/></geometry></collision>'
+    )
+
+
+def arm(
+    axis: str = "0 1 0", effort: float = 60.0, friction: float = 0.0, low: float = -3.0, height: float = 0.5
+) -> Robot:
+    """Return an arm of three bars, 0.3 m each, that turn about y, on a base at a height; ``axis`` is the elbow's."""
+    parts = ['<link name="base"/>']
+    for number, (name, turns) in enumerate([("shoulder", "0 1 0"), ("elbow", axis), ("wrist", "0 1 0")]):
+        above, at = ("base", "0 0 0.5") if number == 0 else (f"bar{number}", "0.3 0 0")
+        parts.append(f'<link name="bar{number + 1}">{bar(0.3)}</link>')
+        parts.append(
+            f'<joint name="{name}" type="revolute"><parent link="{above}"/><child link="bar{number + 1}"/>'
+            f'<origin xyz="{at}"/><axis xyz="{turns}"/><dynamics friction="{friction}" damping="0.02"/>'
+            f'<limit lower="-3" upper="3" effort="{effort if name == "elbow" else 60}" velocity="9"/></joint>'
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        return Robot.load(write(Path(folder), f'<robot name="arm">{"".join(parts)}</robot>'))
+
+
+class Case(NamedTuple):
+    """A run that does not settle, and the finding that names its cause."""
+
+    code: str
+    place: str
+    """Joint or link that is named."""
+    setpoint: tuple[float, ...]
+    start: tuple[float, ...] = (0.0, 0.0, 0.0)
+    robot: Mapping[str, Any] = MappingProxyType({})
+    gains: Mapping[str, Any] = MappingProxyType({})
+    """Arguments of robot.params(); none for the designed gains."""
+    options: Mapping[str, Any] = MappingProxyType({})
+    seconds: float = 2.0
+
+
+LAGGING = bp.make_actuators(3, command_delay=[0.09, 0.0, 0.0])
+STIFF = {"kp": 200.0, "kd": [20.0, 12.0, 5.0]}
+WEAK = {"kp": [200.0, 8.0, 200.0], "kd": [12.0, 10.0, 2.0]}
+LOADED = {"compensate": "none"}
+"""Options without compensation of gravity."""
+CASES = {
+    "pressed into the ground": Case("ground", "bar3", (0.7, 0.3, 0.0)),
+    "links that touch": Case("links", "bar1", (-0.3, 2.3, 2.4)),
+    "a start inside the ground": Case("start-in-ground", "bar3", (0.75, 0.3, 0.0), start=(0.75, 0.3, 0.0)),
+    "a start inside another link": Case("start-touching", "bar1", (-0.3, 2.3, 2.6), start=(-0.3, 2.2, 2.2)),
+    "gravity above the effort limit": Case("weak", "elbow", (0.0, -0.5, 0.0), robot={"effort": 3.0}),
+    "a move too long for the effort limit": Case(
+        "effort-limit", "elbow", (0.0, 2.9, 0.0), robot={"axis": "0 0 1", "effort": 1.0}, seconds=1.0
+    ),
+    "a setpoint outside the limits": Case("setpoint-limits", "wrist", (0.0, 0.0, -3.4)),
+    "gains beyond the stability bound": Case("unstable", "wrist", (0.1, 0.1, 0.1), gains={"kp": 900.0, "kd": 90.0}),
+    "gains that ring": Case("ringing", "shoulder", (0.5, 0.0, 0.0), gains={"kp": 300.0, "kd": 0.05}),
+    "no integral action": Case("no-integral", "shoulder", (-0.5, 0.0, 0.0), gains=STIFF, options=LOADED),
+    "friction": Case(
+        "friction", "wrist", (0.0, 0.0, 0.1), robot={"friction": 4.0}, gains={"kp": 30.0, "kd": 3.0},
+        options={"compensate": "gravity"},
+    ),
+    "a run too short": Case("slow", "elbow", (0.0, 0.5, 0.0), gains=WEAK, seconds=0.5),
+    "an unknown payload": Case(
+        "blocked", "shoulder", (0.2, 0.0, 0.0), gains={"kp": 300.0, "kd": [40.0, 15.0, 5.0]},
+        options={"randomization": Randomization(payload=Uniform(4.0, 4.1), payload_link="bar3")},
+    ),
+    "a setpoint that still moves": Case("moving", "elbow", (0.0, 1.0, 0.0), gains={"kp": 100.0, "kd": 20.0}),
+    "a delay of the motors": Case("oscillates", "shoulder", (0.3, 0.0, 0.0), options={"actuators": LAGGING}),
+    "a joint without gains": Case("no-gains", "elbow", (0.0, 0.5, 0.0), gains={"kp": [200.0, 0, 200], "kd": 12.0}),
+    "a guard": Case(
+        "guard", "elbow", (0.0, 1.0, 0.0), options={"guard": bp.make_guard(3, rate=0.2)}, seconds=1.0
+    ),
+    "an integral at its limit": Case(
+        "integral-limit", "shoulder", (-0.5, 0.0, 0.0), gains={**STIFF, "ki": 300.0, "integral_limit": 0.01},
+        options=LOADED,
+    ),
+}  # fmt: skip
+ENGINES = ("sapien", "mujoco")
+
+
+def run(case: Case, engine: str, envs: int = 1) -> Rollout:
+    """Return the run of a case: setpoints held, or for one that still moves a ramp."""
+    robot = arm(**case.robot)
+    params = robot.params(**case.gains) if case.gains else robot.designed()
+    ticks = round(case.seconds / 0.01)
+    share = np.linspace(0.0, 1.0, ticks)[:, None, None] if case.code == "moving" else np.ones((ticks, 1, 1))
+    with Runner(robot, envs, workers=0, params=params, engine=engine, **case.options) as runner:
+        runner.reset(case.start)
+        return runner.rollout(share * np.array(case.setpoint))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("name", CASES)
+def test_the_cause_is_named_and_first(name, engine):
+    case = CASES[name]
+    rollout = run(case, engine)
+    first = rollout.findings()[0]
+    assert (first.code, first.joint or first.link) == (case.code, case.place)
+    assert first.envs == (0,)
+    assert 0 <= first.time <= rollout.time[-1]
+
+
+def test_the_causes_are_of_twelve_kinds_or_more():
+    assert len({case.code for case in CASES.values()}) == len(CASES) >= 12
+
+
+def test_a_run_that_settles_has_no_findings():
+    with Runner(arm(), 2, workers=0, engine="mujoco") as runner:
+        assert runner.rollout(np.tile([-0.3, 0.2, 0.1], (200, 1))).findings() == []
+
+
+def test_links_that_touch_are_named_with_the_time_and_depth():
+    """The bars are 0.05 m thick: the tip is above the ground until the last of the way."""
+    rollout = run(CASES["pressed into the ground"], "mujoco")
+    (found,) = rollout.findings()
+    tip = 0.5 - 0.3 * np.sin(rollout.qpos[:, 0, 0]) - 0.57 * np.sin(rollout.qpos[:, 0, :2].sum(1))
+    first = int(np.argmax(tip < 0.03))
+    assert found.time == pytest.approx(rollout.time[first], abs=0.05)
+    assert "at the setpoint" in found.detail
+    assert "is pressed into the ground" in str(found)
+
+
+def test_without_collisions_there_is_no_contact_to_name():
+    case = CASES["pressed into the ground"]
+    robot = arm()
+    with (
+        Runner(robot, 1, workers=0, engine="mujoco", collisions=False) as runner,
+        pytest.warns(bp.sim.MissedContactWarning),
+    ):
+        assert runner.rollout(np.tile(case.setpoint, (200, 1))).findings() == []
+
+
+def test_the_cause_of_most_envs_is_first():
+    """Two envs are pressed into the ground, and one has a setpoint beyond a limit."""
+    setpoints = np.tile([[0.7, 0.3, 0.0], [0.0, 0.0, -3.4], [0.7, 0.3, 0.0], [0.0, 0.0, 0.1]], (200, 1, 1))
+    with Runner(arm(), 4, workers=0, engine="mujoco") as runner:
+        found = runner.rollout(setpoints).findings()
+    assert [(each.code, sorted(each.envs)) for each in found] == [("ground", [0, 2]), ("setpoint-limits", [1])]
+    assert "env 0 and 1 more" in str(found[0]) or "env 2 and 1 more" in str(found[0])
+
+
+def test_an_input_that_is_not_finite_is_the_cause():
+    setpoints = np.zeros((20, 2, 3))
+    setpoints[7, 1, 2] = np.nan
+    with Runner(arm(), 2, workers=0, engine="mujoco", on_invalid_input="contain") as runner, pytest.warns(FaultWarning):
+        (found,) = runner.rollout(setpoints).findings()
+    assert (found.code, found.joint, found.envs, found.detail) == ("setpoint-not-finite", "wrist", (1,), "setpoint")
+    assert found.time == pytest.approx(0.07, abs=0.011)
+
+
+def test_a_run_that_diverges_names_the_gains():
+    robot = arm()
+    params = robot.params(kp=9e3, kd=9e3, effort_limit=np.inf)
+    with (
+        Runner(robot, 1, workers=0, engine="mujoco", params=params, speed_limit=1e3) as runner,
+        pytest.warns(FaultWarning),
+    ):
+        (found,) = runner.rollout(np.tile([0.1, 0.1, 0.1], (50, 1))).findings()
+    assert found.code == "unstable"
+    assert "times the bound" in found.detail
+
+
+@pytest.mark.parametrize(("away", "code"), [(3.0, "out-of-reach"), (0.0, None)])
+def test_a_pose_of_a_tool_is_out_of_reach_or_reached(away, code, panda):
+    with Runner(panda, 1, workers=0, engine="mujoco", control="osc", tool="panda_hand") as runner:
+        pose = runner.reset().tool_pose[0].astype(float)
+        pose[0] += away
+        found = runner.rollout(np.tile(pose, (100, 1))).findings()
+    assert [each.code for each in found] == ([] if code is None else [code])
+    assert not found or found[0].link == "panda_hand"
+
+
+def test_a_drive_that_is_too_weak():
+    robot = arm(effort=3.0)
+    params = robot.params(kp=500.0, kd=50.0)
+    with Runner(robot, 1, workers=0, engine="mujoco", params=params, control="drive", compensate="none") as runner:
+        found = runner.rollout(np.tile([0.0, -0.5, 0.0], (200, 1))).findings()
+    assert ("weak", "elbow") in [(each.code, each.joint) for each in found]
+
+
+def test_a_recording_needs_its_robot(tmp_path):
+    case = CASES["a setpoint outside the limits"]
+    rollout, path = run(case, "mujoco"), tmp_path / "run.npz"
+    write_recording(rollout, path)
+    read = read_recording(path)
+    with pytest.raises(InvalidArgumentError, match="robot: of this run is not known"):
+        read.findings()
+    assert str(read.findings(arm())) == str(rollout.findings())
+    with pytest.raises(InvalidArgumentError, match="other joints"):
+        read.findings(Robot.load("panda"))
+
+
+def test_more_envs_than_are_examined():
+    rollout = run(CASES["a setpoint outside the limits"], "mujoco", envs=130)
+    (found,) = rollout.findings()
+    assert len(found.envs) == 100
+    assert dataclasses.replace(found).where == "joint 'wrist'"
