@@ -176,6 +176,8 @@ class RunInfo:
     """Stream and episode of each env at the start (envs, 2)."""
     redraws: tuple[Redraw, ...] = ()
     """Episodes that began after that."""
+    sweep: Mapping[str, Any] | None = None
+    """Inputs of a :func:`batchpid.sim.sweep`, as plain values or digests."""
 
     @property
     def command(self) -> CommandSpec:
