@@ -121,7 +121,7 @@ class RolloutCommand:
             params, control = gains.params, "drive" if gains.control == "drive" else self.control
             if self.rates and setpoints is not None and setpoints.acceleration is not None:
                 _check_accelerations(self.trajectory, control == "pid" and params.gain_units is not None)
-        make: Any = partial(Parts, out) if self.resume else Runner
+        make: Any = partial(Parts, out) if self.resume and out is not None else Runner
         stream = None if out is None or self.resume or out.suffix.lower() == ".npz" else out
         with (
             make(
