@@ -28,6 +28,7 @@ from batchpid.sim.loop.faults import FaultWarning
 from batchpid.sim.observation import Observation, Rollout
 from batchpid.sim.options import RunnerOptions, default_params
 from batchpid.sim.recording.recording_files import HDF5, read_recording, write_recording
+from batchpid.sim.robot.limits import SetpointCheck, SetpointWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
 from batchpid.sim.tuning.history import REMEDY, other_inputs
@@ -122,13 +123,17 @@ def sweep(
         whole = _read(path, inputs)
         shutil.rmtree(folder, ignore_errors=True)  # a kill may have come before it was removed
         return whole
+    limits = SetpointCheck(robot)
+    limits.check("qpos", robot.coupled(start[0]))
+    if checked.sets_positions and checked.guard is None and checked.tool_setpoints is None:
+        limits.check("setpoint", robot.coupled(command["setpoints"]))
     done = {int(each.stem): _read(each, inputs) for each in folder.glob("*.h5") if each.stem.isdecimal()}
     for envs in (progress or iter)(spans := _spans(num_envs, part, done)):
         if envs.start not in done:
             own = {name: _rows(given[name], envs) for name in PER_ENV[4:] if name in given}
             known = given | own | {"params": _rows(gains, envs), "first_env": first + envs.start}
             with warnings.catch_warnings(), Runner(robot, envs.stop - envs.start, **known) as runner:
-                for kind in (FaultWarning, MissedContactWarning):  # they count envs from the part's first
+                for kind in (FaultWarning, MissedContactWarning, SetpointWarning):  # they count from the part's first
                     warnings.simplefilter("ignore", kind)
                 runner.reset(*(rows[envs] for rows in start), seed=_rows(streams, envs))
                 rollout = runner.rollout(**{name: _rows(rows, envs, 1) for name, rows in command.items()})

@@ -30,7 +30,7 @@ def gains(envs):
 
 def starts(envs):
     """Return start poses, one for each env."""
-    return ARM.start + 0.001 * envs[:, None]
+    return ARM.start + 0.0004 * envs[:, None]
 
 
 def content(path):
@@ -145,6 +145,7 @@ def test_killed_at_random_moments_it_ends_with_the_same_file(sets, parts, kills,
             wanted, end = (parts - 2) * (kill + 1) // kills, time.monotonic() + PATIENCE
             while child.poll() is None and done < wanted and time.monotonic() < end:
                 done = len([*folder.glob("[0-9]*.h5")])
+                time.sleep(0.005)
             time.sleep(chance.uniform(0, 0.05))
             child.send_signal(signal.SIGKILL)
         assert child.returncode == -signal.SIGKILL
