@@ -126,7 +126,9 @@ def sweep(
     limits = SetpointCheck(robot)
     limits.check("qpos", robot.coupled(start[0]))
     if checked.sets_positions and checked.guard is None and checked.tool_setpoints is None:
-        limits.check("setpoint", robot.coupled(command["setpoints"]))
+        rows = read_array("setpoints", setpoints)
+        rows = array("setpoints", rows, (*rows.shape[:-1], robot.dof), robot.joint_names, finite=is_finite)
+        limits.check("setpoint", robot.coupled(rows))
     done = {int(each.stem): _read(each, inputs) for each in folder.glob("*.h5") if each.stem.isdecimal()}
     for envs in (progress or iter)(spans := _spans(num_envs, part, done)):
         if envs.start not in done:
