@@ -21,7 +21,9 @@ def _flag(help: str | None = None, **options: Any) -> Any:
 def chosen(command: Any, names: str) -> dict[str, Any]:
     """Return the values of some flags of a command, as arguments of the same names, which are separated by blanks."""
     values = {name: getattr(command, name) for name in names.split()}
-    return values | {name: {"on": True, "off": False, None: None}[values[name]] for name in values if name == "ground"}
+    if "ground" in values and (ground := values.pop("ground")) is not None:
+        values["ground"] = ground == "on"
+    return values
 
 
 OptionalPath = Annotated[Path | None, _flag()]

@@ -41,7 +41,7 @@ class Outputs:
         """Return ``path`` after a check that a file can be written there; None is returned as None.
 
         The check leaves nothing behind. Raises InvalidArgumentError if its suffix is not one of ``suffixes``, its
-        folder does not exist and is not :data:`FOLDER`, it cannot be written, the command reads it or writes it as another
+        folder neither exists nor is :data:`FOLDER`, it cannot be written, the command reads it or writes it as another
         output, or it exists and may not be replaced.
         """
         if path is not None:

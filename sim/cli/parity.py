@@ -66,18 +66,8 @@ class ParityCommand:
         print()
         print("\n".join(found.verdict()))
         if json_path is not None:
-            names = (
-                "bias",
-                "first_tick",
-                "first_chaos",
-                "time",
-                "open_loop",
-                "chaos",
-                "closed_loop",
-                "settling",
-                "push",
-            )
-            figures = {name: getattr(found, name) for name in names}
+            names = "bias first_tick first_chaos time open_loop chaos closed_loop settling push"
+            figures = {name: getattr(found, name) for name in names.split()}
             write_figures(json_path, figures | {"settled": found.settled, "verdict": found.verdict()})
             print(f"\nfigures: {json_path}")
         if picture is not None:

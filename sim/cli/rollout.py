@@ -14,7 +14,8 @@ from batchpid.checks.validate import array, file_path, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Recorder, Robot, write_recording
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.cli.outputs import Outputs, write_figures
+from batchpid.sim.cli.progress import waiting
 from batchpid.sim.recording.recording_files import HDF5
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tool_space.osc_controller import default_tool
@@ -66,6 +67,7 @@ class RolloutCommand:
     physics: flags.Physics = "accurate"
     backend: flags.Backend = "numpy"
     collisions: flags.Collisions = True
+    ground: flags.Ground = None
     dissipation: Literal["urdf", "sapien"] = "urdf"
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""
     randomize: flags.Randomize = None
@@ -77,6 +79,7 @@ class RolloutCommand:
     """Recording to write: .npz at the end, or .h5 tick by tick (extra `record`). For plot, view and render."""
     picture: flags.OptionalPath = None
     """Step responses to draw: .png or .svg."""
+    json: flags.Json = None
     force: flags.Force = False
     resume: flags.Switch = False
     """Run in parts of 128 robots, and continue after the last part of a run with the same options that was stopped.
@@ -87,7 +90,15 @@ class RolloutCommand:
     def run(self) -> None:
         """Run the command."""
         from batchpid.sim import Runner, plots
-        from batchpid.sim.cli.run import Parts, follow, hold_pose, hold_setpoint, read_variation, start_poses
+        from batchpid.sim.cli.run import (
+            Parts,
+            follow,
+            hold_pose,
+            hold_setpoint,
+            read_variation,
+            run_figures,
+            start_poses,
+        )
 
         outputs = Outputs(force=self.force)
         if self.resume and self.out is None:
@@ -97,6 +108,7 @@ class RolloutCommand:
         else:
             out = outputs.path("out", self.out, (".npz", *HDF5))
         picture = outputs.path("picture", self.picture, plots.FORMATS)
+        json = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes))
         robot, randomization = read_variation(robot, self.randomize)
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
@@ -123,16 +135,19 @@ class RolloutCommand:
                 _check_accelerations(self.trajectory, control == "pid" and params.gain_units is not None)
         make: Any = partial(Parts, out) if self.resume and out is not None else Runner
         stream = None if out is None or self.resume or out.suffix.lower() == ".npz" else out
-        with (
-            make(
+        with waiting(f"building {self.num_envs} robots"):
+            made = make(
                 robot,
                 self.num_envs,
                 params=params,
                 control=control,
-                **flags.chosen(self, "tool workers cluster timestep compensate engine physics backend collisions"),
+                **flags.chosen(self, "tool workers cluster timestep compensate engine physics backend"),
+                **flags.chosen(self, "collisions ground"),
                 substeps=self.substeps if setpoints is None else setpoints.substeps,
                 randomization=randomization,
-            ) as runner,
+            )
+        with (
+            made as runner,
             Recorder(stream, runner, seed=self.seed, overwrite=self.force) if stream else nullcontext(),
         ):
             if setpoints is not None:
@@ -144,6 +159,9 @@ class RolloutCommand:
         print(report)
         if out is not None:
             print(f"written: {out}")
+        if json is not None:
+            write_figures(json, run_figures(robot, rollout))
+            print(f"figures: {json}")
         if picture is not None:
             figure = plots.step_responses(rollout, mark=0, title=robot.name)
             print(f"picture: {plots.save(figure, picture)}")

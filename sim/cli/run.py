@@ -24,11 +24,21 @@ from batchpid.sim.identification.setpoint_files import Setpoints
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
-from batchpid.sim.tuning.evaluation import Evaluation, evaluate_gains, run_moves
+from batchpid.sim.tuning.evaluation import (
+    Evaluation,
+    evaluate_gains,
+    following_error,
+    run_moves,
+    step_response_metrics,
+)
 from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 from batchpid.sim.tuning.randomization_presets import at_the_joints, load_randomization, reseeded, usual_variation
 from batchpid.sim.tuning.sweep import sweep
+from batchpid.task_space.frames import pose_error
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+"""Axes of the error of a pose."""
 
 
 class Parts:
@@ -102,6 +112,29 @@ def follow(runner: Runner, start: NDArray[Any], setpoints: Setpoints, rates: boo
         progress=bar("simulating", unit="tick"),
     )
     return rollout, trajectory_report(runner, rollout, setpoints if rates else None, time.perf_counter() - began)
+
+
+def run_figures(robot: Robot, rollout: Rollout) -> dict[str, Any]:
+    """Return the figures of a rollout for --json, lists by env: of steps, or of setpoints that move, or of a tool."""
+    info, failed = rollout.info, np.flatnonzero(~rollout.ok.all(0))
+    about = {name: getattr(info, name) for name in ("robot", "control", "engine", "physics")}
+    seconds = rollout.tick * len(rollout.time)
+    figures: dict[str, Any] = about | {"num_envs": rollout.num_envs, "seconds": seconds, "failed": failed}
+    if rollout.tool_pose is not None:
+        error = np.abs(pose_error(rollout.setpoint[-1, :, :7], rollout.tool_pose[-1].astype(float)))
+        return figures | {"tool": info.tool, "final_error": dict(zip(AXES, error.T, strict=True))}
+    if (rollout.setpoint != rollout.setpoint[0]).any():
+        columns = {"following_error": following_error(robot, rollout)}
+    else:
+        start = robot.start if info.start is None else info.start.astype(np.float64)
+        with_effort = info.control != "drive"
+        columns = step_response_metrics(robot, rollout, start, with_effort=with_effort)._asdict()
+    joints = zip(robot.joint_names, robot.units, strict=True)
+    of_joints = {name: {"unit": unit} for name, unit in joints}
+    for column, rows in columns.items():
+        for name, figure in zip(robot.joint_names, np.asarray(rows).T, strict=True):
+            of_joints[name][column] = figure
+    return figures | {"joints": of_joints}
 
 
 def evaluate_sets(

@@ -163,9 +163,8 @@ class TuneCommand:
             seconds=self.seconds,
             history=history,
             progress=bar("tuning", unit="generation"),
-            **flags.chosen(
-                self, "seed generations population weights time_limit workers engine physics collisions ground"
-            ),
+            **flags.chosen(self, "seed generations population weights time_limit"),
+            **flags.chosen(self, "workers engine physics collisions ground"),
         )
         tool, (before, after) = found.settings["tool"], found.costs
         print(f"{robot.name}, {tool}: cost {before:.4f} by default, {after:.4f} as tuned\n")
