@@ -25,7 +25,7 @@ def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
     """
     from tqdm import tqdm
 
-    options |= {"delay": 1.0, "leave": False, "dynamic_ncols": True, "disable": not sys.stderr.isatty()}
+    options = {"delay": 1.0} | options | {"leave": False, "dynamic_ncols": True, "disable": not sys.stderr.isatty()}
 
     def wrap(items: Iterable[Any]) -> Iterable[Any]:
         shown = tqdm(items, desc=label, **options)
@@ -36,12 +36,12 @@ def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
 
 
 @contextmanager
-def waiting(label: str) -> Iterator[None]:
-    """Show ``label`` and the time since on stderr, from 1 s on, while the block runs."""
+def waiting(label: str, **options: Any) -> Iterator[None]:
+    """Show ``label`` and the time since on stderr, from 1 s on, while the block runs; ``options`` go to tqdm."""
     ended = Event()
 
     def show() -> None:
-        for _ in bar(label, bar_format="{desc}: {elapsed}")(iter(partial(ended.wait, 0.5), True)):
+        for _ in bar(label, bar_format="{desc}: {elapsed}", **options)(iter(partial(ended.wait, 0.5), True)):
             pass
 
     thread = Thread(target=show, daemon=True)

@@ -26,7 +26,7 @@ def saved(batchpid, path, *flags):
 
 
 def test_the_file_holds_the_rollout_of_a_runner_with_tuned_gains(batchpid, tmp_path, panda):
-    file = saved(batchpid, tmp_path / "new" / "run.npz", "--workers", 1, "--seed", 7, "--substeps", 10)
+    file = saved(batchpid, tmp_path / "run.npz", "--workers", 1, "--seed", 7, "--substeps", 10)
     start = start_poses(panda, 3, 0.3, 7)
     with Runner(panda, 3, params=panda.tuned(), workers=0, substeps=10) as runner:
         runner.reset(qpos=start)
