@@ -39,6 +39,8 @@ from batchpid.task_space.frames import pose_error
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Axes of the error of a pose."""
+PART = 128
+"""Robots in a part of a rollout that can be resumed."""
 
 
 class Parts:
@@ -48,7 +50,7 @@ class Parts:
         self.options = known = RunnerOptions(robot, num_envs, **options)
         self.robot, self.num_envs, self.control = robot, num_envs, known.control
         self.timestep, self.substeps = known.timestep, known.substeps
-        self._sweep = partial(sweep, robot, num_envs, path=path, params=params, **options)
+        self._sweep = partial(sweep, robot, num_envs, path=path, params=params, part=PART, **options)
 
     def __enter__(self) -> Parts:
         return self
