@@ -27,7 +27,7 @@ from batchpid.io.versions import package_versions
 from batchpid.sim.loop.faults import FaultWarning
 from batchpid.sim.observation import Observation, Rollout
 from batchpid.sim.options import RunnerOptions, default_params
-from batchpid.sim.recording.recording_files import HDF5, read_recording, write_recording
+from batchpid.sim.recording.recording_files import HDF5, load_h5py, read_recording, write_recording
 from batchpid.sim.robot.limits import SetpointCheck, SetpointWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
@@ -86,8 +86,11 @@ def sweep(
         An argument is out of range; or there is a file of another sweep, and the message names the inputs that differ.
     RecordingError
         The file cannot be written, or a part of it is damaged.
+    MissingDependencyError
+        h5py is not installed.
     """
     path, part = file_path("path", path, HDF5), integer("part", part, 1, 1_000_000)
+    load_h5py()  # raises without it, before anything runs
     num_envs = integer("num_envs", num_envs, 1, 1_000_000)
     first = integer("first_env", options.get("first_env", 0), 0, 10**9)
     numbers = first + np.arange(num_envs)
