@@ -17,14 +17,16 @@ PYTHON ?= $(or $(shell for p in python3 python3.14 python3.13 python3.12 python3
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done),python3)
 VENV := .venv
 RUN := $(VENV)/bin/python
-PIP := $(RUN) -m pip install --quiet --disable-pip-version-check
+# One line for each step of the installation. The extensions are compiled by BUILD, and not a second time by pip.
+STEP := $(RUN) .ci/step.py
+PIP := env BATCHPID_NATIVE=0 $(RUN) -m pip install --progress-bar off --disable-pip-version-check
 ARGS :=
 
-# Sources of the native extensions. pip builds them with the rest; BUILD builds those that are older than their sources.
+# Sources of the native extensions. BUILD builds those that are older than their sources.
 NATIVE := setup.py batchpid/native/extensions.py batchpid/native/operations.py batchpid/native/task_space_extension.py \
 	batchpid/sim/engine/native/interface.py \
 	$(foreach folder,batchpid/native batchpid/sim/engine/native,$(wildcard $(folder)/*.cpp $(folder)/*.h))
-BUILD := $(RUN) -W ignore setup.py --quiet build_ext --inplace
+BUILD := $(STEP) "compiling native extensions" env -u BATCHPID_NATIVE $(RUN) -u -W ignore setup.py build_ext --inplace
 
 # Compiled modules are kept, whatever the caller's setting: the tests start hundreds of processes that import them.
 unexport PYTHONDONTWRITEBYTECODE
@@ -101,7 +103,7 @@ wheel: | $(RUN)
 	@$(WHEEL)/bin/pip install --quiet --disable-pip-version-check build
 	@BATCHPID_REQUIRE_NATIVE=1 $(WHEEL)/bin/python -m build --outdir dist .
 	@$(WHEEL)/bin/pip install --quiet --disable-pip-version-check dist/*.whl
-	@cd $(WHEEL) && bin/batchpid inspect panda --engine | grep "native calls into SAPIEN"
+	@cd $(WHEEL) && bin/batchpid inspect panda --engine sapien | grep "native calls into SAPIEN"
 	@cd $(WHEEL) && bin/batchpid demo --num-envs 2 --seconds 1.5 > demo.txt
 	@ls dist
 
@@ -119,13 +121,11 @@ $(VENV)/.dev: $(VENV)/.tools $(NATIVE)
 	@touch $@
 
 $(VENV)/.python: pyproject.toml | $(RUN)
-	@echo "installing batchpid into $(VENV) (once)"
-	@$(PIP) --editable .
+	@$(STEP) "installing packages into $(VENV) (once)" $(PIP) --editable .
 	@touch $@
 
 $(VENV)/.tools: pyproject.toml | $(RUN)
-	@echo "installing batchpid and its development tools into $(VENV) (once; a minute or two)"
-	@$(PIP) --editable '.[dev]'
+	@$(STEP) "installing packages and development tools into $(VENV) (once)" $(PIP) --editable '.[dev]'
 	@touch $(VENV)/.python $@
 
 $(RUN):

@@ -1,4 +1,7 @@
-"""Build of the extensions, which are optional unless BATCHPID_REQUIRE_NATIVE=1; all else is in pyproject.toml."""
+"""Build of the extensions, which are optional unless BATCHPID_REQUIRE_NATIVE=1; all else is in pyproject.toml.
+
+With BATCHPID_NATIVE=0 none is built.
+"""
 
 import importlib.util
 import os
@@ -62,7 +65,7 @@ class Build(build_ext):
             sys.exit(f"batchpid: the extension {ext.name} cannot be built: {error}; {remedy}")
 
 
-modules = [load(name) for name in MODULES]
+modules = [load(name) for name in MODULES] if os.environ.get("BATCHPID_NATIVE") != "0" else []
 setup(
     cmdclass={"build_ext": Build},
     ext_modules=[built(extension) for module in modules[1:] for extension in module.EXTENSIONS.values()],

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from batchpid.sim.engine.mujoco.solver import MujocoSolver
     from batchpid.sim.engine.sapien.physics import Physics
     from batchpid.sim.runner import Runner
+    from batchpid.sim.tuning.sweep import sweep
     from batchpid.sim.workers.pool import RecoveryWarning
 
 __all__ = [
@@ -84,6 +85,7 @@ __all__ = [
     "StabilityWarning",
     "Uniform",
     "read_recording",
+    "sweep",
     "write_recording",
 ]
 
@@ -92,6 +94,7 @@ _LOADED_LATE = {
     "Physics": "batchpid.sim.engine.sapien.physics",
     "Runner": "batchpid.sim.runner",
     "RecoveryWarning": "batchpid.sim.workers.pool",
+    "sweep": "batchpid.sim.tuning.sweep",
 }
 
 

@@ -205,6 +205,8 @@ class RunInfo:
     """Episodes that began after that."""
     description: Any = field(default=None, repr=False)
     """Robot (:class:`batchpid.sim.Robot`) of the run, for :meth:`Rollout.findings`; not recorded."""
+    sweep: Mapping[str, Any] | None = None
+    """Inputs of a :func:`batchpid.sim.sweep`, as plain values or digests."""
 
     @property
     def command(self) -> CommandSpec:

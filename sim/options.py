@@ -105,6 +105,7 @@ class RunnerOptions:
 
     robot: Robot = field(metadata=_in(snapshot="robot_name"))
     num_envs: int = field(metadata=_in("snapshot"))
+    first_env: int = field(default=0, metadata=_in("snapshot"))
     workers: int | None = field(default=None, metadata=_apart("processes"))
     """None on a cluster."""
     timestep: float = field(default=1 / 2000, metadata=_in("snapshot", "recording", "scene"))
@@ -149,6 +150,7 @@ class RunnerOptions:
         vars(self).update(given | {"robot": robot, "num_envs": integer("num_envs", num_envs, 1, 1_000_000)})
         own = vars(self)
         own |= {
+            "first_env": integer("first_env", self.first_env, 0, 1_000_000_000),
             "timestep": number("timestep", self.timestep, 1e-6, 0.1, "seconds, not a rate: 1/2000"),
             "substeps": integer("substeps", self.substeps, 1, 1_000_000),
             "setpoint_space": choice("setpoint_space", self.setpoint_space, get_args(SetpointSpace)),

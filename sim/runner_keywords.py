@@ -68,6 +68,9 @@ InvalidInputAction = Literal["raise", "contain"]
 class RunnerKeywords(TypedDict, total=False):
     """Options of a :class:`batchpid.sim.Runner`, as they are passed by keyword; all may be left out."""
 
+    first_env: int
+    """Number of the first env; default 0. A runner with 100 for it is bit-identical to the envs from 100 on of a larger
+    one: the noise of sensors, the streams of a randomization and ``build`` go by the numbers of envs."""
     workers: int | None
     """Processes that step the scenes; 0 runs the same code in this process. Default: one per available core, each
     pinned to its core. Results are bit-identical for any number of workers."""

@@ -92,7 +92,7 @@ class Session:
                 options.num_envs, options.timestep, lambda qpos: robot_model(robot).nearest_links(qpos)
             )
         randomization = options.randomization
-        draws = NOTHING if randomization is None else randomization.first(robot, options.num_envs)
+        draws = NOTHING if randomization is None else randomization.first(robot, options.num_envs, options.first_env)
         state = RunnerState(params, faults, draws, actuators=options.actuators, contacts=contacts)
         self.pool = WorkerPool(options, params)
         self._transactions = Transactions(self.pool, state, self._record)
@@ -142,7 +142,7 @@ class Session:
         options, robot, randomization = self.options, self.options.robot, self.options.randomization
         position, velocity, chosen = self._arguments.start(qpos, qvel, mask)
         if randomization is not None:
-            draws = randomization.redraw(robot, draws, chosen, seed)
+            draws = randomization.redraw(robot, draws, chosen, seed, options.first_env)
             position, velocity = randomization.start(position, velocity, draws, robot)
         elif seed is not None:
             raise InvalidArgumentError("seed", "has no effect without a randomization", remedy="leave it out")

@@ -115,12 +115,6 @@ def _interrupt_again(unraisable: Any) -> None:
 
 def parse(arguments: Sequence[str]) -> Any:
     """Return the command with its flags; for --help or unknown flags print help and raise SystemExit."""
-    app = tyro.extras.SubcommandApp()
-    named = bool(arguments) and arguments[0] in COMMANDS
-    for name, command in COMMANDS.items():
-        # The overview shows the first line of each docstring, the help of a command shows all of it.
-        summary = None if named else (command.__doc__ or "").partition("\n")[0]
-        app.command(name=name, help=summary)(command)
     options = (
         tyro.conf.DisallowNone,  # a flag is left out, not given None
         tyro.conf.FlagCreatePairsOff,  # --viewer without --no-viewer
@@ -128,6 +122,12 @@ def parse(arguments: Sequence[str]) -> Any:
         # Without a help of the choice itself, tyro looks for one in the source of `typing`, which takes 0.05 s.
         tyro.conf.arg(help="`batchpid COMMAND --help` lists the flags of a command."),
     )
+    if arguments and arguments[0] in COMMANDS:  # alone, so that a message names its help
+        prog, command = f"batchpid {arguments[0]}", COMMANDS[arguments[0]]
+        return tyro.cli(command, prog=prog, args=arguments[1:], config=options)
+    app = tyro.extras.SubcommandApp()
+    for name, command in COMMANDS.items():
+        app.command(name=name, help=(command.__doc__ or "").partition("\n")[0])(command)
     about = "Joint-level PID control for many robots at once, in SAPIEN or MuJoCo."
     return app.cli(prog="batchpid", description=about, args=arguments, config=options)
 

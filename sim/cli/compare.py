@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.cli.outputs import Outputs, write_figures
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import gain_set
 
@@ -33,11 +33,13 @@ class CompareCommand:
     engine: flags.Engines = (DEFAULT_ENGINE,)
     physics: flags.Physics = "accurate"
     collisions: flags.Collisions = True
+    ground: flags.Ground = None
     workers: flags.Workers = None
     actuators: flags.Actuators = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     picture: flags.OptionalPath = None
     """First two rows of the table on the first move, to draw: .png or .svg."""
+    json: flags.Json = None
     force: flags.Force = False
 
     imports = ("batchpid.sim.plots", "batchpid.sim.runner")
@@ -48,7 +50,9 @@ class CompareCommand:
         from batchpid.sim.cli.report import draw_first_move, evaluation_table
         from batchpid.sim.cli.run import evaluate_sets, read_variation
 
-        picture = Outputs(force=self.force).path("picture", self.picture, plots.FORMATS)
+        outputs = Outputs(force=self.force)
+        picture = outputs.path("picture", self.picture, plots.FORMATS)
+        json = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         default = ("tuned", "tutorial", "drive") if robot.settings else ("designed", "drive")
         sets = [gain_set(robot, name) for name in self.gains or default]
@@ -58,9 +62,14 @@ class CompareCommand:
             raise InvalidArgumentError("gains", "names a single set", remedy="name two, or two engines, for a picture")
         variation = (self.payload, self.friction) if self.variation else None
         robot, randomization = read_variation(robot, self.randomize, variation)
-        options = flags.chosen(self, "moves seed seconds workers physics collisions")
+        options = flags.chosen(self, "moves seed seconds workers physics collisions ground")
         evaluations = evaluate_sets(robot, sets, randomization=randomization, engines=self.engine, **options)
         print(f"{robot.name}: {len(evaluations[0].moves.start)} moves, seed {self.seed}, {self.seconds:g} s each\n")
         print(evaluation_table(robot, evaluations))
+        if json is not None:
+            arrays = "metrics chatter settling_limit following_error"
+            figures = {each.name: {name: getattr(each, name) for name in arrays.split()} for each in evaluations}
+            write_figures(json, {"joints": robot.joint_names, "moves": evaluations[0].moves.names, "gains": figures})
+            print(f"\nfigures: {json}")
         if picture is not None:
             print(f"\npicture: {draw_first_move(robot, evaluations, picture)}")

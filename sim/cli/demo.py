@@ -10,7 +10,8 @@ from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs, beside
+from batchpid.sim.cli.outputs import Outputs, beside, write_figures
+from batchpid.sim.cli.progress import waiting
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import gain_set
 
@@ -20,7 +21,7 @@ class DemoCommand:
     """Move 64 arms to the tutorial's setpoint; print a table of the joints and draw a picture.
 
     PID and passive force are computed at each of the 2000 sim steps of a second. Env 0 starts where SAPIEN's tutorial
-    does, the others at seeded poses within 0.3 rad (or m) of it.
+    does, the others at seeded poses near it.
     """
 
     robot: flags.RobotName = "panda"
@@ -29,12 +30,15 @@ class DemoCommand:
     seconds: flags.Seconds = 2.0
     seed: int = 0
     """Seed of the start poses."""
+    spread: flags.Spread = 0.3
+    ground: flags.Ground = None
     workers: flags.Workers = None
     engine: flags.Engine = DEFAULT_ENGINE
     backend: flags.Backend = "numpy"
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     picture: flags.OptionalPath = None
     """Step responses to draw: .png or .svg. Default: out/ROBOT-demo.png."""
+    json: flags.Json = None
     force: flags.Force = False
     viewer: flags.Switch = False
     """Replay up to 16 robots in SAPIEN's window at the end. Needs a display and a Vulkan device."""
@@ -45,7 +49,7 @@ class DemoCommand:
         """Run the command; return the exit status, 3 if no env settles."""
         from batchpid.sim import Runner, plots
         from batchpid.sim.cli.report import exit_status
-        from batchpid.sim.cli.run import hold_setpoint, start_poses
+        from batchpid.sim.cli.run import hold_setpoint, run_figures, start_poses
 
         if self.viewer:
             from batchpid.sim.view.film import show_window
@@ -59,14 +63,18 @@ class DemoCommand:
                 "robot", "has no tutorial setpoint", value=self.robot, remedy=f"run: batchpid rollout {self.robot}"
             )
         picture = self.picture or beside(Path("out") / robot.path.name, "demo")
-        picture = Outputs(force=self.force).path("picture", picture, plots.FORMATS)
+        outputs = Outputs(force=self.force)
+        picture = outputs.path("picture", picture, plots.FORMATS)
+        json = outputs.path("json", self.json, (".json",))
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
-        start = start_poses(robot, self.num_envs, 0.3, self.seed)
+        start = start_poses(robot, self.num_envs, self.spread, self.seed)
         gains = gain_set(robot, self.gains)
         title = f"{robot.name}: {self.num_envs} robots, {gains.control} at {settings.rate_hz:g} Hz, gains {gains.name}"
         options: dict[str, Any] = {"params": gains.params, "control": gains.control}
-        options |= flags.chosen(self, "workers engine backend")
-        with Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options) as runner:
+        options |= flags.chosen(self, "workers engine backend ground")
+        with waiting(f"building {self.num_envs} robots"):
+            made = Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options)
+        with made as runner:
             print(f"{title}, {robot.dof} joints, {len(runner.pids) or 1} processes, {runner.backend}", flush=True)
             rollout, report = hold_setpoint(runner, start, settings.target, seconds)
         print(report)
@@ -74,6 +82,9 @@ class DemoCommand:
             print(f"Note: {note}")
         figure = plots.step_responses(rollout, mark=0, title=f"{title}; env 0 from the tutorial's pose")
         print(f"\npicture: {plots.save(figure, picture)}")
+        if json is not None:
+            write_figures(json, run_figures(robot, rollout))
+            print(f"figures: {json}")
         if self.viewer:
             show_window(rollout.for_envs(slice(0, 16)))
         return exit_status(robot, rollout)

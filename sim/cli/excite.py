@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
@@ -20,7 +23,7 @@ class ExciteCommand:
     """
 
     robot: flags.RobotName = "panda"
-    duration: float = 10.0
+    seconds: Annotated[float, tyro.conf.arg(aliases=("--duration",))] = 10.0
     """Duration of the motion [s]."""
     rate: float = 500.0
     """Rows per second [Hz]."""
@@ -47,7 +50,7 @@ class ExciteCommand:
         robot = Robot.load(self.robot, **vars(self.meshes))
         out = self.out or Path(f"out/{robot.path.stem}.excite.csv")
         out = Outputs(force=self.force).path("out", out, (".csv",))
-        motion = excite(robot, self.duration, rate=self.rate, lowest=self.lowest, highest=self.highest, seed=self.seed)
+        motion = excite(robot, self.seconds, rate=self.rate, lowest=self.lowest, highest=self.highest, seed=self.seed)
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, setpoint_csv(robot, motion))
         rows = [

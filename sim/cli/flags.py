@@ -20,7 +20,10 @@ def _flag(help: str | None = None, **options: Any) -> Any:
 
 def chosen(command: Any, names: str) -> dict[str, Any]:
     """Return the values of some flags of a command, as arguments of the same names, which are separated by blanks."""
-    return {name: getattr(command, name) for name in names.split()}
+    values = {name: getattr(command, name) for name in names.split()}
+    if "ground" in values and (ground := values.pop("ground")) is not None:
+        values["ground"] = ground == "on"
+    return values
 
 
 OptionalPath = Annotated[Path | None, _flag()]
@@ -108,6 +111,14 @@ Compensate = Annotated[
 ]
 Backend = Annotated[Literal["numpy", "jax"], _flag("Library of the law: NumPy, or JAX, as one program with the steps.")]
 Seconds = Annotated[float, _flag("Simulated time [s].")]
+Ground = Annotated[
+    Literal["on", "off"] | None,
+    _flag(
+        "Ground at height 0. Default: on, unless links of a fixed robot reach it at the start pose.", metavar="on|off"
+    ),
+]
+Spread = Annotated[float, _flag("Largest distance of a start pose from that of env 0 [rad or m].")]
+Json = Annotated[Path | None, _flag("Figures to write: .json.", metavar="FILE")]
 Fps = Annotated[float, _flag("Frames per second.")]
 TimeLimit = Annotated[float | None, _flag("Stop after this wall-clock time [s]. Default: none.")]
 Randomize = Annotated[

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_text
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +11,7 @@ import tyro
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs, beside
+from batchpid.sim.cli.outputs import Outputs, beside, write_figures
 from batchpid.sim.cli.progress import AT_MOST, bar
 
 if TYPE_CHECKING:
@@ -27,14 +26,14 @@ class IdentifyCommand:
 
     Finds armature, damping, friction, strength and bias of each joint, the delay of the commands and the payload at the
     tool, by fitting simulated motions; writes them for --actuators of other commands. A log has a header and SI units:
-    "time, setpoint:JOINT ..., qpos:JOINT ...", with the gains that drove the robot as --params FILE, or
+    "time, setpoint:JOINT ..., qpos:JOINT ...", with the gains that drove the robot as --gains FILE, or
     "time, effort:JOINT ..., qpos:JOINT ...". There is no --engine: the fit simulates a separate rigid-body
     model, with the equations and time steps of both engines.
     """
 
     robot: flags.RobotName = "panda"
     logs: Logs = ()
-    params: flags.OptionalName = None
+    gains: Annotated[flags.OptionalName, tyro.conf.arg(metavar="NAME|FILE", aliases=("--params",))] = None
     """Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file as for --gains of
     other commands. Without it the logs' efforts are used."""
     compensate: Annotated[flags.Compensate | None, tyro.conf.arg(metavar="FORCES")] = None
@@ -62,7 +61,7 @@ class IdentifyCommand:
     """Continue a fit with the same options that was stopped."""
     out: flags.OptionalPath = None
     """Actuators file to write: .yaml or .json. Default: out/ROBOT.actuators.yaml."""
-    json: flags.OptionalPath = None
+    json: flags.Json = None
     """Estimates with their 95 % intervals to write: .json."""
     picture: flags.OptionalPath = None
     """Position errors before and after, to draw: .png or .svg. Default: NAME-fit.png, next to the
@@ -77,7 +76,6 @@ class IdentifyCommand:
 
     def run(self) -> None:
         """Run the command."""
-        from batchpid.io.files import write_atomically
         from batchpid.sim import plots
         from batchpid.sim.identification.identification import identify
 
@@ -87,7 +85,7 @@ class IdentifyCommand:
         if self.actuators is not None or self.evaluations == 0:
             return self._judge(robot)
         out = self.out or Path(f"out/{robot.path.stem}.actuators.yaml")
-        outputs = Outputs(force=self.force, inputs=(None if self.params is None else Path(self.params), *self.logs))
+        outputs = Outputs(force=self.force, inputs=(None if self.gains is None else Path(self.gains), *self.logs))
         out = outputs.path("out", out, (".yaml", ".yml", ".json"))
         details = outputs.path("json", self.json, (".json",))
         picture = outputs.path("picture", self.picture or beside(out, "fit"), plots.FORMATS)
@@ -98,7 +96,7 @@ class IdentifyCommand:
         found = identify(
             robot,
             self.logs,
-            params=None if self.params is None else _params(robot, self.params),
+            params=None if self.gains is None else _params(robot, self.gains),
             payload=not self.no_payload,
             **flags.chosen(self, "compensate timestep sim_steps hold evaluations seed workers"),
             history=history,
@@ -107,13 +105,12 @@ class IdentifyCommand:
         print(report(found))
         if not found.explains:
             problem = "are not explained: the error on the held-out part did not fall, and no file is written"
-            remedy = f"check --params, --timestep and --compensate, and the columns of {found.worst_joint!r}"
+            remedy = f"check --gains, --timestep and --compensate, and the columns of {found.worst_joint!r}"
             raise InvalidArgumentError("logs", problem, remedy=remedy)
         found.save(out)
         print(f"\nwritten: {out}")
         if details is not None:
-            details.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(details, json_text.dumps(found.document(), indent=2, allow_nan=False) + "\n")
+            write_figures(details, found.document())
             print(f"written: {details}")
         names, units = ([table[joint] for joint in found.joints] for table in (robot.joint_names, robot.units))
         errors = [plots.FitErrors(*fit[1:]) for fit in found.fits if fit.log == 0]
@@ -140,7 +137,7 @@ class IdentifyCommand:
             robot,
             self.logs,
             self.actuators,
-            params=None if self.params is None else _params(robot, self.params),
+            params=None if self.gains is None else _params(robot, self.gains),
             **flags.chosen(self, "compensate timestep sim_steps hold"),
         )
         print(_errors(*errors))
@@ -161,7 +158,7 @@ def _params(robot: Robot, name: str) -> Any:
     path, known = Path(name), [each for each in NAMES if each != "drive"]
     if name not in known and not path.is_file():
         remedy = f"use a file or {', '.join(known)}"
-        raise InvalidArgumentError("params", "is neither a name nor a file of gains", value=name, remedy=remedy)
+        raise InvalidArgumentError("gains", "is neither a name nor a file of gains", value=name, remedy=remedy)
     kind = path.suffix.lower()
     if name in known or kind in (".py", ".xml") or (kind != ".json" and is_ros2_control(documents.read(path))):
         return gain_set(robot, name).params
@@ -219,7 +216,7 @@ def _not_identified(found: Identification) -> list[str]:
         remedy = "pass --no-payload if the tool carries none, or record a longer motion without compensation"
         return [*lines, f"  everything: no value is certain beside a payload; {remedy}"]
     if not found.uncertainty.identified.any():
-        remedy = "check --params, --timestep and --compensate, or give more --evaluations"
+        remedy = "check --gains, --timestep and --compensate, or give more --evaluations"
         return [*lines, f"  everything: the fit does not explain the motion; {remedy}"]
     names = [found.robot.joint_names[number] for number in found.joints]
     moves = dict(zip(names, found.uncertainty.moves, strict=True))

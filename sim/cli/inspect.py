@@ -5,11 +5,15 @@ from __future__ import annotations
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Literal
+
+import tyro
 
 from batchpid.io.versions import package_versions
 from batchpid.sim import Finding, Robot
 from batchpid.sim.cli import flags
+from batchpid.sim.cli.outputs import Outputs, write_figures
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.joint_rows import HEADERS, joint_rows
@@ -38,13 +42,16 @@ class InspectCommand:
     strict: flags.Switch = False
     """Exit with status 1 if a finding is worse than a note."""
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
-    engine: flags.Switch = False
-    """Print the kind of the calls into the engine too, and the reason if they are not native."""
+    engine: Annotated[Literal["sapien", "mujoco"] | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    """Print the kind of the calls into this physics engine too, and the reason if they are not native."""
+    json: flags.Json = None
+    force: flags.Force = False
 
     imports = ("batchpid.sim.engine.robot_model",)
 
     def run(self) -> int:
         """Run the command and return its exit status."""
+        json = Outputs(force=self.force).path("json", self.json, (".json",))
         robot = Robot.load(self.robot, **vars(self.meshes))
         mass = sum(link.mass for link in robot.link_masses.values())
         size = f"{robot.dof} degrees of freedom, {len(robot.links)} links, {mass:.4g} kg"
@@ -65,10 +72,18 @@ class InspectCommand:
         if self.engine:
             from batchpid.sim.engine.engines import load_engine
             from batchpid.sim.engine.native import status
-            from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 
-            version = package_versions([DEFAULT_ENGINE])[DEFAULT_ENGINE]
-            print(f"\nEngine: {status().describe(f'{load_engine(DEFAULT_ENGINE).title} {version}')}.")
+            title = load_engine(self.engine).title
+            print(f"\nEngine: {status().describe(f'{title} {package_versions([self.engine])[self.engine]}')}.")
+        if json is not None:
+            names = ("type", "unit", "lower", "upper", "effort_limit", "velocity_limit", "damping", "friction")
+            figures = {
+                **{"robot": robot.name, "mass": mass, "findings": [asdict(each) for each in findings]},
+                "joints": {each.name: {name: getattr(each, name) for name in names} for each in robot.joints},
+                "links": {name: {"mass": link.mass, "source": link.source} for name, link in robot.link_masses.items()},
+            }
+            write_figures(json, figures)
+            print(f"\nfigures: {json}")
         return int(self.strict and any(finding.severity != "note" for finding in findings))
 
 

@@ -5,15 +5,20 @@ A run may take hours, so every possible check is made before it. No file is repl
 
 from __future__ import annotations
 
+import json
+import math
 import os
-from collections.abc import Collection, Iterable
+import shlex
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
-from batchpid.io.files import try_writing
+from batchpid.io.files import try_writing, write_atomically
 
+FOLDER = Path("out")
+"""Folder of default outputs, which is made when a file is written; other folders have to exist."""
 P = TypeVar("P", bound=Path | None)
 
 
@@ -35,9 +40,9 @@ class Outputs:
     def path(self, argument: str, path: P, suffixes: Collection[str]) -> P:
         """Return ``path`` after a check that a file can be written there; None is returned as None.
 
-        The check leaves nothing behind; the folder of ``path`` is made when the file is written. Raises
-        InvalidArgumentError if its suffix is not one of ``suffixes``, it cannot be written, the command reads it or
-        writes it as another output, or it exists and may not be replaced.
+        The check leaves nothing behind. Raises InvalidArgumentError if its suffix is not one of ``suffixes``, its
+        folder neither exists nor is :data:`FOLDER`, it cannot be written, the command reads it or writes it as another
+        output, or it exists and may not be replaced.
         """
         if path is not None:
             file_path(argument, path, suffixes)
@@ -64,11 +69,29 @@ class Outputs:
             try_writing(path)
         except OSError as error:
             problem = f"cannot be written: {error.strerror}"
+        folder = path.parent
+        if problem is None and not folder.exists() and folder != FOLDER:
+            problem, remedy = f"has no folder {str(folder)!r}", f"make it: mkdir -p {shlex.quote(str(folder))}"
         if problem is None and keep is not None and os.path.lexists(path):
             problem, remedy = "exists already", keep
         if problem is not None:
             raise InvalidArgumentError(argument, problem, value=str(path), remedy=remedy)
         self._taken[target] = "is another output of this run"
+
+
+def write_figures(path: Path, figures: Any) -> None:
+    """Write figures as JSON: arrays as lists, named tuples and mappings as objects, null for NaN and infinity."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps(_plain(figures), indent=1, allow_nan=False) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    value = value._asdict() if hasattr(value, "_asdict") else value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def stem(path: Path) -> str:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json as json_text
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from batchpid.io.files import write_atomically
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.cli.outputs import Outputs, write_figures
 from batchpid.sim.tuning.gain_sets import gain_set
 
 
@@ -30,8 +28,7 @@ class ParityCommand:
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     picture: flags.OptionalPath = None
     """Differences over time, to draw: .png or .svg."""
-    json: flags.OptionalPath = None
-    """Figures, as a .json file."""
+    json: flags.Json = None
     force: flags.Force = False
 
     imports = ("batchpid.sim.plots", "batchpid.sim.runner")
@@ -69,12 +66,9 @@ class ParityCommand:
         print()
         print("\n".join(found.verdict()))
         if json_path is not None:
-            figures = {name: getattr(found, name) for name in ("bias", "first_tick", "first_chaos")}
-            arrays = {name: getattr(found, name) for name in ("time", "open_loop", "chaos", "closed_loop", "settling")}
-            figures |= {name: _plain(array) for name, array in arrays.items()}
-            figures |= {"push": _plain(found.push), "settled": found.settled, "verdict": found.verdict()}
-            json_path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(json_path, json_text.dumps(figures, indent=1) + "\n")
+            names = "bias first_tick first_chaos time open_loop chaos closed_loop settling push"
+            figures = {name: getattr(found, name) for name in names.split()}
+            write_figures(json_path, figures | {"settled": found.settled, "verdict": found.verdict()})
             print(f"\nfigures: {json_path}")
         if picture is not None:
             first, second = (each.rollout for each in found.moves)
@@ -82,12 +76,3 @@ class ParityCommand:
             title = f"{robot.name}: MuJoCo compared with SAPIEN"
             figure = engine_differences(found.time, found.open_loop, found.chaos, first.time, apart, title)
             print(f"\npicture: {plots.save(figure, picture)}")
-
-
-def _plain(array: object) -> object:
-    """Return an array as lists, with None in place of numbers that JSON lacks."""
-    if array is None:
-        return None
-    rows = np.asarray(array, float)
-    finite: object = np.where(np.isfinite(rows), rows.astype(object), np.array(None)).tolist()
-    return finite

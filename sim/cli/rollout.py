@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from batchpid.checks.validate import array, number
+from batchpid.checks.validate import array, file_path, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Recorder, Robot, write_recording
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.cli.outputs import Outputs, write_figures
+from batchpid.sim.cli.progress import waiting
+from batchpid.sim.recording.recording_files import HDF5
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tool_space.tool_goals import default_goal
@@ -64,6 +67,7 @@ class RolloutCommand:
     physics: flags.Physics = "accurate"
     backend: flags.Backend = "numpy"
     collisions: flags.Collisions = True
+    ground: flags.Ground = None
     dissipation: Literal["urdf", "sapien"] = "urdf"
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""
     randomize: flags.Randomize = None
@@ -75,7 +79,11 @@ class RolloutCommand:
     """Recording to write: .npz at the end, or .h5 tick by tick (extra `record`). For plot, view and render."""
     picture: flags.OptionalPath = None
     """Step responses to draw: .png or .svg."""
+    json: flags.Json = None
     force: flags.Force = False
+    resume: flags.Switch = False
+    """Run in parts of 128 robots, and continue after the last part of a run with the same options that was stopped.
+    Needs --out NAME.h5; the parts are in NAME.h5.parts until the end."""
 
     imports = ("batchpid.sim.plots", "batchpid.sim.runner")
 
@@ -83,11 +91,25 @@ class RolloutCommand:
         """Run the command; return the exit status, 3 if a setpoint was held and no env settles."""
         from batchpid.sim import Runner, plots
         from batchpid.sim.cli.report import exit_status
-        from batchpid.sim.cli.run import follow, hold_pose, hold_setpoint, read_variation, start_poses
+        from batchpid.sim.cli.run import (
+            Parts,
+            follow,
+            hold_pose,
+            hold_setpoint,
+            read_variation,
+            run_figures,
+            start_poses,
+        )
 
         outputs = Outputs(force=self.force)
-        out = outputs.path("out", self.out, (".npz", ".h5", ".hdf5"))
+        if self.resume and self.out is None:
+            raise InvalidArgumentError("resume", "has no file to continue", remedy="add --out NAME.h5")
+        if self.resume and self.out is not None:
+            out: Path | None = outputs.history(file_path("out", self.out, HDF5), resume=True)
+        else:
+            out = outputs.path("out", self.out, (".npz", *HDF5))
         picture = outputs.path("picture", self.picture, plots.FORMATS)
+        json = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes))
         robot, randomization = read_variation(robot, self.randomize)
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
@@ -112,26 +134,35 @@ class RolloutCommand:
             params, control = gains.params, "drive" if gains.control == "drive" else self.control
             if self.rates and setpoints is not None and setpoints.acceleration is not None:
                 _check_accelerations(self.trajectory, control == "pid" and params.gain_units is not None)
-        with Runner(
-            robot,
-            self.num_envs,
-            params=params,
-            control=control,
-            **flags.chosen(self, "tool workers cluster timestep compensate engine physics backend collisions"),
-            substeps=self.substeps if setpoints is None else setpoints.substeps,
-            randomization=randomization,
-        ) as runner:
-            streamed = out is not None and out.suffix.lower() != ".npz"
-            with Recorder(out, runner, seed=self.seed, overwrite=self.force) if out and streamed else nullcontext():
-                if setpoints is not None:
-                    rollout, report = follow(runner, start, setpoints, self.rates)
-                else:
-                    rollout, report = (hold_pose if osc else hold_setpoint)(runner, start, setpoint, seconds)
-        if out is not None and not streamed:
+        make: Any = partial(Parts, out) if self.resume and out is not None else Runner
+        stream = None if out is None or self.resume or out.suffix.lower() == ".npz" else out
+        with waiting(f"building {self.num_envs} robots"):
+            made = make(
+                robot,
+                self.num_envs,
+                params=params,
+                control=control,
+                **flags.chosen(self, "tool workers cluster timestep compensate engine physics backend"),
+                **flags.chosen(self, "collisions ground"),
+                substeps=self.substeps if setpoints is None else setpoints.substeps,
+                randomization=randomization,
+            )
+        with (
+            made as runner,
+            Recorder(stream, runner, seed=self.seed, overwrite=self.force) if stream else nullcontext(),
+        ):
+            if setpoints is not None:
+                rollout, report = follow(runner, start, setpoints, self.rates)
+            else:
+                rollout, report = (hold_pose if osc else hold_setpoint)(runner, start, setpoint, seconds)
+        if out is not None and stream is None and not self.resume:
             write_recording(rollout, out, seed=self.seed, overwrite=True)
         print(report)
         if out is not None:
             print(f"written: {out}")
+        if json is not None:
+            write_figures(json, run_figures(robot, rollout))
+            print(f"figures: {json}")
         if picture is not None:
             figure = plots.step_responses(rollout, mark=0, title=robot.name)
             print(f"picture: {plots.save(figure, picture)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -20,12 +21,51 @@ from batchpid.sim.cli.progress import bar
 from batchpid.sim.cli.report import run_report, tool_report, trajectory_report
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.identification.setpoint_files import Setpoints
+from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
-from batchpid.sim.tuning.evaluation import Evaluation, evaluate_gains, run_moves
+from batchpid.sim.tuning.evaluation import (
+    Evaluation,
+    evaluate_gains,
+    following_error,
+    run_moves,
+    step_response_metrics,
+)
 from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 from batchpid.sim.tuning.randomization_presets import at_the_joints, load_randomization, reseeded, usual_variation
+from batchpid.sim.tuning.sweep import sweep
+from batchpid.task_space.frames import pose_error
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+"""Axes of the error of a pose."""
+PART = 128
+"""Robots in a part of a rollout that can be resumed."""
+
+
+class Parts:
+    """Runner for one rollout of the functions below, recorded to ``path`` as a :func:`batchpid.sim.sweep`."""
+
+    def __init__(self, path: Path, robot: Robot, num_envs: int, *, params: Any, **options: Any) -> None:
+        self.options = known = RunnerOptions(robot, num_envs, **options)
+        self.robot, self.num_envs, self.control = robot, num_envs, known.control
+        self.timestep, self.substeps = known.timestep, known.substeps
+        self._sweep = partial(sweep, robot, num_envs, path=path, params=params, part=PART, **options)
+
+    def __enter__(self) -> Parts:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing is open: each part has a runner of its own."""
+
+    def reset(self, qpos: NDArray[Any], *, seed: int | None = None) -> None:
+        """Begin at ``qpos`` (envs, dof)."""
+        self._sweep = partial(self._sweep, qpos=qpos, seed=seed)
+
+    def rollout(self, setpoints: NDArray[Any], *, progress: Any = None, **more: Any) -> Rollout:
+        """Return the rollout, from the file as far as it is there."""
+        found: Rollout = self._sweep(setpoints=setpoints, progress=bar("simulating", unit="part"), **more)
+        return found
 
 
 def start_poses(
@@ -74,6 +114,29 @@ def follow(runner: Runner, start: NDArray[Any], setpoints: Setpoints, rates: boo
         progress=bar("simulating", unit="tick"),
     )
     return rollout, trajectory_report(runner, rollout, setpoints if rates else None, time.perf_counter() - began)
+
+
+def run_figures(robot: Robot, rollout: Rollout) -> dict[str, Any]:
+    """Return the figures of a rollout for --json, lists by env: of steps, or of setpoints that move, or of a tool."""
+    info, failed = rollout.info, np.flatnonzero(~rollout.ok.all(0))
+    about = {name: getattr(info, name) for name in ("robot", "control", "engine", "physics")}
+    seconds = rollout.tick * len(rollout.time)
+    figures: dict[str, Any] = about | {"num_envs": rollout.num_envs, "seconds": seconds, "failed": failed}
+    if rollout.tool_pose is not None:
+        error = np.abs(pose_error(rollout.setpoint[-1, :, :7], rollout.tool_pose[-1].astype(float)))
+        return figures | {"tool": info.tool, "final_error": dict(zip(AXES, error.T, strict=True))}
+    if (rollout.setpoint != rollout.setpoint[0]).any():
+        columns = {"following_error": following_error(robot, rollout)}
+    else:
+        start = robot.start if info.start is None else info.start.astype(np.float64)
+        with_effort = info.control != "drive"
+        columns = step_response_metrics(robot, rollout, start, with_effort=with_effort)._asdict()
+    joints = zip(robot.joint_names, robot.units, strict=True)
+    of_joints = {name: {"unit": unit} for name, unit in joints}
+    for column, rows in columns.items():
+        for name, figure in zip(robot.joint_names, np.asarray(rows).T, strict=True):
+            of_joints[name][column] = figure
+    return figures | {"joints": of_joints}
 
 
 def evaluate_sets(

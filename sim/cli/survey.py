@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ import tyro
 
 from batchpid.io.files import write_atomically
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.cli.outputs import Outputs, write_figures
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
@@ -48,7 +47,7 @@ class SurveyCommand:
     """Wall-clock time for each robot [s]."""
     workers: flags.Workers = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
-    json: flags.OptionalPath = None
+    json: flags.Json = None
     """Reports to write: a list of objects, .json."""
     out: flags.OptionalPath = None
     """Table to write in Markdown, .md."""
@@ -75,8 +74,7 @@ class SurveyCommand:
         )
         done = list(bar("surveying", unit="robot", total=len(urdfs))(reports))
         if json_path is not None:
-            json_path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(json_path, json.dumps([report.asdict() for report in done], indent=1) + "\n")
+            write_figures(json_path, [report.asdict() for report in done])
         if out is not None:
             out.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(out, survey_table(done, "github") + "\n")

@@ -42,7 +42,7 @@ class TuneCommand:
     """Candidates of a population, evaluated at once."""
     seed: int = 0
     """Seed of the search and its moves. The result does not depend on the number of workers."""
-    search_seconds: float = 1.5
+    seconds: Annotated[float, tyro.conf.arg(aliases=("--search-seconds",))] = 1.5
     """Simulated time of each move of the search [s]."""
     gain_units: Literal["mass_matrix", "inertia", "effort"] = "mass_matrix"
     """Gains per mass matrix (all joints respond equally fast), per joint inertia, or as efforts (for any
@@ -57,6 +57,7 @@ class TuneCommand:
     engine: flags.Engine = DEFAULT_ENGINE
     physics: flags.Physics = "accurate"
     collisions: flags.Collisions = True
+    ground: flags.Ground = None
     workers: flags.Workers = None
     cluster: flags.Cluster = None
     time_limit: flags.TimeLimit = None
@@ -96,19 +97,19 @@ class TuneCommand:
         robot, randomization = read_variation(robot, self.randomize, variation)
         found = tune(
             robot,
-            seconds=self.search_seconds,
+            seconds=self.seconds,
             randomization=randomization,
             history=history,
             progress=bar("tuning", unit="generation"),
             **flags.chosen(self, "seed generations population gain_units per_joint weights time_limit"),
-            **flags.chosen(self, "workers cluster engine physics collisions"),
+            **flags.chosen(self, "workers cluster engine physics collisions ground"),
         )
         print(
             f"{robot.name}: cost {found.start_cost:.4f} as designed, {found.cost:.4f} as tuned; weight of the settling "
             f"time {self.weights.settling:g}, of the following error {self.weights.following:g}\n"
         )
         sets = GainSet("designed", found.start_params), GainSet("tuned", found.params)
-        options = flags.chosen(self, "seed workers cluster physics collisions")
+        options = flags.chosen(self, "seed workers cluster physics collisions ground")
         evaluations = evaluate_sets(
             robot, sets, moves=20, randomization=randomization, engines=(self.engine,), **options
         )
@@ -159,10 +160,11 @@ class TuneCommand:
         found = tune_tool(
             robot,
             self.tool,
-            seconds=self.search_seconds,
+            seconds=self.seconds,
             history=history,
             progress=bar("tuning", unit="generation"),
-            **flags.chosen(self, "seed generations population weights time_limit workers engine physics collisions"),
+            **flags.chosen(self, "seed generations population weights time_limit"),
+            **flags.chosen(self, "workers engine physics collisions ground"),
         )
         tool, (before, after) = found.settings["tool"], found.costs
         print(f"{robot.name}, {tool}: cost {before:.4f} by default, {after:.4f} as tuned\n")
@@ -179,7 +181,7 @@ class TuneCommand:
         if self.control == "osc":
             words += ["--control", "osc", *([] if self.tool is None else ["--tool", self.tool])]
         defaults = {each.name: each.default for each in fields(self)}
-        for name in ("randomize", "engine", "physics", "collisions", "cluster", "actuators"):
+        for name in ("randomize", "engine", "physics", "collisions", "ground", "cluster", "actuators"):
             if (value := getattr(self, name)) != defaults[name]:
                 words += [f"--no-{name}"] if value is False else [f"--{name}", str(value)]
         if self.meshes.missing_meshes != "skip":

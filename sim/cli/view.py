@@ -41,6 +41,8 @@ class ViewCommand:
     compensate: flags.Compensate = "gravity+coriolis+friction"
     engine: flags.Engine = DEFAULT_ENGINE
     physics: flags.Physics = "accurate"
+    spread: flags.Spread = 0.2
+    ground: flags.Ground = None
     workers: flags.Workers = None
     actuators: flags.Actuators = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
@@ -93,7 +95,7 @@ class ViewCommand:
             controls=self.control,
             tool=self.tool,
             period=1 / self.fps,
-            **flags.chosen(self, "compensate engine physics workers"),
+            **flags.chosen(self, "compensate engine physics spread ground workers"),
             params=gains and gains.params,
         )
         if robot.settings is not None and live.command is None:

@@ -69,9 +69,8 @@ class Loop:
         self._group_ticks = [Ticks(arrays.at((slice(None), group))) for group in slices]
 
     def _build(self, envs: slice, draws: Draws | None = None) -> EnginePack:
-        return make_pack(
-            self.options, self._scene, envs.stop - envs.start, self._first_env + envs.start, draws, self._workspace
-        )
+        first = self.options.first_env + self._first_env + envs.start
+        return make_pack(self.options, self._scene, envs.stop - envs.start, first, draws, self._workspace)
 
     def reset(
         self,

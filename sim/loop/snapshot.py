@@ -237,6 +237,7 @@ class Snapshot:
         if head["format"] not in (_FORMAT, _AT_ORIGIN, _WITH_ISOLATION):
             raise ValueError(f"format {head['format']}, not {_FORMAT}")
         about, steps, choices = head["about"], head["steps"], head["markers"]
+        about.setdefault("first_env", 0)  # written before there was this option
         num_envs = integer("num_envs", about["num_envs"], 1, 2**31)
         dof, steps = len(names("joints", about["joints"])), integer("steps", steps, 0, 2**62)
         if head["format"] == _WITH_ISOLATION and about["engine"] == "sapien":

@@ -46,7 +46,8 @@ def make_constants(
     coupling = coupling_of(scene.joints)
     acting = acting_gains(params, coupling)
     if options.guard is not None:
-        guard = options.guard.for_envs(slice(pack.first_env, pack.first_env + pack.size))
+        row = pack.first_env - options.first_env
+        guard = options.guard.for_envs(slice(row, row + pack.size))
     constants = Constants(
         timestep=scene.timestep,
         limits=(params.effort_min, params.effort_max),

@@ -124,14 +124,17 @@ class Randomization:
             values[name] = rows
         return Draws(episodes, values)
 
-    def first(self, robot: Robot, num_envs: int) -> Draws:
-        """Return the draws for the first episode of each env, of the stream of its index."""
-        return self.draw(robot, np.stack([np.arange(num_envs), np.zeros(num_envs, np.int64)], 1))
+    def first(self, robot: Robot, num_envs: int, first_env: int = 0) -> Draws:
+        """Return the draws for the first episode of each env, of the stream of its number, from ``first_env`` on."""
+        return self.draw(robot, np.stack([first_env + np.arange(num_envs), np.zeros(num_envs, np.int64)], 1))
 
-    def redraw(self, robot: Robot, draws: Draws, mask: NDArray[np.bool_], seed: int | ArrayLike | None) -> Draws:
+    def redraw(
+        self, robot: Robot, draws: Draws, mask: NDArray[np.bool_], seed: int | ArrayLike | None, first_env: int = 0
+    ) -> Draws:
         """Return ``draws`` with new ones for the envs of ``mask`` (envs,), which begin an episode.
 
-        It is the next of each env's stream, or the first of the stream ``seed`` + k for env k, or of ``seed`` (envs,).
+        It is the next of each env's stream, or the first of the stream ``seed`` + k for env number k, from
+        ``first_env`` on, or of ``seed`` (envs,).
 
         Raises
         ------
@@ -143,7 +146,7 @@ class Randomization:
             episodes = draws.episodes + np.array([0, 1])
         else:
             if np.ndim(seed) == 0:
-                streams = integer("seed", seed, 0, LARGEST - num_envs) + np.arange(num_envs)
+                streams = integer("seed", seed, 0, LARGEST - first_env - num_envs) + first_env + np.arange(num_envs)
             else:
                 streams = read_array("seed", seed, "iu")
                 if streams.shape != (num_envs,) or not ((streams >= 0) & (streams <= LARGEST)).all():

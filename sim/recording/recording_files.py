@@ -246,7 +246,7 @@ def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
         known["params"] = bp.dumps_params(info.params, info.joint_names, format="json")
     if info.actuators is not None:
         known["actuators"] = bp.motors.dumps_actuators(info.actuators, info.joint_names, format="json")
-    for name in ("versions", "randomization"):
+    for name in ("versions", "randomization", "sweep"):
         if name in known:
             known[name] = json.dumps(dict(known[name]))
     known["redraws"] = redraws_text(info.redraws)
@@ -280,7 +280,7 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
         "params": lambda text: bp.loads_params(str(text), names)[0],
         "actuators": lambda text: bp.motors.loads_actuators(str(text), names)[0],
         "seed": lambda value: None if str(value) == "none" else int(value),
-        **dict.fromkeys(("versions", "randomization"), lambda text: dict(json.loads(str(text)))),
+        **dict.fromkeys(("versions", "randomization", "sweep"), lambda text: dict(json.loads(str(text)))),
         "redraws": lambda text: tuple(Redraw(*redraw) for redraw in json.loads(str(text))),
         "faults": lambda text: tuple(Fault(**fault) for fault in json.loads(str(text))),
     }

@@ -185,17 +185,19 @@ def run_moves(
         warnings.simplefilter("ignore", SetpointWarning)
         randomized = runner.options.randomization is not None
         start = runner.reset(moves.start, seed=(0 if streams is None else streams) if randomized else None)
-        began = start.qpos.astype(np.float64) if randomized else moves.start
         setpoints, further = np.broadcast_to(moves.target, (ticks, *moves.target.shape)), {}
         if durations is not None:
             total = np.maximum(durations, tick)[:, None]
+            began = start.qpos.astype(np.float64) if randomized else moves.start
             motion = minimum_jerk(began, moves.target, tick, duration=total)
             rows = np.minimum(np.arange(ticks), motion.ticks - 1)  # the last one holds the target, at rest
             smooth = durations[:, None] > 0
             setpoints = np.where(smooth, motion.position[rows], setpoints)
             further["setpoint_rates"] = np.where(smooth, motion.velocity[rows], 0.0)
         rollout = runner.rollout(setpoints, progress=progress, **further)
-    with_effort = runner.control != "drive"
+    with_effort, began = runner.control != "drive", moves.start
+    if randomized and rollout.info.start is not None:
+        began = rollout.info.start.astype(np.float64)
     return rollout, step_response_metrics(runner.robot, rollout, began, with_effort=with_effort)
 
 

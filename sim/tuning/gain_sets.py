@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import warnings
 from pathlib import Path
 from typing import NamedTuple
@@ -59,9 +60,9 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
         return GainSet(f"drive ({stiffness:g}, {damping:g})", params, "drive")
     path = Path(name)
     if not path.is_file():
-        raise InvalidArgumentError(
-            "gains", "is neither a name nor a file", value=name, remedy=f"use a file or {', '.join(NAMES)}"
-        )
+        near = difflib.get_close_matches(name, NAMES, 1)
+        remedy = f"did you mean {near[0]!r}?" if near else f"use a file or {', '.join(NAMES)}"
+        raise InvalidArgumentError("gains", "is neither a name nor a file", value=name, remedy=remedy)
     own = [joint for joint, independent in zip(robot.joint_names, robot.independent, strict=True) if independent]
     if path.suffix.lower() == ".py":
         remedy = "give a params file (.yaml, .json), YAML of ros2_control, or MJCF (.xml)"

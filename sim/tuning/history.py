@@ -16,6 +16,9 @@ from batchpid.io.files import write_atomically
 from batchpid.io.versions import package_versions
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 
+REMEDY = "use the same inputs, remove it, or name another file"
+"""Remedy where a file is of other work."""
+
 
 class HistoryFile:
     """File with the state of a ``kind`` of work, "search" or "fit", that depends on ``settings``, plain values.
@@ -39,13 +42,12 @@ class HistoryFile:
             theirs, state = document["settings"], document["state"]
             if document["digest"] != digest(theirs, state):
                 raise ValueError("it was damaged or edited")
-            ours = self._settings
-            different = {*theirs} ^ {*ours} | {key for key in {*theirs} & {*ours} if theirs[key] != ours[key]}
+            problem = other_inputs(self._kind, theirs, self._settings)
         except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             reason = error if isinstance(error, OSError | ValueError) else type(error).__name__
             raise self.damaged(str(reason)) from None
-        if different:
-            raise self._error(f"is of another {self._kind} ({', '.join(sorted(different))} differ)")
+        if problem is not None:
+            raise self._error(problem)
         return state
 
     def write(self, state: Any) -> None:
@@ -60,8 +62,13 @@ class HistoryFile:
         return self._error(f"is not a history of a {self._kind}: {problem}")
 
     def _error(self, problem: str) -> InvalidArgumentError:
-        remedy = "use the same inputs, remove it, or name another file"
-        return InvalidArgumentError("history", problem, value=str(self._path), remedy=remedy)
+        return InvalidArgumentError("history", problem, value=str(self._path), remedy=REMEDY)
+
+
+def other_inputs(kind: str, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str | None:
+    """Return what is wrong with a file of a ``kind`` of work whose inputs differ from ``ours``; None if none does."""
+    different = {*theirs} ^ {*ours} | {key for key in {*theirs} & {*ours} if theirs[key] != ours[key]}
+    return f"is of another {kind} ({', '.join(sorted(different))} differ)" if different else None
 
 
 def plain_options(options: Mapping[str, Any], resumes: bool) -> dict[str, Any]:

@@ -97,7 +97,7 @@ class Start(Request):
 
     @property
     def numbers(self) -> slice:
-        """Numbers of ``envs`` in the runner."""
+        """Rows of ``envs`` in the runner."""
         return slice(self.first_env + self.envs.start, self.first_env + self.envs.stop)
 
     def limit(self, num_envs: int) -> float:

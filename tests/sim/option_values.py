@@ -62,6 +62,7 @@ VALUES = {
     "robot": [ARM, HEAVY, replace(ARM, actuators=MOTORS), arm(1, dissipation="sapien"), arm(1, self_collision="none")],
     "num_envs": [2, 3],
     "params": [ARM.params(kp=9.0, ki=None, kd=2.0), ARM.params(kp=90.0, ki=1.0, kd=9.0)],
+    "first_env": [0, 5],
     "workers": [0, 1],
     "timestep": [1 / 2000, 1 / 1000],
     "substeps": [20, 7],

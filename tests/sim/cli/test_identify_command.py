@@ -66,7 +66,7 @@ def test_motors_are_written_for_other_commands(batchpid, tmp_path, monkeypatch, 
     robot, recording, gains = make_log(tmp_path, engine)
     out, details = tmp_path / "motors.yaml", tmp_path / "motors.json"
     options = ("--evaluations", evaluations, "--workers", 0, "--no-payload", "--out", out, "--json", details)
-    status, said, error = batchpid("identify", robot, recording, "--params", gains, *options)
+    status, said, error = batchpid("identify", robot, recording, "--gains", gains, *options)
     assert status == 0, error
     assert "hinge" in said
     document = json.loads(details.read_text())
@@ -162,7 +162,7 @@ def test_what_is_missing_is_named(batchpid, log, tmp_path):
         (("identify", robot, recording, "--evaluations", 0), "evaluations: is 0"),
         (("identify", robot, recording, "--actuators", "motors.yaml"), "actuators: are not the start of a fit"),
         (("identify", robot, recording, "--evaluations", 0, "--actuators", "a.yaml"), "out: is for a fit"),
-        (("identify", robot, recording, "--params", "nothing.yaml"), "params: is neither a name nor a file of gains"),
+        (("identify", robot, recording, "--gains", "nothing.yaml"), "gains: is neither a name nor a file of gains"),
     ):
         status, _, error = batchpid(*words, "--out", tmp_path / "motors.yaml")
         assert status != 0
@@ -183,7 +183,7 @@ def test_params_are_any_gains(batchpid, log, tmp_path, monkeypatch):
     own = bp.load_params(gains)[0]
     (other := tmp_path / "controllers.yaml").write_text(to_ros2_control(own, ["hinge"], 0.001).text)
     for words in (gains, other, "designed"):
-        status, _, error = batchpid("identify", robot, recording, "--params", words)
+        status, _, error = batchpid("identify", robot, recording, "--gains", words)
         assert (status, "were read" in error) == (2, True)
     np.testing.assert_array_equal([each.kp[0] for each in seen[:2]], [own.kp[0]] * 2)
     assert seen[2].gain_units is not None

@@ -94,7 +94,6 @@ def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
         "collisions",
         "meshes",
         "seed",
-        "seconds",
         "variation",
         "randomize",
         "fps",

@@ -25,6 +25,7 @@ WORDS = {
     "excite": ("excite", "arm.urdf"),
     "export": ("export", "arm.urdf"),
     "identify": ("identify", "arm.urdf", "run.npz"),
+    "inspect": ("inspect", "arm.urdf"),
     "survey": ("survey", "arm.urdf"),
     "plot": ("plot", "run.npz"),
     "render": ("render", "run.npz"),

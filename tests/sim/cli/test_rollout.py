@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import numpy as np
@@ -26,7 +27,7 @@ def saved(batchpid, path, *flags):
 
 
 def test_the_file_holds_the_rollout_of_a_runner_with_tuned_gains(batchpid, tmp_path, panda):
-    file = saved(batchpid, tmp_path / "new" / "run.npz", "--workers", 1, "--seed", 7, "--substeps", 10)
+    file = saved(batchpid, tmp_path / "run.npz", "--workers", 1, "--seed", 7, "--substeps", 10)
     start = start_poses(panda, 3, 0.3, 7)
     with Runner(panda, 3, params=panda.tuned(), workers=0, substeps=10) as runner:
         runner.reset(qpos=start)
@@ -411,3 +412,49 @@ def test_without_rates_a_trajectory_has_no_accelerations_either(batchpid, tmp_pa
     status, said, error = batchpid("rollout", "--trajectory", path, *ONE, "--no-rates", "--gains", "tutorial")
     assert status == 0, error
     assert "not given" in said
+
+
+@pytest.mark.parametrize("flags", [(), ("--randomize", "payload"), ("--control", "osc")], ids=str)
+def test_a_run_that_resumes_ends_with_the_file_of_one_that_was_not_stopped(flags, batchpid, tmp_path, monkeypatch):
+    whole, parts = tmp_path / "whole.h5", tmp_path / "parts.h5"
+    words = ("rollout", *SHORT, "--engine", "mujoco", *flags)
+    assert batchpid(*words, "--out", whole)[0] == 0
+    with monkeypatch.context() as patch:  # the second part fails
+        made = iter([Runner])
+        patch.setattr("batchpid.sim.tuning.sweep.Runner", lambda *words, **options: next(made)(*words, **options))
+        patch.setattr("batchpid.sim.cli.run.PART", 2)
+        with pytest.raises(StopIteration):
+            main([*map(str, words), "--out", str(parts), "--resume"])
+    assert [path.name for path in (tmp_path / "parts.h5.parts").iterdir()] == ["0.h5"]
+    status, said, err = batchpid(*words, "--out", parts, "--resume")
+    assert status == 0, err
+    assert f"written: {parts}" in said
+    one, other = map(read_recording, (whole, parts))
+    for name, rows in one.arrays().items():
+        np.testing.assert_array_equal(rows, other.arrays()[name])
+    status, _, err = batchpid(*words, "--seed", 1, "--out", parts, "--resume")
+    assert status == 2
+    assert "is of another sweep (" in err
+    assert not (tmp_path / "parts.h5.parts").exists()
+
+
+def test_only_a_recording_in_hdf5_can_be_resumed(batchpid, tmp_path):
+    assert "resume: has no file to continue" in batchpid("rollout", "--resume")[2]
+    assert "out: unknown file format" in batchpid("rollout", "--resume", "--out", tmp_path / "a.npz")[2]
+
+
+@pytest.mark.parametrize("command", ["rollout", "demo"])
+def test_the_figures_are_those_of_the_table(command, batchpid, tmp_path):
+    words = ("--num-envs", 2, "--workers", 0, "--seconds", 1.5, "--engine", "mujoco")
+    status, said, err = batchpid(command, *words, "--json", tmp_path / "a.json")
+    assert status == 0, err
+    figures = json.loads((tmp_path / "a.json").read_text())
+    assert (figures["robot"], figures["num_envs"], figures["failed"]) == ("panda", 2, [])
+    row = next(line for line in said.splitlines() if line.startswith("panda_joint2"))
+    assert f"{max(figures['joints']['panda_joint2']['settling_time']):.2f} s" in row
+    assert f"{max(figures['joints']['panda_joint2']['steady_state_error']):.2g} rad" in row
+
+
+def test_the_ground_is_on_or_off(batchpid, tmp_path):
+    for word, expected in (("on", True), ("off", False)):
+        assert bool(saved(batchpid, tmp_path / "a.npz", "--ground", word)["ground"]) is expected

@@ -15,7 +15,7 @@ KEYS = {
 def test_prints_a_table_and_writes_the_reports(batchpid, tmp_path):
     write(tmp_path, one_joint(), "arm.urdf")
     write(tmp_path, "<robot/>", "nothing.urdf")
-    reports, page = tmp_path / "new" / "reports.json", tmp_path / "new" / "folder" / "table.md"
+    reports, page = tmp_path / "reports.json", tmp_path / "table.md"
     status, out, _ = batchpid("survey", tmp_path, "--moves", 1, "--seconds", 2.5, "--json", reports, "--out", page)
     assert status == 0
     assert "1 of 1 files with a moving joint load, 1 get moves, 1 settle on all of them (1 files without" in out
