@@ -64,11 +64,12 @@ class InspectCommand:
         print("\n" + contact_lines(robot, pairs_too=self.all))
         if self.engine:
             from batchpid.sim.engine.engines import load_engine
-            from batchpid.sim.engine.native import status
+            from batchpid.sim.engine.native import describe_calls
             from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 
             version = package_versions([DEFAULT_ENGINE])[DEFAULT_ENGINE]
-            print(f"\nEngine: {status().describe(f'{load_engine(DEFAULT_ENGINE).title} {version}')}.")
+            engine = load_engine(DEFAULT_ENGINE)
+            print(f"\nEngine: {describe_calls(f'{engine.title} {version}', engine.native_obstacle())}.")
         return int(self.strict and any(finding.severity != "note" for finding in findings))
 
 
