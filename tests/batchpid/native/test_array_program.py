@@ -16,11 +16,12 @@ from batchpid.motors import Coefficients as ActuatorCoefficients
 from batchpid.motors.envelope import Envelope
 from batchpid.native import array_program
 from batchpid.native.array_program import ArrayProgram
-from batchpid.native.availability import every_operation, program_status
-from batchpid.native.symbols import Stack
+from batchpid.native.availability import obstacle
+from batchpid.native.operations import OPERATIONS
+from batchpid.native.symbols import Namespace, Stack, Symbol
 from batchpid.native.tracing import trace
 
-pytestmark = pytest.mark.skipif(not program_status().active, reason="there are no native programs")
+pytestmark = pytest.mark.skipif(bool(obstacle()), reason="there are no native programs")
 DTYPES = st.sampled_from([np.float64, np.float32])
 SHAPES = st.tuples(st.sampled_from([1, 3, 64, 250]), st.sampled_from([1, 2, 7, 9, 16, 33, 100]))
 
@@ -28,6 +29,32 @@ SHAPES = st.tuples(st.sampled_from([1, 3, 64, 250]), st.sampled_from([1, 2, 7, 9
 def assert_identical(ours, theirs):
     for mine, expected in zip(ours, theirs, strict=True):
         assert bits(mine) == bits(np.broadcast_to(expected, mine.shape))
+
+
+def every_operation(a, b, c, matrix):
+    """Apply all operations of programs to arrays (rows, columns) and a matrix for each row; return the results."""
+    xp = a.__array_namespace__()
+    masks = a > b, a >= b, a < b, a <= b, a == b, a != b, xp.isfinite(a)
+    some = (a > b) & (b < c), (a > b) | (b < c), ~(a > b)
+    numbers = a + b, a - b, a * b, a / b, -a, abs(a), xp.rint(a), xp.ceil(a), xp.floor(a), xp.sqrt(a), xp.sign(a)
+    pairs = a * b + c, a + b * c, a + b - c, (a - b) * c, xp.minimum(xp.maximum(a, b), c)
+    ends = xp.maximum(a, b), xp.minimum(a, b), xp.maximum(b, a), xp.minimum(b, a)
+    least = xp.zeros_like(a) + a.min(axis=-1, keepdims=True)
+    product = (matrix * b[:, None, :]).sum(axis=-1)
+    return [*numbers, *pairs, *ends, xp.where(a > b, b, c), least, product, *masks, *some]
+
+
+def history_operations(places, history, a, b):
+    """Push ``a`` and ``b``, side by side, to ``history``; return its numbers at ``places`` (1, rows, columns)."""
+    xp = a.__array_namespace__()
+    later = xp.concatenate((xp.concatenate((a, b), axis=1)[:, None], history[:, :-1]), axis=1)
+    return [*later.take(places)]
+
+
+def columns_of(columns, a, b):
+    """Return the columns ``columns`` (columns,) of ``a``, and of a mask."""
+    xp = a.__array_namespace__()
+    return [xp.take(a, columns, axis=-1), xp.take(a > b, columns, axis=-1)]
 
 
 @given(SHAPES, DTYPES, st.integers(0, 2**32), st.data())
@@ -42,6 +69,27 @@ def test_every_operation_on_inputs_of_every_shape(shape, dtype, seed, data):
         program = ArrayProgram(trace(every_operation, 0, 4, dtype), (), 4, shape, dtype, data.draw(st.integers(1, 4)))
     with np.errstate(all="ignore"):
         assert_identical(program(*inputs), every_operation(*wide))
+
+
+def test_histories_and_columns():
+    rng, shape = np.random.default_rng(0), (5, 9)
+    a, b, history = *rng.normal(size=(2, *shape)), rng.normal(size=(5, 4, 18))
+    places, columns = rng.integers(history.size, size=(1, *shape)), rng.integers(9, size=9)
+    traced = trace(lambda places, *others: history_operations(Stack([places]), *others), 1, 3)
+    expected = history_operations(places, history, a, b)[0]
+    assert_identical(ArrayProgram(traced, [*places], 3, shape)(history, a, b), [expected])
+    found = ArrayProgram(trace(columns_of, 1, 2), [columns], 2, shape)(a, b)
+    assert_identical(found, columns_of(columns, a, b))
+
+
+def test_no_operation_is_left_out():
+    namespace = Namespace()
+    every_operation(*(Symbol(namespace) for _ in range(4)))
+    history_operations(Stack([Symbol(namespace)]), *(Symbol(namespace) for _ in range(3)))
+    columns_of(*(Symbol(namespace) for _ in range(3)))
+    noted = {name for name, _, _ in namespace.noted}
+    numbers = np.frombuffer(trace(every_operation, 0, 4).operations, np.int32).reshape(-1, 5)[:, 0]
+    assert noted | {OPERATIONS[number] for number in numbers} == set(OPERATIONS)
 
 
 @given(SHAPES, DTYPES, st.integers(0, 2**32), st.data())
