@@ -64,9 +64,8 @@ class Options:
 
 def main(options: Options) -> None:
     """Print the table and write the figures."""
-    print(
-        f"{native.obstacle() or 'native code'}\n\n| robot, solver, motion | moved | us | tutorial's loop |\n{'| --- ' * 4}|"
-    )
+    print(native.obstacle() or "native code")
+    print(f"\n| robot, solver, motion | moved | us | tutorial's loop |\n{'| --- ' * 4}|")
     figures: dict[str, dict[str, dict[str, float]]] = {}
     for name in options.robots:
         robot = Robot.load(name, dissipation="sapien")

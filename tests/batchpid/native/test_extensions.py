@@ -21,6 +21,7 @@ from batchpid.native.task_space_extension import TASK_SPACE
 from batchpid.sim.engine.native.interface import EXTENSIONS
 
 needs_extension = pytest.mark.skipif(bool(obstacle()), reason="there is no native code")
+needs_sources = pytest.mark.skipif(not (ROOT / PROGRAM.files[0]).is_file(), reason="a wheel has no C++ files")
 ALL = {each.module: each for each in (PROGRAM, TASK_SPACE, *EXTENSIONS.values())}
 
 
@@ -42,6 +43,7 @@ def steps():
     return [pid(*rng.normal(size=(2, 4, 3))).tobytes() for _ in range(5)], pid.native
 
 
+@needs_sources
 @pytest.mark.parametrize("name", ALL)
 def test_a_digest_changes_with_its_file_alone(name, tmp_path):
     extension = ALL[name]
@@ -62,6 +64,7 @@ def test_a_digest_changes_with_its_file_alone(name, tmp_path):
     assert flags[1:] == before[1:]
 
 
+@needs_sources
 @pytest.mark.parametrize("name", ALL)
 def test_the_files_are_all_that_are_included_and_the_tables(name):
     included, pending = set(), [(ROOT / ALL[name].files[0]).resolve()]
@@ -86,6 +89,7 @@ def other_file(monkeypatch, changed):
 
 
 @needs_extension
+@needs_sources
 @pytest.mark.parametrize("file", ["native/program.h", "native/operations.py", "flags"])
 def test_a_stale_extension_is_one_warning_and_numpy_does_the_work(monkeypatch, file):
     expected = steps()
