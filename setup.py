@@ -35,17 +35,15 @@ def load(name):
 
 
 def built(extension):
-    """Return an extension, as setuptools has them, with the digests of its tables and sources."""
-    digests = {"TABLES": extension.tables_digest(), "SOURCES": extension.sources_digest()}
-    macros = {f"BATCHPID_{kind}": f'"{digest}"' for kind, digest in digests.items()}
+    """Return an extension, as setuptools has them, with the digests of its files."""
     return Extension(
         extension.module,
         [extension.files[0]],
-        depends=["setup.py", *(f"{name.replace('.', '/')}.py" for name in MODULES), *extension.files[1:]],
+        depends=["setup.py", "batchpid/native/extensions.py", *extension.files[1:]],
         include_dirs=["."],
         extra_compile_args=list(extension.flags),
         language="c++",
-        define_macros=[("Py_LIMITED_API", "0x030B0000"), *macros.items()],
+        define_macros=[("Py_LIMITED_API", "0x030B0000"), ("BATCHPID_SOURCES", f'"{" ".join(extension.digests())}"')],
         py_limited_api=True,
         optional=REQUIRED == "0",  # without a compiler batchpid works as well, only slower
     )

@@ -12,7 +12,7 @@ from batchpid.law import pid
 from batchpid.law.coefficients import discretise
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
-from batchpid.native.availability import program_status
+from batchpid.native.availability import obstacle
 from batchpid.native.compiled_law import CompiledLaw
 
 LARGE = 2**18
@@ -32,7 +32,7 @@ class NumPyBackend:
 
     def __init__(self, dt: float, terms: bool, threads: int | None = None) -> None:
         self.dt, self.terms, self.threads = dt, terms, threads
-        self.native = program_status().active
+        self.native = not obstacle()
         """Whether the native extension computes the law, which then writes over the arrays of the state."""
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
@@ -47,7 +47,7 @@ class NumPyBackend:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Build the native program again, if this process has the extension."""
         self.__dict__.update(state)
-        self.native = program_status().active
+        self.native = not obstacle()
         self.prepare(self.params, self.shape)
 
     def array(self, value: Any) -> Any:

@@ -16,10 +16,11 @@ import re
 import statistics
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
+from unittest.mock import patch
 
 import numpy as np
 import tyro
@@ -33,6 +34,7 @@ from batchpid.io.versions import package_versions
 from batchpid.sim import Robot
 from batchpid.sim.cli.report import table
 from batchpid.sim.engine import native
+from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.loop import Loop
@@ -88,7 +90,7 @@ def make_loop(workload: Workload, name: str) -> Case:
     options = dict((LOOPS | XLA_LOOPS | MUJOCO_LOOPS)[name])
     if name.startswith(POLICY):
         options["control"] = ResidualPolicy(workload.robot)
-    with native.python_calls() if name == PYTHON else nullcontext():
+    with patch.dict(os.environ, {native.SWITCH: "0"} if name == PYTHON else {}):
         runner = workload.runner(**options)
     setpoints = np.broadcast_to(workload.target, (workload.ticks, *workload.target.shape))
 
@@ -235,7 +237,7 @@ def main(options: Options) -> None:
         "phases": _rounded(measure_phases(workload)),
         "free_phases": _rounded(measure_phases(replace(workload, physics="free"), collisions=False)),
     }
-    calls = native.status().describe("SAPIEN")
+    calls = native.describe_calls("SAPIEN", load_engine("sapien").native_obstacle())
     print(f"{options.robot}, {options.num_envs} envs, {workload.processes} processes, {calls}\n")
     columns = figures["rates"], figures["ratios"], figures["per_process"]
     rows = [

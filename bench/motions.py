@@ -23,7 +23,7 @@ from tutorial import TutorialLoop
 
 from batchpid.io.files import write_atomically
 from batchpid.sim import Robot, Runner
-from batchpid.sim.engine.native import status
+from batchpid.sim.engine import native
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 
 SUBSTEPS = 20
@@ -64,7 +64,8 @@ class Options:
 
 def main(options: Options) -> None:
     """Print the table and write the figures."""
-    print(f"{status()}\n\n| robot, solver, motion | moved | us | tutorial's loop |\n{'| --- ' * 4}|")
+    print(native.obstacle() or "native code")
+    print(f"\n| robot, solver, motion | moved | us | tutorial's loop |\n{'| --- ' * 4}|")
     figures: dict[str, dict[str, dict[str, float]]] = {}
     for name in options.robots:
         robot = Robot.load(name, dissipation="sapien")

@@ -13,7 +13,7 @@ import numpy as np
 
 from batchpid.motors import STAGES, Coefficients, Stages
 from batchpid.native.array_program import ArrayProgram
-from batchpid.native.availability import program_status
+from batchpid.native.availability import obstacle
 from batchpid.native.operations import OPERATION
 from batchpid.native.tracing import trace_trees
 from batchpid.native.trees import leaves, mapped, structure
@@ -27,7 +27,7 @@ def compiled_stages(k: Coefficients, shape: tuple[int, int]) -> Stages:
 
     ``shape`` is (envs, joints).
     """
-    if not program_status().active:
+    if obstacle():
         return STAGES
     return Stages(*(_compiled(stage, k, shape) for stage in STAGES))
 

@@ -1,4 +1,4 @@
-// Module of an extension, with digests of its tables and sources; see extensions.py.
+// Module of an extension, with digests of its files; see extensions.py.
 
 #pragma once
 
@@ -8,8 +8,8 @@
 #endif
 #include <Python.h>
 
-#if !defined(BATCHPID_TABLES) || !defined(BATCHPID_SOURCES)
-#error "the digests of the tables and of the sources are missing: build with setup.py"
+#ifndef BATCHPID_SOURCES
+#error "the digests of the files are missing: build with setup.py"
 #endif
 
 #pragma GCC visibility push(hidden)
@@ -19,8 +19,7 @@ namespace batchpid {
 inline PyObject *make_module(PyModuleDef &definition) {
   PyObject *module = PyModule_Create(&definition);
   if (module == nullptr) return nullptr;
-  if (PyModule_AddStringConstant(module, "tables", BATCHPID_TABLES) != 0 ||
-      PyModule_AddStringConstant(module, "sources", BATCHPID_SOURCES) != 0) {
+  if (PyModule_AddStringConstant(module, "sources", BATCHPID_SOURCES) != 0) {
     Py_DECREF(module);
     return nullptr;
   }

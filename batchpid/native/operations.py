@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from batchpid.native.extensions import ROUNDED, Extension
 
 OPERATIONS = (
@@ -25,13 +23,7 @@ MOST_SUMMED = 128
 """Largest number of terms for which a sum has NumPy's order."""
 
 
-def _tables() -> tuple[Any, ...]:
-    return OPERATIONS, OPERATION, MOST_SUMMED
-
-
-HEADERS = tuple(f"batchpid/native/{name}" for name in ("make_program.h", "extension.h", "program.h"))
-"""Headers of programs, which other extensions may include."""
-PROGRAM = Extension(
-    "batchpid.native._program", ("batchpid/native/program.cpp", *HEADERS), (*ROUNDED, "-pthread"), _tables
-)
-EXTENSIONS = {PROGRAM.name: PROGRAM}
+PROGRAMS = tuple(f"batchpid/native/{name}" for name in ("make_program.h", "extension.h", "program.h", "operations.py"))
+"""Headers and tables of programs, for extensions that include them."""
+PROGRAM = Extension("batchpid.native._program", ("batchpid/native/program.cpp", *PROGRAMS), (*ROUNDED, "-pthread"))
+EXTENSIONS = {"_program": PROGRAM}

@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from batchpid.native.extensions import ROUNDED, Extension
 
 BODY = {"rotation": 9, "position": 3, "mass": 1, "center": 3, "tensor": 9}
@@ -39,20 +37,16 @@ DECOUPLING = ("full", "partial", "none")
 BUFFER, CALL, COUPLING, LANES, RIGID_BODY = (
     f"batchpid/native/{name}.h" for name in ("buffer", "call", "coupling", "lanes", "rigid_body")
 )
+TABLES = "batchpid/native/task_space_extension.py"
 _HEADERS = tuple(
     f"batchpid/native/{name}.h"
     for name in ("extension", "mobility", "osc_friction", "osc_law", "pose_search", "tables", "tool", "tool_dynamics")
 )
 
 
-def _tables() -> tuple[Any, ...]:
-    return list(BODY.items()), KINEMATICS, LAW, FRICTION, SEARCH, DECOUPLING
-
-
 TASK_SPACE = Extension(
     "batchpid.native._task_space",
-    ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, CALL, COUPLING, LANES, RIGID_BODY),
+    ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, CALL, COUPLING, LANES, RIGID_BODY, TABLES),
     (*ROUNDED, "-Wno-psabi"),
-    _tables,
 )
-EXTENSIONS = {TASK_SPACE.name: TASK_SPACE}
+EXTENSIONS = {"_task_space": TASK_SPACE}

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import os
-import warnings
 from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
@@ -18,8 +17,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.native.availability import SWITCH
-from batchpid.native.extensions import StaleExtensionError, load
+from batchpid.native.availability import SWITCH, obstacle
+from batchpid.native.extensions import load
 from batchpid.native.task_space_extension import KINEMATICS, TASK_SPACE
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -43,20 +42,13 @@ _trees: WeakKeyDictionary[RigidTree, _NativeTree] = WeakKeyDictionary()
 
 
 def in_use() -> Any:
-    """Return the extension, or None; one that cannot be used gives one RuntimeWarning per process."""
+    """Return the extension, or None where native code is not used."""
     return None if os.environ.get(SWITCH) == "0" else _extension()
 
 
 @cache
 def _extension() -> Any:
-    try:
-        return load(TASK_SPACE)
-    except StaleExtensionError as error:
-        text = f"the native extension is not used, only NumPy: {TASK_SPACE.name} {error}"
-        warnings.warn(text, RuntimeWarning, stacklevel=3)
-    except ModuleNotFoundError:
-        pass
-    return None
+    return None if obstacle() else load(TASK_SPACE)
 
 
 def kinematics(

@@ -71,10 +71,10 @@ class InspectCommand:
         print("\n" + contact_lines(robot, pairs_too=self.all))
         if self.engine:
             from batchpid.sim.engine.engines import load_engine
-            from batchpid.sim.engine.native import status
+            from batchpid.sim.engine.native import describe_calls
 
-            title = load_engine(self.engine).title
-            print(f"\nEngine: {status().describe(f'{title} {package_versions([self.engine])[self.engine]}')}.")
+            engine, version = load_engine(self.engine), package_versions([self.engine])[self.engine]
+            print(f"\nEngine: {describe_calls(f'{engine.title} {version}', engine.native_obstacle())}.")
         if json is not None:
             names = ("type", "unit", "lower", "upper", "effort_limit", "velocity_limit", "damping", "friction")
             figures = {

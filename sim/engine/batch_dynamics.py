@@ -61,7 +61,7 @@ SWEEPS = 2
 
 def batch_dynamics(robot: RobotDescription, joints: tuple[int, ...]) -> NativeBatchDynamics | NumpyBatchDynamics:
     """Return the dynamics of ``joints`` of ``robot`` on a fixed base: native ones where the extension is used."""
-    kind = NativeBatchDynamics if native.status().active else NumpyBatchDynamics
+    kind = NumpyBatchDynamics if native.obstacle() else NativeBatchDynamics
     return kind(Loaded.of(robot), MovingJoints.of(robot, joints))
 
 

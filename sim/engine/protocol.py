@@ -235,6 +235,9 @@ class Engine(Protocol):
     physics: Mapping[str, Any]
     group_size: int
 
+    def native_obstacle(self) -> str:
+        """Return why native code cannot call the engine, in a sentence; "" if it can."""
+
     def is_physics(self, settings: object) -> bool:
         """Return whether ``settings`` are settings of its solver."""
 

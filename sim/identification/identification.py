@@ -122,7 +122,7 @@ def identify(
         "payload": payload,
         "evaluations": evaluations,
         "seed": seed,
-        "native": native.status().active,
+        "native": not native.obstacle(),
         "versions": package_versions(("batchpid", "sapien", "numpy", "scipy", "cmaes")),
     }
     record = History(history, settings)
@@ -133,8 +133,7 @@ def identify(
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
     pool: Any = nullcontext()
     if processes > 1:
-        verdict: Any = {"initializer": native.take_verdict, "initargs": (native.environment(),)}
-        pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), **verdict)
+        pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
     with pool as executor:
 
         def fit_under(drive: Drive, regression: Regression, record: History) -> tuple[Problem, Solution]:

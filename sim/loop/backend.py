@@ -22,10 +22,7 @@ def obstacle(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     if not options.robot.fixed_base and options.robot.friction.any():
         return "joints with friction on a floating base take an inertia of NumPy"
     engine = options.load_engine()
-    if reason := _engine_obstacle(engine) or _force_obstacle(engine, options):
-        return reason
-    status = xla.status()
-    return "" if status.active else status.reason
+    return _engine_obstacle(engine) or _force_obstacle(engine, options) or engine.native_obstacle() or xla.obstacle()
 
 
 def _engine_obstacle(engine: Engine) -> str:
@@ -58,16 +55,16 @@ def native_obstacle(options: RunnerOptions) -> str:
 
 def describe(options: RunnerOptions, actuators: bp.Actuators | None) -> str:
     """Describe the library of the law, and the calls into the engine, with reasons."""
-    engine = options.load_engine().title
-    calls = native.status().describe(engine)
+    engine = options.load_engine()
+    lack = engine.native_obstacle()
+    calls = native.describe_calls(engine.title, lack)
     drives = options.control == "drive"
     if drives or options.backend == "numpy" or (options.control == "effort" and obstacle(options, actuators)):
-        active = native.status().active
-        reason = native_obstacle(options) if active else ""
+        reason = "" if lack else native_obstacle(options)
         each = f", a call each sim step ({reason})" if reason else ""
         if drives:
-            return f"law in {engine} (control 'drive'){each}, {calls}"
-        return f"law {'as a native program' if active and not reason else 'in NumPy'}{each}, {calls}"
+            return f"law in {engine.title} (control 'drive'){each}, {calls}"
+        return f"law {'in NumPy' if lack or reason else 'as a native program'}{each}, {calls}"
     reason = obstacle(options, actuators)
     law = f"law in XLA ({options.dtype})"
     if not reason:

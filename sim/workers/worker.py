@@ -173,7 +173,7 @@ class ProcessWorker(Worker):
                     "batchpid.sim.workers.serve:main",
                     (theirs.fileno(), self._memory, self._trace.fileno()),
                     imports=("batchpid.sim.workers.serve", MODULES[self._start.options.engine]),
-                    environment=native.environment(),
+                    environment={native.SWITCH: "0"} if native.obstacle() else None,  # one warning for all
                 )
             undo.pop_all()
         self._name = self._name.replace("(", f"(pid {process.pid}, ")

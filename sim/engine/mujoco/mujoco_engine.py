@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from batchpid.sim.engine.mujoco.mujoco_pack import MujocoPack
+from batchpid.sim.engine.mujoco.mujoco_step import obstacle
 from batchpid.sim.engine.mujoco.solver import SOLVERS, MujocoSolver
 from batchpid.sim.engine.protocol import Capability, Engine
 from batchpid.sim.engine.robot_model import description_tree
@@ -20,6 +21,8 @@ class MujocoEngine:
     capabilities: frozenset[Capability] = frozenset({"drive", "compiled_steps"})
     physics: Mapping[str, Any] = SOLVERS
     group_size = 64
+
+    native_obstacle = staticmethod(obstacle)
 
     def is_physics(self, settings: object) -> bool:
         """Return whether these are :class:`batchpid.sim.MujocoSolver`."""

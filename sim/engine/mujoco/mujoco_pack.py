@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 import batchpid.task_space as ts
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
-from batchpid.sim.engine import native
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.data_pool import DataPool
 from batchpid.sim.engine.mujoco.model_builder import FLOATING, LARGEST_FORCE, RobotMj, robot_model, set_inertia
-from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, functions
+from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.protocol import FAILED
@@ -62,7 +61,7 @@ class MujocoPack(SingleOwner):
     ) -> None:
         self.spec, self.size, self.first_env = spec, size, first_env
         self._workspace = {} if workspace is None else workspace
-        self.steps_natively = native.status().active and functions() is not None
+        self.steps_natively = not obstacle()
         self.dof, self._variation = len(spec.joints), variation or Variation()
         varied = self._variation
         self._masses_vary = any(each is not None for each in (varied.payload, varied.link_mass, varied.center_of_mass))

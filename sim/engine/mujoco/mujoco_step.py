@@ -40,6 +40,13 @@ def mujoco_library() -> Path:
     return path
 
 
+def obstacle() -> str:
+    """Return why native code cannot call MuJoCo; "" if it can."""
+    if (reason := native.obstacle()) or functions() is not None:
+        return reason
+    return f"MuJoCo {mujoco.__version__} lacks functions for native calls"
+
+
 @cache
 def functions() -> dict[str, int] | None:
     """Return the addresses of functions and clock by field; None if this version of MuJoCo lacks one of them."""

@@ -7,11 +7,10 @@ package, so it may import only that module, others that it lists before this one
 from __future__ import annotations
 
 import ctypes
-from typing import Any
 
 from batchpid.native.extensions import ROUNDED, Extension
-from batchpid.native.operations import HEADERS, PROGRAM
-from batchpid.native.task_space_extension import BODY, BUFFER, CALL, COUPLING, LANES, RIGID_BODY
+from batchpid.native.operations import PROGRAMS
+from batchpid.native.task_space_extension import BUFFER, CALL, COUPLING, LANES, RIGID_BODY, TABLES
 
 SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation7getQposEv",
@@ -159,40 +158,8 @@ class Transfer(ctypes.Structure):
     ]
 
 
-def _layout(structure: type[ctypes.Structure]) -> list[tuple[str, int, int]]:
-    """Return the fields of a structure, with their places and sizes."""
-    return [
-        (field, getattr(structure, field).offset, getattr(structure, field).size) for field, *_ in structure._fields_
-    ]
-
-
 def _files(*names: str) -> tuple[str, ...]:
-    return (*(f"batchpid/sim/engine/native/{name}" for name in names), "batchpid/native/extension.h")
-
-
-def _gateway_tables() -> tuple[Any, ...]:
-    return (
-        SYMBOLS,
-        STATUS,
-        FARTHEST,
-        _layout(Group),
-        _layout(Clearance),
-        _layout(Mujoco),
-        _layout(Constraint),
-        _layout(Model),
-        _layout(Refresh),
-        STAGES,
-        _layout(Stage),
-        _layout(Tick),
-        TRANSFERS,
-        _layout(Transfer),
-        list(BODY.items()),
-        PROGRAM.tables(),
-    )
-
-
-def _batch_dynamics_tables() -> tuple[Any, ...]:
-    return DYNAMICS, STEP, list(BODY.items())
+    return (*(f"batchpid/sim/engine/native/{name}" for name in (*names, "interface.py")), "batchpid/native/extension.h")
 
 
 EXTENSIONS = {
@@ -216,15 +183,14 @@ EXTENSIONS = {
             COUPLING,
             LANES,
             RIGID_BODY,
-            *HEADERS,
+            TABLES,
+            *PROGRAMS,
         ),
         (*ROUNDED, "-pthread", "-Wno-psabi"),
-        _gateway_tables,
     ),
     "_batch_dynamics": Extension(
         "batchpid.sim.engine.native._batch_dynamics",
-        (*_files("batch_dynamics.cpp"), BUFFER, LANES, RIGID_BODY),
+        (*_files("batch_dynamics.cpp"), BUFFER, LANES, RIGID_BODY, TABLES),
         (*ROUNDED, "-Wno-psabi"),
-        _batch_dynamics_tables,
     ),
 }

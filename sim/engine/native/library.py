@@ -1,15 +1,22 @@
-"""Functions of SAPIEN's shared library that the gateway calls."""
+"""SAPIEN's shared library: whether native code can call it, and the functions that the gateway calls."""
 
 from __future__ import annotations
 
 import ctypes
 import warnings
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import SYMBOLS
+
+TESTED = ("3.0.3",)
+"""Versions of SAPIEN that native code calls; tests/sim/engine/test_native.py must pass with each.
+
+The gateway repeats the layout of two types of SAPIEN (gateway.h). No header promises it, and the names of the
+functions do not contain the type that they return: a version that changes it would corrupt memory.
+"""
 
 
 def import_sapien() -> Any:
@@ -22,21 +29,25 @@ def import_sapien() -> Any:
     return sapien
 
 
-@cache
-def sapien_library() -> Path:
-    """Return the path of SAPIEN's shared library, which comes with its Python package; that is not imported."""
-    spec = find_spec("sapien")
-    packages = [] if spec is None else [Path(folder) for folder in spec.submodule_search_locations or ()]
-    folders = [folder for package in packages for folder in (package, package.parent / "sapien.libs")]
-    paths = [path for folder in folders for path in folder.glob("libsapien*.so*")]
-    if len(paths) != 1:
-        raise OSError("SAPIEN's shared library is not installed, or more than once")
-    return paths[0]
+def obstacle() -> str:
+    """Return why native code cannot call SAPIEN; "" if it can."""
+    if reason := native.obstacle():
+        return reason
+    if (version := import_sapien().__version__) not in TESTED:
+        return f"native calls are not tested with SAPIEN {version}; install sapien=={TESTED[-1]}"
+    try:
+        functions()
+    except (OSError, AttributeError) as error:
+        return f"SAPIEN {version} has another library: {error}; install sapien=={version} from PyPI"
+    return ""
 
 
 @cache
 def functions() -> tuple[int, ...]:
     """Return the addresses of the exported functions; AttributeError names one that is missing."""
-    import_sapien()
-    library = ctypes.CDLL(str(sapien_library()))
+    folder = Path(import_sapien().__file__).parent
+    paths = [path for place in (folder, folder.parent / "sapien.libs") for path in place.glob("libsapien*.so*")]
+    if len(paths) != 1:
+        raise OSError("libsapien.so is missing, or there is more than one")
+    library = ctypes.CDLL(str(paths[0]))
     return tuple(ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value or 0 for symbol in SYMBOLS)

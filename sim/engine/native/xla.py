@@ -15,19 +15,17 @@ from batchpid.sim.engine import native
 _lock = threading.Lock()
 
 
-def status() -> native.NativeStatus:
-    """Return whether programs of JAX can call the extension, and the reason if not. Imports JAX."""
-    calls = native.status()
-    if not calls.active:
-        return calls
+def obstacle() -> str:
+    """Return why programs of JAX cannot call the extension; "" if they can. Imports JAX."""
+    if reason := native.obstacle():
+        return reason
     with _lock:  # JAX takes a name once
-        problem = _registered()
-    return native.NativeStatus(not problem, problem)
+        return _registered()
 
 
 @cache
 def _registered() -> str:
-    """Register the functions with JAX; return the problem, or an empty string."""
+    """Register the functions with JAX; return the problem, or ""."""
     import jax
 
     for name, address in native.extension("_gateway").xla_functions().items():
@@ -77,8 +75,8 @@ def mass_matrix(tree: Any, bodies: Any, qpos: Any) -> Any:
     """
     import jax
 
-    if not (calls := status()).active:
-        problem = f"is an array of JAX, for which the mass matrix needs native calls ({calls.reason})"
+    if reason := obstacle():
+        problem = f"is an array of JAX, for which the mass matrix needs native code ({reason})"
         remedy = "use batchpid.task_space.mass_matrix(robot.kinematic_tree(), qpos), or an array of NumPy"
         raise InvalidArgumentError("qpos", problem, remedy=remedy)
     result = jax.ShapeDtypeStruct((*qpos.shape, qpos.shape[-1]), qpos.dtype)

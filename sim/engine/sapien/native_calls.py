@@ -2,7 +2,7 @@
 
 The extension calls functions that SAPIEN's shared library exports, so that it needs nothing of SAPIEN to be compiled.
 It depends on the layout of two of SAPIEN's types, which no header promises: see
-:mod:`batchpid.sim.engine.native.verdict`.
+:data:`batchpid.sim.engine.native.library.TESTED`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.sim.engine.native import extension
+from batchpid.sim.engine.native import SWITCH, extension
 from batchpid.sim.engine.native.library import functions
 from batchpid.sim.engine.sapien.calls import EngineCalls, PythonCalls
 
@@ -83,7 +83,8 @@ def pointer(wrapper: Any, kind: str) -> int:
     """
     capsule = wrapper._pybind11_conduit_v1_(_ABI, extension("_gateway").type_info(kind), b"raw_pointer_ephemeral")
     if capsule is None:
-        raise RuntimeError(f"SAPIEN's {kind} is not of the type that the extension was made for")
+        problem = f"SAPIEN's {kind} is not of the type that the extension was made for"
+        raise RuntimeError(f"{problem}; install SAPIEN from PyPI, or set {SWITCH}=0 for Python calls")
     return _capsule_pointer(capsule, _capsule_name(capsule))
 
 

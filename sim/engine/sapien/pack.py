@@ -21,9 +21,9 @@ from batchpid.arrays.array_types import Float32, Float64
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
-from batchpid.sim.engine import native
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
+from batchpid.sim.engine.native.library import obstacle
 from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.sapien.building import build_scene, engine_settings, link_frames, new_system
 from batchpid.sim.engine.sapien.built_tree import scene_tree
@@ -56,7 +56,7 @@ class Pack(SingleOwner):
     """
 
     def __init__(self, spec: SceneSpec, size: int, first_env: int = 0) -> None:
-        self.spec, self.first_env, self.steps_natively = spec, first_env, native.status().active
+        self.spec, self.first_env, self.steps_natively = spec, first_env, not obstacle()
         self.systems = [new_system(spec) for _ in range(size)]
         built = [self._build(row, system) for row, system in enumerate(self.systems)]
         # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
+from batchpid.sim.engine.native.library import obstacle
 from batchpid.sim.engine.protocol import Capability, Engine
 from batchpid.sim.engine.sapien.built_tree import scene_tree
 from batchpid.sim.engine.sapien.pack import Pack
@@ -47,6 +48,7 @@ class SapienEngine:
             return Pack(spec, size, first_env)
         return VariedPack(spec, size, first_env, variation, carrier, links)
 
+    native_obstacle = staticmethod(obstacle)
     scene_tree = staticmethod(scene_tree)
 
 

@@ -11,16 +11,18 @@ from hypothesis import strategies as st
 from test_compiled_law import bits, numbers
 
 import batchpid as bp
-from batchpid.arrays.elementwise import push_history, read_history
+from batchpid.arrays.elementwise import matrix_vector, push_history, read_history, row_minimum, take_columns
 from batchpid.motors import STAGES, delay, friction, guard
 from batchpid.motors import Coefficients as ActuatorCoefficients
 from batchpid.motors.envelope import Envelope
 from batchpid.native import array_program
 from batchpid.native.array_program import ArrayProgram
-from batchpid.native.availability import every_operation, program_status
+from batchpid.native.availability import obstacle
+from batchpid.native.operations import OPERATIONS
+from batchpid.native.symbols import Namespace, Symbol
 from batchpid.native.tracing import trace
 
-pytestmark = pytest.mark.skipif(not program_status().active, reason="there are no native programs")
+pytestmark = pytest.mark.skipif(bool(obstacle()), reason="there are no native programs")
 DTYPES = st.sampled_from([np.float64, np.float32])
 SHAPES = st.tuples(st.sampled_from([1, 3, 64, 250]), st.sampled_from([1, 2, 7, 9, 16, 33, 100]))
 
@@ -28,6 +30,28 @@ SHAPES = st.tuples(st.sampled_from([1, 3, 64, 250]), st.sampled_from([1, 2, 7, 9
 def assert_identical(ours, theirs):
     for mine, expected in zip(ours, theirs, strict=True):
         assert bits(mine) == bits(np.broadcast_to(expected, mine.shape))
+
+
+def every_operation(a, b, c, matrix):
+    """Apply all operations of programs to arrays (rows, columns) and a matrix for each row; return the results."""
+    xp = a.__array_namespace__()
+    masks = a > b, a >= b, a < b, a <= b, a == b, a != b, xp.isfinite(a)
+    some = (a > b) & (b < c), (a > b) | (b < c), ~(a > b)
+    numbers = a + b, a - b, a * b, a / b, -a, abs(a), xp.rint(a), xp.ceil(a), xp.floor(a), xp.sqrt(a), xp.sign(a)
+    pairs = a * b + c, a + b * c, a + b - c, (a - b) * c, xp.minimum(xp.maximum(a, b), c)
+    ends = xp.maximum(a, b), xp.minimum(a, b), xp.maximum(b, a), xp.minimum(b, a)
+    across = xp.zeros_like(a) + row_minimum(a), matrix_vector(matrix, b)
+    return [*numbers, *pairs, *ends, xp.where(a > b, b, c), *across, *masks, *some]
+
+
+def history_operations(places, history, a, b):
+    """Push ``a`` and ``b``, side by side, to ``history``; return its numbers at ``places`` (rows, columns)."""
+    return [read_history(push_history(history, a, b), places)]
+
+
+def columns_of(columns, a, b):
+    """Return the columns ``columns`` (columns,) of ``a``, and of a mask."""
+    return [take_columns(a, columns), take_columns(a > b, columns)]
 
 
 @given(SHAPES, DTYPES, st.integers(0, 2**32), st.data())
@@ -42,6 +66,27 @@ def test_every_operation_on_inputs_of_every_shape(shape, dtype, seed, data):
         program = ArrayProgram(trace(every_operation, 0, 4, dtype), (), 4, shape, dtype, data.draw(st.integers(1, 4)))
     with np.errstate(all="ignore"):
         assert_identical(program(*inputs), every_operation(*wide))
+
+
+def test_histories_and_columns():
+    rng, shape = np.random.default_rng(0), (5, 9)
+    a, b, history = *rng.normal(size=(2, *shape)), rng.normal(size=(5, 4, 18))
+    places, columns = rng.integers(history.size, size=shape), rng.integers(9, size=9)
+    traced = trace(history_operations, 1, 3)
+    (expected,) = history_operations(places, history, a, b)
+    assert_identical(ArrayProgram(traced, [places], 3, shape)(history, a, b), [expected])
+    found = ArrayProgram(trace(columns_of, 1, 2), [columns], 2, shape)(a, b)
+    assert_identical(found, columns_of(columns, a, b))
+
+
+def test_no_operation_is_left_out():
+    namespace = Namespace()
+    every_operation(*(Symbol(namespace) for _ in range(4)))
+    history_operations(*(Symbol(namespace) for _ in range(4)))
+    columns_of(*(Symbol(namespace) for _ in range(3)))
+    noted = {name for name, _, _ in namespace.noted}
+    numbers = np.frombuffer(trace(every_operation, 0, 4).operations, np.int32).reshape(-1, 5)[:, 0]
+    assert noted | {OPERATIONS[number] for number in numbers} == set(OPERATIONS)
 
 
 @given(SHAPES, DTYPES, st.integers(0, 2**32), st.data())

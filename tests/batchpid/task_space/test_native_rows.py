@@ -13,7 +13,6 @@ from trees import planar, states, tool_of, tree_of
 
 import batchpid.task_space as ts
 from batchpid.native.availability import SWITCH
-from batchpid.native.extensions import StaleExtensionError
 from batchpid.task_space import native_rows
 
 pytestmark = pytest.mark.skipif(native_rows.in_use() is None, reason="there is no extension")
@@ -173,20 +172,6 @@ def test_a_row_is_the_same_in_any_company():
         part = ts.init(params, qpos[chosen])
         _, alone = ts.osc(k, part, hand, ts.OSCInputs(goal[chosen], qpos[chosen], qvel[chosen]))
         np.testing.assert_array_equal(alone.effort, effort[chosen])
-
-
-def test_a_stale_extension_is_a_warning_and_numpy_computes():
-    tree, qpos = planar(), np.ones((2, 2))
-    native_rows._extension.cache_clear()
-    try:
-        with (
-            mock.patch.object(native_rows, "load", side_effect=StaleExtensionError("was built from other sources")),
-            pytest.warns(RuntimeWarning, match="only NumPy: _task_space was built from other sources"),
-        ):
-            ts.mass_matrix(tree, qpos)
-    finally:
-        native_rows._extension.cache_clear()
-    assert native_rows.in_use() is not None
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -18,7 +18,7 @@ from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 
 MARGIN = 1e-4  # of clearance.h
-needs_extension = pytest.mark.skipif(not native.status().active, reason="there are no native calls")
+needs_extension = pytest.mark.skipif(bool(native.obstacle()), reason="there are no native calls")
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning", "ignore::batchpid.sim.FaultWarning")
 
 

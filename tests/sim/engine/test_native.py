@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,14 +10,17 @@ from identical import assert_identical
 from robots import load_bundled
 from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
 
+from batchpid.native.extensions import NOT_BUILT
 from batchpid.sim import Robot, Runner
 from batchpid.sim.engine import native
+from batchpid.sim.engine.sapien.building import build_scene, new_system
+from batchpid.sim.engine.sapien.calls import PythonCalls
+from batchpid.sim.engine.sapien.native_calls import NativeCalls
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
 
-BUILT = not native.status().reason.startswith("the extension was not built")
-needs_extension = pytest.mark.skipif(not BUILT, reason="the extension was not built: no C++ compiler")
+needs_extension = pytest.mark.skipif(native.obstacle() == NOT_BUILT, reason=NOT_BUILT)
 SOLID = INERTIAL + '<collision><geometry><box size="0.1 0.1 0.3"/></geometry></collision>'
 
 
@@ -91,66 +94,67 @@ def test_a_robot_whose_scene_is_gone_raises(panda):
         pack.read_qpos()
 
 
-def test_python_calls_without_the_extension(monkeypatch):
-    monkeypatch.setenv(native.SWITCH, "0")
-    assert native.status() == (False, "native calls are switched off by BATCHPID_NATIVE=0", "")
-    assert native.environment() == {"BATCHPID_NATIVE_REFUSED": native.status().reason}
+SPECS = {
+    "slider": {},
+    "panda": {},
+    "panda, fast": {"physics": PHYSICS["fast"]},
+    "panda, no shapes": {"collisions": False},
+}
 
 
-class Told:
-    """Controller whose effort is 1 in a process with native calls, else 2."""
-
-    def init(self, robot, num_envs):
-        return None
-
-    def __call__(self, state, setpoint, qpos, qvel, passive):
-        return state, np.full_like(qpos, 1.0 if native.status().active else 2.0)
-
-
-@needs_extension
-@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_python_calls_hold_for_the_workers_of_a_runner(panda, workers, monkeypatch):
-    monkeypatch.delenv(native.SWITCH, raising=False)
-    with native.python_calls():
-        runner = Runner(panda, 1, workers=workers, control=Told(), params=panda.params(effort_limit=None))
-    with runner:
-        effort = runner.step(panda.settings.target).effort
-        runner.params = panda.params(effort_limit=50.0)
-        runner.reset()
-        runner.step(panda.settings.target)
-    assert (effort == (1.0 if workers == 0 else 2.0)).all()  # in this process they are switched on again
-
-
-def test_python_calls_are_those_of_one_thread():
-    before = native.status()
-    with native.python_calls(), ThreadPoolExecutor(1) as other:
-        assert not native.status().active
-        assert other.submit(native.status).result() == before
+def spec_of(case, slider):
+    robot = slider if case == "slider" else load_bundled("panda")
+    spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["accurate"])
+    return replace(spec, **SPECS[case]), np.clip(robot.start, robot.lower, robot.upper)
 
 
 @needs_extension
-@pytest.mark.parametrize(
-    ("program", "problem"),
-    [
-        ("raise SystemExit('the results differ')", "the results differ"),
-        ("import os; os.abort()", "exit status -6"),
-        ("import ctypes; ctypes.string_at(8)", "exit status -11"),
-    ],
-)
-def test_a_failed_self_test_is_a_warning(monkeypatch, tmp_path, program, problem):
-    monkeypatch.delenv("BATCHPID_NATIVE_VERIFIED", raising=False)
-    status = native.verify(tmp_path, program)
-    warning = f"native calls do not work with this SAPIEN: {problem}"
-    assert status == (False, f"the self-test failed: {problem}", warning)
-    assert not list(tmp_path.iterdir())
+@pytest.mark.parametrize("case", SPECS)
+@pytest.mark.parametrize("gravity", [True, False])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_each_native_call_is_sapiens(case, gravity, dtype, slider):
+    """Efforts vary, one robot is skipped, and a robot whose scene is gone is an error of both."""
+    (spec, start), found = spec_of(case, slider), []
+    for make in (PythonCalls, NativeCalls):
+        systems = [new_system(spec) for _ in range(4)]
+        scenes, robots = zip(*(build_scene(spec, system) for system in systems), strict=True)
+        qf, reads = np.zeros((4, len(start)), np.float32), []
+        for row, each in enumerate(robots):
+            each.set_qpos((start + 0.01 * row).astype(np.float32))
+        calls = make(robots, systems, qf, np.array([False, False, False, True]))
+        for step in range(30):
+            qf[...] = calls.passive_force(True, True, np.float64) + np.sin(step + np.arange(len(start)))
+            calls.write_qf()
+            calls.step()
+            reads += [calls.qpos(dtype), calls.qvel(dtype), calls.passive_force(gravity, True, dtype)]
+        for scene in scenes:
+            scene.clear()
+        with pytest.raises(RuntimeError):
+            calls.qpos(dtype)
+        found.append(reads)
+    for theirs, ours in zip(*found, strict=True):
+        assert ours.dtype == theirs.dtype == dtype
+        assert ours.tobytes() == theirs.tobytes()
+    assert np.ptp(found[0][-3], axis=0).any()
 
 
-@pytest.mark.slow
 @needs_extension
-def test_the_self_test_runs_once_for_a_pair_of_libraries(monkeypatch, tmp_path):
-    monkeypatch.delenv("BATCHPID_NATIVE_VERIFIED", raising=False)
-    assert native.verify(tmp_path / "cache").active
-    assert len(list((tmp_path / "cache").iterdir())) == 1
-    assert native.verify(tmp_path / "cache", "raise SystemExit('not run again')").active
-    (tmp_path / "file").touch()
-    assert native.verify(tmp_path / "file").active  # an unwritable cache is not used
+@pytest.mark.parametrize("case", SPECS)
+def test_a_native_sim_step_is_the_calls_one_after_another(monkeypatch, case, slider):
+    (spec, start), packs = spec_of(case, slider), []
+    for switch in "10":
+        monkeypatch.setenv(native.SWITCH, switch)
+        packs.append(Pack(spec, 4))
+    ours, theirs = packs
+    for pack in packs:
+        pack.write_state(range(4), np.linspace(start, start + 0.1, 4), np.zeros((4, len(start))))
+    table = np.zeros((3, 4, len(start)))
+    step = ours.compiled_step(True, True, True, None)
+    for number in range(50):
+        effort = np.tile(5.0 * np.sin(number + np.arange(len(start))), (4, 1))
+        theirs.write_qf(effort)
+        theirs.step()
+        assert step(effort, *table) == 0
+        reads = theirs.read_qpos(), theirs.read_qvel(), theirs.passive_force(True, True)
+        assert np.array(reads).tobytes() == table.tobytes()
+    assert np.abs(table[0] - start).max() > 1e-3

@@ -143,6 +143,9 @@ class ToyEngine:
     name, title, capabilities, physics = "toy", "Toy", frozenset(), {"accurate": Solver(1)}
     group_size = 4
 
+    def native_obstacle(self):
+        return "a toy"
+
     def is_physics(self, settings):
         return False
 

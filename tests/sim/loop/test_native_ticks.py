@@ -11,7 +11,7 @@ from batchpid.sim.loop.native_ticks import NativeTicks
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning", "ignore::batchpid.sim.StabilityWarning"),
-    pytest.mark.skipif(not native.status().active, reason="there are no native calls"),
+    pytest.mark.skipif(bool(native.obstacle()), reason="there are no native calls"),
 ]
 
 

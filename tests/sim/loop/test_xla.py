@@ -21,7 +21,7 @@ from batchpid.sim.engine import native
 jax = pytest.importorskip("jax")
 jnp = jax.numpy
 N = 5
-needs_extension = pytest.mark.skipif(not native.status().active, reason="there are no native calls")
+needs_extension = pytest.mark.skipif(bool(native.obstacle()), reason="there are no native calls")
 
 
 def commands(robot, ticks, envs=N, spread=0.3):
@@ -32,7 +32,7 @@ def commands(robot, ticks, envs=N, spread=0.3):
 
 def rollout(robot, backend="jax", ticks=20, envs=N, **options):
     with Runner(robot, envs, backend=backend, **({"workers": 0, "substeps": 10} | options)) as runner:
-        if backend == "jax" and native.status().active:
+        if backend == "jax" and not native.obstacle():
             assert runner.backend == f"law in XLA ({runner.options.dtype}), in one program with native sim steps"
         return runner.rollout(commands(robot, ticks, envs))
 
@@ -245,7 +245,7 @@ def test_without_native_calls_the_law_is_called_each_sim_step(monkeypatch, panda
     monkeypatch.setenv(native.SWITCH, "0")
     with Runner(panda, 2, control=control, backend="jax", workers=0, substeps=10) as runner:
         assert runner.backend == (
-            "law in XLA (float64), a call each sim step (native calls are switched off by BATCHPID_NATIVE=0), "
+            "law in XLA (float64), a call each sim step (native code is switched off by BATCHPID_NATIVE=0), "
             "Python calls into SAPIEN"
         )
         ours = runner.rollout(commands(panda, 3, 2))
@@ -266,7 +266,7 @@ def test_options(panda):
         assert "a call each sim step (actuators" in runner.backend
         runner.step(panda.start)
         runner.actuators = None
-        assert native.status().active == ("in one program" in runner.backend)
+        assert (not native.obstacle()) == ("in one program" in runner.backend)
 
 
 def test_jax_is_not_imported_unless_it_is_asked_for():
