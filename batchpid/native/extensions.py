@@ -18,8 +18,17 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[2]
 NOT_BUILT = "the extension was not built: it needs a C++ compiler when batchpid is installed"
-ROUNDED = ("-std=c++17", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
+ROUNDED = (
+    *("-std=c++17", "-O3", "-g0", "-fvisibility=hidden"),
+    *("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
+)
 """Compiler flags under which each operation is rounded as in NumPy: operations are not fused."""
+LANES_ONLY = (
+    *("-O2", "-fvect-cost-model=dynamic", "-fno-tree-loop-vectorize", "-fpeel-loops", "-Wno-psabi"),
+    *("--param=max-completely-peel-times=6", "--param=max-completely-peeled-insns=120"),
+)
+"""Flags for code that computes on Lanes (lanes.h), which are vectors already: compiled in half the time of -O3, and as
+fast."""
 
 
 class StaleExtensionError(ImportError):

@@ -29,7 +29,7 @@ def _tables() -> tuple[Any, ...]:
     return OPERATIONS, OPERATION, MOST_SUMMED
 
 
-HEADERS = tuple(f"batchpid/native/{name}" for name in ("make_program.h", "extension.h", "program.h"))
+HEADERS = tuple(f"batchpid/native/{name}.h" for name in ("make_program", "extension", "buffer", "program"))
 """Headers of programs, which other extensions may include."""
 PROGRAM = Extension(
     "batchpid.native._program", ("batchpid/native/program.cpp", *HEADERS), (*ROUNDED, "-pthread"), _tables
