@@ -27,8 +27,8 @@ LANES_ONLY = (
     *("-O2", "-fvect-cost-model=dynamic", "-fno-tree-loop-vectorize", "-fpeel-loops", "-Wno-psabi"),
     *("--param=max-completely-peel-times=6", "--param=max-completely-peeled-insns=120"),
 )
-"""Flags for code that computes on Lanes (lanes.h), which are vectors already: compiled in half the time of -O3, and as
-fast."""
+"""Flags for code that computes on Lanes (lanes.h), which are vectors already: compiled in about half the time of
+-O3."""
 
 
 class StaleExtensionError(ImportError):
