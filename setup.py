@@ -50,7 +50,12 @@ def built(extension):
 
 
 class Build(build_ext):
-    """Build that names the extension which fails, and the remedy, if extensions are required."""
+    """Build of all extensions at once, which names one that fails, and the remedy, if extensions are required."""
+
+    def finalize_options(self):
+        """Use all cores by default."""
+        super().finalize_options()
+        self.parallel = self.parallel or True
 
     def build_extension(self, ext):
         """Compile and link one extension."""
@@ -64,8 +69,10 @@ class Build(build_ext):
 
 
 modules = [load(name) for name in MODULES] if os.environ.get("BATCHPID_NATIVE") != "0" else []
+extensions = [extension for module in modules[1:] for extension in module.EXTENSIONS.values()]
 setup(
     cmdclass={"build_ext": Build},
-    ext_modules=[built(extension) for module in modules[1:] for extension in module.EXTENSIONS.values()],
+    # The longest to compile come first.
+    ext_modules=[built(extension) for extension in sorted(extensions, key=lambda each: -len(each.files))],
     options={"bdist_wheel": {"py_limited_api": "cp311"}},
 )

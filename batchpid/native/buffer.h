@@ -1,4 +1,4 @@
-// Contiguous arrays of Python.
+// Objects of Python in C++: contiguous arrays, and capsules.
 
 #pragma once
 
@@ -8,7 +8,9 @@
 #endif
 #include <Python.h>
 
-#pragma GCC visibility push(hidden)
+#include <cstddef>
+#include <memory>
+#include <vector>
 
 namespace batchpid {
 
@@ -38,6 +40,37 @@ class Buffer {
   bool held_ = false;
 };
 
-}  // namespace batchpid
+// Open arrays of double with these counts of numbers, of which those from `written` on are results. None is an array of
+// no numbers, without data.
+template <std::size_t N>
+bool open_doubles(PyObject *const *given, Py_ssize_t const (&counts)[N], std::size_t written, Buffer (&arrays)[N]) {
+  for (std::size_t i = 0; i < N; ++i) {
+    int const flags = PyBUF_C_CONTIGUOUS | (i < written ? 0 : PyBUF_WRITABLE);
+    if (counts[i] == 0 && given[i] == Py_None) continue;
+    if (!arrays[i].open(given[i], counts[i], sizeof(double), flags)) return false;
+  }
+  return true;
+}
 
-#pragma GCC visibility pop
+// Copy the numbers of an array.
+template <class T>
+bool copy(PyObject *array, Py_ssize_t count, std::vector<T> &to) {
+  Buffer from;
+  if (!from.open(array, count, sizeof(T), PyBUF_C_CONTIGUOUS)) return false;
+  to.assign(from.as<T>(), from.as<T>() + count);
+  return true;
+}
+
+// Return the object in a capsule, or null with an exception. T::CAPSULE is the name of its capsules.
+template <class T>
+T *held(PyObject *capsule) {
+  return static_cast<T *>(PyCapsule_GetPointer(capsule, T::CAPSULE));
+}
+
+// Return a capsule that owns an object.
+template <class T>
+PyObject *capsule_of(std::unique_ptr<T> object) {
+  return PyCapsule_New(object.release(), T::CAPSULE, [](PyObject *capsule) { delete held<T>(capsule); });
+}
+
+}  // namespace batchpid

@@ -2,8 +2,6 @@
 
 #pragma once
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 struct Call {
@@ -11,5 +9,3 @@ struct Call {
 };
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

@@ -5,8 +5,6 @@
 #include <cstddef>
 #include <cstdint>
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 // Leaders and multipliers of the joints; null for none.
@@ -47,5 +45,3 @@ struct Coupling {
 };
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

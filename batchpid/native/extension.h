@@ -2,19 +2,18 @@
 
 #pragma once
 
-#define PY_SSIZE_T_CLEAN
-#ifndef Py_LIMITED_API
-#define Py_LIMITED_API 0x030B0000
-#endif
-#include <Python.h>
+#include "batchpid/native/buffer.h"
 
 #ifndef BATCHPID_SOURCES
 #error "the digests of the files are missing: build with setup.py"
 #endif
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
+
+template <class Function>
+PyCFunction method(Function function) {
+  return reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function));
+}
 
 inline PyObject *make_module(PyModuleDef &definition) {
   PyObject *module = PyModule_Create(&definition);
@@ -27,5 +26,3 @@ inline PyObject *make_module(PyModuleDef &definition) {
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

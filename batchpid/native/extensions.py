@@ -16,8 +16,16 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).parents[2]
 NOT_BUILT = "the extension was not built: it needs a C++ compiler when batchpid is installed"
-ROUNDED = ("-std=c++17", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math")
+ROUNDED = (
+    *("-std=c++17", "-O3", "-g0", "-fvisibility=hidden"),
+    *("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
+)
 """Compiler flags under which each operation is rounded as in NumPy: operations are not fused."""
+LANES_ONLY = (
+    *("-fno-tree-loop-vectorize", "-fno-unswitch-loops", "-fno-split-loops", "-fno-ipa-cp-clone"),
+    "-Wno-psabi",
+)
+"""Flags for code that computes on Lanes (lanes.h), which are vectors already: a third less to compile."""
 
 
 class StaleExtensionError(ImportError):

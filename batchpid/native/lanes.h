@@ -2,15 +2,10 @@
 
 #pragma once
 
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
-
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <limits>
-
-#pragma GCC visibility push(hidden)
 
 namespace batchpid {
 
@@ -192,5 +187,3 @@ void solve_both(std::int64_t n, Lanes const *l, Lanes *x) {
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

@@ -8,8 +8,6 @@
 
 #include "program.h"
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 template <class T>
@@ -130,5 +128,3 @@ inline bool tables_fit(Program const &program, Index rows, std::vector<Input> co
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

@@ -8,8 +8,6 @@
 #include "batchpid/native/lanes.h"
 #include "batchpid/native/tool.h"
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 constexpr int SWEEPS = 12;
@@ -161,5 +159,3 @@ inline void selected_inverse(Lanes const (&mobility)[AXES * AXES], Lanes const *
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

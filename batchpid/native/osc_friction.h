@@ -9,24 +9,12 @@
 #include "batchpid/native/lanes.h"
 #include "batchpid/native/tool.h"
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 // Arrays of `friction`: FRICTION in task_space_extension.py.
 enum Friction {
-  AT_POSE,
-  AT_JACOBIAN,
-  ON_CHAIN,
-  GOAL_POSE,
-  GOAL_TWIST,
-  OTHERS_GOAL,
-  AT_QPOS,
-  AT_QVEL,
-  VISCOUS,
-  COULOMB,
-  BAND,
-  RUBBING,
+  AT_POSE, AT_JACOBIAN, ON_CHAIN, GOAL_POSE, GOAL_TWIST, OTHERS_GOAL, AT_QPOS, AT_QVEL,
+  VISCOUS, COULOMB, BAND, RUBBING,
   FRICTION
 };
 
@@ -58,5 +46,3 @@ inline void write_friction(std::int64_t dof, Lanes const *const (&of)[FRICTION],
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

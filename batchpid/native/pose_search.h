@@ -14,8 +14,6 @@
 #include "batchpid/native/tables.h"
 #include "batchpid/native/tool.h"
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 // Arrays of `search`: SEARCH in task_space_extension.py.
@@ -219,5 +217,3 @@ FOR_EACH_PROCESSOR static void search_poses(Tree const &tree, std::int64_t body,
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

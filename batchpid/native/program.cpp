@@ -2,11 +2,14 @@
 
 #include "make_program.h"
 
+#include <atomic>
+#include <system_error>
+#include <thread>
+
 using namespace batchpid;
 
 namespace {
 
-constexpr char PROGRAM[] = "batchpid.program", BOUND[] = "batchpid.bound_program";
 constexpr Index WITH_LOCK = 1 << 14;  // most numbers computed with the GIL held: a few microseconds
 
 // First fields of a dtype and of an array of NumPy: _PyArray_DescrNumPy2 and PyArrayObject_fields in
@@ -130,14 +133,34 @@ bool fits(Program const &program, Index rows, std::vector<Input> const &inputs, 
   return good;
 }
 
-void run_unlocked(Program const &program, Input const *inputs, Output const *outputs, Index rows, int threads) {
-  if (rows * program.columns <= WITH_LOCK && threads == 1) return run(program, inputs, outputs, 0, rows);
+BATCHPID_CLONES void run_single(Program const &program, Input const *inputs, Output const *outputs, Index first,
+                                Index rows) {
+  detail::run_rows<float>(program, inputs, outputs, first, rows);
+}
+
+// Run a program on all rows, on several threads. The result does not depend on their number. Up to WITH_LOCK numbers
+// are computed with the GIL held.
+void run_all(Program const &program, Input const *inputs, Output const *outputs, Index rows, int threads) {
+  auto const run_some = program.single ? run_single : batchpid::run;
+  if (rows * program.columns <= WITH_LOCK && threads == 1) return run_some(program, inputs, outputs, 0, rows);
   Py_BEGIN_ALLOW_THREADS
-  if (threads == 1) {
-    run(program, inputs, outputs, 0, rows);
-  } else {
-    run_on_threads(program, inputs, outputs, rows, threads);
+  // Rows that a thread takes at once: some blocks, and few enough to keep all threads busy to the end.
+  Index const some = std::max<Index>(1, std::min(4 * BLOCK / program.columns, rows / (4 * threads)));
+  Index const slab = threads == 1 ? rows : some;
+  std::atomic<Index> next{0};
+  auto const work = [&] {
+    for (Index row; (row = next.fetch_add(slab)) < rows;) {
+      run_some(program, inputs, outputs, row, std::min(slab, rows - row));
+    }
+  };
+  std::vector<std::thread> others;
+  others.reserve(static_cast<std::size_t>(threads));
+  try {
+    while (static_cast<int>(others.size()) + 1 < threads) others.emplace_back(work);
+  } catch (std::system_error const &) {  // no more threads available: the running ones do all the work
   }
+  work();
+  for (std::thread &other : others) other.join();
   Py_END_ALLOW_THREADS
 }
 
@@ -145,23 +168,15 @@ void run_unlocked(Program const &program, Input const *inputs, Output const *out
 PyObject *make(PyObject *, PyObject *arguments) {
   auto program = make_program(arguments);
   if (program == nullptr) return nullptr;
-  return PyCapsule_New(program.release(), PROGRAM, [](PyObject *capsule) {
-    delete static_cast<Program *>(PyCapsule_GetPointer(capsule, PROGRAM));
-  });
+  return capsule_of(std::move(program));
 }
 
-bool read_all(Program const &program, Index rows, PyObject *arrays, std::vector<Input> &inputs) {
+// Read the arrays of a tuple with read_input or read_output.
+template <class Array, class Read>
+bool read_all(Program const &program, Index rows, PyObject *arrays, std::vector<Array> &found, Read read) {
   for (Py_ssize_t i = 0, count = PyTuple_Size(arrays); i < count; ++i) {
-    inputs.emplace_back();
-    if (!read_input(program, rows, PyTuple_GetItem(arrays, i), inputs.back())) return false;
-  }
-  return true;
-}
-
-bool read_all(Program const &program, Index rows, PyObject *arrays, std::vector<Output> &outputs) {
-  for (Py_ssize_t i = 0, count = PyTuple_Size(arrays); i < count; ++i) {
-    outputs.emplace_back();
-    if (!read_output(program, rows, PyTuple_GetItem(arrays, i), outputs.back())) return false;
+    found.emplace_back();
+    if (!read(program, rows, PyTuple_GetItem(arrays, i), found.back())) return false;
   }
   return true;
 }
@@ -174,19 +189,24 @@ PyObject *run_arrays(PyObject *, PyObject *arguments) {
   if (!PyArg_ParseTuple(arguments, "OnO!O!i", &capsule, &rows, &PyTuple_Type, &read, &PyTuple_Type, &written, &threads)) {
     return nullptr;
   }
-  auto const *program = static_cast<Program *>(PyCapsule_GetPointer(capsule, PROGRAM));
+  auto const *program = held<Program>(capsule);
   if (program == nullptr) return nullptr;
   std::vector<Input> inputs;
   std::vector<Output> outputs;
-  bool const good = read_all(*program, rows, read, inputs) && read_all(*program, rows, written, outputs);
+  bool const good = read_all(*program, rows, read, inputs, read_input) &&
+                    read_all(*program, rows, written, outputs, read_output);
   if (!good || !fits(*program, rows, inputs, outputs)) return misfit();
-  run_unlocked(*program, inputs.data(), outputs.data(), rows, threads);
+  run_all(*program, inputs.data(), outputs.data(), rows, threads);
   Py_RETURN_NONE;
 }
 
 // Program with fixed arrays for its first inputs and for all outputs but the last.
 struct Bound {
-  PyObject *kept;    // arguments of bind, among them the program and the arrays
+  static constexpr char CAPSULE[] = "batchpid.bound_program";
+
+  ~Bound() { Py_XDECREF(kept); }
+
+  PyObject *kept = nullptr;  // arguments of bind, among them the program and the arrays
   PyObject *output;  // arguments of numpy.empty
   Program const *program;
   Index rows;
@@ -207,11 +227,11 @@ PyObject *bind(PyObject *, PyObject *arguments) {
                         &bound->given, &bound->full, &PyTuple_Type, &bound->output, &bound->threads)) {
     return nullptr;
   }
-  bound->program = static_cast<Program *>(PyCapsule_GetPointer(capsule, PROGRAM));
+  bound->program = held<Program>(capsule);
   if (bound->program == nullptr) return nullptr;
   Program const &program = *bound->program;
-  bool good = read_all(program, bound->rows, read, bound->inputs) &&
-              read_all(program, bound->rows, written, bound->outputs);
+  bool good = read_all(program, bound->rows, read, bound->inputs, read_input) &&
+              read_all(program, bound->rows, written, bound->outputs, read_output);
   auto inputs = bound->inputs;
   auto outputs = bound->outputs;
   inputs.resize(static_cast<std::size_t>(program.inputs), {nullptr, Shape::FULL});
@@ -220,17 +240,13 @@ PyObject *bind(PyObject *, PyObject *arguments) {
   if (!good || !fits(program, bound->rows, inputs, outputs)) return misfit();
   bound->kept = arguments;
   Py_INCREF(arguments);
-  return PyCapsule_New(bound.release(), BOUND, [](PyObject *held) {
-    auto *mine = static_cast<Bound *>(PyCapsule_GetPointer(held, BOUND));
-    Py_DECREF(mine->kept);
-    delete mine;
-  });
+  return capsule_of(std::move(bound));
 }
 
 // call(bound, out, *arrays): write and return the last output, a new array if out is None. Do nothing and return
 // NotImplemented if an array is not a plain ndarray of a shape that broadcasts.
 PyObject *call(PyObject *, PyObject *const *arguments, Py_ssize_t count) {
-  auto *bound = static_cast<Bound *>(PyCapsule_GetPointer(arguments[0], BOUND));
+  auto *bound = held<Bound>(arguments[0]);
   if (bound == nullptr) return nullptr;
   Program const &program = *bound->program;
   Input inputs[MOST];
@@ -267,13 +283,8 @@ PyObject *call(PyObject *, PyObject *const *arguments, Py_ssize_t count) {
     if (out == nullptr) return nullptr;
     if (!read_output(program, bound->rows, out, outputs[written])) return Py_DECREF(out), misfit();
   }
-  run_unlocked(program, inputs, outputs, bound->rows, bound->threads);
+  run_all(program, inputs, outputs, bound->rows, bound->threads);
   return out;
-}
-
-template <class Function>
-PyCFunction method(Function function) {
-  return reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function));
 }
 
 PyMethodDef METHODS[] = {

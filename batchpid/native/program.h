@@ -11,13 +11,10 @@
 #pragma once
 
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
-#include <system_error>
-#include <thread>
 #include <vector>
 
 #if defined(__x86_64__) && defined(__ELF__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
@@ -26,8 +23,6 @@
 #define BATCHPID_CLONES
 #endif
 #define BATCHPID_INLINE inline __attribute__((always_inline))
-
-#pragma GCC visibility push(hidden)
 
 namespace batchpid {
 
@@ -71,6 +66,8 @@ constexpr Index BLOCK = 8192;  // bytes of a register in a block
 
 // Registers are numbered: constants, inputs, temporaries. A Program is immutable, so any number of threads may run it.
 struct Program {
+  static constexpr char CAPSULE[] = "batchpid.program";
+
   bool single = false;  // float, else double
   Index columns = 0, chunk = 0, inputs = 0, registers = 0;
   Index rows = 0;  // of constants (rows, columns)
@@ -284,11 +281,6 @@ BATCHPID_INLINE void run_rows(Program const &program, Input const *inputs, Outpu
   }
 }
 
-BATCHPID_CLONES static void run_single(Program const &program, Input const *inputs, Output const *outputs, Index first,
-                                       Index rows) {
-  run_rows<float>(program, inputs, outputs, first, rows);
-}
-
 BATCHPID_CLONES static void run_double(Program const &program, Input const *inputs, Output const *outputs, Index first,
                                        Index rows) {
   run_rows<double>(program, inputs, outputs, first, rows);
@@ -296,31 +288,10 @@ BATCHPID_CLONES static void run_double(Program const &program, Input const *inpu
 
 }  // namespace detail
 
-// Run a program on some rows; inputs and outputs have its type and number. Tables have to fit: make_program.h.
+// Run a program of doubles on some rows; inputs and outputs have its type and number. Tables have to fit:
+// make_program.h.
 inline void run(Program const &program, Input const *inputs, Output const *outputs, Index first_row, Index rows) {
-  (program.single ? detail::run_single : detail::run_double)(program, inputs, outputs, first_row, rows);
-}
-
-// Run a program on all rows, on several threads. The result does not depend on their number.
-inline void run_on_threads(Program const &program, Input const *inputs, Output const *outputs, Index rows, int threads) {
-  // Rows that a thread takes at once: some blocks, and few enough to keep all threads busy to the end.
-  Index const slab = std::max<Index>(1, std::min(4 * BLOCK / program.columns, rows / (4 * threads)));
-  std::atomic<Index> next{0};
-  auto const work = [&] {
-    for (Index row; (row = next.fetch_add(slab)) < rows;) {
-      run(program, inputs, outputs, row, std::min(slab, rows - row));
-    }
-  };
-  std::vector<std::thread> others;
-  others.reserve(static_cast<std::size_t>(threads));
-  try {
-    while (static_cast<int>(others.size()) + 1 < threads) others.emplace_back(work);
-  } catch (std::system_error const &) {  // no more threads available: the running ones do all the work
-  }
-  work();
-  for (std::thread &other : others) other.join();
+  detail::run_double(program, inputs, outputs, first_row, rows);
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

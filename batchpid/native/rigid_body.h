@@ -8,8 +8,6 @@
 #include <cmath>
 #include <cstdint>
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 template <class N>
@@ -217,5 +215,3 @@ void move_bodies(std::int64_t dof, std::int32_t const *tree, BodyState<N> const 
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

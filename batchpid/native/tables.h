@@ -9,8 +9,6 @@
 #include "batchpid/native/buffer.h"
 #include "batchpid/native/lanes.h"
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 // WIDTH numbers anywhere in an array.
@@ -104,5 +102,3 @@ class Tables {
 };
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

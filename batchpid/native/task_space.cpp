@@ -1,5 +1,7 @@
 // Kinematics, dynamics, inverse kinematics and operational-space control of many robots of one kind, for Python.
 
+#include <algorithm>
+#include <iterator>
 #include <memory>
 #include <utility>
 #include <vector>
@@ -21,17 +23,6 @@ using namespace batchpid;
 namespace {
 
 constexpr Py_ssize_t COLUMNS = sizeof(BodyRow<double>) / sizeof(double);
-char const *const TREE = "batchpid.RigidTree";
-
-Tree *tree_of(PyObject *capsule) { return static_cast<Tree *>(PyCapsule_GetPointer(capsule, TREE)); }
-
-template <class T>
-bool copy(PyObject *array, Py_ssize_t count, std::vector<T> &to) {
-  Buffer from;
-  if (!from.open(array, count, sizeof(T), PyBUF_C_CONTIGUOUS)) return false;
-  to.assign(from.as<T>(), from.as<T>() + count);
-  return true;
-}
 
 // tree(dof, tree, rows, armature, (gravity), leader, multiplier, offset)
 PyObject *make_tree(PyObject *, PyObject *arguments) {
@@ -51,7 +42,7 @@ PyObject *make_tree(PyObject *, PyObject *arguments) {
     return nullptr;
   }
   for (Py_ssize_t j = 0; j < dof; ++j) made->coupled = made->coupled || made->leader[j] != j;
-  return PyCapsule_New(made.release(), TREE, [](PyObject *capsule) { delete tree_of(capsule); });
+  return capsule_of(std::move(made));
 }
 
 // Arrays of `kinematics`: KINEMATICS in task_space_extension.py.
@@ -93,7 +84,7 @@ bool open_kinematics(Tables &table, PyObject *const *arrays, std::int64_t rows, 
 
 // kinematics(tree, body, rows, *arrays)
 PyObject *kinematics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  Tree const *tree = tree_of(arguments[0]);
+  Tree const *tree = held<Tree>(arguments[0]);
   if (tree == nullptr) return nullptr;
   std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]);
   Tables table;
@@ -104,42 +95,14 @@ PyObject *kinematics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
 
 // Columns of an array of `law`.
 std::int64_t law_columns(int array, std::int64_t dof) {
-  switch (array) {
-    case TASK_POSE:
-    case SETPOINT:
-      return POSE;
-    case TASK_JACOBIAN:
-      return AXES * dof;
-    case TASK_MASS:
-      return dof * dof;
-    case POSITION_LIMIT:
-    case ROTATION_LIMIT:
-    case SMALLEST:
-    case TASK_SHARE:
-    case POSTURE_SHARE:
-    case NEAR_SINGULAR:
-      return 1;
-    case TASK_RATE:
-    case TWIST:
-    case ACCELERATION:
-    case WRENCH:
-    case INTEGRAL:
-    case KP:
-    case KD:
-    case C:
-    case ACCELERATION_SHARE:
-    case KI_DT:
-    case KI_DT2:
-    case INTEGRAL_LIMIT:
-    case SELECTED:
-    case FORCE_AXES:
-    case NEXT_INTEGRAL:
-    case TASK_ERROR:
-    case FORCE:
-      return AXES;
-    default:
-      return dof;
-  }
+  constexpr int ONE[] = {POSITION_LIMIT, ROTATION_LIMIT, SMALLEST, TASK_SHARE, POSTURE_SHARE, NEAR_SINGULAR};
+  constexpr int SIX[] = {TASK_RATE, TWIST, ACCELERATION, WRENCH, INTEGRAL, KP, KD, C, ACCELERATION_SHARE, KI_DT, KI_DT2,
+                         INTEGRAL_LIMIT, SELECTED, FORCE_AXES, NEXT_INTEGRAL, TASK_ERROR, FORCE};
+  if (array == TASK_POSE || array == SETPOINT) return POSE;
+  if (array == TASK_JACOBIAN) return AXES * dof;
+  if (array == TASK_MASS) return dof * dof;
+  if (std::count(std::begin(ONE), std::end(ONE), array)) return 1;
+  return std::count(std::begin(SIX), std::end(SIX), array) ? AXES : dof;
 }
 
 bool open_law(Tables &table, PyObject *const *arrays, std::int64_t rows, std::int64_t dof) {
@@ -196,7 +159,7 @@ struct Step : Call {
   }
   // Arguments: tree, body, rows, tool, and those of `open`.
   bool open_with_tree(PyObject *const *arguments) {
-    Tree const *given = tree_of(arguments[0]);
+    Tree const *given = held<Tree>(arguments[0]);
     if (given == nullptr) return false;
     tree = *given;
     dof = tree.dof;
@@ -252,6 +215,7 @@ void write_step(Step const &step) {
 
 // Step on arrays that stay, with its room.
 struct BoundStep : Step {
+  static constexpr char CAPSULE[] = "batchpid.BoundStep";
   std::unique_ptr<StepRoom> room;
 };
 
@@ -304,8 +268,6 @@ PyObject *friction(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
-char const *const BOUND = "batchpid.BoundStep";
-
 // bind(*arguments of Step::open_with_friction) -> (object, address of Call)
 PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto bound = std::make_unique<BoundStep>();
@@ -313,15 +275,12 @@ PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   if (!bound->open_with_friction(arguments)) return nullptr;
   bound->room = std::make_unique<StepRoom>(*bound);
   PyObject *address = PyLong_FromVoidPtr(static_cast<Call *>(bound.get()));
-  PyObject *capsule = PyCapsule_New(bound.release(), BOUND, [](PyObject *object) {
-    delete static_cast<BoundStep *>(PyCapsule_GetPointer(object, BOUND));
-  });
-  return Py_BuildValue("NN", capsule, address);
+  return Py_BuildValue("NN", capsule_of(std::move(bound)), address);
 }
 
 // search(tree, body, rows, iterations, *arrays)
 PyObject *search(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  Tree const *tree = tree_of(arguments[0]);
+  Tree const *tree = held<Tree>(arguments[0]);
   if (tree == nullptr) return nullptr;
   std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]);
   std::int64_t const iterations = PyLong_AsLong(arguments[3]), dof = tree->dof;
@@ -333,11 +292,6 @@ PyObject *search(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   }
   search_poses(*tree, body, rows, iterations, table);
   Py_RETURN_NONE;
-}
-
-template <class Function>
-PyCFunction method(Function function) {
-  return reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function));
 }
 
 PyMethodDef METHODS[] = {

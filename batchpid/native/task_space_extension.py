@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from batchpid.native.extensions import ROUNDED, Extension
+from batchpid.native.extensions import LANES_ONLY, ROUNDED, Extension
 
 BODY = {"rotation": 9, "position": 3, "mass": 1, "center": 3, "tensor": 9}
 """Numbers in a row of constants of a body, as BodyRow in rigid_body.h."""
@@ -47,6 +47,6 @@ _HEADERS = tuple(
 TASK_SPACE = Extension(
     "batchpid.native._task_space",
     ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, CALL, COUPLING, LANES, RIGID_BODY, TABLES),
-    (*ROUNDED, "-Wno-psabi"),
+    (*ROUNDED, *LANES_ONLY),
 )
 EXTENSIONS = {"_task_space": TASK_SPACE}

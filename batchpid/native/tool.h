@@ -12,14 +12,13 @@
 #include "batchpid/native/lanes.h"
 #include "batchpid/native/rigid_body.h"
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 constexpr int AXES = 6, POSE = 7, FRAME = 12;
 
 // Constants of a tree; the axes of joints are the x axes of their bodies.
 struct Tree {
+  static constexpr char CAPSULE[] = "batchpid.RigidTree";
   BodyRow<double> const *bodies() const { return reinterpret_cast<BodyRow<double> const *>(rows.data()); }
 
   std::int64_t dof;
@@ -141,5 +140,3 @@ inline void write_error(Lanes const *goal, Lanes const *pose, Lanes *out) {
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

@@ -11,8 +11,6 @@
 #include "batchpid/native/rigid_body.h"
 #include "batchpid/native/tool.h"
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 class ToolDynamics {
@@ -77,5 +75,3 @@ class ToolDynamics {
 };
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

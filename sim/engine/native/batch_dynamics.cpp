@@ -15,10 +15,10 @@ using namespace batchpid;
 namespace {
 
 constexpr Py_ssize_t COLUMNS = sizeof(BodyRow<double>) / sizeof(double);
-char const *const TREE = "batchpid.Tree";
 
 // Constants of a robot. Followers move with their leaders: q = rest + multiplier * q_leader.
 struct Tree {
+  static constexpr char CAPSULE[] = "batchpid.Tree";
   BodyRow<double> const *bodies() const { return reinterpret_cast<BodyRow<double> const *>(rows.data()); }
 
   std::int64_t dof, joints;
@@ -45,16 +45,6 @@ struct Workspace {
   }
 };
 
-Tree *tree_of(PyObject *capsule) { return static_cast<Tree *>(PyCapsule_GetPointer(capsule, TREE)); }
-
-template <class T>
-bool copy(PyObject *array, Py_ssize_t count, std::vector<T> &to) {
-  Buffer from;
-  if (!from.open(array, count, sizeof(T), PyBUF_C_CONTIGUOUS)) return false;
-  to.assign(from.as<T>(), from.as<T>() + count);
-  return true;
-}
-
 // tree(tree, rows, leader, multiplier, rest, joints, carrier, point, gravity)
 PyObject *make_tree(PyObject *, PyObject *arguments) {
   PyObject *tree, *rows, *leader, *multiplier, *rest;
@@ -72,7 +62,7 @@ PyObject *make_tree(PyObject *, PyObject *arguments) {
       !copy(multiplier, dof, made->multiplier) || !copy(rest, dof, made->rest)) {
     return nullptr;
   }
-  return PyCapsule_New(made.release(), TREE, [](PyObject *capsule) { delete tree_of(capsule); });
+  return capsule_of(std::move(made));
 }
 
 // Set positions and velocities of all joints from the given joints', and the bodies' frames, inertias and motions.
@@ -139,7 +129,7 @@ FOR_EACH_PROCESSOR void write_dynamics(Tree const &tree, std::int64_t rows, doub
 
 // dynamics(tree, qpos, qvel, payload, matrix, force, payload_force): DYNAMICS in interface.py
 PyObject *dynamics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  Tree const *tree = tree_of(arguments[0]);
+  Tree const *tree = held<Tree>(arguments[0]);
   if (tree == nullptr) return nullptr;
   std::int64_t const rows = PyObject_Size(arguments[1]), joints = tree->joints;
   std::int64_t const sizes[6] = {joints, joints, 1, joints * joints, joints, joints};
@@ -217,11 +207,6 @@ PyObject *step(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   if (PyErr_Occurred()) return nullptr;
   step_rows(rows, joints, table, dt, sweeps);
   Py_RETURN_NONE;
-}
-
-template <class Function>
-PyCFunction method(Function function) {
-  return reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function));
 }
 
 PyMethodDef METHODS[] = {

@@ -17,8 +17,6 @@
 #include <cstring>
 #include <limits>
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 // Kinds of shapes: mjtGeom.
@@ -334,5 +332,3 @@ inline void switch_contacts(Clearance const &clearance, std::int64_t row, Looked
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

@@ -8,8 +8,6 @@
 #include <cmath>
 #include <cstdint>
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 // Python fills in the fields (Constraint in interface.py) and owns what they point to.
@@ -109,5 +107,3 @@ void constrain(Constraint const &of, std::int64_t row, std::int64_t dof, double 
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

@@ -32,32 +32,30 @@ PyObject *make_gateway(PyObject *, PyObject *arguments) {
   Py_ssize_t dof;
   if (!PyArg_ParseTuple(arguments, "OOOn", &functions, &robots, &systems, &dof)) return nullptr;
   std::vector<char *> addresses;
-  auto *gateway = new Gateway{};
+  auto gateway = std::make_unique<Gateway>();
   gateway->dof = dof;
   if (!pointers(functions, addresses) || !pointers(robots, gateway->robots) || !pointers(systems, gateway->systems)) {
-    delete gateway;
     return nullptr;
   }
   static_assert(sizeof(Functions) == 7 * sizeof(void *));
   if (addresses.size() != 7 || gateway->systems.size() != gateway->robots.size()) {
-    delete gateway;
     PyErr_SetString(PyExc_ValueError, "needs seven functions, and a system for each robot");
     return nullptr;
   }
   std::memcpy(&gateway->functions, addresses.data(), sizeof(Functions));
-  return PyCapsule_New(gateway, GATEWAY, [](PyObject *capsule) { delete gateway_of(capsule); });
+  return capsule_of(std::move(gateway));
 }
 
 // address(gateway): of the Gateway, which lives as long as the capsule.
 PyObject *address(PyObject *, PyObject *capsule) {
-  Gateway *gateway = gateway_of(capsule);
+  Gateway *gateway = held<Gateway>(capsule);
   return gateway == nullptr ? nullptr : PyLong_FromVoidPtr(gateway);
 }
 
 // Copy one vector of each robot into the rows of an array of float or double.
 template <class Get>
 PyObject *read_rows(PyObject *capsule, PyObject *array, Get get) {
-  Gateway *gateway = gateway_of(capsule);
+  Gateway *gateway = held<Gateway>(capsule);
   if (gateway == nullptr) return nullptr;
   auto const count = static_cast<Py_ssize_t>(gateway->robots.size()) * gateway->dof;
   Buffer out;
@@ -97,7 +95,7 @@ PyObject *passive_force(PyObject *, PyObject *const *arguments, Py_ssize_t) {
 
 // write_qf(gateway, qf, skip): qf (robots, dof) of float; robots of the mask `skip` keep what they have.
 PyObject *write_qf(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  Gateway *gateway = gateway_of(arguments[0]);
+  Gateway *gateway = held<Gateway>(arguments[0]);
   if (gateway == nullptr) return nullptr;
   auto const count = static_cast<Py_ssize_t>(gateway->robots.size());
   Buffer qf, skip;
@@ -112,7 +110,7 @@ PyObject *write_qf(PyObject *, PyObject *const *arguments, Py_ssize_t) {
 }
 
 PyObject *step(PyObject *, PyObject *capsule) {
-  Gateway *gateway = gateway_of(capsule);
+  Gateway *gateway = held<Gateway>(capsule);
   if (gateway == nullptr) return nullptr;
   return without_gil([&] {
     for (System *system : gateway->systems) gateway->functions.step(system);
@@ -124,11 +122,9 @@ PyObject *step_group(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[0]));
   if (group == nullptr) return nullptr;
   auto const dof = static_cast<Py_ssize_t>(group->dof), rows = static_cast<Py_ssize_t>(group->robots);
+  Py_ssize_t const count = rows * dof;
   Buffer arrays[4];
-  for (int i = 0; i < 4; ++i) {
-    int const flags = PyBUF_C_CONTIGUOUS | (i == 0 ? 0 : PyBUF_WRITABLE);
-    if (!arrays[i].open(arguments[i + 1], rows * dof, sizeof(double), flags)) return nullptr;
-  }
+  if (!open_doubles(arguments + 1, {count, count, count, count}, 1, arrays)) return nullptr;
   std::int32_t status = 0;
   PyObject *done = without_gil([&] {
     status = try_sim_step(*group, rows, arrays[0].as<double>(), arrays[1].as<double>(), arrays[2].as<double>(),
@@ -219,12 +215,9 @@ PyObject *joint_matrices(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto const *model = structure<Model>(arguments[0]);
   if (model == nullptr) return nullptr;
   Py_ssize_t const rows = PyLong_AsSsize_t(arguments[3]), dof = model->dof;
-  Buffer qpos, out;
-  if (!qpos.open(arguments[1], rows * dof, sizeof(double), PyBUF_C_CONTIGUOUS) ||
-      !out.open(arguments[2], rows * dof * dof, sizeof(double), PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE)) {
-    return nullptr;
-  }
-  return without_gil([&] { write_joint_matrices(*model, rows, qpos.as<double>(), out.as<double>()); });
+  Buffer arrays[2];
+  if (!open_doubles(arguments + 1, {rows * dof, rows * dof * dof}, 1, arrays)) return nullptr;
+  return without_gil([&] { write_joint_matrices(*model, rows, arrays[0].as<double>(), arrays[1].as<double>()); });
 }
 
 // forces(address of a Model, gravity, coriolis, qpos, qvel, turning or None, out, rows)
@@ -233,17 +226,12 @@ PyObject *forces(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   if (model == nullptr) return nullptr;
   Parts const parts{PyObject_IsTrue(arguments[1]) == 1, PyObject_IsTrue(arguments[2]) == 1};
   Py_ssize_t const rows = PyLong_AsSsize_t(arguments[7]), count = rows * model->dof;
-  bool const floats = arguments[5] != Py_None;
-  Buffer qpos, qvel, turning, out;
-  if (!qpos.open(arguments[3], count, sizeof(double), PyBUF_C_CONTIGUOUS) ||
-      !qvel.open(arguments[4], count, sizeof(double), PyBUF_C_CONTIGUOUS) ||
-      (floats && !turning.open(arguments[5], 3 * rows, sizeof(double), PyBUF_C_CONTIGUOUS)) ||
-      !out.open(arguments[6], count, sizeof(double), PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE)) {
-    return nullptr;
-  }
+  Py_ssize_t const turning = arguments[5] == Py_None ? 0 : 3 * rows;
+  Buffer arrays[4];
+  if (!open_doubles(arguments + 3, {count, count, turning, count}, 3, arrays)) return nullptr;
   return without_gil([&] {
-    write_forces(*model, parts, rows, qpos.as<double>(), qvel.as<double>(), floats ? turning.as<double>() : nullptr,
-                 out.as<double>());
+    write_forces(*model, parts, rows, arrays[0].as<double>(), arrays[1].as<double>(), arrays[2].as<double>(),
+                 arrays[3].as<double>());
   });
 }
 
@@ -253,10 +241,7 @@ PyObject *refresh_friction(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   if (of == nullptr) return nullptr;
   Py_ssize_t const rows = PyLong_AsSsize_t(arguments[4]), count = rows * of->model->dof;
   Buffer arrays[3];
-  for (int i = 0; i < 3; ++i) {
-    int const flags = PyBUF_C_CONTIGUOUS | (i == 0 ? 0 : PyBUF_WRITABLE);
-    if (!arrays[i].open(arguments[i + 1], count, sizeof(double), flags)) return nullptr;
-  }
+  if (!open_doubles(arguments + 1, {count, count, count}, 1, arrays)) return nullptr;
   return without_gil([&] {
     refresh(*of, rows, arrays[0].as<double>(), arrays[1].as<double>(), arrays[2].as<double>(), nullptr);
   });
@@ -267,14 +252,11 @@ PyObject *update(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto const *of = structure<Constraint>(arguments[0]);
   if (of == nullptr) return nullptr;
   Py_ssize_t const rows = PyLong_AsSsize_t(arguments[4]), count = rows * of->model->dof;
-  Buffer qpos, passive, wanted;
-  if (!qpos.open(arguments[1], count, sizeof(double), PyBUF_C_CONTIGUOUS) ||
-      !passive.open(arguments[2], count, sizeof(double), PyBUF_C_CONTIGUOUS) ||
-      !wanted.open(arguments[3], rows, 1, PyBUF_C_CONTIGUOUS)) {
-    return nullptr;
-  }
+  Buffer arrays[2], wanted;
+  if (!open_doubles(arguments + 1, {count, count}, 2, arrays)) return nullptr;
+  if (!wanted.open(arguments[3], rows, 1, PyBUF_C_CONTIGUOUS)) return nullptr;
   return without_gil([&] {
-    update_constraint(*of, rows, qpos.as<double>(), passive.as<double>(), wanted.as<char>());
+    update_constraint(*of, rows, arrays[0].as<double>(), arrays[1].as<double>(), wanted.as<char>());
   });
 }
 
@@ -289,11 +271,6 @@ PyObject *xla_functions(PyObject *, PyObject *) {
   add("batchpid_sim_step", xla::batchpid_sim_step);
   add("batchpid_mass_matrix", xla::batchpid_mass_matrix);
   return functions;
-}
-
-template <class Function>
-PyCFunction method(Function function) {
-  return reinterpret_cast<PyCFunction>(reinterpret_cast<void (*)()>(function));
 }
 
 PyMethodDef METHODS[] = {

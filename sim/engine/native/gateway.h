@@ -13,12 +13,11 @@
 #include "batchpid/native/buffer.h"
 
 namespace sapien::physx {
-class PhysxArticulation {};  // never defined here; their type_info, which pybind11 compares by name, is all that is used
-class PhysxSystemCpu {};
-class PhysxArticulationJoint {};
+// Never defined here: their type_info, which pybind11 compares by name, is all that is used.
+class __attribute__((visibility("default"))) PhysxArticulation {};
+class __attribute__((visibility("default"))) PhysxSystemCpu {};
+class __attribute__((visibility("default"))) PhysxArticulationJoint {};
 }  // namespace sapien::physx
-
-#pragma GCC visibility push(hidden)
 
 namespace batchpid {
 
@@ -45,6 +44,8 @@ struct Functions {
 };
 
 struct Gateway {
+  static constexpr char CAPSULE[] = "batchpid.gateway";
+
   Functions functions;
   std::vector<Articulation *> robots;
   std::vector<System *> systems;  // one for each robot
@@ -58,12 +59,6 @@ inline void apply(Functions const &call, Articulation *robot, float *qf, std::pt
     ~Borrowed() {}
   } borrowed{{qf, dof}};
   call.set_qf(robot, borrowed.vector);
-}
-
-inline constexpr char GATEWAY[] = "batchpid.gateway";
-
-inline Gateway *gateway_of(PyObject *capsule) {
-  return static_cast<Gateway *>(PyCapsule_GetPointer(capsule, GATEWAY));
 }
 
 // Run `work` without the GIL; a C++ exception becomes a RuntimeError.
@@ -104,5 +99,3 @@ bool pointers(PyObject *sequence, std::vector<T *> &out) {
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

@@ -178,7 +178,6 @@ EXTENSIONS = {
                 "tick.h",
                 "xla_call.h",
             ),
-            BUFFER,
             CALL,
             COUPLING,
             LANES,

@@ -8,8 +8,6 @@
 
 #include <vector>
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 // Robots of one kind: the joint above each, or -1, and whether it slides (dof, 2); and rows of BodyRow (dof, 25).
@@ -216,5 +214,3 @@ FOR_EACH_PROCESSOR static void write_float_mass_matrices(Bodies<float> const &of
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

@@ -11,8 +11,6 @@
 #include <cstring>
 #include <mutex>
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 // Beginning of mjLogMessage (mjtype.h).
@@ -120,5 +118,3 @@ inline bool advance(Mujoco const &mujoco, std::int64_t row, std::int64_t dof, do
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

@@ -5,8 +5,6 @@
 #include "batchpid/native/coupling.h"
 #include "model.h"
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 // Constants of the friction model; Python fills in the fields (Refresh in interface.py).
@@ -67,5 +65,3 @@ FOR_EACH_PROCESSOR static void refresh(Refresh const &of, std::int64_t robots, d
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

@@ -10,8 +10,6 @@
 #include <cmath>
 #include <vector>
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid {
 
 // Largest position of a robot that has not failed [rad or m].
@@ -209,5 +207,3 @@ inline void update_constraint(Group const &group, double const *qpos, double con
 }
 
 }  // namespace batchpid
-
-#pragma GCC visibility pop

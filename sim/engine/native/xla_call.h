@@ -9,8 +9,6 @@
 #include "model.h"
 #include "sim_step.h"
 
-#pragma GCC visibility push(hidden)
-
 namespace batchpid::xla {
 
 enum DataType { S32 = 4, U32 = 8, F32 = 11, F64 = 12 };
@@ -159,5 +157,3 @@ extern "C" inline Error *batchpid_mass_matrix(CallFrame *frame) {
 }
 
 }  // namespace batchpid::xla
-
-#pragma GCC visibility pop
