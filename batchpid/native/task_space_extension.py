@@ -33,6 +33,11 @@ FRICTION = (
 """Arrays of ``friction``; the last is the result."""
 SEARCH = ("goal", "tool", "lower", "upper", "tolerances", "qpos", "errors", "steps")
 """Arrays of ``search`` in pose_search.h; those after the tolerances are results. ``qpos`` holds the starts first."""
+MOVE = (
+    *("qpos", "qvel", "friction", "matrix", "effort", "added"),
+    *("limit", "keep", "creep", "low", "high"),
+)
+"""Arrays of ``move``; the first three are changed."""
 DECOUPLING = ("full", "partial", "none")
 """Kinds of decoupling, as Decoupling in task_space.cpp."""
 
@@ -46,7 +51,7 @@ _HEADERS = tuple(
 
 
 def _tables() -> tuple[Any, ...]:
-    return list(BODY.items()), KINEMATICS, LAW, FRICTION, SEARCH, DECOUPLING
+    return list(BODY.items()), KINEMATICS, LAW, FRICTION, SEARCH, MOVE, DECOUPLING
 
 
 TASK_SPACE = Extension(

@@ -9,11 +9,7 @@ from __future__ import annotations
 from importlib import import_module
 from importlib.util import find_spec
 
-import numpy as np
-
 from batchpid.native.availability import first_difference
-from batchpid.sim.engine.batch_dynamics import Friction, Loaded, MovingJoints, NativeBatchDynamics, NumpyBatchDynamics
-from batchpid.sim.engine.robot_model import description_tree
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.parts import Joint
 
@@ -33,7 +29,6 @@ def main() -> None:
     This process uses the extensions without a test, since their fingerprint is in its environment.
     """
     _compare_programs()
-    _compare_dynamics()
     if find_spec("sapien"):
         import_module("batchpid.sim.engine.sapien.self_test").main()
 
@@ -42,37 +37,6 @@ def _compare_programs() -> None:
     """Compare programs of all operations with NumPy."""
     if problem := first_difference():
         raise AssertionError(problem)
-
-
-def _compare_dynamics() -> None:
-    """Compare the dynamics and a step of robots with payloads: with NumPy's, and with a call for each robot alone."""
-    loaded = Loaded(description_tree(spec_of_two_joints()).held, 1, np.array([0.1, 0.0, 0.05]))
-    limit = np.array([np.inf, 1.0])
-    joints = MovingJoints(np.array([0, 1], np.int32), np.ones(2), np.zeros(2), -limit, limit)
-    rng, count = np.random.default_rng(0), 6
-    qpos, qvel, effort = rng.uniform(-0.9, 0.9, (3, count, 2))
-    payload, added = np.linspace(0.0, 2.0, count)[:, None], np.full((count, 2), 0.1)
-    friction = Friction(np.full((count, 2), 0.3), np.full((count, 1), 0.01), np.full((count, 2), 0.02))
-    results = []
-    ours = NativeBatchDynamics(loaded, joints)
-    for model, groups in (
-        (ours, [slice(0, count)]),
-        (ours, [slice(row, row + 1) for row in range(count)]),
-        (NumpyBatchDynamics(loaded, joints), [slice(0, count)]),
-    ):
-        parts = []
-        for rows in groups:
-            found = model.at(qpos[rows], qvel[rows], payload[rows])
-            state = (qpos[rows], qvel[rows], np.zeros_like(qpos[rows]))
-            friction_rows = Friction(*(leaf[rows] for leaf in friction))
-            step = model.step(state, found.matrix, effort[rows], added[rows], friction_rows, 1e-2)
-            parts.append([*found, *step])
-        results.append([np.concatenate(leaves) for leaves in zip(*parts, strict=True)])
-    for mine, alone, theirs in zip(*results, strict=True):
-        if mine.tobytes() != alone.tobytes():
-            raise AssertionError("the native dynamics of a robot depend on the others")
-        if not np.allclose(mine, theirs, rtol=1e-9, atol=1e-9):
-            raise AssertionError("native dynamics and NumPy's give different results")
 
 
 def spec_of_two_joints() -> SceneSpec:

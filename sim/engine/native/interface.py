@@ -25,10 +25,6 @@ SYMBOLS = (
 """Functions of SAPIEN, in the order of Functions in gateway.h."""
 STATUS = ("not_finite", "too_fast", "failed")
 """Bits of the status of a sim step: reasons to stop a loop over sim steps, as Status in sim_step.h."""
-DYNAMICS = ("qpos", "qvel", "payload", "matrix", "force", "payload_force")
-"""Arrays of ``dynamics`` in batch_dynamics.cpp, after the tree."""
-STEP = ("qpos", "qvel", "friction", "matrix", "effort", "added", "limit", "keep", "creep", "low", "high")
-"""Arrays of ``step``, as Leaf in batch_dynamics.cpp."""
 FARTHEST = 1e6
 """Largest position of a joint [rad or m], as in sim_step.h. A robot beyond it has failed: its state is float32."""
 
@@ -178,10 +174,6 @@ def _gateway_tables() -> tuple[Any, ...]:
     )
 
 
-def _batch_dynamics_tables() -> tuple[Any, ...]:
-    return DYNAMICS, STEP, list(BODY.items())
-
-
 EXTENSIONS = {
     "_gateway": Extension(
         "batchpid.sim.engine.native._gateway",
@@ -208,11 +200,5 @@ EXTENSIONS = {
         ),
         (*ROUNDED, "-pthread", "-Wno-psabi"),
         _gateway_tables,
-    ),
-    "_batch_dynamics": Extension(
-        "batchpid.sim.engine.native._batch_dynamics",
-        (*_files("batch_dynamics.cpp"), BUFFER, LANES, RIGID_BODY),
-        (*ROUNDED, "-Wno-psabi"),
-        _batch_dynamics_tables,
     ),
 }
