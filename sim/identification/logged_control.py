@@ -12,6 +12,7 @@ import numpy as np
 import batchpid as bp
 from batchpid import motors as actuator_model
 from batchpid.arrays.array_types import Float64
+from batchpid.arrays.elementwise import namespace
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
@@ -100,7 +101,8 @@ class Control:
             law = PIDLaw.of(params)._replace(measures_rate=drive.measured_rate)
             params = params._replace(measurement_rate=None)  # the log's loop decides, not the params
             control, k = "pid", bp.discretise(params, dt * drive.substeps, len(qpos))
-            state = StepState((bp.init(params, qpos), np.zeros_like(qpos)))
+            first = bp.init(params, qpos)
+            state = StepState(first if drive.substeps == 1 else (first, np.zeros_like(qpos)))
         self._layout = Layout(control, law)
         constants = Constants(
             dt, (None, None), Coupling.of(qpos.shape[1]), k, friction=Friction(viscous=actuators.viscous)
@@ -119,26 +121,27 @@ class Control:
             constants = constants._replace(damping=damping if law.whole and np.any(damping) else None)
         self._model = Model(model)
         self._constants, self._state = constants, mapped(partial(np.array, order="C"), state)
-        self._programs: dict[tuple[bool, bool, bool], Any] = {}
+        self._programs: dict[tuple[bool, bool], Any] = {}
 
     def advance(
         self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64 | None, noise: Float64 | None = None
     ) -> Float64:
-        """Return the motors' efforts in a sim step, less viscous friction (n, joints).
+        """Return the motors' efforts in a sim step, less viscous friction (n, joints); the next step may reuse the array.
 
         ``command`` are setpoints or efforts, ``passive`` is the force that the law compensates, and ``noise`` that of
         the measured positions, each (n, joints).
         """
-        asks = self._number % self._drive.substeps == 0
-        if self._matrix_steps and self._number % (self._drive.substeps * self._matrix_steps) == 0:
+        substeps = self._drive.substeps
+        due = None if substeps == 1 else np.array([[float(self._number % substeps == 0)]])
+        if self._matrix_steps and self._number % (substeps * self._matrix_steps) == 0:
             self._update_matrix(qpos, qvel)
         self._number += 1
-        inputs = [self._state, Command(command), Measured(qpos, qvel, passive), noise]
-        key = asks, passive is None, noise is None
+        inputs = self._state, Command(command), Measured(qpos, qvel, passive), noise, due
+        key = passive is None, noise is None
         if key not in self._programs:
-            self._programs[key] = self._program(asks, inputs)
+            self._programs[key] = self._program(inputs)
         if (program := self._programs[key]) is None:
-            self._state, effort = _step(asks, self._layout, self._constants, *inputs)
+            self._state, effort = _step(self._layout, self._constants, *inputs)
             return effort
         run, results, effort = program
         run(*leaves(inputs), out=results)
@@ -151,13 +154,13 @@ class Control:
         whole = self._state.matrix.ndim == 3
         self._state.matrix[...] = found if whole else np.einsum("ejj->ej", found)
 
-    def _program(self, asks: bool, inputs: list[Any]) -> Any:
+    def _program(self, inputs: tuple[Any, ...]) -> Any:
         """Return the program, the arrays of its results, and the one of the efforts; None for NumPy."""
         if not program_status().active:
             return None
         constants = mapped(_stacked, self._constants)
         try:
-            traced = _trace(asks, self._layout, *map(structure, (constants, *inputs)))
+            traced = _trace(self._layout, *map(structure, (constants, *inputs)))
         except (TypeError, AttributeError, AssertionError):  # it has tables
             return None
         effort = np.zeros_like(inputs[2].qpos)
@@ -166,34 +169,35 @@ class Control:
 
 
 def _step(
-    asks: bool, layout: Layout, constants: Constants, state: StepState, command: Any, measured: Any, noise: Any
-) -> Any:
-    """Return state and efforts of a control step; between the steps of the law its effort is kept."""
+    layout: Layout, constants: Constants, state: StepState, command: Any, measured: Any, noise: Any, due: Any
+) -> tuple[StepState, Any]:
+    """Return state and efforts of a control step; ``due`` is 1.0 where the law is, 0.0 where its effort is kept."""
     model = Model(
         when=lambda due, function, otherwise: otherwise,
-        law=_asked if asks else _kept,
+        law=PIDLaw.advance if due is None else partial(_where_due, due),
         noise=None if noise is None else lambda *_: (noise, None),
     )
-    new, outputs = control_step(
-        layout._replace(model=model), constants, state, command, measured, Step(0, 1, observed=False)
-    )
+    step = Step(0, 1, observed=False)
+    new, outputs = control_step(layout._replace(model=model), constants, state, command, measured, step)
     return new, outputs.qf
 
 
-def _asked(law: PIDLaw, k: Any, state: Any, *inputs: Any, observed: bool) -> Any:
+def _where_due(due: Any, law: PIDLaw, k: Any, state: Any, *inputs: Any, observed: bool) -> Any:
+    """Advance a law where it is due; its state includes the effort that it asked for."""
+    before, asked = state
     new, effort, saturated = law.advance(k, state[0], *inputs, observed=observed)
-    return (new, effort), effort, saturated
-
-
-def _kept(law: PIDLaw, k: Any, state: Any, *inputs: Any, observed: bool) -> Any:
-    return state, state[1], None
+    xp = namespace(due, effort)
+    both = zip(new, before, strict=True)
+    law_state = [None if leaf is None else xp.where(due > 0, leaf, old) for leaf, old in both]
+    asked = xp.where(due > 0, effort, asked)
+    return (bp.PIDState(*law_state), asked), asked, saturated
 
 
 @lru_cache(maxsize=64)
-def _trace(asks: bool, layout: Layout, *structures: Any) -> Trace:
+def _trace(layout: Layout, *structures: Any) -> Trace:
     def function(*symbols: Symbol) -> list[Any]:
         given = iter(symbols)
-        new, effort = _step(asks, layout, *(filled(each, given) for each in structures))
+        new, effort = _step(layout, *(filled(each, given) for each in structures))
         return [*leaves(_returned(new)), effort]
 
     first = len(leaves(structures[0]))

@@ -170,7 +170,7 @@ def _law_efforts(plant: Plant, motion: Motion) -> Float64:
     """Return the efforts (steps, joints) of the law along a measured ``motion``, without compensation."""
     rows = [(q[None], v[None], u[None]) for q, v, u in zip(motion.qpos, motion.qvel, motion.command, strict=True)]
     control = plant.control(Actuators(), *rows[0][:2])
-    return np.array([control.advance(u, q, v, None)[0] for q, v, u in rows])
+    return np.array([control.advance(u, q, v, None)[0].copy() for q, v, u in rows])
 
 
 def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float64:
