@@ -11,7 +11,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -69,13 +69,35 @@ def kinematics(
     native = in_use() if type(qpos) is np.ndarray and (point is None or isinstance(point, np.ndarray)) else None
     if native is None or not (tree.fixed_base or _DYNAMICS.isdisjoint(wanted)):
         return None
-    own = native_tree(native, tree)
     dof, leading, rows = tree.dof, qpos.shape[:-1], math.prod(qpos.shape[:-1])
     found = empty(wanted, leading, dof)
     inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
-    results = [found.get(name) for name in KINEMATICS[3:]]
-    call(native.kinematics, own.tree, tree.link_bodies[index], rows, *inputs, tool(own, index, point), *results)
+    call(native.kinematics, *_arguments(native, tree, found, inputs, index, point))
     return tuple(found.values())
+
+
+def bound(
+    tree: RigidTree, wanted: tuple[str, ...], qpos: Float64, qvel: Float64, index: int
+) -> tuple[Callable[[], None], tuple[Float64, ...]] | None:
+    """Return a function that computes the results of :func:`kinematics`, on a fixed base, and their arrays.
+
+    It takes what the contiguous arrays ``qpos`` and ``qvel`` (rows, dof) hold when it is called.
+    """
+    if (native := in_use()) is None:
+        return None
+    found = empty(wanted, qpos.shape[:1], tree.dof)
+    return partial(native.kinematics, *_arguments(native, tree, found, [qpos, qvel], index, None)), tuple(
+        found.values()
+    )
+
+
+def _arguments(
+    native: Any, tree: RigidTree, found: dict[str, Float64], inputs: Any, index: int, point: Any
+) -> list[Any]:
+    """Return the arguments of ``kinematics`` in task_space.cpp."""
+    own, rows = native_tree(native, tree), len(inputs[0])
+    results = [found.get(name) for name in KINEMATICS[3:]]
+    return [own.tree, tree.link_bodies[index], rows, *inputs, tool(own, index, point), *results]
 
 
 def empty(wanted: tuple[str, ...], leading: tuple[int, ...], dof: int) -> dict[str, Float64]:

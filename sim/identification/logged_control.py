@@ -126,7 +126,7 @@ class Control:
     def advance(
         self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64 | None, noise: Float64 | None = None
     ) -> Float64:
-        """Return the motors' efforts in a sim step, less viscous friction (n, joints); the next step may reuse the array.
+        """Return the motors' efforts in a sim step, less viscous friction (n, joints); which the next step may reuse.
 
         ``command`` are setpoints or efforts, ``passive`` is the force that the law compensates, and ``noise`` that of
         the measured positions, each (n, joints).
@@ -136,15 +136,16 @@ class Control:
         if self._matrix_steps and self._number % (substeps * self._matrix_steps) == 0:
             self._update_matrix(qpos, qvel)
         self._number += 1
-        inputs = self._state, Command(command), Measured(qpos, qvel, passive), noise, due
         key = passive is None, noise is None
         if key not in self._programs:
-            self._programs[key] = self._program(inputs)
+            self._programs[key] = self._program(command, qpos, qvel, passive, noise, due)
         if (program := self._programs[key]) is None:
-            self._state, effort = _step(self._layout, self._constants, *inputs)
+            self._state, effort = _step(
+                self._layout, self._constants, self._state, command, qpos, qvel, passive, noise, due
+            )
             return effort
-        run, results, effort = program
-        run(*leaves(inputs), out=results)
+        run, state, results, effort = program
+        run(*state, *[each for each in (command, qpos, qvel, passive, noise, due) if each is not None], out=results)
         return effort
 
     def _update_matrix(self, qpos: Float64, qvel: Float64) -> None:
@@ -154,22 +155,30 @@ class Control:
         whole = self._state.matrix.ndim == 3
         self._state.matrix[...] = found if whole else np.einsum("ejj->ej", found)
 
-    def _program(self, inputs: tuple[Any, ...]) -> Any:
-        """Return the program, the arrays of its results, and the one of the efforts; None for NumPy."""
+    def _program(self, *inputs: Any) -> Any:
+        """Return the program, the arrays of its state, of its results, and of the efforts; None for NumPy."""
         if not program_status().active:
             return None
         constants = mapped(_stacked, self._constants)
         try:
-            traced = _trace(self._layout, *map(structure, (constants, *inputs)))
+            traced = _trace(self._layout, *map(structure, (constants, self._state, *inputs)))
         except (TypeError, AttributeError, AssertionError):  # it has tables
             return None
-        effort = np.zeros_like(inputs[2].qpos)
-        program = ArrayProgram(traced, leaves(constants), len(leaves(inputs)), effort.shape)
-        return program, [*leaves(_returned(self._state)), effort], effort
+        effort, state = np.zeros_like(inputs[1]), leaves(self._state)
+        program = ArrayProgram(traced, leaves(constants), len(state) + len(leaves(inputs)), effort.shape)
+        return program, state, (*leaves(_returned(self._state)), effort), effort
 
 
 def _step(
-    layout: Layout, constants: Constants, state: StepState, command: Any, measured: Any, noise: Any, due: Any
+    layout: Layout,
+    constants: Constants,
+    state: StepState,
+    command: Any,
+    qpos: Any,
+    qvel: Any,
+    passive: Any,
+    noise: Any,
+    due: Any,
 ) -> tuple[StepState, Any]:
     """Return state and efforts of a control step; ``due`` is 1.0 where the law is, 0.0 where its effort is kept."""
     model = Model(
@@ -177,8 +186,8 @@ def _step(
         law=PIDLaw.advance if due is None else partial(_where_due, due),
         noise=None if noise is None else lambda *_: (noise, None),
     )
-    step = Step(0, 1, observed=False)
-    new, outputs = control_step(layout._replace(model=model), constants, state, command, measured, step)
+    measured, step = Measured(qpos, qvel, passive), Step(0, 1, observed=False)
+    new, outputs = control_step(layout._replace(model=model), constants, state, Command(command), measured, step)
     return new, outputs.qf
 
 

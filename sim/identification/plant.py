@@ -22,6 +22,7 @@ followers move with their leaders.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -36,6 +37,7 @@ from batchpid.sim.identification.logged_control import Control, Drive
 from batchpid.sim.identification.unknowns import Motors, actuators_of
 from batchpid.sim.robot.robot import Robot
 from batchpid.task_space import native_rows
+from batchpid.task_space.rigid_tree import RigidTree
 
 DIVERGED = 1e6
 """Position beyond which a simulation has diverged [rad or m]."""
@@ -43,6 +45,10 @@ SWEEPS = 2
 """Sweeps over the joints in a step."""
 _CREEP = 1 / 9
 """Share of its friction-free acceleration that a joint creeps with before it stops, with ``stopping``; MuJoCo's."""
+PAYLOAD = "payload at the tool"
+"""Link at the place of the payload: the center of mass of the tool."""
+_EMPTY = "mass_matrix", "bias"
+_LOADED = *_EMPTY, "jacobian", "jacobian_rate"
 
 
 class Segment(NamedTuple):
@@ -81,14 +87,12 @@ class Plant:
             Follower(number[each], number[coupling.leader[each]], coupling.multiplier[each], coupling.offset[each])
             for each in np.flatnonzero(moves & ~coupling.independent)
         ]
+        tool = whole.index(whole.tool)
+        frame = whole.bodies.link_frames[tool]
+        tree = _with_payload(tree, whole.link_bodies[tool], frame[:, :3] @ whole.center[tool] + frame[:, 3])
         fixed = tree.fixed_at(coupling.positions(robot.start), moves)
         self._tree = replace(fixed, coupling=Coupling.of(fixed.dof, followers))
         self._own = None if np.array_equal(number[own], np.arange(fixed.dof)) else number[own]
-        tool = whole.index(whole.tool)
-        self._tool = tree.links[tree.link_bodies.index(whole.link_bodies[tool])]
-        turn, shift = np.split(tree.bodies.link_frames[tree.index(self._tool)], [3], axis=1)
-        frame = whole.bodies.link_frames[tool]
-        self._place = turn.T @ (frame[:, :3] @ whole.center[tool] + frame[:, 3] - shift[:, 0])
         free = robot.continuous[own]
         self.low, self.high = (
             np.where(free, end, limit[own])[None] for end, limit in ((-np.inf, robot.lower), (np.inf, robot.upper))
@@ -110,20 +114,36 @@ class Plant:
 
     def at(self, qpos: Float64, qvel: Float64, payload: Float64) -> Passive:
         """Return the dynamics at ``qpos`` and ``qvel`` (n, joints) with ``payload`` (n, 1) [kg] at the tool."""
-        tree, own = self._tree, self._own
-        if own is not None:
-            whole = np.zeros((2, len(qpos), tree.dof))
-            whole[..., own] = qpos, qvel
-            qpos, qvel = tree.positions(whole[0]), tree.rates(whole[1])
-        found = ts.task_dynamics(tree, qpos, qvel, self._tool, point=self._place)
-        matrix, force, jacobian = found.mass_matrix, found.bias, found.jacobian[:, :3]
-        if own is not None:
-            matrix, force, jacobian = matrix[:, own[:, None], own], force[:, own], jacobian[..., own]
-        if not payload.any():
-            return Passive(matrix, force, 0.0)
-        pull = payload[..., None] * jacobian.swapaxes(1, 2)
-        rate = found.jacobian_rate[:, :3] - tree.gravity
-        return Passive(matrix + pull @ jacobian, force, (pull @ rate[..., None])[..., 0])
+        return self._dynamics(qpos, qvel, payload)()
+
+    def _dynamics(self, qpos: Float64, qvel: Float64, payload: Float64) -> Callable[[], Passive]:
+        """Return :meth:`at` of what the arrays then hold; each result takes the place of the one before."""
+        tree, own, index = self._tree, self._own, len(self._tree.links) - 1
+        wanted = _LOADED if payload.any() else _EMPTY
+        whole = (qpos, qvel) if own is None else np.zeros((2, len(qpos), tree.dof))
+        native = native_rows.bound(tree, wanted, np.ascontiguousarray(whole[0]), np.ascontiguousarray(whole[1]), index)
+
+        def dynamics() -> Passive:
+            if own is not None:
+                whole[..., own] = qpos, qvel  # type: ignore[call-overload]
+                whole[0][...], whole[1][...] = tree.positions(whole[0]), tree.rates(whole[1])
+            if native is None:
+                of_tree = ts.task_dynamics(tree, *whole, PAYLOAD)
+                matrix, force, *tool = (getattr(of_tree, name) for name in wanted)
+            else:
+                native[0]()
+                matrix, force, *tool = native[1]
+            if own is not None:
+                matrix, force = np.ascontiguousarray(matrix[:, own[:, None], own]), force[:, own]
+            if not tool:
+                return Passive(matrix, force, 0.0)
+            jacobian, rate = tool[0][:, :3], tool[1][:, :3] - tree.bodies.gravity
+            jacobian = jacobian if own is None else jacobian[..., own]
+            pull = payload[..., None] * jacobian.swapaxes(1, 2)
+            matrix += pull @ jacobian
+            return Passive(matrix, force, (pull @ rate[..., None])[..., 0])
+
+        return dynamics
 
     def _compensation(self, qpos: Float64, found: Passive, payload: Float64) -> Float64 | None:
         if self.drive.compensate == "none":
@@ -153,7 +173,7 @@ class Plant:
         held = self.compensation(q, v, payload) if drive.through else None
         asked = np.zeros((1, *q.shape)) if drive.params is not None else command[max(past - 1, 0) :: -1]
         control = self.control(actuators, q, v, asked if held is None else asked + held)
-        motion = _Motion(self, actuators, motors)
+        motion, dynamics = _Motion(self, actuators, motors), self._dynamics(q, v, payload)
         out = np.empty((len(q), len(command) - past + 1, q.shape[1]))
         out[:, 0] = q
         with np.errstate(all="ignore"):
@@ -163,7 +183,7 @@ class Plant:
                     for array in (q, v, motion.friction):
                         array[bad] = 0.0
                     out[bad, step:] = np.inf
-                passive, now = self.at(q, v, payload), past + step
+                passive, now = dynamics(), past + step
                 c = self._compensation(q, passive, payload)
                 inside, outside = (c, None) if drive.through else (None, c)
                 shake = noise[now] if drive.noisy else None
@@ -174,6 +194,16 @@ class Plant:
                 out[:, step + 1] = q
         out[:, -1] = np.where(np.abs(out[:, -1]) <= DIVERGED, out[:, -1], np.inf)
         return out
+
+
+def _with_payload(tree: RigidTree, body: int, place: Float64) -> RigidTree:
+    """Return ``tree`` with a link without mass for the payload, at a ``place`` (3,) [m] in the frame of a body."""
+    carrier = tree.link_bodies.index(body)
+    frame = tree.bodies.link_frames[carrier]
+    more = {"position": frame[:, :3].T @ (place - frame[:, 3]), "wxyz": [1, 0, 0, 0], "axis": [1, 0, 0]}
+    more |= {"parent": carrier, "mass": 0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}
+    tables = {name: np.concatenate([getattr(tree, name), np.array([row])]) for name, row in more.items()}
+    return replace(tree, links=(*tree.links, PAYLOAD), joint_types=(*tree.joint_types, "fixed"), **tables)
 
 
 class _Motion:
