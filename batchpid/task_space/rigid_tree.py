@@ -217,8 +217,8 @@ class RigidTree:
                 position[link] += q * turn @ self.axis[link]
             types[link] = "fixed"
         names = tuple(name for name, kept in zip(self.joint_names, moves, strict=True) if kept)
-        rows = {name: getattr(self, name)[moves] for name in ("armature", "lower", "upper")}  # type: ignore[index]
-        places = {"position": position, "wxyz": wxyz, "joint_types": tuple(types)}
+        rows = {name: getattr(self, name)[moves] for name in ("armature", "lower", "upper")}
+        places: dict[str, Any] = {"position": position, "wxyz": wxyz, "joint_types": tuple(types)}
         return replace(self, **places, **rows, joint_names=names, coupling=Coupling.of(len(names)))
 
     @property

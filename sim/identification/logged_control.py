@@ -191,10 +191,10 @@ def _step(
     return new, outputs.qf
 
 
-def _where_due(due: Any, law: PIDLaw, k: Any, state: Any, *inputs: Any, observed: bool) -> Any:
+def _where_due(due: Any, law: PIDLaw, k: Any, state: Any, *inputs: Any, **options: Any) -> Any:
     """Advance a law where it is due; its state includes the effort that it asked for."""
     before, asked = state
-    new, effort, saturated = law.advance(k, state[0], *inputs, observed=observed)
+    new, effort, saturated = law.advance(k, state[0], *inputs, **options)
     xp = namespace(due, effort)
     both = zip(new, before, strict=True)
     law_state = [None if leaf is None else xp.where(due > 0, leaf, old) for leaf, old in both]

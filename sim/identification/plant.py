@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -110,7 +110,7 @@ class Plant:
 
     def compensation(self, qpos: Float64, qvel: Float64, payload: Float64) -> Float64 | None:
         """Return the robot's compensation (n, joints), None for none; ``payload`` is included if the robot knows it."""
-        return self._compensation(qpos, self.at(qpos, qvel, payload), payload)
+        return self._compensation(self.at(qpos, qvel, payload), self._at_rest(qpos, payload))
 
     def at(self, qpos: Float64, qvel: Float64, payload: Float64) -> Passive:
         """Return the dynamics at ``qpos`` and ``qvel`` (n, joints) with ``payload`` (n, 1) [kg] at the tool."""
@@ -120,15 +120,15 @@ class Plant:
         """Return :meth:`at` of what the arrays then hold; each result takes the place of the one before."""
         tree, own, index = self._tree, self._own, len(self._tree.links) - 1
         wanted = _LOADED if payload.any() else _EMPTY
-        whole = (qpos, qvel) if own is None else np.zeros((2, len(qpos), tree.dof))
-        native = native_rows.bound(tree, wanted, np.ascontiguousarray(whole[0]), np.ascontiguousarray(whole[1]), index)
+        q, v = (np.ascontiguousarray(each) if own is None else np.zeros((len(qpos), tree.dof)) for each in (qpos, qvel))
+        native = native_rows.bound(tree, wanted, q, v, index)
 
         def dynamics() -> Passive:
             if own is not None:
-                whole[..., own] = qpos, qvel  # type: ignore[call-overload]
-                whole[0][...], whole[1][...] = tree.positions(whole[0]), tree.rates(whole[1])
+                q[:, own], v[:, own] = qpos, qvel
+                q[...], v[...] = tree.positions(q), tree.rates(v)
             if native is None:
-                of_tree = ts.task_dynamics(tree, *whole, PAYLOAD)
+                of_tree = ts.task_dynamics(tree, q, v, PAYLOAD)
                 matrix, force, *tool = (getattr(of_tree, name) for name in wanted)
             else:
                 native[0]()
@@ -145,17 +145,24 @@ class Plant:
 
         return dynamics
 
-    def _compensation(self, qpos: Float64, found: Passive, payload: Float64) -> Float64 | None:
+    def _at_rest(self, qpos: Float64, payload: Float64) -> Callable[[], Passive] | None:
+        """Return the dynamics without velocities, as :meth:`_dynamics` does; None where these are not compensated."""
+        return self._dynamics(qpos, np.zeros_like(qpos), payload) if self.drive.compensate == "gravity" else None
+
+    def _compensation(self, found: Passive, at_rest: Callable[[], Passive] | None) -> Float64 | None:
         if self.drive.compensate == "none":
             return None
-        if self.drive.compensate == "gravity":
-            found = self.at(qpos, np.zeros_like(qpos), payload)
+        if at_rest is not None:
+            found = at_rest()
         return found.force + found.payload_force if self.drive.knows_payload else found.force
 
     def control(self, actuators: Actuators, qpos: Float64, qvel: Float64, asked: Float64 | None = None) -> Control:
         """Return the control of robots at ``qpos`` and ``qvel`` (n, joints), with their motors."""
         unloaded = np.zeros((len(qpos), 1))
-        model = lambda qpos: self.mass_matrix(qpos, unloaded)  # noqa: E731
+
+        def model(qpos: Float64) -> Float64:
+            return self.mass_matrix(qpos, unloaded)
+
         return Control(self.drive, actuators, qpos, qvel, asked, self._damping, model)
 
     def simulate(self, motors: Motors, segments: list[Segment], past: int) -> Float64:
@@ -173,7 +180,8 @@ class Plant:
         held = self.compensation(q, v, payload) if drive.through else None
         asked = np.zeros((1, *q.shape)) if drive.params is not None else command[max(past - 1, 0) :: -1]
         control = self.control(actuators, q, v, asked if held is None else asked + held)
-        motion, dynamics = _Motion(self, actuators, motors), self._dynamics(q, v, payload)
+        motion = _Motion(self, actuators, motors)
+        dynamics, at_rest = self._dynamics(q, v, payload), self._at_rest(q, payload)
         out = np.empty((len(q), len(command) - past + 1, q.shape[1]))
         out[:, 0] = q
         with np.errstate(all="ignore"):
@@ -184,7 +192,7 @@ class Plant:
                         array[bad] = 0.0
                     out[bad, step:] = np.inf
                 passive, now = dynamics(), past + step
-                c = self._compensation(q, passive, payload)
+                c = self._compensation(passive, at_rest)
                 inside, outside = (c, None) if drive.through else (None, c)
                 shake = noise[now] if drive.noisy else None
                 effort = control.advance(command[now], q, v, inside, shake) - passive.force - passive.payload_force
@@ -202,7 +210,9 @@ def _with_payload(tree: RigidTree, body: int, place: Float64) -> RigidTree:
     frame = tree.bodies.link_frames[carrier]
     more = {"position": frame[:, :3].T @ (place - frame[:, 3]), "wxyz": [1, 0, 0, 0], "axis": [1, 0, 0]}
     more |= {"parent": carrier, "mass": 0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}
-    tables = {name: np.concatenate([getattr(tree, name), np.array([row])]) for name, row in more.items()}
+    tables: dict[str, Any] = {
+        name: np.concatenate([getattr(tree, name), np.array([row])]) for name, row in more.items()
+    }
     return replace(tree, links=(*tree.links, PAYLOAD), joint_types=(*tree.joint_types, "fixed"), **tables)
 
 

@@ -18,7 +18,6 @@ from batchpid.native import extensions
 from batchpid.native.operations import PROGRAM
 from batchpid.sim import Runner
 from batchpid.sim.engine import native
-from batchpid.sim.engine.batch_dynamics import NumpyBatchDynamics, batch_dynamics
 from batchpid.sim.engine.native import interface, verdict
 from batchpid.sim.engine.native.interface import EXTENSIONS
 
@@ -27,14 +26,11 @@ OTHERS = {
     "SYMBOLS": interface.SYMBOLS[::-1],
     "STATUS": interface.STATUS[::-1],
     "BODY": interface.BODY | {"mass": 2},
-    "DYNAMICS": interface.DYNAMICS[::-1],
-    "STEP": interface.STEP[::-1],
     "Tick": type("Tick", (ctypes.Structure,), {"_fields_": interface.Tick._fields_[::-1]}),
     "Group": type("Group", (ctypes.Structure,), {"_fields_": interface.Group._fields_[::-1]}),
 }
 USERS = {
     "_gateway": {"SYMBOLS", "STATUS", "BODY", "Tick", "Group"},
-    "_batch_dynamics": {"BODY", "DYNAMICS", "STEP"},
 }
 
 
@@ -81,7 +77,6 @@ def test_a_stale_extension_is_one_warning_and_python_does_the_work(monkeypatch, 
     assert len(caught) == 1
     assert backend.startswith(f"law in NumPy, Python calls into SAPIEN ({reason}")
     assert_identical(expected, found)
-    assert isinstance(batch_dynamics(panda, (0, 1)), NumpyBatchDynamics)
     (variable, told), *others = native.environment().items()
     assert (variable, others) == ("BATCHPID_NATIVE_REFUSED", [])
     assert told in backend
@@ -90,7 +85,7 @@ def test_a_stale_extension_is_one_warning_and_python_does_the_work(monkeypatch, 
 @needs_extension
 def test_worker_processes_take_the_verdict_without_a_warning_of_their_own(monkeypatch, panda, capfd):
     monkeypatch.setattr(extensions.Extension, "tables_digest", lambda self: "other")
-    with pytest.warns(RuntimeWarning, match="_gateway was built from other tables, _batch"):
+    with pytest.warns(RuntimeWarning, match="_gateway was built from other tables"):
         expected, _ = rollout(panda)
     found, _ = rollout(panda, workers=2)
     assert_identical(expected, found)

@@ -26,7 +26,7 @@ from batchpid.sim.identification.plant import Plant, Segment
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import smooth
 from batchpid.sim.identification.statistics import EXPLAINED, uncertainty
-from batchpid.sim.identification.unknowns import KINDS, Motors, Unknowns, take
+from batchpid.sim.identification.unknowns import KINDS, Kind, Motors, Unknowns, take
 
 pytest.importorskip("scipy")
 EXAMPLE = Path(__file__).parents[4] / "examples/mujoco_log.py"
@@ -250,6 +250,27 @@ def test_known_motors_are_found(arm, runs, kind):
     assert actuators.coulomb[0, 0] == pytest.approx(document["joints"]["shoulder"]["friction"][0])
     if by_law:
         assert error_of_the_export(found, setpoints, arm.designed("effort"), DT) < 2 * after
+
+
+@pytest.mark.usefixtures("short_search")
+def test_an_effect_of_the_motors_is_identified_by_a_line_in_the_table(arm, runs, monkeypatch, tmp_path):
+    """Here the lag: of logs that the Runner's motors made, and in the file that is saved."""
+    monkeypatch.setitem(KINDS, "lag", Kind("lag", True, 0.0, 0.1, 2e-3, 20.0, 2e-3))
+    truth, params = [0.006, 0.012], arm.designed("effort")
+    plain = {"armature": [0.1, 0.03], "viscous": [0.5, 0.2], "coulomb": [0.3, 0.1], "command_delay": 0.003}
+    motion = excite(arm, 2.5, rate=1000.0, lowest=0.6).position
+    options = {"params": params, "compensate": "gravity+coriolis", "timestep": DT, "substeps": 1, "workers": 0}
+    with Runner(arm, 1, **options, actuators=bp.make_actuators(2, **plain, lag=truth)) as runner:
+        begin = runner.reset(motion[:1]).qpos
+        qpos = np.concatenate([begin, runner.rollout(motion[:, None]).qpos[:, 0]])[:-1]
+    time = DT * np.arange(len(qpos))
+    log = Log("log", (0, 1), "setpoint", time, qpos, time, motion, False)
+    found = identify(arm, log, params=params, timestep=DT, workers=0, payload=False, evaluations=12)
+    for joint, wanted in enumerate(truth):
+        assert found.interval("lag", joint)[0] == pytest.approx(wanted, rel=0.1)
+    found.save(tmp_path / "motors.yaml")
+    saved = bp.load_actuators(tmp_path / "motors.yaml", arm.joint_names)[0]
+    np.testing.assert_allclose(saved.lag[0], truth, rtol=0.1)
 
 
 def test_a_joint_that_did_not_move_is_left_out_by_name(mujoco_log, tmp_path):
