@@ -136,16 +136,15 @@ class Control:
         if self._matrix_steps and self._number % (substeps * self._matrix_steps) == 0:
             self._update_matrix(qpos, qvel)
         self._number += 1
+        inputs = command, qpos, qvel, passive, noise, due
         key = passive is None, noise is None
         if key not in self._programs:
-            self._programs[key] = self._program(command, qpos, qvel, passive, noise, due)
+            self._programs[key] = self._program(inputs)
         if (program := self._programs[key]) is None:
-            self._state, effort = _step(
-                self._layout, self._constants, self._state, command, qpos, qvel, passive, noise, due
-            )
+            self._state, effort = _step(self._layout, self._constants, self._state, inputs)
             return effort
         run, state, results, effort = program
-        run(*state, *[each for each in (command, qpos, qvel, passive, noise, due) if each is not None], out=results)
+        run(*state, *[each for each in inputs if each is not None], out=results)
         return effort
 
     def _update_matrix(self, qpos: Float64, qvel: Float64) -> None:
@@ -155,13 +154,13 @@ class Control:
         whole = self._state.matrix.ndim == 3
         self._state.matrix[...] = found if whole else np.einsum("ejj->ej", found)
 
-    def _program(self, *inputs: Any) -> Any:
+    def _program(self, inputs: tuple[Any, ...]) -> Any:
         """Return the program, the arrays of its state, of its results, and of the efforts; None for NumPy."""
         if not program_status().active:
             return None
         constants = mapped(_stacked, self._constants)
         try:
-            traced = _trace(self._layout, *map(structure, (constants, self._state, *inputs)))
+            traced = _trace(self._layout, *map(structure, (constants, self._state, inputs)))
         except (TypeError, AttributeError, AssertionError):  # it has tables
             return None
         effort, state = np.zeros_like(inputs[1]), leaves(self._state)
@@ -169,18 +168,9 @@ class Control:
         return program, state, (*leaves(_returned(self._state)), effort), effort
 
 
-def _step(
-    layout: Layout,
-    constants: Constants,
-    state: StepState,
-    command: Any,
-    qpos: Any,
-    qvel: Any,
-    passive: Any,
-    noise: Any,
-    due: Any,
-) -> tuple[StepState, Any]:
+def _step(layout: Layout, constants: Constants, state: StepState, inputs: tuple[Any, ...]) -> tuple[StepState, Any]:
     """Return state and efforts of a control step; ``due`` is 1.0 where the law is, 0.0 where its effort is kept."""
+    command, qpos, qvel, passive, noise, due = inputs
     model = Model(
         when=lambda due, function, otherwise: otherwise,
         law=PIDLaw.advance if due is None else partial(_where_due, due),

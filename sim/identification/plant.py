@@ -244,21 +244,9 @@ class _Motion:
             self._slides = np.abs(self.friction) >= limit
 
 
-def _move(
-    dt: float,
-    q: Float64,
-    v: Float64,
-    f: Float64,
-    matrix: Float64,
-    effort: Float64,
-    added: Float64,
-    limit: Float64,
-    keep: Float64,
-    creep: Float64,
-    low: Float64,
-    high: Float64,
-) -> None:
+def _move(dt: float, *arrays: Float64) -> None:
     """Change positions, velocities and friction as :func:`batchpid.task_space.native_rows.move` does."""
+    q, v, f, matrix, effort, added, limit, keep, creep, low, high = arrays
     mobility = dt * np.linalg.inv(matrix + added[:, :, None] * np.eye(q.shape[1]))
 
     def along(effort: Float64) -> Float64:
