@@ -258,7 +258,7 @@ def test_an_effect_of_the_motors_is_identified_by_a_line_in_the_table(arm, monke
     monkeypatch.setitem(KINDS, "lag", Kind("lag", True, 1e-3, 0.1, 5e-3, 20.0, 5e-3))
     truth, params = [0.006, 0.012], arm.designed("effort").replace(setpoint_weight=1.0)
     plain = {"armature": [0.1, 0.03], "viscous": [0.5, 0.2], "command_delay": 0.003}
-    motion = excite(arm, 1.2, rate=1000.0, lowest=0.6).position
+    motion = excite(arm, 1.6, rate=1000.0, lowest=0.6).position
     options = {"params": params, "compensate": "none", "timestep": DT, "workers": 0}
     with Runner(arm, 1, substeps=1, **options, actuators=bp.make_actuators(2, **plain, lag=truth)) as runner:
         begin = runner.reset(motion[:1]).qpos
