@@ -31,6 +31,11 @@ FRICTION = (
 """Arrays of ``friction``; the last is the result."""
 SEARCH = ("goal", "tool", "lower", "upper", "tolerances", "qpos", "errors", "steps")
 """Arrays of ``search`` in pose_search.h; those after the tolerances are results. ``qpos`` holds the starts first."""
+MOVE = (
+    *("qpos", "qvel", "friction", "matrix", "effort", "added"),
+    *("limit", "keep", "creep", "low", "high"),
+)
+"""Arrays of ``move``; the first three are changed."""
 DECOUPLING = ("full", "partial", "none")
 """Kinds of decoupling, as Decoupling in task_space.cpp."""
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -62,13 +62,35 @@ def kinematics(
     native = in_use() if type(qpos) is np.ndarray and (point is None or isinstance(point, np.ndarray)) else None
     if native is None or not (tree.fixed_base or _DYNAMICS.isdisjoint(wanted)):
         return None
-    own = native_tree(native, tree)
     dof, leading, rows = tree.dof, qpos.shape[:-1], math.prod(qpos.shape[:-1])
     found = empty(wanted, leading, dof)
     inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
-    results = [found.get(name) for name in KINEMATICS[3:]]
-    call(native.kinematics, own.tree, tree.link_bodies[index], rows, *inputs, tool(own, index, point), *results)
+    call(native.kinematics, *_arguments(native, tree, found, inputs, index, point))
     return tuple(found.values())
+
+
+def bound(
+    tree: RigidTree, wanted: tuple[str, ...], qpos: Float64, qvel: Float64, index: int
+) -> tuple[Callable[[], None], tuple[Float64, ...]] | None:
+    """Return a function that computes the results of :func:`kinematics`, on a fixed base, and their arrays.
+
+    It takes what the contiguous arrays ``qpos`` and ``qvel`` (rows, dof) hold when it is called.
+    """
+    if (native := in_use()) is None:
+        return None
+    found = empty(wanted, qpos.shape[:1], tree.dof)
+    return partial(native.kinematics, *_arguments(native, tree, found, [qpos, qvel], index, None)), tuple(
+        found.values()
+    )
+
+
+def _arguments(
+    native: Any, tree: RigidTree, found: dict[str, Float64], inputs: Any, index: int, point: Any
+) -> list[Any]:
+    """Return the arguments of ``kinematics`` in task_space.cpp."""
+    own, rows = native_tree(native, tree), len(inputs[0])
+    results = [found.get(name) for name in KINEMATICS[3:]]
+    return [own.tree, tree.link_bodies[index], rows, *inputs, tool(own, index, point), *results]
 
 
 def empty(wanted: tuple[str, ...], leading: tuple[int, ...], dof: int) -> dict[str, Float64]:
@@ -101,6 +123,18 @@ def search(
     call(native.search, own.tree, tree.link_bodies[index], rows, iterations, *arrays, *found)
     found[0] = tree.positions(found[0])
     return found
+
+
+def move(dt: float, sweeps: int, *arrays: Float64) -> bool:
+    """Step joints with friction by ``dt`` [s], in place; return False where native code is not used.
+
+    ``arrays`` are the contiguous arrays of :data:`batchpid.native.task_space_extension.MOVE`, (rows, columns) or
+    (1, columns); those that change are (rows, joints).
+    """
+    if (native := in_use()) is None:
+        return False
+    native.move(*arrays[0].shape, dt, sweeps, *arrays)
+    return True
 
 
 def tool(own: _NativeTree, index: int, point: Any) -> Float64:

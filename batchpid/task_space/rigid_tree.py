@@ -24,7 +24,7 @@ from batchpid.arrays.read_only import read_only
 from batchpid.checks.validate import choice, entries, names, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
-from batchpid.task_space.frames import matrix_of, turned
+from batchpid.task_space.frames import matrix_of, turned, wxyz_of
 from batchpid.task_space.spatial_inertia import SpatialInertia, inertia_rows, moved_matrix, spatial_matrix
 
 Float64 = NDArray[np.float64]
@@ -200,6 +200,26 @@ class RigidTree:
     @cached_property
     def _held(self) -> RigidTree:
         return replace(self, fixed_base=True, coupling=Coupling.of(self.dof))
+
+    def fixed_at(self, qpos: Float64, moves: NDArray[np.bool_]) -> RigidTree:
+        """Return the tree in which only the joints of the mask ``moves`` (dof,) move, and are independent.
+
+        The others are fixed at ``qpos`` (dof,) [rad or m].
+        """
+        position, wxyz, types = self.position.copy(), self.wxyz.copy(), np.array(self.joint_types, object)
+        above = np.flatnonzero(types != "fixed")
+        for link, q in zip(above[~moves], np.asarray(qpos)[~moves], strict=True):
+            turn = matrix_of(wxyz[link])
+            if types[link] == "revolute":
+                half = np.array([np.cos(0.5 * q), *np.sin(0.5 * q) * self.axis[link]])
+                wxyz[link] = wxyz_of(turn @ matrix_of(half))
+            else:
+                position[link] += q * turn @ self.axis[link]
+            types[link] = "fixed"
+        names = tuple(name for name, kept in zip(self.joint_names, moves, strict=True) if kept)
+        rows = {name: getattr(self, name)[moves] for name in ("armature", "lower", "upper")}
+        places: dict[str, Any] = {"position": position, "wxyz": wxyz, "joint_types": tuple(types)}
+        return replace(self, **places, **rows, joint_names=names, coupling=Coupling.of(len(names)))
 
     @property
     def independent(self) -> NDArray[np.bool_]:

@@ -173,7 +173,6 @@ def report(found: Identification) -> str:
     """Return a table of the joints, and the delay, the payload and the errors in lines."""
     from batchpid.sim.cli.report import table
     from batchpid.sim.identification.statistics import EXPLAINED
-    from batchpid.sim.identification.unknowns import PER_JOINT
 
     def cell(kind: str, joint: int | None = None, factor: float = 1.0) -> str:
         row = document[kind] if joint is None else document["joints"][names[joint]][kind]
@@ -182,8 +181,9 @@ def report(found: Identification) -> str:
         return f"{value:.4g} ± {max(high - value, value - low):.1g}{mark}"
 
     document, names = found.document(), [found.robot.joint_names[joint] for joint in found.joints]
-    rows = [[name, *(cell(kind, joint) for kind in PER_JOINT)] for joint, name in enumerate(names)]
-    text = [table(rows, ["95 % intervals, SI units", *PER_JOINT], "lrrrrr"), ""]
+    kinds = found.unknowns.per_joint
+    rows = [[name, *(cell(kind, joint) for kind in kinds)] for joint, name in enumerate(names)]
+    text = [table(rows, ["95 % intervals, SI units", *kinds], "l" + len(kinds) * "r"), ""]
     text.append(f"delay of the commands: {cell('delay', None, 1e3)} ms")
     if ("payload", None) in found.unknowns.names:
         payload = cell("payload")
@@ -205,8 +205,6 @@ def report(found: Identification) -> str:
 
 def _not_identified(found: Identification) -> list[str]:
     """Return lines for the unknowns that the logs do not identify, by joint, each with the remedy."""
-    from batchpid.sim.identification.unknowns import PER_JOINT
-
     of_joints, others = found.missing()
     if not of_joints and not others:
         return []
@@ -223,7 +221,7 @@ def _not_identified(found: Identification) -> list[str]:
     for joint, kinds in of_joints.items():
         if not moves[joint]:
             remedy = "it hardly moves; move it more (batchpid excite)"
-        elif {*kinds} == {*PER_JOINT}:
+        elif {*kinds} == {*found.unknowns.per_joint}:
             remedy = "no value is certain, perhaps their ratios are; record with more load, or faster motion"
         elif "strength" in kinds:
             remedy = "only ratios to the strength are identifiable; record without compensation, or with more load"

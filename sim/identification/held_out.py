@@ -15,16 +15,13 @@ from batchpid.io import documents
 from batchpid.motors.actuator_fields import FIELDS
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.log import Log
-from batchpid.sim.identification.plant import Motors
 from batchpid.sim.identification.problem import Problem
-from batchpid.sim.identification.regression import STOPPING, hypotheses, smooth, variants
-from batchpid.sim.identification.unknowns import LIMITS, Unknowns
+from batchpid.sim.identification.regression import hypotheses, smooth, variants
+from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Motors, Unknowns
 from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Compensation
 
-_MODELLED = ("command_delay", "strength", "bias", "coulomb", "viscous", "armature")
-"""Fields of actuators that the model has."""
 ASSUMED = "simulated_with"
 """Key of an actuators file, under "about": how the error that it states was simulated."""
 
@@ -94,39 +91,30 @@ def error_of(problem: Problem, residuals: list[Float64]) -> float:
 
 def ideal_motors(robot: Robot, joints: tuple[int, ...]) -> Motors:
     """Return the motors according to the robot's description."""
-    zero, own = np.zeros((1, len(joints))), list(joints)
-    damping, friction, none = robot.damping[None, own], robot.friction[None, own], np.zeros((1, 1))
-    return Motors(zero, damping, friction, zero + 1, zero, none, none, none)
+    return motors_of(bp.Actuators(), robot, joints, 0.0, 0.0)
 
 
 def motors_of(
     actuators: bp.Actuators, robot: Robot, joints: tuple[int, ...], stopping: float, payload: float
 ) -> Motors:
     """Return the motors of ``joints`` with ``actuators`` of ``robot``, a stopping time [s] and a payload [kg]."""
-
-    def row(name: str, neutral: float = 0.0) -> Float64:
-        leaf = getattr(actuators, name)
-        return np.full((1, len(joints)), neutral) if leaf is None else np.array(leaf, float)[:1, list(joints)]
-
-    own = list(joints)
-    return Motors(
-        armature=row("armature"),
-        damping=robot.damping[own] + row("viscous"),
-        friction=robot.friction[own] + row("coulomb"),
-        strength=row("strength", 1.0),
-        bias=row("bias"),
-        delay=row("command_delay")[:, :1],
-        stopping=np.array([[stopping]]),
-        payload=np.array([[payload]]),
-    )
+    own, motors = list(joints), {"stopping": np.array([[stopping]]), "payload": np.array([[payload]])}
+    for name, kind in KINDS.items():
+        if kind.field is None:
+            continue
+        leaf = getattr(actuators, kind.field)
+        row = np.full((1, len(own)), kind.neutral) if leaf is None else np.array(leaf, float)[:1, own]
+        row = row + getattr(robot, name)[own] if name in DESCRIBED else row
+        motors[name] = row if kind.per_joint else row[:, :1]
+    return motors
 
 
 def _assumed(source: str, document: Any) -> dict[str, Any]:
     """Return the assumptions of an actuators file; stopping time and payload alone if it states none."""
     stated = document.get("about", {}).get(ASSUMED, {})
-    found = {"stopping": STOPPING, "payload": 0.0} | (stated if isinstance(stated, dict) else {})
+    found = {name: KINDS[name].start for name in ("stopping", "payload")} | (stated if isinstance(stated, dict) else {})
     for name in ("stopping", "payload"):
-        low, high = LIMITS[name]
+        low, high = KINDS[name].low, KINDS[name].high
         if not documents.is_number(found[name]) or not low <= float(found[name]) <= high:
             remedy = f"give a number from {low:g} to {high:g}, or leave out {ASSUMED}"
             raise InvalidArgumentError(f"{source}: {name}", "is out of range", value=found[name], remedy=remedy)
@@ -135,17 +123,18 @@ def _assumed(source: str, document: Any) -> dict[str, Any]:
 
 def _check_modelled(source: str, actuators: bp.Actuators, robot: Robot, joints: tuple[int, ...]) -> None:
     """Raise InvalidArgumentError if ``joints`` have effects in ``actuators`` that the model lacks."""
+    modelled = {kind.field: kind for kind in KINDS.values() if kind.field is not None}
     for name, field in FIELDS.items():
         leaf = getattr(actuators, name)
         if leaf is None:
             continue
         values = np.array(leaf, float)[:, list(joints)]
-        if name not in _MODELLED and (values != field.neutral).any():
+        if name not in modelled and (values != field.neutral).any():
             joint = robot.joint_names[joints[int((values != field.neutral).any(0).argmax())]]
-            remedy = f"leave it out; the model has {', '.join(_MODELLED)}"
+            remedy = f"leave it out; the model has {', '.join(modelled)}"
             raise InvalidArgumentError(f"{source}: {name}", "is not part of the model", joint=joint, remedy=remedy)
-        if name == "command_delay" and np.ptp(values) > 0:
-            problem = "differs between joints, and the model has one delay"
+        if name in modelled and not modelled[name].per_joint and np.ptp(values) > 0:
+            problem = "differs between joints, and the model has one for all"
             raise InvalidArgumentError(f"{source}: {name}", problem, remedy="give every joint the same")
     if actuators.limit_positions is not None:
         raise InvalidArgumentError(f"{source}: position_limit", "is not part of the model", remedy="leave it out")

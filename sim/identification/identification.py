@@ -19,7 +19,7 @@ from batchpid.arrays.digest import digest
 from batchpid.checks.validate import flag, integer
 from batchpid.io.versions import package_versions
 from batchpid.motors.actuator_files import dumps_actuators, loads_actuators
-from batchpid.sim.engine import native
+from batchpid.native.availability import obstacle
 from batchpid.sim.identification.fit import Solution, Step
 from batchpid.sim.identification.fit_history import History, State
 from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, search
@@ -27,13 +27,13 @@ from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log
-from batchpid.sim.identification.plant import Motors, Plant
+from batchpid.sim.identification.plant import Plant
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import Motion, Regression, best_drive, hypotheses, smooth, variants
 from batchpid.sim.identification.result import Fit, Identification, actuators_at
 from batchpid.sim.identification.start import begin
 from batchpid.sim.identification.statistics import EXPLAINED, misfits, uncertainty
-from batchpid.sim.identification.unknowns import Unknowns
+from batchpid.sim.identification.unknowns import Motors, Unknowns
 from batchpid.sim.identification.windows import rows_of
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Compensation
@@ -122,7 +122,7 @@ def identify(
         "payload": payload,
         "evaluations": evaluations,
         "seed": seed,
-        "native": not native.obstacle(),
+        "native": not obstacle(),
         "versions": package_versions(("batchpid", "sapien", "numpy", "scipy", "cmaes")),
     }
     record = History(history, settings)
@@ -186,14 +186,14 @@ def _unknowns(
     plant = Plant(robot, joints, drive)
     qpos = np.concatenate([motion.qpos[::200] for motion in motions])
     matrix = plant.mass_matrix(qpos, np.zeros((len(qpos), 1)))
-    links, armature = np.diagonal(matrix, axis1=1, axis2=2).mean(0), motors.armature[0]
+    links, armature = np.diagonal(matrix, axis1=1, axis2=2).mean(0), motors["armature"][0]
     inertia = links + armature
     speed, acceleration = (
         np.sqrt(np.mean(np.concatenate([getattr(motion, name) for motion in motions]) ** 2, axis=0))
         for name in ("qvel", "qacc")
     )
     speed = np.maximum(speed, 1e-3)
-    effort = np.maximum(inertia * acceleration + motors.friction[0], inertia * 0.1)
+    effort = np.maximum(inertia * acceleration + motors["friction"][0], inertia * 0.1)
     return Unknowns.of(links, armature, effort, speed, payload)
 
 
@@ -201,5 +201,5 @@ def _saved(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Flo
     """Return ``theta`` as its actuators file describes it, with the stopping time and payload of ``theta``."""
     text = dumps_actuators(actuators_at(robot, joints, unknowns, theta), robot.joint_names)
     found = unknowns.motors(theta[None])
-    common = float(found.stopping[0, 0]), float(found.payload[0, 0])
+    common = float(found["stopping"][0, 0]), float(found["payload"][0, 0])
     return unknowns.point(motors_of(loads_actuators(text, robot.joint_names)[0], robot, joints, *common))

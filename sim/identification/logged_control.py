@@ -1,14 +1,38 @@
-"""Control of the robot in a log, and its PID law along simulated and measured motions."""
+"""Control of the robot in a log: the Runner's control step, along simulated and measured motions."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 
 import batchpid as bp
+from batchpid import motors as actuator_model
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.loop.pid_law import PIDLaw
+from batchpid.arrays.elementwise import namespace
+from batchpid.motors.actuators import Actuators
+from batchpid.motors.coupling import Coupling
+from batchpid.motors.friction import Friction
+from batchpid.native.array_program import ArrayProgram
+from batchpid.native.availability import obstacle
+from batchpid.native.symbols import Stack, Symbol
+from batchpid.native.tracing import Trace, trace
+from batchpid.native.trees import filled, leaves, mapped, structure
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.control_step import (
+    Constants,
+    Layout,
+    Measured,
+    Model,
+    Step,
+    StepState,
+    control_step,
+    mass_matrix,
+)
+from batchpid.sim.loop.pid_law import PIDLaw, half_way
 
 
 @dataclass(frozen=True)
@@ -49,23 +73,142 @@ class Drive:
         }
 
 
-class Law:
-    """PID law of many candidates."""
+class Control:
+    """Control and motors of n robots: :func:`batchpid.sim.loop.control_step.control_step` at every sim step.
 
-    def __init__(self, drive: Drive, qpos: Float64, qvel: Float64) -> None:
-        params = drive.params
-        assert params is not None
-        self._law = PIDLaw.of(params)._replace(measures_rate=drive.measured_rate)
-        params = params._replace(measurement_rate=None)  # the log's loop decides, not the params
-        self._k = bp.discretise(params, drive.timestep * drive.substeps, len(qpos))
-        self._state = bp.init(params, qpos)
+    It is a native program where programs are used, with the same bits as NumPy.
+    """
 
-    def effort(
-        self, setpoint: Float64, qpos: Float64, qvel: Float64, matrix: Float64, feedforward: Float64 | None
-    ) -> Float64:
-        """Advance the law by a step and return the efforts (n, joints)."""
-        given = matrix if self._law.whole else np.diagonal(matrix, axis1=1, axis2=2)
-        self._state, effort, _ = self._law.advance(
-            self._k, self._state, (setpoint, None, None), qpos, qvel, feedforward, given
+    def __init__(
+        self,
+        drive: Drive,
+        actuators: Actuators,
+        qpos: Float64,
+        qvel: Float64,
+        asked: Float64 | None = None,
+        damping: Float64 | None = None,
+        model: Callable[[Float64], Float64] | None = None,
+    ) -> None:
+        """Begin at ``qpos`` and ``qvel`` (n, joints).
+
+        ``asked`` are the efforts asked for so far, the latest first (samples, n, joints); None: 0. Laws with the mass
+        matrix take ``model``, from positions to matrices, and the ``damping`` (joints,) that it knows.
+        """
+        dt, params, self._drive = drive.timestep, drive.params, drive
+        self._number, self._matrix_steps = 0, 0
+        control, state, k, law = "effort", StepState(None), None, None
+        if params is not None:
+            law = PIDLaw.of(params)._replace(measures_rate=drive.measured_rate)
+            params = params._replace(measurement_rate=None)  # the log's loop decides, not the params
+            control, k = "pid", bp.discretise(params, dt * drive.substeps, len(qpos))
+            first = bp.init(params, qpos)
+            state = StepState(first if drive.substeps == 1 else (first, np.zeros_like(qpos)))
+        self._layout = Layout(control, law)
+        constants = Constants(
+            dt, (None, None), Coupling.of(qpos.shape[1]), k, friction=Friction(viscous=actuators.viscous)
         )
-        return np.asarray(effort)
+        if not actuators._replace(**dict.fromkeys(actuator_model.JOINT_SIDE)).is_ideal:
+            latest = None if asked is None else asked[0]
+            motors = actuator_model.init(actuators, qpos, dt, qvel=qvel, effort=latest)
+            if motors.command is not None and asked is not None:
+                samples = np.minimum(np.arange(motors.command.shape[1]), len(asked) - 1)
+                motors = motors._replace(command=np.ascontiguousarray(asked[samples].swapaxes(0, 1)))
+            constants = constants._replace(motors=actuator_model.discretise(actuators, motors, dt, len(qpos)))
+            state = state._replace(motors=motors)
+        if law is not None and law.needs_matrix:
+            self._matrix_steps = law.matrix_steps
+            state = state._replace(matrix=np.zeros((*qpos.shape, qpos.shape[1])[: 3 if law.whole else 2]))
+            constants = constants._replace(damping=damping if law.whole and np.any(damping) else None)
+        self._model = Model(model)
+        self._constants, self._state = constants, mapped(partial(np.array, order="C"), state)
+        self._programs: dict[tuple[bool, bool], Any] = {}
+
+    def advance(
+        self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64 | None, noise: Float64 | None = None
+    ) -> Float64:
+        """Return the motors' efforts in a sim step, less viscous friction (n, joints); which the next step may reuse.
+
+        ``command`` are setpoints or efforts, ``passive`` is the force that the law compensates, and ``noise`` that of
+        the measured positions, each (n, joints).
+        """
+        substeps = self._drive.substeps
+        due = None if substeps == 1 else np.array([[float(self._number % substeps == 0)]])
+        if self._matrix_steps and self._number % (substeps * self._matrix_steps) == 0:
+            self._update_matrix(qpos, qvel)
+        self._number += 1
+        inputs = command, qpos, qvel, passive, noise, due
+        key = passive is None, noise is None
+        if key not in self._programs:
+            self._programs[key] = self._program(inputs)
+        if (program := self._programs[key]) is None:
+            self._state, effort = _step(self._layout, self._constants, self._state, inputs)
+            return effort
+        run, state, results, effort = program
+        run(*state, *[each for each in inputs if each is not None], out=results)
+        return effort
+
+    def _update_matrix(self, qpos: Float64, qvel: Float64) -> None:
+        steps, dt = self._matrix_steps, self._drive.timestep * self._drive.substeps
+        layout = self._layout._replace(model=self._model)
+        found = mass_matrix(layout, self._constants, half_way(qpos, qvel, steps, dt))
+        whole = self._state.matrix.ndim == 3
+        self._state.matrix[...] = found if whole else np.einsum("ejj->ej", found)
+
+    def _program(self, inputs: tuple[Any, ...]) -> Any:
+        """Return the program, the arrays of its state, of its results, and of the efforts; None for NumPy."""
+        if obstacle():
+            return None
+        constants = mapped(_stacked, self._constants)
+        try:
+            traced = _trace(self._layout, *map(structure, (constants, self._state, inputs)))
+        except (TypeError, AttributeError, AssertionError):  # it has tables
+            return None
+        effort, state = np.zeros_like(inputs[1]), leaves(self._state)
+        program = ArrayProgram(traced, leaves(constants), len(state) + len(leaves(inputs)), effort.shape)
+        return program, state, (*leaves(_returned(self._state)), effort), effort
+
+
+def _step(layout: Layout, constants: Constants, state: StepState, inputs: tuple[Any, ...]) -> tuple[StepState, Any]:
+    """Return state and efforts of a control step; ``due`` is 1.0 where the law is, 0.0 where its effort is kept."""
+    command, qpos, qvel, passive, noise, due = inputs
+    model = Model(
+        when=lambda due, function, otherwise: otherwise,
+        law=PIDLaw.advance if due is None else partial(_where_due, due),
+        noise=None if noise is None else lambda *_: (noise, None),
+    )
+    measured, step = Measured(qpos, qvel, passive), Step(0, 1, observed=False)
+    new, outputs = control_step(layout._replace(model=model), constants, state, Command(command), measured, step)
+    return new, outputs.qf
+
+
+def _where_due(due: Any, law: PIDLaw, k: Any, state: Any, *inputs: Any, **options: Any) -> Any:
+    """Advance a law where it is due; its state includes the effort that it asked for."""
+    before, asked = state
+    new, effort, saturated = law.advance(k, state[0], *inputs, **options)
+    xp = namespace(due, effort)
+    both = zip(new, before, strict=True)
+    law_state = [None if leaf is None else xp.where(due > 0, leaf, old) for leaf, old in both]
+    asked = xp.where(due > 0, effort, asked)
+    return (bp.PIDState(*law_state), asked), asked, saturated
+
+
+@lru_cache(maxsize=64)
+def _trace(layout: Layout, *structures: Any) -> Trace:
+    def function(*symbols: Symbol) -> list[Any]:
+        given = iter(symbols)
+        new, effort = _step(layout, *(filled(each, given) for each in structures))
+        return [*leaves(_returned(new)), effort]
+
+    first = len(leaves(structures[0]))
+    return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))
+
+
+def _returned(state: StepState) -> StepState:
+    """Return what a program returns of a state: without the matrix, and histories, which it changes in place."""
+    motors = None if state.motors is None else state.motors._replace(command=None, sensor=None)
+    return state._replace(matrix=None, motors=motors)
+
+
+def _stacked(array: Any) -> Any:
+    """Return an array (n, envs, joints) as a stack of n arrays, and other arrays unchanged."""
+    return Stack(array) if array.ndim == 3 else array

@@ -34,7 +34,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.regression import Motion
-from batchpid.sim.identification.unknowns import Unknowns
+from batchpid.sim.identification.unknowns import Unknowns, take
 from batchpid.sim.identification.wander import spread, whiten
 from batchpid.sim.identification.windows import Subject, Window, cut, project, rows_of, simulate, whole
 from batchpid.sim.robot.robot import Robot
@@ -198,7 +198,7 @@ class Problem:
         for number, group in enumerate(groups):
             most = max(1, CHUNK // len(group))
             parts = np.array_split(np.arange(len(states)), -(-len(states) // most))
-            tasks += [(group, motors.take(part), states[part], draws[part]) for part in parts]
+            tasks += [(group, take(motors, part), states[part], draws[part]) for part in parts]
             places += [number] * len(parts)
         simulated = self._map(tasks)
         found = []

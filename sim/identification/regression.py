@@ -20,10 +20,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
+from batchpid.motors.actuators import Actuators
 from batchpid.sim.identification.log_noise import Noise, split
-from batchpid.sim.identification.logged_control import Drive, Law
+from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log
-from batchpid.sim.identification.plant import Motors, Plant
+from batchpid.sim.identification.plant import Plant
+from batchpid.sim.identification.unknowns import Motors
 
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
@@ -34,7 +36,6 @@ MOVES, LEAST_ROWS = 0.4, 50
 """Speed, over its root mean square, below which a joint may stick, and the least number of rows above it."""
 EDGE = 0.15
 """Time left out at both ends of a log, where the filter begins [s]."""
-STOPPING = 5e-3
 _EVERY = 0.005
 PAYLOADS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0)
 """Payloads that are tried [kg]."""
@@ -44,6 +45,10 @@ _PRIOR = 0.005
 """Weight of the prior at ideal motors, over the effort's size."""
 NO_PRIOR, WEAK, STRONG = 1e-3, 0.1, 3.0
 """Weights of the prior at strength 1; the strong one is safe where the log hardly shows the strengths."""
+
+
+FOUND = ("armature", "damping", "friction", "strength", "bias", "delay", "payload")
+"""Kinds of unknowns that a regression gives."""
 
 
 class Motion(NamedTuple):
@@ -102,7 +107,7 @@ class Regression:
             rows = np.arange(edge, len(motion.qpos) - edge, max(1, round(_EVERY / dt)))
             v, a = motion.qvel[rows], motion.qacc[rows]
             empty, loaded = (_required(plant, motion, rows, kg) for kg in (0.0, 1.0 if payload else 0.0))
-            effort = motion.command if drive.params is None else _law_efforts(drive, plant, motion)
+            effort = motion.command if drive.params is None else _law_efforts(plant, motion)
             unloaded = np.zeros((len(motion.qpos), 1))
             if drive.through and (held := plant.compensation(motion.qpos, motion.qvel, unloaded)) is not None:
                 effort = effort + held
@@ -137,9 +142,8 @@ class Regression:
             required, *columns = (table[rows, joint] for table in tables)
             both.append(_solve_joint(required, columns, float(priors[joint])))
         cost = float(sum(np.log(mean + 1e-30) for mean, _ in both))
-        armature, damping, friction, strength, bias = np.array([found for _, found in both]).T[:, None]
-        common = (np.array([[value]]) for value in (delay, STOPPING, kg))
-        return Start(Motors(armature, damping, friction, strength, bias, *common), cost)
+        values = [*np.array([found for _, found in both]).T[:, None], *np.array([delay, kg])[:, None, None]]
+        return Start(dict(zip(FOUND, values, strict=True)), cost)
 
     @cached_property
     def best(self) -> Start:
@@ -149,7 +153,7 @@ class Regression:
             return empty
         loaded = empty
         for _ in range(2):
-            costs = [self.at(loaded.motors.delay[0, 0], kg, NO_PRIOR).cost for kg in PAYLOADS]
+            costs = [self.at(loaded.motors["delay"][0, 0], kg, NO_PRIOR).cost for kg in PAYLOADS]
             loaded = self._at_best_delay(PAYLOADS[int(np.argmin(costs))])
         return loaded if explains_better(loaded, empty) else empty
 
@@ -159,25 +163,14 @@ class Regression:
 
 def explains_better(special: Start, plain: Start) -> bool:
     """Return whether ``special`` explains the efforts significantly better than ``plain``."""
-    return plain.cost - special.cost > EVIDENCE * plain.motors.armature.shape[1]
+    return plain.cost - special.cost > EVIDENCE * plain.motors["armature"].shape[1]
 
 
-def _law_efforts(drive: Drive, plant: Plant, motion: Motion) -> Float64:
+def _law_efforts(plant: Plant, motion: Motion) -> Float64:
     """Return the efforts (steps, joints) of the law along a measured ``motion``, without compensation."""
-    law = Law(drive, motion.qpos[:1], motion.qvel[:1])
-    needs = drive.params is not None and drive.params.gain_units is not None
-    none = np.zeros((1, 1))
-    matrix = plant.mass_matrix(motion.qpos[:1], none)
-    efforts = np.empty_like(motion.qpos)
-    for step in range(len(motion.qpos)):
-        if step % drive.substeps:
-            efforts[step] = efforts[step - 1]
-            continue
-        q, v = motion.qpos[step : step + 1], motion.qvel[step : step + 1]
-        if needs and step % 8 == 0:
-            matrix = plant.mass_matrix(q, none)
-        efforts[step] = law.effort(motion.command[step : step + 1], q, v, matrix, None)[0]
-    return efforts
+    rows = [(q[None], v[None], u[None]) for q, v, u in zip(motion.qpos, motion.qvel, motion.command, strict=True)]
+    control = plant.control(Actuators(), *rows[0][:2])
+    return np.array([control.advance(u, q, v, None)[0].copy() for q, v, u in rows])
 
 
 def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float64:

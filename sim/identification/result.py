@@ -15,7 +15,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.held_out import ASSUMED
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.statistics import INTERVAL, Uncertainty
-from batchpid.sim.identification.unknowns import PER_JOINT, Unknowns
+from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknowns
 from batchpid.sim.robot.robot import Robot
 
 
@@ -61,8 +61,9 @@ class Identification(NamedTuple):
     def interval(self, kind: str, joint: int | None = None) -> tuple[float, float, float] | None:
         """Return estimate, lower and upper end of the 95 % interval; None if the logs do not identify the unknown.
 
-        ``kind`` is "armature", "damping", "friction", "strength" or "bias" of a ``joint``, by its number among
-        :attr:`joints`; or "delay", "stopping" or "payload", without joint.
+        ``kind`` is a name of :data:`batchpid.sim.identification.unknowns.KINDS`: "armature", "damping", "friction",
+        "strength" or "bias" of a ``joint``, by its number among :attr:`joints`; or "delay", "stopping" or "payload",
+        without joint.
 
         Raises
         ------
@@ -70,8 +71,8 @@ class Identification(NamedTuple):
             The logs do not hold that joint, or there is no such unknown.
         """
         kind = choice("kind", kind, list(dict.fromkeys(name for name, _ in self.unknowns.names)))
-        if (kind in PER_JOINT) != (joint is not None):
-            remedy = f"give its number, 0 to {len(self.joints) - 1}" if kind in PER_JOINT else "leave it out"
+        if KINDS[kind].per_joint != (joint is not None):
+            remedy = f"give its number, 0 to {len(self.joints) - 1}" if KINDS[kind].per_joint else "leave it out"
             raise InvalidArgumentError("joint", f"does not go with {kind!r}", value=joint, remedy=remedy)
         if joint is not None:
             joint = integer("joint", joint, 0, len(self.joints) - 1)
@@ -114,10 +115,9 @@ class Identification(NamedTuple):
             "identified_from": self.settings["logs"],
             "held_out_error": document["held_out_error"],
             "misfit": document["misfit"],
-            ASSUMED: self.drive.assumptions
-            | {kind: float(getattr(motors, kind)[0, 0]) for kind in ("stopping", "payload")},
+            ASSUMED: self.drive.assumptions | {kind: float(motors[kind][0, 0]) for kind in ("stopping", "payload")},
             "intervals": document["joints"]
-            | {kind: document[kind] for kind in ("delay", "payload") if kind in document},
+            | {kind: document[kind] for kind, joint in self.unknowns.names if joint is None and kind in document},
             "not_well_determined": of_joints | ({"all joints": others} if others else {}),
             "did_not_move_hence_ideal": self.settings["still"],
             "not_in_the_logs_hence_ideal": [
@@ -137,13 +137,11 @@ class Identification(NamedTuple):
 
         document: dict[str, Any] = {
             "joints": {
-                self.robot.joint_names[number]: {kind: row(kind, joint) for kind in PER_JOINT}
+                self.robot.joint_names[number]: {kind: row(kind, joint) for kind in self.unknowns.per_joint}
                 for joint, number in enumerate(self.joints)
-            },
-            "delay": row("delay"),
+            }
         }
-        if ("payload", None) in self.unknowns.names:
-            document["payload"] = row("payload")
+        document |= {kind: row(kind) for kind, joint in self.unknowns.names if joint is None and kind != "stopping"}
         return document | {
             "held_out_error": [value if np.isfinite(value) else None for value in self.held_out_error],
             "misfit": self.misfit if np.isfinite(self.misfit) else None,
@@ -179,19 +177,16 @@ class Identification(NamedTuple):
 
 def actuators_at(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Float64) -> bp.Actuators:
     """Return the actuators of ``robot`` at a point (unknowns,); joints that are not in ``joints`` are ideal."""
-    found = unknowns.motors(theta[None])
-    columns = {kind: np.zeros(robot.dof) for kind in PER_JOINT}
-    columns["strength"][:] = 1.0
-    columns["damping"][:], columns["friction"][:] = robot.damping, robot.friction
-    for kind in PER_JOINT:
-        columns[kind][list(joints)] = getattr(found, kind)[0]
-    return bp.make_actuators(
-        robot.dof,
-        command_delay=float(found.delay[0, 0]),
-        strength=columns["strength"],
-        bias=columns["bias"],
-        coulomb=np.maximum(columns["friction"] - robot.friction, 0.0),
-        viscous=np.maximum(columns["damping"] - robot.damping, 0.0),
-        armature=columns["armature"],
-        joint_names=robot.joint_names,
-    )
+    found, options = unknowns.motors(theta[None]), dict[str, Any]()
+    for name, kind in KINDS.items():
+        if kind.field is None:
+            continue
+        column = np.full(robot.dof, kind.neutral)
+        if not kind.per_joint:
+            column[:] = found[name][0]
+        elif name in DESCRIBED:
+            column[list(joints)] = np.maximum(found[name][0] - getattr(robot, name)[list(joints)], 0.0)
+        else:
+            column[list(joints)] = found[name][0]
+        options[kind.field] = column
+    return bp.make_actuators(robot.dof, **options, joint_names=robot.joint_names)

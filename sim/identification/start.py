@@ -10,10 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.identification.plant import Motors
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import DELAYS, STRONG, WEAK, Regression
-from batchpid.sim.identification.unknowns import LIMITS
+from batchpid.sim.identification.unknowns import KINDS, Motors
 
 GRID = DELAYS[::4]
 """Delays that are tried first [s]."""
@@ -33,20 +32,22 @@ def begin(problem: Problem, regression: Regression, ideal: Motors, seed: int) ->
         return problem.costs(problem.sizes(problem.residuals(points)))
 
     # Each joint has its prior: the strong one where the log hardly shows the strength.
-    kg, priors = regression.best.motors.payload[0, 0], np.array([WEAK, STRONG])
+    kg, priors = regression.best.motors["payload"][0, 0], np.array([WEAK, STRONG])
     grid = costs([regression.at(delay, kg, prior).motors for prior in priors for delay in GRID])
     both = grid.reshape(len(priors), len(GRID), -1)
     late = both.min(0).sum(1).argmin()
     prior = priors[both[:, late].argmin(0)]
 
+    yields = KINDS["stopping"]
+
     def candidate(x: Float64) -> Motors:
         delay, stopping, kg = x * SPREAD
-        stopping = np.clip(np.exp(stopping), *LIMITS["stopping"])
-        return regression.at(delay, kg, prior).motors._replace(stopping=np.array([[stopping]]))
+        stopping = np.clip(np.exp(stopping), yields.low, yields.high)
+        return regression.at(delay, kg, prior).motors | {"stopping": np.array([[stopping]])}
 
     first = regression.at(GRID[late], kg, prior).motors
-    mean = np.array([GRID[late], np.log(first.stopping[0, 0]), kg]) / SPREAD
-    bounds = np.array([[0.0, DELAYS[-1]], np.log(LIMITS["stopping"]), [0.0, np.inf]]) / SPREAD[:, None]
+    mean = np.array([GRID[late], np.log(yields.start), kg]) / SPREAD
+    bounds = np.array([[0.0, DELAYS[-1]], np.log([yields.low, yields.high]), [0.0, np.inf]]) / SPREAD[:, None]
     bounds = bounds if ("payload", None) in unknowns.names else bounds[:2]
     optimizer = CMA(mean[: len(bounds)], 1.0, bounds=bounds, seed=seed, population_size=POPULATION)
     tried = [first, ideal]

@@ -1,41 +1,76 @@
-"""Unknowns of a fit: their names, units, scales, bounds and weak priors, and the motors at a point."""
+"""Unknowns of a fit: a table of their kinds, their names, scales, bounds and weak priors, and the motors at a point."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.identification.plant import Motors
+from batchpid.motors.actuator_fields import FIELDS
+from batchpid.motors.actuators import Actuators
 
-PER_JOINT = ("armature", "damping", "friction", "strength", "bias")
-LIMITS = {
-    "armature": (0.0, np.inf),
-    "damping": (0.0, np.inf),
-    "friction": (0.0, np.inf),
-    "strength": (0.05, 5.0),
-    "bias": (-np.inf, np.inf),
-    "delay": (0.0, 0.09),
-    "stopping": (5e-4, 0.1),
-    "payload": (0.0, np.inf),
+Motors = dict[str, Float64]
+"""Values of n candidates by kind of unknown: (n, joints), or (n, 1) where all joints share it."""
+
+
+class Kind(NamedTuple):
+    """Kind of unknown, in SI units."""
+
+    field: str | None
+    """Field of :class:`batchpid.Actuators`; None: of the plant, :mod:`batchpid.sim.identification.plant`."""
+    per_joint: bool
+    low: float
+    high: float
+    size: str | float
+    """Typical size: a number, or the name of a typical value of each joint, as of :meth:`Unknowns.of`."""
+    spread: float
+    """Standard deviation of the prior, over the typical size."""
+    start: float = 0.0
+    """Mean of the prior, and value at the start of a fit where the regression does not give it."""
+
+    @property
+    def neutral(self) -> float:
+        """Value of ideal motors."""
+        return 0.0 if self.field is None else FIELDS[self.field].neutral
+
+
+KINDS = {
+    "armature": Kind("armature", True, 0.0, np.inf, "inertia", 10.0),
+    "damping": Kind("viscous", True, 0.0, np.inf, "damping", 10.0),
+    "friction": Kind("coulomb", True, 0.0, np.inf, "effort", 10.0),
+    "strength": Kind("strength", True, 0.05, 5.0, 1.0, 0.5, 1.0),
+    "bias": Kind("bias", True, -np.inf, np.inf, "effort", 10.0),
+    "delay": Kind("command_delay", False, 0.0, 0.09, 5e-3, 20.0),
+    "stopping": Kind(None, False, 5e-4, 0.1, 5e-3, 4.0, 5e-3),
+    "payload": Kind(None, False, 0.0, np.inf, 0.2, 50.0),
 }
-"""Bounds of each kind of unknown, SI units."""
-_SPREAD = {
-    "armature": 10.0,
-    "damping": 10.0,
-    "friction": 10.0,
-    "strength": 0.5,
-    "bias": 10.0,
-    "delay": 20,
-    "stopping": 4,
-    "payload": 50,
-}
-_PRIOR = {"strength": 1.0, "stopping": 5e-3}
+"""Kinds of unknowns. A line here is all that an effect of :mod:`batchpid.motors` needs to be identified."""
+DESCRIBED = ("damping", "friction")
+"""Kinds of which the robot's description states a share, under the same name; here they are the whole."""
 _STEP = 2e-3
 """Change of an unknown for a finite difference, in units of its scale."""
 _STRENGTH_STEP = 1e-2
 """Change of a strength, over it."""
+
+
+def take(motors: Motors, rows: NDArray[np.intp]) -> Motors:
+    """Return the candidates ``rows``."""
+    return {kind: values[rows] for kind, values in motors.items()}
+
+
+def actuators_of(motors: Motors, joints: int) -> Actuators:
+    """Return the actuators (n, joints) of candidates, friction and damping of the description included."""
+    fields = {KINDS[kind].field: values for kind, values in motors.items()}
+    spread = {
+        field: np.ascontiguousarray(np.broadcast_to(values, (len(values), joints)))
+        for field, values in fields.items()
+        if field is not None
+    }
+    delays = [spread[field].max(initial=0.0) for field in ("command_delay", "sensor_delay") if field in spread]
+    return Actuators(**spread, max_delay=np.array([[max(delays)]]) if delays else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +79,7 @@ class Unknowns:
 
     joints: int
     names: tuple[tuple[str, int | None], ...]
-    """Kind and joint of each, None for delay and payload."""
+    """Kind and joint of each, None where all joints share it."""
     scale: Float64
     """Typical sizes, powers of 2: points over them are exact, so that a fit resumes bit-identically."""
     inertia: Float64
@@ -57,41 +92,48 @@ class Unknowns:
         Parameters are typical values (joints,): inertia of the links and of the motor, and root mean squares of effort
         and speed.
         """
-        inertia = links + armature
-        sizes = {
-            "armature": inertia,
-            "damping": effort / speed,
-            "friction": effort,
-            "strength": np.ones_like(inertia),
-            "bias": effort,
-        }
-        names: list[tuple[str, int | None]] = [(kind, joint) for kind in PER_JOINT for joint in range(len(inertia))]
-        scale = [*np.concatenate([sizes[kind] for kind in PER_JOINT]), 5e-3, 5e-3]
-        names += [("delay", None), ("stopping", None)]
-        if payload:
-            names.append(("payload", None))
-            scale.append(0.2)
-        return cls(len(inertia), tuple(names), np.exp2(np.round(np.log2(np.array(scale, np.float64)))), links)
+        typical = {"inertia": links + armature, "damping": effort / speed, "effort": effort}
+        names, scale = list[tuple[str, int | None]](), list[float]()
+        for name, kind in KINDS.items():
+            if name == "payload" and not payload:
+                continue
+            numbers = range(len(links)) if kind.per_joint else [None]
+            size = typical[kind.size] if isinstance(kind.size, str) else kind.size
+            names += [(name, number) for number in numbers]
+            scale += np.broadcast_to(size, len(numbers)).tolist()
+        return cls(len(links), tuple(names), np.exp2(np.round(np.log2(np.array(scale)))), links)
+
+    def _each(self, leaf: str) -> Float64:
+        return np.array([getattr(KINDS[kind], leaf) for kind, _ in self.names])
 
     @property
     def low(self) -> Float64:
         """Lower bounds."""
-        return np.array([LIMITS[kind][0] for kind, _ in self.names])
+        return self._each("low")
 
     @property
     def high(self) -> Float64:
         """Upper bounds."""
-        return np.array([LIMITS[kind][1] for kind, _ in self.names])
+        return self._each("high")
 
     @property
     def spread(self) -> Float64:
         """Standard deviations of the prior, which matter only for unknowns that the log does not show."""
-        return np.array([_SPREAD[kind] for kind, _ in self.names]) * self.scale
+        return self._each("spread") * self.scale
 
     @property
     def prior(self) -> Float64:
-        """Means of the prior: ideal motors."""
-        return np.array([_PRIOR.get(kind, 0.0) for kind, _ in self.names])
+        """Means of the prior."""
+        return self._each("start")
+
+    @property
+    def per_joint(self) -> list[str]:
+        """Kinds of unknowns of each joint."""
+        return [kind for kind, joint in self.names if joint == 0]
+
+    def of_kind(self, name: str) -> NDArray[np.intp]:
+        """Return the places of the unknowns of a kind in a point."""
+        return np.flatnonzero([kind == name for kind, _ in self.names])
 
     def changes(self, theta: Float64) -> Float64:
         """Return the changes (changes, unknowns) for finite differences at ``theta``.
@@ -101,11 +143,10 @@ class Unknowns:
         coupling.
         """
         steps = np.maximum(_STEP * np.abs(theta), 0.5 * _STEP * self.scale)
-        table, n = np.diag(steps), self.joints
-        strengths = PER_JOINT.index("strength") * n + np.arange(n)
+        table, strengths = np.diag(steps), self.of_kind("strength")
         table[strengths, strengths] = _STRENGTH_STEP * theta[strengths]
         for kind in ("armature", "damping", "friction", "bias"):
-            own = PER_JOINT.index(kind) * n + np.arange(n)
+            own = self.of_kind(kind)
             table[strengths, own] = _STRENGTH_STEP * (theta[own] + (self.inertia if kind == "armature" else 0.0))
         return table
 
@@ -114,17 +155,14 @@ class Unknowns:
         return np.clip(theta, self.low, self.high)
 
     def point(self, motors: Motors) -> Float64:
-        """Return the point of one candidate."""
-        values = [
-            *np.concatenate([getattr(motors, kind)[0] for kind in PER_JOINT]),
-            motors.delay[0, 0],
-            motors.stopping[0, 0],
-        ]
-        return np.array([*values, motors.payload[0, 0]] if len(self.names) > len(values) else values)
+        """Return the point of one candidate; unknowns that it lacks are those at the start of a fit."""
+        point = self.prior
+        for kind, values in motors.items():
+            own = self.of_kind(kind)
+            point[own] = values[0, : len(own)]
+        return point
 
     def motors(self, points: Float64) -> Motors:
-        """Return the candidates at ``points`` (n, unknowns)."""
-        n, own = self.joints, len(PER_JOINT) * self.joints
-        columns = {kind: points[:, k * n : (k + 1) * n] for k, kind in enumerate(PER_JOINT)}
-        payload = points[:, own + 2 :] if points.shape[1] > own + 2 else np.zeros((len(points), 1))
-        return Motors(**columns, delay=points[:, own : own + 1], stopping=points[:, own + 1 : own + 2], payload=payload)
+        """Return the candidates at ``points`` (n, unknowns), ideal in what is not an unknown."""
+        ideal = {name: np.full((len(points), 1), kind.neutral) for name, kind in KINDS.items()}
+        return ideal | {kind: points[:, self.of_kind(kind)] for kind in dict(self.names)}

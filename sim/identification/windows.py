@@ -12,8 +12,9 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log
-from batchpid.sim.identification.plant import Motors, Plant, Segment
+from batchpid.sim.identification.plant import Plant, Segment
 from batchpid.sim.identification.regression import Motion
+from batchpid.sim.identification.unknowns import Motors, take
 from batchpid.sim.robot.robot import Robot
 
 WINDOW = 0.3
@@ -102,7 +103,7 @@ def simulate(
             qpos, qvel, *given = drawn[draw]
             segments.append(Segment(qpos + shift[0], qvel + shift[1], *given))
     count = len(states)
-    everyone = motors.take(np.tile(np.arange(count), len(windows)))
+    everyone = take(motors, np.tile(np.arange(count), len(windows)))
     out = plant_of(subject).simulate(everyone, segments, windows[0].past)
     found = []
     with np.errstate(invalid="ignore"):

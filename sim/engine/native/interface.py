@@ -10,7 +10,7 @@ import ctypes
 
 from batchpid.native.extensions import ROUNDED, Extension
 from batchpid.native.operations import PROGRAMS
-from batchpid.native.task_space_extension import BUFFER, CALL, COUPLING, LANES, RIGID_BODY, TABLES
+from batchpid.native.task_space_extension import CALL, COUPLING, LANES, RIGID_BODY, TABLES
 
 SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation7getQposEv",
@@ -28,10 +28,6 @@ STAGES = ("program", "force", "inertia", "mass_matrix", "controller", "targets",
 """Kinds of a :class:`Stage`."""
 TRANSFERS = ("read", "write_floats", "write_bytes")
 """Kinds of a :class:`Transfer`."""
-DYNAMICS = ("qpos", "qvel", "payload", "matrix", "force", "payload_force")
-"""Arrays of ``dynamics`` in batch_dynamics.cpp, after the tree."""
-STEP = ("qpos", "qvel", "friction", "matrix", "effort", "added", "limit", "keep", "creep", "low", "high")
-"""Arrays of ``step``, as Leaf in batch_dynamics.cpp."""
 FARTHEST = 1e6
 """Largest position of a joint [rad or m], as in sim_step.h. A robot beyond it has failed: its state is float32."""
 
@@ -186,10 +182,5 @@ EXTENSIONS = {
             *PROGRAMS,
         ),
         (*ROUNDED, "-pthread", "-Wno-psabi"),
-    ),
-    "_batch_dynamics": Extension(
-        "batchpid.sim.engine.native._batch_dynamics",
-        (*_files("batch_dynamics.cpp"), BUFFER, LANES, RIGID_BODY, TABLES),
-        (*ROUNDED, "-Wno-psabi"),
     ),
 }

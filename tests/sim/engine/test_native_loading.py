@@ -15,7 +15,6 @@ from batchpid.native import availability, extensions
 from batchpid.native.operations import PROGRAM
 from batchpid.sim import Runner
 from batchpid.sim.engine import native
-from batchpid.sim.engine.batch_dynamics import NumpyBatchDynamics, batch_dynamics
 from batchpid.sim.engine.native import library
 from batchpid.sim.engine.native.interface import EXTENSIONS
 
@@ -67,7 +66,6 @@ def test_a_stale_extension_is_one_warning_and_python_does_the_work(monkeypatch, 
     assert [reason in str(each.message) for each in caught] == [True]
     assert backend.startswith(f"law in NumPy, Python calls into SAPIEN ({reason}")
     assert_identical(expected, found)
-    assert isinstance(batch_dynamics(panda, (0, 1)), NumpyBatchDynamics)
 
 
 @needs_extension

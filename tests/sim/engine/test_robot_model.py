@@ -10,12 +10,13 @@ from tiny_urdf import random_tree, robot, write
 import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.sim import OperationalSpace, Robot, Runner
-from batchpid.sim.engine.batch_dynamics import batch_dynamics
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.robot_model import passive_force, scene_tree
 from batchpid.sim.engine.sapien.building import build_scene, new_system
 from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.plant import Plant
 from batchpid.task_space import osc_state, tree_dynamics
 
 NAMES = ["panda", "jaco2", 0, 1, 2, 3]
@@ -144,11 +145,12 @@ def uses(engine, panda):
             control = options.get("control")
             runner.step(panda.start if control is None else control.command.neutral)
 
+    drive = Drive(1e-3, None, "none")
     yield "law", lambda: run(compensate="gravity+coriolis")
     yield "friction", lambda: run(params=panda.params(), actuators=bp.make_actuators(panda.dof, coulomb=0.5))
     yield "task space", lambda: run(control=OperationalSpace(panda, "panda_hand", posture=panda.settings.target))
     yield "design", lambda: panda.designed("effort")
-    yield "identification", lambda: batch_dynamics(panda, (0, 1)).at(*np.zeros((2, 1, 2)), np.zeros((1, 1)))
+    yield "identification", lambda: Plant(panda, (0, 1), drive).mass_matrix(np.zeros((1, 2)), np.zeros((1, 1)))
 
 
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])

@@ -22,16 +22,17 @@ from batchpid.sim.identification.fit_search import Progress, search
 from batchpid.sim.identification.log_noise import split
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log, LogWarning, read_logs
-from batchpid.sim.identification.plant import Motors, Plant, Segment
+from batchpid.sim.identification.plant import Plant, Segment
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import smooth
 from batchpid.sim.identification.statistics import EXPLAINED, uncertainty
-from batchpid.sim.identification.unknowns import PER_JOINT, Unknowns
+from batchpid.sim.identification.unknowns import KINDS, Kind, Motors, Unknowns, take
 
 pytest.importorskip("scipy")
 EXAMPLE = Path(__file__).parents[4] / "examples/mujoco_log.py"
 DT = 1 / 1000
 """Time step of the logs of ``runs``: half the sim steps of the default."""
+PER_JOINT = [name for name, kind in KINDS.items() if kind.per_joint]
 ARM = """<robot name="arm2"><link name="base"/>
 <link name="upper"><inertial><origin xyz="0 0 0.2"/><mass value="2"/>
 <inertia ixx="0.03" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.005"/></inertial></link>
@@ -131,11 +132,16 @@ def row(value) -> np.ndarray:
     return np.atleast_2d(np.asarray(value, float))
 
 
+def motors_of(*values) -> Motors:
+    """Return one candidate, from the values of all kinds in the order of the table."""
+    return dict(zip(KINDS, map(row, values), strict=True))
+
+
 def test_the_plant_moves_as_mujoco(arm, mujoco_log):
     truth, params = mujoco_log["plausible"](arm, 3)._replace(noise=0.0), arm.designed("effort")
     table = mujoco_log["simulate"](arm, truth, excite(arm, 1.0, lowest=0.6), params, every=1)
-    per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
-    motors = Motors(*per_joint, row(truth.delay), row(0.0095), row(0.0))
+    per_joint = [getattr(truth, kind) for kind in PER_JOINT]
+    motors = motors_of(*per_joint, truth.delay, 0.0095, 0.0)
     for kind in ("setpoint", "effort"):
         plant = Plant(arm, (0, 1), Drive(1 / 2000, params if kind == "setpoint" else None, "gravity+coriolis"))
         segment = Segment(table["qpos"][0], np.zeros(2), table[kind], np.zeros((len(table[kind]), 2)))
@@ -150,7 +156,7 @@ def test_a_stronger_motor_with_more_inertia_moves_one_joint_alike(arm):
         np.zeros((1, 1)), np.zeros((1, 1))
     )
     unknowns = Unknowns.of(inertia[0, 0], np.array([0.02]), np.ones(1), np.ones(1), payload=False)
-    theta = unknowns.point(Motors(*(row(value) for value in (0.02, 0.1, 0.2, 0.9, 0.05, 0.004, 0.005, 0.0))))
+    theta = unknowns.point(motors_of(0.02, 0.1, 0.2, 0.9, 0.05, 0.004, 0.005, 0.0))
     changes = unknowns.changes(theta)
     assert np.linalg.matrix_rank(changes / unknowns.scale) == len(theta)
     params = bp.make_params(1, kp=40.0, ki=10.0, kd=2.0)
@@ -170,8 +176,8 @@ def test_a_search_leaves_a_delay_that_is_best_nearby_only(arm, runs):
     joints, drive = (0, 1), Drive(DT, None, "gravity+coriolis")
     unknowns = Unknowns.of(*(np.ones(2) for _ in range(4)), payload=False)
     problem = Problem(arm, joints, drive, [efforts], [smooth(efforts, DT)], unknowns)
-    per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
-    theta = unknowns.point(Motors(*per_joint, row(truth.delay + 7e-4), row(0.0095), row(0.0)))
+    per_joint = [getattr(truth, kind) for kind in PER_JOINT]
+    theta = unknowns.point(motors_of(*per_joint, truth.delay + 7e-4, 0.0095, 0.0))
     begin, delay = State(Step.first(theta, 20)), unknowns.names.index(("delay", None))
     same, found = search([problem], begin, 20, History(None, {}), Progress(1, 20, None))
     assert same is problem
@@ -182,8 +188,8 @@ def test_a_search_leaves_a_delay_that_is_best_nearby_only(arm, runs):
 def test_a_slow_control_is_simulated_in_smaller_steps(arm, mujoco_log):
     truth, params = mujoco_log["plausible"](arm, 1), arm.designed("effort")
     motion = excite(arm, 1.0, rate=2000.0, lowest=1.0).position
-    per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
-    motors = Motors(*per_joint, row(truth.delay), row(0.005), row(0.0))
+    per_joint = [getattr(truth, kind) for kind in PER_JOINT]
+    motors = motors_of(*per_joint, truth.delay, 0.005, 0.0)
     drive = Drive(1 / 2000, params, "gravity+coriolis", substeps=4)
     segment = Segment(motion[0], np.zeros(2), motion, np.zeros_like(motion))
     qpos = Plant(arm, (0, 1), drive).simulate(motors, [segment], 0)[0, :-1:4]
@@ -200,13 +206,14 @@ def test_rows_of_a_simulation_do_not_depend_on_their_company(arm):
     plant = Plant(arm, (0, 1), Drive(1 / 2000, arm.designed("effort"), "gravity"))
     rng = np.random.default_rng(0)
     leaves = [rng.uniform(0.1, 1.0, (3, 2)) for _ in PER_JOINT]
-    motors = Motors(*leaves, *(rng.uniform(0.002, 0.01, (3, 1)) for _ in range(2)), np.array([[0.0], [0.3], [0.3]]))
+    leaves += [*rng.uniform(0.002, 0.01, (2, 3, 1)), np.array([[0.0], [0.3], [0.3]])]
+    motors = dict(zip(KINDS, leaves, strict=True))
     segments = [
         Segment(q, np.zeros(2), np.tile(q + 0.2, (50, 1)), np.zeros((50, 2))) for q in rng.uniform(-1, 1, (3, 2))
     ]
     together = plant.simulate(motors, segments, 0)
     for k in range(3):
-        assert np.array_equal(plant.simulate(motors.take([k]), [segments[k]], 0)[0], together[k])
+        assert np.array_equal(plant.simulate(take(motors, [k]), [segments[k]], 0)[0], together[k])
 
 
 @pytest.mark.parametrize("kind", [pytest.param("setpoint", marks=pytest.mark.slow), "effort"])
@@ -243,6 +250,27 @@ def test_known_motors_are_found(arm, runs, kind):
     assert actuators.coulomb[0, 0] == pytest.approx(document["joints"]["shoulder"]["friction"][0])
     if by_law:
         assert error_of_the_export(found, setpoints, arm.designed("effort"), DT) < 2 * after
+
+
+@pytest.mark.usefixtures("short_search")
+def test_an_effect_of_the_motors_is_identified_by_a_line_in_the_table(arm, monkeypatch, tmp_path):
+    """Here the lag: from a log of the Runner, and in the file that is saved."""
+    monkeypatch.setitem(KINDS, "lag", Kind("lag", True, 1e-3, 0.1, 5e-3, 20.0, 5e-3))
+    truth, params = [0.006, 0.012], arm.designed("effort").replace(setpoint_weight=1.0)
+    plain = {"armature": [0.1, 0.03], "viscous": [0.5, 0.2], "command_delay": 0.003}
+    motion = excite(arm, 1.6, rate=1000.0, lowest=0.6).position
+    options = {"params": params, "compensate": "none", "timestep": DT, "workers": 0}
+    with Runner(arm, 1, substeps=1, **options, actuators=bp.make_actuators(2, **plain, lag=truth)) as runner:
+        begin = runner.reset(motion[:1]).qpos
+        qpos = np.concatenate([begin, runner.rollout(motion[:, None]).qpos[:, 0]])[:-1]
+    time = DT * np.arange(len(qpos))
+    log = Log("log", (0, 1), "setpoint", time, qpos, time, motion, False)
+    found = identify(arm, log, **options, payload=False, evaluations=12)
+    for joint, wanted in enumerate(truth):
+        assert found.interval("lag", joint)[0] == pytest.approx(wanted, rel=0.1)
+    found.save(tmp_path / "motors.yaml")
+    saved = bp.load_actuators(tmp_path / "motors.yaml", arm.joint_names)[0]
+    np.testing.assert_allclose(saved.lag[0], truth, rtol=0.1)
 
 
 def test_a_joint_that_did_not_move_is_left_out_by_name(mujoco_log, tmp_path):
@@ -354,8 +382,8 @@ def test_joints_that_noise_alone_shakes_tell_nothing(arm, runs):
     unknowns = Unknowns.of(*(np.ones(2) for _ in range(4)), payload=False)
     drive, motion = Drive(DT, None, "gravity+coriolis"), smooth(efforts, DT)
     problem = Problem(arm, (0, 1), drive, [efforts], [motion], unknowns)
-    per_joint = [row(getattr(truth, kind)) for kind in PER_JOINT]
-    theta = unknowns.point(Motors(*per_joint, row(truth.delay), row(0.0095), row(0.0)))
+    per_joint = [getattr(truth, kind) for kind in PER_JOINT]
+    theta = unknowns.point(motors_of(*per_joint, truth.delay, 0.0095, 0.0))
     found = fit(problem, Step.first(theta, 10))
     of_elbow = np.array([joint == 1 for _, joint in unknowns.names])
     known = uncertainty(problem, found).identified

@@ -3,9 +3,9 @@ import pytest
 
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log
-from batchpid.sim.identification.plant import Motors, Plant, Segment
+from batchpid.sim.identification.plant import Plant, Segment
 from batchpid.sim.identification.regression import STRONG, Regression, smooth
-from batchpid.sim.identification.unknowns import PER_JOINT
+from batchpid.sim.identification.unknowns import KINDS, Motors
 
 pytest.importorskip("scipy")
 DT = 1 / 2000
@@ -17,8 +17,7 @@ def log_of(qpos: np.ndarray, command: np.ndarray, every: int) -> Log:
 
 
 def motors_of(**values: list[float]) -> Motors:
-    joints = [np.array([values[kind]]) for kind in PER_JOINT]
-    return Motors(*joints, *(np.array([[values[kind]]]) for kind in ("delay", "stopping", "payload")))
+    return {kind: np.atleast_2d(values[kind]) for kind in KINDS}
 
 
 @pytest.mark.slow
@@ -39,4 +38,4 @@ def test_joints_that_stick_half_of_the_time_are_found(panda):
     assert (np.abs(motion.qvel) < 1e-3).mean() > 0.2
     found = Regression(plant, [log], [motion], False).at(0.002, 0.0, STRONG).motors
     for kind in ("armature", "friction", "strength"):
-        np.testing.assert_allclose(getattr(found, kind), getattr(sticky, kind), rtol=0.2, err_msg=kind)
+        np.testing.assert_allclose(found[kind], sticky[kind], rtol=0.2, err_msg=kind)

@@ -15,8 +15,9 @@ import batchpid as bp
 from batchpid.sim import Robot
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log
-from batchpid.sim.identification.plant import Motors, Segment
+from batchpid.sim.identification.plant import Segment
 from batchpid.sim.identification.regression import smooth
+from batchpid.sim.identification.unknowns import Unknowns
 from batchpid.sim.identification.windows import Subject, plant_of, whole
 
 GAINS = st.lists(st.integers(0, 3).map(float), min_size=2, max_size=2)
@@ -61,8 +62,8 @@ def test_permuted_gains_do_not_share_a_plant(arm, gains):
 
 
 def positions(plant) -> np.ndarray:
-    ones, zeros = np.ones((1, 2)), np.zeros((1, 2))
-    motors = Motors(zeros, zeros, zeros, ones, zeros, *(np.zeros((1, 1)) for _ in range(3)))
+    ones, zeros = np.ones(2), np.zeros((1, 2))
+    motors = Unknowns.of(ones, ones, ones, ones, payload=True).motors(np.array([[*zeros[0]] * 3 + [1, 1] + [0] * 5]))
     command = np.full((20, 2), 0.1)
     return plant.simulate(motors, [Segment(zeros[0], zeros[0], command, np.zeros_like(command))], 0)
 
