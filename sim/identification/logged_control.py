@@ -18,21 +18,12 @@ from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
-from batchpid.native.symbols import Stack, Symbol
-from batchpid.native.tracing import Trace, trace
-from batchpid.native.trees import filled, leaves, mapped, structure
+from batchpid.native.tracing import Trace, trace_trees
+from batchpid.native.trees import leaves, mapped, structure
 from batchpid.sim.loop.arrays import Command
-from batchpid.sim.loop.control_step import (
-    Constants,
-    Layout,
-    Measured,
-    Model,
-    Step,
-    StepState,
-    control_step,
-    mass_matrix,
-)
+from batchpid.sim.loop.control_step import control_step, mass_matrix
 from batchpid.sim.loop.pid_law import PIDLaw, half_way
+from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Step, StepState
 
 
 @dataclass(frozen=True)
@@ -158,7 +149,7 @@ class Control:
         """Return the program, the arrays of its state, of its results, and of the efforts; None for NumPy."""
         if obstacle():
             return None
-        constants = mapped(_stacked, self._constants)
+        constants = mapped(lambda array: tuple(array) if array.ndim == 3 else array, self._constants)
         try:
             traced = _trace(self._layout, *map(structure, (constants, self._state, inputs)))
         except (TypeError, AttributeError, AssertionError):  # it has tables
@@ -176,7 +167,7 @@ def _step(layout: Layout, constants: Constants, state: StepState, inputs: tuple[
         law=PIDLaw.advance if due is None else partial(_where_due, due),
         noise=None if noise is None else lambda *_: (noise, None),
     )
-    measured, step = Measured(qpos, qvel, passive), Step(0, 1, observed=False)
+    measured, step = Measured(qpos, qvel, passive), Step(0, 1)
     new, outputs = control_step(layout._replace(model=model), constants, state, Command(command), measured, step)
     return new, outputs.qf
 
@@ -194,21 +185,14 @@ def _where_due(due: Any, law: PIDLaw, k: Any, state: Any, *inputs: Any, **option
 
 @lru_cache(maxsize=64)
 def _trace(layout: Layout, *structures: Any) -> Trace:
-    def function(*symbols: Symbol) -> list[Any]:
-        given = iter(symbols)
-        new, effort = _step(layout, *(filled(each, given) for each in structures))
+    def function(*parts: Any) -> list[Any]:
+        new, effort = _step(layout, *parts)
         return [*leaves(_returned(new)), effort]
 
-    first = len(leaves(structures[0]))
-    return trace(function, first, sum(len(leaves(each)) for each in structures[1:]))
+    return trace_trees(function, *structures)
 
 
 def _returned(state: StepState) -> StepState:
     """Return what a program returns of a state: without the matrix, and histories, which it changes in place."""
     motors = None if state.motors is None else state.motors._replace(command=None, sensor=None)
     return state._replace(matrix=None, motors=motors)
-
-
-def _stacked(array: Any) -> Any:
-    """Return an array (n, envs, joints) as a stack of n arrays, and other arrays unchanged."""
-    return Stack(array) if array.ndim == 3 else array
