@@ -418,7 +418,7 @@ def test_without_rates_a_trajectory_has_no_accelerations_either(batchpid, tmp_pa
 def test_a_run_that_resumes_ends_with_the_file_of_one_that_was_not_stopped(flags, batchpid, tmp_path, monkeypatch):
     whole, parts = tmp_path / "whole.h5", tmp_path / "parts.h5"
     words = ("rollout", *SHORT, "--engine", "mujoco", *flags)
-    assert batchpid(*words, "--out", whole)[0] == 0
+    assert batchpid(*words, "--out", whole)[0] == 3, "too short to settle"
     with monkeypatch.context() as patch:  # the second part fails
         made = iter([Runner])
         patch.setattr("batchpid.sim.tuning.sweep.Runner", lambda *words, **options: next(made)(*words, **options))
@@ -427,7 +427,7 @@ def test_a_run_that_resumes_ends_with_the_file_of_one_that_was_not_stopped(flags
             main([*map(str, words), "--out", str(parts), "--resume"])
     assert [path.name for path in (tmp_path / "parts.h5.parts").iterdir()] == ["0.h5"]
     status, said, err = batchpid(*words, "--out", parts, "--resume")
-    assert status == 0, err
+    assert status == 3, err
     assert f"written: {parts}" in said
     one, other = map(read_recording, (whole, parts))
     for name, rows in one.arrays().items():
