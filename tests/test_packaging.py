@@ -205,3 +205,15 @@ with Runner(Robot.load("panda"), num_envs=2, workers=1) as runner:
 assert sim.joints() == 3
 """
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(site)}, check=True)
+
+
+def test_a_step_of_the_installation_is_one_line_and_shows_its_output_if_it_fails():
+    def run(script):
+        words = [sys.executable, ROOT / ".ci/step.py", "installing", "sh", "-c", script]
+        return subprocess.run(words, capture_output=True, text=True)
+
+    done = run("echo Collecting a; echo building b")
+    assert re.fullmatch(r"installing \.\.\.\ninstalling: \d+ s\n", done.stdout)
+    assert (done.returncode, done.stderr) == (0, "")
+    failed = run("echo Collecting a; echo no space left >&2; exit 3")
+    assert (failed.returncode, failed.stderr) == (3, "\nCollecting a\nno space left\n")
