@@ -60,6 +60,8 @@ def excite(
 ) -> Trajectory:
     """Return setpoints (ticks, dof) that move every joint, from rest to rest at their first row.
 
+    A joint whose effort limit does not overcome its friction and gravity in nearly any pose stays still.
+
     Parameters
     ----------
     duration
@@ -85,10 +87,12 @@ def excite(
     phase = rng.uniform(0, 2 * np.pi, robot.dof)
     best: tuple[float, Trajectory] | None = None
     obstacles = Counter[str]()
-    for count, center in enumerate(_centers(robot, rng)):
+    easy, movable = easy_pose(robot, robot.dynamics(), robot.sample(200, seed=0))
+    movable = movable if movable.any() else ~movable
+    for count, center in enumerate(_centers(robot, easy, rng)):
         if best is not None and count > 3:
             break
-        share = np.ones(robot.dof)
+        share = 1.0 * movable
         for _ in range(_ROUNDS):
             motion = _chirp(robot, center, share, time, lowest, highest, phase)
             obstacle = _obstacle(robot, motion)
@@ -97,7 +101,7 @@ def excite(
                     best = float(share.mean()), motion
                 break
             share[robot.coupling.leader[list(obstacle.joints)]] *= _SHRINK
-            if not obstacle.joints or share.min() < _LEAST:
+            if not obstacle.joints or share[movable].min() < _LEAST:
                 obstacles[obstacle.text] += 1
                 break
         if best is not None and best[0] >= _ENOUGH:
@@ -111,7 +115,10 @@ def excite(
 
 
 def is_feasible(robot: Robot, motion: Trajectory) -> bool:
-    """Return whether a motion keeps within the limits of position, velocity and effort, and free of contact."""
+    """Return whether a motion keeps within the limits of position, velocity and effort, and free of contact.
+
+    Joints that stay still throughout may need more effort than their limit.
+    """
     return _obstacle(robot, motion) is None
 
 
@@ -133,11 +140,12 @@ def _obstacle(robot: Robot, motion: Trajectory) -> _Obstacle | None:
     position, velocity = motion.position[rows], motion.velocity[rows]
     effort = motion_effort(robot, position, velocity, motion.acceleration[rows])
     effort += robot.damping * velocity + robot.friction * np.sign(velocity)
-    excess = np.abs(effort) - robot.design_effort_limit
+    moves = np.ptp(motion.position, axis=0) > 0
+    excess = np.where(moves, np.abs(effort) - robot.design_effort_limit, 0.0)
     if (excess > 0).any():
         joint, limit = int(excess.max(0).argmax()), robot.design_effort_limit
         needed = robot.holding_efforts(position[:1])[0]
-        weak = np.flatnonzero(np.abs(needed) + robot.friction > limit)
+        weak = np.flatnonzero(moves & (np.abs(needed) + robot.friction > limit))
         if weak.size:
             joint = int(weak[0])
             load = f"gravity and friction take {abs(needed[joint]) + robot.friction[joint]:.3g} of {limit[joint]:.3g}"
@@ -193,8 +201,8 @@ def _between(robot: Robot, pair: tuple[str, str]) -> set[int]:
     return chains[0] ^ chains[1] or chains[0] | chains[1]
 
 
-def _centers(robot: Robot, rng: np.random.Generator) -> Iterator[Float64]:
-    """Yield candidates for the center: the start pose, one with room, moved away from joint limits, and random ones."""
+def _centers(robot: Robot, easy: Float64, rng: np.random.Generator) -> Iterator[Float64]:
+    """Yield candidates for the center, away from joint limits: the start pose, the ``easy`` one, and random ones."""
     low, high = np.maximum(robot.lower, robot.start - np.pi), np.minimum(robot.upper, robot.start + np.pi)
     edge = np.minimum(0.4 * (high - low), [REACH[unit] for unit in robot.units])
 
@@ -203,7 +211,6 @@ def _centers(robot: Robot, rng: np.random.Generator) -> Iterator[Float64]:
 
     yield inside(robot.start)
     yield inside(robot.start, 0.2)
-    easy, _ = easy_pose(robot, robot.dynamics(), robot.sample(200, seed=0))
     yield inside(easy, 0.2)
     yield inside(easy)
     yield from map(inside, robot.sample(_DRAWS, seed=int(rng.integers(2**31))))

@@ -60,12 +60,12 @@ BAR = """<inertial><origin xyz="0.15 0 0"/><mass value="1"/>
 <collision><origin xyz="0.15 0 0"/><geometry><box size="0.24 0.05 0.05"/></geometry></collision>"""
 
 
-def arm(folder, height=0.15, effort=60.0, wall=None):
+def arm(folder, height=0.15, effort=60.0, bend=60.0, wall=None):
     """Return an arm of two bars that turn about y above the ground; a wall in front of it is fixed to its base."""
     lift = (
         f'<origin xyz="0 0 {height}"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="{effort}" velocity="9"/>'
     )
-    place = '<origin xyz="0.3 0 0"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="60" velocity="9"/>'
+    place = f'<origin xyz="0.3 0 0"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="{bend}" velocity="9"/>'
     parts = [
         '<link name="base"/>',
         f'<link name="upper">{BAR}</link><link name="lower">{BAR}</link>',
@@ -100,4 +100,10 @@ def test_links_that_touch_near_every_pose_are_named(tmp_path):
 
 def test_a_joint_that_is_too_weak_is_named_with_its_load(tmp_path):
     with pytest.raises(bp.InvalidArgumentError, match=r"joint 'lift' is too weak"):
-        excite(arm(tmp_path, height=1.0, effort=0.01), 2.0, rate=50)
+        excite(arm(tmp_path, height=1.0, effort=0.01, bend=0.01), 2.0, rate=50)
+
+
+def test_a_joint_that_is_always_too_weak_stays_still(tmp_path):
+    motion = excite(arm(tmp_path, height=1.0, bend=0.01), 2.0, rate=50)
+    assert np.ptp(motion.position[:, 0]) > 0.1
+    assert np.ptp(motion.position[:, 1]) == 0
