@@ -92,7 +92,7 @@ def excite(
     for count, center in enumerate(_centers(robot, easy, rng)):
         if best is not None and count > 3:
             break
-        share = 1.0 * movable
+        share = movable.astype(np.float64)
         for _ in range(_ROUNDS):
             motion = _chirp(robot, center, share, time, lowest, highest, phase)
             obstacle = _obstacle(robot, motion)
