@@ -8,6 +8,8 @@ from typing import Annotated
 
 import tyro
 
+import numpy as np
+
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import Outputs
@@ -65,6 +67,10 @@ class ExciteCommand:
             )
         ]
         print(table(rows, ["joint", "moves from ... to", "fastest"], "lrr"))
+        if still := [
+            name for name, span in zip(robot.joint_names, np.ptp(motion.position, axis=0), strict=True) if not span
+        ]:
+            print(f"\nToo weak for their friction and gravity, so they stay still: {', '.join(still)}.")
         print(
             f"\nwritten: {out}: {motion.ticks} rows of {motion.time[0]:g} s; the robot starts at rest at the first row"
         )

@@ -10,9 +10,16 @@ so that it is limited by the joint's range at low frequencies, by velocity and b
 to 1 and back as a cosine, shifted by the joint's share of the time, so that all joints move differently. The window w
 rises from 0 and falls back within a tenth of the time: the motion begins and ends at rest at c. Low frequencies show
 friction, gravity and strength, high ones inertia and delay.
+
+Where two links would come too near each other, the joints that bring them together get smaller amplitudes, and so does
+a joint beyond its limits, until the motion is free: about the start pose, or about another one with more room.
 """
 
 from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +27,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.tuning.moves import motion_effort
+from batchpid.sim.tuning.moves import easy_pose, motion_effort
 from batchpid.trajectories import Trajectory
 
 REACH = {"rad": 0.8, "m": 0.1}
@@ -30,10 +37,13 @@ VELOCITY_SHARE, EFFORT_SHARE = 0.6, 0.7
 FREE_VELOCITY = {"rad": 2.0, "m": 0.3}
 """Velocity limit of joints without one, per second."""
 CLEARANCE = 0.01
-"""Least distance from contact [m]."""
+"""Least distance from contact [m]; half of the distance at the center for links that are nearer there."""
 _EDGE = 0.1
-_DRAWS = 60
-_SHARES = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)
+_DRAWS = 20
+_ROUNDS, _SHRINK, _LEAST = 60, 0.7, 0.04
+"""Number of motions about a center, factor of an amplitude from one to the next, and its least share."""
+_ENOUGH = 0.5  # mean share of the amplitudes with which no other center is tried
+_COARSE = 40  # poses that are tested first
 _CHECKS = 400  # poses of a motion that are tested for contact
 _WINDOW = 0.1
 _SHARPNESS = 4
@@ -50,6 +60,8 @@ def excite(
 ) -> Trajectory:
     """Return setpoints (ticks, dof) that move every joint, from rest to rest at their first row.
 
+    A joint whose effort limit does not overcome its friction and gravity in nearly any pose stays still.
+
     Parameters
     ----------
     duration
@@ -64,7 +76,8 @@ def excite(
     Raises
     ------
     InvalidArgumentError
-        An argument is out of range, or the robot touches itself, or is too weak, near every pose.
+        An argument is out of range, or near every pose the robot touches itself or is too weak: the message names the
+        links or the joint.
     """
     duration, rate = number("duration", duration, 1.0, 3600.0, "s"), number("rate", rate, 20.0, 10_000.0, "Hz")
     lowest = number("lowest", lowest, 0.01, 50.0, "Hz")
@@ -73,50 +86,140 @@ def excite(
     time = np.arange(1, round(duration * rate) + 1) / rate
     phase = rng.uniform(0, 2 * np.pi, robot.dof)
     best: tuple[float, Trajectory] | None = None
-    for center in _centers(robot, rng):
-        for share in _SHARES:
-            if best is not None and share <= best[0]:
-                break
+    obstacles = Counter[str]()
+    easy, movable = easy_pose(robot, robot.dynamics(), robot.sample(200, seed=0))
+    movable = movable if movable.any() else ~movable
+    for count, center in enumerate(_centers(robot, easy, rng)):
+        if best is not None and count > 3:
+            break
+        share = movable.astype(np.float64)
+        for _ in range(_ROUNDS):
             motion = _chirp(robot, center, share, time, lowest, highest, phase)
-            if is_feasible(robot, motion):
-                best = share, motion
+            obstacle = _obstacle(robot, motion)
+            if obstacle is None:
+                if best is None or share.mean() > best[0]:
+                    best = float(share.mean()), motion
                 break
-        if best is not None and best[0] >= 0.5:
+            share[robot.coupling.leader[list(obstacle.joints)]] *= _SHRINK
+            if not obstacle.joints or share[movable].min() < _LEAST:
+                obstacles[obstacle.text] += 1
+                break
+        if best is not None and best[0] >= _ENOUGH:
             break
     if best is None:
-        problem = f"{robot.name!r} touches itself or the ground, or is too weak, near every pose that was tried"
-        remedy = "correct what batchpid inspect lists as touching or weak"
+        ((text, _),) = obstacles.most_common(1)
+        problem = f"{robot.name!r} has no free motion about any pose that was tried: {text}"
+        remedy = "disable pairs of links that only seem to touch in an .srdf, or correct the effort limit or the masses"
         raise InvalidArgumentError("robot", problem, remedy=remedy)
     return best[1]
 
 
 def is_feasible(robot: Robot, motion: Trajectory) -> bool:
-    """Return whether a motion keeps within the limits of position, velocity and effort, and free of contact."""
-    inside = (motion.position >= robot.lower - 1e-9) & (motion.position <= robot.upper + 1e-9)
-    slow = np.abs(motion.velocity) <= robot.velocity_limit
-    if not (inside.all() and slow.all()):
-        return False
+    """Return whether a motion keeps within the limits of position, velocity and effort, and free of contact.
+
+    Joints that stay still throughout may need more effort than their limit.
+    """
+    return _obstacle(robot, motion) is None
+
+
+class _Obstacle(NamedTuple):
+    """Reason for which a motion is not possible, and the joints that have to move less; none if that does not help."""
+
+    text: str
+    joints: tuple[int, ...] = ()
+
+
+def _obstacle(robot: Robot, motion: Trajectory) -> _Obstacle | None:
+    """Return the first obstacle of a motion about its first row; None if it is feasible."""
+    outside = (motion.position < robot.lower - 1e-9) | (motion.position > robot.upper + 1e-9)
+    outside |= np.abs(motion.velocity) > robot.velocity_limit
+    if outside.any():
+        joints = np.flatnonzero(outside.any(0)).tolist()
+        return _Obstacle(f"joint {robot.joint_names[joints[0]]!r} exceeds its limits", tuple(joints))
     rows = np.unique(np.linspace(0, motion.ticks - 1, _CHECKS).astype(int))
     position, velocity = motion.position[rows], motion.velocity[rows]
     effort = motion_effort(robot, position, velocity, motion.acceleration[rows])
     effort += robot.damping * velocity + robot.friction * np.sign(velocity)
-    if (np.abs(effort) > robot.design_effort_limit).any():
-        return False
-    return not robot.dynamics().in_contact(position, CLEARANCE).any()
+    moves = np.ptp(motion.position, axis=0) > 0
+    excess = np.where(moves, np.abs(effort) - robot.design_effort_limit, 0.0)
+    if (excess > 0).any():
+        joint, limit = int(excess.max(0).argmax()), robot.design_effort_limit
+        needed = robot.holding_efforts(position[:1])[0]
+        weak = np.flatnonzero(moves & (np.abs(needed) + robot.friction > limit))
+        if weak.size:
+            joint = int(weak[0])
+            load = f"gravity and friction take {abs(needed[joint]) + robot.friction[joint]:.3g} of {limit[joint]:.3g}"
+            return _Obstacle(
+                f"joint {robot.joint_names[joint]!r} is too weak: {load} {robot.joints[joint].effort_unit}"
+            )
+        text = f"joint {robot.joint_names[joint]!r} is too weak to move"
+        return _Obstacle(text, tuple(np.flatnonzero((excess > 0).any(0)).tolist()))
+    return _contact(robot, position)
 
 
-def _centers(robot: Robot, rng: np.random.Generator) -> list[Float64]:
-    """Return candidates for the center: the start pose, moved away from joint limits, and random poses."""
+def _contact(robot: Robot, position: Float64) -> _Obstacle | None:
+    """Return the first pair of links that come too near each other at poses (n, dof), compared with the first one."""
+    dynamics = robot.dynamics()
+
+    def apart(qpos: Float64, within: float = CLEARANCE) -> dict[tuple[str, str], float]:
+        found: dict[tuple[str, str], float] = {}
+        for first, second, distance in dynamics.near(qpos, within):
+            found[first, second] = min(distance, found.get((first, second), np.inf))
+        return found
+
+    center = position[0]
+    allowed = {pair: max(0.0, 0.5 * distance) for pair, distance in apart(center).items()}
+    first = np.linspace(0, len(position) - 1, _COARSE).astype(int)
+    for row in (*first, *range(len(position))):
+        qpos = position[row]
+        for pair, distance in apart(qpos).items():
+            if distance >= allowed.get(pair, CLEARANCE):
+                continue
+            names = " and ".join(repr(name) for name in pair if name) + (" and the ground" if not pair[1] else "")
+            text, gains = f"{names} touch", {}
+            for joint in sorted(_between(robot, pair)):
+                back = qpos.copy()
+                back[joint] = center[joint]
+                gains[joint] = apart(robot.coupled(back), 2 * CLEARANCE).get(pair, 2 * CLEARANCE) - distance
+            if row == 0 or not gains or max(gains.values()) <= 0:
+                return _Obstacle(text, () if row == 0 else tuple(gains))
+            return _Obstacle(text, tuple(joint for joint, gain in gains.items() if gain > 0.3 * max(gains.values())))
+    return None
+
+
+def _between(robot: Robot, pair: tuple[str, str]) -> set[int]:
+    """Return the joints, or the leaders of followers, that move two links relative to each other or the ground."""
+    above = {joint.child_link: joint for joint in robot.all_joints}
+    chains = []
+    for link in pair:
+        chain = set()
+        while link in above:
+            if above[link].moves:
+                chain.add(int(robot.coupling.leader[robot.joint_names.index(above[link].name)]))
+            link = above[link].parent_link
+        chains.append(chain)
+    return chains[0] ^ chains[1] or chains[0] | chains[1]
+
+
+def _centers(robot: Robot, easy: Float64, rng: np.random.Generator) -> Iterator[Float64]:
+    """Yield candidates for the center, away from joint limits: the start pose, the ``easy`` one, and random ones."""
     low, high = np.maximum(robot.lower, robot.start - np.pi), np.minimum(robot.upper, robot.start + np.pi)
     edge = np.minimum(0.4 * (high - low), [REACH[unit] for unit in robot.units])
-    poses = [robot.start, *robot.sample(_DRAWS, seed=int(rng.integers(2**31)))]
-    return [robot.coupled(np.clip(pose, low + edge, high - edge)) for pose in poses]
+
+    def inside(pose: Float64, share: float = 1.0) -> Float64:
+        return robot.coupled(np.clip(pose, low + share * edge, high - share * edge))
+
+    yield inside(robot.start)
+    yield inside(robot.start, 0.2)
+    yield inside(easy, 0.2)
+    yield inside(easy)
+    yield from map(inside, robot.sample(_DRAWS, seed=int(rng.integers(2**31))))
 
 
 def _chirp(
-    robot: Robot, center: Float64, share: float, time: Float64, lowest: float, highest: float, phase: Float64
+    robot: Robot, center: Float64, share: Float64, time: Float64, lowest: float, highest: float, phase: Float64
 ) -> Trajectory:
-    """Return the chirp about ``center`` with amplitudes of ``share`` of the possible ones."""
+    """Return the chirp about ``center`` with amplitudes of ``share`` (dof,) of the possible ones."""
     dt, total, dof = float(time[0]), float(time[-1]), robot.dof
     room = np.minimum(robot.upper - center, center - robot.lower) * (1 - _EDGE)
     reach = np.minimum(room, [REACH[unit] for unit in robot.units])

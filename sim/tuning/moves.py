@@ -124,7 +124,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
     reach = np.ptp(poses, axis=0)
     low, high = robot.lower + _EDGE * reach, robot.upper - _EDGE * reach
     line = np.linspace(0, 1 + MAX_OVERSHOOT, _LINE)[:, None]
-    center, movable = _center(robot, dynamics, poses[:200])
+    center, movable = easy_pose(robot, dynamics, poses[:200])
     clearance = 0.0 if dynamics.in_contact(center[None], _CLEARANCE)[0] else _CLEARANCE
     share, in_vain = 1.0, 0
 
@@ -156,7 +156,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
     return draw_moves(robot, count, draw)
 
 
-def _center(robot: Robot, dynamics: Dynamics, poses: Float64) -> tuple[Float64, NDArray[np.bool_]]:
+def easy_pose(robot: Robot, dynamics: Dynamics, poses: Float64) -> tuple[Float64, NDArray[np.bool_]]:
     """Return the pose about which moves lie if they are hard to find, and the joints that can move (dof,).
 
     It is the start pose if its links are well apart and the effort limits hold it easily. Otherwise a better pose is

@@ -53,3 +53,57 @@ def test_a_log_may_keep_the_rates_of_the_setpoints(panda, tmp_path):
 def test_options_out_of_range_are_refused(panda, name, value):
     with pytest.raises(bp.InvalidArgumentError, match=name):
         excite(panda, **{name: value})
+
+
+BAR = """<inertial><origin xyz="0.15 0 0"/><mass value="1"/>
+<inertia ixx="0.001" iyy="0.008" izz="0.008" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin xyz="0.15 0 0"/><geometry><box size="0.24 0.05 0.05"/></geometry></collision>"""
+
+
+def arm(folder, height=0.15, effort=60.0, bend=60.0, wall=None):
+    """Return an arm of two bars that turn about y above the ground; a wall in front of it is fixed to its base."""
+    lift = (
+        f'<origin xyz="0 0 {height}"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="{effort}" velocity="9"/>'
+    )
+    place = f'<origin xyz="0.3 0 0"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="{bend}" velocity="9"/>'
+    parts = [
+        '<link name="base"/>',
+        f'<link name="upper">{BAR}</link><link name="lower">{BAR}</link>',
+        f'<joint name="lift" type="revolute"><parent link="base"/><child link="upper"/>{lift}</joint>',
+        f'<joint name="bend" type="revolute"><parent link="upper"/><child link="lower"/>{place}</joint>',
+    ]
+    if wall is not None:
+        shape = '<collision><geometry><box size="0.1 1 4"/></geometry></collision>'
+        parts.append(
+            f'<link name="wall">{shape}</link><joint name="hold" type="fixed"><parent link="base"/>'
+            f'<child link="wall"/><origin xyz="{wall} 0 0"/></joint>'
+        )
+    path = folder / "arm.urdf"
+    path.write_text(f'<robot name="arm">{"".join(parts)}</robot>')
+    return bp.sim.Robot.load(path, self_collision="urdf")
+
+
+def test_joints_that_would_touch_the_ground_move_less(tmp_path):
+    """The arm is level and 0.15 m above the ground: 0.25 rad of both joints touch it."""
+    robot = arm(tmp_path)
+    motion = excite(robot, 4.0, rate=100)
+    assert is_feasible(robot, motion)
+    assert (np.ptp(motion.position, axis=0) > 0.06).all()
+    assert not robot.dynamics().in_contact(motion.position, 0.009).any()
+
+
+def test_links_that_touch_near_every_pose_are_named(tmp_path):
+    """The wall is in the middle of the upper bar, whatever the joints do but at their ends."""
+    with pytest.raises(bp.InvalidArgumentError, match=r"'upper' and 'wall' touch|'wall' and 'upper' touch"):
+        excite(arm(tmp_path, height=1.0, wall=0.03), 2.0, rate=50)
+
+
+def test_a_joint_that_is_too_weak_is_named_with_its_load(tmp_path):
+    with pytest.raises(bp.InvalidArgumentError, match=r"joint 'lift' is too weak"):
+        excite(arm(tmp_path, height=1.0, effort=0.01, bend=0.01), 2.0, rate=50)
+
+
+def test_a_joint_that_is_always_too_weak_stays_still(tmp_path):
+    motion = excite(arm(tmp_path, height=1.0, bend=0.01), 2.0, rate=50)
+    assert np.ptp(motion.position[:, 0]) > 0.1
+    assert np.ptp(motion.position[:, 1]) == 0
