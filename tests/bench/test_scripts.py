@@ -62,9 +62,9 @@ def test_film(tmp_path):
 
 
 def test_newcomer(tmp_path, capfd):
-    """In place of the README's commands, which take minutes: one that succeeds, one that fails, one without an end."""
+    """In place of the pages' commands, which take minutes: one that succeeds, one that fails, one without an end."""
     newcomer = load_script("newcomer")
-    readme = newcomer.commands((ROOT / "README.md").read_text())
+    readme = newcomer.commands(ROOT)
     assert readme[0] == "make demo"
     assert {line.split()[1] for line in readme if line.startswith("batchpid")} >= {"inspect", "tune", "view"}
     missing = "echo \"install it with: pip install 'batchpid[tune]'\" >&2; exit 2"
