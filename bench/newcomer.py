@@ -3,9 +3,9 @@
     python bench/newcomer.py --out out/newcomer
 
 Needs network. Every command of their shell blocks runs as it stands there, in order, in an environment that ``make
-demo`` builds. A command whose error names an extra is repeated after that extra was installed. Commands of batchpid that
-have not ended after ``--limit`` seconds, such as ``batchpid view``, are ended as by Ctrl-C. Two files of a user are
-supplied: the bundled panda as arm.urdf, and a log of it from MuJoCo.
+demo`` builds. A command whose error names an extra is repeated after that extra was installed. Commands of batchpid
+that have not ended after ``--limit`` seconds, such as ``batchpid view``, are ended as by Ctrl-C. Two files of a user
+are supplied: the bundled panda as arm.urdf, and a log of it from MuJoCo.
 """
 
 from __future__ import annotations
