@@ -109,7 +109,7 @@ def test_draw(tmp_path):
     """From the figures of the page, as the programs of ``make figures`` write them, comes the page again."""
     docs = tmp_path / "docs"
     (docs / "images").mkdir(parents=True)
-    for name in ("docs/physics-presets.md", "docs/performance.md", "docs/performance.json"):
+    for name in ("docs/performance.md", "docs/performance.json"):
         shutil.copy(ROOT / name, tmp_path / name)
     draw = load_script("draw")
     figures = json.loads((docs / "performance.json").read_text())
@@ -133,7 +133,7 @@ def test_draw(tmp_path):
     (new / "motions.json").write_text(json.dumps(figures["motions"]))
     (new / "accuracy.json").write_text(json.dumps({"accuracy": figures["accuracy"]}))
     draw.main(draw.Options(new, docs))
-    for name in ("docs/physics-presets.md", "docs/performance.md", "docs/performance.json"):
+    for name in ("docs/performance.md", "docs/performance.json"):
         assert (tmp_path / name).read_text() == (ROOT / name).read_text(), f"{name}: run bench/draw.py"
     for name in ("performance", "accuracy"):
         assert (docs / "images" / f"{name}.png").stat().st_size > 10_000
