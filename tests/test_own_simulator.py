@@ -40,6 +40,7 @@ def test_the_env_passes_gymnasiums_checks_and_reaches_its_goal(namespace):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # XLA compiles for minutes
 def test_gradients_through_mjx_are_those_of_differences(namespace):
     pytest.importorskip("mujoco.mjx")
     import jax
@@ -52,4 +53,4 @@ def test_gradients_through_mjx_are_those_of_differences(namespace):
         for joint, kp in enumerate((80.0, 30.0)):
             step = jnp.zeros(2).at[joint].set(0.05 * kp)
             high, low = (error(jnp.array([80.0, 30.0]) + sign * step, setpoint) for sign in (1, -1))
-            assert gradients[at, joint] == pytest.approx((high - low) / (0.1 * kp), rel=0.05)
+            assert gradients[at, joint] == pytest.approx(float(high - low) / (0.1 * kp), rel=0.05)
