@@ -91,12 +91,14 @@ def test_the_tables_of_fields_are_those_of_the_code():
 
 LONGER = {
     "tutorial.md": 200,
+    "choosing-gains.md": 155,
+    "sim-to-real.md": 180,
     "task-space.md": 160,
     "reliability.md": 190,
     "coming-from.md": 165,
     "robots.md": 205,
     "architecture.md": 170,
-    "performance.md": 220,
+    "performance.md": 225,
     "training.md": 260,
     "deploy.md": 260,
     "notes.md": 460,
