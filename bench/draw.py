@@ -62,12 +62,12 @@ RESOURCES = {
 
 @dataclass(frozen=True)
 class Options:
-    """Draw the figures of docs/performance.md and docs/physics-presets.md, and write their tables."""
+    """Draw the figures of docs/performance.md, and write its tables."""
 
     folder: tyro.conf.Positional[Path | None] = None
     """Folder of new measurements; default: none."""
     docs: Path = DOCS
-    """Folder of performance.md and physics-presets.md."""
+    """Folder of performance.md."""
 
 
 def main(options: Options) -> None:
@@ -80,12 +80,12 @@ def main(options: Options) -> None:
         write_atomically(path, json.dumps(figures, indent=1) + "\n")
     save(draw_speed(figures), docs / "images" / "performance.png")
     save(draw_accuracy(figures["accuracy"]), docs / "images" / "accuracy.png")
-    for page in (docs / "performance.md", docs / "physics-presets.md"):
-        text = page.read_text()
-        for name, table in tables(figures).items():
-            marked = re.compile(rf"(<!-- {name}: [^>]*-->\n).*?(<!-- end -->)", re.DOTALL)
-            text = marked.sub(lambda match, table=table: f"{match[1]}{table}\n{match[2]}", text)
-        write_atomically(page, text)
+    page = docs / "performance.md"
+    text = page.read_text()
+    for name, table in tables(figures).items():
+        marked = re.compile(rf"(<!-- {name}: [^>]*-->\n).*?(<!-- end -->)", re.DOTALL)
+        text = marked.sub(lambda match, table=table: f"{match[1]}{table}\n{match[2]}", text)
+    write_atomically(page, text)
 
 
 # -- figures -----------------------------------------------------------------------------------------------------

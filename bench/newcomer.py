@@ -1,11 +1,11 @@
-"""Follow the README in a clean clone, as a newcomer does, and time each command.
+"""Follow the README and the index of the pages in a clean clone, as a newcomer does, and time each command.
 
     python bench/newcomer.py --out out/newcomer
 
-Needs network. Every command of the README's shell blocks runs as it stands there, in order, in an environment that
-``make demo`` builds. A command whose error names an extra is repeated after that extra was installed. Commands of
-batchpid that have not ended after ``--limit`` seconds, such as ``batchpid view``, are ended as by Ctrl-C. ``make test``
-is left out. Two files of a user are supplied: the bundled panda as arm.urdf, and a log of it from MuJoCo.
+Needs network. Every command of their shell blocks runs as it stands there, in order, in an environment that ``make
+demo`` builds. A command whose error names an extra is repeated after that extra was installed. Commands of batchpid
+that have not ended after ``--limit`` seconds, such as ``batchpid view``, are ended as by Ctrl-C. Two files of a user
+are supplied: the bundled panda as arm.urdf, and a log of it from MuJoCo.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from typing import NamedTuple
 import tyro
 
 ROOT = Path(__file__).resolve().parent.parent
-LEFT_OUT = ("make test", "pip install .")
-"""Commands that are not run: ``make demo`` has installed batchpid already, and a newcomer need not run the tests."""
+PAGES = ("README.md", "docs/README.md")
+LEFT_OUT = ("pip install '.[view,tune,record]'",)
+"""Commands that are not run: extras are installed when a message names them."""
 REMEDY = re.compile(r"pip install 'batchpid\[(\w+)\]'")
 FILES = """
 mkdir -p robots
@@ -50,7 +51,7 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Options:
-    """Follow the README in a clean clone, and time each command."""
+    """Follow README and index in a clean clone, and time each command."""
 
     out: Path
     """Folder of the clone; must not exist."""
@@ -58,9 +59,10 @@ class Options:
     """Seconds after which a command is ended."""
 
 
-def commands(readme: str) -> list[str]:
-    """Return the commands of the shell blocks of ``readme``, without comments."""
-    lines = "".join(re.findall(r"```sh\n(.*?)```", readme, re.DOTALL)).splitlines()
+def commands(folder: Path) -> list[str]:
+    """Return the commands of the shell blocks of the pages in a checkout, without comments."""
+    text = "".join((folder / page).read_text() for page in PAGES)
+    lines = "".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL)).splitlines()
     found = [shlex.join(words) for line in lines if (words := shlex.split(line, comments=True))]
     return [command for command in found if command not in LEFT_OUT]
 
@@ -104,7 +106,7 @@ def main(options: Options) -> int:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it, and so would its children
     subprocess.run(["git", "clone", "--quiet", ROOT, options.out], check=True)
     folder = options.out.resolve()
-    wanted = commands((folder / "README.md").read_text())
+    wanted = commands(folder)
     wanted.insert(1, FILES)
     identify = next(at for at, command in enumerate(wanted) if command.startswith("batchpid identify"))
     wanted.insert(identify, LOG)

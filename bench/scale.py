@@ -1,4 +1,4 @@
-"""Expected rates of runners on clusters larger than those at hand: a simulation with measured costs (docs/scale.md).
+"""Expected rates of runners on clusters larger than those at hand: a simulation with measured costs (docs/notes.md).
 
     python bench/scale.py              # print the tables of the page; the same at every run
     python bench/scale.py --measure    # measure Ray's costs on this machine: half a minute, idle
@@ -148,7 +148,7 @@ def table(ticks: int, costs: Costs) -> str:
 
 
 def report(costs: Costs) -> str:
-    """Return the tables of docs/scale.md."""
+    """Return the tables of docs/notes.md."""
     piece = NODE_STEPS // (SUBSTEPS * ENVS)
     fast = Costs(bandwidth=10 * costs.bandwidth)
     cases = (

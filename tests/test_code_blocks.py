@@ -29,7 +29,7 @@ from batchpid.sim.cli import COMMANDS, main, parse
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md")])
 TEXTS = sorted({*PAGES, *ROOT.glob("*.md"), ROOT / "assets/README.md"})
-BLOCK = re.compile(r"(?:<!-- needs: (?P<needs>[\w, ]+) -->\n)?```(?P<language>\w*)\n(?P<code>.*?)```", re.DOTALL)
+BLOCK = re.compile(r"(?:<!-- needs: (?P<needs>[\w., ]+) -->\n)?```(?P<language>\w*)\n(?P<code>.*?)```", re.DOTALL)
 SHORTER = {
     # command: flags that make it short
     "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
@@ -54,7 +54,7 @@ ON_TWO_JOINTS = ("docs/sim-to-real.md",)  # a fit of all joints of the panda is 
 RARE = {
     # pages whose blocks seldom change and take seconds: slow
     "python": ("docs/sim-to-real.md", "docs/runner.md", "docs/controllers.md", "docs/view.md", "docs/task-space.md"),
-    "sh": ("docs/two-engines.md", "docs/view.md", "docs/deploy.md", "docs/sim-to-real.md", "docs/gallery.md"),
+    "sh": ("docs/two-engines.md", "docs/view.md", "docs/deploy.md", "docs/sim-to-real.md"),
 }
 ONLY_PARSED = ("tune", "identify", "render", "survey")
 
@@ -80,7 +80,7 @@ def shell_lines(page: Path) -> list[list[str]]:
 
 
 def missing(match: re.Match) -> list[str]:
-    needed = re.findall(r"\w+", match["needs"] or "")
+    needed = re.findall(r"[\w.]+", match["needs"] or "")
     return [name for name in needed if importlib.util.find_spec(name) is None]
 
 

@@ -89,7 +89,20 @@ def test_the_tables_of_fields_are_those_of_the_code():
     assert old == [], "run python docs/tables.py"
 
 
-LONGER = {"tutorial.md": 200, "task-space.md": 160, "reliability.md": 160}
+LONGER = {
+    "tutorial.md": 200,
+    "choosing-gains.md": 155,
+    "sim-to-real.md": 180,
+    "task-space.md": 160,
+    "reliability.md": 190,
+    "coming-from.md": 165,
+    "robots.md": 205,
+    "architecture.md": 170,
+    "performance.md": 225,
+    "training.md": 260,
+    "deploy.md": 260,
+    "notes.md": 460,
+}
 """Pages that may have more than 150 lines."""
 
 

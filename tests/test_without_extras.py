@@ -1,4 +1,4 @@
-"""The README followed to the letter without any extra: each command and program runs, or names the extra it needs."""
+"""README and index followed without any extra: each command and program runs, or names the extra that it needs."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from packaging.requirements import Requirement
 from test_code_blocks import ROOT, SHORTER, SHORTER_CODE, TWO_JOINTS, blocks, shell_lines
 from tiny_urdf import write
 
-README = ROOT / "README.md"
+README, INDEX = ROOT / "README.md", ROOT / "docs/README.md"
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 FOR_USERS = set(re.findall(r"\[(.*)\]", EXTRAS["all"][0])[0].split(","))
 MODULES = {"pycollada": "collada", "imageio-ffmpeg": "imageio_ffmpeg"}
 """Name of a package's module, where it is another than the package's."""
 NEEDED = {"tune": "tune", "identify": "tune", "view": "view"}
-"""Commands of the README that need an extra."""
+"""Commands of the two pages that need an extra."""
 SIZES = SHORTER | {"survey": ["--workers", "0"]}
 PROGRAM = """
 import contextlib, io, json, sys, warnings
@@ -54,10 +54,10 @@ def modules_of_extras() -> list[str]:
     return sorted(MODULES.get(package, package) for package in packages)
 
 
-def test_the_readme_lists_every_extra_for_users():
-    rows = re.findall(r"^\| (.*) \|.*\|.*[GM]B \|$", README.read_text(), re.MULTILINE)
+def test_the_index_lists_every_extra_for_users():
+    rows = re.findall(r"^\| (.*) \|.*\|.*[GM]B \|$", INDEX.read_text(), re.MULTILINE)
     assert [row.strip("`") for row in rows if row != "none"][-1] == "all"
-    assert {row.strip("`") for row in rows} == {"none", "all"} | FOR_USERS
+    assert {row.strip("`") for row in rows} == {"none", "all", "sb3"} | FOR_USERS
 
 
 def test_the_base_contains_no_package_of_an_extra():
@@ -68,13 +68,13 @@ def test_the_base_contains_no_package_of_an_extra():
 
 @pytest.mark.slow
 def test_each_command_and_program_runs_or_names_its_extra(tmp_path: Path):
-    lines = [words[1:] for words in shell_lines(README) if words[0] == "batchpid"]
+    lines = [words[1:] for page in (README, INDEX) for words in shell_lines(page) if words[0] == "batchpid"]
     sizes = [[] if "--trajectory" in words else SIZES.get(words[0], []) for words in lines]
     commands = [[*words, *size] for words, size in zip(lines, sizes, strict=True)]
     commands.append(["rollout", "panda", "--backend", "jax", "--out", "jax.npz"])
     (tmp_path / "robots").mkdir()
     write(tmp_path / "robots", TWO_JOINTS, "two.urdf")
-    programs = [match["code"] for match in blocks(README, "python")]
+    programs = [match["code"] for page in (README, INDEX) for match in blocks(page, "python")]
     for pattern, size in (SHORTER_CODE | {"workers=2": "workers=0"}).items():
         programs = [re.sub(pattern, size, program) for program in programs]
     assert len(commands) > 10

@@ -38,6 +38,24 @@ def check_render_mode(mode: Any, num_envs: int) -> str | None:
     return str(mode)
 
 
+class EnvMetadata(dict[str, Any]):
+    """Metadata of an env. Its "render_modes" are those of this machine, which is tested when they are first read."""
+
+    def __getitem__(self, key: str) -> Any:
+        if key == "render_modes" and not super().__contains__(key):
+            from batchpid.sim.view.renderer import render_problem
+
+            self[key] = list(RENDER_MODES) if render_problem() is None else []
+        return super().__getitem__(key)
+
+    def __contains__(self, key: object) -> bool:
+        return key == "render_modes" or super().__contains__(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return the value of ``key``, or ``default``."""
+        return self[key] if key in self else default
+
+
 class EnvPictures:
     """Lit scene of each env, with its robot and the content of ``build``, and a camera of ``size`` (width, height)."""
 

@@ -20,7 +20,7 @@ from batchpid.checks.keywords import check_keywords
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import array, choice, env_mask, flag, integer, number
 from batchpid.errors import CallOrderError, InvalidArgumentError
-from batchpid.sim.gym.pictures import RENDER_MODES, EnvPictures, check_render_mode
+from batchpid.sim.gym.pictures import RENDER_MODES, EnvMetadata, EnvPictures, check_render_mode
 from batchpid.sim.observation import Observation
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import LARGEST
@@ -136,11 +136,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.render_mode = check_render_mode(render_mode, self.num_envs)
-        self.metadata = {  # type: ignore[misc]
-            "render_modes": RENDER_MODES,
-            "render_fps": 1 / self.step_seconds,
-            "autoreset_mode": self.autoreset_mode,
-        }
+        self.metadata = EnvMetadata(  # type: ignore[misc]
+            render_fps=1 / self.step_seconds, autoreset_mode=self.autoreset_mode
+        )
 
         self.runner = Runner(self.robot, self.num_envs, substeps=substeps, **self._options)
         self._generators = np.random.default_rng().spawn(self.num_envs)

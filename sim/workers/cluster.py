@@ -23,6 +23,10 @@ from batchpid.sim.workers.placement import split_in_shares
 
 NODE_STEPS = 25_000
 """Sim steps times envs of a worker in one request to its node, at most, unless a tick has more: half a second."""
+_JOIN = (
+    "if it has a token, set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN or ~/.ray/auth_token to that token, for this program "
+    "and on every machine; if this machine does not belong to it, run ray start --address=... here"
+)
 _PROBE_LIMIT = 2.0  # seconds for a connection to a machine
 _LATENCY_RUNS = 50  # requests over which time and work are compared
 _QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
@@ -176,13 +180,9 @@ def _connect(options: Ray) -> Any:
     try:
         if address != "local":
             ray.init(address, **quiet)
-    except ConnectionError as error:
-        if address != "auto":
-            raise InvalidArgumentError(
-                "cluster",
-                f"at {address} cannot be joined: {error}",
-                remedy="run ray start --address=... on this machine first",
-            ) from error
+    except (ConnectionError, ray.exceptions.RayError) as error:  # Ray says in its log alone that a token is wrong
+        if address != "auto" or not isinstance(error, ConnectionError):
+            raise InvalidArgumentError("cluster", f"at {address} cannot be joined: {error}", remedy=_JOIN) from error
     if not ray.is_initialized():
         ray.init("local", num_cpus=len(os.sched_getaffinity(0)), include_dashboard=False, **quiet)
     return ray

@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-README = Path(__file__).parents[2] / "README.md"
+INDEX = Path(__file__).parents[2] / "docs" / "README.md"
 REFUSE = """
 import sys
 
@@ -25,9 +25,9 @@ def run(program):
     return done.stdout
 
 
-def test_the_example_of_the_readme_needs_numpy_alone():
+def test_the_example_of_the_index_needs_numpy_alone():
     (program,) = (
-        code for code in re.findall(r"```python\n(.*?)```", README.read_text(), re.S) if "bp.BatchPID" in code
+        code for code in re.findall(r"```python\n(.*?)```", INDEX.read_text(), re.S) if "bp.BatchPID" in code
     )
     assert "jax" not in re.sub("#.*", "", program)
     run(program + "assert effort.shape == (64, 9)")

@@ -1,4 +1,4 @@
-"""The page on large clusters shows the output of its simulation, and the simulation agrees with simple cases."""
+"""The notes on large clusters show the output of its simulation, and the simulation agrees with simple cases."""
 
 import numpy as np
 import pytest
@@ -13,14 +13,14 @@ EVEN = {"jitter": 0.0, "slow": 0.0, "detection": -20.0, "restart": 0.0}
 
 @pytest.mark.slow
 def test_the_page_shows_what_the_script_prints():
-    page = (ROOT / "docs/scale.md").read_text()
+    page = (ROOT / "docs/notes.md").read_text()
     shown = page.split("<!-- scale: printed by bench/scale.py -->\n")[1].split("<!-- end -->")[0]
     assert shown.strip() == SCALE["report"](SCALE["Costs"]()).strip()
 
 
 def test_the_page_has_the_bytes_of_the_arrays():
     down, up = SCALE["traffic"](9)
-    page = (ROOT / "docs/scale.md").read_text()
+    page = (ROOT / "docs/notes.md").read_text()
     assert f"| {down}: the setpoint | {up}: the observation ({up - 32}), the faults (32) |" in page
     assert f"| bytes of an env step | {down / SCALE['SUBSTEPS']:.1f} | {up / SCALE['SUBSTEPS']:.1f} |" in page
 

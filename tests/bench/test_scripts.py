@@ -6,10 +6,12 @@ import shutil
 import numpy as np
 import pytest
 from clusters import FILTERS
+from PIL import Image
 from robots import load_bundled
 from scripts import ROOT, load_script
 
-TESTED = {"accuracy", "circles", "cluster", "draw", "measure", "motions", "newcomer", "scale", "trajectories", "view"}
+TESTED = {"accuracy", "circles", "cluster", "draw", "film", "measure", "motions", "newcomer", "scale"}
+TESTED |= {"trajectories", "view"}
 
 
 def rows(text):
@@ -41,10 +43,28 @@ def test_circles(monkeypatch):
     np.testing.assert_allclose(np.linalg.norm(wanted - center, axis=1), circles.RADIUS)
 
 
+def test_film(tmp_path):
+    """Few and short: the gains by hand overshoot, the designed ones do not, and every picture shows robots."""
+    film, path = load_script("film"), tmp_path / "new" / "film.gif"
+    moves = film.simulate(load_bundled("panda"), 1.0)
+    overshoot = [move.qpos[:, :, film.JOINT].max() - film.GOAL[film.JOINT] for move in moves.values()]
+    assert overshoot[0] < 0.01
+    assert overshoot[1] > 0.3
+    film.main(film.Options(path, seconds=0.2, interval=0.1))
+    with Image.open(path) as pictures:
+        assert pictures.n_frames == 2
+        shown = []
+        for at in range(2):
+            pictures.seek(at)
+            shown.append(np.asarray(pictures.convert("L"))[:, :500])
+    assert all((picture < 200).mean() > 0.02 for picture in shown)
+    assert (shown[0] != shown[1]).any()
+
+
 def test_newcomer(tmp_path, capfd):
-    """In place of the README's commands, which take minutes: one that succeeds, one that fails, one without an end."""
+    """In place of the pages' commands, which take minutes: one that succeeds, one that fails, one without an end."""
     newcomer = load_script("newcomer")
-    readme = newcomer.commands((ROOT / "README.md").read_text())
+    readme = newcomer.commands(ROOT)
     assert readme[0] == "make demo"
     assert {line.split()[1] for line in readme if line.startswith("batchpid")} >= {"inspect", "tune", "view"}
     missing = "echo \"install it with: pip install 'batchpid[tune]'\" >&2; exit 2"
@@ -89,7 +109,7 @@ def test_draw(tmp_path):
     """From the figures of the page, as the programs of ``make figures`` write them, comes the page again."""
     docs = tmp_path / "docs"
     (docs / "images").mkdir(parents=True)
-    for name in ("docs/physics-presets.md", "docs/performance.md", "docs/performance.json"):
+    for name in ("docs/performance.md", "docs/performance.json"):
         shutil.copy(ROOT / name, tmp_path / name)
     draw = load_script("draw")
     figures = json.loads((docs / "performance.json").read_text())
@@ -113,7 +133,7 @@ def test_draw(tmp_path):
     (new / "motions.json").write_text(json.dumps(figures["motions"]))
     (new / "accuracy.json").write_text(json.dumps({"accuracy": figures["accuracy"]}))
     draw.main(draw.Options(new, docs))
-    for name in ("docs/physics-presets.md", "docs/performance.md", "docs/performance.json"):
+    for name in ("docs/performance.md", "docs/performance.json"):
         assert (tmp_path / name).read_text() == (ROOT / name).read_text(), f"{name}: run bench/draw.py"
     for name in ("performance", "accuracy"):
         assert (docs / "images" / f"{name}.png").stat().st_size > 10_000

@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 from batchpid.errors import CallOrderError, InvalidArgumentError  # noqa: E402
 from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Uniform  # noqa: E402
 from batchpid.sim.gym import ReachEnv, ReachVectorEnv  # noqa: E402
+from batchpid.sim.view import renderer  # noqa: E402
 from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write  # noqa: E402
 
 ID = "batchpid.sim.gym:batchpid/Reach-v0"
@@ -25,6 +26,27 @@ def test_gymnasiums_own_checks_pass():
     check_env(env.unwrapped, skip_render_check=True)
     env = gymnasium.make(ID, robot="jaco2", actions="increment")
     check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_gymnasiums_own_checks_pass_without_a_render_device(monkeypatch):
+    """All of them: the metadata of an env name the modes that this machine can render."""
+    monkeypatch.setattr(renderer, "render_problem", lambda: "no device")
+    env = gymnasium.make(ID)
+    assert env.unwrapped.metadata["render_modes"] == []
+    check_env(env.unwrapped)
+    assert ReachEnv.metadata["render_modes"] == ["rgb_array"]
+
+
+def test_the_modes_that_a_device_renders_are_tested_at_the_first_look(monkeypatch):
+    looks: list[int] = []
+    monkeypatch.setattr(renderer, "render_problem", lambda: looks.append(1))
+    envs = ReachVectorEnv(1, workers=0)
+    assert envs.metadata["render_fps"] == pytest.approx(50)
+    assert not looks
+    assert envs.metadata.get("render_modes") == ["rgb_array"]
+    assert envs.metadata["render_modes"] == ["rgb_array"]
+    assert len(looks) == 1
+    envs.close()
 
 
 MODES = [AutoresetMode.NEXT_STEP]

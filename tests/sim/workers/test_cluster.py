@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -264,6 +265,21 @@ def test_bad_options_are_refused(options, message, monkeypatch):
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
     with pytest.raises(InvalidArgumentError, match=message):
         make_runner(**options)
+
+
+@pytest.mark.parametrize("error", [ConnectionError("failed"), ray.exceptions.AuthenticationError("no token")])
+def test_a_cluster_that_refuses_says_what_a_token_needs(error, monkeypatch):
+    """Ray names a wrong token in its log alone, and an absent one by an error of its own."""
+
+    def refuse(*_, **__):
+        raise error
+
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray, "init", refuse)
+    with socket.create_server(("127.0.0.1", 0)) as head:
+        address = f"127.0.0.1:{head.getsockname()[1]}"
+        with pytest.raises(InvalidArgumentError, match=rf"at {address} cannot be joined.*RAY_AUTH_MODE=token"):
+            make_runner(cluster=Ray(address))
 
 
 @given(st.integers(1, 300), st.lists(st.integers(1, 64), min_size=1, max_size=9))

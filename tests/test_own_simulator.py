@@ -1,0 +1,56 @@
+"""The examples of docs/own-simulator.md: short, complete, and each does what it says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_code_blocks import ROOT, blocks
+
+PAGE = ROOT / "docs/own-simulator.md"
+MODEL, PLAIN, MJX, ENV = (match["code"] for match in blocks(PAGE, "python"))
+LONGEST = 30
+"""Lines of an example, without blank ones."""
+
+
+@pytest.fixture
+def namespace() -> dict:
+    values: dict = {"__name__": "__main__"}
+    exec(MODEL, values)
+    exec(PLAIN.split("pid = ")[0], values)
+    return values
+
+
+@pytest.mark.parametrize("code", [PLAIN, MJX, ENV], ids=["plain", "mjx", "env"])
+def test_each_example_is_short(code):
+    assert len([line for line in code.splitlines() if line.strip()]) <= LONGEST
+
+
+def test_plain_mujoco_reaches_every_setpoint(namespace):
+    exec(PLAIN, namespace)
+    assert np.abs(namespace["setpoint"] - namespace["qpos"]).max() < 1e-2
+    assert (np.abs(namespace["effort"]) <= namespace["params"].effort_max).all()
+
+
+def test_the_env_passes_gymnasiums_checks_and_reaches_its_goal(namespace):
+    checker = pytest.importorskip("gymnasium.utils.env_checker")
+    exec(ENV, namespace)
+    assert namespace["reward"] > -1e-2
+    with pytest.warns(UserWarning):  # its observations have no bounds, and it has no spec
+        checker.check_env(namespace["Reach"]())
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)  # XLA compiles for minutes
+def test_gradients_through_mjx_are_those_of_differences(namespace):
+    pytest.importorskip("mujoco.mjx")
+    import jax
+
+    exec(MJX, namespace)
+    jnp, gradients = namespace["jnp"], np.asarray(namespace["gradients"])
+    assert (gradients < 0).all()
+    error = jax.jit(namespace["error"])
+    for at, setpoint in enumerate(namespace["setpoints"]):
+        for joint, kp in enumerate((80.0, 30.0)):
+            step = jnp.zeros(2).at[joint].set(0.05 * kp)
+            high, low = (error(jnp.array([80.0, 30.0]) + sign * step, setpoint) for sign in (1, -1))
+            assert gradients[at, joint] == pytest.approx(float(high - low) / (0.1 * kp), rel=0.05)
