@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 import numpy as np
+import tyro
 
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
