@@ -24,8 +24,8 @@ from batchpid.sim.workers.placement import split_in_shares
 NODE_STEPS = 25_000
 """Sim steps times envs of a worker in one request to its node, at most, unless a tick has more: half a second."""
 _JOIN = (
-    "if it has a token, set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN or ~/.ray/auth_token to that token, for this program "
-    "and on every machine; if this machine does not belong to it, run ray start --address=... here"
+    "if it has a token, set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN or ~/.ray/auth_token to that token, for this "
+    "program and on every machine; if this machine does not belong to it, run ray start --address=... here"
 )
 _PROBE_LIMIT = 2.0  # seconds for a connection to a machine
 _LATENCY_RUNS = 50  # requests over which time and work are compared

@@ -26,9 +26,7 @@ def run(program):
 
 
 def test_the_example_of_the_index_needs_numpy_alone():
-    (program,) = (
-        code for code in re.findall(r"```python\n(.*?)```", INDEX.read_text(), re.S) if "bp.BatchPID" in code
-    )
+    (program,) = (code for code in re.findall(r"```python\n(.*?)```", INDEX.read_text(), re.S) if "bp.BatchPID" in code)
     assert "jax" not in re.sub("#.*", "", program)
     run(program + "assert effort.shape == (64, 9)")
 
