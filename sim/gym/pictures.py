@@ -53,14 +53,10 @@ class EnvMetadata(dict[str, Any]):
 
     def get(self, key: str, default: Any = None) -> Any:
         """Return the value of ``key``, or ``default``."""
-<<<<<<< HEAD
-        return self[key] if key in self else default  # noqa: SIM401  (this is get)
-=======
         try:
             return self[key]
         except KeyError:
             return default
->>>>>>> pages
 
 
 class EnvPictures:
