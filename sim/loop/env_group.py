@@ -58,6 +58,7 @@ class EnvGroup:
         self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._motor = np.zeros((pack.size, pack.dof), np.float32)
         self._saturated, self._guarded = (np.zeros((pack.size, pack.dof), bool) for _ in range(2))
+        self._table: Table | None = None
         self._steps = 0
         collides, ground = options.collisions, options.robot.has_ground
         self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
@@ -172,8 +173,10 @@ class EnvGroup:
         if containment.suspended.any() or not finite(*command):
             command = self._without_faults(command)
         elif self._contacts is None and self.pack.spec.fixed_base:
-            fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
-            table = Table(ticks.arrays, Shown(self._motor, self._saturated, self._guarded, fault))
+            if self._table is None:
+                fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
+                self._table = Table(ticks.arrays, Shown(self._motor, self._saturated, self._guarded, fault))
+            table = self._table
         tick, done = self._execute(command, Span(first, 0, until, substeps), table)
         if not done:
             return tick

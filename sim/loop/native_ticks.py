@@ -125,7 +125,9 @@ class NativeTicks:
         self._place(qf=self.outputs.qf)
         self._kept.append(table := (interface.Stage * len(self._stages))(*self._stages))
         self._tick.stages, self._tick.stage_count = ctypes.addressof(table), len(table)
-        self._calls = tuple(self._programs)
+        self._calls, self._address = tuple(self._programs), ctypes.addressof(self._tick)
+        self._is_noisy = bool(leaves(noise))
+        self._counted = None if self.state.motors is None else self.state.motors.step
 
     # -- running -----------------------------------------------------------------------------------------------
 
@@ -160,22 +162,20 @@ class NativeTicks:
         complete or not observed, its sim steps that are done, and the last status. An event that needs Python stops
         the ticks: a status that is not 0, and with ``whole`` a command or velocities that are not finite.
         """
-        group, address, status = step.prepare(), ctypes.addressof(self._tick), _NO_NOISE
+        given, status = (self._calls, self._address, step.prepare()), _NO_NOISE
         while status == _NO_NOISE:
-            noise, before = leaves(self._draw()), (tick, begin)
-            for place, block in enumerate(noise):
-                self._tick.noise[place] = block.ctypes.data
-            drawn = min([len(block) for block in noise], default=-1)
-            tick, begin, status = self._native.ticks(
-                self._calls, address, group, tick, begin, until, steps, drawn, whole
-            )
-            self._count((tick - before[0]) * steps + begin - before[1])
+            drawn, before = self._give_noise() if self._is_noisy else -1, (tick, begin)
+            tick, begin, status = self._native.ticks(*given, tick, begin, until, steps, drawn, whole)
+            if self._counted is not None:
+                self._counted[...] += (tick - before[0]) * steps + begin - before[1]
         return tick, begin, status
 
-    def _count(self, steps: int) -> None:
-        """Count sim steps in the state of the motors."""
-        if self.state.motors is not None and self.state.motors.step is not None:
-            self.state.motors.step[...] += steps
+    def _give_noise(self) -> int:
+        """Let native code read the noise of the next sim steps; return their number."""
+        noise = leaves(self._draw())
+        for place, block in enumerate(noise):
+            self._tick.noise[place] = block.ctypes.data
+        return min(map(len, noise))
 
     def _draw(self) -> Any:
         """Return the noise of positions and velocities in the next steps (steps, M, dof) each, or None."""

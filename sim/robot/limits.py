@@ -108,7 +108,11 @@ class MovingSetpointCheck:
             last, self._last = self._last, rows
             if last is None:
                 continue
-            change, reduce = np.abs(rows - last), np.logical_or.reduce  # methods of arrays take calls of Python
+            reduce = np.logical_or.reduce  # methods of arrays take calls of Python
+            if not reduce(rows != last, None):
+                self._moved = 0.0
+                continue
+            change = np.abs(rows - last)
             moves = reduce((change > 0) & self._lags, axis=1)
             moves &= ~reduce(change > self._fastest * seconds, axis=1)
             self._moved = (self._moved + seconds) * moves
