@@ -43,7 +43,6 @@ def test_the_env_passes_gymnasiums_checks_and_reaches_its_goal(namespace):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)  # XLA compiles for minutes
 def test_gradients_through_mjx_are_those_of_differences(namespace):
     pytest.importorskip("mujoco.mjx")
     import jax
