@@ -1,7 +1,7 @@
 """Film of four robots under two sets of gains, with the response of one joint: ``python bench/film.py``.
 
 It draws docs/images/two-gains.gif, the picture of the README, without a render device: triangles of the robots' shapes,
-sorted by depth. The gains are those of docs/tutorial.md, designed ones and ones chosen by hand.
+sorted by depth. The gains are from docs/tutorial.md: designed, and chosen by hand.
 """
 
 from __future__ import annotations

@@ -131,7 +131,7 @@ def advance(
 ) -> tuple[PIDState, Terms]:
     """Advance the law with given coefficients, for loops with constant params; return the state and the terms.
 
-    The arguments are those of :func:`step`, as arrays. A term may be an array of the caller: :meth:`Terms.filled`.
+    It takes the arguments of :func:`step`, as arrays. A term may be an array of the caller: :meth:`Terms.filled`.
 
     Raises InvalidArgumentError if the coefficients are of gain_units other than "effort", or need a measured rate that
     is not given. Gains per inertia: :mod:`batchpid.law.computed_torque`.

@@ -18,7 +18,7 @@ SWITCH = "BATCHPID_NATIVE"
 def obstacle(*extensions: Extension) -> str:
     """Return why native code is not used, "" if it is; a faulty installation gives one RuntimeWarning per process.
 
-    ``extensions`` are needed in addition to those of this package.
+    ``extensions`` are needed besides the extensions of this package.
     """
     if os.environ.get(SWITCH) == "0":
         return f"native code is switched off by {SWITCH}=0"

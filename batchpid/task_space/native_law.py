@@ -32,7 +32,8 @@ def law(
 
     Raises ValueError if an array has a wrong shape.
     """
-    tool, given = None, tuple[Any, ...](dynamics)
+    tool: Tool | None = None
+    given: tuple[Any, ...] = dynamics
     if isinstance(dynamics, Tool):
         tool = dynamics
         (qpos, qvel), *_ = prepared(tool.tree, qpos=inputs.qpos, qvel=inputs.qvel)

@@ -74,7 +74,7 @@ def bound(
 ) -> tuple[Callable[[], None], tuple[Float64, ...]] | None:
     """Return a function that computes the results of :func:`kinematics`, on a fixed base, and their arrays.
 
-    It takes what the contiguous arrays ``qpos`` and ``qvel`` (rows, dof) hold when it is called.
+    A call reads the contiguous arrays ``qpos`` and ``qvel`` (rows, dof).
     """
     if (native := in_use()) is None:
         return None

@@ -88,8 +88,8 @@ class EnginePack(Protocol):
     def update_constraint(self, rows: Any = slice(None)) -> None:
         """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are coupled."""
 
-    def step(self, update: bool = True) -> None:
-        """Do one sim step of every env. Without ``update`` coupled joints may use the mass matrix of an earlier step.
+    def step(self) -> None:
+        """Do one sim step of every env, with the constraint efforts of the last :meth:`update_constraint`.
 
         A non-finite state raises no error: the loop detects it in its next reading.
         """

@@ -20,8 +20,8 @@ from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays, Ticks
 from batchpid.sim.loop.backend import obstacle
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.faults import FaultContainment, far, finite, near
-from batchpid.sim.loop.native_executor import NativeExecutor, Table
-from batchpid.sim.loop.native_ticks import Shown
+from batchpid.sim.loop.native_executor import NativeExecutor
+from batchpid.sim.loop.native_ticks import Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor, Span, passive_forces, with_model
 from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
@@ -175,7 +175,7 @@ class EnvGroup:
         elif self._contacts is None and self.pack.spec.fixed_base:
             if self._table is None:
                 fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
-                self._table = Table(ticks.arrays, Shown(self._motor, self._saturated, self._guarded, fault))
+                self._table = Table(ticks.arrays, self._motor, self._saturated, self._guarded, fault)
             table = self._table
         tick, done = self._execute(command, Span(first, 0, until, substeps), table)
         if not done:

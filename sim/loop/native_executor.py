@@ -6,7 +6,7 @@ reads.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -14,19 +14,12 @@ from batchpid.native.operations import MOST_SUMMED
 from batchpid.native.trees import leaves, mapped
 from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.protocol import FAILED, CompiledModel, CompiledPack, CompiledStep, DrivenPack
-from batchpid.sim.loop.arrays import Arrays, Command
-from batchpid.sim.loop.native_ticks import NativeTicks, Shown
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.native_ticks import NativeTicks, Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran, Span
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, StepState, Values
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
-
-
-class Table(NamedTuple):
-    """Tables of the ticks of a run, and the arrays of the last observation."""
-
-    arrays: Arrays
-    shown: Shown
 
 
 class NativeExecutor(NumPyExecutor):
@@ -65,7 +58,7 @@ class NativeExecutor(NumPyExecutor):
         ticks = self._ticks_for(state, command)
         ticks.load(state, measured, None if table else command)
         if table:
-            ticks.exchange(*table)
+            ticks.exchange(table)
         until = span.until if table else span.tick + 1
         tick, done, status = ticks.run(self._prepared(), span.tick, span.begin, until, span.steps, table is not None)
         failed = self._may_have_failed(status)

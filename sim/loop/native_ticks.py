@@ -2,6 +2,8 @@
 
 It is made in three steps: buffers for everything that the stages read and write, programs of the stages that are pure
 functions of arrays (traced, neighbours together), and the table of stages that native code runs.
+
+Longer than 300 lines because all three steps work on the same buffers.
 """
 
 from __future__ import annotations
@@ -28,16 +30,17 @@ from batchpid.sim.loop.control_step import COUPLING_STEPS, SimStage
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
 
 
-class Shown(NamedTuple):
-    """Arrays of a group's observation besides positions and velocities, the same arrays in every tick.
+class Table(NamedTuple):
+    """Commands and observations of the ticks of a run, and arrays of its last observation."""
 
-    Effort, saturated and guarded joints of the last tick (envs, dof), and the last fault of each env (envs,).
-    """
-
+    arrays: Arrays
+    """(ticks, envs, ...), the same in every run."""
     effort: NDArray[np.float32]
+    """Of the last tick (envs, dof), as the next two."""
     saturated: NDArray[np.bool_]
     guarded: NDArray[np.bool_]
     fault: FaultArrays
+    """Last fault of each env (envs,)."""
 
 
 class NativeTicks:
@@ -147,11 +150,11 @@ class NativeTicks:
             if array is not None:
                 array[...] = value
 
-    def exchange(self, arrays: Arrays, shown: Shown) -> None:
-        """Take commands from tables (ticks, envs, ...), and write observations to them and to ``shown``."""
+    def exchange(self, table: Table) -> None:
+        """Take commands from ``table``, and write observations to it."""
         if self._transfers is None:
-            self._transfers = table = self._transfers_of(arrays, shown)
-            self._tick.transfers, self._tick.transfer_count = ctypes.addressof(table), len(table)
+            self._transfers = found = self._transfers_of(table)
+            self._tick.transfers, self._tick.transfer_count = ctypes.addressof(found), len(found)
 
     def run(
         self, step: CompiledStep, tick: int, begin: int, until: int, steps: int, whole: bool
@@ -214,8 +217,8 @@ class NativeTicks:
         law = state.law if self._controller is None else None
         return state._replace(law=law, age=None, motors=motors)
 
-    def _transfers_of(self, arrays: Arrays, shown: Shown) -> ctypes.Array[interface.Transfer]:
-        outputs, seen, transfers = self.outputs, arrays.observation, list[interface.Transfer]()
+    def _transfers_of(self, own: Table) -> ctypes.Array[interface.Transfer]:
+        outputs, seen, transfers = self.outputs, own.arrays.observation, list[interface.Transfer]()
 
         def add(kind: str, table: NDArray[Any], row: NDArray[Any], stride: int | None = None) -> None:
             dtype = {"read": np.float64, "write_floats": np.float32}.get(kind, row.dtype)
@@ -227,23 +230,23 @@ class NativeTicks:
             transfers.append(interface.Transfer(*addresses, stride, size, interface.TRANSFERS.index(kind)))
             self._kept.extend((table, row))
 
-        for table, row in zip(arrays.command, self.command, strict=True):
+        for table, row in zip(own.arrays.command, self.command, strict=True):
             if row is not None:
                 add("read", table, row)
         for table, row in ((seen.qpos, self._reading.qpos), (seen.qvel, self._reading.qvel)):
             add("write_floats", table, row)
         add("write_floats", seen.effort, outputs.motor)
-        add("write_floats", shown.effort[None], outputs.motor, 0)
-        none = np.zeros(shown.saturated.shape, bool)
+        add("write_floats", own.effort[None], outputs.motor, 0)
+        none = np.zeros(self._shape, bool)
         for table, kept, output in (
-            (seen.saturated, shown.saturated, outputs.saturated),
-            (seen.guarded, shown.guarded, outputs.guarded),
+            (seen.saturated, own.saturated, outputs.saturated),
+            (seen.guarded, own.guarded, outputs.guarded),
         ):
             row = none if output is None else output
             add("write_bytes", table, row)
             add("write_bytes", kept[None], row, 0)
         add("write_bytes", seen.ok, np.ones(len(none), bool))
-        for table, row in zip(arrays.fault, shown.fault, strict=True):
+        for table, row in zip(own.arrays.fault, own.fault, strict=True):
             add("write_bytes", table, row)
         return (interface.Transfer * len(transfers))(*transfers)
 

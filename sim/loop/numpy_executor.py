@@ -121,7 +121,7 @@ class NumPyExecutor:
     def _step_engine(self, values: Values) -> Values:
         """Do a sim step; return its reading as the values' ``measured``, and note whether an env may have failed."""
         self._pack.write_qf(values.outputs.qf)
-        self._pack.step(False)
+        self._pack.step()
         measured = self.measure()
         self._failed = not sound(measured, self._speed_limit)
         return values._replace(measured=measured)

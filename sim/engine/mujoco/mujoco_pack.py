@@ -181,13 +181,8 @@ class MujocoPack(SingleOwner):
         """Apply joint efforts [N m or N]. They persist until written again."""
         self.qf[...] = effort
 
-    def step(self, update: bool = True) -> None:
-        """Do one sim step of every robot, with constraint efforts on coupled joints.
-
-        Without ``update`` these take the mass matrix of an earlier step.
-        """
-        if update:
-            self.update_constraint()
+    def step(self) -> None:
+        """Do one sim step of every robot, with constraint efforts on coupled joints."""
         if self.steps_natively:
             if self._own_step is None:
                 self._own_step = self._make_step(False, None)

@@ -107,14 +107,9 @@ class Pack(SingleOwner):
             robots, self.systems, self._joint_qf[: len(robots)], self._suspended[: len(robots)], self.steps_natively
         )
 
-    def step(self, update: bool = True) -> None:
-        """Do one sim step of every scene, with constraint efforts on coupled joints.
-
-        Without ``update`` these take the mass matrix of an earlier step.
-        """
+    def step(self) -> None:
+        """Do one sim step of every scene, with constraint efforts on coupled joints."""
         if self._constraint is not None:
-            if update:
-                self.update_constraint()
             qpos, qvel = self._calls.qpos(np.float64), self._calls.qvel(np.float64)
             self._joint_qf[...] = self._constraint.apply(self.qf, qpos, qvel)
             self._calls.write_qf()

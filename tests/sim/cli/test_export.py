@@ -72,7 +72,7 @@ def test_controllers_of_ros2_control_are_written_and_read(batchpid, tmp_path):
     inertia = np.diagonal(panda.mass_matrix(panda.start)[0])
     np.testing.assert_allclose(params.kp[0], panda.tuned().kp[0] * inertia, rtol=1e-12)
     status, said, _ = batchpid("rollout", "panda", "--gains", out, "--seconds", 0.01, "--workers", 0, "--num-envs", 1)
-    assert status == 3  # so short a run does not settle
+    assert status == 0
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

@@ -97,7 +97,7 @@ class DoubleIntegrators:
     def update_constraint(self, rows=slice(None)):
         pass
 
-    def step(self, update=True):
+    def step(self):
         qpos, qvel = self._state
         qvel += self.spec.timestep * self._moves * self.qf
         qpos += self.spec.timestep * qvel
