@@ -37,7 +37,7 @@ class Reading(NamedTuple):
     """Unit of the times; None: as the column's name says, such as ``time_ms``, else seconds."""
     degrees: bool = False
     """True if positions and velocities of revolute joints, setpoints included, are in degrees."""
-    sensor: Sensor | None = None
+    measured: Sensor | None = None
     """Place at which the column ``effort`` was measured; None: it was commanded. Columns ``measured_effort`` are taken
     as measured at the motor unless this says "link"."""
     topic: str = "/joint_states"

@@ -94,6 +94,10 @@ def _logs(robot: Robot, logs: Iterable[Any], kind: Any, hold: bool) -> list[Log]
     ]
     if not found:
         raise InvalidArgumentError("logs", "are missing", remedy="name one file or more")
+    held_out = {log.settings.held_out for log in found}
+    if len(held_out) == 1 and held_out != {None}:
+        problem = "are all held out" if True in held_out else "hold out nothing, which would test the fit"
+        raise InvalidArgumentError("logs", problem, remedy="set held_out of some of them, or of none")
     for log in found:
         if log.joints != found[0].joints:
             raise InvalidArgumentError(

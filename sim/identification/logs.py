@@ -102,7 +102,7 @@ def _read(robot: Robot, path: Path, kind: CommandKind | None, hold: bool, readin
     if not path.exists():
         raise FileNotFoundError(2, "there is no such file", str(path))
     if path.suffix.lower() in runs.SUFFIXES:
-        return runs.read_runs(path, robot, read_logs, hold, reading)
+        return runs.read_runs(path, robot, read_logs, kind, hold, reading)
     if bags.is_bag(path):
         states, *commands = [_named(robot, str(path), each, reading) for each in bags.read_bag(path, reading)]
         return _build(robot, str(path), states, None, kind, hold, reading, *commands)
@@ -192,7 +192,7 @@ def _build(
     time = time_column(source, columns, reading.time_unit)
     command_time = time if commands is None else commands["time"]
     by = _by_quantity(robot, source, columns if commands is None else columns | commands, reading)
-    sensor = reading.sensor if by["effort"] or by["measured_effort"] else None
+    sensor = reading.measured if by["effort"] or by["measured_effort"] else None
     if by["measured_effort"]:
         sensor = sensor or "motor"
     elif sensor is not None:

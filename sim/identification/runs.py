@@ -42,11 +42,18 @@ OWN = ("log", "gains", "payload", "urdf", "held_out", "hold")
 MOST_PAYLOAD = 1000.0
 
 
-def read_runs(path: Path, robot: Robot, read: Callable[..., list[Log]], hold: bool, reading: Reading) -> list[Log]:
+def read_runs(
+    path: Path,
+    robot: Robot,
+    read: Callable[..., list[Log]],
+    kind: CommandKind | None,
+    hold: bool,
+    reading: Reading,
+) -> list[Log]:
     """Return the logs of a list, with their settings; ``read`` is :func:`batchpid.sim.identification.logs.read_logs`.
 
-    ``hold`` and ``reading`` apply where the list does not say otherwise. Raises InvalidArgumentError for a key or value
-    that is not understood, and the errors of :func:`batchpid.sim.identification.logs.read_logs`.
+    ``kind``, ``hold`` and ``reading`` apply where the list does not say otherwise. Raises InvalidArgumentError for a
+    key or value that is not understood, and the errors of :func:`batchpid.sim.identification.logs.read_logs`.
     """
     document = documents.read(path)
     if not isinstance(document, dict) or not isinstance(document.get("logs"), list) or not document["logs"]:
@@ -58,14 +65,12 @@ def read_runs(path: Path, robot: Robot, read: Callable[..., list[Log]], hold: bo
         entry = common | instance(where, entry, dict, "write a mapping, such as {log: monday.csv}")
         for key in entry:
             choice(f"{where}: key", key, (*OWN, *Reading._fields))
-        if not isinstance(entry.get("log"), str):
-            raise error(where, "names no log", "add 'log: FILE'")
-        found += _read(where, path.parent, robot, read, entry)
+        if not isinstance(entry.get("log"), str) or Path(entry["log"]).suffix.lower() in SUFFIXES:
+            raise error(where, "names no log", "add 'log: FILE', of another kind than this list")
+        found += _read(where, path.parent, robot, read, kind, entry)
     if any(log.settings.held_out for log in found):
         whole = [log.settings._replace(held_out=bool(log.settings.held_out)) for log in found]
         found = [replace(log, settings=each) for log, each in zip(found, whole, strict=True)]
-        if all(each.held_out for each in whole):
-            raise error(str(path), "holds out all logs", "leave one at least to be fitted")
     return found
 
 
@@ -85,7 +90,14 @@ def gains_of(robot: Robot, name: str) -> bp.PIDParams:
     return bp.load_params(path, order)[0]
 
 
-def _read(where: str, folder: Path, robot: Robot, read: Callable[..., list[Log]], entry: dict[str, Any]) -> list[Log]:
+def _read(
+    where: str,
+    folder: Path,
+    robot: Robot,
+    read: Callable[..., list[Log]],
+    kind: CommandKind | None,
+    entry: dict[str, Any],
+) -> list[Log]:
     """Return the stretches of one log of a list, with its settings."""
     own, params = robot, None
     if (urdf := entry.get("urdf")) is not None:
@@ -101,9 +113,9 @@ def _read(where: str, folder: Path, robot: Robot, read: Callable[..., list[Log]]
     if held_out is not None:
         flag(f"{where}: held_out", held_out)
     settings = LogSettings(None if own is robot else own, params, payload, held_out)
-    kind: CommandKind = "effort" if params is None else "setpoint"
+    wanted: CommandKind | None = kind if params is None else "setpoint"
     hold, reading = flag(f"{where}: hold", entry["hold"]), _reading(where, robot, entry)
-    found = read(own, [folder / entry["log"]], kind, hold=hold, reading=reading)
+    found = read(own, [folder / entry["log"]], wanted, hold=hold, reading=reading)
     return [replace(log, settings=settings) for log in found]
 
 
@@ -112,8 +124,8 @@ def _reading(where: str, robot: Robot, entry: dict[str, Any]) -> Reading:
     reading = Reading(**{key: entry[key] for key in Reading._fields})
     if reading.time_unit is not None:
         choice(f"{where}: time_unit", reading.time_unit, get_args(TimeUnit))
-    if reading.sensor is not None:
-        choice(f"{where}: sensor", reading.sensor, get_args(Sensor))
+    if reading.measured is not None:
+        choice(f"{where}: measured", reading.measured, get_args(Sensor))
     flag(f"{where}: degrees", reading.degrees)
     for key in ("topic", "prefix", *(["command_topic"] if reading.command_topic is not None else [])):
         instance(f"{where}: {key}", getattr(reading, key), str, "write a text")
