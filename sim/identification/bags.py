@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.errors import MissingDependencyError
+from batchpid.errors import BatchPIDError, MissingDependencyError
 from batchpid.sim.identification.columns import Reading, error
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -59,8 +59,10 @@ def read_bag(path: Path, reading: Reading) -> list[dict[str, Float64]]:
                 message: Any = reader.deserialize(raw, connection.msgtype)
                 stamp = message.header.stamp
                 messages[connection.topic].append((stamp.sec * 10**9 + stamp.nanosec or received, message))
-    except (OSError, ValueError) as bad:  # InvalidArgumentError is a ValueError, and passes
-        raise bad if hasattr(bad, "remedy") else error(str(path), f"cannot be read: {bad}", "record it again") from None
+    except BatchPIDError:
+        raise
+    except Exception as bad:  # a damaged file can make the library raise anything
+        raise error(str(path), f"cannot be read: {bad}", "correct or record it again") from None
     begin = min((stamp for stamp, _ in messages[reading.topic]), default=0)
     return [_columns(f"{path}: {topic}", messages[topic], names, begin) for topic, names in topics.items()]
 
