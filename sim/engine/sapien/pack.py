@@ -210,7 +210,7 @@ class Pack(SingleOwner):
         """Return the robots (M,) whose floating base is not finite or beyond FARTHEST."""
         if self.spec.fixed_base:
             return np.zeros(self.size, bool)
-        return (~(np.abs(self.read_base()) <= FARTHEST)).any(1)
+        return np.array(~(np.abs(self.read_base()) <= FARTHEST).all(1))
 
     def read_base(self) -> Float64:
         return self._moved_to_origin(np.array([read_root(robot) for robot in self.robots], np.float64), -1.0)

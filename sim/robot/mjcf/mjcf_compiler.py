@@ -34,7 +34,7 @@ class Attempt(NamedTuple):
     """
 
     scene: Any
-    model: Any | None
+    model: Any
     reading: str
     missing: tuple[str, ...] = ()
     weighing: tuple[tuple[str, str], ...] = ()

@@ -45,7 +45,7 @@ class Names:
         self._left_out = bodies
         self.joints = {joint: name for joint, name in self.joints.items() if self.is_of_robot(self._bodies[joint])}
 
-    def is_of_robot(self, body: int) -> bool:
+    def is_of_robot(self, body: Any) -> bool:
         """Return whether a body, the world included, is none of those that were left out, nor below one."""
         return int(self._roots[body]) not in self._left_out
 
