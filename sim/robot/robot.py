@@ -139,6 +139,7 @@ class Robot(RobotDescription):
             bodies=bodies,
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
             defaults=None if mjcf is None else _file_defaults(mjcf, joints),
+            mjcf=None if mjcf is None else mjcf.file,
         )
         if actuators is None and mjcf is not None:
             actuators = _file_actuators(mjcf, joints)
