@@ -161,7 +161,7 @@ class RunnerOptions:
             "dtype": choice("dtype", self.dtype, get_args(Precision)),
             "compensate": choice("compensate", self.compensate, get_args(Compensation)),
             "collisions": (collisions := flag("collisions", self.collisions)),
-            "ground": collisions and robot.has_ground if given["ground"] is None else flag("ground", self.ground),
+            "ground": collisions and self._has_ground if given["ground"] is None else flag("ground", self.ground),
             "on_fault": choice("on_fault", self.on_fault, get_args(FaultAction)),
             "on_invalid_input": choice("on_invalid_input", self.on_invalid_input, get_args(InvalidInputAction)),
             "recover": flag("recover", self.recover),
@@ -224,6 +224,10 @@ class RunnerOptions:
     def mjcf(self) -> MjcfFile | None:
         """MJCF file that the engine simulates as it is; None for others, and in SAPIEN."""
         return self.robot.mjcf if self.engine == "mujoco" else None
+
+    @property
+    def _has_ground(self) -> bool:
+        return (self.mjcf is not None and self.mjcf.has_floor) or self.robot.has_ground
 
     @property
     def loops(self) -> tuple[str, ...]:
