@@ -19,7 +19,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.fit import LEAST_GAIN, Solution, Step, fit
 from batchpid.sim.identification.fit_history import History, State
-from batchpid.sim.identification.plant import Plant
+from batchpid.sim.identification.plant import plants_of
 from batchpid.sim.identification.problem import Evaluation, Problem
 from batchpid.sim.identification.regression import Regression
 from batchpid.sim.identification.unknowns import LAW
@@ -92,10 +92,12 @@ def extended(problem: Problem, best: Solution, kinds: tuple[str, ...]) -> tuple[
 
 def _regressed(problem: Problem, point: Float64) -> Float64:
     """Return ``point`` with the motors that a regression gives for the law at ``point``."""
-    unknowns, plant = problem.unknowns, Plant(problem.robot, problem.joints, problem.drive)
+    unknowns, both = problem.unknowns, zip(problem.logs, problem.motions, strict=True)
+    logs, motions = map(list, zip(*(each for each in both if not each[0].settings.held_out), strict=True))
+    plants = plants_of(problem.robot, problem.joints, problem.drive, logs)
     motors, payload = unknowns.motors(point[None]), ("payload", None) in unknowns.names
     law = {name: motors[name] for name in LAW if name in motors}
-    start = Regression(plant, problem.logs, problem.motions, payload, "gain" not in law, law)
+    start = Regression(plants, logs, motions, payload, "gain" not in law, law)
     return unknowns.clip(unknowns.point(motors | start.best.motors))
 
 
@@ -143,6 +145,8 @@ def _stage(problems: list[Problem], done: list[tuple[int, Solution]], evaluation
 
 def _delayed(problem: Problem, theta: Float64, steps: int) -> Float64 | None:
     """Return ``theta`` with the delay increased by ``steps``, None if that is out of bounds."""
+    if ("delay", None) not in problem.unknowns.names:
+        return None
     delay = problem.unknowns.names.index(("delay", None))
     later = theta.copy()
     later[delay] += steps * problem.drive.timestep

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -81,7 +82,7 @@ def held_out_error(
         residuals = problem.residuals(point)
         tried.append((problem.costs(problem.sizes(residuals)).sum(), problem, residuals))
     _, problem, residuals = min(tried, key=lambda each: each[0])
-    before = problem.residuals(unknowns.point(ideal_motors(robot, joints))[None])
+    before = residuals_of_ideal(problem, robot)
     return error_of(problem, before), error_of(problem, residuals)
 
 
@@ -91,6 +92,12 @@ def error_of(problem: Problem, residuals: list[Float64]) -> float:
     with np.errstate(invalid="ignore", over="ignore"):
         error = float(np.sqrt((np.concatenate(kept) ** 2).mean()))
     return error if np.isfinite(error) else float("inf")
+
+
+def residuals_of_ideal(problem: Problem, robot: Robot) -> list[Float64]:
+    """Return the residuals (1, rows, joints) of each window for the motors according to the robot's description."""
+    plain = replace(problem, unknowns=replace(problem.unknowns, known={}))
+    return plain.residuals(plain.unknowns.point(ideal_motors(robot, problem.joints))[None])
 
 
 def ideal_motors(robot: Robot, joints: tuple[int, ...]) -> Motors:

@@ -18,6 +18,9 @@ from batchpid.sim.identification.statistics import INTERVAL, Uncertainty
 from batchpid.sim.identification.unknowns import ADDED, DESCRIBED, KINDS, Unknowns, kind_of
 from batchpid.sim.robot.robot import Robot
 
+SHORT = 30.0
+"""Length of a log [s] below which intervals hold for its motion only."""
+
 
 class Fit(NamedTuple):
     """Position errors along a simulated stretch of a log: measured less simulated positions [rad or m]."""
@@ -163,6 +166,8 @@ class Identification(NamedTuple):
     @property
     def strength_taken(self) -> list[str]:
         """Joints of which the logs show only ratios to the strength: it is taken as 1."""
+        if "strength" in self.unknowns.known:
+            return []
         known = self.unknowns.joints_of("strength") + self.unknowns.joints_of("gain")
         return [self.robot.joint_names[number] for at, number in enumerate(self.joints) if at not in known]
 
@@ -179,6 +184,11 @@ class Identification(NamedTuple):
     def worst_joint(self) -> str:
         """Name of the joint with the largest of :attr:`misfits`."""
         return self.robot.joint_names[self.joints[int(self.misfits.argmax())]]
+
+    @property
+    def is_short(self) -> bool:
+        """True if there is one log of less than :data:`SHORT`, which shows nothing of other motions, loads and days."""
+        return len({fit.log for fit in self.fits}) == 1 and sum(float(np.ptp(fit.time)) for fit in self.fits) < SHORT
 
     @property
     def explains(self) -> bool:

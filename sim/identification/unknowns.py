@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -56,6 +56,7 @@ KINDS = {
 }
 """Kinds of unknowns. A line here is all that an effect of :mod:`batchpid.motors` needs to be identified."""
 ADDED = {
+    "lag": Kind("lag", True, 0.0, 0.1, 5e-3, 20.0),
     "load_friction": Kind("load_friction", True, 0.0, 0.9, 0.1, 5.0, tries=(0.5, 2.0)),
     "static": Kind("static", True, 0.0, np.inf, "friction", 10.0, tries=(1.3, 2.0)),
     "stribeck": Kind("stribeck", True, 0.0, np.inf, "speed", 2.0, tries=(0.03, 0.2)),
@@ -126,6 +127,8 @@ class Unknowns:
     """Typical sizes, powers of 2: points over them are exact, so that a fit resumes bit-identically."""
     inertia: Float64
     """Typical inertia that the joints show without armature (joints,)."""
+    known: Motors = field(default_factory=dict)
+    """Values (1, joints or 1) of kinds that are known, in place of ideal ones."""
 
     @classmethod
     def of(
@@ -173,6 +176,17 @@ class Unknowns:
     def _size(self, name: str, sizes: Mapping[str, Float64]) -> Float64:
         size = kind_of(name).size
         return np.broadcast_to(sizes[size] if isinstance(size, str) else size, self.joints)
+
+    def without(self, known: Motors) -> Unknowns:
+        """Return the unknowns without the kinds in ``known``, whose values (1, joints or 1) are taken as they are."""
+        kept = [index for index, (name, _) in enumerate(self.names) if name not in known]
+        return replace(self, names=tuple(self.names[index] for index in kept), scale=self.scale[kept], known=known)
+
+    def plus_known(self, names: tuple[tuple[str, int | None], ...]) -> Unknowns:
+        """Return the unknowns with ``names`` among them, whose kinds are known no longer."""
+        known = {kind: values for kind, values in self.known.items() if kind not in dict(names)}
+        scale = np.append(self.scale, np.ones(len(names)))
+        return replace(self, names=(*self.names, *names), scale=scale, known=known)
 
     def _each(self, leaf: str) -> Float64:
         return np.array([getattr(kind_of(kind), leaf) for kind, _ in self.names])
@@ -243,12 +257,13 @@ class Unknowns:
 
     def motors(self, points: Float64) -> Motors:
         """Return the candidates at ``points`` (n, unknowns), ideal in what is not an unknown."""
-        kinds = KINDS | {name: ADDED[name] for name in dict(self.names) if name not in KINDS}
+        named = {*dict(self.names), *self.known}
+        kinds = KINDS | {name: kind for name, kind in ADDED.items() if name in named}
         found = {}
         for name, kind in kinds.items():
             joints = self.joints_of(name)
-            columns = self.joints if kind.per_joint and joints else 1
-            found[name] = np.full((len(points), columns), kind.neutral)
+            ideal = np.full((1, self.joints if kind.per_joint and joints else 1), kind.neutral)
+            found[name] = np.repeat(self.known.get(name, ideal), len(points), axis=0)
             found[name][:, joints] = points[:, self.of_kind(name)]
         return found
 

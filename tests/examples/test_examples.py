@@ -15,6 +15,7 @@ from robots import load_bundled
 import batchpid as bp
 import batchpid.sim
 from batchpid.sim import Runner
+from batchpid.sim.cli import main
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -103,6 +104,22 @@ def test_the_integral_removes_the_error_of_an_uncompensated_drive(run, tmp_path)
     assert max(errors["PID, no compensation"]) < 2e-3
     assert max(errors["PID, compensated"]) < 1e-3
     assert picture.stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["torque", "servo", "velocity", "mit"])
+def test_the_motor_of_each_kind_of_controller_is_identified(run, tmp_path, kind):
+    (line,) = [each for each in run("real_logs.py", "--out", str(tmp_path)).splitlines() if f"{kind}." in each]
+    words = [*line.split()[1:], "--workers", "0", "--out", str(tmp_path / "motors.yaml")]
+    assert not main(words)
+    module = runpy.run_path(str(EXAMPLES / "real_logs.py"))
+    found = bp.load_actuators(tmp_path / "motors.yaml", ("hinge",))[0]
+    for name, value, near in (
+        ("strength", module["STRENGTH"][kind], 0.01),
+        *((name, value, 0.03) for name, value in module["MOTOR"].items()),
+    ):
+        if (name, kind) != ("command_delay", "velocity"):  # nothing of it shows in measured efforts
+            assert getattr(found, name)[0, 0] == pytest.approx(value, rel=near)
 
 
 needs_training = pytest.mark.skipif(importlib.util.find_spec("optax") is None, reason="needs the extra [train]")

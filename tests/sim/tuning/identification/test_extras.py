@@ -28,11 +28,18 @@ def pendulum(tmp_path_factory) -> Robot:
     return Robot.load(path)
 
 
-def log_of(robot: Robot, *, gains=GAINS, rate=None, kind="setpoint", seconds=5.0, noise=1e-4, **motor) -> Log:
+@pytest.fixture
+def short_search(monkeypatch):
+    """The search has one generation, and short fits of neighbours and of effects."""
+    monkeypatch.setattr("batchpid.sim.identification.start.GENERATIONS", 1)
+    monkeypatch.setattr("batchpid.sim.identification.fit_search.NEIGHBOUR_EVALUATIONS", 2)
+
+
+def log_of(robot: Robot, *, gains=GAINS, rate=None, kind="setpoint", seconds=2.4, noise=1e-4, **motor) -> Log:
     """Return a log of a Runner whose servo has ``gains`` and limits the rate of its goals: sines, then steps."""
     time = DT * np.arange(round(seconds / DT))
     wave = 0.7 * np.sin(5 * time) + 0.3 * np.sin(11 * time + 1)
-    goal = np.where(time % 2 < 1.2, wave, np.where(time % 0.4 < 0.2, 0.8, -0.6))[:, None]
+    goal = np.where(time % 1.2 < 0.7, wave, np.where(time % 0.4 < 0.2, 0.8, -0.6))[:, None]
     guard = None if rate is None else robot.guard(rate=rate)
     actuators = bp.make_actuators(1, **MOTOR | motor)
     options = {"params": gains, "compensate": "none", "timestep": DT, "substeps": 1, "workers": 0, "guard": guard}
@@ -45,6 +52,8 @@ def log_of(robot: Robot, *, gains=GAINS, rate=None, kind="setpoint", seconds=5.0
     return Log("log", (0,), kind, time, qpos, time, command, kind == "effort")
 
 
+@pytest.mark.usefixtures("short_search")
+@pytest.mark.quick_rows(1)
 @pytest.mark.parametrize(
     ("extra", "made", "kind", "truth"),
     [
@@ -54,17 +63,18 @@ def log_of(robot: Robot, *, gains=GAINS, rate=None, kind="setpoint", seconds=5.0
     ],
 )
 def test_an_effect_is_found_and_kept(pendulum, extra, made, kind, truth):
-    found = identify(pendulum, log_of(pendulum, **made), params=GAINS, **OPTIONS, extras=[extra], evaluations=6)
-    plain = identify(pendulum, log_of(pendulum, **made), params=GAINS, **OPTIONS, evaluations=6)
-    assert found.held_out_error[1] < plain.held_out_error[1]
+    found = identify(pendulum, log_of(pendulum, **made), params=GAINS, **OPTIONS, extras=[extra], evaluations=4)
+    assert found.held_out_error[1] < 3e-4
     assert found.document()["joints"]["servo"][kind][0] == pytest.approx(truth, rel=0.05)
 
 
+@pytest.mark.usefixtures("short_search")
 def test_an_effect_that_is_not_there_is_not_kept(pendulum):
-    found = identify(pendulum, log_of(pendulum), params=GAINS, **OPTIONS, extras=["slew"], evaluations=6)
-    assert ("slew", 0) not in found.unknowns.names
+    found = identify(pendulum, log_of(pendulum), params=GAINS, **OPTIONS, extras=["load_friction"], evaluations=4)
+    assert ("load_friction", 0) not in found.unknowns.names
 
 
+@pytest.mark.slow
 def test_gains_that_are_not_known_are_found(pendulum):
     guess = GAINS.replace(kp=4.0, kd=0.06)
     found = identify(pendulum, log_of(pendulum), params=guess, **OPTIONS, extras=["gain"])
