@@ -61,7 +61,17 @@ ARM = f"""
   <actuator><motor joint="turn"/><motor joint="lift"/><motor joint="bend"/></actuator>
   <keyframe><key name="home" qpos="0 0 .2 .3 .09 .05 1 0 0 0 1 0 0 0 0 1 .06 1 0 0 0 .2"/></keyframe>
 </mujoco>"""
-TEXTS = {"four-bar": FOUR_BAR, "gripper": GRIPPER, "arm": ARM}
+CLOTH = (
+    ARM.replace("<keyframe>", "<!--")
+    .replace("</keyframe>", "-->")
+    .replace(
+        "</worldbody>",
+        """<flexcomp name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" radius=".01" dim="2"
+          pos=".3 .1 .3" mass=".1">
+      <edge equality="true"/></flexcomp></worldbody>""",
+    )
+)
+TEXTS = {"four-bar": FOUR_BAR, "gripper": GRIPPER, "arm": ARM, "cloth": CLOTH}
 OBJECTS = ("cube", "lamp", "chest", "lid")
 
 
