@@ -31,7 +31,7 @@ class Config(ppo.Config):
     updates: int = 70  # Updates of the agent.
     epochs: int = 5  # Passes over the data of an update.
     discount: float = 0.97  # Of the reward, per step.
-    log_std: float = -1.0  # Logarithm of the standard deviation of actions, at the start.
+    log_std: float = -2.0  # Logarithm of the standard deviation of actions, at the start.
     episode: int = 250  # Steps of an episode in training, 50 a second.
     speed: float = 0.5  # Commanded forward velocity [m/s].
     evaluated: int = 32  # Robots of the evaluation.

@@ -35,8 +35,8 @@ class WalkVectorEnv(RobotVectorEnv):
 
     - *Observation*: of the trunk, in its own axes, velocity [m/s], angular velocity [rad/s] and the upright axis, (3)
       each; command (3); of the joints, position from the posture, velocity, last action; sine and cosine of the clock.
-    - *Reward*: exp(-error^2 / 0.25) for the horizontal velocity, half of that for the turn; minus v_z^2, 0.02 times the
-      squared rates of roll and pitch, 2 sin^2 of the tilt, 1e-4 effort^2, and 0.01 change of the action^2.
+    - *Reward*: exp(-error^2 / 0.1) for the horizontal velocity and 0.5 exp(-error^2 / 0.25) for the turn, minus v_z^2,
+      0.02 (roll rate^2 + pitch rate^2), 2 sin^2 of the tilt, 1e-4 effort^2, and 0.01 (change of the action)^2.
     - *Terminated*: the robot fell: its trunk is lower than :attr:`lowest`, or tilted by 60 degrees; or it diverged.
     - *Info*: "speed" (forward [m/s]), "distance" (from the start along x [m]), "diverged".
 
@@ -133,7 +133,7 @@ class WalkVectorEnv(RobotVectorEnv):
         off, turn = ((command[:, :2] - velocity[:, :2]) ** 2).sum(1), (command[:, 2] - rate[:, 2]) ** 2
         costs = velocity[:, 2] ** 2 + 0.02 * (rate[:, :2] ** 2).sum(1) + 2.0 * (upright[:, :2] ** 2).sum(1)
         costs += 1e-4 * (self.observed.effort.astype(np.float64) ** 2).sum(1) + 0.01 * (self._change**2).sum(1)
-        return np.exp(-off / 0.25) + 0.5 * np.exp(-turn / 0.25) - costs
+        return np.exp(-off / 0.1) + 0.5 * np.exp(-turn / 0.25) - costs
 
     def terminated(self, observation: Float32, success: Bool) -> Bool:
         """Return whether the robot fell."""

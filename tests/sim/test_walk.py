@@ -57,7 +57,7 @@ def test_the_reward_is_the_one_that_is_documented(walkers):
         velocity, rate = turn.apply(seen.base_twist[:, :3]), turn.apply(seen.base_twist[:, 3:])
         tilt = turn.apply([0.0, 0.0, 1.0])
         command = observation[:, 9:12]
-        wanted = np.exp(-((command - velocity)[:, :2] ** 2).sum(1) / 0.25)
+        wanted = np.exp(-((command - velocity)[:, :2] ** 2).sum(1) / 0.1)
         wanted += 0.5 * np.exp(-((command - rate)[:, 2] ** 2) / 0.25)
         wanted -= velocity[:, 2] ** 2 + 0.02 * (rate[:, :2] ** 2).sum(1) + 2 * (1 - tilt[:, 2] ** 2)
         wanted -= 1e-4 * (seen.effort**2).sum(1) + 0.01 * ((action - last) ** 2).sum(1)
