@@ -28,7 +28,7 @@ from batchpid.sim.identification.unknowns import KINDS, Motors, kind_of
 from batchpid.sim.identification.windows import share_fitted
 from batchpid.sim.robot.robot import Robot
 
-LAGS = np.r_[0.0, np.geomspace(5e-4, 0.1, 24)]
+LAGS = np.r_[0.0, np.geomspace(5e-4, 0.1, 12)]
 """Lags that are tried [s]."""
 STEPS, STEP = 8, 1e-4
 """Gauss-Newton steps, and change of a time for a finite difference [s]."""
@@ -133,7 +133,7 @@ class _Tables:
             grid = log.time[0] + self._dt * np.arange(len(motion.qpos))
             kept = (log.time > log.time[0] + EDGE) & (log.time < log.time[-1] - EDGE)
             step = np.ceil((log.time[kept] - log.time[0]) / self._dt - 1e-6).astype(int) - 1
-            self._commands.append(log.commands_at(grid))
+            self._commands.append(self._filtered(log.commands_at(grid)))
             self._index.append(np.clip(step, 0, len(grid) - 1))
             assert log.measured is not None
             measured = self._filtered(np.stack([np.interp(grid, log.time, m) for m in log.measured.T], 1))
@@ -162,7 +162,7 @@ class _Tables:
             if lag > 0:
                 a = 1 - np.exp(-self._dt / lag)
                 late = lfilter([a], [1, a - 1], late, zi=[(1 - a) * late[0]])[0]
-            parts.append(self._filtered(late[:, None])[index, 0])
+            parts.append(late[index])
         effort = np.concatenate(parts)
         return np.stack([effort, np.ones_like(effort), *(each[:, joint] for each in self._motion)], axis=1)
 
