@@ -99,6 +99,7 @@ class IdentifyCommand:
 
     def run(self) -> None:
         """Run the command."""
+        import batchpid as bp
         from batchpid.sim import plots
         from batchpid.sim.identification.identification import identify
         from batchpid.sim.identification.runs import gains_of
@@ -137,6 +138,10 @@ class IdentifyCommand:
             raise InvalidArgumentError("logs", problem, remedy=remedy)
         found.save(out)
         print(f"\nwritten: {out}")
+        if found.finds_gains:
+            path = beside(out, "gains").with_suffix(".yaml")
+            bp.save_params(path, found.gains(), [robot.joint_names[joint] for joint in found.joints])
+            print(f"gains that were found, for --gains: {path}")
         if details is not None:
             write_figures(details, found.document())
             print(f"written: {details}")
@@ -223,6 +228,8 @@ def report(found: Identification) -> str:
     taken = found.strength_taken
     rows = [[name, *(cell(kind, joint) for kind in kinds)] for joint, name in enumerate(names)]
     text = [table(rows, ["95 % intervals, SI units", *kinds], "l" + len(kinds) * "r"), ""]
+    if "slew" in kinds:
+        text.append("slew is the limit of the setpoints' rate: simulate with guard=robot.guard(rate=...)")
     if taken:
         text.append(f"strength taken as 1, because the logs show only ratios to it: {', '.join(taken)}")
     if ("delay", None) in found.unknowns.names:

@@ -171,6 +171,11 @@ class Identification(NamedTuple):
         known = self.unknowns.joints_of("strength") + self.unknowns.joints_of("gain")
         return [self.robot.joint_names[number] for at, number in enumerate(self.joints) if at not in known]
 
+    @property
+    def finds_gains(self) -> bool:
+        """True if :meth:`gains` differ from the params of the law that were given."""
+        return not {"gain", "kd", "saturation"}.isdisjoint(self.unknowns.per_joint)
+
     def gains(self) -> bp.PIDParams | None:
         """Return the params of the law that was found, of the logged joints; None for logs of efforts."""
         return self.drive.of(self.unknowns.motors(self.estimate[None])).params
