@@ -198,7 +198,7 @@ def _known(log: Log, payload: bool, ratios: EffortRatios | None) -> Motors:
     Behind the gear they are free of the motor's inertia and friction.
     """
     if ratios is not None:
-        return ratios.values("strength", "delay", "lag")
+        return ratios.values(("strength", "delay", "lag"))
     if not log.is_measured:
         return {}
     of_motor = ("armature", "damping", "friction") if log.sensor == "link" else ()
