@@ -65,6 +65,9 @@ class IdentifyCommand:
     """Prefix of the joints' names in the logs."""
     no_payload: flags.Switch = False
     """The tool carries no payload."""
+    extras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = ()
+    """Effects to try, each kept where the error on the held-out part falls: load_friction, stribeck, offset; with
+    --gains also gain (a factor of gains that are not known), kd, saturation and slew (the limit of the goal's rate)."""
     evaluations: int = 25
     """Largest number of evaluations of the fit; each simulates the robot along the logs and, for each unknown,
     a perturbed one, so that a minute of logs takes six times as long as ten seconds. 0: no fit; with --actuators their
@@ -123,7 +126,7 @@ class IdentifyCommand:
             logs,
             params=params,
             payload=not self.no_payload,
-            **flags.chosen(self, "compensate timestep sim_steps hold evaluations seed workers"),
+            **flags.chosen(self, "compensate timestep sim_steps hold extras evaluations seed workers"),
             history=history,
             progress=bar("identifying", bar_format=AT_MOST),
         )
@@ -211,13 +214,18 @@ def report(found: Identification) -> str:
     def cell(kind: str, joint: int | None = None, factor: float = 1.0) -> str:
         row = document[kind] if joint is None else document["joints"][names[joint]][kind]
         value, low, high = (factor * each for each in row)
+        if (kind, joint) not in found.unknowns.names:
+            return f"{value:.4g} taken" if kind == "strength" else "-"
         mark = "" if found.interval(kind, joint) else " ?"
         return f"{value:.4g} ± {max(high - value, value - low):.1g}{mark}"
 
     document, names = found.document(), [found.robot.joint_names[joint] for joint in found.joints]
     kinds = found.unknowns.per_joint
+    taken = found.strength_taken
     rows = [[name, *(cell(kind, joint) for kind in kinds)] for joint, name in enumerate(names)]
     text = [table(rows, ["95 % intervals, SI units", *kinds], "l" + len(kinds) * "r"), ""]
+    if taken:
+        text.append(f"strength taken as 1, because the logs show only ratios to it: {', '.join(taken)}")
     if ("delay", None) in found.unknowns.names:
         text.append(f"delay of the commands: {cell('delay', None, 1e3)} ms")
     else:

@@ -79,6 +79,8 @@ class Identification(NamedTuple):
             raise InvalidArgumentError("joint", f"does not go with {kind!r}", value=joint, remedy=remedy)
         if joint is not None:
             joint = integer("joint", joint, 0, len(self.joints) - 1)
+        if (kind, joint) not in self.unknowns.names:
+            return None
         index = self.unknowns.names.index((kind, joint))
         return self._row(index) if self.uncertainty.identified[index] else None
 
@@ -112,13 +114,16 @@ class Identification(NamedTuple):
         """
         of_joints, others = self.missing()
         document, motors = self.document(), self.unknowns.motors(self.estimate[None])
-        logged = {self.robot.joint_names[number] for number in self.joints}
+        names = [self.robot.joint_names[number] for number in self.joints]
+        logged = set(names)
         own = zip(self.robot.joint_names, self.robot.independent, strict=True)
         about = {
             "identified_from": self.settings["logs"],
             "held_out_error": document["held_out_error"],
             "misfit": document["misfit"],
-            ASSUMED: self.drive.assumptions | {kind: float(motors[kind][0, 0]) for kind in ("stopping", "payload")},
+            ASSUMED: self.drive.assumptions
+            | {kind: float(motors[kind][0, 0]) for kind in ("stopping", "payload")}
+            | ({"slew": dict(zip(names, motors["slew"][0].tolist(), strict=True))} if "slew" in motors else {}),
             "intervals": document["joints"]
             | {kind: document[kind] for kind, joint in self.unknowns.names if joint is None and kind in document},
             "not_well_determined": of_joints | ({"all joints": others} if others else {}),
@@ -136,6 +141,8 @@ class Identification(NamedTuple):
         """
 
         def row(kind: str, joint: int | None = None) -> list[float]:
+            if (kind, joint) not in self.unknowns.names:
+                return [kind_of(kind).neutral] * 3
             return list(self._row(self.unknowns.names.index((kind, joint))))
 
         document: dict[str, Any] = {
@@ -149,11 +156,24 @@ class Identification(NamedTuple):
             "held_out_error": [value if np.isfinite(value) else None for value in self.held_out_error],
             "misfit": self.misfit if np.isfinite(self.misfit) else None,
             "not_identified": self.not_identified,
+            "strength_taken_as_1": self.strength_taken,
             "singular_values": self.uncertainty.singular_values.tolist(),
             "noise": self.noise.tolist(),
             "compensation": "through the motors" if self.drive.through else self.drive.compensate,
             "about": self.settings,
         }
+
+    @property
+    def strength_taken(self) -> list[str]:
+        """Joints of which the logs show only ratios to the strength: it is taken as 1."""
+        if "strength" in self.unknowns.known:
+            return []
+        known = self.unknowns.joints_of("strength") + self.unknowns.joints_of("gain")
+        return [self.robot.joint_names[number] for at, number in enumerate(self.joints) if at not in known]
+
+    def gains(self) -> bp.PIDParams | None:
+        """Return the params of the law that was found, of the logged joints; None for logs of efforts."""
+        return self.drive.of(self.unknowns.motors(self.estimate[None])).params
 
     @property
     def misfit(self) -> float:
@@ -193,8 +213,11 @@ def actuators_at(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, thet
         if not kind.per_joint:
             column[:] = found[name][0]
         elif name in DESCRIBED:
-            column[list(joints)] = np.maximum(found[name][0] - getattr(robot, name)[list(joints)], 0.0)
+            column[list(joints)] = np.maximum(found[name][0] - getattr(robot, DESCRIBED[name])[list(joints)], 0.0)
         else:
             column[list(joints)] = found[name][0]
         options[kind.field] = column
+    if "static" in options:  # below Coulomb's it has no effect, nor has the Stribeck velocity
+        more = options["static"] > options["coulomb"]
+        options |= {name: np.where(more, options[name], 0.0) for name in ("static", "stribeck")}
     return bp.make_actuators(robot.dof, **options, joint_names=robot.joint_names)

@@ -182,7 +182,9 @@ def _add_keyframe(root: Any, model: Any, robot: RobotDescription, motors: MjcfAc
 
 
 def _compare(found: Drive, robot: RobotDescription, friction: Any) -> None:
-    """Add the differences of MuJoCo's friction and constraints."""
+    """Add the differences of MuJoCo's friction and constraints, and from an MJCF file that the robot is from."""
+    if robot.mjcf is not None:
+        found.append("scene: the robot alone, without objects, tendons, springs and equalities of its MJCF file")
     if friction.coulomb is not None and np.any(friction.coulomb):
         found.append("friction: a soft constraint in MuJoCo, in which a joint creeps below its friction")
     if names := [robot.joint_names[joint] for joint in robot.coupling.followers]:

@@ -15,7 +15,7 @@ from batchpid.sim.robot.mjcf.mjcf_compiler import Attempt, compile_file
 from batchpid.sim.robot.mjcf.mjcf_laws import plugin_name
 from batchpid.sim.robot.mjcf.mjcf_motors import Motors, read_couplings, read_motors
 from batchpid.sim.robot.mjcf.mjcf_names import ALONE, Names, label
-from batchpid.sim.robot.mjcf.mjcf_shapes import excluded_pairs
+from batchpid.sim.robot.mjcf.mjcf_shapes import PLANE, can_collide, excluded_pairs
 from batchpid.sim.robot.mjcf.mjcf_tree import Tree
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.self_collision import DisabledPair
@@ -65,7 +65,7 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> M
     findings += [*_in_radians(model, names), *_unused(model, names, key)]
     pose = model.qpos0 if key is None else model.key_qpos[key]
     start = {name: float(pose[model.jnt_qposadr[joint]]) for joint, name in names.joints.items()}
-    file = _file(path, compiled, names)
+    file = _file(path, compiled, names, fixed_base)
     return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, missing, tuple(findings), file)
 
 
@@ -74,7 +74,7 @@ def home(model: Any) -> int | None:
     return next((key for key in range(model.nkey) if model.key(key).name == _KEYFRAME), None)
 
 
-def _file(path: Path, compiled: Attempt, names: Names) -> MjcfFile:
+def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> MjcfFile:
     """Return what the engine MuJoCo needs to know of the file."""
     model, loops = compiled.model, []
     for equality in np.flatnonzero(model.eq_active0):
@@ -86,6 +86,8 @@ def _file(path: Path, compiled: Attempt, names: Names) -> MjcfFile:
         if all(names.is_of_robot(body) for body in at):
             loops.append(label(model.equality(int(equality))))
     free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    floats = any(names.is_of_robot(body) for body in free)
+    planes = np.flatnonzero((model.geom_bodyid == 0) & (model.geom_type == PLANE))
     return MjcfFile(
         path=str(path),
         reading=compiled.reading,
@@ -94,6 +96,7 @@ def _file(path: Path, compiled: Attempt, names: Names) -> MjcfFile:
         falling=tuple(names.bodies[int(body)] for body in free if not names.is_of_robot(body)),
         loops=tuple(loops),
         is_alone=all(names.is_of_robot(body) for body in model.jnt_bodyid),
+        has_floor=any(can_collide(model, geom) for geom in planes) and not (floats and fixed_base),
     )
 
 

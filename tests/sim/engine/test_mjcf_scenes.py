@@ -310,3 +310,19 @@ def test_gains_of_the_law_are_those_of_the_user(load):
             runner.step(np.zeros(3))
         poses.append(runner.bodies(["upper"]))
     np.testing.assert_array_equal(*poses)
+
+
+def test_the_planes_of_the_file_are_the_ground(load):
+    """A floor below an arm that reaches under height 0 stays, and the runner's ground stands in for a missing one."""
+    low = ARM.replace('type="plane"', 'type="plane" pos="0 0 -.5"').replace(
+        '<body name="post">', '<body name="post" pos="0 0 -.2">'
+    )
+    heights = {}
+    for name, text, options in (("file", low, {}), ("off", low, {"ground": False}), ("ours", ARM, {})):
+        text = text if name != "ours" else text.replace('<geom name="floor" type="plane" size="1 1 .1"/>', "")
+        with Runner(load(text), 1, workers=0, engine="mujoco", **options) as runner:
+            for _ in range(100):
+                runner.step(runner.robot.start)
+            heights[name] = runner.bodies(["cube"])[0, 0, 2]
+    np.testing.assert_allclose((heights["file"], heights["ours"]), (-0.46, 0.04), atol=2e-3)
+    assert heights["off"] < -3
