@@ -507,4 +507,4 @@ def default_params(
         if settings is None:
             return robot.designed("effort").replace(ki=0.0, setpoint_weight=None, derivative_filter_time=None)
         return robot.params(kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None)
-    return robot.designed("effort" if loops else "mass_matrix") if settings is None else robot.tuned()
+    return robot.tuned() if robot.has_tuned else robot.designed("effort" if loops else "mass_matrix")

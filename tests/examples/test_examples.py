@@ -14,7 +14,7 @@ from robots import load_bundled
 
 import batchpid as bp
 import batchpid.sim
-from batchpid.sim import Runner
+from batchpid.sim import Runner, read_recording
 from batchpid.sim.cli import main
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -22,6 +22,8 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 @pytest.fixture
 def run(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(EXAMPLES)  # as Python does for a script: examples share a module
+
     def run(name, *arguments):
         monkeypatch.setattr(sys, "argv", [name, *arguments])
         runpy.run_path(str(EXAMPLES / name), run_name="__main__")
@@ -137,9 +139,21 @@ def test_a_short_training_ends_with_a_picture(run, tmp_path):
 
 
 @needs_training
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_compilation")
+def test_a_short_training_to_walk_ends_with_a_picture_and_a_recording(run, tmp_path):
+    pytest.importorskip("mujoco")
+    files = ("--picture", str(tmp_path / "curve.png"), "--record", str(tmp_path / "walk.h5"))
+    text = run("train_walk.py", *SMALL, "--epochs", "1", "--time", "0.2", "--evaluated", "4", *files)
+    assert "of 4 robots walk for 0.2 s" in text
+    assert (tmp_path / "curve.png").stat().st_size > 10_000
+    assert read_recording(tmp_path / "walk.h5").base_pose.shape == (10, 4, 7)
+
+
+@needs_training
 def test_the_advantages_of_the_training_are_those_of_the_definition():
     """The sum over later steps of the same episode, written out (arXiv:1506.02438, equation 16)."""
-    module = runpy.run_path(str(EXAMPLES / "train_reach.py"))
+    module = runpy.run_path(str(EXAMPLES / "ppo.py"))
     config, rng, steps = module["Config"](), np.random.default_rng(0), 7
     value, reward = rng.normal(size=(2, steps, 2)).astype(np.float32)
     done = rng.random((steps, 2)) < 0.3
@@ -155,6 +169,15 @@ def test_the_advantages_of_the_training_are_those_of_the_definition():
                 total += factor * delta[each, env]
                 factor *= config.discount * config.gae_lambda * (not done[each, env])
             assert found[step, env] == pytest.approx(total, rel=1e-4, abs=1e-5)
+
+
+@needs_training
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_the_trained_quadruped_walks(run):
+    share = re.search(r"exploration ([\d.]+)% of 32 robots walk for 10 s", run("train_walk.py"))
+    assert share is not None
+    assert float(share[1]) >= 95
 
 
 @needs_training

@@ -96,7 +96,7 @@ def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> Mjcf
         falling=tuple(names.bodies[int(body)] for body in free if not names.is_of_robot(body)),
         loops=tuple(loops),
         is_alone=all(names.is_of_robot(body) for body in model.jnt_bodyid),
-        has_floor=any(can_collide(model, geom) for geom in planes) and not (floats and fixed_base),
+        has_floor=any(can_collide(model, int(geom)) for geom in planes) and not (floats and fixed_base),
     )
 
 
