@@ -190,18 +190,19 @@ class IdentifyCommand:
             remedy = "give 1 or more, name an actuators file as --actuators, or a log with measured efforts too"
             raise InvalidArgumentError("evaluations", "is 0, and there is no file", value=0, remedy=remedy)
         found = measured_motors(robot, logs, timestep=self.timestep, hold=self.hold)
-        rows = []
-        for index, (kind, joint) in enumerate(found.names):
-            value, low, high = found.row(index)
-            name = "all joints" if joint is None else robot.joint_names[found.joints[joint]]
-            rows.append([name, kind, f"{value:.4g} ± {max(high - value, value - low):.1g}"])
+        document = found.document(robot)
+        rows = [
+            [joint, kind, f"{value:.4g} ± {high - value:.1g}"]
+            for joint, kinds in document.items()
+            for kind, (value, _, high) in kinds.items()
+        ]
         print(table(rows, ["joint", "95 % intervals, SI units", "value"], "llr"))
         print(f"\nerror of the effort on the part that was kept: up to {found.error.max():.2g} of the effort")
         out.parent.mkdir(parents=True, exist_ok=True)
-        found.save(out, [log.source for log in logs])
+        found.save(out, robot)
         print(f"written: {out}")
         if details is not None:
-            write_figures(details, found.document())
+            write_figures(details, document)
             print(f"written: {details}")
 
 

@@ -63,7 +63,8 @@ def identify(
     Parameters
     ----------
     logs
-        Files (:mod:`batchpid.sim.identification.logs`), or logs that were read.
+        Files (:mod:`batchpid.sim.identification.logs`), lists of logs with settings of their own
+        (:mod:`batchpid.sim.identification.runs`), or logs that were read.
     params
         Params of the PID law that drove the robot, of all its joints or of those in the logs: the setpoints of the logs
         are used. None: the efforts.
@@ -78,7 +79,8 @@ def identify(
         control, as a real robot under control at 500 Hz or less. Otherwise half the difference of the steps counts as
         delay.
     payload
-        Find a payload at the tool, too.
+        Find a payload at the tool, too. Efforts that were measured then count as exact; otherwise their scale is found
+        as strength.
     hold
         Commands hold from row to row of a file: :func:`batchpid.sim.identification.logs.read_logs`.
     extras
@@ -219,7 +221,7 @@ def _known(log: Log, payload: bool, ratios: EffortRatios | None) -> Motors:
     Behind the gear they are free of the motor's inertia and friction.
     """
     if ratios is not None:
-        return ratios.values("strength", "delay", "lag")
+        return ratios.values(("strength", "delay", "lag"))
     if not log.is_measured:
         return {}
     of_motor = ("armature", "damping", "friction") if log.sensor == "link" else ()
