@@ -110,7 +110,7 @@ def stability_bound(
     late, slow = _columns(mass_matrix, dt, delay=delay, lag=lag)[1:]
     if model is not None or late.any() or slow.any():
         unit = np.eye(m.shape[-1]) if model is None else read_array("model", model).astype(np.float64)
-        return _late_bound(m, np.broadcast_to(unit, m.shape), p, c, tau, b, late, slow, dt)
+        return _late_bound(m, np.broadcast_to(unit, m.shape), [p, c, tau, b, late, slow], dt)
     passed = dt / (dt + 2 * tau)
     weight = np.sqrt(passed * dt * c + 0.5 * dt**2 * p)
     inverse = np.linalg.inv(m + 0.5 * dt * b[..., None] * np.eye(m.shape[-1]))
@@ -118,16 +118,15 @@ def stability_bound(
     return StabilityBound(ratio=0.5 * values[..., -1], participation=vectors[..., -1] ** 2)
 
 
-def _late_bound(m: Float64, unit: Float64, *columns: Any) -> StabilityBound:
-    """Return the bound of loops whose efforts are late; ``columns`` are those of :func:`_loop`, and dt at the end."""
-    *leaves, dt = columns
+def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) -> StabilityBound:
+    """Return the bound of loops whose efforts are late; ``columns`` are those of :func:`_loop` (..., joints)."""
     ratio, participation = np.zeros(m.shape[:-2]), np.zeros(m.shape[:-1])
     for at in np.ndindex(*m.shape[:-2]):
-        own = [leaf[at] for leaf in leaves]
+        own = [column[at] for column in columns]
         slowest = _SLOWEST / (1 + float(np.max(own[-2] + own[-1])) / dt)
         slow = np.geomspace(slowest, np.pi / 4, _FREQUENCIES)
         z = np.exp(1j * np.append(slow, np.linspace(np.pi / 4, np.pi, _FREQUENCIES)[1:]))
-        loop = _loop(z, m[at], unit[at], *own, dt)
+        loop = _loop(z, m[at], unit[at], own, dt)
         ratio[at], where = _crossing(z, np.linalg.eigvals(loop))
         values, vectors = np.linalg.eig(loop[where])
         # The mode that crosses there; kinetic energy, apart from the coupling of joints.
@@ -137,19 +136,12 @@ def _late_bound(m: Float64, unit: Float64, *columns: Any) -> StabilityBound:
     return StabilityBound(ratio, participation)
 
 
-def _loop(
-    z: NDArray[np.complex128],
-    m: Float64,
-    unit: Float64,
-    p: Float64,
-    c: Float64,
-    tau: Float64,
-    b: Float64,
-    delay: Float64,
-    lag: Float64,
-    dt: float,
-) -> NDArray[np.complex128]:
-    """Return L (frequencies, joints, joints) of one loop at the points ``z`` (frequencies,) of the unit circle."""
+def _loop(z: NDArray[Any], m: Float64, unit: Float64, columns: list[Float64], dt: float) -> NDArray[Any]:
+    """Return L (frequencies, joints, joints) of one loop at the points ``z`` (frequencies,) of the unit circle.
+
+    ``columns`` are kp, kd, filter time, damping, delay and lag (joints,).
+    """
+    p, c, tau, b, delay, lag = columns
     each = z[:, None]
     law = p + c * (each - 1) / ((tau + dt) * each - tau)
     whole = np.floor(delay / dt)
@@ -157,11 +149,11 @@ def _loop(
     intake = -np.expm1(-dt / np.maximum(lag, 1e-3 * dt))
     late = each**-whole * (1 - part + part / each) * intake / (1 - (1 - intake) / each)
     plant = (z - 1)[:, None, None] * m + dt * z[:, None, None] * (b * np.eye(len(b)))
-    moved: NDArray[np.complex128] = np.linalg.solve(plant, late[..., None] * unit * law[:, None, :])
+    moved: NDArray[Any] = np.linalg.solve(plant, late[..., None] * unit * law[:, None, :])
     return moved * (dt**2 * z / (z - 1))[:, None, None]
 
 
-def _crossing(z: NDArray[np.complex128], values: NDArray[np.complex128]) -> tuple[float, int]:
+def _crossing(z: NDArray[Any], values: NDArray[Any]) -> tuple[float, int]:
     """Return the largest modulus at which a locus falls through -180 degrees, and the number of its frequency.
 
     ``values`` (frequencies, joints) are the eigenvalues of L at ``z``. The loci begin below the negative real axis

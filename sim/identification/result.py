@@ -12,6 +12,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, integer
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.identification.confidence_region import KEY, Region
 from batchpid.sim.identification.held_out import ASSUMED
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.statistics import INTERVAL, Uncertainty
@@ -118,6 +119,7 @@ class Identification(NamedTuple):
             ASSUMED: self.drive.assumptions | {kind: float(motors[kind][0, 0]) for kind in ("stopping", "payload")},
             "intervals": document["joints"]
             | {kind: document[kind] for kind, joint in self.unknowns.names if joint is None and kind in document},
+            KEY: self.region.to_dict(),
             "not_well_determined": of_joints | ({"all joints": others} if others else {}),
             "did_not_move_hence_ideal": self.settings["still"],
             "not_in_the_logs_hence_ideal": [
@@ -125,6 +127,13 @@ class Identification(NamedTuple):
             ],
         }
         bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
+
+    @property
+    def region(self) -> Region:
+        """Joint confidence region of all unknowns."""
+        joints = [self.robot.joint_names[number] for number in self.joints]
+        names = tuple((kind, None if joint is None else joints[joint]) for kind, joint in self.unknowns.names)
+        return Region(names, self.estimate, self.uncertainty.deviation, self.uncertainty.correlation)
 
     def document(self) -> dict[str, Any]:
         """Return the result as plain values: for each unknown the estimate and its 95 % interval, however wide.

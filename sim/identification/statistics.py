@@ -50,6 +50,8 @@ class Uncertainty(NamedTuple):
     """Joints (joints,) that the motion moves, and not only the noise of their sensor."""
     singular_values: Float64
     """Singular values of the Jacobian in units of typical sizes, over the largest, descending."""
+    correlation: Float64
+    """Correlations of the estimates (unknowns, unknowns)."""
 
 
 def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
@@ -81,12 +83,16 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     covariance = inverse @ (spread + np.diag(prior)) @ inverse
     variance = np.maximum(np.diagonal(covariance), np.diagonal(inverse))
     deviation = np.hypot(MODEL_ERROR * unknowns.scale * np.sqrt(variance), LEAST_DEVIATION * np.abs(point.theta))
+    least = np.maximum(deviation**2 - MODEL_ERROR**2 * unknowns.scale**2 * np.diagonal(covariance), 0.0)
+    joint = MODEL_ERROR**2 * np.outer(unknowns.scale, unknowns.scale) * covariance + np.diag(least)
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(normal)[::-1], 0.0))
     resolved = np.array([DELAY_RESOLVED if kind == "delay" else RESOLVED for kind, _ in unknowns.names])
     moves = _motion(problem) > LEAST_MOTION * problem.noise / NOISES
     known = np.array([joint is None or moves[joint] for _, joint in unknowns.names])
     identified = known & (INTERVAL * deviation <= resolved * np.abs(point.theta))
-    return Uncertainty(deviation, identified, moves, values / max(values[0], 1e-300))
+    return Uncertainty(
+        deviation, identified, moves, values / max(values[0], 1e-300), joint / np.outer(deviation, deviation)
+    )
 
 
 def misfits(problem: Problem, point: Solution) -> Float64:

@@ -105,27 +105,28 @@ def gains_at(
         rows = np.full((1, robot.dof), neutral) if leaf is None else np.asarray(leaf, np.float64)
         return np.broadcast_to(rows, (len(rows), robot.dof))
 
-    leaves = params.kp, params.ki, params.kd, params.derivative_filter_time
-    gains = [column(leaf)[:, independent] for leaf in leaves]
+    kp, ki, kd, tau = (
+        column(leaf)[:, independent] for leaf in (params.kp, params.ki, params.kd, params.derivative_filter_time)
+    )
     delay = column(motors.command_delay) + column(motors.sensor_delay)
     late, lag = delay[:, independent], column(motors.lag)[:, independent]
     strength = column(motors.strength, 1.0)[:, independent]
     armature = np.broadcast_to(armature, (1, robot.dof)) + column(motors.armature)
     of_mass, joints = isinstance(params.gain_units, PerMassMatrix), late.shape[1]
     if of_mass and actuators is None:  # the law knows the plant
-        return Gains(np.eye(joints)[None], np.zeros((1, joints)), *gains, late, lag, None)
+        return Gains(np.eye(joints)[None], np.zeros((1, joints)), kp, ki, kd, tau, late, lag, None)
     matrix, damping = _matrix(robot, qpos, armature), robot.damping + column(motors.viscous)
     damping = np.stack([robot.coupling.reduced_damping(row) for row in damping])
     if isinstance(params.gain_units, PerInertia):
         strength = strength * np.diagonal(_matrix(robot, qpos, known_joints(robot).armature[None])[0])
     if not of_mass:
-        return Gains(matrix, damping, *(strength * leaf for leaf in gains[:3]), gains[3], late, lag, None)
+        return Gains(matrix, damping, strength * kp, strength * ki, strength * kd, tau, late, lag, None)
     # The law knows the damping, too, as part of its matrix.
     known, eye = known_joints(robot), np.eye(joints)
     model = _matrix(robot, qpos, known.armature[None])
     model = model + timestep * eye * robot.coupling.reduced_damping(robot.damping + known.viscous)
     matrix = matrix + timestep * eye * damping[:, None, :]
-    return Gains(matrix, np.zeros_like(damping), *gains, late, lag, strength[..., None] * model)
+    return Gains(matrix, np.zeros_like(damping), kp, ki, kd, tau, late, lag, strength[..., None] * model)
 
 
 def _matrix(robot: RobotDescription, qpos: Float64, armature: Float64) -> Float64:
