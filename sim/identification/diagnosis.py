@@ -1,0 +1,260 @@
+r"""Diagnosis of the model beside a fit: links whose masses are off, and the stretch of the logs that disagrees most.
+
+Required efforts are linear in the mass m and the first moment m c of every link, and in its inertia tensor (C. G.
+Atkeson, C. H. An and J. M. Hollerbach, "Estimation of inertial parameters of manipulator loads and links", Int. J.
+Robotics Research 5(3), 1986). With the tables of :mod:`batchpid.sim.identification.regression` and motors of strength
+1, the efforts of all joints obey::
+
+    u - b - (M q'' + h) = A q'' + B q' + F sgn(q') + sum over links of columns x
+
+in two ways: x are changes of each link's mass and first moment, or the one link is heavier by the factor x, with the
+same shape. The first says how much free masses would explain, the second gives a link its name. A heavier link and a
+weaker motor may look alike: then both are said. Every fourth half second is left out and decides, and single rows that
+disagree much have little weight (P. J. Huber, "Robust estimation of a location parameter", Annals of Mathematical
+Statistics 35, 1964).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.arrays.array_types import Float64
+from batchpid.sim.identification.regression import Regression
+from batchpid.task_space.rigid_tree import RigidTree
+
+SPREAD, MOMENT_SPREAD = 0.5, 0.05
+"""Standard deviations of the prior: of a mass over the mass, of a first moment over the mass [m]."""
+DECREASE, EXPLAINED = 0.03, 0.5
+"""Least decrease of the residual, over it, for which a link is named, and least share of the efforts that is explained
+then."""
+ALIKE = 1.1
+"""Ratio of residuals up to which two explanations are alike."""
+LEAST_CHANGE = 0.05
+"""Least change of a link's mass, over the mass, that is named."""
+MOST_LINKS = 3
+SLOW = 0.02
+"""Speed, over its root mean square, below which a joint may stick."""
+STRETCH, STANDS_OUT, SHARE = 0.25, 5.0, 0.3
+"""Length of a stretch [s]; its residual over the median stretch's, and over the joint's efforts, from which it is a
+disturbance."""
+_HUBER, _ROUNDS = 2.0, 6
+
+
+class Disturbance(NamedTuple):
+    """Stretch of a log in which the efforts disagree most with the model."""
+
+    log: int
+    """Number of the log."""
+    time: float
+    """Middle of the stretch [s], as in the log."""
+    joint: int
+    """Number among the logged joints."""
+    effort: float
+    """Root mean square of the effort that the model does not explain there [N m or N]."""
+    ratio: float
+    """The same over that of the joint's median stretch."""
+
+
+class Diagnosis(NamedTuple):
+    """How well the model explains the efforts, and what would explain them better."""
+
+    explained: tuple[float, float]
+    """Share of the efforts on the held-out part that is explained, 1 - |residual| / |effort|, with the masses of the
+    description, and with free masses and first moments."""
+    links: dict[str, float]
+    """Factors of the mass of links that seem lighter or heavier than described."""
+    strengths: Float64 | None
+    """Strengths (joints,) that explain the efforts as well as ``links``; None where they do not, or no link is named."""
+    disturbance: Disturbance | None
+
+
+def diagnose(regression: Regression) -> Diagnosis:
+    """Return the diagnosis of the model of ``regression``, at its best delay and payload."""
+    system = _System(regression)
+    described = system.solve(np.zeros((system.rows, system.joints, 0)))
+    tree = regression.plant.tree
+    own = [k for k, body in enumerate(tree.link_bodies) if body >= 0 and tree.mass[k] > 0]
+    free = np.concatenate([system.columns(each) for k in own for each in _moments(tree, k)], axis=2)
+    masses = system.solve(free)
+    scaled = {tree.links[k]: system.columns(_scaled(tree, k)) for k in own}
+    links, best = _heavier(system, scaled, described)
+    strong, strengths = system.with_strengths()
+    if links and (strong.held_out * ALIKE < best.held_out or best.explained < EXPLAINED):
+        links, best = {}, described  # the motors explain it better, or nothing does
+    alike = bool(links) and strong.held_out <= ALIKE * best.held_out
+    least = min((described, best, strong), key=lambda each: each.held_out)
+    explained = described.explained, max(masses.explained, best.explained)
+    return Diagnosis(explained, links, strengths if alike else None, system.disturbance(least))
+
+
+class _Solved(NamedTuple):
+    """Solution of a regression."""
+
+    values: Float64
+    """Of the further columns."""
+    residual: Float64
+    """(rows, joints)."""
+    held_out: float
+    """Residual of the held-out rows, weighted by joint."""
+    explained: float
+
+
+class _System:
+    """Regression of all joints together."""
+
+    def __init__(self, regression: Regression) -> None:
+        self.regression, best = regression, regression.best.motors
+        self.delay, self.kg = best["delay"][0, 0], best["payload"][0, 0]
+        self._required, a, v, sign, self._effort = regression.tables(self.delay, self.kg)
+        self.rows, self.joints = a.shape
+        self._motion = np.stack([a, v, sign, np.ones_like(a)], axis=2)
+        fast = np.abs(v) > SLOW * np.sqrt((v**2).mean(0))
+        self._moves = fast | (fast.mean(0) < 0.2)
+        stretch = round(2 * STRETCH / regression.plant.drive.timestep)
+        self._held_out = np.concatenate([(rows // stretch) % 4 == 3 for rows, _ in self._of_logs()])
+        self._size = np.sqrt((self._effort**2).mean(0)) + 1e-9
+
+    def _of_logs(self) -> list[tuple[NDArray[np.intp], Any]]:
+        return list(zip(self.regression.rows, self.regression.motions, strict=True))
+
+    def columns(self, tree: RigidTree) -> Float64:
+        """Return the change of the required efforts with the masses of ``tree`` (rows, joints, 1)."""
+        plant, found = self.regression.plant, []
+        for rows, motion in self._of_logs():
+            q, v, a = (table[rows] for table in motion[:3])
+            none = np.zeros((len(q), 1))
+            both = []
+            for each in (plant.with_tree(tree), plant):
+                passive = each.at(q, v, none)
+                both.append((passive.matrix @ a[..., None])[..., 0] + passive.force)
+            found.append(both[0] - both[1])
+        return np.concatenate(found)[..., None]
+
+    def solve(self, further: Float64, spread: Float64 | float = SPREAD) -> _Solved:
+        """Return the solution with ``further`` columns (rows, joints, n), which all joints share."""
+        count, shared = 4 * self.joints, further.shape[2]
+        target, weight = self._effort - self._required, np.where(self._moves, 1.0, 0.0)
+        residual = target
+        for _ in range(_ROUNDS):
+            size = self._spread_of(residual)
+            small = np.minimum(1.0, _HUBER * size / (np.abs(residual) + 1e-12))
+            root = np.sqrt(weight * small) / size
+            factors = [np.diag(np.r_[np.full(count, 1e-6), 1 / np.broadcast_to(spread, shared)])]
+            rhs = [np.zeros(count + shared)]
+            for joint in range(self.joints):
+                rows = ~self._held_out & self._moves[:, joint]
+                matrix = np.zeros((rows.sum(), count + shared))
+                matrix[:, 4 * joint : 4 * joint + 4] = self._motion[rows, joint]
+                matrix[:, count:] = further[rows, joint]
+                factors.append(root[rows, joint, None] * matrix)
+                rhs.append(root[rows, joint] * target[rows, joint])
+            found = _bounded(np.vstack(factors), np.concatenate(rhs), count)
+            own = found[:count].reshape(self.joints, 4)
+            residual = target - (self._motion * own).sum(2) - further @ found[count:]
+        return self._solved(found[count:], residual)
+
+    def with_strengths(self) -> tuple[_Solved, Float64]:
+        """Return the solution with free strengths in place of further columns, and the strengths (joints,)."""
+        motors = self.regression.at(self.delay, self.kg).motors
+        residual = np.zeros((self.rows, self.joints))
+        for joint in range(self.joints):
+            names = ("armature", "damping", "friction", "bias")
+            own = np.array([motors[name][0, joint] for name in names]) * [1, 1, 1, -1]
+            asked = self._required[:, joint] + self._motion[:, joint] @ own
+            residual[:, joint] = self._effort[:, joint] - asked / motors["strength"][0, joint]
+        return self._solved(np.zeros(0), residual), motors["strength"][0]
+
+    def _spread_of(self, residual: Float64) -> Float64:
+        """Return the size of the fitted residuals (joints,), of which half are less than 2 / 3."""
+        each = np.where(self._moves & ~self._held_out[:, None], np.abs(residual), np.nan)
+        size: Float64 = 1.4826 * np.nanmedian(each, axis=0) + 1e-6 * self._size
+        return size
+
+    def _solved(self, values: Float64, residual: Float64) -> _Solved:
+        kept = self._moves & self._held_out[:, None]
+        weighed = np.where(kept, residual / self._size, 0.0)
+        left, whole = (np.linalg.norm(np.where(kept, each, 0.0)) for each in (residual, self._effort))
+        return _Solved(values, residual, float(np.linalg.norm(weighed)), float(1 - left / max(whole, 1e-12)))
+
+    def disturbance(self, solved: _Solved) -> Disturbance | None:
+        """Return the stretch with the largest residual, over that of the joint's median stretch; None without one."""
+        dt, begin, stretches = self.regression.plant.drive.timestep, 0, []
+        for log, (rows, _) in enumerate(self._of_logs()):
+            part = solved.residual[begin : begin + len(rows)]
+            begin += len(rows)
+            pieces = max(1, round((rows[-1] - rows[0]) * dt / STRETCH))
+            for at, piece in zip(np.array_split(rows, pieces), np.array_split(part, pieces), strict=True):
+                stretches.append((log, float(at.mean()) * dt, np.sqrt((piece**2).mean(0))))
+        sizes = np.array([size for _, _, size in stretches])
+        ratio = sizes / (np.median(sizes, axis=0) + 1e-3 * self._size)
+        ratio = np.where(sizes > SHARE * self._size, ratio, 0.0)
+        stretch, joint = np.unravel_index(int(ratio.argmax()), ratio.shape)
+        if ratio[stretch, joint] < STANDS_OUT:
+            return None
+        log, time, size = stretches[stretch]
+        return Disturbance(log, time, int(joint), float(size[joint]), float(ratio[stretch, joint]))
+
+
+def _heavier(system: _System, scaled: dict[str, Float64], described: _Solved) -> tuple[dict[str, float], _Solved]:
+    """Return the factors of the links that explain the efforts better, one after another, and the solution."""
+    chosen, best = list[str](), described
+    while len(chosen) < MOST_LINKS:
+        tried = {
+            name: system.solve(np.concatenate([scaled[each] for each in (*chosen, name)], axis=2))
+            for name in scaled
+            if name not in chosen
+        }
+        if not tried:
+            break
+        name = min(tried, key=lambda each: tried[each].held_out)
+        if tried[name].held_out > (1 - DECREASE) * best.held_out:
+            break
+        chosen, best = [*chosen, name], tried[name]
+    factors = {name: float(1 + value) for name, value in zip(chosen, best.values, strict=True)}
+    return {name: each for name, each in factors.items() if abs(each - 1) > LEAST_CHANGE and each > 0}, best
+
+
+def _scaled(tree: RigidTree, link: int) -> RigidTree:
+    """Return ``tree`` with one link twice as heavy, of the same shape."""
+    mass, inertia = tree.mass.copy(), tree.inertia.copy()
+    mass[link] *= 2
+    inertia[link] *= 2
+    return replace(tree, mass=mass, inertia=inertia)
+
+
+def _moments(tree: RigidTree, link: int) -> list[RigidTree]:
+    """Return trees in which one link has more mass at its origin, or a larger first moment along each axis.
+
+    The first moments are a pair of masses: one at the end of the axis is added, and one at the center subtracted.
+    """
+    mass = tree.mass[link]
+    trees = [_with_point(tree, link, SPREAD * mass, tree.center[link])]
+    for axis in np.eye(3):
+        trees.append(_with_point(tree, link, mass, tree.center[link] + 2 * MOMENT_SPREAD * axis, -1.0))
+    return trees
+
+
+def _with_point(tree: RigidTree, link: int, more: float, place: Float64, shift: float = 0.0) -> RigidTree:
+    """Return ``tree`` with a point mass ``more`` added to a link at ``place``, or with its center moved there."""
+    mass, center = tree.mass.copy(), tree.center.copy()
+    if shift:
+        center[link] = place
+    else:
+        mass[link] += more
+    return replace(tree, mass=mass, center=center)
+
+
+def _bounded(matrix: Float64, target: Float64, count: int) -> Float64:
+    """Return the least squares with armature, damping and friction of at least 0 among the first ``count``."""
+    from scipy.optimize import lsq_linear
+
+    factor = np.linalg.qr(np.column_stack([matrix, target]), mode="r")
+    low = np.full(matrix.shape[1], -np.inf)
+    low[:count].reshape(-1, 4)[:, :3] = 0.0
+    scale = np.maximum(np.abs(factor[:, :-1]).max(0), 1e-12)
+    found = lsq_linear(factor[:, :-1] / scale, factor[:, -1], (low, np.inf)).x
+    return np.asarray(found / scale, np.float64)
