@@ -1,7 +1,7 @@
 r"""Joint confidence region of identified motors: kept in the actuators file, and drawn from.
 
 The estimates of a fit are correlated: where the strength is higher, so are armature and friction. With the estimate m,
-the standard deviations d and the correlations R, the region is the ellipsoid that holds 95 % of the normal distribution::
+the standard deviations d and the correlations R, the region is the ellipsoid with 95 % of the normal distribution::
 
     theta = m + d * (R^1/2 z),     |z|^2 <= chi^2_0.95(n)
 

@@ -23,11 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
+from batchpid.sim.identification.plant import Plant
 from batchpid.sim.identification.regression import Regression
 from batchpid.task_space.rigid_tree import RigidTree
 
 SPREAD, MOMENT_SPREAD = 0.5, 0.05
-"""Standard deviations of the prior: of a mass over the mass, of a first moment over the mass [m]."""
+"""Standard deviations of the prior: of a mass over the mass, of a first moment over the mass [m]; the change of the
+tensor with the square of the latter is small."""
 DECREASE, EXPLAINED = 0.03, 0.5
 """Least decrease of the residual, over it, for which a link is named, and least share of the efforts that is explained
 then."""
@@ -68,7 +70,7 @@ class Diagnosis(NamedTuple):
     links: dict[str, float]
     """Factors of the mass of links that seem lighter or heavier than described."""
     strengths: Float64 | None
-    """Strengths (joints,) that explain the efforts as well as ``links``; None where they do not, or no link is named."""
+    """Strengths (joints,) that explain the efforts as well as ``links``; None where they do not, or there are none."""
     disturbance: Disturbance | None
 
 
@@ -76,11 +78,12 @@ def diagnose(regression: Regression) -> Diagnosis:
     """Return the diagnosis of the model of ``regression``, at its best delay and payload."""
     system = _System(regression)
     described = system.solve(np.zeros((system.rows, system.joints, 0)))
-    tree = regression.plant.tree
-    own = [k for k, body in enumerate(tree.link_bodies) if body >= 0 and tree.mass[k] > 0]
-    free = np.concatenate([system.columns(each) for k in own for each in _moments(tree, k)], axis=2)
-    masses = system.solve(free)
-    scaled = {tree.links[k]: system.columns(_scaled(tree, k)) for k in own}
+    tree = regression.plants[0].tree
+    own = [tree.links[k] for k, body in enumerate(tree.link_bodies) if body >= 0 and tree.mass[k] > 0]
+    own = [link for link in own if all(link in plant.tree.links for plant in regression.plants)]
+    scaled = {link: system.columns(link, 1.0) for link in own}
+    moments = [system.columns(link, 0.0, MOMENT_SPREAD * axis) for link in own for axis in np.eye(3)]
+    masses = system.solve(np.concatenate([*scaled.values(), *moments], axis=2), 1.0)
     links, best = _heavier(system, scaled, described)
     strong, strengths = system.with_strengths()
     if links and (strong.held_out * ALIKE < best.held_out or best.explained < EXPLAINED):
@@ -114,21 +117,24 @@ class _System:
         self._motion = np.stack([a, v, sign, np.ones_like(a)], axis=2)
         fast = np.abs(v) > SLOW * np.sqrt((v**2).mean(0))
         self._moves = fast | (fast.mean(0) < 0.2)
-        stretch = round(2 * STRETCH / regression.plant.drive.timestep)
-        self._held_out = np.concatenate([(rows // stretch) % 4 == 3 for rows, _ in self._of_logs()])
+        stretch = round(2 * STRETCH / regression.plants[0].drive.timestep)
+        self._held_out = np.concatenate([(rows // stretch) % 4 == 3 for rows, *_ in self._of_logs()])
         self._size = np.sqrt((self._effort**2).mean(0)) + 1e-9
 
-    def _of_logs(self) -> list[tuple[NDArray[np.intp], Any]]:
-        return list(zip(self.regression.rows, self.regression.motions, strict=True))
+    def _of_logs(self) -> list[tuple[NDArray[np.intp], Any, Plant]]:
+        return list(zip(self.regression.rows, self.regression.motions, self.regression.plants, strict=True))
 
-    def columns(self, tree: RigidTree) -> Float64:
-        """Return the change of the required efforts with the masses of ``tree`` (rows, joints, 1)."""
-        plant, found = self.regression.plant, []
-        for rows, motion in self._of_logs():
+    def columns(self, link: str, more: float = 0.0, further: Float64 | float = 0.0) -> Float64:
+        """Return the change of the required efforts (rows, joints, 1) with a link that is heavier, or has its center
+        of mass elsewhere.
+
+        It is heavier by the share ``more``, of the same shape; its center is ``further`` on (3,) [m].
+        """
+        found = []
+        for rows, motion, plant in self._of_logs():
             q, v, a = (table[rows] for table in motion[:3])
-            none = np.zeros((len(q), 1))
-            both = []
-            for each in (plant.with_tree(tree), plant):
+            both, none = [], np.zeros((len(q), 1))
+            for each in (plant.with_tree(_changed(plant.tree, link, more, further)), plant):
                 passive = each.at(q, v, none)
                 both.append((passive.matrix @ a[..., None])[..., 0] + passive.force)
             found.append(both[0] - both[1])
@@ -182,8 +188,8 @@ class _System:
 
     def disturbance(self, solved: _Solved) -> Disturbance | None:
         """Return the stretch with the largest residual, over that of the joint's median stretch; None without one."""
-        dt, begin, stretches = self.regression.plant.drive.timestep, 0, []
-        for log, (rows, _) in enumerate(self._of_logs()):
+        dt, begin, stretches = self.regression.plants[0].drive.timestep, 0, []
+        for log, (rows, *_) in enumerate(self._of_logs()):
             part = solved.residual[begin : begin + len(rows)]
             begin += len(rows)
             pieces = max(1, round((rows[-1] - rows[0]) * dt / STRETCH))
@@ -218,34 +224,13 @@ def _heavier(system: _System, scaled: dict[str, Float64], described: _Solved) ->
     return {name: each for name, each in factors.items() if abs(each - 1) > LEAST_CHANGE and each > 0}, best
 
 
-def _scaled(tree: RigidTree, link: int) -> RigidTree:
-    """Return ``tree`` with one link twice as heavy, of the same shape."""
-    mass, inertia = tree.mass.copy(), tree.inertia.copy()
-    mass[link] *= 2
-    inertia[link] *= 2
-    return replace(tree, mass=mass, inertia=inertia)
-
-
-def _moments(tree: RigidTree, link: int) -> list[RigidTree]:
-    """Return trees in which one link has more mass at its origin, or a larger first moment along each axis.
-
-    The first moments are a pair of masses: one at the end of the axis is added, and one at the center subtracted.
-    """
-    mass = tree.mass[link]
-    trees = [_with_point(tree, link, SPREAD * mass, tree.center[link])]
-    for axis in np.eye(3):
-        trees.append(_with_point(tree, link, mass, tree.center[link] + 2 * MOMENT_SPREAD * axis, -1.0))
-    return trees
-
-
-def _with_point(tree: RigidTree, link: int, more: float, place: Float64, shift: float = 0.0) -> RigidTree:
-    """Return ``tree`` with a point mass ``more`` added to a link at ``place``, or with its center moved there."""
-    mass, center = tree.mass.copy(), tree.center.copy()
-    if shift:
-        center[link] = place
-    else:
-        mass[link] += more
-    return replace(tree, mass=mass, center=center)
+def _changed(tree: RigidTree, link: str, more: float, further: Float64 | float) -> RigidTree:
+    mass, center, inertia = tree.mass.copy(), tree.center.copy(), tree.inertia.copy()
+    index = tree.index(link)
+    mass[index] *= 1 + more
+    inertia[index] *= 1 + more
+    center[index] += further
+    return replace(tree, mass=mass, center=center, inertia=inertia)
 
 
 def _bounded(matrix: Float64, target: Float64, count: int) -> Float64:

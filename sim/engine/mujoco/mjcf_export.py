@@ -90,6 +90,7 @@ def to_mjcf(
         merge_fixed=robot.merge_fixed,
         engine="mujoco",
     )
+    # The bodies are those that the engine simulates; inertias and efforts are then written with all their digits.
     inertias = body_inertias(spec.urdf, spec.merge_fixed)
     scene, names = robot_spec(spec, inertias)
     scene.modelname, scene.option.disableflags = robot.name, 0
@@ -101,6 +102,7 @@ def to_mjcf(
     for at in np.flatnonzero(np.isfinite(motors.effort_range).any(1)):
         joint = scene.joint(robot.joint_names[at])
         joint.actfrclimited, joint.actfrcrange = True, np.clip(motors.effort_range[at], -FAR, FAR)
+    # Compiled twice: once to find what the robot lacks, and again with the actuators, whose keyframe needs their sizes.
     try:
         scene.compile()
         root = _exact(scene)

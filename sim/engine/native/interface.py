@@ -75,7 +75,8 @@ class Mujoco(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("models", "data")),
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")),
         *((name, ctypes.c_void_p) for name in ("ctrl", "stiffness", "rate_gain")),
-        ("clearance", ctypes.c_void_p),
+        *((name, ctypes.c_void_p) for name in ("clearance", "turn")),
+        ("base", ctypes.c_int64),
     ]
 
 
