@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
+from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.plant import Plant
 from batchpid.sim.identification.regression import Regression
 from batchpid.task_space.rigid_tree import RigidTree
@@ -49,12 +50,11 @@ _HUBER, _ROUNDS = 2.0, 6
 class Disturbance(NamedTuple):
     """Stretch of a log in which the efforts disagree most with the model."""
 
-    log: int
-    """Number of the log."""
+    log: str
+    """Source of the log."""
     time: float
     """Middle of the stretch [s], as in the log."""
-    joint: int
-    """Number among the logged joints."""
+    joint: str
     effort: float
     """Root mean square of the effort that the model does not explain there [N m or N]."""
     ratio: float
@@ -73,9 +73,44 @@ class Diagnosis(NamedTuple):
     """Strengths (joints,) that explain the efforts as well as ``links``; None where they do not, or there are none."""
     disturbance: Disturbance | None
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values."""
+        return {
+            "effort_explained": list(self.explained),
+            "mass_factors": self.links,
+            "or_strengths": None if self.strengths is None else self.strengths.tolist(),
+            "disturbance": None if self.disturbance is None else self.disturbance._asdict(),
+        }
 
-def diagnose(regression: Regression) -> Diagnosis:
-    """Return the diagnosis of the model of ``regression``, at its best delay and payload."""
+    def sentences(self) -> list[str]:
+        """Return what is found, in sentences."""
+        described, free = (100 * max(each, 0.0) for each in self.explained)
+        found = [f"the efforts of the motion are explained to {described:.3g} %"]
+        if self.links:
+            links = " and ".join(
+                f"link {name} seems {100 * abs(factor - 1):.0f} % {'heavier' if factor > 1 else 'lighter'}"
+                for name, factor in self.links.items()
+            )
+            found = [
+                f"with free masses the efforts are explained to {free:.3g} % instead of {described:.3g} %; {links} "
+                "than in the robot's description"
+            ]
+        if self.strengths is not None:
+            listed = ", ".join(f"{each:.2g}" for each in self.strengths)
+            found.append(f"or the motors have strengths of {listed}: these logs do not tell which; weigh the link")
+        if (one := self.disturbance) is not None:
+            found.append(
+                f"at {one.time:.1f} s of {one.log} the effort of {one.joint!r} is off by {one.effort:.3g}, "
+                f"{one.ratio:.2g} times the usual: contact, a push or a stop? If so, leave that stretch out"
+            )
+        return found
+
+
+def diagnose(regression: Regression, logs: list[Log], joints: list[str]) -> Diagnosis:
+    """Return the diagnosis of the model of ``regression`` of ``logs``, at its best delay and payload.
+
+    ``joints`` are the names of the logged joints.
+    """
     system = _System(regression)
     described = system.solve(np.zeros((system.rows, system.joints, 0)))
     tree = regression.plants[0].tree
@@ -91,7 +126,7 @@ def diagnose(regression: Regression) -> Diagnosis:
     alike = bool(links) and strong.held_out <= ALIKE * best.held_out
     least = min((described, best, strong), key=lambda each: each.held_out)
     explained = described.explained, max(masses.explained, best.explained)
-    return Diagnosis(explained, links, strengths if alike else None, system.disturbance(least))
+    return Diagnosis(explained, links, strengths if alike else None, system.disturbance(least, logs, joints))
 
 
 class _Solved(NamedTuple):
@@ -186,7 +221,7 @@ class _System:
         left, whole = (np.linalg.norm(np.where(kept, each, 0.0)) for each in (residual, self._effort))
         return _Solved(values, residual, float(np.linalg.norm(weighed)), float(1 - left / max(whole, 1e-12)))
 
-    def disturbance(self, solved: _Solved) -> Disturbance | None:
+    def disturbance(self, solved: _Solved, logs: list[Log], joints: list[str]) -> Disturbance | None:
         """Return the stretch with the largest residual, over that of the joint's median stretch; None without one."""
         dt, begin, stretches = self.regression.plants[0].drive.timestep, 0, []
         for log, (rows, *_) in enumerate(self._of_logs()):
@@ -202,7 +237,8 @@ class _System:
         if ratio[stretch, joint] < STANDS_OUT:
             return None
         log, time, size = stretches[stretch]
-        return Disturbance(log, time, int(joint), float(size[joint]), float(ratio[stretch, joint]))
+        where = logs[log].source, float(logs[log].time[0] + time), joints[joint]
+        return Disturbance(*where, float(size[joint]), float(ratio[stretch, joint]))
 
 
 def _heavier(system: _System, scaled: dict[str, Float64], described: _Solved) -> tuple[dict[str, float], _Solved]:

@@ -13,11 +13,13 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.confidence_region import KEY, Region
+from batchpid.sim.identification.diagnosis import Diagnosis
 from batchpid.sim.identification.held_out import ASSUMED
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.statistics import INTERVAL, Uncertainty
 from batchpid.sim.identification.unknowns import ADDED, DESCRIBED, KINDS, Unknowns, kind_of
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.urdf_export import to_urdf
 
 SHORT = 30.0
 """Length of a log [s] below which intervals hold for its motion only."""
@@ -61,6 +63,8 @@ class Identification(NamedTuple):
     """Logs, options and versions, for the record."""
     fits: tuple[Fit, ...]
     """Errors along each stretch of the logs that was simulated."""
+    diagnosis: Diagnosis
+    """Links whose masses seem off, and the stretch of the logs that disagrees most."""
 
     def interval(self, kind: str, joint: int | None = None) -> tuple[float, float, float] | None:
         """Return estimate, lower and upper end of the 95 % interval; None if the logs do not identify the unknown.
@@ -138,6 +142,21 @@ class Identification(NamedTuple):
         names = tuple((kind, None if joint is None else joints[joint]) for kind, joint in self.unknowns.names)
         return Region(names, self.estimate, self.uncertainty.deviation, self.uncertainty.correlation)
 
+    def corrected_urdf(self) -> str:
+        """Return the URDF of the robot with the masses of :attr:`diagnosis`, and tensors in proportion.
+
+        Raises
+        ------
+        InvalidArgumentError
+            No link's mass seems off.
+        RobotError
+            The robot's file cannot be read, or has changed since.
+        """
+        if not self.diagnosis.links:
+            remedy = "leave the option out; the robot's description is as good as these logs tell"
+            raise InvalidArgumentError("corrected_urdf", "no link's mass seems off", remedy=remedy)
+        return to_urdf(self.robot, mass_factors=self.diagnosis.links).text
+
     def document(self) -> dict[str, Any]:
         """Return the result as plain values: for each unknown the estimate and its 95 % interval, however wide.
 
@@ -160,6 +179,7 @@ class Identification(NamedTuple):
             "not_identified": self.not_identified,
             "singular_values": self.uncertainty.singular_values.tolist(),
             "noise": self.noise.tolist(),
+            "diagnosis": self.diagnosis.to_dict(),
             "compensation": "through the motors" if self.drive.through else self.drive.compensate,
             "about": self.settings,
         }
