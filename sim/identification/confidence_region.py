@@ -103,8 +103,8 @@ def read_region(path: str | os.PathLike[str], robot: Robot) -> Region:
             correlation[k, : k + 1] = correlation[: k + 1, k] = row
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InvalidArgumentError(source, f"cannot be read ({error})", remedy=remedy) from None
-    right = estimate.shape == deviation.shape == (len(names),) and np.isfinite([*estimate, *deviation]).all()
-    right = right and (deviation >= 0).all() and (np.abs(correlation) <= 1).all() and len(names) > 0
+    right = estimate.shape == deviation.shape == (len(names),) and bool(np.isfinite([*estimate, *deviation]).all())
+    right = right and bool((deviation >= 0).all() and (np.abs(correlation) <= 1).all()) and len(names) > 0
     if not right or any(kind not in KINDS for kind, _ in names):
         raise InvalidArgumentError(source, "has wrong shapes, numbers or unknowns", remedy=remedy)
     if strangers := sorted({joint for _, joint in names if joint} - set(robot.joint_names)):

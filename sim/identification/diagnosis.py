@@ -29,8 +29,8 @@ from batchpid.sim.identification.regression import Regression
 from batchpid.task_space.rigid_tree import RigidTree
 
 SPREAD, MOMENT_SPREAD = 0.5, 0.05
-"""Standard deviations of the prior: of a mass over the mass, of a first moment over the mass [m]; the change of the
-tensor with the square of the latter is small."""
+"""Standard deviations of the priors: of the change of a link's mass, over the mass, where only some links change, and
+of its center of mass [m] where all masses are free."""
 DECREASE, EXPLAINED = 0.03, 0.5
 """Least decrease of the residual, over it, for which a link is named, and least share of the efforts that is explained
 then."""
@@ -223,7 +223,8 @@ class _System:
 
     def disturbance(self, solved: _Solved, logs: list[Log], joints: list[str]) -> Disturbance | None:
         """Return the stretch with the largest residual, over that of the joint's median stretch; None without one."""
-        dt, begin, stretches = self.regression.plants[0].drive.timestep, 0, []
+        dt, begin = self.regression.plants[0].drive.timestep, 0
+        stretches: list[tuple[int, float, Float64]] = []
         for log, (rows, *_) in enumerate(self._of_logs()):
             part = solved.residual[begin : begin + len(rows)]
             begin += len(rows)
@@ -231,7 +232,8 @@ class _System:
             for at, piece in zip(np.array_split(rows, pieces), np.array_split(part, pieces), strict=True):
                 stretches.append((log, float(at.mean()) * dt, np.sqrt((piece**2).mean(0))))
         sizes = np.array([size for _, _, size in stretches])
-        ratio = sizes / (np.median(sizes, axis=0) + 1e-3 * self._size)
+        median: Float64 = np.median(sizes, axis=0)
+        ratio = sizes / (median + 1e-3 * self._size)
         ratio = np.where(sizes > SHARE * self._size, ratio, 0.0)
         stretch, joint = np.unravel_index(int(ratio.argmax()), ratio.shape)
         if ratio[stretch, joint] < STANDS_OUT:
@@ -273,7 +275,7 @@ def _bounded(matrix: Float64, target: Float64, count: int) -> Float64:
     """Return the least squares with armature, damping and friction of at least 0 among the first ``count``."""
     from scipy.optimize import lsq_linear
 
-    factor = np.linalg.qr(np.column_stack([matrix, target]), mode="r")
+    factor: Any = np.linalg.qr(np.column_stack([matrix, target]), mode="r")
     low = np.full(matrix.shape[1], -np.inf)
     low[:count].reshape(-1, 4)[:, :3] = 0.0
     scale = np.maximum(np.abs(factor[:, :-1]).max(0), 1e-12)

@@ -107,8 +107,8 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     moves = _motion(problem) > LEAST_MOTION * problem.noise / NOISES
     known = np.array([joint is None or moves[joint] for _, joint in unknowns.names])
     identified = known & _resolved([kind for kind, _ in unknowns.names], point.theta, deviation)
-    joint = covariance + np.diag(variance - np.diagonal(covariance))
-    correlation = joint / np.sqrt(np.outer(variance, variance))
+    raised = covariance + np.diag(variance - np.diagonal(covariance))
+    correlation = raised / np.sqrt(np.outer(variance, variance))
     return Uncertainty(deviation, identified, moves, values / max(values[0], 1e-300), correlation)
 
 

@@ -57,7 +57,11 @@ def within(
     """
     draws, count = motors.num_envs, len(moves.start)
     every = moves.take(np.tile(np.arange(count), draws))
-    known = {"substeps": SUBSTEPS, "params": params, "actuators": motors.for_envs(np.repeat(np.arange(draws), count))}
+    known: dict[str, Any] = {
+        "substeps": SUBSTEPS,
+        "params": params,
+        "actuators": motors.for_envs(np.repeat(np.arange(draws), count)),
+    }
     with Runner(robot, draws * count, **known | options) as runner:
         metrics, timestep = run_moves(runner, every, seconds)[1], runner.timestep
     arm = np.flatnonzero(arm_joints(robot))

@@ -25,8 +25,8 @@ def region(spread=1.0):
     names = (("strength", "shoulder"), ("armature", "shoulder"), ("friction", "elbow"), ("delay", None))
     correlation = np.eye(4)
     correlation[0, 1] = correlation[1, 0] = 0.99
-    deviation = spread * np.array([0.05, 0.005, 0.1, 5e-4])
-    return Region(names, np.array([0.9, 0.05, 0.4, 4e-3]), deviation, correlation)
+    deviation = spread * np.array([0.05, 0.005, 0.02, 5e-4])
+    return Region(names, np.array([0.9, 0.05, 0.2, 4e-3]), deviation, correlation)
 
 
 def saved(path, robot, known):
@@ -80,9 +80,9 @@ def test_a_file_without_a_region_is_refused(robot, tmp_path, change, problem):
 
 def test_what_holds_for_all_draws(robot, tmp_path):
     """Slow gains hold; gains beyond the bound of the latest motor do not, and that draw is named."""
-    drawn = draw_motors(saved(tmp_path / "motors.yaml", robot, region(3.0).to_dict()), robot, 12)
+    drawn = draw_motors(saved(tmp_path / "motors.yaml", robot, region().to_dict()), robot, 12)
     moves, options = random_moves(robot, 2, 0), {"workers": 0, "collisions": False, "ground": False}
-    good = bp.design_gains(robot, 2.0, gain_units="mass_matrix", measurement_rate="measured")
+    good = bp.design_gains(robot, 3.0, gain_units="mass_matrix", measurement_rate="measured")
     found = within(robot, good, drawn.actuators, moves, **options)
     assert found.holds
     assert found.settling.shape == (12,)
