@@ -218,7 +218,7 @@ class _System:
     def _solved(self, values: Float64, residual: Float64) -> _Solved:
         kept = self._moves & self._held_out[:, None]
         weighed = np.where(kept, residual / self._size, 0.0)
-        left, whole = (np.linalg.norm(np.where(kept, each, 0.0)) for each in (residual, self._effort))
+        left, whole = (float(np.linalg.norm(np.where(kept, each, 0.0))) for each in (residual, self._effort))
         return _Solved(values, residual, float(np.linalg.norm(weighed)), float(1 - left / max(whole, 1e-12)))
 
     def disturbance(self, solved: _Solved, logs: list[Log], joints: list[str]) -> Disturbance | None:
