@@ -21,6 +21,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.motors.actuator_files import dumps_actuators, loads_actuators
 from batchpid.native.availability import obstacle
+from batchpid.sim.identification.diagnosis import diagnose
 from batchpid.sim.identification.effort_ratios import EffortRatios, effort_ratios
 from batchpid.sim.identification.fit import Solution, Step
 from batchpid.sim.identification.fit_history import History, State
@@ -193,6 +194,9 @@ def identify(
     )
     errors_of_fit = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
     noise = np.sqrt((errors_of_fit**2).mean(0))
+    if problem.drive.compensation != drive.compensation:
+        regression = Regression(plants_of(resting, joints, problem.drive, fitted), fitted, fitted_motions, payload)
+    diagnosis = diagnose(regression, fitted, [robot.joint_names[joint] for joint in joints])
     estimate = best.theta
     if ratios is not None:
         own = [at for at, (kind, _) in enumerate(ratios.names) if kind in unknowns.known]
@@ -211,6 +215,7 @@ def identify(
         problem.drive,
         settings,
         fits,
+        diagnosis,
     )
 
 
