@@ -20,7 +20,6 @@ each env is a log.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -30,6 +29,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, file_path
+from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.columns import QUANTITIES, error, read_csv, read_hdf5_columns
 from batchpid.sim.identification.gaps import MIN_ROWS, MIN_SECONDS, divided
@@ -121,7 +121,7 @@ def logs_of_rollout(
         raise InvalidArgumentError(source, problem, remedy=remedy)
     if info.rates is None and not info.complete and found == "setpoint":
         problem = f"{source}: was cut short, before it said whether setpoints had rates"
-        warnings.warn(f"{problem}; it is fitted as a run without: if it had them, record another", LogWarning, 2)
+        warn(f"{problem}; it is fitted as a run without: if it had them, record another", LogWarning)
     if not rollout.ok.all():
         env = int(np.argmin(rollout.ok.all(0)))
         raise InvalidArgumentError(source, "has failed", env=env, remedy="record a run without faults")
@@ -238,9 +238,7 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
         wrapped |= dict.fromkeys(found)
     if stopped := [name for name in wrapped if not robot.continuous[robot.joint_names.index(name)]]:
         problem = f"{log.source}: the positions of {', '.join(stopped)} jump by whole turns, and were unwrapped"
-        warnings.warn(
-            f"{problem}; in the robot's file the type is not continuous: correct it", LogWarning, stacklevel=3
-        )
+        warn(f"{problem}; in the robot's file the type is not continuous: correct it", LogWarning)
     return parts
 
 

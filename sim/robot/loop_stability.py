@@ -12,7 +12,6 @@ the ratio, at the gains of the same law at this time step, is below 1 for any ga
 
 from __future__ import annotations
 
-import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +19,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.choices import PerInertia, PerMassMatrix
+from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.gains.stability import Oscillation, oscillation
 from batchpid.law.implicit import as_explicit
@@ -151,20 +151,19 @@ class StabilityCheck:
         self._robot, self._timestep = robot, timestep
         self._has_warned = False
 
-    def check(self, params: bp.PIDParams, actuators: bp.Actuators | None, stacklevel: int = 3) -> None:
-        """Warn if ``params`` pass the bound, ``stacklevel`` frames up."""
+    def check(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
+        """Warn if ``params`` pass the bound."""
         report = self._beyond(params, bp.Actuators() if actuators is None else actuators)
         if report is not None and not self._has_warned:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
             env = f", env {report.env}" if params.num_envs > 1 else ""
-            warnings.warn(
+            warn(
                 f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the sampled PID loop, "
                 f"mostly of joint {joint!r}{env}, at the start pose with a time step of {self._timestep:g} s: efforts "
                 f"alternate from step to step, and the joint chatters or diverges; use at most "
                 f"{0.5 / report.robot_ratio:.1g} times these gains, a derivative_filter_time, "
                 f"{implicit_remedy(params)}or robot.designed()",
                 StabilityWarning,
-                stacklevel=stacklevel,
             )
         self._has_warned = report is not None
 

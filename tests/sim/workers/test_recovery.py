@@ -341,43 +341,9 @@ def test_a_runner_works_on_after_ctrl_c_in_a_rollout(workers):
     assert again.ok.all()
 
 
-def test_a_tick_whose_call_ends_after_the_workers_answers_is_replayed_once(monkeypatch):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    with make_runner(workers=1) as runner, make_runner(workers=0) as model:
-        with monkeypatch.context() as patched:
-            patched.setattr("batchpid.sim.session.MovingSetpointCheck.see", interrupt)
-            with pytest.raises(KeyboardInterrupt):
-                runner.step(setpoints()[0])
-        assert_identical(runner.observe(), model.step(setpoints()[0]))
-        send(runner.pids[0], signal.SIGKILL)
-        with pytest.warns(RecoveryWarning):
-            assert_identical(runner.step(setpoints()[1]), model.step(setpoints()[1]))
-
-
-def test_a_tick_whose_recording_was_interrupted_is_recorded_by_the_next_call():
-    class Tape:
-        times, interrupts = (), 1
-
-        def append(self, time_, setpoint, observation, has_rates):
-            if self.interrupts:
-                self.interrupts = 0
-                raise KeyboardInterrupt
-            self.times += (time_,)
-
-    with make_runner(workers=0) as runner:
-        tape = runner.recorder = Tape()
-        with pytest.raises(KeyboardInterrupt):
-            runner.step(setpoints()[0])
-        assert tape.times == ()
-        runner.observe()
-        assert tape.times == (runner.time,)
-
-
 @pytest.mark.quick_rows(1)
 @pytest.mark.parametrize("workers", [0, 2])
-def test_an_interrupted_tick_is_finished_before_the_next_call(workers):
+def test_an_interrupted_tick_is_done_completely(workers):
     results = []
     for interrupted in (False, True):
         with make_runner(workers=workers if interrupted else 0) as runner:
