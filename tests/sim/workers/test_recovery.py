@@ -331,12 +331,13 @@ def test_an_error_in_a_loop_is_raised_with_its_traceback():
 def test_a_runner_works_on_after_ctrl_c_in_a_rollout(workers):
     with make_runner(workers=workers) as runner, warnings.catch_warnings():
         warnings.simplefilter("ignore", RecoveryWarning)
-        for delay in (0.02, 0.07, 0.11):
-            with later(delay, lambda: signal.raise_signal(signal.SIGINT)), pytest.raises(KeyboardInterrupt):
-                runner.rollout(setpoints(2000))
+        for tick in (0, 1, 150):
+            interrupt = at_ticks({tick: lambda: signal.raise_signal(signal.SIGINT)})
+            with pytest.raises(KeyboardInterrupt):
+                runner.rollout(setpoints(200), progress=interrupt)
         ended, steps = runner.observe(), round(runner.time * 2000)
         again = runner.rollout(setpoints(3))
-    assert 0 < steps < 3 * 2000 * 20
+    assert 0 < steps < 3 * 200 * 20
     assert ended.ok.all()
     assert again.ok.all()
 
