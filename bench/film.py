@@ -1,7 +1,7 @@
 """Film of four robots under two sets of gains, with the response of one joint: ``python bench/film.py``.
 
-It draws docs/images/two-gains.gif, the picture of the README, without a render device: triangles of the robots' shapes,
-sorted by depth. The gains are from docs/tutorial.md: designed, and chosen by hand.
+It draws docs/images/two-gains.gif, the picture of the README, without a render device. The gains are from
+docs/tutorial.md: designed, and chosen by hand.
 """
 
 from __future__ import annotations
@@ -13,15 +13,12 @@ from typing import Any
 import numpy as np
 import tyro
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-import batchpid.task_space as ts
 from batchpid.sim import Robot, Rollout, Runner
-from batchpid.sim.robot.shapes import surfaces
-from batchpid.task_space.rotations import rotate
+from batchpid.sim.view.painter import Triangles, paint
 
 PICTURE = Path(__file__).resolve().parent.parent / "docs" / "images" / "two-gains.gif"
 GOAL = (0.5, 0.6, -0.5, -1.5, 0.5, 1.0)
@@ -35,8 +32,6 @@ SPACING = 1.05
 CAMERA = np.array([1.0, 0.45, 0.4]) / np.linalg.norm([1.0, 0.45, 0.4])
 """Direction from the robots to the camera."""
 RIGHT = np.cross([0.0, 0.0, 1.0], CAMERA) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], CAMERA))
-LIGHT = np.array([0.5, 0.2, 0.85]) / np.linalg.norm([0.5, 0.2, 0.85])
-"""Direction to the light."""
 
 
 @dataclass(frozen=True)
@@ -65,30 +60,13 @@ def simulate(robot: Robot, seconds: float, num_envs: int = 4) -> dict[str, Rollo
     return found
 
 
-def triangles(robot: Robot, qpos: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners (triangles, 3, 3) [m] and the colours (triangles, 3) of robots at ``qpos`` (envs, dof)."""
-    drawn = surfaces(robot, deviation=8e-3)
-    poses = ts.link_poses(robot.kinematic_tree(), qpos, [surface.link for surface in drawn])
-    corners, colours = [], []
-    for env, pose_of in enumerate(poses):
-        aside = SPACING * (env - (len(qpos) - 1) / 2) * RIGHT
-        for surface, pose in zip(drawn, pose_of, strict=True):
-            vertices = rotate(pose[3:], surface.vertices) + pose[:3] + aside
-            corners.append(vertices[surface.faces])
-            colours.append(np.tile(surface.rgba[:3], (len(surface.faces), 1)))
-    return np.concatenate(corners), np.concatenate(colours)
-
-
 def draw_robots(axes: Any, robot: Robot, qpos: NDArray[np.float64]) -> None:
-    """Draw robots at ``qpos`` (envs, dof) side by side, the faces nearest to the camera last."""
-    corners, colours = triangles(robot, qpos)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    bright = 0.55 + 0.45 * np.clip(normals @ LIGHT, 0, 1)
+    """Draw robots at ``qpos`` (envs, dof) side by side, without perspective."""
+    triangles, count = Triangles(robot), len(qpos)
+    aside = SPACING * (np.arange(count) - (count - 1) / 2)[:, None] * RIGHT
+    corners = triangles.corners(qpos, aside).reshape(-1, 3, 3)
     places = np.stack([corners @ RIGHT, corners @ np.cross(CAMERA, RIGHT)], axis=-1)
-    order = np.argsort((corners @ CAMERA).mean(axis=1))
-    shaded = np.clip(colours * bright[:, None], 0, 1)[order]
-    axes.add_collection(PolyCollection(places[order], facecolors=shaded, edgecolors=shaded, linewidths=0.3))
+    paint(axes, corners, np.tile(triangles.colours, (count, 1)), places, -(corners @ CAMERA).mean(axis=1))
 
 
 def draw_frame(robot: Robot, moves: dict[str, Rollout], at: int) -> Image.Image:

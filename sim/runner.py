@@ -6,7 +6,7 @@ Longer than 300 lines because the public signatures and their documentation are 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from inspect import Parameter, Signature, signature
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.checks.single_owner import SingleOwner
-from batchpid.checks.validate import instance, integer
+from batchpid.checks.validate import choice, instance, integer
 from batchpid.checks.warn import warn
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError
 from batchpid.io.versions import package_versions
@@ -107,7 +107,9 @@ class Runner(SingleOwner):
         """Options, checked."""
         self.robot, self.num_envs, self.control = checked.robot, checked.num_envs, checked.control
         self.timestep, self.substeps = checked.timestep, checked.substeps
-        params = checked.check_params(default_params(robot, checked.control) if params is None else params)
+        params = checked.check_params(
+            default_params(robot, checked.control, checked.loops) if params is None else params
+        )
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call, self._warnings = OneCall(), RunWarnings(checked)
@@ -360,6 +362,24 @@ class Runner(SingleOwner):
             remedy = "let build(scene, env) return as many entities for every env"
             raise InvalidArgumentError("build", problem, remedy=remedy)
         return np.stack(rows)
+
+    def bodies(self, names: Sequence[str]) -> NDArray[np.float64]:
+        """Return the poses of bodies of an MJCF file (envs, names, 7), in the engine "mujoco".
+
+        They are the positions [m] and quaternions (w, x, y, z) of MuJoCo's body frames in the world: of objects, which
+        the file has besides the robot, and of the robot's own bodies.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The robot is not from an MJCF file, the engine is another, or the file has no such body.
+        """
+        self._ready()
+        if self.options.mjcf is None:
+            problem, remedy = "are those of an MJCF file in the engine 'mujoco'", "use robot.kinematic_tree() for links"
+            raise InvalidArgumentError("names", problem, remedy=remedy)
+        chosen = tuple([choice("names", name, self.options.mjcf.bodies) for name in names])
+        return np.stack([row for part in self._execute(Read(ReadPoses(chosen))).results for row in part])
 
     @property
     def params(self) -> bp.PIDParams:

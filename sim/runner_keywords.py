@@ -113,7 +113,8 @@ class RunnerKeywords(TypedDict, total=False):
     something."""
     ground: bool | None
     """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
-    so low that other links reach the ground at its start pose."""
+    so low that other links reach the ground at its start pose. With engine "mujoco" the planes in the world of an MJCF
+    file take its place, by default as in the file."""
     build: Callable[[Any, int], Any] | None
     """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
     that code written for a screen runs unchanged. It may return the entities that :meth:`batchpid.sim.Runner.poses`

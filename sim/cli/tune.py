@@ -146,7 +146,7 @@ class TuneCommand:
 
     def _tune_tool(self, robot: Robot, named: Path, outputs: Outputs) -> None:
         """Tune operational-space control: print a table and write the options."""
-        from batchpid.sim.cli.report import gains_table
+        from batchpid.sim.cli.report import cause_lines, gains_table
         from batchpid.sim.tuning.tool_search import tune_tool
 
         defaults = {each.name: each.default for each in fields(self)}
@@ -171,6 +171,9 @@ class TuneCommand:
         print(gains_table(("default", "tuned"), found.metrics))
         if found.rejected:
             print(f"\nThe default gains are written, the tuned ones are rejected: {found.rejected}.")
+        if found.findings:
+            print("\nNot settled under the gains written (each env makes one move):")
+            print(*cause_lines(found.findings), sep="\n")
         save_osc_options(out, found.options, found.settings)
         history.unlink(missing_ok=True)
         print(f"\nwritten: {out}\nnext: {self._next_command(out)}")

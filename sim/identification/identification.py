@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
@@ -16,24 +16,26 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
-from batchpid.checks.validate import flag, integer
+from batchpid.checks.validate import choice, flag, integer
+from batchpid.errors import InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.motors.actuator_files import dumps_actuators, loads_actuators
 from batchpid.native.availability import obstacle
+from batchpid.sim.identification.effort_ratios import EffortRatios, effort_ratios
 from batchpid.sim.identification.fit import Solution, Step
 from batchpid.sim.identification.fit_history import History, State
-from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, search
-from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_of
+from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, extended, search
+from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_of, residuals_of_ideal
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log
-from batchpid.sim.identification.plant import Plant
+from batchpid.sim.identification.plant import Plant, plants_of
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import Motion, Regression, best_drive, hypotheses, smooth, variants
 from batchpid.sim.identification.result import Fit, Identification, actuators_at
 from batchpid.sim.identification.start import begin
 from batchpid.sim.identification.statistics import EXPLAINED, misfits, uncertainty
-from batchpid.sim.identification.unknowns import Motors, Unknowns
+from batchpid.sim.identification.unknowns import EXTRAS, KINDS, LAW, Motors, Unknowns
 from batchpid.sim.identification.windows import rows_of
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Compensation
@@ -49,6 +51,7 @@ def identify(
     sim_steps: int = 1,
     payload: bool = True,
     hold: bool = False,
+    extras: Sequence[str] = (),
     evaluations: int = 25,
     seed: int = 0,
     workers: int | None = None,
@@ -78,6 +81,12 @@ def identify(
         Find a payload at the tool, too.
     hold
         Commands hold from row to row of a file: :func:`batchpid.sim.identification.logs.read_logs`.
+    extras
+        Effects to try beside those of every fit, by name. Each is kept at the joints whose error on the held-out part
+        falls: "load_friction", "stribeck" (friction at rest and the speed at which it has fallen), "offset" (of the
+        encoder); and of the law in the robot, for logs of setpoints, "saturation" (its effort limit), "slew" (the limit
+        of the setpoints' rate), "kd" (a factor of that gain). "gain" is a factor of all gains of a law of which only
+        the form is known; the strength, which has the same effect, is then 1.
     evaluations
         Largest number of evaluations of each fit, with and without noise in the law. An evaluation simulates the robot
         and, for each unknown, a perturbed robot.
@@ -106,20 +115,27 @@ def identify(
     evaluations, seed = integer("evaluations", evaluations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
     if workers is not None:
         integer("workers", workers, 0, 1024)
-    payload = flag("payload", payload)
+    payload, gains_known = flag("payload", payload), "gain" not in extras
+    for name in extras:
+        choice("extras", name, [*EXTRAS, "gain"])
     resting, found, assumed, still = inputs = read_inputs(robot, logs, params, compensate, timestep, sim_steps, hold)
+    if params is None and (of_law := [name for name in extras if name in LAW]):
+        remedy = "leave it out, or give the params of the law"
+        raise InvalidArgumentError("extras", "is of a law, and the logs hold efforts", value=of_law[0], remedy=remedy)
     joints, params, timestep = inputs.joints, assumed.params, assumed.timestep
     settings = {
         **resting.describe(),
         "still": still,
         "logs": [log.source for log in found],
-        "data": digest([replace(log, source="") for log in found]),
+        "data": digest([replace(log, source="", settings=log.settings._replace(robot=None)) for log in found]),
+        "robots": digest([own and own.describe() for own in (log.settings.robot for log in found)]),
         "command": found[0].kind,
         "params": None if params is None else digest(params),
         "compensate": assumed.compensate,
         "timestep": assumed.timestep * assumed.substeps,
         "sim_steps": assumed.substeps,
         "payload": payload,
+        "extras": [*extras],
         "evaluations": evaluations,
         "seed": seed,
         "native": not obstacle(),
@@ -127,8 +143,14 @@ def identify(
     }
     record = History(history, settings)
     motions = [smooth(log, timestep) for log in found]
-    drive, regression = best_drive(resting, joints, assumed, found, motions, payload)
-    unknowns = _unknowns(resting, joints, drive, regression.best.motors, motions, payload)
+    fitted = [log for log in found if not log.settings.held_out]
+    fitted_motions = [each for each, log in zip(motions, found, strict=True) if not log.settings.held_out]
+    drive, regression = best_drive(resting, joints, assumed, fitted, fitted_motions, payload, gains_known)
+    unknowns = _unknowns(resting, joints, drive, regression, motions, payload)
+    if not gains_known:
+        unknowns = unknowns.plus(["gain"], range(len(joints)), {})
+    ratios = None if found[0].measured is None else effort_ratios(inputs)
+    unknowns = unknowns.without(_known(found[0], payload, ratios))
     ideal = ideal_motors(robot, joints)
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
     pool: Any = nullcontext()
@@ -149,10 +171,15 @@ def identify(
         if misfits(*fits_of_ways[0]).max() > EXPLAINED:  # then the regression may have chosen the wrong compensation
             for way in hypotheses(assumed, payload):
                 if way.compensation != drive.compensation:
-                    other = Regression(Plant(resting, joints, way), found, motions, payload)
+                    plants = plants_of(resting, joints, way, fitted)
+                    other = Regression(plants, fitted, fitted_motions, payload, gains_known)
                     fits_of_ways.append(fit_under(way, other, History(None, settings)))
         problem, best = min(fits_of_ways, key=lambda each: each[1].cost)
-        before, after = problem.residuals(unknowns.point(ideal)[None]), [window.residual for window in best.windows]
+        for name in extras:
+            if name in EXTRAS:
+                problem, best = extended(problem, best, EXTRAS[name])
+        unknowns = problem.unknowns
+        before, after = residuals_of_ideal(problem, robot), [window.residual for window in best.windows]
         sure = uncertainty(problem, best)
         saved = problem.residuals(_saved(robot, joints, unknowns, best.theta)[None])
     errors = error_of(problem, before), error_of(problem, saved)
@@ -162,13 +189,19 @@ def identify(
         Fit(w.log, found[w.log].time[rows_of(w)], w.fitted, b[0], a)
         for w, b, a in zip(problem.windows, before, after, strict=True)
     )
-    fitted = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
-    noise = np.sqrt((fitted**2).mean(0))
+    errors_of_fit = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
+    noise = np.sqrt((errors_of_fit**2).mean(0))
+    estimate = best.theta
+    if ratios is not None:
+        own = [at for at, (kind, _) in enumerate(ratios.names) if kind in unknowns.known]
+        unknowns = unknowns.plus_known(tuple(ratios.names[at] for at in own))
+        more = [ratios.names[at][0] for at in own], ratios.estimate[own], ratios.deviation[own]
+        estimate, sure = np.append(estimate, more[1]), sure.plus(*more)
     return Identification(
         robot,
         joints,
         unknowns,
-        best.theta,
+        estimate,
         sure,
         (errors[0], errors[1]),
         misfits(problem, best),
@@ -179,11 +212,26 @@ def identify(
     )
 
 
+def _known(log: Log, payload: bool, ratios: EffortRatios | None) -> Motors:
+    """Return the values of kinds that are no unknowns of a fit of logs such as ``log``.
+
+    Measured efforts have no delay, and count as exact if a payload is to be found; else the strength is their scale.
+    Behind the gear they are free of the motor's inertia and friction.
+    """
+    if ratios is not None:
+        return ratios.values("strength", "delay", "lag")
+    if not log.is_measured:
+        return {}
+    of_motor = ("armature", "damping", "friction") if log.sensor == "link" else ()
+    kinds = ("delay", *of_motor, *(("strength",) if payload else ()))
+    return {kind: np.full((1, 1), KINDS[kind].neutral) for kind in kinds}
+
+
 def _unknowns(
-    robot: Robot, joints: tuple[int, ...], drive: Drive, motors: Motors, motions: list[Motion], payload: bool
+    robot: Robot, joints: tuple[int, ...], drive: Drive, start: Regression, motions: list[Motion], payload: bool
 ) -> Unknowns:
     """Return the unknowns with typical sizes from the motion."""
-    plant = Plant(robot, joints, drive)
+    plant, motors = Plant(robot, joints, drive), start.best.motors
     qpos = np.concatenate([motion.qpos[::200] for motion in motions])
     matrix = plant.mass_matrix(qpos, np.zeros((len(qpos), 1)))
     links, armature = np.diagonal(matrix, axis1=1, axis2=2).mean(0), motors["armature"][0]
@@ -194,7 +242,8 @@ def _unknowns(
     )
     speed = np.maximum(speed, 1e-3)
     effort = np.maximum(inertia * acceleration + motors["friction"][0], inertia * 0.1)
-    return Unknowns.of(links, armature, effort, speed, payload)
+    known = np.flatnonzero(start.ratios_only) if start.gains_known else range(len(joints))
+    return Unknowns.of(links, armature, effort, speed, payload, [*known])
 
 
 def _saved(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Float64) -> Float64:
@@ -202,4 +251,5 @@ def _saved(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Flo
     text = dumps_actuators(actuators_at(robot, joints, unknowns, theta), robot.joint_names)
     found = unknowns.motors(theta[None])
     common = float(found["stopping"][0, 0]), float(found["payload"][0, 0])
-    return unknowns.point(motors_of(loads_actuators(text, robot.joint_names)[0], robot, joints, *common))
+    motors = motors_of(loads_actuators(text, robot.joint_names)[0], robot, joints, *common)
+    return unknowns.point(motors | {name: found[name] for name in LAW if name in found})

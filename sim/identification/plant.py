@@ -32,7 +32,10 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.coupling import Coupling, Follower
+from batchpid.motors.friction import Friction, bound_of
+from batchpid.sim.engine.joint_friction import added_friction
 from batchpid.sim.engine.robot_model import robot_model
+from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.logged_control import Control, Drive
 from batchpid.sim.identification.unknowns import Motors, actuators_of
 from batchpid.sim.robot.robot import Robot
@@ -62,6 +65,8 @@ class Segment(NamedTuple):
     """Setpoints or efforts (past + steps, joints) from ``past`` steps before the start on."""
     noise: Float64
     """Noise of the positions that the law is given (past + steps, joints)."""
+    feedforward: Float64 | None = None
+    """Efforts that are added to the efforts of the law (past + steps, joints)."""
 
 
 class Passive(NamedTuple):
@@ -156,14 +161,21 @@ class Plant:
             found = at_rest()
         return found.force + found.payload_force if self.drive.knows_payload else found.force
 
-    def control(self, actuators: Actuators, qpos: Float64, qvel: Float64, asked: Float64 | None = None) -> Control:
-        """Return the control of robots at ``qpos`` and ``qvel`` (n, joints), with their motors."""
+    def control(
+        self,
+        actuators: Actuators,
+        qpos: Float64,
+        qvel: Float64,
+        asked: Float64 | None = None,
+        drive: Drive | None = None,
+    ) -> Control:
+        """Return the control of robots at ``qpos`` and ``qvel`` (n, joints), with their motors; default: its drive."""
         unloaded = np.zeros((len(qpos), 1))
 
         def model(qpos: Float64) -> Float64:
             return self.mass_matrix(qpos, unloaded)
 
-        return Control(self.drive, actuators, qpos, qvel, asked, self._damping, model)
+        return Control(drive or self.drive, actuators, qpos, qvel, asked, self._damping, model)
 
     def simulate(self, motors: Motors, segments: list[Segment], past: int) -> Float64:
         """Return the positions (n, steps + 1, joints) of candidate i in segment i, the start included.
@@ -176,10 +188,17 @@ class Plant:
         command, noise = (
             np.stack([getattr(segment, name) for segment in segments], axis=1) for name in ("command", "noise")
         )
+        forward = None
+        if any(segment.feedforward is not None for segment in segments):
+            none = np.zeros_like(command[:, 0])
+            rows = [none if segment.feedforward is None else segment.feedforward for segment in segments]
+            forward = np.stack(rows, axis=1)
         actuators = actuators_of(motors, q.shape[1])
         held = self.compensation(q, v, payload) if drive.through else None
+        if (offset := motors.get("offset")) is not None:
+            q -= offset
         asked = np.zeros((1, *q.shape)) if drive.params is not None else command[max(past - 1, 0) :: -1]
-        control = self.control(actuators, q, v, asked if held is None else asked + held)
+        control = self.control(actuators, q, v, asked if held is None else asked + held, drive.of(motors))
         motion = _Motion(self, actuators, motors)
         dynamics, at_rest = self._dynamics(q, v, payload), self._at_rest(q, payload)
         out = np.empty((len(q), len(command) - past + 1, q.shape[1]))
@@ -194,14 +213,28 @@ class Plant:
                 passive, now = dynamics(), past + step
                 c = self._compensation(passive, at_rest)
                 inside, outside = (c, None) if drive.through else (None, c)
+                if forward is not None:
+                    inside = forward[now] if inside is None else inside + forward[now]
                 shake = noise[now] if drive.noisy else None
-                effort = control.advance(command[now], q, v, inside, shake) - passive.force - passive.payload_force
+                effort = control.advance(command[now], q, v, inside, shake)
                 if outside is not None:
-                    effort += outside
-                motion.step(q, v, passive.matrix, effort)
+                    effort = effort + outside
+                motion.step(q, v, passive.matrix, effort, passive.force + passive.payload_force)
                 out[:, step + 1] = q
         out[:, -1] = np.where(np.abs(out[:, -1]) <= DIVERGED, out[:, -1], np.inf)
-        return out
+        return out if offset is None else out + offset[:, None]
+
+
+def plants_of(robot: Robot, joints: tuple[int, ...], drive: Drive, logs: list[Log]) -> list[Plant]:
+    """Return the plant of each log under ``drive``, with the robot and the params of its settings."""
+    known: dict[tuple[int, int], Plant] = {}
+    found = []
+    for own, params, *_ in (log.settings for log in logs):
+        key = id(own), id(params)
+        if key not in known:
+            known[key] = Plant(own or robot, joints, drive if params is None else replace(drive, params=params))
+        found.append(known[key])
+    return found
 
 
 def _with_payload(tree: RigidTree, body: int, place: Float64) -> RigidTree:
@@ -227,21 +260,25 @@ class _Motion:
         self.friction = np.zeros(shape)
         """Efforts of friction in the last step (n, joints) [N m or N]."""
         self._added = actuators.armature + dt * actuators.viscous
-        self._coulomb, self._static, self._slides = actuators.coulomb, actuators.static, np.zeros(shape, bool)
+        self._friction, self._slides = added_friction(Friction(), actuators), np.zeros(shape)
         keep = np.maximum(1 - dt / np.maximum(stopping, dt), 0.0)
         creep = np.where(stopping > dt, _CREEP * dt * np.diagonal(own, axis1=1, axis2=2), 0.0)
         self._constants = keep, creep, plant.low, plant.high
 
-    def step(self, qpos: Float64, qvel: Float64, matrix: Float64, effort: Float64) -> None:
-        """Change positions and velocities (n, joints) to those after a step; ``effort`` excludes friction."""
-        limit = self._coulomb
-        if self._static is not None:
-            limit = np.where(self._slides, limit, np.maximum(limit, self._static))
-        arrays = qpos, qvel, self.friction, matrix, effort, self._added, limit, *self._constants
+    def step(self, qpos: Float64, qvel: Float64, matrix: Float64, effort: Float64, force: Float64) -> None:
+        """Change positions and velocities (n, joints) to those after a step.
+
+        ``effort`` are the motors' efforts less viscous friction, ``force`` the robot's gravity and Coriolis forces.
+        """
+        model, motor = self._friction, effort
+        if model.load is not None:
+            motor = effort + model.viscous * qvel
+        limit = bound_of(model, self._slides, motor, qvel)
+        arrays = qpos, qvel, self.friction, matrix, effort - force, self._added, limit, *self._constants
         if not native_rows.move(self._dt, SWEEPS, *arrays):
             _move(self._dt, *arrays)
-        if self._static is not None:
-            self._slides = np.abs(self.friction) >= limit
+        if model.static is not None:
+            self._slides = (np.abs(self.friction) >= limit).astype(float)
 
 
 def _move(dt: float, *arrays: Float64) -> None:

@@ -6,8 +6,10 @@ likelihood is, over the number of rows and joints::
 
     mean over rows and joints of log(sigma_bj),     sigma_bj^2 = f_j^2 + mean over the rows of b of r_j^2
 
-f is twice the noise of the sensor. Where the model fails, for example where a joint slips a little sooner or later in
-the simulation, the size is large and the stretch has little weight.
+f^2 is the sum of the squares of twice the noise of the sensor, and of twice the root mean square of r_j in a stretch,
+on average over all: no model is exact, and a stretch in which the robot hardly moves would have all the weight. Where
+the model fails, for example where a joint slips a little sooner or later in the simulation, the size is large and the
+stretch has less weight.
 
 Motion by unknown disturbances, such as sensor noise between the rows, is removed from residuals and Jacobian
 (:mod:`batchpid.sim.identification.wander`); the simulated motion is the mean over several draws of them.
@@ -23,7 +25,7 @@ out of the residual and the Jacobian of that window.
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any, NamedTuple
 
@@ -45,6 +47,8 @@ STRETCH = 0.5
 """Length of the stretches of a log [s], about."""
 NOISES = 2
 """Least size of residuals, over the noise of the sensor."""
+MODEL_ERROR = 2
+"""Least size of residuals, over their root mean square in a stretch, on average over the stretches."""
 LEAST_NOISE = 1e-6
 """Least noise of a sensor, over the range of the motion."""
 WORST = 1e6
@@ -86,7 +90,13 @@ class Problem:
     """Numbers of the fitted rows in each stretch of each window."""
 
     def __post_init__(self) -> None:
-        self._subject = Subject.of(self.robot, self.joints, self.drive)
+        subjects = [
+            Subject.of(
+                own or self.robot, self.joints, self.drive if params is None else replace(self.drive, params=params)
+            )
+            for own, params, *_ in (log.settings for log in self.logs)
+        ]
+        self._subjects = list(zip(subjects, [log.settings.payload for log in self.logs], strict=True))
         divide = whole if self.drive.params is not None else cut
         self.windows = [
             window
@@ -145,7 +155,9 @@ class Problem:
                 for residual, stretches in zip(residuals, self.stretches, strict=True)
                 for rows in stretches
             ]
-            return np.sqrt(np.stack(squares, axis=-2) + self.noise**2)
+            stretches = np.stack(squares, axis=-2)
+            mean = np.average(np.sqrt(stretches), axis=-2, weights=self._rows)[..., None, :]
+            return np.sqrt(stretches + self.noise**2 + (MODEL_ERROR * mean) ** 2)
 
     def costs(self, sizes: Float64, determinants: Float64 | float = 0.0) -> Float64:
         """Return the negative logarithms of the likelihood (..., joints) for ``sizes`` (..., stretches, joints).
@@ -193,12 +205,14 @@ class Problem:
         numbers = np.r_[np.arange(count), np.zeros(len(states), int)]
         states = np.concatenate([np.zeros((count, *states.shape[1:])), STATE_STEP * states])
         motors, draws = self.unknowns.motors(points[numbers]), draws[numbers]
-        groups = [list(group) for _, group in groupby(self.windows, lambda w: (w.segment.command.shape, w.past))]
+        groups = [list(group) for _, group in groupby(self.windows, self._alike)]
         tasks, places = [], []
         for number, group in enumerate(groups):
             most = max(1, CHUNK // len(group))
             parts = np.array_split(np.arange(len(states)), -(-len(states) // most))
-            tasks += [(group, take(motors, part), states[part], draws[part]) for part in parts]
+            subject, known = self._subjects[group[0].log]
+            loaded = motors | {"payload": motors["payload"] + known}
+            tasks += [(subject, group, take(loaded, part), states[part], draws[part]) for part in parts]
             places += [number] * len(parts)
         simulated = self._map(tasks)
         found = []
@@ -212,5 +226,10 @@ class Problem:
 
     def _map(self, tasks: list[Any]) -> list[list[Float64]]:
         if self.executor is None:
-            return [simulate(self._subject, *task) for task in tasks]
-        return list(self.executor.map(simulate, [self._subject] * len(tasks), *zip(*tasks, strict=True)))
+            return [simulate(*task) for task in tasks]
+        return list(self.executor.map(simulate, *zip(*tasks, strict=True)))
+
+    def _alike(self, window: Window) -> tuple[Any, ...]:
+        """Return what windows have in common that are simulated together."""
+        subject, payload = self._subjects[window.log]
+        return window.segment.command.shape, window.past, subject.key, payload

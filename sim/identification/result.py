@@ -15,8 +15,11 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.held_out import ASSUMED
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.statistics import INTERVAL, Uncertainty
-from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknowns
+from batchpid.sim.identification.unknowns import ADDED, DESCRIBED, KINDS, Unknowns, kind_of
 from batchpid.sim.robot.robot import Robot
+
+SHORT = 30.0
+"""Length of a log [s] below which intervals hold for its motion only."""
 
 
 class Fit(NamedTuple):
@@ -71,11 +74,13 @@ class Identification(NamedTuple):
             The logs do not hold that joint, or there is no such unknown.
         """
         kind = choice("kind", kind, list(dict.fromkeys(name for name, _ in self.unknowns.names)))
-        if KINDS[kind].per_joint != (joint is not None):
-            remedy = f"give its number, 0 to {len(self.joints) - 1}" if KINDS[kind].per_joint else "leave it out"
+        if kind_of(kind).per_joint != (joint is not None):
+            remedy = f"give its number, 0 to {len(self.joints) - 1}" if kind_of(kind).per_joint else "leave it out"
             raise InvalidArgumentError("joint", f"does not go with {kind!r}", value=joint, remedy=remedy)
         if joint is not None:
             joint = integer("joint", joint, 0, len(self.joints) - 1)
+        if (kind, joint) not in self.unknowns.names:
+            return None
         index = self.unknowns.names.index((kind, joint))
         return self._row(index) if self.uncertainty.identified[index] else None
 
@@ -109,13 +114,16 @@ class Identification(NamedTuple):
         """
         of_joints, others = self.missing()
         document, motors = self.document(), self.unknowns.motors(self.estimate[None])
-        logged = {self.robot.joint_names[number] for number in self.joints}
+        names = [self.robot.joint_names[number] for number in self.joints]
+        logged = set(names)
         own = zip(self.robot.joint_names, self.robot.independent, strict=True)
         about = {
             "identified_from": self.settings["logs"],
             "held_out_error": document["held_out_error"],
             "misfit": document["misfit"],
-            ASSUMED: self.drive.assumptions | {kind: float(motors[kind][0, 0]) for kind in ("stopping", "payload")},
+            ASSUMED: self.drive.assumptions
+            | {kind: float(motors[kind][0, 0]) for kind in ("stopping", "payload")}
+            | ({"slew": dict(zip(names, motors["slew"][0].tolist(), strict=True))} if "slew" in motors else {}),
             "intervals": document["joints"]
             | {kind: document[kind] for kind, joint in self.unknowns.names if joint is None and kind in document},
             "not_well_determined": of_joints | ({"all joints": others} if others else {}),
@@ -133,6 +141,8 @@ class Identification(NamedTuple):
         """
 
         def row(kind: str, joint: int | None = None) -> list[float]:
+            if (kind, joint) not in self.unknowns.names:
+                return [kind_of(kind).neutral] * 3
             return list(self._row(self.unknowns.names.index((kind, joint))))
 
         document: dict[str, Any] = {
@@ -146,11 +156,24 @@ class Identification(NamedTuple):
             "held_out_error": [value if np.isfinite(value) else None for value in self.held_out_error],
             "misfit": self.misfit if np.isfinite(self.misfit) else None,
             "not_identified": self.not_identified,
+            "strength_taken_as_1": self.strength_taken,
             "singular_values": self.uncertainty.singular_values.tolist(),
             "noise": self.noise.tolist(),
             "compensation": "through the motors" if self.drive.through else self.drive.compensate,
             "about": self.settings,
         }
+
+    @property
+    def strength_taken(self) -> list[str]:
+        """Joints of which the logs show only ratios to the strength: it is taken as 1."""
+        if "strength" in self.unknowns.known:
+            return []
+        known = self.unknowns.joints_of("strength") + self.unknowns.joints_of("gain")
+        return [self.robot.joint_names[number] for at, number in enumerate(self.joints) if at not in known]
+
+    def gains(self) -> bp.PIDParams | None:
+        """Return the params of the law that was found, of the logged joints; None for logs of efforts."""
+        return self.drive.of(self.unknowns.motors(self.estimate[None])).params
 
     @property
     def misfit(self) -> float:
@@ -161,6 +184,11 @@ class Identification(NamedTuple):
     def worst_joint(self) -> str:
         """Name of the joint with the largest of :attr:`misfits`."""
         return self.robot.joint_names[self.joints[int(self.misfits.argmax())]]
+
+    @property
+    def is_short(self) -> bool:
+        """True if there is one log of less than :data:`SHORT`, which shows nothing of other motions, loads and days."""
+        return len({fit.log for fit in self.fits}) == 1 and sum(float(np.ptp(fit.time)) for fit in self.fits) < SHORT
 
     @property
     def explains(self) -> bool:
@@ -178,15 +206,18 @@ class Identification(NamedTuple):
 def actuators_at(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Float64) -> bp.Actuators:
     """Return the actuators of ``robot`` at a point (unknowns,); joints that are not in ``joints`` are ideal."""
     found, options = unknowns.motors(theta[None]), dict[str, Any]()
-    for name, kind in KINDS.items():
-        if kind.field is None:
+    for name, kind in (KINDS | ADDED).items():
+        if kind.field is None or name not in found:
             continue
         column = np.full(robot.dof, kind.neutral)
         if not kind.per_joint:
             column[:] = found[name][0]
         elif name in DESCRIBED:
-            column[list(joints)] = np.maximum(found[name][0] - getattr(robot, name)[list(joints)], 0.0)
+            column[list(joints)] = np.maximum(found[name][0] - getattr(robot, DESCRIBED[name])[list(joints)], 0.0)
         else:
             column[list(joints)] = found[name][0]
         options[kind.field] = column
+    if "static" in options:  # below Coulomb's it has no effect, nor has the Stribeck velocity
+        more = options["static"] > options["coulomb"]
+        options |= {name: np.where(more, options[name], 0.0) for name in ("static", "stribeck")}
     return bp.make_actuators(robot.dof, **options, joint_names=robot.joint_names)

@@ -172,7 +172,7 @@ class EnvGroup:
         self._steps = steps
         if containment.suspended.any() or not finite(*command):
             command = self._without_faults(command)
-        elif self._contacts is None and self.pack.spec.fixed_base:
+        elif self._contacts is None and self.pack.spec.is_alone:
             if self._table is None:
                 fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
                 self._table = Table(ticks.arrays, self._motor, self._saturated, self._guarded, fault)
@@ -185,7 +185,8 @@ class EnvGroup:
                 command = ticks[tick].command.with_only(given)
             _, done = self._execute(command, Span(tick, done, tick + 1, substeps), None)
         with np.errstate(all="ignore"):
-            if not (near(self._qpos) and finite(self.pack.read_qvel()) and self._base_is_near()):
+            strays = not self.pack.spec.is_alone and self.pack.strays().any()
+            if strays or not (near(self._qpos) and finite(self.pack.read_qvel())):
                 self._contain(self._qpos, substeps, None)
         if self._contacts is not None:
             self._contacts.look(self._qpos, self._steps + substeps, containment.missed_contact)
@@ -205,9 +206,6 @@ class EnvGroup:
             if ran.failed:
                 self._contain(rows(ran.before), ran.done, ran.outputs.returned)
         return ran.tick, ran.done
-
-    def _base_is_near(self) -> bool:
-        return self.pack.spec.fixed_base or near(self.pack.read_base())
 
     def _mask(self, array: Any) -> Any:
         return False if array is None else self._executor.rows(array)
@@ -296,9 +294,7 @@ class EnvGroup:
         """
         containment, step = self._containment, self._steps + done
         qpos, qvel = self.pack.read_qpos(), self.pack.read_qvel()
-        bad = far(qpos) | ~np.isfinite(qvel)
-        if not self.pack.spec.fixed_base:
-            bad |= far(self.pack.read_base()).any(1, keepdims=True)
+        bad = far(qpos) | ~np.isfinite(qvel) | self.pack.strays()[:, None]
         # One step after a NaN effort at one joint, all joints are NaN. The effort shows the first joint.
         failed = bad.any(1, keepdims=True)
         source = ~np.isfinite(self.pack.qf) & failed

@@ -476,8 +476,8 @@ class _Run:
 
     @cached_property
     def _collides(self) -> bool:
-        """Whether contacts were simulated, at poses that are known."""
-        return self.rollout.info.collisions is not False and self.robot.fixed_base
+        """Whether contacts were simulated."""
+        return self.rollout.info.collisions is not False
 
     @cached_property
     def _times(self) -> dict[tuple[str, ...], int]:
@@ -485,8 +485,11 @@ class _Run:
         return defaultdict(int)
 
     def _near(self, qpos: Float64, within: float = TOUCH) -> dict[tuple[str, ...], float]:
-        """Return the distances [m] below ``within`` of pairs of links, of one link to the ground, nearest first."""
-        pairs = self.robot.dynamics(self.rollout.info.ground).near(qpos, within)
+        """Return the distances [m] below ``within`` of pairs of links, of one link to the ground, nearest first.
+
+        A robot on a floating base stands on the ground: there only pairs of links count.
+        """
+        pairs = self.robot.dynamics(self.rollout.info.ground if self.robot.fixed_base else False).near(qpos, within)
         found: dict[tuple[str, ...], float] = {}
         for first, second, distance in pairs:
             links = tuple(name for name in (first, second) if name)

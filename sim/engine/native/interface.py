@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 
-from batchpid.native.extensions import ROUNDED, Extension
+from batchpid.native.extensions import ROUNDED, VECTORIZED_ONLY, Extension
 from batchpid.native.operations import PROGRAMS
 from batchpid.native.task_space_extension import CALL, COUPLING, LANES, RIGID_BODY, TABLES
 
@@ -75,7 +75,8 @@ class Mujoco(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("models", "data")),
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")),
         *((name, ctypes.c_void_p) for name in ("ctrl", "stiffness", "rate_gain")),
-        ("clearance", ctypes.c_void_p),
+        *((name, ctypes.c_void_p) for name in ("clearance", "turn")),
+        ("base", ctypes.c_int64),
     ]
 
 
@@ -181,6 +182,6 @@ EXTENSIONS = {
             TABLES,
             *PROGRAMS,
         ),
-        (*ROUNDED, "-pthread", "-Wno-psabi"),
+        (*ROUNDED, *VECTORIZED_ONLY, "-pthread", "-Wno-psabi"),
     ),
 }

@@ -38,6 +38,8 @@ struct Mujoco {
   double *const *ctrl;                      // (robots,): arrays of their mjData, (dof,) each with drives
   double const *stiffness, *rate_gain;      // (robots, dof): gains of the drives, or null if no target changes
   Clearance const *clearance;               // or null: collision detection of all shapes in every sim step
+  double const *turn;                       // (3, 3): axes of the body of a floating base in its link
+  std::int64_t base;                        // index of that base in qvel
 };
 
 // Handler of MuJoCo's messages while this thread steps. After an error MuJoCo would end the process: the handler jumps

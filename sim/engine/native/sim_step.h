@@ -172,9 +172,13 @@ inline void write_targets(Group const &group, double const *target, double const
   }
 }
 
-// Write the velocities (robots, 3) at which bases in MuJoCo turn, in their own axes.
+// Write the velocities (robots, 3) at which bases in MuJoCo turn, in the axes of their links.
 inline void write_turning(Group const &group, double *out) {
-  for (std::int64_t row = 0; row < group.robots; ++row) std::copy_n(group.mujoco->qvel[row] + 3, 3, out + 3 * row);
+  double const *const turn = group.mujoco->turn;
+  for (std::int64_t at = 0; at < 3 * group.robots; ++at) {
+    double const *const own = group.mujoco->qvel[at / 3] + group.mujoco->base + 3, *const axis = turn + 3 * (at % 3);
+    out[at] = axis[0] * own[0] + axis[1] * own[1] + axis[2] * own[2];
+  }
 }
 
 // Write a part of the passive force (robots, dof) of a model at a state of the robots.

@@ -23,6 +23,7 @@ from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
+from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native.library import obstacle
 from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.sapien.building import build_scene, engine_settings, link_frames, new_system
@@ -205,6 +206,12 @@ class Pack(SingleOwner):
         if self._constraint is None:
             self._calls.write_qf()
 
+    def strays(self) -> NDArray[np.bool_]:
+        """Return the robots (M,) whose floating base is not finite or beyond FARTHEST."""
+        if self.spec.fixed_base:
+            return np.zeros(self.size, bool)
+        return np.array(~(np.abs(self.read_base()) <= FARTHEST).all(1))
+
     def read_base(self) -> Float64:
         return self._moved_to_origin(np.array([read_root(robot) for robot in self.robots], np.float64), -1.0)
 
@@ -285,7 +292,7 @@ class Pack(SingleOwner):
         self._suspended = mask.copy()
         self._bind()
 
-    def read_poses(self) -> list[Float32]:
+    def read_poses(self, names: Sequence[str] | None = None) -> list[Float32]:
         """Return the poses of each scene's watched entities, (watched, 7) each."""
         return [content.poses() for content in self._contents]
 
