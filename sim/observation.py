@@ -87,6 +87,15 @@ class Observation(NamedTuple):
         """Return an observation with ``function`` applied to each array that there is."""
         return Observation._make([None if array is None else function(array) for array in self])
 
+    def copied(self, tool_pose: Callable[[NDArray[Any]], NDArray[np.float32]] | None = None) -> Observation:
+        """Return a copy with arrays of its own; ``tool_pose`` gives the pose of the tool at positions (..., dof)."""
+        rows = list[Any]()
+        for array in self:  # no comprehension, which is a call of Python in the path of a tick
+            rows.append(None if array is None else array.copy())
+        if tool_pose is not None:
+            rows[_TOOL_POSE] = tool_pose(rows[0])
+        return Observation(*rows)
+
     @staticmethod
     def join(parts: Sequence[Observation]) -> Observation:
         """Return the observations as one, along the first axis."""
@@ -98,6 +107,7 @@ class Observation(NamedTuple):
         return f"Observation({envs} envs, {dof} joints, {_failed_envs(self.ok)})"
 
 
+_TOOL_POSE = Observation._fields.index("tool_pose")
 _SEEN = {name: hint.__metadata__[0] for name, hint in get_type_hints(Observation, include_extras=True).items()}
 OPTIONAL = ("tool_pose", "base_pose", "base_twist")
 """Fields of :class:`Observation` that may be None."""

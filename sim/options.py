@@ -23,10 +23,11 @@ from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
 from batchpid.checks.keywords import check_keywords
-from batchpid.checks.validate import choice, flag, instance, integer, joint_speeds, number
+from batchpid.checks.validate import AxisKind, choice, flag, instance, integer, joint_speeds, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.inputs import check_drive
+from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.command import CommandSpec, joint_command, own_command
 from batchpid.sim.engine.engines import load_engine
@@ -286,6 +287,17 @@ class RunnerOptions:
     def command(self) -> CommandSpec:
         """Names and units of the setpoint's entries."""
         return self.own_command or joint_command(self.robot.joint_names, self.robot.units, self.control)
+
+    @cached_property
+    def command_columns(self) -> tuple[tuple[AxisKind, tuple[str, ...]], ...]:
+        """Last axis of each array of a command: the kind of its columns, and their names."""
+        kind: AxisKind = "joint" if self.own_command is None else "entry"
+        return (*[(kind, self.command.names)] * 3, ("joint", self.robot.joint_names))
+
+    @cached_property
+    def command_coupling(self) -> Coupling | None:
+        """Coupling of the joints that setpoints are for; None where there is none."""
+        return self.robot.coupling if self.sets_positions and not self.robot.independent.all() else None
 
     @property
     def tool_pose(self) -> Callable[[NDArray[Any]], NDArray[np.float32]] | None:

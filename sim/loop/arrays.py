@@ -97,19 +97,19 @@ class Ticks:
     """Views of :class:`Arrays` (ticks, envs, ...) at each tick, made when first used."""
 
     def __init__(self, arrays: Arrays) -> None:
-        self.arrays, self._views = arrays, list[Arrays]()
+        self.arrays = arrays
+        self.made = list[Arrays]()
+        """The views that there are."""
 
     def __len__(self) -> int:
         return len(self.arrays.observation.ok)
 
     def __getitem__(self, tick: int) -> Arrays:
         """Return the views at a tick, 0 or more."""
-        views = self._views
-        return views[tick] if tick < len(views) else self.first(tick + 1)[tick]
+        return self.made[tick] if tick < len(self.made) else self.first(tick + 1)[tick]
 
     def first(self, count: int) -> list[Arrays]:
         """Return the views at the first ``count`` ticks."""
-        views = self._views
-        while len(views) < count:
-            views.append(self.arrays.at(len(views)))
-        return views[:count]
+        while len(self.made) < count:
+            self.made.append(self.arrays.at(len(self.made)))
+        return self.made[:count]

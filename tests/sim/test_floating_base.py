@@ -91,7 +91,7 @@ def test_the_base_is_that_of_the_engine(quadruped, engine):
     with Runner(quadruped, 1, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:
         runner.reset(base_pose=[0, 0, 0.5, 0.9, 0.1, 0.3, 0.2], base_twist=[0.3, 0.1, 0, 0, 1, 0])
         seen = runner.step(quadruped.start)
-        pack = runner._session.pool.workers[0]._loop.groups[0].pack
+        pack = runner._pool.workers[0]._loop.groups[0].pack
         if engine == "mujoco":
             data, velocity = pack._data[0], np.zeros(6)
             mujoco.mj_objectVelocity(pack.models[0], data, mujoco.mjtObj.mjOBJ_XBODY, 1, velocity, 0)
