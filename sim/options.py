@@ -22,17 +22,19 @@ from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
 from batchpid.checks.keywords import check_keywords
-from batchpid.checks.validate import choice, flag, instance, integer, joint_speeds, number
+from batchpid.checks.validate import choice, flag, instance, integer, joint_speeds, names, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.inputs import check_drive
 from batchpid.sim.command import CommandSpec, joint_command, own_command
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.protocol import Capability, Engine, require
+from batchpid.sim.observation import Quantity, observed_by_loop
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
+from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 from batchpid.sim.runner_keywords import (
@@ -128,6 +130,8 @@ class RunnerOptions:
     )
     collisions: bool = field(default=True, metadata=_in("snapshot", "recording", "scene"))
     ground: bool = field(default=_DERIVED, metadata=_in("snapshot", "recording", "scene"))
+    contacts: tuple[str, ...] | None = field(default=None, metadata=_in("scene", "recording", snapshot="contact_list"))
+    wrenches: tuple[str, ...] | None = field(default=None, metadata=_in("scene", "recording", snapshot="wrench_list"))
     build: Callable[[Any, int], Any] | None = field(default=None, metadata=_in("scene", snapshot="build_digest"))
     on_fault: FaultAction = field(default="hold", metadata=_in("snapshot"))
     speed_limit: NDArray[np.float64] | None = field(default=None, metadata=_in(snapshot="speed_limits"))
@@ -192,6 +196,8 @@ class RunnerOptions:
         own["guard"] = fit_guard(given["guard"], robot, self.num_envs, self.control_name, self.sets_positions)
         own["actuators"] = self.check_actuators(given["actuators"])
         self._check_collisions()
+        for name in ("contacts", "wrenches"):
+            own[name] = self._sensed_links(name, given[name])
         for name in ("controller_digest", "build_digest"):  # of the objects as they are now
             getattr(self, name)
 
@@ -219,6 +225,48 @@ class RunnerOptions:
         if not self.robot.fixed_base:
             problem = f"are False, and nothing holds the floating base of {self.robot.name!r}"
             raise InvalidArgumentError("collisions", problem, remedy="load the robot with fixed_base=True")
+
+    def _sensed_links(self, option: str, given: Any) -> tuple[str, ...] | None:
+        """Return the links of the option "contacts" or "wrenches"; None without any.
+
+        Raises InvalidArgumentError for a link that is unknown, or has no sensor of this kind.
+        """
+        robot, known = self.robot, [link.name for link in self.robot.links]
+        if not (links := () if given is None else tuple(names(option, given))):
+            return None
+        if option == "contacts" and not self.collisions:
+            raise InvalidArgumentError(option, "need collisions, which are off", remedy="leave out collisions=False")
+        if self.engine_name == "sapien" and robot.dissipation == "sapien":
+            problem = "need a robot without SAPIEN's link damping, which acts like a contact"
+            raise InvalidArgumentError(option, problem, remedy="load the robot with dissipation='urdf'")
+        bodies = place_links(robot.urdf, robot.merge_fixed)
+        root = next(at.link for at in bodies.values())
+        for link in links:
+            if link not in known:
+                remedy = f"use links of {robot.name!r}: {', '.join(known)}"
+                raise InvalidArgumentError(option, f"names an unknown link {link!r}", remedy=remedy)
+            if bodies[link].link == root and (option == "wrenches" or robot.fixed_base):
+                problem = f"names {link!r}, which no joint moves"
+                raise InvalidArgumentError(option, problem, remedy="name a link further along the robot")
+            if option == "wrenches" and bodies[link].link != link:
+                problem = f"names {link!r}, which is simulated as one with {bodies[link].link!r}"
+                raise InvalidArgumentError(option, problem, remedy="load the robot with merge_fixed=False")
+        return links
+
+    @cached_property
+    def observed(self) -> dict[str, Quantity]:
+        """Quantities that the loop observes."""
+        return observed_by_loop(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
+
+    @property
+    def contact_list(self) -> list[str] | None:
+        """The option ``contacts`` as plain values."""
+        return None if self.contacts is None else list(self.contacts)
+
+    @property
+    def wrench_list(self) -> list[str] | None:
+        """The option ``wrenches`` as plain values."""
+        return None if self.wrenches is None else list(self.wrenches)
 
     @property
     def solver(self) -> Physics | MujocoSolver:

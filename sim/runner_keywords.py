@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict
 
@@ -114,6 +114,13 @@ class RunnerKeywords(TypedDict, total=False):
     ground: bool | None
     """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
     so low that other links reach the ground at its start pose."""
+    contacts: Sequence[str] | None
+    """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``. Links that fixed joints join
+    are one body, and count as one. Default none. The links must move; with SAPIEN the robot has
+    ``dissipation="urdf"``."""
+    wrenches: Sequence[str] | None
+    """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``. Default none. A
+    link that a fixed joint holds needs a robot with ``merge_fixed=False``."""
     build: Callable[[Any, int], Any] | None
     """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
     that code written for a screen runs unchanged. It may return the entities that :meth:`batchpid.sim.Runner.poses`

@@ -27,7 +27,7 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.custom import initial_state
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
-from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation, observed_by_loop
+from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation, untouched
 from batchpid.sim.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.draws import NOTHING
 from batchpid.sim.robot.drive_chatter import DriveChatterCheck
@@ -231,8 +231,7 @@ class Session:
             self._transactions.state.params, setpoints, setpoint_rates, setpoint_accelerations, feedforwards
         )
         ticks = len(command.setpoint)
-        robot = options.robot
-        seen = empty_observation(ticks, options.num_envs, robot.dof, fixed_base=robot.fixed_base)
+        seen = empty_observation(ticks, options.num_envs, options.robot.dof, observed=options.observed)
         times = (steps + options.substeps * np.arange(1.0, ticks + 1)) * options.timestep
         info, done = replace(self.info(), rates=command.setpoint_rate is not None), 0
         shown = iter(range(ticks) if progress is None else progress(range(ticks)))
@@ -244,7 +243,7 @@ class Session:
                 rows_of_part = command.map(lambda rows, part=part: rows[part])
                 self._transactions.run(*self._ticks(rows_of_part, options.substeps))
                 self._warn(stacklevel=4)
-                for name in observed_by_loop(robot.fixed_base):
+                for name in options.observed:
                     getattr(seen, name)[part] = getattr(self.pool.arrays.observation, name)[: done - tick]
         next(shown, None)  # the end
         if self._tool_pose is not None:
@@ -332,6 +331,7 @@ class Session:
             options.guard is not None,
             sizes,
             options.command.size,
+            untouched(options.num_envs, options.observed),
         )
         request = Restore(replace(snapshot, params=params, actuators=actuators), draws).copy()
 

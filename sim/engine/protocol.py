@@ -100,6 +100,13 @@ class EnginePack(Protocol):
         Position [m], quaternion (w, x, y, z), linear and angular velocity [m/s, rad/s].
         """
 
+    def take_sensed(self) -> dict[str, Float64]:
+        """Return what the sensors of links summed up in all sim steps since the last call, and begin again.
+
+        ``contact_force`` (M, links, 3), ``touching`` (M, links), 0 without a contact, and ``wrench`` (M, links, 6), as
+        :class:`batchpid.sim.Observation` describes them; of robots that were placed meanwhile, since then.
+        """
+
     def write_state(
         self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], base: Float64 | None = None
     ) -> None:

@@ -28,7 +28,8 @@ class SceneSpec:
     collide; ``joints`` are the degrees of freedom, in the order of all arrays. ``physics`` are the solver
     settings of ``engine``, in the engine's type. With ``merge_fixed`` each rigid body is one link
     (:mod:`batchpid.sim.robot.merging`). Without ``collisions`` scenes have no collision shapes and no ground, but the
-    same masses and inertias. Specs that differ in ``build`` alone are equal.
+    same masses and inertias. ``contacts`` and ``wrenches`` are links with sensors. Specs that differ in ``build`` alone
+    are equal.
     """
 
     urdf: str
@@ -44,6 +45,8 @@ class SceneSpec:
     build: Build | None = field(default=None, compare=False)
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     engine: str = "sapien"
+    contacts: tuple[str, ...] | None = None
+    wrenches: tuple[str, ...] | None = None
 
 
 class Variation(NamedTuple):

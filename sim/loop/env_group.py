@@ -29,6 +29,7 @@ from batchpid.sim.loop.step_constants import make_constants, make_layout
 from batchpid.sim.loop.step_state import init_motors, reset_friction, reset_guard, with_friction, with_params
 from batchpid.sim.loop.step_values import StepState
 from batchpid.sim.loop.xla_executor import XLAExecutor
+from batchpid.sim.observation import untouched
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.draws import Draws
 
@@ -59,6 +60,7 @@ class EnvGroup:
         self._motor = np.zeros((pack.size, pack.dof), np.float32)
         self._saturated, self._guarded = (np.zeros((pack.size, pack.dof), bool) for _ in range(2))
         self._table: Table | None = None
+        self._sensed = untouched(pack.size, options.observed)
         self._steps = 0
         collides, ground = options.collisions, options.robot.has_ground
         self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
@@ -157,6 +159,8 @@ class EnvGroup:
         if base is not None:
             containment.start_base[good] = base[good]
         self._place(mask, containment.start_qpos, containment.start_qvel)
+        for sensed in self._sensed.values():
+            sensed[mask] = 0
         for cause, entries in bad.items():
             containment.fail(entries, cause, steps, containment.start_qpos)
         self._place_failed()
@@ -170,9 +174,11 @@ class EnvGroup:
         containment, command = self._containment, ticks[first].command.with_only(given)
         containment.failed, table = containment.suspended.copy(), None
         self._steps = steps
+        if self._sensed:
+            self.pack.take_sensed()
         if containment.suspended.any() or not finite(*command):
             command = self._without_faults(command)
-        elif self._contacts is None and self.pack.spec.fixed_base:
+        elif self._contacts is None and self.pack.spec.fixed_base and not self._sensed:
             if self._table is None:
                 fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
                 self._table = Table(ticks.arrays, self._motor, self._saturated, self._guarded, fault)
@@ -189,6 +195,11 @@ class EnvGroup:
                 self._contain(self._qpos, substeps, None)
         if self._contacts is not None:
             self._contacts.look(self._qpos, self._steps + substeps, containment.missed_contact)
+        if self._sensed:
+            for name, rows in self.pack.take_sensed().items():
+                sensed = self._sensed[name]
+                sensed[...] = rows > 0 if sensed.dtype == bool else rows / substeps
+                sensed[containment.failed] = 0
         self.observe(ticks[tick])
         return tick + 1
 
@@ -223,6 +234,8 @@ class EnvGroup:
         observation.ok[...] = ~containment.failed
         if observation.base_pose is not None and observation.base_twist is not None:
             observation.base_pose[...], observation.base_twist[...] = np.split(self.pack.read_base(), [7], axis=1)
+        for name, values in self._sensed.items():
+            getattr(observation, name)[...] = values
         fault = rows.fault
         fault.step[...], fault.joint[...], fault.cause[...] = containment.step, containment.joint, containment.cause
         fault.missed_contact[...] = containment.missed_contact
@@ -247,6 +260,7 @@ class EnvGroup:
             actuators={} if state.motors is None else {**state.motors.leaves(), EPISODE: self._episode.copy()},
             guard={} if state.guard is None else {**state.guard._asdict(), CHANGED: self._guarded.copy()},
             containment=self._containment.read(),
+            sensors={name: rows.copy() for name, rows in self._sensed.items()},
         )
 
     def write(self, pack: EnginePack, states: EnvStates) -> None:
@@ -260,6 +274,8 @@ class EnvGroup:
         pack.write_qf(states.effort)
         state = StepState(states.controller if self._controller else bp.PIDState(**states.controller))
         self._saturated[...], self._motor[...] = states.saturated, states.effort
+        for name, rows in states.sensors.items():
+            self._sensed[name][...] = rows
         if states.friction:
             leaves = (states.friction[name] for name in FrictionState._fields)
             state = state._replace(friction=FrictionState(*leaves), age=states.friction[AGE])

@@ -22,6 +22,7 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from batchpid.errors import RobotError
+from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
 from batchpid.sim.engine.mujoco.solver import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import add_geom, link_shapes
@@ -98,6 +99,7 @@ def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[An
         names = _add_links(scene, spec, inertias)
         if spec.collisions:
             _add_shapes(scene, spec, names)
+        add_link_sensors(scene, spec, names)
     except ValueError as error:
         raise _refusal(error) from error
     return scene, names

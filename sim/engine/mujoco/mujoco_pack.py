@@ -20,6 +20,7 @@ from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.data_pool import DataPool
+from batchpid.sim.engine.mujoco.link_sensors import LinkSensors
 from batchpid.sim.engine.mujoco.model_builder import FLOATING, LARGEST_FORCE, RobotMj, robot_model, set_inertia
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
@@ -97,6 +98,8 @@ class MujocoPack(SingleOwner):
         if robot not in self._workspace:
             self._workspace[robot] = DataPool(robot)
         self._robot, self._pool = robot, self._workspace[robot]
+        self._sensors = LinkSensors(self.spec, robot.model, robot.bodies)
+        self._sensed = np.zeros((self.size, self._sensors.size))
         self.models, self.rows = [self._pool.model] * self.size, self._pool.initial(self.size)
         self._at, self._moves = _columns(robot.qpos), _columns(robot.qvel)
         self._change_masses(range(self.size))
@@ -200,6 +203,7 @@ class MujocoPack(SingleOwner):
                 model, data = self.models[row], everyone[row]
                 data.qfrc_applied[self._moves] = effort[row]
                 mujoco.mj_step2(model, data)
+                self._sensed[row] += data.sensordata
                 if (np.abs(data.qpos[self._at]) <= FARTHEST).all():
                     mujoco.mj_step1(model, data)
         finally:
@@ -231,7 +235,8 @@ class MujocoPack(SingleOwner):
         constraint, arrays = None if self._constraint is None else self._constraint.address, (self.qf, self._suspended)
         moving = (self._stiffness, self._rate_gain) if drives else None
         return MujocoStep(
-            self._robot, self.models, lambda: self._data, *arrays, reads_force, speed_limit, constraint, moving
+            *(self._robot, self.models, lambda: self._data, *arrays, reads_force, speed_limit, constraint, moving),
+            sensed=self._sensed,
         )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
@@ -246,6 +251,12 @@ class MujocoPack(SingleOwner):
         rows = np.array([np.concatenate([data.qpos[: FLOATING + 1], data.qvel[:FLOATING]]) for data in self._data])
         rows[:, 10:] = np.einsum("eij,ej->ei", matrix_of(rows[:, 3:7]), rows[:, 10:])  # MuJoCo's are in the body's axes
         return rows
+
+    def take_sensed(self) -> dict[str, Float64]:
+        """Return the sums of the links' sensors since the last call, as EnginePack says, and begin again."""
+        sums = self._sensors.quantities(self._sensed) if self._sensors.size else {}
+        self._sensed[...] = 0.0
+        return sums
 
     def write_state(
         self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], base: Float64 | None = None
@@ -263,6 +274,7 @@ class MujocoPack(SingleOwner):
             data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = position, velocity
             data.ctrl[:] = ctrl
             self.qf[row] = 0.0
+            self._sensed[row] = 0.0
         self._evaluate(rows)
         self.update_constraint(list(rows))  # within a tick, the robots may have failed
 

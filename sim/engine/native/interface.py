@@ -37,7 +37,7 @@ class Group(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("gateway", "qf", "skip", "speed_limit")),
-        *((name, ctypes.c_void_p) for name in ("mujoco", "constraint", "joints")),
+        *((name, ctypes.c_void_p) for name in ("mujoco", "constraint", "joints", "sense")),
         ("robots", ctypes.c_int64),
         ("dof", ctypes.c_int64),
         ("gravity", ctypes.c_int32),
@@ -75,7 +75,8 @@ class Mujoco(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("models", "data")),
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")),
         *((name, ctypes.c_void_p) for name in ("ctrl", "stiffness", "rate_gain")),
-        ("clearance", ctypes.c_void_p),
+        *((name, ctypes.c_void_p) for name in ("clearance", "sensors", "sensed")),
+        ("sensor_size", ctypes.c_int64),
     ]
 
 

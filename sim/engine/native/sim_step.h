@@ -27,6 +27,7 @@ struct Group {
   Mujoco const *mujoco;              // robots in MuJoCo, or null; then there is no gateway
   Constraint const *constraint;      // of coupled joints, or null
   Joint *const *joints;              // (robots, dof): in SAPIEN, or null without targets of drives that move
+  void (*sense)(std::int64_t row);   // reads the sensors of a robot's links in SAPIEN after a sim step, or null
   std::int64_t robots, dof;
   std::int32_t gravity, coriolis;    // parts of the passive force; without both it is zero
   std::int32_t velocities, unused;   // whether to read velocities; otherwise they are zero
@@ -72,6 +73,7 @@ std::int32_t sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos,
     if (group.constraint != nullptr) constrain_row(group, row, qf);
     if (!group.skip[row]) apply(call, robot, qf, dof);
     call.step(gateway.systems[row]);
+    if (group.sense != nullptr) group.sense(static_cast<std::int64_t>(row));
     VectorXf const position = call.get_qpos(robot);
     copy_row(position, qpos + at, dof);
     if (group.velocities || group.speed_limit) copy_row(call.get_qvel(robot), qvel + at, dof);

@@ -28,6 +28,7 @@ from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.sapien.building import build_scene, engine_settings, link_frames, new_system
 from batchpid.sim.engine.sapien.built_tree import scene_tree
 from batchpid.sim.engine.sapien.calls import EngineCalls
+from batchpid.sim.engine.sapien.link_sensors import LinkSensors
 from batchpid.sim.engine.sapien.native_calls import engine_calls
 from batchpid.sim.engine.sapien.sim_step import NativeStep
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, refuse_shapes, write_root
@@ -89,6 +90,7 @@ class Pack(SingleOwner):
             self._constraint.implicit[...] = self._implicit
             if self.steps_natively:
                 self._constraint.use(self._joint_model, None)
+        self._sensors = LinkSensors(spec, self.robots, self.systems) if spec.contacts or spec.wrenches else None
         self._bind()
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
@@ -115,6 +117,9 @@ class Pack(SingleOwner):
             self._calls.write_qf()
         self._stepped[...] = True
         self._calls.step()
+        if self._sensors is not None:
+            for row in range(self.size):
+                self._sensors.add(row)
 
     @property
     def calls(self) -> EngineCalls:
@@ -136,7 +141,8 @@ class Pack(SingleOwner):
         """Return the sim step as one native call, which holds for the present :attr:`calls`."""
         constraint = None if self._constraint is None else self._constraint.address
         reads, joints = (gravity, coriolis, velocities), self._joints if drives else None
-        return NativeStep(self.calls, self._stepped, *reads, speed_limit, constraint, joints)
+        sense = None if self._sensors is None else self._sensors.add
+        return NativeStep(self.calls, self._stepped, *reads, speed_limit, constraint, joints, sense)
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
         """Give the constraint efforts of robots ``rows`` the present mass matrix and passive force."""
@@ -218,6 +224,9 @@ class Pack(SingleOwner):
         velocity = roots[:, 7:10] + sign * np.cross(roots[:, 10:], arm)
         return np.concatenate([roots[:, :7], velocity, roots[:, 10:]], axis=1)
 
+    def take_sensed(self) -> dict[str, Float64]:
+        return {} if self._sensors is None else self._sensors.take()
+
     def write_state(
         self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], base: Float64 | None = None
     ) -> None:
@@ -245,6 +254,8 @@ class Pack(SingleOwner):
                 self._contents[row].reset()
         if self._constraint is not None:
             self._constraint.place(rows, qpos)
+        if self._sensors is not None:
+            self._sensors.place(rows)
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
         """Raise TypeError: the robots of this pack equal the model; see :mod:`batchpid.sim.engine.sapien.variation`."""
