@@ -193,6 +193,7 @@ class RunnerOptions:
         if self.randomization is not None:
             remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
             check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
+            self._check_world(self.randomization)
         own["guard"] = fit_guard(given["guard"], robot, self.num_envs, self.control_name, self.sets_positions)
         own["actuators"] = self.check_actuators(given["actuators"])
         self._check_collisions()
@@ -225,6 +226,14 @@ class RunnerOptions:
         if not self.robot.fixed_base:
             problem = f"are False, and nothing holds the floating base of {self.robot.name!r}"
             raise InvalidArgumentError("collisions", problem, remedy="load the robot with fixed_base=True")
+
+    def _check_world(self, randomization: Randomization) -> None:
+        """Raise InvalidArgumentError for draws of the world that this runner's scenes do not take."""
+        if randomization.ground_friction is not None and not self.collisions:
+            raise InvalidArgumentError("ground_friction", "has no effect without collisions", remedy="leave it out")
+        if randomization.gravity is not None and self.build is not None:
+            problem = "cannot change in scenes with content of build: SAPIEN's systems keep their gravity"
+            raise InvalidArgumentError("gravity", problem, remedy="leave out one of them")
 
     def _sensed_links(self, option: str, given: Any) -> tuple[str, ...] | None:
         """Return the links of the option "contacts" or "wrenches"; None without any.
@@ -323,6 +332,11 @@ class RunnerOptions:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
         added = actuators is not None and (actuators.coulomb is not None or actuators.static is not None)
         return bool(self.robot.friction.any()) or added or getattr(self.randomization, "friction", None) is not None
+
+    @property
+    def has_pushes(self) -> bool:
+        """True if floating bases are pushed."""
+        return self.randomization is not None and self.randomization.push is not None
 
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
         """Return ``params``, as a read-only copy, if they fit the robot, the number of envs and the control.

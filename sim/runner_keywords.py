@@ -100,7 +100,8 @@ class RunnerKeywords(TypedDict, total=False):
     compensate: Compensation
     """Passive force, and the known Coulomb friction on the way to the setpoint, added at every sim step.
     ``"gravity+coriolis+friction"``, the default, or a part of it; under control "effort" friction is not
-    compensated."""
+    compensated. On a floating base the passive force is the joints' own share, as if the base were held where it is:
+    what the legs carry of the base depends on their contacts, and is left to the law."""
     engine: EngineName
     """Physics engine: ``"sapien"``, the reference and the default where it is installed, or ``"mujoco"``, several times
     as fast (docs/two-engines.md)."""

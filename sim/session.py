@@ -332,6 +332,7 @@ class Session:
             sizes,
             options.command.size,
             untouched(options.num_envs, options.observed),
+            options.has_pushes,
         )
         request = Restore(replace(snapshot, params=params, actuators=actuators), draws).copy()
 

@@ -65,6 +65,10 @@ class Variation(NamedTuple):
     """Viscous damping of the joints (envs, dof) [N m s/rad or N s/m]."""
     armature: Float64 | None = None
     """Reflected inertia of the motors (envs, dof) [kg m^2 or kg]."""
+    ground_friction: Float64 | None = None
+    """Coefficient of sliding friction of the ground and all shapes of the robot (envs,)."""
+    gravity: Float64 | None = None
+    """(envs, 3) [m/s^2]"""
 
 
 def varied_inertia(body: Body, variation: Variation, row: int) -> SpatialInertia:

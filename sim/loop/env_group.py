@@ -24,6 +24,7 @@ from batchpid.sim.loop.native_executor import NativeExecutor
 from batchpid.sim.loop.native_ticks import Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor, Span, passive_forces, with_model
 from batchpid.sim.loop.pid_law import PIDLaw
+from batchpid.sim.loop.pushes import Pushes
 from batchpid.sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
 from batchpid.sim.loop.step_constants import make_constants, make_layout
 from batchpid.sim.loop.step_state import init_motors, reset_friction, reset_guard, with_friction, with_params
@@ -61,6 +62,7 @@ class EnvGroup:
         self._saturated, self._guarded = (np.zeros((pack.size, pack.dof), bool) for _ in range(2))
         self._table: Table | None = None
         self._sensed = untouched(pack.size, options.observed)
+        self._pushes = Pushes(options, pack.size) if options.has_pushes else None
         self._steps = 0
         collides, ground = options.collisions, options.robot.has_ground
         self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
@@ -176,6 +178,8 @@ class EnvGroup:
         self._steps = steps
         if self._sensed:
             self.pack.take_sensed()
+        if self._pushes is not None:
+            self._push(self._pushes, substeps)
         if containment.suspended.any() or not finite(*command):
             command = self._without_faults(command)
         elif self._contacts is None and self.pack.spec.fixed_base and not self._sensed:
@@ -202,6 +206,15 @@ class EnvGroup:
                 sensed[containment.failed] = 0
         self.observe(ticks[tick])
         return tick + 1
+
+    def _push(self, pushes: Pushes, substeps: int) -> None:
+        """Push the bases that are due before a tick."""
+        assert self.draws is not None
+        rows, twists = pushes.due(self._containment.suspended, self.draws.episodes)
+        if rows:
+            self.pack.push(rows, twists)
+            self._measured = self._executor.measure()
+        pushes.advance(substeps)
 
     def _execute(self, command: Command, span: Span, table: Table | None) -> tuple[int, int]:
         """Run sim steps and handle an event; return the first tick that is not observed, and its steps done."""
@@ -261,6 +274,7 @@ class EnvGroup:
             guard={} if state.guard is None else {**state.guard._asdict(), CHANGED: self._guarded.copy()},
             containment=self._containment.read(),
             sensors={name: rows.copy() for name, rows in self._sensed.items()},
+            pushes={} if self._pushes is None else {name: rows.copy() for name, rows in self._pushes.counts.items()},
         )
 
     def write(self, pack: EnginePack, states: EnvStates) -> None:
@@ -276,6 +290,8 @@ class EnvGroup:
         self._saturated[...], self._motor[...] = states.saturated, states.effort
         for name, rows in states.sensors.items():
             self._sensed[name][...] = rows
+        if self._pushes is not None:
+            self._pushes.counts = {name: rows.copy() for name, rows in states.pushes.items()}
         if states.friction:
             leaves = (states.friction[name] for name in FrictionState._fields)
             state = state._replace(friction=FrictionState(*leaves), age=states.friction[AGE])
@@ -358,6 +374,8 @@ class EnvGroup:
         pack.write_state(rows.tolist(), qpos[rows], qvel[rows], base)
         pack.suspend(self._containment.suspended)
         self._motor[mask], self._saturated[mask], self._guarded[mask] = 0.0, False, False
+        if self._pushes is not None and self.draws is not None:
+            self._pushes.begin(mask, self.draws.episodes)
         self._measured = self._executor.measure()
         if self._contacts is not None:
             self._contacts.place(mask)

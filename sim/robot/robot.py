@@ -38,6 +38,8 @@ _ASSETS = Path(assets.__file__).parent
 MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
 DESIGN_HZ = 1.7
 """Bandwidth of :meth:`Robot.designed` with the mass matrix."""
+STANDING_HZ = 4.0
+"""Bandwidth of :meth:`Robot.designed` for a robot that stands: its weight sinks by about g / (2 pi STANDING_HZ)^2."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -178,7 +180,7 @@ class Robot(RobotDescription):
             params = self.params()
         return check(self, params, qpos, setpoint, timestep, control)
 
-    def designed(self, gain_units: str = "mass_matrix") -> bp.PIDParams:
+    def designed(self, gain_units: str | None = None) -> bp.PIDParams:
         """Return params designed from the robot's inertia alone; a search for gains starts from them.
 
         With the mass matrix the poles lie between the poles of Bessel's prototype s^3 + 6 s^2 + 15 s + 15 (W. E.
@@ -190,15 +192,20 @@ class Robot(RobotDescription):
         Parameters
         ----------
         gain_units
-            ``"mass_matrix"``, ``"inertia"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`.
+            ``"mass_matrix"``, ``"inertia"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
+            ``"mass_matrix"``; on a floating base ``"effort"``, for legs that carry the base at the start pose: the mass
+            matrix is that of legs in the air, a twentieth.
 
         Raises
         ------
         InvalidArgumentError
             Unknown gain_units, or a mass matrix that is not positive definite.
         """
-        choice("gain_units", gain_units, CHOICES["gain_units"])
+        chosen = ("mass_matrix" if self.fixed_base else "effort") if gain_units is None else gain_units
+        gain_units = choice("gain_units", chosen, CHOICES["gain_units"])
         options: dict[str, Any] = {"gain_units": gain_units, "measurement_rate": "measured"}
+        if gain_units == "effort" and not self.fixed_base:
+            return bp.design_gains(self, STANDING_HZ, load=self.dynamics().standing_inertia(self.start), **options)
         if gain_units != "mass_matrix":
             return bp.design_gains(self, 2.25, **options)
         return bp.design_gains(self, DESIGN_HZ, 0.82, integral_time=4.5 / (2 * np.pi * DESIGN_HZ), **options)

@@ -26,14 +26,13 @@ from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
 from batchpid.sim.engine.mujoco.solver import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import add_geom, link_shapes
+from batchpid.sim.robot.dissipation import CONTACT_FRICTION
 from batchpid.sim.robot.parts import MOVING_TYPES
 from batchpid.sim.robot.simulated_links import body_inertias, simulated
 from batchpid.sim.robot.xml import numbers
 from batchpid.task_space.rotations import from_rpy
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
-_FRICTION = 0.3
-"""Coefficient of sliding friction of every shape, as in SAPIEN's default material."""
 FLOATING = 6
 """Degrees of freedom of a floating base, which come first in MuJoCo's arrays."""
 LARGEST_FORCE = 1e10
@@ -226,7 +225,7 @@ def _add_drives(scene: Any, spec: SceneSpec) -> None:
 
 
 def _contact(spec: SceneSpec) -> dict[str, Any]:
-    return {"friction": [_FRICTION, 0.005, 0.0001], "solref": [spec.physics.contact_time, 1.0]}
+    return {"friction": [CONTACT_FRICTION, 0.005, 0.0001], "solref": [spec.physics.contact_time, 1.0]}
 
 
 def set_inertia(model: Any, body: int, inertia: SpatialInertia) -> None:

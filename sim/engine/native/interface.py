@@ -20,8 +20,12 @@ SYMBOLS = (
     "_ZN6sapien5physx14PhysxSystemCpu4stepEv",
     "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetPositionEf",
     "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetVelocityEf",
+    "_ZN6sapien5physx17PhysxArticulation11getRootPoseEv",
+    "_ZN6sapien5physx17PhysxArticulation22getRootAngularVelocityEv",
 )
 """Functions of SAPIEN, in the order of Functions in gateway.h."""
+BASES = ("fixed", "free", "held")
+"""Kinds of the base of a :class:`Model`, as Base in model.h."""
 STATUS = ("not_finite", "too_fast", "failed", "no_noise")
 """Bits of the status of a sim step: reasons to stop a loop over sim steps, as Status in sim_step.h."""
 STAGES = ("program", "force", "inertia", "mass_matrix", "controller", "targets", "constraint", "engine")
@@ -101,7 +105,7 @@ class Model(ctypes.Structure):
         ("gravity", 3 * ctypes.c_double),
         ("dof", ctypes.c_int64),
         ("varies", ctypes.c_int32),
-        ("floats", ctypes.c_int32),
+        ("base", ctypes.c_int32),
     ]
 
 

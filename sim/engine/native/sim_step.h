@@ -174,18 +174,43 @@ inline void write_targets(Group const &group, double const *target, double const
   }
 }
 
-// Write the velocities (robots, 3) at which bases in MuJoCo turn, in their own axes.
-inline void write_turning(Group const &group, double *out) {
-  for (std::int64_t row = 0; row < group.robots; ++row) std::copy_n(group.mujoco->qvel[row] + 3, 3, out + 3 * row);
+// Write R^T v for the rotation R of a quaternion (w, x, y, z), as turned_back in robot_model.py.
+inline void turn_back(double const *q, double const *v, double *out) {
+  double const w = q[0], x = q[1], y = q[2], z = q[3], s = 2 / (w * w + x * x + y * y + z * z);
+  double const rows[3][3] = {{1 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)},
+                             {s * (x * y - w * z), 1 - s * (x * x + z * z), s * (y * z + w * x)},
+                             {s * (x * z + w * y), s * (y * z - w * x), 1 - s * (x * x + y * y)}};
+  for (int i = 0; i < 3; ++i) out[i] = rows[i][0] * v[0] + rows[i][1] * v[1] + rows[i][2] * v[2];
+}
+
+// Write gravity and the rates at which bases turn, in their own axes (robots, BASE_SIZE).
+inline void write_bases(Group const &group, double const *gravity, double *out) {
+  for (std::int64_t row = 0; row < group.robots; ++row, out += BASE_SIZE) {
+    double q[4], turning[3];
+    if (group.mujoco != nullptr) {
+      std::copy_n(group.mujoco->qpos[row] + 3, 4, q);
+      std::copy_n(group.mujoco->qvel[row] + 3, 3, turning);
+    } else {
+      Functions const &call = group.gateway->functions;
+      Articulation *robot = group.gateway->robots[static_cast<std::size_t>(row)];
+      RootPose const pose = call.get_root_pose(robot);
+      Vec3 const rate = call.get_root_angular_velocity(robot);
+      std::copy_n(pose.wxyz, 4, q);
+      double const world[3] = {rate.x, rate.y, rate.z};
+      turn_back(q, world, turning);
+    }
+    turn_back(q, gravity, out);
+    std::copy_n(turning, 3, out + 3);
+  }
 }
 
 // Write a part of the passive force (robots, dof) of a model at a state of the robots.
 inline void write_force(Group const &group, Model const &model, Parts parts, double const *qpos, double const *qvel,
                         double *out) {
-  thread_local std::vector<double> turning;
-  turning.resize(static_cast<std::size_t>(3 * group.robots));
-  if (model.floats) write_turning(group, turning.data());
-  write_forces(model, parts, group.robots, qpos, qvel, model.floats ? turning.data() : nullptr, out);
+  thread_local std::vector<double> bases;
+  bases.resize(static_cast<std::size_t>(BASE_SIZE * group.robots));
+  if (model.base != Base::FIXED) write_bases(group, model.gravity, bases.data());
+  write_forces(model, parts, group.robots, qpos, qvel, bases.data(), out);
 }
 
 // Give the constraint efforts the present mass matrices and passive forces; qpos and qvel (robots, dof) are the present.

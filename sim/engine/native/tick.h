@@ -122,7 +122,7 @@ inline std::int32_t run_stage(Stage const &stage, BoundProgram *const *programs,
       return 0;
     }
     case StageKind::FORCE:
-      write_forces(*tick.measured_force, parts, robots, tick.pose, tick.rate, nullptr, tick.passive);
+      write_force(group, *tick.measured_force, parts, tick.pose, tick.rate, tick.passive);
       return 0;
     case StageKind::INERTIA:
       refresh(*tick.refresh, robots, tick.qpos, tick.gain, tick.memory, tick.age);

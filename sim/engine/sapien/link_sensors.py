@@ -28,9 +28,8 @@ class LinkSensors:
         parents = [None if joint.parent_link is None else joint.parent_link.name for joint in robots[0].joints]
         self._children = {at: [i for i, name in enumerate(parents) if name == links[at]] for at in self._contacts}
         self._roots = {at for at, name in enumerate(parents) if name is None}
-        self._gravity = np.array(spec.gravity)
         self._velocities = np.zeros((len(robots), len(self._contacts), 3))
-        self._parts: list[Any] = [None] * len(robots)  # links, joints, and numbers of the links by entity
+        self._parts: list[Any] = [None] * len(robots)  # links, joints, numbers of the links by entity, and gravity
         self._sums: dict[str, Float64] = {}
         self.take()
         self.place(range(len(robots)))
@@ -46,7 +45,8 @@ class LinkSensors:
         """Begin again for robots ``rows``, which were placed."""
         for row in rows:
             robot = self._robots[row]
-            self._parts[row] = robot.links, robot.joints, {link.entity: at for at, link in enumerate(robot.links)}
+            numbers = {link.entity: at for at, link in enumerate(robot.links)}
+            self._parts[row] = robot.links, robot.joints, numbers, self._systems[row].config.gravity
             self._velocities[row] = self._read_velocities(row)
             for sums in self._sums.values():
                 sums[row] = 0.0
@@ -57,7 +57,7 @@ class LinkSensors:
 
     def add(self, row: int) -> None:
         """Add the sensors of robot ``row`` after a sim step."""
-        links, joints, _ = self._parts[row]
+        links, joints, _, gravity = self._parts[row]
         forces = self._robots[row].get_link_incoming_joint_forces()
         if self._wrenches:
             self._sums["wrench"][row] += [_in_link(joints[at], forces[at]) for at in self._wrenches]
@@ -68,7 +68,7 @@ class LinkSensors:
             if at not in touched:
                 continue
             rate = (velocities[number] - self._velocities[row, number]) / self._spec.timestep
-            force = links[at].mass * (rate - self._gravity)
+            force = links[at].mass * (rate - gravity)
             if at not in self._roots:
                 force -= _in_world(links[at], joints[at], forces[at])
             for child in self._children[at]:
@@ -79,7 +79,7 @@ class LinkSensors:
 
     def _touched(self, row: int) -> set[int]:
         """Return the links with a contact that pushes."""
-        _, _, numbers = self._parts[row]
+        _, _, numbers, _ = self._parts[row]
         return {
             numbers[body.entity]
             for contact in self._systems[row].get_contacts()
