@@ -22,6 +22,7 @@ from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.findings import Findings
+from batchpid.sim.robot.joint_repair import free_base, free_joint_of
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.mimics import couple
 from batchpid.sim.robot.parts import FileDefaults, Joint, Settings
@@ -38,7 +39,7 @@ _ASSETS = Path(assets.__file__).parent
 MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
 DESIGN_HZ = 1.7
 """Bandwidth of :meth:`Robot.designed` with the mass matrix."""
-STANDING_HZ = 4.0
+STANDING_HZ = 3.0
 """Bandwidth of :meth:`Robot.designed` for a robot that stands: its weight sinks by about g / (2 pi STANDING_HZ)^2."""
 
 
@@ -54,7 +55,7 @@ class Robot(RobotDescription):
         package_dirs: Sequence[str | Path] = (),
         missing_meshes: str = "skip",
         dissipation: str = "urdf",
-        fixed_base: bool = True,
+        fixed_base: bool | None = None,
         merge_fixed: bool = True,
         self_collision: str = "auto",
         actuators: bp.Actuators | str | Path | None = None,
@@ -73,7 +74,8 @@ class Robot(RobotDescription):
             :mod:`batchpid.motors.friction`; no link damping. ``"sapien"``: SAPIEN's defaults, PhysX's joint friction
             0.05 and link damping 0.05, for comparison with its tutorial.
         fixed_base
-            True to fix the root link to the world.
+            True to fix the root link to the world. Default True, unless the root of a URDF is a link without mass and
+            shapes and its only joint is floating or planar: then the base floats, and the root is that joint's child.
         merge_fixed
             True to simulate links that are joined by fixed joints as one, with the exact inertia: fewer links, faster
             steps. False keeps every link, and contacts between links that are joined through other links.
@@ -103,14 +105,18 @@ class Robot(RobotDescription):
         choice("missing_meshes", missing_meshes, ("error", "skip"))
         choice("dissipation", dissipation, DISSIPATION)
         choice("self_collision", self_collision, SELF_COLLISION)
-        fixed_base, strict = flag("fixed_base", fixed_base), flag("strict", strict)
-        merge_fixed = flag("merge_fixed", merge_fixed)
+        fixed_base = None if fixed_base is None else flag("fixed_base", fixed_base)
+        strict, merge_fixed = flag("strict", strict), flag("merge_fixed", merge_fixed)
         if not isinstance(package_dirs, list | tuple):
             problem = "must be a list of folders"
             raise InvalidArgumentError("package_dirs", problem, value=package_dirs, remedy="pass a list of paths")
         path = _find(name_or_path)
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
-        root, repairs, mjcf = read_source(path, fixed_base, missing_meshes)
+        root, repairs, mjcf = read_source(path, fixed_base is not False, missing_meshes)
+        free_joint = free_joint_of(root)
+        fixed_base = free_joint is None if fixed_base is None else fixed_base
+        if free_joint is not None and not fixed_base:
+            free_base(root, free_joint)
         urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
         if mjcf is not None:
             urdf = replace(urdf, missing_meshes=(*mjcf.missing_meshes, *urdf.missing_meshes))

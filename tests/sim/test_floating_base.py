@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import mujoco
 import numpy as np
 import pytest
@@ -295,3 +297,60 @@ def test_pushes_need_a_floating_base_and_friction_contacts(panda):
     world = Randomization(ground_friction=Uniform(0.1, 1))
     with pytest.raises(InvalidArgumentError, match=r"ground_friction: has no effect without collisions"):
         Runner(panda, 1, workers=0, engine="mujoco", collisions=False, randomization=world)
+
+
+LIMB = """
+  <link name="{1}{0}"><inertial><origin xyz="0 0 -0.1"/><mass value="{2}"/>
+    <inertia ixx="2e-3" iyy="2e-3" izz="2e-4" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin xyz="0 0 -0.2"/><geometry><sphere radius="0.02"/></geometry></collision></link>
+  <joint name="{1}_joint{0}" type="revolute"><parent link="{3}"/><child link="{1}{0}"/><origin xyz="{4}" rpy="0 {5} 0"/>
+    <axis xyz="0 1 0"/><limit lower="-1.5" upper="1.5" effort="60" velocity="20"/></joint>"""
+
+
+def limbs(number, x, y):
+    thigh = LIMB.format(number, "thigh", 1.0, "trunk", f"{x} {y} 0", 0.6)
+    return thigh + LIMB.format(number, "calf", 0.2, f"thigh{number}", "0 0 -0.2", -1.2)
+
+
+TRUNK = TABLE.partition('<link name="foot0">')[0]
+DOG = f"{TRUNK}{''.join(limbs(number, *place) for number, place in enumerate(PLACES))}</robot>"
+
+
+def test_designed_gains_carry_the_base(tmp_path, engine):
+    """By default a dog on bent legs stands; with gains for legs in the air it sinks down."""
+    path = tmp_path / "dog.urdf"
+    path.write_text(DOG)
+    dog, sinks = Robot.load(path, fixed_base=False), []
+    for params in (None, dog.designed("inertia")):
+        with Runner(dog, 1, workers=0, engine=engine, params=params) as runner:
+            start = runner.observe().base_pose[0]
+            stood = runner.rollout(np.tile(dog.start, (60, 1)))
+        sinks.append(np.abs(stood.base_pose[:, 0, :3] - start[:3]).max())
+        tilts = np.degrees(2 * np.hypot(*stood.base_pose[:, 0, 4:6].T))
+        assert params is not None or tilts.max() < 3
+    assert sinks[0] < 0.02
+    assert sinks[1] > 2 * sinks[0]
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_a_free_joint_at_the_root_makes_a_floating_base(tmp_path, kind):
+    path = tmp_path / "table.urdf"
+    free = f'<link name="world"/><joint name="free" type="{kind}"><parent link="world"/><child link="trunk"/></joint>'
+    path.write_text(TABLE.replace("</robot>", free + "</robot>"))
+    table, held = Robot.load(path), Robot.load(path, fixed_base=True)
+    assert (table.fixed_base, held.fixed_base) == (False, True)
+    assert {link.name for link in held.links} - {link.name for link in table.links} == {"world"}
+    with Runner(table, 1, params=table.params(**GAINS), workers=0, engine="mujoco") as runner:
+        np.testing.assert_allclose(runner.observe().base_pose[0, :3], [0, 0, 0.35], atol=1e-6)
+    assert "joint-type" in {each.code for each in held.check()}
+    assert "joint-type" not in {each.code for each in table.check()}
+
+
+def test_tasks_observe_the_base(quadruped):
+    gym = pytest.importorskip("batchpid.sim.gym")
+    with contextlib.closing(gym.ReachVectorEnv(2, quadruped, workers=0, engine="mujoco")) as env:
+        observation, _ = env.reset(seed=0)
+        seen = env.runner.observe()
+        np.testing.assert_array_equal(observation[:, 8:15], seen.base_pose)
+        np.testing.assert_array_equal(observation[:, 15:21], seen.base_twist)
+        assert env.single_observation_space.shape == observation.shape[1:] == (8 + 13 + 4,)
