@@ -23,13 +23,13 @@ from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.task_space.rigid_tree import RigidTree
 
-Capability = Literal["drive", "build", "compiled_steps", "partial_force", "base_force", "sapien_dissipation"]
+Capability = Literal["drive", "build", "compiled_steps", "partial_force", "base_state", "sapien_dissipation"]
 """
 - ``"drive"``: packs are :class:`DrivenPack`, for the control "drive";
 - ``"build"``: the user's function ``build`` adds content to scenes;
 - ``"compiled_steps"``: packs are :class:`CompiledPack`, for programs of XLA;
 - ``"partial_force"``: compiled steps read gravity or Coriolis forces alone;
-- ``"base_force"``: compiled steps read the passive force of robots on a floating base;
+- ``"base_state"``: compiled steps read state and passive force of robots on a floating base;
 - ``"sapien_dissipation"``: SAPIEN's own friction and damping in place of the URDF's.
 """
 FAILED = 1 << STATUS.index("failed")

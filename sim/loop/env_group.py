@@ -63,6 +63,8 @@ class EnvGroup:
         self._table: Table | None = None
         self._sensed = untouched(pack.size, options.observed)
         self._pushes = Pushes(options, pack.size) if options.has_pushes else None
+        reads_base = options.robot.fixed_base or "base_state" in options.load_engine().capabilities
+        self._observes_natively = reads_base and not self._sensed and self._pushes is None
         self._steps = 0
         collides, ground = options.collisions, options.robot.has_ground
         self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
@@ -182,7 +184,7 @@ class EnvGroup:
             self._push(self._pushes, substeps)
         if containment.suspended.any() or not finite(*command):
             command = self._without_faults(command)
-        elif self._contacts is None and self.pack.spec.fixed_base and not self._sensed:
+        elif self._contacts is None and self._observes_natively:
             if self._table is None:
                 fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
                 self._table = Table(ticks.arrays, self._motor, self._saturated, self._guarded, fault)

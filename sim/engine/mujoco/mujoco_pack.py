@@ -257,7 +257,8 @@ class MujocoPack(SingleOwner):
     def read_base(self) -> Float64:
         """Return pose and twist of floating bases (M, 13), as :class:`batchpid.sim.engine.protocol.EnginePack` says."""
         rows = np.array([np.concatenate([data.qpos[: FLOATING + 1], data.qvel[:FLOATING]]) for data in self._data])
-        rows[:, 10:] = np.einsum("eij,ej->ei", matrix_of(rows[:, 3:7]), rows[:, 10:])  # MuJoCo's are in the body's axes
+        inverse = rows[:, 3:7] * [1.0, -1.0, -1.0, -1.0]
+        rows[:, 10:] = turned_back(inverse, rows[:, 10:])  # MuJoCo's are in the body's axes
         return rows
 
     def take_sensed(self) -> dict[str, Float64]:

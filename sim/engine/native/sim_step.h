@@ -183,6 +183,22 @@ inline void turn_back(double const *q, double const *v, double *out) {
   for (int i = 0; i < 3; ++i) out[i] = rows[i][0] * v[0] + rows[i][1] * v[1] + rows[i][2] * v[2];
 }
 
+// Write poses (robots, 7) and twists (robots, 6) of floating bases in MuJoCo, as read_base in mujoco_pack.py. Return
+// whether all are finite, and not too far.
+inline bool write_base_states(Group const &group, double *pose, double *twist) {
+  bool near = true;
+  for (std::int64_t row = 0; row < group.robots; ++row, pose += 7, twist += 6) {
+    double const *qvel = group.mujoco->qvel[row];
+    std::copy_n(group.mujoco->qpos[row], 7, pose);
+    std::copy_n(qvel, 3, twist);
+    double const back[4] = {pose[3], -pose[4], -pose[5], -pose[6]};
+    turn_back(back, qvel + 3, twist + 3);
+    for (int i = 0; i < 7; ++i) near = near && std::fabs(pose[i]) <= FARTHEST;
+    for (int i = 0; i < 6; ++i) near = near && std::fabs(twist[i]) <= FARTHEST;
+  }
+  return near;
+}
+
 // Write gravity and the rates at which bases turn, in their own axes (robots, BASE_SIZE).
 inline void write_bases(Group const &group, double const *gravity, double *out) {
   for (std::int64_t row = 0; row < group.robots; ++row, out += BASE_SIZE) {

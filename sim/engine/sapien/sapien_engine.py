@@ -18,7 +18,7 @@ class SapienEngine:
     """SAPIEN with PhysX on the CPU. Implements :class:`batchpid.sim.engine.protocol.Engine`."""
 
     name, title = "sapien", "SAPIEN"
-    capabilities: frozenset[Capability] = frozenset(get_args(Capability)) - {"base_force"}
+    capabilities: frozenset[Capability] = frozenset(get_args(Capability)) - {"base_state"}
     physics: Mapping[str, Any] = PHYSICS
     group_size = 16
 
