@@ -149,6 +149,7 @@ def step_metrics(
         y = np.concatenate([broadcast("start", start, y.shape[1:])[None], y])
         r = np.concatenate([r[:1], r])
     t = time_step("dt", dt) * np.arange(len(y), dtype=np.float64)
+    # A joint with a NaN gets figures of inf, by judged() below: it must lose every comparison, not drop out of it.
     finite = np.isfinite(y).all(0) & np.isfinite(r).all(0)
     y, r = np.where(finite, y, 0.0), np.where(finite, r, 0.0)
     if continuous is not None:
@@ -158,6 +159,7 @@ def step_metrics(
     size, direction = np.abs(move), np.where(move < 0, -1.0, 1.0)
     error, final_error = r - y, r[-1] - y
     tolerance: Float64 = np.maximum(band * size, floor)
+    # For a joint that hardly moves, rise and overshoot would measure noise; its deviation is still reported.
     moves = size >= floor / band
     beyond = np.where(moves, np.max(-final_error * direction, 0), np.max(np.abs(final_error), 0))
     beyond = np.maximum(beyond, 0.0)

@@ -209,6 +209,7 @@ def jerk_limited(
     }
     joints = way.shape[-1]
     rows = {name: value.reshape(-1, joints) for name, value in asked.items()}
+    # ruckig plans one env at a time, and knows the joints of it that have to arrive together.
     planner, plans = ruckig.Ruckig(joints, time_step("dt", dt)), []
     for env in range(way.size // joints):
         inputs, plan = ruckig.InputParameter(joints), ruckig.Trajectory(joints)

@@ -243,7 +243,7 @@ class Options:
 def main(options: Options) -> None:
     """Print the table and write the figures."""
     figures: list[dict[str, Any]] = []
-    for name in Robot.bundled():
+    for name in [each for each in Robot.bundled() if Robot.load(each).has_tuned]:
         for motion in REFERENCES:
             errors = measure_errors(Robot.load(name), motion, count=options.count, seconds=options.seconds)
             for (physics, reference), error in errors.items():

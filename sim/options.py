@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.choices import PerMassMatrix
 from batchpid.arrays.digest import digest, object_digest
 from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
@@ -35,6 +36,7 @@ from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
 from batchpid.sim.robot.merging import place_links
+from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 from batchpid.sim.runner_keywords import (
@@ -163,7 +165,7 @@ class RunnerOptions:
             "dtype": choice("dtype", self.dtype, get_args(Precision)),
             "compensate": choice("compensate", self.compensate, get_args(Compensation)),
             "collisions": (collisions := flag("collisions", self.collisions)),
-            "ground": collisions and robot.has_ground if given["ground"] is None else flag("ground", self.ground),
+            "ground": collisions and self._has_ground if given["ground"] is None else flag("ground", self.ground),
             "on_fault": choice("on_fault", self.on_fault, get_args(FaultAction)),
             "on_invalid_input": choice("on_invalid_input", self.on_invalid_input, get_args(InvalidInputAction)),
             "recover": flag("recover", self.recover),
@@ -194,6 +196,7 @@ class RunnerOptions:
             remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
             check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
             self._check_world(self.randomization)
+        self._check_tree()
         own["guard"] = fit_guard(given["guard"], robot, self.num_envs, self.control_name, self.sets_positions)
         own["actuators"] = self.check_actuators(given["actuators"])
         self._check_collisions()
@@ -216,10 +219,35 @@ class RunnerOptions:
             if needs:
                 require(engine, capability, argument)
 
+    def _check_tree(self) -> None:
+        """Raise InvalidArgumentError for options that need a kinematic tree, if the robot has closed loops."""
+        needs = {"control": isinstance(self.control, OperationalSpace), "setpoint_space": self.setpoint_space == "tool"}
+        for argument in [name for name, given in needs.items() if given and self.loops]:
+            problem = f"needs a kinematic tree, and {', '.join(self.loops)} of the file closes a loop of links"
+            remedy = "control the joints, or remove the equality constraint"
+            raise InvalidArgumentError(argument, problem, value=getattr(self, argument), remedy=remedy)
+
+    @property
+    def mjcf(self) -> MjcfFile | None:
+        """MJCF file that the engine simulates as it is; None for others, and in SAPIEN."""
+        return self.robot.mjcf if self.engine == "mujoco" else None
+
+    @property
+    def _has_ground(self) -> bool:
+        return (self.mjcf is not None and self.mjcf.has_floor) or self.robot.has_ground
+
+    @property
+    def loops(self) -> tuple[str, ...]:
+        """Equality constraints that close loops of the simulated robot's links."""
+        return () if self.mjcf is None else self.mjcf.loops
+
     def _check_collisions(self) -> None:
         """Raise InvalidArgumentError for options that have no meaning without collisions."""
         if self.collisions:
             return
+        if self.mjcf is not None and self.mjcf.falling:
+            problem = f"are False, and nothing holds the bodies {', '.join(self.mjcf.falling)} of the file"
+            raise InvalidArgumentError("collisions", problem, remedy="leave it out")
         if self.ground:
             problem, remedy = "is True, and collisions are False", "leave it out: nothing can touch a ground"
             raise InvalidArgumentError("ground", problem, remedy=remedy)
@@ -353,6 +381,9 @@ class RunnerOptions:
                 f"have no meaning under control {self.control_name!r}",
                 remedy="use control 'pid', or params with gain_units 'effort'",
             )
+        if isinstance(params.gain_units, PerMassMatrix) and self.loops:
+            problem = f"are 'mass_matrix', which needs a kinematic tree: {', '.join(self.loops)} closes a loop of links"
+            raise InvalidArgumentError("gain_units", problem, remedy='use robot.designed("effort")')
         check_gain_units(params)
         if self.control == "drive":
             check_drive(params)
@@ -513,10 +544,13 @@ def _places(workers: Any, cluster: Any) -> tuple[int | None, Ray | None]:
     return None, cluster
 
 
-def default_params(robot: Robot, control: ControlMode | Controller = "pid") -> bp.PIDParams:
+def default_params(
+    robot: Robot, control: ControlMode | Controller = "pid", loops: tuple[str, ...] = ()
+) -> bp.PIDParams:
     """Return the params of a runner that is given none.
 
-    - ``"pid"``: ``robot.tuned()`` where the robot ships them, else ``robot.designed()``;
+    - ``"pid"``: ``robot.tuned()`` where the robot ships them, else ``robot.designed()``, or with closed ``loops``
+      ``robot.designed("effort")``;
     - ``"drive"``: the drive gains of a bundled robot's settings, else the gains of ``robot.designed("effort")`` without
       ki, setpoint weight and filter, which a drive does not have: the integral would overshoot;
     - ``"effort"``, and a :class:`Controller`: zero gains and the robot's effort limits.
@@ -533,4 +567,4 @@ def default_params(robot: Robot, control: ControlMode | Controller = "pid") -> b
         if settings is None:
             return robot.designed("effort").replace(ki=0.0, setpoint_weight=None, derivative_filter_time=None)
         return robot.params(kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None)
-    return robot.designed() if settings is None else robot.tuned()
+    return robot.tuned() if robot.has_tuned else robot.designed("effort" if loops else None)

@@ -6,7 +6,7 @@ Longer than 300 lines because the public signatures and their documentation are 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from inspect import Parameter, Signature, signature
 from typing import ClassVar, Unpack
 
@@ -65,7 +65,9 @@ class Runner(SingleOwner):
         """Options, checked."""
         self.robot, self.num_envs, self.control = checked.robot, checked.num_envs, checked.control
         self.timestep, self.substeps = checked.timestep, checked.substeps
-        params = checked.check_params(default_params(robot, checked.control) if params is None else params)
+        params = checked.check_params(
+            default_params(robot, checked.control, checked.loops) if params is None else params
+        )
         self._session = Session(checked, params)
         try:
             self._session.open()
@@ -228,6 +230,19 @@ class Runner(SingleOwner):
             There is no ``build``, or it returned more entities for one env than for another.
         """
         return self._session.poses()
+
+    def bodies(self, names: Sequence[str]) -> NDArray[np.float64]:
+        """Return the poses of bodies of an MJCF file (envs, names, 7), in the engine "mujoco".
+
+        They are the positions [m] and quaternions (w, x, y, z) of MuJoCo's body frames in the world: of objects, which
+        the file has besides the robot, and of the robot's own bodies.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The robot is not from an MJCF file, the engine is another, or the file has no such body.
+        """
+        return self._session.bodies(names)
 
     @property
     def params(self) -> bp.PIDParams:

@@ -114,7 +114,8 @@ class RunnerKeywords(TypedDict, total=False):
     something."""
     ground: bool | None
     """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
-    so low that other links reach the ground at its start pose."""
+    so low that other links reach the ground at its start pose. With engine "mujoco" the planes in the world of an MJCF
+    file take its place, by default as in the file."""
     contacts: Sequence[str] | None
     """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``. Links that fixed joints join
     are one body, and count as one. Default none. The links must move; with SAPIEN the robot has

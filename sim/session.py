@@ -6,7 +6,7 @@ Longer than 300 lines because all commands are here, each with the change of sta
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from operator import methodcaller
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.checks.validate import instance
+from batchpid.checks.validate import choice, instance
 from batchpid.errors import BatchPIDError, CallOrderError, InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.sim.arguments import Arguments
@@ -269,6 +269,15 @@ class Session:
                 remedy="let build(scene, env) return as many entities for every env",
             )
         return np.stack(rows)
+
+    def bodies(self, names: Sequence[str]) -> NDArray[np.float64]:
+        """Return the poses of bodies of an MJCF file."""
+        self._transactions.ready()
+        if self.options.mjcf is None:
+            problem, remedy = "are those of an MJCF file in the engine 'mujoco'", "use robot.kinematic_tree() for links"
+            raise InvalidArgumentError("names", problem, remedy=remedy)
+        chosen = tuple([choice("names", name, self.options.mjcf.bodies) for name in names])
+        return np.stack([row for part in self._execute(ReadPoses(chosen)) for row in part])
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight."""

@@ -92,7 +92,6 @@ def test_the_tables_of_fields_are_those_of_the_code():
 LONGER = {
     "tutorial.md": 200,
     "choosing-gains.md": 155,
-    "sim-to-real.md": 180,
     "task-space.md": 160,
     "reliability.md": 190,
     "coming-from.md": 165,

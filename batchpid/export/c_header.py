@@ -128,6 +128,7 @@ class Header:
         rates = [each for each in RATES if each in chosen]
         self.given = ["setpoint", "measurement", *rates, *([self.matrix] if self.matrix else [])]
         """Inputs of a step, in their order."""
+        # init runs on a measurement of NaN: what is NaN afterwards is a copy of the measurement.
         nan = np.full((1, joints), math.nan, params.dtype)
         started: dict[str, Any] = pid.init(params, nan).leaves()
         if guard is not None:

@@ -16,6 +16,7 @@ from batchpid.task_space.rigid_tree import RigidTree
 def rigid_body(c: Dialect, tree: RigidTree) -> str:
     """Return the functions ``PREFIX_mass_matrix``, ``PREFIX_bias`` and ``PREFIX_gravity`` of a tree."""
     bodies, p, t, n, f = tree.bodies, c.prefix, c.type, c.size, c.suffix
+    # A joint's rotation is linear in 1, sin q and 1 - cos q, so that three constant matrices a joint are enough.
     rotations = {"turn": bodies.at_zero, "sine": bodies.sine, "cosine": bodies.cosine}
     poses = "".join(c.table(f"k_{name}", leaf[:, :, :3].reshape(-1, 9)) for name, leaf in rotations.items())
     poses += c.table("k_place", bodies.at_zero[..., 3]) + c.table("k_slide", bodies.slide[..., 3])
@@ -23,6 +24,8 @@ def rigid_body(c: Dialect, tree: RigidTree) -> str:
     poses += c.table("k_tensor", bodies.tensor.reshape(-1, 9)) + _integers(c, "slides", bodies.slides[:, 0])
     above, masses = _integers(c, "above", tree.body_parents), c.table("k_mass", bodies.mass[:, 0])
     fall = ", ".join(map(c.number, bodies.gravity.tolist()))
+    # Everything is about the world's origin: sums over bodies then need no shift from one to the next.
+    # The mass matrix is that of composite bodies, the bias recursive Newton-Euler (Featherstone 2008, ch. 5 and 6).
     return f"""/* Bodies at a pose, in the axes of the world. */
 typedef struct {{
   {t} turn[{n}][9], place[{n}][3];      /* axes (rows of a matrix) and origin */

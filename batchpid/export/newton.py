@@ -53,6 +53,7 @@ def to_newton(
     found.compare_integral(first=True)
     delay = found.delay_steps()
     found.lack_motors(("saturation_effort", "command_delay", "position_limit", *JOINT_FIELDS))
+    # The text is a table and one loop, not a call per joint: a reader compares gains line by line.
     used, rows = set[str](), []
     for at, joint in enumerate(found.joints):
         drive, clamps, options = _drive(found, at), _clamps(found, at), _gains(found, at)

@@ -64,9 +64,11 @@ def track(
     rate = zero if measurement_rate is None else -measurement_rate
     if setpoint_rate is not None:
         rate = rate + weighted_rate(k, setpoint_rate)
+    # The law solved for its integral: I = u - P - D - feedforward, with the derivative filter settled on its input.
     integral = effort - proportional(k, error, measurement, origin)
     integral = integral if k.kd is None else integral - k.kd * rate
     integral = integral if feedforward is None else integral - feedforward
+    # The next step adds the error of this step before it uses the integral, so that part is taken off here.
     if params.integration is not None:
         integral = integral - k.ki_dt * error
         if k.ki_dt2 is not None and setpoint_rate is not None:

@@ -258,6 +258,7 @@ def make_params(
     InvalidArgumentError
         Naming the option, joint, env and value.
     """
+    # The options of one kind are read from the tables of fields, by name; only limits and anti-windup belong together.
     given = locals()
     build = LeafBuilder(joints, joint_names, dtype, given.values())
     if kp is None:
@@ -270,6 +271,7 @@ def make_params(
         d = build.array("kd", 0.0, FIELDS["kd"]) if d is None else d
     effort_ends = build.limits("effort", effort_limit, effort_min, effort_max)
     integral_ends = build.limits("integral", integral_limit, integral_min, integral_max)
+    # The joints may have different strategies: each becomes an array of the joints that use it, or None for none.
     clamp, conditional, back = build.strategies(anti_windup)
     integral_ends = build.clamped(clamp, integral_ends, effort_ends)
     names = "kp", "ki", "kd", "effort_min", "effort_max", "integral_min", "integral_max"

@@ -186,6 +186,7 @@ def make_osc_params(
     """
     check_masses(instance("tree", tree, RigidTree, "pass robot.kinematic_tree()"))
     joints = tree.joint_names
+    # An option without effect is an error: it is nearly always a misunderstanding.
     _check_unused("damping_ratio", damping_ratio, 1.0, damping is not None, "damping is given, too")
     _check_unused("integral_limit", integral_limit, math.inf, integral_gain is None, "integral_gain is not given")
     _check_unused("limit_stiffness", limit_stiffness, 400.0, limit_margin is None, "limit_margin is not given")
@@ -215,6 +216,8 @@ def make_osc_params(
     if low is not None and high is not None:
         ends = np.broadcast_arrays(low, high)
         entries("effort_min", ends[0], ends[0] <= ends[1], "exceeds effort_max", joints)
+    # Joints without limits that turn are angles modulo 2 pi for the posture. Followers have no posture and no limits of
+    # their own: their leader has them.
     limits, own = np.array([tree.lower, tree.upper]), tree.independent
     endless = np.isinf(limits).all(0) & (tree.bodies.slides[:, 0] == 0)
     margin = None if limit_margin is None else _rows("limit_margin", limit_margin, joints)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -15,9 +15,14 @@ from batchpid.sim.cli.outputs import Outputs, beside, write_figures
 from batchpid.sim.cli.progress import AT_MOST, bar
 
 if TYPE_CHECKING:
+    from batchpid.sim.identification.log import Log
     from batchpid.sim.identification.result import Identification
 
-Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(help="Logs: .csv, .h5 or recordings.")]
+Logs = Annotated[
+    tuple[Path, ...],
+    tyro.conf.Positional,
+    tyro.conf.arg(help="Logs: .csv, .h5, ROS bags (.bag, .mcap, folders) or recordings; or a list of logs (.yaml)."),
+]
 
 
 @dataclass(frozen=True)
@@ -45,11 +50,26 @@ class IdentifyCommand:
     """Sim steps in each control step: about 4 for a robot under control at 500 Hz, or its hold counts as delay."""
     hold: flags.Switch = False
     """Commands hold from row to row of a log; otherwise they are interpolated. Recordings are always held."""
+    measured: Annotated[Literal["motor", "link"] | None, tyro.conf.arg(metavar="motor|link")] = None
+    """The efforts of the logs were measured, at the motor (as its current) or behind the gear, and not commanded. A
+    file may have both: effort:JOINT and measured_effort:JOINT."""
+    time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, tyro.conf.arg(metavar="s|ms|us|ns")] = None
+    """Unit of the times. Default: as the column's name says (time_ms, time_ns), else seconds."""
+    degrees: flags.Switch = False
+    """Positions, setpoints and velocities of revolute joints are in degrees."""
+    topic: str = "/joint_states"
+    """Topic of the measurements in a ROS bag (sensor_msgs/JointState), whose efforts count as measured."""
+    command_topic: flags.OptionalName = None
+    """Topic of the commands in a ROS bag: positions are setpoints, efforts are efforts. Default: measured efforts."""
+    prefix: str = ""
+    """Prefix of the joints' names in the logs."""
     no_payload: flags.Switch = False
     """The tool carries no payload."""
     evaluations: int = 25
     """Largest number of evaluations of the fit; each simulates the robot along the logs and, for each unknown,
-    a perturbed one, so that a minute of logs takes six times as long as ten seconds. 0, with --actuators: no fit."""
+    a perturbed one, so that a minute of logs takes six times as long as ten seconds. 0: no fit; with --actuators their
+    error is printed, and without them strength, delay and lag are found from efforts that are commanded and measured,
+    without a model of the robot."""
     actuators: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """With --evaluations 0: an actuators file whose error on the held-out part is printed. Nothing is fitted or
     written."""
@@ -78,25 +98,30 @@ class IdentifyCommand:
         """Run the command."""
         from batchpid.sim import plots
         from batchpid.sim.identification.identification import identify
+        from batchpid.sim.identification.runs import gains_of
 
         robot = Robot.load(self.robot, **vars(self.meshes))
         if not self.logs:
             raise InvalidArgumentError("logs", "are missing", remedy="name one file or more after the robot")
-        if self.actuators is not None or self.evaluations == 0:
-            return self._judge(robot)
+        if self.actuators is not None:
+            return self._judge(robot, self.actuators)
         out = self.out or Path(f"out/{robot.path.stem}.actuators.yaml")
         outputs = Outputs(force=self.force, inputs=(None if self.gains is None else Path(self.gains), *self.logs))
         out = outputs.path("out", out, (".yaml", ".yml", ".json"))
         details = outputs.path("json", self.json, (".json",))
         picture = outputs.path("picture", self.picture or beside(out, "fit"), plots.FORMATS)
         history = outputs.history(out.with_suffix(".fit.json"), resume=self.resume)
+        params = None if self.gains is None else gains_of(robot, self.gains)
+        logs = self._logs(robot)
+        if self.evaluations == 0:
+            return self._compare_efforts(robot, logs, out, details)
         out.parent.mkdir(parents=True, exist_ok=True)
         note = "first a search for the start of the fit, then the fit; both take longer the longer the logs are"
         print(f"{robot.name}: {note}", flush=True)
         found = identify(
             robot,
-            self.logs,
-            params=None if self.gains is None else _params(robot, self.gains),
+            logs,
+            params=params,
             payload=not self.no_payload,
             **flags.chosen(self, "compensate timestep sim_steps hold evaluations seed workers"),
             history=history,
@@ -118,16 +143,14 @@ class IdentifyCommand:
         print(f"picture: {plots.save(plots.fit_errors(errors, names, units, title), picture)}")
         history.unlink(missing_ok=True)
 
-    def _judge(self, robot: Robot) -> None:
+    def _judge(self, robot: Robot, actuators: Path) -> None:
         """Print the error of an actuators file."""
         from batchpid.sim.identification.held_out import held_out_error
+        from batchpid.sim.identification.runs import gains_of
 
-        if self.actuators is None:
-            remedy = "give 1 or more, or name an actuators file as --actuators"
-            raise InvalidArgumentError("evaluations", "is 0, and there is no file", value=0, remedy=remedy)
         if self.evaluations:
             remedy = "add --evaluations 0 to print the error of the file, or leave it out to fit"
-            raise InvalidArgumentError("actuators", "are not the start of a fit", value=self.actuators, remedy=remedy)
+            raise InvalidArgumentError("actuators", "are not the start of a fit", value=actuators, remedy=remedy)
         defaults = {each.name: each.default for each in fields(self)}
         for name in ("no_payload", "seed", "workers", "resume", "out", "json", "picture"):
             if (value := getattr(self, name)) != defaults[name]:
@@ -135,38 +158,48 @@ class IdentifyCommand:
                 raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
         errors = held_out_error(
             robot,
-            self.logs,
-            self.actuators,
-            params=None if self.gains is None else _params(robot, self.gains),
+            self._logs(robot),
+            actuators,
+            params=None if self.gains is None else gains_of(robot, self.gains),
             **flags.chosen(self, "compensate timestep sim_steps hold"),
         )
         print(_errors(*errors))
+
+    def _logs(self, robot: Robot) -> list[Log]:
+        from batchpid.sim.identification.columns import Reading
+        from batchpid.sim.identification.logs import read_logs
+
+        names = "time_unit degrees measured topic command_topic prefix"
+        kind: Literal["setpoint", "effort"] = "effort" if self.gains is None else "setpoint"
+        return read_logs(robot, self.logs, kind, hold=self.hold, reading=Reading(**flags.chosen(self, names)))
+
+    def _compare_efforts(self, robot: Robot, logs: list[Log], out: Path, details: Path | None) -> None:
+        """Print and write the motors that measured efforts show."""
+        from batchpid.sim.cli.report import table
+        from batchpid.sim.identification.effort_ratios import measured_motors
+
+        if logs[0].measured is None:
+            remedy = "give 1 or more, name an actuators file as --actuators, or a log with measured efforts too"
+            raise InvalidArgumentError("evaluations", "is 0, and there is no file", value=0, remedy=remedy)
+        found = measured_motors(robot, logs, timestep=self.timestep, hold=self.hold)
+        rows = []
+        for index, (kind, joint) in enumerate(found.names):
+            value, low, high = found.row(index)
+            name = "all joints" if joint is None else robot.joint_names[found.joints[joint]]
+            rows.append([name, kind, f"{value:.4g} ± {max(high - value, value - low):.1g}"])
+        print(table(rows, ["joint", "95 % intervals, SI units", "value"], "llr"))
+        print(f"\nerror of the effort on the part that was kept: up to {found.error.max():.2g} of the effort")
+        out.parent.mkdir(parents=True, exist_ok=True)
+        found.save(out, [log.source for log in logs])
+        print(f"written: {out}")
+        if details is not None:
+            write_figures(details, found.document())
+            print(f"written: {details}")
 
 
 def _errors(before: float, after: float) -> str:
     """Return a line with the errors on the held-out part, of ideal motors and of an actuators file."""
     return f"position error on the part that was kept: {before:.3g} as described, {after:.3g} by the values of the file"
-
-
-def _params(robot: Robot, name: str) -> Any:
-    """Return the gains of a name or file, for all joints of ``robot``; a params file may have only some joints."""
-    import batchpid as bp
-    from batchpid.export.ros2_control_reader import is_ros2_control
-    from batchpid.io import documents
-    from batchpid.sim.tuning.gain_sets import NAMES, gain_set
-
-    path, known = Path(name), [each for each in NAMES if each != "drive"]
-    if name not in known and not path.is_file():
-        remedy = f"use a file or {', '.join(known)}"
-        raise InvalidArgumentError("gains", "is neither a name nor a file of gains", value=name, remedy=remedy)
-    kind = path.suffix.lower()
-    if name in known or kind in (".py", ".xml") or (kind != ".json" and is_ros2_control(documents.read(path))):
-        return gain_set(robot, name).params
-    names = bp.load_params(path)[1]
-    order = [joint for joint in robot.joint_names if joint in names]
-    if len(order) < len(names):
-        return bp.load_params(path, robot.joint_names)[0]  # raises, naming the joints
-    return bp.load_params(path, order)[0]
 
 
 def report(found: Identification) -> str:
@@ -184,10 +217,13 @@ def report(found: Identification) -> str:
     kinds = found.unknowns.per_joint
     rows = [[name, *(cell(kind, joint) for kind in kinds)] for joint, name in enumerate(names)]
     text = [table(rows, ["95 % intervals, SI units", *kinds], "l" + len(kinds) * "r"), ""]
-    text.append(f"delay of the commands: {cell('delay', None, 1e3)} ms")
+    if ("delay", None) in found.unknowns.names:
+        text.append(f"delay of the commands: {cell('delay', None, 1e3)} ms")
+    else:
+        text.append("the efforts were measured, so nothing of the delay shows in them")
     if ("payload", None) in found.unknowns.names:
         payload = cell("payload")
-        shows = found.interval("payload") is not None
+        shows = document["payload"][1] > 0
         text.append(f"payload at the tool: {f'{payload} kg' if shows else 'none that shows'}")
     if found.drive.params is None and found.drive.compensate == "none":
         text.append("gravity: within the logged efforts")
@@ -200,6 +236,8 @@ def report(found: Identification) -> str:
             f"the error there is up to {found.misfit:.2g} times the noise of the sensors, at {found.worst_joint!r}: "
             "the model does not explain all of the motion, and the intervals hold for this motion only"
         )
+    elif found.is_short:
+        text.append("the logs are one short motion: the intervals hold for this motion only; record others, too")
     return "\n".join(text + _not_identified(found))
 
 

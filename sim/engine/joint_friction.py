@@ -22,7 +22,7 @@ def own_friction(spec: SceneSpec, variation: Variation | None = None) -> Frictio
         model = model._replace(coulomb=coupling_of(spec.joints).of_independent(variation.friction))
     if variation is not None and variation.damping is not None:
         model = model._replace(viscous=variation.damping.copy())
-    return model
+    return model if spec.mjcf is None else model._replace(viscous=None)  # there MuJoCo computes the damping
 
 
 def added_friction(own: Friction, actuators: Actuators | None) -> Friction:

@@ -155,8 +155,14 @@ class EnginePack(Protocol):
         Rows may be longer, with more NaN at the end. The loop writes efforts and suspension afterwards.
         """
 
-    def read_poses(self) -> list[NDArray[np.float32]]:
-        """Return the poses that ``build`` asked for in each env (poses, 7): x, y, z [m], quaternion w, x, y, z."""
+    def read_poses(self, names: Sequence[str] | None = None) -> list[NDArray[Any]]:
+        """Return the poses that ``build`` asked for in each env (poses, 7): x, y, z [m], quaternion w, x, y, z.
+
+        With ``names``, those of these bodies of the file of ``spec``, in float64.
+        """
+
+    def strays(self) -> Bool:
+        """Return the envs (M,) with a floating base, or an object of a file, that is not finite or beyond FARTHEST."""
 
     def close(self) -> None:
         """Free the envs. The pack cannot be used afterwards."""

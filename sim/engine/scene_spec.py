@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.robot.parts import Joint
+from batchpid.sim.robot.parts import Joint, MjcfFile
 from batchpid.sim.robot.simulated_links import Body
 from batchpid.task_space.spatial_inertia import SpatialInertia, total
 
@@ -28,8 +28,8 @@ class SceneSpec:
     collide; ``joints`` are the degrees of freedom, in the order of all arrays. ``physics`` are the solver
     settings of ``engine``, in the engine's type. With ``merge_fixed`` each rigid body is one link
     (:mod:`batchpid.sim.robot.merging`). Without ``collisions`` scenes have no collision shapes and no ground, but the
-    same masses and inertias. ``contacts`` and ``wrenches`` are links with sensors. Specs that differ in ``build`` alone
-    are equal.
+    same masses and inertias. ``mjcf`` is the file that MuJoCo compiles in place of ``urdf``. ``contacts`` and
+    ``wrenches`` are links with sensors. Specs that differ in ``build`` alone are equal.
     """
 
     urdf: str
@@ -47,6 +47,12 @@ class SceneSpec:
     engine: str = "sapien"
     contacts: tuple[str, ...] | None = None
     wrenches: tuple[str, ...] | None = None
+    mjcf: MjcfFile | None = None
+
+    @property
+    def is_alone(self) -> bool:
+        """True if nothing moves but the joints of the robot."""
+        return self.fixed_base and (self.mjcf is None or self.mjcf.is_alone)
 
 
 class Variation(NamedTuple):

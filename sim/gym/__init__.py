@@ -1,9 +1,9 @@
 """Gymnasium environments: tasks of N robots, whose base class :class:`RobotVectorEnv` has hooks for others.
 
-``import batchpid.sim.gym`` registers ``batchpid/Reach-v0``, ``batchpid/ToolReach-v0`` and ``batchpid/Push-v0`` for
-``gymnasium.make_vec("batchpid/Reach-v0", num_envs=64)``; ``make_vec("batchpid.sim.gym:batchpid/Reach-v0", ...)`` does
-both. Arrays are NumPy's, new at every step: ``jax.dlpack.from_dlpack`` and ``torch.from_dlpack`` take them without a
-copy.
+``import batchpid.sim.gym`` registers ``batchpid/Reach-v0``, ``batchpid/ToolReach-v0``, ``batchpid/Push-v0`` and
+``batchpid/Walk-v0`` for ``gymnasium.make_vec("batchpid/Reach-v0", num_envs=64)``;
+``make_vec("batchpid.sim.gym:batchpid/Reach-v0", ...)`` does both. Arrays are NumPy's, new at every step:
+``jax.dlpack.from_dlpack`` and ``torch.from_dlpack`` take them without a copy.
 """
 
 from batchpid.errors import MissingDependencyError
@@ -18,6 +18,7 @@ from batchpid.sim.gym.reach import ReachEnv, ReachVectorEnv
 from batchpid.sim.gym.robot_env import RobotEnv
 from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
 from batchpid.sim.gym.tool_reach import ToolReachEnv, ToolReachVectorEnv
+from batchpid.sim.gym.walk import WalkEnv, WalkVectorEnv
 
 __all__ = [
     "PushEnv",
@@ -28,9 +29,11 @@ __all__ = [
     "RobotVectorEnv",
     "ToolReachEnv",
     "ToolReachVectorEnv",
+    "WalkEnv",
+    "WalkVectorEnv",
 ]
 
-for _task in ("Reach", "ToolReach", "Push"):
+for _task in ("Reach", "ToolReach", "Push", "Walk"):
     gymnasium.register(
         f"batchpid/{_task}-v0",
         f"batchpid.sim.gym:{_task}Env",

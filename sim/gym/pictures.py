@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.observation import Observation
 from batchpid.sim.robot.robot import Robot
 
 RENDER_MODES = ["rgb_array"]
@@ -78,12 +79,12 @@ class EnvPictures:
             if build is not None:
                 scene.add_content(build, env)
 
-    def draw(self, qpos: NDArray[Any], poses: NDArray[Any] | None) -> tuple[NDArray[np.uint8], ...]:
-        """Return a picture (height, width, 3) of each env at ``qpos`` (envs, dof) and content ``poses``."""
-        pictures = []
+    def draw(self, observed: Observation, poses: NDArray[Any] | None) -> tuple[NDArray[np.uint8], ...]:
+        """Return a picture (height, width, 3) of each env at the observed joints and base, and content ``poses``."""
+        pictures, base = [], observed.base_pose
         for env, (scene, camera) in enumerate(zip(self._scenes, self._cameras, strict=True)):
             if poses is not None:
                 scene.place_content(poses[env])
-            scene.place(qpos[env : env + 1])
+            scene.place(observed.qpos[env : env + 1], None if base is None else base[env : env + 1])
             pictures.append(camera())
         return tuple(pictures)

@@ -363,7 +363,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             build, ground = self.runner.options.build, self.runner.options.ground
             self._pictures = EnvPictures(self.robot, self.num_envs, ground, build, self.picture_size)
         poses = None if self.runner.options.build is None else self.runner.poses()
-        return self._pictures.draw(self.runner.observe().qpos, poses)
+        return self._pictures.draw(self.runner.observe(), poses)
 
     def close_extras(self, **_: Any) -> None:
         """Close the runner."""

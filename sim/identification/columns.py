@@ -6,24 +6,54 @@ import csv
 import io
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.identification.log import Sensor
 from batchpid.sim.recording.hdf5 import LOG_QUANTITIES as QUANTITIES
 from batchpid.sim.recording.hdf5 import read_hdf5
 from batchpid.sim.recording.recording_files import RecordingError, load_h5py
 
 MAX_BYTES = 1 << 30
 """Most that the columns of an HDF5 file may take."""
+TimeUnit = Literal["s", "ms", "us", "ns"]
+SECONDS: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_TIME = re.compile(r"time[\s_]*[\[(]?(s|ms|us|ns)?[\])]?")
 _QUOTED = re.compile(r'"[^"]*"')
 _NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
 _DECIMAL_COMMA = re.compile(r"[+-]?[\d.]*,\d+([eE][+-]?\d+)?")
 _WITH_UNIT = re.compile(rf"{_NUMBER}\s*[^\W\d].*")
+
+
+class Reading(NamedTuple):
+    """Meaning of the columns of log files; recordings say it themselves."""
+
+    time_unit: TimeUnit | None = None
+    """Unit of the times; None: as the column's name says, such as ``time_ms``, else seconds."""
+    degrees: bool = False
+    """True if positions and velocities of revolute joints, setpoints included, are in degrees."""
+    measured: Sensor | None = None
+    """Place at which the column ``effort`` was measured; None: it was commanded. Columns ``measured_effort`` are taken
+    as measured at the motor unless this says "link"."""
+    topic: str = "/joint_states"
+    """Topic of the measurements in a ROS bag."""
+    command_topic: str | None = None
+    """Topic of the commands in a ROS bag; None: the measured efforts are used."""
+    prefix: str = ""
+    """Prefix of the joints' names in a file, which the robot's do not have."""
+    sign: Mapping[str, float] | None = None
+    """Factors, 1 or -1, of all columns of some joints."""
+    scale: Mapping[str, float] | None = None
+    """Factors of the efforts of some joints, such as N m per A."""
+    start: float = -math.inf
+    """Time [s] of the first row to read."""
+    end: float = math.inf
+    """Time [s] of the last row to read."""
 
 
 def error(source: str, problem: str, remedy: str, value: Any = None) -> InvalidArgumentError:
@@ -70,6 +100,21 @@ def read_csv(path: Path, quantities: Sequence[str] = QUANTITIES) -> tuple[dict[s
         raise error(str(path), f"has the column {twice!r} twice", "keep one of them")
     table = np.array(rows)
     return {name: table[:, index] for index, name in enumerate(header)}, lines
+
+
+def time_column(source: str, columns: dict[str, Float64], unit: TimeUnit | None) -> Float64:
+    """Return the times [s] of the column ``time``, whose name may end in its unit, such as ``time_ms``.
+
+    Raises InvalidArgumentError if there is none, or if the name contradicts ``unit``.
+    """
+    found = {name: match[1] for name in columns if (match := _TIME.fullmatch(name))}
+    name = "time" if "time" in found else next(iter(found), None)
+    if name is None:
+        problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
+        raise error(source, problem, "begin the header with time, in seconds, or time_ms, time_us, time_ns")
+    if unit is not None and found[name] not in (None, unit):
+        raise error(source, f"has the column {name!r}, not in {unit}", "leave out the unit of the times", unit)
+    return SECONDS[unit or found[name] or "s"] * columns[name]
 
 
 def _unquoted(path: Path, number: int, line: str, delimiter: str) -> list[str]:

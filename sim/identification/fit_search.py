@@ -86,6 +86,8 @@ def _stage(problems: list[Problem], done: list[tuple[int, Solution]], evaluation
 
 def _delayed(problem: Problem, theta: Float64, steps: int) -> Float64 | None:
     """Return ``theta`` with the delay increased by ``steps``, None if that is out of bounds."""
+    if ("delay", None) not in problem.unknowns.names:
+        return None
     delay = problem.unknowns.names.index(("delay", None))
     later = theta.copy()
     later[delay] += steps * problem.drive.timestep

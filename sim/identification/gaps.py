@@ -81,20 +81,17 @@ def divided(log: Log, row: Callable[[int], str]) -> list[Log]:
         return [log]
     parts = []
     for rows in found.rows:
-        time, given = log.time[rows], log.command_time
-        # Commands of the stretch, with the one that acts at its first row and, for interpolation, one after its last.
-        first = min(np.searchsorted(given, time[0] - found.gap / 2), np.searchsorted(given, time[0], "right") - 1)
-        stop = max(np.searchsorted(given, time[-1] + found.gap / 2, "right"), np.searchsorted(given, time[-1]) + 1)
-        commands = slice(max(int(first), 0), int(stop))
-        parts.append(
-            replace(
-                log,
-                source=f"{log.source}, {row(rows.start)} to {row(rows.stop - 1)}",
-                time=time,
-                qpos=log.qpos[rows],
-                command_time=given[commands],
-                command=log.command[commands],
-                qvel=None if log.qvel is None else log.qvel[rows],
-            )
-        )
+        commands = commands_of(log.time[rows], log.command_time, found.gap)
+        source = f"{log.source}, {row(rows.start)} to {row(rows.stop - 1)}"
+        parts.append(replace(log.part(rows, commands), source=source))
     return parts
+
+
+def commands_of(time: Float64, command_time: Float64, gap: float = GAP) -> slice:
+    """Return the commands at the rows ``time``, within half a ``gap`` [s] of them.
+
+    The one that acts at the first row and, for interpolation, one after the last are among them.
+    """
+    first = np.searchsorted(command_time, time[0] - gap / 2), np.searchsorted(command_time, time[0], "right") - 1
+    stop = np.searchsorted(command_time, time[-1] + gap / 2, "right"), np.searchsorted(command_time, time[-1]) + 1
+    return slice(max(int(min(first)), 0), int(max(stop)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import hypotheses, smooth, variants
-from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Motors, Unknowns
+from batchpid.sim.identification.unknowns import ADDED, DESCRIBED, KINDS, Motors, Unknowns
 from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Compensation
@@ -67,7 +68,9 @@ def held_out_error(
     _check_modelled(source, own, robot, joints)
     motors = motors_of(own, robot, joints, float(assumed["stopping"]), float(assumed["payload"]))
     one = np.ones(len(joints))
-    unknowns = Unknowns.of(one, one, one, one, payload=True)
+    unknowns = Unknowns.of(one, one, one, one, payload=True).without(
+        {"lag": motors.pop("lag")} if "lag" in motors else {}
+    )
     motions = [smooth(log, inputs.drive.timestep) for log in inputs.logs]
     ways = [each for way in hypotheses(inputs.drive, payload=True) for each in variants(way, motions)]
     stated = [way for way in ways if way.assumptions.items() <= assumed.items()]
@@ -77,7 +80,7 @@ def held_out_error(
         residuals = problem.residuals(point)
         tried.append((problem.costs(problem.sizes(residuals)).sum(), problem, residuals))
     _, problem, residuals = min(tried, key=lambda each: each[0])
-    before = problem.residuals(unknowns.point(ideal_motors(robot, joints))[None])
+    before = residuals_of_ideal(problem, robot)
     return error_of(problem, before), error_of(problem, residuals)
 
 
@@ -87,6 +90,12 @@ def error_of(problem: Problem, residuals: list[Float64]) -> float:
     with np.errstate(invalid="ignore", over="ignore"):
         error = float(np.sqrt((np.concatenate(kept) ** 2).mean()))
     return error if np.isfinite(error) else float("inf")
+
+
+def residuals_of_ideal(problem: Problem, robot: Robot) -> list[Float64]:
+    """Return the residuals (1, rows, joints) of each window for the motors according to the robot's description."""
+    plain = replace(problem, unknowns=replace(problem.unknowns, known={}))
+    return plain.residuals(plain.unknowns.point(ideal_motors(robot, problem.joints))[None])
 
 
 def ideal_motors(robot: Robot, joints: tuple[int, ...]) -> Motors:
@@ -99,10 +108,10 @@ def motors_of(
 ) -> Motors:
     """Return the motors of ``joints`` with ``actuators`` of ``robot``, a stopping time [s] and a payload [kg]."""
     own, motors = list(joints), {"stopping": np.array([[stopping]]), "payload": np.array([[payload]])}
-    for name, kind in KINDS.items():
-        if kind.field is None:
+    for name, kind in (KINDS | ADDED).items():
+        leaf = None if kind.field is None else getattr(actuators, kind.field)
+        if kind.field is None or (name in ADDED and leaf is None):
             continue
-        leaf = getattr(actuators, kind.field)
         row = np.full((1, len(own)), kind.neutral) if leaf is None else np.array(leaf, float)[:1, own]
         row = row + getattr(robot, name)[own] if name in DESCRIBED else row
         motors[name] = row if kind.per_joint else row[:, :1]
@@ -123,7 +132,7 @@ def _assumed(source: str, document: Any) -> dict[str, Any]:
 
 def _check_modelled(source: str, actuators: bp.Actuators, robot: Robot, joints: tuple[int, ...]) -> None:
     """Raise InvalidArgumentError if ``joints`` have effects in ``actuators`` that the model lacks."""
-    modelled = {kind.field: kind for kind in KINDS.values() if kind.field is not None}
+    modelled = {kind.field: kind for kind in (KINDS | ADDED).values() if kind.field is not None}
     for name, field in FIELDS.items():
         leaf = getattr(actuators, name)
         if leaf is None:

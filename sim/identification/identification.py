@@ -20,20 +20,21 @@ from batchpid.checks.validate import flag, integer
 from batchpid.io.versions import package_versions
 from batchpid.motors.actuator_files import dumps_actuators, loads_actuators
 from batchpid.native.availability import obstacle
+from batchpid.sim.identification.effort_ratios import EffortRatios, effort_ratios
 from batchpid.sim.identification.fit import Solution, Step
 from batchpid.sim.identification.fit_history import History, State
 from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, search
-from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_of
+from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_of, residuals_of_ideal
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log
-from batchpid.sim.identification.plant import Plant
+from batchpid.sim.identification.plant import Plant, plants_of
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import Motion, Regression, best_drive, hypotheses, smooth, variants
 from batchpid.sim.identification.result import Fit, Identification, actuators_at
 from batchpid.sim.identification.start import begin
 from batchpid.sim.identification.statistics import EXPLAINED, misfits, uncertainty
-from batchpid.sim.identification.unknowns import Motors, Unknowns
+from batchpid.sim.identification.unknowns import KINDS, Motors, Unknowns
 from batchpid.sim.identification.windows import rows_of
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Compensation
@@ -113,7 +114,8 @@ def identify(
         **resting.describe(),
         "still": still,
         "logs": [log.source for log in found],
-        "data": digest([replace(log, source="") for log in found]),
+        "data": digest([replace(log, source="", settings=log.settings._replace(robot=None)) for log in found]),
+        "robots": digest([own and own.describe() for own in (log.settings.robot for log in found)]),
         "command": found[0].kind,
         "params": None if params is None else digest(params),
         "compensate": assumed.compensate,
@@ -127,8 +129,12 @@ def identify(
     }
     record = History(history, settings)
     motions = [smooth(log, timestep) for log in found]
-    drive, regression = best_drive(resting, joints, assumed, found, motions, payload)
+    fitted = [log for log in found if not log.settings.held_out]
+    fitted_motions = [each for each, log in zip(motions, found, strict=True) if not log.settings.held_out]
+    drive, regression = best_drive(resting, joints, assumed, fitted, fitted_motions, payload)
     unknowns = _unknowns(resting, joints, drive, regression.best.motors, motions, payload)
+    ratios = None if found[0].measured is None else effort_ratios(inputs)
+    unknowns = unknowns.without(_known(found[0], payload, ratios))
     ideal = ideal_motors(robot, joints)
     processes = len(os.sched_getaffinity(0)) if workers is None else workers
     pool: Any = nullcontext()
@@ -149,10 +155,10 @@ def identify(
         if misfits(*fits_of_ways[0]).max() > EXPLAINED:  # then the regression may have chosen the wrong compensation
             for way in hypotheses(assumed, payload):
                 if way.compensation != drive.compensation:
-                    other = Regression(Plant(resting, joints, way), found, motions, payload)
+                    other = Regression(plants_of(resting, joints, way, fitted), fitted, fitted_motions, payload)
                     fits_of_ways.append(fit_under(way, other, History(None, settings)))
         problem, best = min(fits_of_ways, key=lambda each: each[1].cost)
-        before, after = problem.residuals(unknowns.point(ideal)[None]), [window.residual for window in best.windows]
+        before, after = residuals_of_ideal(problem, robot), [window.residual for window in best.windows]
         sure = uncertainty(problem, best)
         saved = problem.residuals(_saved(robot, joints, unknowns, best.theta)[None])
     errors = error_of(problem, before), error_of(problem, saved)
@@ -162,13 +168,19 @@ def identify(
         Fit(w.log, found[w.log].time[rows_of(w)], w.fitted, b[0], a)
         for w, b, a in zip(problem.windows, before, after, strict=True)
     )
-    fitted = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
-    noise = np.sqrt((fitted**2).mean(0))
+    errors_of_fit = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
+    noise = np.sqrt((errors_of_fit**2).mean(0))
+    estimate = best.theta
+    if ratios is not None:
+        own = [at for at, (kind, _) in enumerate(ratios.names) if kind in unknowns.known]
+        unknowns = unknowns.plus_known(tuple(ratios.names[at] for at in own))
+        more = [ratios.names[at][0] for at in own], ratios.estimate[own], ratios.deviation[own]
+        estimate, sure = np.append(estimate, more[1]), sure.plus(*more)
     return Identification(
         robot,
         joints,
         unknowns,
-        best.theta,
+        estimate,
         sure,
         (errors[0], errors[1]),
         misfits(problem, best),
@@ -177,6 +189,21 @@ def identify(
         settings,
         fits,
     )
+
+
+def _known(log: Log, payload: bool, ratios: EffortRatios | None) -> Motors:
+    """Return the values of kinds that are no unknowns of a fit of logs such as ``log``.
+
+    Measured efforts have no delay, and count as exact if a payload is to be found; else the strength is their scale.
+    Behind the gear they are free of the motor's inertia and friction.
+    """
+    if ratios is not None:
+        return ratios.values("strength", "delay", "lag")
+    if not log.is_measured:
+        return {}
+    of_motor = ("armature", "damping", "friction") if log.sensor == "link" else ()
+    kinds = ("delay", *of_motor, *(("strength",) if payload else ()))
+    return {kind: np.full((1, 1), KINDS[kind].neutral) for kind in kinds}
 
 
 def _unknowns(

@@ -65,9 +65,16 @@ def read_inputs(
     choice("compensate", compensate, ("gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"))
     logged = found[0].joints
     found, resting, still = _without_still(robot, found)
+    numbers = [logged.index(joint) for joint in found[0].joints]
+
+    def of_logs(params: Any) -> Any:
+        return None if params is None else _of_joints(params, robot, logged).for_joints(numbers)
+
     if params is not None:
-        params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, logged)
-        params = params.for_joints([logged.index(joint) for joint in found[0].joints])
+        params = of_logs(instance("params", params, bp.PIDParams, "load them with load_params()"))
+    own = {id(each): of_logs(each) for each in (log.settings.params for log in found)}
+    found = [replace(log, settings=log.settings._replace(params=own[id(log.settings.params)])) for log in found]
+    params = found[0].settings.params if params is None else params
     measured = params is not None and params.measurement_rate is not None
     forces = _forces(compensate)
     drive = Drive(control / sim_steps, params, forces, substeps=sim_steps, measured_rate=measured)
@@ -79,19 +86,30 @@ def _logs(robot: Robot, logs: Iterable[Any], kind: Any, hold: bool) -> list[Log]
     found = [
         log
         for each in given
-        for log in (checked(robot, each) if isinstance(each, Log) else read_logs(robot, [each], kind, hold=hold))
+        for log in (
+            checked(each.settings.robot or robot, each)
+            if isinstance(each, Log)
+            else read_logs(robot, [each], kind, hold=hold)
+        )
     ]
     if not found:
         raise InvalidArgumentError("logs", "are missing", remedy="name one file or more")
+    held_out = {log.settings.held_out for log in found}
+    if len(held_out) == 1 and held_out != {None}:
+        problem = "are all held out" if True in held_out else "hold out nothing, which would test the fit"
+        raise InvalidArgumentError("logs", problem, remedy="set held_out of some of them, or of none")
     for log in found:
         if log.joints != found[0].joints:
             raise InvalidArgumentError(
                 log.source, f"holds other joints than {found[0].source}", remedy="fit them one by one"
             )
-        if log.kind != kind:
+        if log.kind != ("effort" if kind == "effort" and log.settings.params is None else "setpoint"):
             remedy = "give the params that drove the robot" if log.kind == "setpoint" else "give no params"
             raise InvalidArgumentError(log.source, f"holds {log.kind}s", remedy=remedy)
-        if stopped := at_limits(robot, log):
+        if (log.kind, log.sensor, log.is_measured) != (found[0].kind, found[0].sensor, found[0].is_measured):
+            problem = f"holds other commands or measured efforts than {found[0].source}"
+            raise InvalidArgumentError(log.source, problem, remedy="fit them one by one")
+        if stopped := at_limits(log.settings.robot or robot, log):
             message = "; ".join(stopped) + ": stops are not part of the model; record between the limits"
             warnings.warn(message, LogWarning, stacklevel=4)
     return found
@@ -124,18 +142,15 @@ def _without_still(robot: Robot, logs: list[Log]) -> tuple[list[Log], Robot, lis
             warnings.warn(f"{message}; its motor cannot be identified", LogWarning, stacklevel=4)
     start = robot.start
     start[[joint for joint, each in zip(joints, moves, strict=True) if not each]] = qpos.mean(0)[~moves]
-    kept = tuple(joint for joint, each in zip(joints, moves, strict=True) if each)
-    found = [
-        replace(
-            log,
-            joints=kept,
-            qpos=log.qpos[:, moves],
-            qvel=None if log.qvel is None else log.qvel[:, moves],
-            command=log.command[:, moves],
-        )
-        for log in logs
-    ]
-    return found, replace(robot, settings=None, defaults=FileDefaults(start)), still
+
+    def resting(robot: Robot) -> Robot:
+        return replace(robot, settings=None, defaults=FileDefaults(start))
+
+    found = [log.part(joints=moves) for log in logs]
+    for index, log in enumerate(found):
+        if (own := log.settings.robot) is not None:
+            found[index] = replace(log, settings=log.settings._replace(robot=resting(own)))
+    return found, resting(robot), still
 
 
 def _quoted(names: list[str]) -> str:

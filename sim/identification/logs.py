@@ -1,13 +1,16 @@
-"""Logs of a robot in motion: commands and measured positions over time, from CSV, HDF5 or recordings.
+"""Logs of a robot in motion: commands and measured positions over time, from CSV, HDF5, ROS bags or recordings.
 
 A CSV file has a header and one row per sample, in SI units::
 
-    time, setpoint:JOINT or effort:JOINT ..., qpos:JOINT ..., optionally qvel:JOINT ...
+    time, qpos:JOINT ..., setpoint:JOINT or effort:JOINT ..., and where there are any qvel:JOINT, measured_effort:JOINT,
+    feedforward:JOINT
 
 An HDF5 file has one dataset per column, of the same names. A row holds the position measured at ``time`` and the
-command computed from it, which acts from then on. Columns may have any order, joints may be missing, and times need not
-be equidistant. Columns of other quantities are ignored, such as the rates of setpoints that ``batchpid excite``
-writes.
+command computed from it, which acts from then on. A feedforward is an effort that is added to the law's. Columns may
+have any order, joints may be missing, and times need not be equidistant. Columns of other quantities are ignored, such
+as the rates of setpoints that ``batchpid excite`` writes. :class:`batchpid.sim.identification.columns.Reading` has
+other units and names; :mod:`batchpid.sim.identification.bags` reads ROS bags, and
+:mod:`batchpid.sim.identification.runs` lists of logs with settings of their own (.yaml).
 
 Where the times have a gap, such as between two recordings, each stretch without gap is a log
 (:mod:`batchpid.sim.identification.gaps`). Positions and setpoints that wrap at +-pi or at 0 and 2 pi are unwrapped
@@ -31,8 +34,9 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, file_path
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.identification.columns import QUANTITIES, error, read_csv, read_hdf5_columns
-from batchpid.sim.identification.gaps import MIN_ROWS, MIN_SECONDS, divided
+from batchpid.sim.identification import bags, runs
+from batchpid.sim.identification.columns import QUANTITIES, Reading, error, read_csv, read_hdf5_columns, time_column
+from batchpid.sim.identification.gaps import MIN_ROWS, MIN_SECONDS, commands_of, divided
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning
 from batchpid.sim.identification.turns import unwrapped
 from batchpid.sim.observation import Rollout
@@ -41,15 +45,22 @@ from batchpid.sim.robot.robot import Robot
 
 __all__ = ["CommandKind", "Log", "LogWarning", "at_limits", "checked", "logs_of_rollout", "read_logs"]
 
-SUFFIXES = (".csv", ".txt", ".npz", *HDF5)
+SUFFIXES = (".csv", ".txt", ".npz", *HDF5, *bags.SUFFIXES)
 AT_LIMIT = 1e-3
 """Distance to a joint limit at which a joint counts as stopped by it, over its range."""
+SPEEDING = 4.0
+"""Speed of nearly all rows, over the joint's velocity limit, from which positions may be in degrees."""
 BEYOND = {"rad": 0.3, "m": 0.05}
 """Distance beyond a joint limit at which a position counts as given in another unit."""
 
 
 def read_logs(
-    robot: Robot, paths: Iterable[str | os.PathLike[str]], kind: CommandKind | None = None, *, hold: bool = False
+    robot: Robot,
+    paths: Iterable[str | os.PathLike[str]],
+    kind: CommandKind | None = None,
+    *,
+    hold: bool = False,
+    reading: Reading | None = None,
 ) -> list[Log]:
     """Return the logs in files, one for each stretch without gaps in time.
 
@@ -60,6 +71,8 @@ def read_logs(
     hold
         True if the commands of CSV and HDF5 files hold from row to row, False to interpolate between rows, as for
         commands that changed between rows as well. Recordings are always held.
+    reading
+        Units and names in the files; default SI units and the robot's names. Recordings have no use for it.
 
     Raises
     ------
@@ -68,11 +81,12 @@ def read_logs(
     RecordingError
         A recording cannot be read.
     MissingDependencyError
-        h5py is not installed, which .h5 files need.
+        h5py or rosbags is not installed, which .h5 files and ROS bags need.
     FileNotFoundError
         There is no such file.
     """
-    logs = [log for path in paths for log in _read(robot, file_path("log", path, SUFFIXES), kind, hold)]
+    reading = reading or Reading()
+    logs = [log for path in paths for log in _read(robot, Path(path), kind, hold, reading)]
     if not logs:
         raise InvalidArgumentError("logs", "are missing", remedy="name one file or more")
     kinds = {log.kind for log in logs}
@@ -82,17 +96,42 @@ def read_logs(
     return logs
 
 
-def _read(robot: Robot, path: Path, kind: CommandKind | None, hold: bool) -> list[Log]:
+def _read(robot: Robot, path: Path, kind: CommandKind | None, hold: bool, reading: Reading) -> list[Log]:
+    if not bags.is_bag(path):
+        file_path("log", path, (*SUFFIXES, *runs.SUFFIXES))
     if not path.exists():
         raise FileNotFoundError(2, "there is no such file", str(path))
+    if path.suffix.lower() in runs.SUFFIXES:
+        return runs.read_runs(path, robot, read_logs, kind, hold, reading)
+    if bags.is_bag(path):
+        states, *commands = [_named(robot, str(path), each, reading) for each in bags.read_bag(path, reading)]
+        return _build(robot, str(path), states, None, kind, hold, reading, *commands)
+    columns, lines = None, None
     if path.suffix.lower() in (".csv", ".txt"):
         columns, lines = read_csv(path)
-        return _build(robot, str(path), columns, lines, kind, hold)
-    if path.suffix.lower() in HDF5:
-        found = read_hdf5_columns(path)
-        if found is not None:
-            return _build(robot, str(path), found, None, kind, hold)
+    elif path.suffix.lower() in HDF5:
+        columns = read_hdf5_columns(path)
+    if columns is not None:
+        return _build(robot, str(path), columns, lines, kind, hold, reading)
+    if reading != Reading():
+        given = ", ".join(name for name, a, b in zip(Reading._fields, reading, Reading(), strict=True) if a != b)
+        remedy = "leave it out"
+        raise InvalidArgumentError(given, f"is not for {path}, a recording, which has SI units", remedy=remedy)
     return logs_of_rollout(robot, read_recording(path), kind, source=str(path))
+
+
+def _named(robot: Robot, source: str, columns: dict[str, Float64], reading: Reading) -> dict[str, Float64]:
+    """Return the columns of a bag without those of other joints, which are named in a warning."""
+    ours = {f"{reading.prefix}{name}" for name in robot.joint_names}
+    theirs = dict.fromkeys(name.partition(":")[2] for name in columns if name != "time")
+    others = [name for name in theirs if name not in ours]
+    if len(others) == len(theirs):
+        remedy = f"the robot has {', '.join(robot.joint_names)}: give the prefix of the names, or another topic"
+        raise error(source, f"has none of the robot's joints, but {', '.join(others)}", remedy)
+    if others:
+        message = f"{source}: {', '.join(others)}: no joint of the robot, left out"
+        warnings.warn(message, LogWarning, stacklevel=4)
+    return {name: values for name, values in columns.items() if name.partition(":")[2] not in others}
 
 
 def logs_of_rollout(
@@ -146,24 +185,25 @@ def _build(
     lines: list[int] | None,
     kind: CommandKind | None,
     hold: bool,
+    reading: Reading,
+    commands: dict[str, Float64] | None = None,
 ) -> list[Log]:
-    """Return the logs that the columns of a file hold."""
-    if "time" not in columns:
-        problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
-        raise error(source, problem, "begin the header with time, in seconds")
-    by: dict[str, dict[str, Float64]] = {quantity: {} for quantity in QUANTITIES}
-    for name, values in columns.items():
-        quantity, colon, joint = name.partition(":")
-        quantity, joint = quantity.strip(), joint.strip()
-        if colon and quantity in by:
-            choice(f"{source}: column {name!r}: joint", joint, robot.joint_names)
-            if joint in by[quantity]:
-                raise error(source, f"has the column '{quantity}:{joint}' twice, apart from blanks", "keep one of them")
-            by[quantity][joint] = values
+    """Return the logs that the columns of a file hold; ``commands`` are those that have times of their own."""
+    time = time_column(source, columns, reading.time_unit)
+    command_time = time if commands is None else commands["time"]
+    by = _by_quantity(robot, source, columns if commands is None else columns | commands, reading)
+    sensor = reading.measured if by["effort"] or by["measured_effort"] else None
+    if by["measured_effort"]:
+        sensor = sensor or "motor"
+    elif sensor is not None:
+        by["measured_effort"], by["effort"] = by["effort"], {}
     if not by["qpos"]:
         raise error(
             source, "has no column qpos:JOINT", "measured positions are needed, e.g. qpos:" + robot.joint_names[0]
         )
+    measured_alone = kind != "setpoint" and not by["effort"] and by["measured_effort"] and (kind or not by["setpoint"])
+    if measured_alone:
+        by["effort"], by["measured_effort"] = by["measured_effort"], {}
     kinds: list[CommandKind] = [each for each in ("effort", "setpoint") if by[each]]
     if not kinds or (kind is not None and kind not in kinds):
         wanted = kind or "setpoint"
@@ -171,23 +211,66 @@ def _build(
             source, f"has no column {wanted}:JOINT", f"commands are needed, e.g. {wanted}:{robot.joint_names[0]}"
         )
     found = kind or kinds[0]
-    for joint in by[found].keys() ^ by["qpos"].keys():
-        lacking = "qpos" if joint in by[found] else found
+    if found == "setpoint" and by["measured_effort"]:
+        message = f"{source}: measured efforts are not used with setpoints; without gains they are"
+        warnings.warn(message, LogWarning, stacklevel=4)
+        by["measured_effort"], sensor = {}, None
+    if found == "effort" and by["feedforward"]:
+        remedy = "give the gains of the law that it was added to, or leave the column out"
+        raise error(source, "has a feedforward, which efforts include", remedy)
+    needed = [found, *(q for q in ("feedforward", "measured_effort") if by[q])]
+    for joint in {name for q in needed for name in by[q].keys() ^ by["qpos"].keys()}:
+        lacking = next(q for q in ("qpos", *needed) if joint not in by[q])
         remedy = "give both of a joint or neither; a joint that is left out rests at the robot's start pose"
         raise InvalidArgumentError(f"{source}: column {lacking}:{joint}", "is missing", remedy=remedy)
-    names = [name for name in robot.joint_names if name in by["qpos"]]
-    names = [name for name, free in zip(robot.joint_names, robot.independent, strict=True) if free and name in names]
+    names = [name for name, free in zip(robot.joint_names, robot.independent, strict=True) if free]
+    names = [name for name in names if name in by["qpos"]]
     if not names:
         raise error(source, "holds followers alone, which their leaders move", "give the columns of the leaders")
-    read = [values for q in ("qpos", "qvel", found) for name, values in by[q].items() if name in names]
-    if len({len(columns["time"]), *map(len, read)}) > 1:
-        raise error(source, "has columns of different lengths", "give one value per row in each")
-    tables = {q: np.stack([by[q][n] for n in names], axis=1) for q in ("qpos", found)}
-    qvel = np.stack([by["qvel"][n] for n in names], axis=1) if by["qvel"].keys() >= {*names} else None
+    if not by["qvel"].keys() >= {*names}:
+        by["qvel"] = {}
+    used = {quantity: [by[quantity][name] for name in names] for quantity in ("qpos", "qvel", *needed) if by[quantity]}
+    for quantity, own in used.items():
+        wanted_length = len(time if quantity in ("qpos", "qvel", "measured_effort") else command_time)
+        if {*map(len, own)} != {wanted_length}:
+            raise error(source, "has columns of different lengths", "give one value per row in each")
+    tables = {quantity: np.stack(own, axis=1) for quantity, own in used.items()}
     joints = tuple(robot.joint_names.index(name) for name in names)
-    time = columns["time"]
-    log = Log(source, joints, found, time, tables["qpos"], time, tables[found], hold, qvel)
-    return checked(robot, log, lines)
+    log = Log(source, joints, found, time, tables["qpos"], command_time, tables[found], hold, tables.get("qvel"))
+    log = replace(log, feedforward=tables.get("feedforward"), measured=tables.get("measured_effort"), sensor=sensor)
+    rows = np.flatnonzero((time >= reading.start) & (time <= reading.end) | np.isnan(time))
+    if not len(rows):
+        span = f"its times are {time[0]:g} to {time[-1]:g} s"
+        raise error(source, f"has no rows from {reading.start:g} to {reading.end:g} s", span)
+    if len(rows) < len(time):
+        lines = None if lines is None else [lines[row] for row in rows]
+        log = log.part(rows, commands_of(time[rows], command_time))
+    parts = checked(robot, log, lines)
+    if fast := _in_degrees(robot, parts):
+        message = f"{source}: {fast} moves {SPEEDING:g} times as fast as its limit of velocity or more"
+        warnings.warn(f"{message}: positions look like degrees (option degrees)", LogWarning, stacklevel=4)
+    return parts
+
+
+def _by_quantity(
+    robot: Robot, source: str, columns: dict[str, Float64], reading: Reading
+) -> dict[str, dict[str, Float64]]:
+    """Return the columns by quantity and by the robot's name of their joint, in SI units."""
+    by: dict[str, dict[str, Float64]] = {quantity: {} for quantity in QUANTITIES}
+    for name, values in columns.items():
+        quantity, colon, joint = name.partition(":")
+        quantity, joint = quantity.strip(), joint.strip().removeprefix(reading.prefix)
+        if not colon or quantity not in by:
+            continue
+        choice(f"{source}: column {name!r}: joint", joint, robot.joint_names)
+        if joint in by[quantity]:
+            raise error(source, f"has the column '{quantity}:{joint}' twice, apart from blanks", "keep one of them")
+        angle = robot.units[robot.joint_names.index(joint)] == "rad" and quantity in ("qpos", "qvel", "setpoint")
+        factor = (reading.sign or {}).get(joint, 1.0)
+        if quantity in ("effort", "measured_effort", "feedforward"):
+            factor *= (reading.scale or {}).get(joint, 1.0)
+        by[quantity][joint] = factor * (np.radians(values) if reading.degrees and angle else values)
+    return by
 
 
 def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[Log]:
@@ -200,7 +283,8 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
         return f"row {index + 1}" if lines is None else f"line {lines[index]}"
 
     names = [robot.joint_names[joint] for joint in log.joints]
-    for quantity, table in (("qpos", log.qpos), (log.kind, log.command), ("qvel", log.qvel)):
+    tables = (("qpos", log.qpos), (log.kind, log.command), ("qvel", log.qvel))
+    for quantity, table in (*tables, ("feedforward", log.feedforward), ("measured_effort", log.measured)):
         if table is not None and not np.isfinite(table).all():
             index, joint = (int(n) for n in np.argwhere(~np.isfinite(table))[0])
             remedy = "remove the row, or give the number"
@@ -226,7 +310,8 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
     if beyond.any():
         index, joint = (int(n) for n in np.argwhere(beyond)[0])
         problem = f"{row(index)}, column 'qpos:{names[joint]}' is far beyond the joint's limits"
-        remedy = f"positions are in {robot.units[log.joints[joint]]}; the limits are {low[joint]:g} to {high[joint]:g}"
+        unit = robot.units[log.joints[joint]]
+        remedy = f"positions are in {unit}, or degrees as an option; the limits are {low[joint]:g} to {high[joint]:g}"
         if np.isclose(high[joint] - low[joint], 2 * np.pi, rtol=0.01):
             remedy += "; a joint that turns freely is of type continuous"
         raise error(log.source, problem, remedy, float(log.qpos[index, joint]))
@@ -242,6 +327,16 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
             f"{problem}; in the robot's file the type is not continuous: correct it", LogWarning, stacklevel=3
         )
     return parts
+
+
+def _in_degrees(robot: Robot, logs: list[Log]) -> str:
+    """Return the names of the joints that move too fast for positions in rad, without rare jumps."""
+    rates = [np.abs(np.diff(log.qpos, axis=0)) / np.diff(log.time)[:, None] for log in logs]
+    speeds, own = np.concatenate(rates), list(logs[0].joints)
+    typical = np.sqrt((np.minimum(speeds, np.quantile(speeds, 0.95, axis=0)) ** 2).mean(0))
+    limit = robot.velocity_limit[own]
+    fast = (limit > 0) & (typical > SPEEDING * limit) & (np.array(robot.units)[own] == "rad")
+    return ", ".join(robot.joint_names[joint] for joint, each in zip(own, fast, strict=True) if each)
 
 
 def _row_from(row: Callable[[int], str], first: int, index: int) -> str:

@@ -33,6 +33,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.coupling import Coupling, Follower
 from batchpid.sim.engine.robot_model import robot_model
+from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.logged_control import Control, Drive
 from batchpid.sim.identification.unknowns import Motors, actuators_of
 from batchpid.sim.robot.robot import Robot
@@ -62,6 +63,8 @@ class Segment(NamedTuple):
     """Setpoints or efforts (past + steps, joints) from ``past`` steps before the start on."""
     noise: Float64
     """Noise of the positions that the law is given (past + steps, joints)."""
+    feedforward: Float64 | None = None
+    """Efforts that are added to the efforts of the law (past + steps, joints)."""
 
 
 class Passive(NamedTuple):
@@ -176,6 +179,11 @@ class Plant:
         command, noise = (
             np.stack([getattr(segment, name) for segment in segments], axis=1) for name in ("command", "noise")
         )
+        forward = None
+        if any(segment.feedforward is not None for segment in segments):
+            none = np.zeros_like(command[:, 0])
+            rows = [none if segment.feedforward is None else segment.feedforward for segment in segments]
+            forward = np.stack(rows, axis=1)
         actuators = actuators_of(motors, q.shape[1])
         held = self.compensation(q, v, payload) if drive.through else None
         asked = np.zeros((1, *q.shape)) if drive.params is not None else command[max(past - 1, 0) :: -1]
@@ -194,6 +202,8 @@ class Plant:
                 passive, now = dynamics(), past + step
                 c = self._compensation(passive, at_rest)
                 inside, outside = (c, None) if drive.through else (None, c)
+                if forward is not None:
+                    inside = forward[now] if inside is None else inside + forward[now]
                 shake = noise[now] if drive.noisy else None
                 effort = control.advance(command[now], q, v, inside, shake) - passive.force - passive.payload_force
                 if outside is not None:
@@ -202,6 +212,18 @@ class Plant:
                 out[:, step + 1] = q
         out[:, -1] = np.where(np.abs(out[:, -1]) <= DIVERGED, out[:, -1], np.inf)
         return out
+
+
+def plants_of(robot: Robot, joints: tuple[int, ...], drive: Drive, logs: list[Log]) -> list[Plant]:
+    """Return the plant of each log under ``drive``, with the robot and the params of its settings."""
+    known: dict[tuple[int, int], Plant] = {}
+    found = []
+    for own, params, *_ in (log.settings for log in logs):
+        key = id(own), id(params)
+        if key not in known:
+            known[key] = Plant(own or robot, joints, drive if params is None else replace(drive, params=params))
+        found.append(known[key])
+    return found
 
 
 def _with_payload(tree: RigidTree, body: int, place: Float64) -> RigidTree:

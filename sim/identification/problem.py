@@ -23,7 +23,7 @@ out of the residual and the Jacobian of that window.
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any, NamedTuple
 
@@ -86,7 +86,13 @@ class Problem:
     """Numbers of the fitted rows in each stretch of each window."""
 
     def __post_init__(self) -> None:
-        self._subject = Subject.of(self.robot, self.joints, self.drive)
+        subjects = [
+            Subject.of(
+                own or self.robot, self.joints, self.drive if params is None else replace(self.drive, params=params)
+            )
+            for own, params, *_ in (log.settings for log in self.logs)
+        ]
+        self._subjects = list(zip(subjects, [log.settings.payload for log in self.logs], strict=True))
         divide = whole if self.drive.params is not None else cut
         self.windows = [
             window
@@ -193,12 +199,14 @@ class Problem:
         numbers = np.r_[np.arange(count), np.zeros(len(states), int)]
         states = np.concatenate([np.zeros((count, *states.shape[1:])), STATE_STEP * states])
         motors, draws = self.unknowns.motors(points[numbers]), draws[numbers]
-        groups = [list(group) for _, group in groupby(self.windows, lambda w: (w.segment.command.shape, w.past))]
+        groups = [list(group) for _, group in groupby(self.windows, self._alike)]
         tasks, places = [], []
         for number, group in enumerate(groups):
             most = max(1, CHUNK // len(group))
             parts = np.array_split(np.arange(len(states)), -(-len(states) // most))
-            tasks += [(group, take(motors, part), states[part], draws[part]) for part in parts]
+            subject, known = self._subjects[group[0].log]
+            loaded = motors | {"payload": motors["payload"] + known}
+            tasks += [(subject, group, take(loaded, part), states[part], draws[part]) for part in parts]
             places += [number] * len(parts)
         simulated = self._map(tasks)
         found = []
@@ -212,5 +220,10 @@ class Problem:
 
     def _map(self, tasks: list[Any]) -> list[list[Float64]]:
         if self.executor is None:
-            return [simulate(self._subject, *task) for task in tasks]
-        return list(self.executor.map(simulate, [self._subject] * len(tasks), *zip(*tasks, strict=True)))
+            return [simulate(*task) for task in tasks]
+        return list(self.executor.map(simulate, *zip(*tasks, strict=True)))
+
+    def _alike(self, window: Window) -> tuple[Any, ...]:
+        """Return what windows have in common that are simulated together."""
+        subject, payload = self._subjects[window.log]
+        return window.segment.command.shape, window.past, subject.key, payload

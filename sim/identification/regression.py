@@ -24,7 +24,7 @@ from batchpid.motors.actuators import Actuators
 from batchpid.sim.identification.log_noise import Noise, split
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log
-from batchpid.sim.identification.plant import Plant
+from batchpid.sim.identification.plant import Plant, plants_of
 from batchpid.sim.identification.unknowns import Motors
 
 CUTOFF = 15.0
@@ -62,6 +62,8 @@ class Motion(NamedTuple):
     """Noise of the measured positions."""
     jitter: Noise | None
     """Noise of logged efforts that change between the rows; None where the commands are known."""
+    feedforward: Float64 | None = None
+    """Efforts that are added to the efforts of the law."""
 
 
 class Start(NamedTuple):
@@ -88,27 +90,29 @@ def smooth(log: Log, timestep: float) -> Motion:
         efforts, jitter = split(log.command_time, log.command, time, given=True)
         command = efforts + jitter.values if jitter.size.any() else command
     sensor = split(log.time, log.qpos, time)[1]
-    return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), command, sensor, jitter)
+    forward = None if log.feedforward is None else log.commands_at(time, log.feedforward)
+    return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), command, sensor, jitter, forward)
 
 
 class Regression:
     """Efforts that the motions required and commanded efforts, with the same filter, for regressions at any delay."""
 
-    def __init__(self, plant: Plant, logs: list[Log], motions: list[Motion], payload: bool) -> None:
+    def __init__(self, plants: list[Plant], logs: list[Log], motions: list[Motion], payload: bool) -> None:
         from scipy.signal import butter, sosfiltfilt
 
-        drive, dt = plant.drive, plant.drive.timestep
+        drive, dt = plants[0].drive, plants[0].drive.timestep
         period = max(float(np.median(np.diff(log.time))) for log in logs)
         sections = butter(4, min(CUTOFF, 0.2 / period), fs=1 / dt, output="sos")
         blocks: list[tuple[Float64, ...]] = []
         late: list[Float64] = []
-        for motion in motions:
+        for plant, log, motion in zip(plants, logs, motions, strict=True):
             edge = min(round(EDGE / dt), len(motion.qpos) // 5)
             rows = np.arange(edge, len(motion.qpos) - edge, max(1, round(_EVERY / dt)))
             v, a = motion.qvel[rows], motion.qacc[rows]
-            empty, loaded = (_required(plant, motion, rows, kg) for kg in (0.0, 1.0 if payload else 0.0))
+            known = log.settings.payload
+            empty, loaded = (_required(plant, motion, rows, known + kg) for kg in (0.0, 1.0 if payload else 0.0))
             effort = motion.command if drive.params is None else _law_efforts(plant, motion)
-            unloaded = np.zeros((len(motion.qpos), 1))
+            unloaded = np.full((len(motion.qpos), 1), known)
             if drive.through and (held := plant.compensation(motion.qpos, motion.qvel, unloaded)) is not None:
                 effort = effort + held
             if drive.params is None:  # the law's efforts are computed from filtered positions
@@ -170,7 +174,8 @@ def _law_efforts(plant: Plant, motion: Motion) -> Float64:
     """Return the efforts (steps, joints) of the law along a measured ``motion``, without compensation."""
     rows = [(q[None], v[None], u[None]) for q, v, u in zip(motion.qpos, motion.qvel, motion.command, strict=True)]
     control = plant.control(Actuators(), *rows[0][:2])
-    return np.array([control.advance(u, q, v, None)[0].copy() for q, v, u in rows])
+    efforts = np.array([control.advance(u, q, v, None)[0].copy() for q, v, u in rows])
+    return efforts if motion.feedforward is None else efforts + motion.feedforward
 
 
 def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float64:
@@ -234,7 +239,7 @@ def best_drive(
 ) -> tuple[Drive, Regression]:
     """Return the drive that explains the logs best, with its regression."""
     ways = hypotheses(drive, payload)
-    found = [(Regression(Plant(robot, joints, each), logs, motions, payload), each) for each in ways]
+    found = [(Regression(plants_of(robot, joints, each, logs), logs, motions, payload), each) for each in ways]
     best, chosen = found[0]
     for other, way in found[1:]:
         if explains_better(other.best, best.best):

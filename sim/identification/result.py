@@ -15,8 +15,11 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.held_out import ASSUMED
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.statistics import INTERVAL, Uncertainty
-from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknowns
+from batchpid.sim.identification.unknowns import ADDED, DESCRIBED, KINDS, Unknowns, kind_of
 from batchpid.sim.robot.robot import Robot
+
+SHORT = 30.0
+"""Length of a log [s] below which intervals hold for its motion only."""
 
 
 class Fit(NamedTuple):
@@ -71,8 +74,8 @@ class Identification(NamedTuple):
             The logs do not hold that joint, or there is no such unknown.
         """
         kind = choice("kind", kind, list(dict.fromkeys(name for name, _ in self.unknowns.names)))
-        if KINDS[kind].per_joint != (joint is not None):
-            remedy = f"give its number, 0 to {len(self.joints) - 1}" if KINDS[kind].per_joint else "leave it out"
+        if kind_of(kind).per_joint != (joint is not None):
+            remedy = f"give its number, 0 to {len(self.joints) - 1}" if kind_of(kind).per_joint else "leave it out"
             raise InvalidArgumentError("joint", f"does not go with {kind!r}", value=joint, remedy=remedy)
         if joint is not None:
             joint = integer("joint", joint, 0, len(self.joints) - 1)
@@ -163,6 +166,11 @@ class Identification(NamedTuple):
         return self.robot.joint_names[self.joints[int(self.misfits.argmax())]]
 
     @property
+    def is_short(self) -> bool:
+        """True if there is one log of less than :data:`SHORT`, which shows nothing of other motions, loads and days."""
+        return len({fit.log for fit in self.fits}) == 1 and sum(float(np.ptp(fit.time)) for fit in self.fits) < SHORT
+
+    @property
     def explains(self) -> bool:
         """True if the error on the held-out part fell."""
         return self.held_out_error[1] < self.held_out_error[0]
@@ -178,8 +186,8 @@ class Identification(NamedTuple):
 def actuators_at(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Float64) -> bp.Actuators:
     """Return the actuators of ``robot`` at a point (unknowns,); joints that are not in ``joints`` are ideal."""
     found, options = unknowns.motors(theta[None]), dict[str, Any]()
-    for name, kind in KINDS.items():
-        if kind.field is None:
+    for name, kind in (KINDS | ADDED).items():
+        if kind.field is None or name not in found:
             continue
         column = np.full(robot.dof, kind.neutral)
         if not kind.per_joint:

@@ -7,8 +7,12 @@ residuals r and Jacobian J of the N rows of each joint, the covariance of the es
 
 c is the autocovariance of the joint's residuals, tapered (E. A. Morelli and V. Klein, "Accuracy of aerodynamic model
 parameters estimated from flight test data", Journal of Guidance, Control, and Dynamics 20(1), 1997). For white
-residuals it is H^-1. Small singular values of J, in units of typical sizes, mark combinations of unknowns that a log
-does not show.
+residuals it is H^-1. What the residuals of a log cannot show, such as friction that depends on load or temperature,
+shows in the scatter of the parts of the logs. The estimate without part p is theta - (H - H_p)^-1 (J^T r - J_p^T r_p),
+and P times the variance of these by the jackknife (B. Efron, The Jackknife, the Bootstrap and Other Resampling Plans,
+SIAM, 1982) is the variance between P parts; where it exceeds P cov, the excess is added.
+
+Small singular values of J, in units of typical sizes, mark combinations of unknowns that a log does not show.
 """
 
 from __future__ import annotations
@@ -29,6 +33,8 @@ MODEL_ERROR = 2.0
 sees noise. Without it 30 % of the intervals missed the truth on logs of a two-joint arm in MuJoCo."""
 LEAST_DEVIATION, LEAST_OF_BIAS = 5e-3, 2e-2
 """Least standard deviation of an unknown, over its estimate, and of a bias: no model is more exact."""
+PARTS, LEAST_PARTS = 10, 4
+"""Most parts of the logs, each a stretch or more, whose estimates are compared, and least number of them."""
 INTERVAL = 1.96
 """Half width of a 95 % interval, in standard deviations."""
 RESOLVED, DELAY_RESOLVED = 0.05, 0.1
@@ -50,6 +56,13 @@ class Uncertainty(NamedTuple):
     """Joints (joints,) that the motion moves, and not only the noise of their sensor."""
     singular_values: Float64
     """Singular values of the Jacobian in units of typical sizes, over the largest, descending."""
+
+    def plus(self, kinds: list[str], estimate: Float64, deviation: Float64) -> Uncertainty:
+        """Return the uncertainty with further values (n,) of some ``kinds``."""
+        more = _resolved(kinds, estimate, deviation)
+        return self._replace(
+            deviation=np.append(self.deviation, deviation), identified=np.append(self.identified, more)
+        )
 
 
 def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
@@ -80,13 +93,48 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     inverse = np.linalg.inv(normal + np.diag(prior))
     covariance = inverse @ (spread + np.diag(prior)) @ inverse
     variance = np.maximum(np.diagonal(covariance), np.diagonal(inverse))
-    deviation = np.hypot(MODEL_ERROR * unknowns.scale * np.sqrt(variance), LEAST_DEVIATION * np.abs(point.theta))
+    parts = _parts(problem, point)
+    excess = np.maximum(variance_between(parts, prior) - len(parts) * variance, 0.0)
+    own = unknowns.scale * np.sqrt(MODEL_ERROR**2 * variance + excess)
+    deviation = np.hypot(own, LEAST_DEVIATION * np.abs(point.theta))
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(normal)[::-1], 0.0))
-    resolved = np.array([DELAY_RESOLVED if kind == "delay" else RESOLVED for kind, _ in unknowns.names])
     moves = _motion(problem) > LEAST_MOTION * problem.noise / NOISES
     known = np.array([joint is None or moves[joint] for _, joint in unknowns.names])
-    identified = known & (INTERVAL * deviation <= resolved * np.abs(point.theta))
+    identified = known & _resolved([kind for kind, _ in unknowns.names], point.theta, deviation)
     return Uncertainty(deviation, identified, moves, values / max(values[0], 1e-300))
+
+
+def _resolved(kinds: list[str], estimate: Float64, deviation: Float64) -> NDArray[np.bool_]:
+    """Return which intervals are narrow enough to count as identified."""
+    most = np.array([DELAY_RESOLVED if kind == "delay" else RESOLVED for kind in kinds])
+    return np.asarray(INTERVAL * deviation <= most * np.abs(estimate))
+
+
+def _parts(problem: Problem, point: Solution) -> list[tuple[Float64, Float64]]:
+    """Return J^T J and J^T r of parts of the logs, in units of typical sizes, in order of time."""
+    tables, sizes = [], iter(point.sizes)
+    for evaluation, stretches in zip(point.windows, problem.stretches, strict=True):
+        for rows in stretches:
+            size = next(sizes)[:, None]
+            jacobian = np.nan_to_num(evaluation.jacobian[rows] * problem.unknowns.scale) / size
+            columns = np.concatenate([jacobian, evaluation.white[rows][..., None] / size], axis=2)
+            flat = columns.reshape(-1, columns.shape[2])
+            tables.append(flat.T @ flat)
+    parts = [sum(part) for part in np.array_split(np.array(tables), min(PARTS, len(tables)))]
+    return [(part[:-1, :-1], part[:-1, -1]) for part in parts]
+
+
+def variance_between(parts: list[tuple[Float64, Float64]], prior: Float64) -> Float64:
+    """Return the variances (unknowns,) of estimates from one part, by leaving out each in turn.
+
+    ``parts`` are J^T J and J^T r; ``prior`` is the information of the prior (unknowns,). It is 0 for too few parts.
+    """
+    count = len(parts)
+    if count < LEAST_PARTS:
+        return np.zeros(len(prior))
+    whole, gradient = sum(part[0] for part in parts) + np.diag(prior), sum(part[1] for part in parts)
+    estimates = np.array([np.linalg.solve(whole - own, gradient - pull) for own, pull in parts])
+    return (count - 1) * ((estimates - estimates.mean(0)) ** 2).sum(0)
 
 
 def misfits(problem: Problem, point: Solution) -> Float64:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -48,12 +48,19 @@ KINDS = {
     "payload": Kind(None, False, 0.0, np.inf, 0.2, 50.0),
 }
 """Kinds of unknowns. A line here is all that an effect of :mod:`batchpid.motors` needs to be identified."""
+ADDED = {"lag": Kind("lag", True, 0.0, 0.1, 5e-3, 20.0)}
+"""Kinds that a fit has only where it is asked for them; they stay out of simulations otherwise."""
 DESCRIBED = ("damping", "friction")
 """Kinds of which the robot's description states a share, under the same name; here they are the whole."""
 _STEP = 2e-3
 """Change of an unknown for a finite difference, in units of its scale."""
 _STRENGTH_STEP = 1e-2
 """Change of a strength, over it."""
+
+
+def kind_of(name: str) -> Kind:
+    """Return the kind of a name."""
+    return KINDS[name] if name in KINDS else ADDED[name]
 
 
 def take(motors: Motors, rows: NDArray[np.intp]) -> Motors:
@@ -63,7 +70,7 @@ def take(motors: Motors, rows: NDArray[np.intp]) -> Motors:
 
 def actuators_of(motors: Motors, joints: int) -> Actuators:
     """Return the actuators (n, joints) of candidates, friction and damping of the description included."""
-    fields = {KINDS[kind].field: values for kind, values in motors.items()}
+    fields = {kind_of(name).field: values for name, values in motors.items()}
     spread = {
         field: np.ascontiguousarray(np.broadcast_to(values, (len(values), joints)))
         for field, values in fields.items()
@@ -84,6 +91,8 @@ class Unknowns:
     """Typical sizes, powers of 2: points over them are exact, so that a fit resumes bit-identically."""
     inertia: Float64
     """Typical inertia that the joints show without armature (joints,)."""
+    known: Motors = field(default_factory=dict)
+    """Values (1, joints or 1) of kinds that are known, in place of ideal ones."""
 
     @classmethod
     def of(cls, links: Float64, armature: Float64, effort: Float64, speed: Float64, payload: bool) -> Unknowns:
@@ -103,8 +112,19 @@ class Unknowns:
             scale += np.broadcast_to(size, len(numbers)).tolist()
         return cls(len(links), tuple(names), np.exp2(np.round(np.log2(np.array(scale)))), links)
 
+    def without(self, known: Motors) -> Unknowns:
+        """Return the unknowns without the kinds in ``known``, whose values (1, joints or 1) are taken as they are."""
+        kept = [index for index, (name, _) in enumerate(self.names) if name not in known]
+        return replace(self, names=tuple(self.names[index] for index in kept), scale=self.scale[kept], known=known)
+
+    def plus_known(self, names: tuple[tuple[str, int | None], ...]) -> Unknowns:
+        """Return the unknowns with ``names`` among them, whose kinds are known no longer."""
+        known = {kind: values for kind, values in self.known.items() if kind not in dict(names)}
+        scale = np.append(self.scale, np.ones(len(names)))
+        return replace(self, names=(*self.names, *names), scale=scale, known=known)
+
     def _each(self, leaf: str) -> Float64:
-        return np.array([getattr(KINDS[kind], leaf) for kind, _ in self.names])
+        return np.array([getattr(kind_of(kind), leaf) for kind, _ in self.names])
 
     @property
     def low(self) -> Float64:
@@ -147,6 +167,8 @@ class Unknowns:
         table[strengths, strengths] = _STRENGTH_STEP * theta[strengths]
         for kind in ("armature", "damping", "friction", "bias"):
             own = self.of_kind(kind)
+            if len(own) != len(strengths):
+                continue
             table[strengths, own] = _STRENGTH_STEP * (theta[own] + (self.inertia if kind == "armature" else 0.0))
         return table
 
@@ -165,4 +187,5 @@ class Unknowns:
     def motors(self, points: Float64) -> Motors:
         """Return the candidates at ``points`` (n, unknowns), ideal in what is not an unknown."""
         ideal = {name: np.full((len(points), 1), kind.neutral) for name, kind in KINDS.items()}
-        return ideal | {kind: points[:, self.of_kind(kind)] for kind in dict(self.names)}
+        known = {name: np.repeat(values, len(points), axis=0) for name, values in self.known.items()}
+        return ideal | known | {kind: points[:, self.of_kind(kind)] for kind in dict(self.names)}

@@ -100,8 +100,8 @@ def simulate(
     for window in windows:
         drawn = {draw: window.drawn(draw) for draw in set(draws.tolist())}
         for shift, draw in zip(states, draws.tolist(), strict=True):
-            qpos, qvel, *given = drawn[draw]
-            segments.append(Segment(qpos + shift[0], qvel + shift[1], *given))
+            given = drawn[draw]
+            segments.append(given._replace(qpos=given.qpos + shift[0], qvel=given.qvel + shift[1]))
     count = len(states)
     everyone = take(motors, np.tile(np.arange(count), len(windows)))
     out = plant_of(subject).simulate(everyone, segments, windows[0].past)
@@ -146,8 +146,9 @@ def _window(
     noise = np.zeros_like(command) if past else motion.sensor.values[steps]
     errors = np.zeros((0, *command.shape)) if given is None else given.errors[:, steps]
     start = (motion.qpos[first], motion.qvel[first], np.zeros(len(log.joints))) if first else _start(log, motion)
-    segment = Segment(start[0], start[1], command, noise)
-    fitted = log.time[rows] <= log.time[0] + (1 - HELD_OUT) * log.seconds
+    forward = None if motion.feedforward is None else motion.feedforward[steps]
+    segment = Segment(start[0], start[1], command, noise, forward)
+    fitted = log.time[rows] <= log.time[0] + share_fitted(log) * log.seconds
     compared = index - first, part, log.qpos[rows], int(rows[0]), fitted
     return Window(number, segment, past, *compared, errors, start[2])
 
@@ -176,6 +177,11 @@ def _start(log: Log, motion: Motion) -> tuple[Float64, Float64, Float64]:
     return log.qpos[0] + position, velocity / end, np.maximum(deviation * noise / end, 0.1 * rest)
 
 
+def share_fitted(log: Log) -> float:
+    """Return the share of a log, at its start, that is fitted."""
+    return {None: 1 - HELD_OUT, False: np.inf, True: -1.0}[log.settings.held_out]
+
+
 def whole(number: int, log: Log, motion: Motion, dt: float) -> list[Window]:
     """Return one window that covers the log."""
     settle = min(SETTLE, 0.2 * log.seconds)
@@ -185,7 +191,8 @@ def whole(number: int, log: Log, motion: Motion, dt: float) -> list[Window]:
 def cut(number: int, log: Log, motion: Motion, dt: float) -> list[Window]:
     """Return windows of WINDOW seconds; a window begins where the held-out part begins."""
     total, past, edge = len(motion.qpos) - 1, round(0.1 / dt), round(0.05 / dt)
-    split = int((1 - HELD_OUT) * total)
-    length = min(round(WINDOW / dt), total - split - 2)
-    starts = [*range(edge, split - length + 1, length), *range(split + 1, total - length + 1, length)]
+    split = int(min(share_fitted(log), 1.0) * total)
+    first, rest = max(split + 1, edge), total - split - 2
+    length = min(round(WINDOW / dt), rest if split < total else total - edge)
+    starts = [*range(edge, split - length + 1, length), *range(first, total - length + 1, length)]
     return [_window(number, log, motion, dt, first, first + length, past, 0.0) for first in starts]

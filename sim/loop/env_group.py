@@ -63,8 +63,9 @@ class EnvGroup:
         self._table: Table | None = None
         self._sensed = untouched(pack.size, options.observed)
         self._pushes = Pushes(options, pack.size) if options.has_pushes else None
-        reads_base = options.robot.fixed_base or "base_state" in options.load_engine().capabilities
-        self._observes_natively = reads_base and not self._sensed and self._pushes is None
+        reads_base = "base_state" in options.load_engine().capabilities and pack.spec.mjcf is None
+        observed = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
+        self._observes_natively = observed and not self._sensed and self._pushes is None
         self._steps = 0
         collides, ground = options.collisions, options.robot.has_ground
         self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
@@ -197,7 +198,8 @@ class EnvGroup:
                 command = ticks[tick].command.with_only(given)
             _, done = self._execute(command, Span(tick, done, tick + 1, substeps), None)
         with np.errstate(all="ignore"):
-            if not (near(self._qpos) and finite(self.pack.read_qvel()) and self._base_is_near()):
+            strays = not self.pack.spec.is_alone and self.pack.strays().any()
+            if strays or not (near(self._qpos) and finite(self.pack.read_qvel())):
                 self._contain(self._qpos, substeps, None)
         if self._contacts is not None:
             self._contacts.look(self._qpos, self._steps + substeps, containment.missed_contact)
@@ -231,9 +233,6 @@ class EnvGroup:
             if ran.failed:
                 self._contain(rows(ran.before), ran.done, ran.outputs.returned)
         return ran.tick, ran.done
-
-    def _base_is_near(self) -> bool:
-        return self.pack.spec.fixed_base or near(self.pack.read_base())
 
     def _mask(self, array: Any) -> Any:
         return False if array is None else self._executor.rows(array)
@@ -330,9 +329,7 @@ class EnvGroup:
         """
         containment, step = self._containment, self._steps + done
         qpos, qvel = self.pack.read_qpos(), self.pack.read_qvel()
-        bad = far(qpos) | ~np.isfinite(qvel)
-        if not self.pack.spec.fixed_base:
-            bad |= far(self.pack.read_base()).any(1, keepdims=True)
+        bad = far(qpos) | ~np.isfinite(qvel) | self.pack.strays()[:, None]
         # One step after a NaN effort at one joint, all joints are NaN. The effort shows the first joint.
         failed = bad.any(1, keepdims=True)
         source = ~np.isfinite(self.pack.qf) & failed

@@ -7,6 +7,7 @@ group, so that its working set stays in the cache; nothing depends on how envs a
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,7 @@ class Loop:
             dissipation=robot.dissipation,
             fixed_base=robot.fixed_base,
             merge_fixed=robot.merge_fixed,
+            mjcf=options.mjcf,
             **options.values_for("scene"),
         )
         self._steps = 0
@@ -158,9 +160,9 @@ class Loop:
         """Return the number of values in the engine's state of each env."""
         return [size for group in self.groups for size in group.pack.state_sizes()]
 
-    def poses(self) -> list[NDArray[np.float32]]:
-        """Return the poses of the entities that ``build`` returned for each env, (entities, 7) each."""
-        return [rows for group in self.groups for rows in group.pack.read_poses()]
+    def poses(self, names: Sequence[str] | None = None) -> list[NDArray[Any]]:
+        """Return the poses of the entities that ``build`` returned for each env, or of bodies ``names``, (..., 7)."""
+        return [rows for group in self.groups for rows in group.pack.read_poses(names)]
 
     def close(self) -> None:
         """Free the scenes."""

@@ -27,8 +27,10 @@ MEMORY = 1 << 30
 BLOCK = 1 << 23
 NOT_WRITTEN = -1
 """Checksum of a row that is not written yet."""
-LOG_QUANTITIES = ("setpoint", "effort", "qpos", "qvel")
+LOG_QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos", "qvel")
 """Quantities of the columns of a log, QUANTITY:JOINT."""
+LOG_TIMES = ("time", "time_s", "time_ms", "time_us", "time_ns")
+"""Names of the column of the times."""
 READ_ATTEMPTS = 24
 """Attempts at metadata that a writer is changing. HDF5 makes 100 and doubles its pause, from 1 ns, after each."""
 
@@ -91,7 +93,7 @@ def _main() -> None:
         is_log = names is None
         if is_log:
             columns = [name for name in file if ":" in name and name.partition(":")[0].strip() in LOG_QUANTITIES]
-            names = [*(name for name in file if name.strip() == "time"), *columns]
+            names = [*(name for name in file if name.strip() in LOG_TIMES), *columns]
         datasets = {name: _open_dataset(file, name) for name in names if file.id.links.exists(name.encode())}
         if (total := sum(dataset.nbytes for dataset in datasets.values())) > max_bytes:
             raise ValueError(f"it holds {total:,} bytes, more than max_bytes={max_bytes:,}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -26,7 +26,7 @@ from batchpid.sim.robot.joint_rows import HEADERS, joint_rows
 from batchpid.sim.robot.link_masses import link_masses
 from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.parts import FileDefaults, Joint, LinkMass, Placement, Settings, Urdf
+from batchpid.sim.robot.parts import FileDefaults, Joint, LinkMass, MjcfFile, Placement, Settings, Urdf
 from batchpid.sim.robot.robot_tree import rigid_tree
 from batchpid.sim.robot.self_collision import SelfContact, Srdf
 from batchpid.sim.robot.self_contact import self_contact
@@ -79,8 +79,9 @@ class RobotDescription(Urdf):
 
     ``joints`` are the degrees of freedom, the moving joints of ``all_joints``. ``bodies`` is the placement of every
     link, by name, in its simulated link: links joined by fixed joints are simulated as one, unless ``merge_fixed`` is
-    False. ``settings`` come from a bundled robot, ``defaults`` from an MJCF file, else None. ``package_dirs`` are the
-    folders in which meshes are looked up first. ``actuators`` are its motors and sensors, None for ideal ones.
+    False. ``settings`` come from a bundled robot, ``defaults`` and ``mjcf`` from an MJCF file, else None.
+    ``package_dirs`` are the folders in which meshes are looked up first. ``actuators`` are its motors and sensors, None
+    for ideal ones.
     """
 
     path: Path
@@ -95,6 +96,7 @@ class RobotDescription(Urdf):
     package_dirs: tuple[Path, ...] = ()
     actuators: bp.Actuators | None = None
     defaults: FileDefaults | None = None
+    mjcf: MjcfFile | None = None
 
     def __repr__(self) -> str:
         given = sum(link.mass or 0.0 for link in self.links)
@@ -315,6 +317,7 @@ class RobotDescription(Urdf):
             "urdf": self._urdf_digest,
             "srdf": digest(self.srdf.disabled, self.srdf.enabled),
             "settings": digest(self.settings) if self.defaults is None else digest(self.defaults),
+            "mjcf": None if self.mjcf is None else digest(replace(self.mjcf, path="")),
             **{name: getattr(self, name) for name in ("self_collision", "dissipation", "fixed_base", "merge_fixed")},
         }
 

@@ -142,6 +142,27 @@ class FileDefaults:
     imax: Float64 | None = None
 
 
+@dataclass(frozen=True)
+class MjcfFile:
+    """MJCF file that MuJoCo simulates itself, with all that it holds besides the robot.
+
+    ``reading`` is the way in which it was read (:func:`batchpid.sim.robot.mjcf.mjcf_compiler.attempt`), ``content`` the
+    digest of what was read. ``bodies`` are the names of all bodies, ``falling`` those of bodies on free joints beside
+    the robot. ``loops`` are the equality constraints that close loops of the robot's links. ``is_alone`` is False if
+    more than the robot moves. ``has_floor`` is True if planes of the world can collide, unless the root is fixed to the
+    origin in place of its free joint.
+    """
+
+    path: str
+    reading: str
+    content: str
+    bodies: tuple[str, ...]
+    falling: tuple[str, ...] = ()
+    loops: tuple[str, ...] = ()
+    is_alone: bool = True
+    has_floor: bool = False
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Urdf:
     """URDF prepared for headless simulation.

@@ -110,6 +110,7 @@ class Robot(RobotDescription):
         if not isinstance(package_dirs, list | tuple):
             problem = "must be a list of folders"
             raise InvalidArgumentError("package_dirs", problem, value=package_dirs, remedy="pass a list of paths")
+        # Options are checked before a file is read, so that a wrong one is not hidden by a fault of the file.
         path = _find(name_or_path)
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
         root, repairs, mjcf = read_source(path, fixed_base is not False, missing_meshes)
@@ -122,6 +123,7 @@ class Robot(RobotDescription):
             urdf = replace(urdf, missing_meshes=(*mjcf.missing_meshes, *urdf.missing_meshes))
         if not any(joint.moves for joint in urdf.all_joints):
             raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
+        # From here on links mean bodies: those that fixed joints hold together are one.
         bodies = place_links(urdf.urdf, merge_fixed)
         if (count := len({at.link for at in bodies.values()})) > MAX_LINKS:
             problem = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
@@ -145,6 +147,7 @@ class Robot(RobotDescription):
             bodies=bodies,
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
             defaults=None if mjcf is None else _file_defaults(mjcf, joints),
+            mjcf=None if mjcf is None else mjcf.file,
         )
         if actuators is None and mjcf is not None:
             actuators = _file_actuators(mjcf, joints)

@@ -130,6 +130,7 @@ class OperationalSpace:
         self._params = params
         self._k, self._timestep = ts.discretise(params, 1 / 2000), 1 / 2000
         self._friction: Friction | None = None
+        # Damping and friction that the robot is known to have: the law acts against them.
         modelled, known = DISSIPATION[robot.dissipation].modelled, known_joints(robot)
         damping = known.viscous + np.array([joint.damping * modelled for joint in robot.joints])
         self._damping = damping[None] if damping.any() else None
@@ -137,6 +138,7 @@ class OperationalSpace:
         band = np.array([BAND[unit] for unit in robot.units])
         self._known_friction = Friction(coulomb[None], band[None]) if coulomb.any() else None
         chain = tree.chain(link)
+        # A setpoint has the pose (7), then the optional twist, acceleration and wrench (6 each), then single joints.
         self._columns = np.zeros(tree.dof, np.intp)  # of the setpoint, for each joint; 0 for none
         entries, self._parts = dict(POSE_UNITS), dict[str, slice]()
         for name, wanted in {"twist": twist, "acceleration": acceleration, "wrench": wrench}.items():

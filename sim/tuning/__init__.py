@@ -1,1 +1,79 @@
-"""Gains by simulation: moves to evaluate them on, their evaluation, and the search for them."""
+"""Gains by simulation: moves to evaluate them on, their evaluation, the search for them, and sweeps.
+
+Names are loaded when they are first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from batchpid.sim.tuning.engine_parity import compare_engines
+    from batchpid.sim.tuning.evaluation import (
+        Evaluation,
+        arm_joints,
+        evaluate_gains,
+        following_error,
+        run_moves,
+        step_response_metrics,
+    )
+    from batchpid.sim.tuning.gain_sets import GainSet, gain_set
+    from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
+    from batchpid.sim.tuning.randomization_presets import load_randomization, payload_capacity, usual_variation
+    from batchpid.sim.tuning.robot_survey import find_robots, survey
+    from batchpid.sim.tuning.search import Tuning, tune
+    from batchpid.sim.tuning.tool_search import ToolTuning, tune_tool
+    from batchpid.sim.tuning.weights import Weights
+
+__all__ = [
+    "Evaluation",
+    "GainSet",
+    "Moves",
+    "ToolTuning",
+    "Tuning",
+    "Weights",
+    "arm_joints",
+    "compare_engines",
+    "evaluate_gains",
+    "find_robots",
+    "following_error",
+    "gain_set",
+    "load_randomization",
+    "payload_capacity",
+    "random_moves",
+    "run_moves",
+    "search_moves",
+    "step_response_metrics",
+    "survey",
+    "tune",
+    "tune_tool",
+    "tutorial_move",
+    "usual_variation",
+]
+
+_MODULES = {
+    "engine_parity": ("compare_engines",),
+    "evaluation": (
+        "Evaluation",
+        "arm_joints",
+        "evaluate_gains",
+        "following_error",
+        "run_moves",
+        "step_response_metrics",
+    ),
+    "gain_sets": ("GainSet", "gain_set"),
+    "moves": ("Moves", "random_moves", "search_moves", "tutorial_move"),
+    "randomization_presets": ("load_randomization", "payload_capacity", "usual_variation"),
+    "robot_survey": ("find_robots", "survey"),
+    "search": ("Tuning", "tune"),
+    "tool_search": ("ToolTuning", "tune_tool"),
+    "weights": ("Weights",),
+}
+_HOMES = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'batchpid.sim.tuning' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"batchpid.sim.tuning.{_HOMES[name]}"), name)

@@ -145,7 +145,7 @@ def compare_engines(
 def _params(robot: Robot, params: bp.PIDParams | None) -> bp.PIDParams:
     if params is not None:
         return params
-    return robot.tuned() if robot.settings is not None else robot.designed()
+    return robot.tuned() if robot.has_tuned else robot.designed()
 
 
 def _dynamics(robot: Robot, seed: int) -> float:

@@ -98,7 +98,7 @@ def sweep(
     given |= {name: given[name](numbers) for name in PER_ENV if callable(given.get(name))}
     gains, *start, streams = (given.pop(name) for name in PER_ENV[:4])
     checked = RunnerOptions(robot, num_envs, **given)
-    gains = checked.check_params(default_params(robot, checked.control) if gains is None else gains)
+    gains = checked.check_params(default_params(robot, checked.control, checked.loops) if gains is None else gains)
     is_finite, shape = checked.on_invalid_input == "raise", (num_envs, robot.dof)
     if start[0] is None:
         start[0] = robot.start

@@ -224,14 +224,18 @@ class ReadStateSizes(Request):
 
 @dataclass(frozen=True)
 class ReadPoses(Request):
-    """Read the poses of the entities that ``build`` returned."""
+    """Read the poses of the entities that ``build`` returned, or of the bodies ``names`` of a file."""
 
+    names: tuple[str, ...] | None = None
     changes_loop = False
 
-    def apply(self, loop: Loop) -> list[NDArray[np.float32]]:
-        return loop.poses()
+    def for_envs(self, envs: slice) -> Self:
+        return self
 
-    def join(self, results: list[list[NDArray[np.float32]]]) -> list[NDArray[np.float32]]:
+    def apply(self, loop: Loop) -> list[NDArray[Any]]:
+        return loop.poses(self.names)
+
+    def join(self, results: list[list[NDArray[Any]]]) -> list[NDArray[Any]]:
         return [rows for poses in results for rows in poses]
 
 

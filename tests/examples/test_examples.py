@@ -14,13 +14,16 @@ from robots import load_bundled
 
 import batchpid as bp
 import batchpid.sim
-from batchpid.sim import Runner
+from batchpid.sim import Runner, read_recording
+from batchpid.sim.cli import main
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture
 def run(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(EXAMPLES)  # as Python does for a script: examples share a module
+
     def run(name, *arguments):
         monkeypatch.setattr(sys, "argv", [name, *arguments])
         runpy.run_path(str(EXAMPLES / name), run_name="__main__")
@@ -105,6 +108,22 @@ def test_the_integral_removes_the_error_of_an_uncompensated_drive(run, tmp_path)
     assert picture.stat().st_size > 10_000
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["torque", "servo", "velocity", "mit"])
+def test_the_motor_of_each_kind_of_controller_is_identified(run, tmp_path, kind):
+    (line,) = [each for each in run("real_logs.py", "--out", str(tmp_path)).splitlines() if f"{kind}." in each]
+    words = [*line.split()[1:], "--workers", "0", "--out", str(tmp_path / "motors.yaml")]
+    assert not main(words)
+    module = runpy.run_path(str(EXAMPLES / "real_logs.py"))
+    found = bp.load_actuators(tmp_path / "motors.yaml", ("hinge",))[0]
+    for name, value, near in (
+        ("strength", module["STRENGTH"][kind], 0.01),
+        *((name, value, 0.03) for name, value in module["MOTOR"].items()),
+    ):
+        if (name, kind) != ("command_delay", "velocity"):  # nothing of it shows in measured efforts
+            assert getattr(found, name)[0, 0] == pytest.approx(value, rel=near)
+
+
 needs_training = pytest.mark.skipif(importlib.util.find_spec("optax") is None, reason="needs the extra [train]")
 SMALL = ("--num-envs", "4", "--workers", "0", "--episode", "5", "--steps", "8", "--updates", "2", "--minibatches", "2")
 
@@ -120,9 +139,21 @@ def test_a_short_training_ends_with_a_picture(run, tmp_path):
 
 
 @needs_training
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_compilation")
+def test_a_short_training_to_walk_ends_with_a_picture_and_a_recording(run, tmp_path):
+    pytest.importorskip("mujoco")
+    files = ("--picture", str(tmp_path / "curve.png"), "--record", str(tmp_path / "walk.h5"))
+    text = run("train_walk.py", *SMALL, "--epochs", "1", "--time", "0.2", "--evaluated", "4", *files)
+    assert "of 4 robots walk for 0.2 s" in text
+    assert (tmp_path / "curve.png").stat().st_size > 10_000
+    assert read_recording(tmp_path / "walk.h5").base_pose.shape == (10, 4, 7)
+
+
+@needs_training
 def test_the_advantages_of_the_training_are_those_of_the_definition():
     """The sum over later steps of the same episode, written out (arXiv:1506.02438, equation 16)."""
-    module = runpy.run_path(str(EXAMPLES / "train_reach.py"))
+    module = runpy.run_path(str(EXAMPLES / "ppo.py"))
     config, rng, steps = module["Config"](), np.random.default_rng(0), 7
     value, reward = rng.normal(size=(2, steps, 2)).astype(np.float32)
     done = rng.random((steps, 2)) < 0.3
@@ -138,6 +169,15 @@ def test_the_advantages_of_the_training_are_those_of_the_definition():
                 total += factor * delta[each, env]
                 factor *= config.discount * config.gae_lambda * (not done[each, env])
             assert found[step, env] == pytest.approx(total, rel=1e-4, abs=1e-5)
+
+
+@needs_training
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_the_trained_quadruped_walks(run):
+    share = re.search(r"exploration ([\d.]+)% of 32 robots walk for 10 s", run("train_walk.py"))
+    assert share is not None
+    assert float(share[1]) >= 95
 
 
 @needs_training

@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 
 from batchpid.errors import InvalidArgumentError, MissingDependencyError  # noqa: E402
 from batchpid.sim import RecoveryWarning, Robot, Runner  # noqa: E402
-from batchpid.sim.gym import PushVectorEnv, RobotEnv, RobotVectorEnv, ToolReachVectorEnv  # noqa: E402
+from batchpid.sim.gym import PushVectorEnv, RobotEnv, RobotVectorEnv, ToolReachVectorEnv, WalkVectorEnv  # noqa: E402
 from batchpid.sim.view import renderer  # noqa: E402
 from batchpid.task_space.frames import rotation_error  # noqa: E402
 from tests.sim.tiny_urdf import one_joint, write  # noqa: E402
@@ -418,7 +418,7 @@ class Still:
 
     def add_camera(self, width, height):
         self.size = height, width, 3
-        return lambda: np.full(self.size, 100 * (self.qpos[0, 0] + 1) + 10 * self.content[0], np.uint8)
+        return lambda: np.full(self.size, 100 * (self.qpos[0, 0] + 1) + 10 * self.content[0] + self.height, np.uint8)
 
     def add_content(self, build, env):
         self.content = np.full(7, np.nan)
@@ -426,8 +426,8 @@ class Still:
     def place_content(self, poses):
         self.content = poses[0]
 
-    def place(self, qpos):
-        self.qpos = qpos
+    def place(self, qpos, base_pose):
+        self.qpos, self.height = qpos, 0.0 if base_pose is None else 40 * base_pose[0, 2]
 
 
 def test_pictures_show_each_env(hinge, monkeypatch):
@@ -447,6 +447,10 @@ def test_pictures_show_each_env(hinge, monkeypatch):
     pushes.reset(seed=0)
     assert pushes.render()[0][0, 0, 0] == 104  # the box is at x = 0.49 m
     pushes.close()
+    walkers = WalkVectorEnv(1, workers=0, render_mode="rgb_array")
+    walkers.runner.reset(base_pose=[0, 0, 1.0, 1, 0, 0, 0])
+    assert walkers.render()[0][0, 0, 0] == 140
+    walkers.close()
 
 
 def test_pictures_of_a_box_where_sapien_renders():

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.sim.engine.link_reach import LinkExtent, closing_arms, link_reach
-from batchpid.sim.engine.mujoco.model_builder import RobotMj
+from batchpid.sim.engine.mujoco.model_builder import FLOATING, RobotMj
 from batchpid.sim.engine.native.interface import Clearance
 
 Arrays = dict[str, NDArray[Any]]
@@ -42,9 +42,15 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
     """Return the tables of shapes and pairs for ``Clearance`` in ``clearance.h``, the same for every robot.
 
     None if collision detection is never skipped: the model has no pair of shapes that may touch, or a kind of shape
-    that is not supported, or the fields to change are not found in this version of MuJoCo.
+    that is not supported, or the fields to change are not found in this version of MuJoCo. The same for a file with
+    bodies that move beside the robot, pairs or margins of its own, or flexible bodies.
     """
     model = robot.model
+    moves = len(robot.qvel) + (0 if robot.base is None else FLOATING)
+    special = model.npair or model.nflex or model.geom_margin.any()
+    special |= int(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT))
+    if special or model.nv > moves or robot.base not in (None, (0, 0)):
+        return None
     pairs = touching_pairs(model) if places() is not None else np.empty((0, 2))
     if not len(pairs) or not set(model.geom_type.tolist()) <= _KINDS:
         return None

@@ -54,7 +54,7 @@ class DataPool:
                 for model, each, row in zip(self._user.models, self._taken, self._user.rows, strict=True):
                     mujoco.mj_getState(model, each, row, STATE)
             self._user, self._taken = user, self._new(len(user.rows))
-            sound = np.all(np.abs(user.rows[:, POSITIONS + self.robot.qpos]) <= FARTHEST, axis=1)
+            sound = np.all(np.abs(user.rows[:, POSITIONS : POSITIONS + self.robot.model.nq]) <= FARTHEST, axis=1)
             for model, each, row, finite in zip(user.models, self._taken, user.rows, sound.tolist(), strict=True):
                 mujoco.mj_setState(model, each, row, STATE)
                 if finite:

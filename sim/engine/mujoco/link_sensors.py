@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -25,19 +25,30 @@ def contact_bodies(spec: SceneSpec) -> list[str]:
     return [bodies[link].link for link in spec.contacts or ()]
 
 
-def add_link_sensors(scene: Any, spec: SceneSpec, names: dict[str, str]) -> None:
-    """Add sensors for the links of ``spec.contacts`` and ``spec.wrenches``; ``names`` are the bodies of the links."""
+def add_link_sensors(scene: Any, spec: SceneSpec, names: dict[str, str], frames: Mapping[str, Any]) -> None:
+    """Add sensors for the links of ``spec.contacts`` and ``spec.wrenches``.
+
+    ``names`` are the bodies of the links, ``frames`` frames of links in their bodies, where these differ.
+    """
     kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
     for link in dict.fromkeys(contact_bodies(spec)):
-        body = scene.body(names[link])
-        for part in (body, *(child for child in body.bodies if child.name not in names.values())):
+        for part in _parts(scene.body(names[link]), {*names.values()}):
             sensor = scene.add_sensor(type=kinds.mjSENS_CONTACT, objtype=objects.mjOBJ_BODY, objname=part.name)
             sensor.intprm[:3] = _FOUND_AND_FORCE, _NET_FORCE, 1
     for link in spec.wrenches or ():
         site = f"{link} (wrench)"
-        scene.body(names[link]).add_site(name=site)
+        place = {} if (frame := frames.get(link)) is None else {"pos": frame.position, "quat": frame.wxyz}
+        scene.body(names[link]).add_site(name=site, **place)
         for kind in (kinds.mjSENS_FORCE, kinds.mjSENS_TORQUE):
             scene.add_sensor(type=kind, objtype=objects.mjOBJ_SITE, objname=site)
+
+
+def _parts(body: Any, others: set[str]) -> Iterator[Any]:
+    """Yield the body of a link, and those below it that belong to it: they are not among the ``others``."""
+    yield body
+    for child in body.bodies:
+        if child.name not in others:
+            yield from _parts(child, others)
 
 
 class LinkSensors:
@@ -45,7 +56,9 @@ class LinkSensors:
 
     def __init__(self, spec: SceneSpec, model: Any, bodies: dict[str, int]) -> None:
         ids = model.sensor_objid[model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT]
-        owners = [body if body in bodies.values() else model.body_parentid[body] for body in ids.tolist()]
+        owners = ids.copy()
+        while (lower := ~np.isin(owners, [*bodies.values()])).any():
+            owners[lower] = model.body_parentid[owners[lower]]
         self._rows: Sequence[Any] = [np.flatnonzero(np.equal(owners, bodies[link])) for link in contact_bodies(spec)]
         self._contacts, self._wrenches, self.size = len(owners), len(spec.wrenches or ()), int(model.nsensordata)
 

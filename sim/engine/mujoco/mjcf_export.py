@@ -90,6 +90,7 @@ def to_mjcf(
         merge_fixed=robot.merge_fixed,
         engine="mujoco",
     )
+    # The bodies are those that the engine simulates; inertias and efforts are then written with all their digits.
     inertias = body_inertias(spec.urdf, spec.merge_fixed)
     scene, names = robot_spec(spec, inertias)
     scene.modelname, scene.option.disableflags = robot.name, 0
@@ -101,6 +102,7 @@ def to_mjcf(
     for at in np.flatnonzero(np.isfinite(motors.effort_range).any(1)):
         joint = scene.joint(robot.joint_names[at])
         joint.actfrclimited, joint.actfrcrange = True, np.clip(motors.effort_range[at], -FAR, FAR)
+    # Compiled twice: once to find what the robot lacks, and again with the actuators, whose keyframe needs their sizes.
     try:
         scene.compile()
         root = _exact(scene)
@@ -180,7 +182,9 @@ def _add_keyframe(root: Any, model: Any, robot: RobotDescription, motors: MjcfAc
 
 
 def _compare(found: Drive, robot: RobotDescription, friction: Any) -> None:
-    """Add the differences of MuJoCo's friction and constraints."""
+    """Add the differences of MuJoCo's friction and constraints, and from an MJCF file that the robot is from."""
+    if robot.mjcf is not None:
+        found.append("scene: the robot alone, without objects, tendons, springs and equalities of its MJCF file")
     if friction.coulomb is not None and np.any(friction.coulomb):
         found.append("friction: a soft constraint in MuJoCo, in which a joint creeps below its friction")
     if names := [robot.joint_names[joint] for joint in robot.coupling.followers]:

@@ -6,12 +6,15 @@ with another body in part has one body without mass for each link with shapes, s
 
 MuJoCo does not compute damping and Coulomb friction: the loop applies them as efforts, in the same way for every
 engine, with the damping's share dt d in the armature, which makes it implicit (:mod:`batchpid.motors.friction`).
+
+A robot of an MJCF file is the file's model (:mod:`batchpid.sim.engine.mujoco.file_scene`), in which MuJoCo computes the
+damping of the file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import combinations, count, product
 from typing import Any
@@ -22,12 +25,13 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from batchpid.errors import RobotError
+from batchpid.sim.engine.mujoco.file_scene import BodyFrame, file_scene, set_ground
 from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
 from batchpid.sim.engine.mujoco.solver import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import add_geom, link_shapes
 from batchpid.sim.robot.dissipation import CONTACT_FRICTION
-from batchpid.sim.robot.parts import MOVING_TYPES
+from batchpid.sim.robot.parts import MOVING_TYPES, MjcfFile
 from batchpid.sim.robot.simulated_links import body_inertias, simulated
 from batchpid.sim.robot.xml import numbers
 from batchpid.task_space.rotations import from_rpy
@@ -41,6 +45,8 @@ _NARROWEST = 1e-9
 """Smallest range of a limited joint [rad or m]: MuJoCo requires a positive one."""
 _HARD = (0.99, 0.999, 1e-4, 0.5, 2.0)
 """Impedance of joint limits (MuJoCo's solimp): nearly all of the acceleration that violates a limit is cancelled."""
+_NOT_KEPT = sum(int(getattr(mujoco.mjtEnableBit, f"mjENBL_{name}", 0)) for name in ("SLEEP", "ENERGY", "FWDINV"))
+"""Parts that a file cannot enable: a snapshot does not hold what sleeps, and nobody reads the others."""
 _FARTHEST = 1e10
 """Limit in place of an infinite one on one side [rad or m]."""
 
@@ -57,6 +63,14 @@ class RobotMj:
     """Index of each joint in MuJoCo's qvel (dof,)."""
     bodies: dict[str, int]
     """Number of the body of each simulated link."""
+    own: Any = (0.0, 0.0)
+    """Armature and damping (2, dof) of the joints besides those of the description and of motors."""
+    frames: Mapping[str, BodyFrame] = field(default_factory=dict)
+    """Frames of simulated links in their bodies; of other links the frames are the same."""
+    base: tuple[int, int] | None = None
+    """Index of a floating base in MuJoCo's qpos and qvel; None on a fixed one."""
+    turn: NDArray[np.float64] = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    """Rotation (4,) of that body's axes in the root link."""
 
 
 @lru_cache(maxsize=8)
@@ -68,6 +82,8 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     RobotError
         MuJoCo's compiler refuses the description, or a mesh cannot be read.
     """
+    if spec.mjcf is not None:
+        return _file_model(spec, spec.mjcf, drives)
     inertias = body_inertias(spec.urdf, spec.merge_fixed)
     scene, names = robot_spec(spec, inertias)
     if drives:
@@ -80,9 +96,47 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     for link, body in bodies.items():  # the compiler refuses some inertias that both engines simulate
         model.body_inertia[body] = np.linalg.eigh(inertias[link].tensor)[0]
     mujoco.mj_setConst(model, mujoco.MjData(model))
+    return RobotMj(model, *_places(model, spec), bodies, base=None if spec.fixed_base else (0, 0))
+
+
+def _places(model: Any, spec: SceneSpec) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the indices of the joints in MuJoCo's qpos and qvel."""
     joints = [model.joint(joint.name) for joint in spec.joints]
     qpos, qvel = (np.array([getattr(joint, name)[0] for joint in joints]) for name in ("qposadr", "dofadr"))
-    return RobotMj(model, qpos, qvel, bodies)
+    return qpos, qvel
+
+
+def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
+    """Return the model of a file, with the damping of the robot's joints, and without their friction and motors."""
+    found = file_scene(spec, file)
+    scene, off = found.scene, mujoco.mjtDisableBit
+    option = scene.option
+    option.disableflags &= ~(off.mjDSBL_GRAVITY | off.mjDSBL_ACTUATION | off.mjDSBL_CLAMPCTRL)
+    option.enableflags &= ~(_NOT_KEPT)
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    _set_options(scene, spec)
+    if not spec.collisions:
+        option.disableflags |= off.mjDSBL_CONTACT
+    set_ground(scene, spec.ground)
+    add_link_sensors(scene, spec, found.names, found.frames)
+    if drives:
+        _add_drives(scene, spec)
+    try:
+        model = scene.compile()
+    except ValueError as error:
+        problem = f"MuJoCo cannot compile it without its actuators: {' '.join(str(error).split())}"
+        raise RobotError(f"{file.path}: {problem}; remove what refers to them") from error
+    qpos, qvel = _places(model, spec)
+    armature, damping = found.own
+    model.dof_armature[qvel], model.dof_frictionloss[qvel] = np.maximum(armature, 0.0), 0.0
+    model.dof_damping[qvel] = np.maximum(damping + [joint.damping for joint in spec.joints], 0.0)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    base, turn = None, np.array([1.0, 0.0, 0.0, 0.0])
+    if found.root:
+        joint = model.joint(model.body(found.root).jntadr[0])
+        base, turn = (int(joint.qposadr[0]), int(joint.dofadr[0])), model.body(found.root).quat.copy()
+    bodies = {link: model.body(name).id for link, name in found.names.items()}
+    return RobotMj(model, qpos, qvel, bodies, found.own, found.frames, base, turn)
 
 
 def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[Any, dict[str, str]]:
@@ -92,13 +146,15 @@ def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[An
 
     Raises RobotError if MuJoCo refuses a part of the robot.
     """
-    scene = mujoco.MjSpec()
+    scene, off = mujoco.MjSpec(), mujoco.mjtDisableBit
     _set_options(scene, spec)
+    scene.option.disableflags |= off.mjDSBL_SPRING | off.mjDSBL_DAMPER
+    scene.compiler.fusestatic, scene.compiler.degree = False, False
     try:
         names = _add_links(scene, spec, inertias)
         if spec.collisions:
             _add_shapes(scene, spec, names)
-        add_link_sensors(scene, spec, names)
+        add_link_sensors(scene, spec, names, {})
     except ValueError as error:
         raise _refusal(error) from error
     return scene, names
@@ -130,8 +186,7 @@ def _set_options(scene: Any, spec: SceneSpec) -> None:
     option.iterations, option.tolerance = solver.iterations, solver.tolerance
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if solver.elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
     # A diverged env must stay visible: the loop suspends or resets it, and reports it.
-    option.disableflags |= off.mjDSBL_AUTORESET | off.mjDSBL_ACTUATION | off.mjDSBL_SPRING | off.mjDSBL_DAMPER
-    scene.compiler.fusestatic, scene.compiler.degree = False, False
+    option.disableflags |= off.mjDSBL_AUTORESET | off.mjDSBL_ACTUATION
 
 
 def _add_links(scene: Any, spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> dict[str, str]:
@@ -228,11 +283,16 @@ def _contact(spec: SceneSpec) -> dict[str, Any]:
     return {"friction": [CONTACT_FRICTION, 0.005, 0.0001], "solref": [spec.physics.contact_time, 1.0]}
 
 
-def set_inertia(model: Any, body: int, inertia: SpatialInertia) -> None:
-    """Give a body of a ``mujoco.MjModel`` this inertia, in the frame of the body; ``mj_setConst`` comes next."""
+def set_inertia(model: Any, robot: RobotMj, link: str, inertia: SpatialInertia) -> None:
+    """Give a simulated link in a ``mujoco.MjModel`` this inertia, in the link's frame; ``mj_setConst`` comes next."""
+    body, welded = robot.bodies[link], tuple[int, ...]()
+    if link in robot.frames:
+        position, turn, welded = robot.frames[link]
+        inertia = inertia.moved(position, turn)
     moments, wxyz = principal_inertia(inertia)
     model.body_mass[body], model.body_ipos[body] = inertia.mass, inertia.center
     model.body_iquat[body], model.body_inertia[body] = wxyz, moments
+    model.body_mass[[*welded]], model.body_inertia[[*welded]] = 0.0, 0.0
     # Without the compiler's shortcuts for centers of mass at the body's origin, and bodies that are moved by one joint.
     model.body_sameframe[body], model.body_simple[body] = 0, 0
     model.dof_simplenum[:] = 0

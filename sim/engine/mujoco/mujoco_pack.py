@@ -32,13 +32,14 @@ from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.simulated_links import varied_bodies
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.rotations import multiply, rotate
 from batchpid.task_space.spatial_inertia import spatial_matrix, total
 
 Float64 = NDArray[np.float64]
 
 _STATE = ("qpos", "qvel", "qacc_warmstart")
 """Fields of ``mujoco.MjData`` that a robot's later motion depends on, besides its efforts."""
-_JOINTS = ("dof_armature", "actuator_biasprm", "actuator_forcerange")
+_JOINTS = ("dof_armature", "dof_damping", "actuator_biasprm", "actuator_forcerange")
 """Fields of ``mujoco.MjModel`` that joints and drives change."""
 
 
@@ -79,10 +80,11 @@ class MujocoPack(SingleOwner):
         self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
         self.friction = own_friction(spec, self._variation)
         self.armature = self._motors = np.zeros((1, self.dof)) if varied.armature is None else varied.armature
-        self._implicit = spec.timestep * np.array([[joint.damping for joint in spec.joints]])
+        viscous = self.friction.viscous
+        self._implicit = spec.timestep * (np.zeros((1, self.dof)) if viscous is None else viscous)
         self._actuators: Actuators | None = None
         coupling, self._constraint = coupling_of(spec.joints), None
-        if not coupling.is_identity:
+        if not coupling.is_identity and spec.mjcf is None:  # else MuJoCo has the file's equalities
             self._constraint = ConstraintEfforts(size, coupling, np.zeros(self.dof, bool), spec.timestep)
             self._constraint.implicit[...] = self._implicit
             if self.steps_natively:
@@ -256,10 +258,24 @@ class MujocoPack(SingleOwner):
 
     def read_base(self) -> Float64:
         """Return pose and twist of floating bases (M, 13), as :class:`batchpid.sim.engine.protocol.EnginePack` says."""
-        rows = np.array([np.concatenate([data.qpos[: FLOATING + 1], data.qvel[:FLOATING]]) for data in self._data])
-        inverse = rows[:, 3:7] * [1.0, -1.0, -1.0, -1.0]
+        rows, turn = self._bases(), self._robot.turn
+        inverse = rows[:, 3:7] * _CONJUGATE
         rows[:, 10:] = turned_back(inverse, rows[:, 10:])  # MuJoCo's are in the body's axes
+        if turn[0] != 1.0:
+            rows[:, 3:7] = multiply(rows[:, 3:7], turn * _CONJUGATE)
         return rows
+
+    def _bases(self) -> Float64:
+        """Return pose and velocities of the bodies of floating bases (M, 13), angular ones in the body's axes."""
+        qpos, qvel = self._robot.base or (0, 0)
+        parts = slice(qpos, qpos + FLOATING + 1), slice(qvel, qvel + FLOATING)
+        return np.array([np.concatenate([data.qpos[parts[0]], data.qvel[parts[1]]]) for data in self._data])
+
+    def strays(self) -> NDArray[np.bool_]:
+        """Return the robots (M,) whose base, or an object beside it, is beyond :data:`FARTHEST` or not finite."""
+        if self._robot.model.nq == self.dof:
+            return np.zeros(self.size, bool)
+        return ~np.array([np.abs(data.qpos).max() <= FARTHEST for data in self._data])
 
     def take_sensed(self) -> dict[str, Float64]:
         """Return the sums of the links' sensors since the last call, as EnginePack says, and begin again."""
@@ -271,30 +287,37 @@ class MujocoPack(SingleOwner):
         """Return gravity and the rate at which floating bases turn, in their own axes (M, 6); None for fixed ones."""
         if self.spec.fixed_base:
             return None
-        rows = np.array([np.concatenate([data.qpos[3:7], data.qvel[3:FLOATING]]) for data in self._data])
-        return np.concatenate([turned_back(rows[:, :4], np.array(self.spec.gravity)), rows[:, 4:]], axis=1)
+        rows, turn = self._bases(), self._robot.turn
+        parts = turned_back(rows[:, 3:7], np.array(self.spec.gravity)), rows[:, 10:]
+        return np.concatenate([rotate(turn, part) for part in parts], axis=1)
 
     def push(self, rows: Sequence[int], twists: Float64) -> None:
         """Add ``twists`` (len(rows), 6) to the twists of floating bases, as :meth:`read_base` has them."""
-        data, turns = self._data, matrix_of(self.read_base()[rows, 3:7])
+        data, turns = self._data, matrix_of(self._bases()[rows, 3:7])
+        _, at = self._robot.base or (0, 0)
         for row, twist, turn in zip(rows, twists, turns, strict=True):
-            data[row].qvel[:3] += twist[:3]
-            data[row].qvel[3:FLOATING] += turn.T @ twist[3:]
+            data[row].qvel[at : at + 3] += twist[:3]
+            data[row].qvel[at + 3 : at + FLOATING] += turn.T @ twist[3:]
         self._evaluate(rows)
 
     def write_state(
         self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], base: Float64 | None = None
     ) -> None:
         """Place robots ``rows``: positions and velocities (len(rows), dof), zero efforts, the root at ``base``."""
-        everyone, floats = self._data, not self.spec.fixed_base
+        everyone, floats = self._data, self._robot.base is not None
         bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else base.copy()
+        at, moves = self._robot.base or (0, 0)
+        if self._robot.turn[0] != 1.0:
+            bases[:, 3:7] = multiply(bases[:, 3:7], self._robot.turn)
         bases[:, 10:] = np.einsum("eji,ej->ei", matrix_of(bases[:, 3:7]), bases[:, 10:])
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
             data = everyone[row]
             ctrl = data.ctrl.copy()
             mujoco.mj_resetData(self.models[row], data)
+            if self.models[row].nkey:
+                mujoco.mj_resetDataKeyframe(self.models[row], data, 0)
             if floats:
-                data.qpos[: FLOATING + 1], data.qvel[:FLOATING] = np.split(root, [FLOATING + 1])
+                data.qpos[at : at + FLOATING + 1], data.qvel[moves : moves + FLOATING] = np.split(root, [FLOATING + 1])
             data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = position, velocity
             data.ctrl[:] = ctrl
             self.qf[row] = 0.0
@@ -316,12 +339,17 @@ class MujocoPack(SingleOwner):
         self._implicit = self.armature + self.spec.timestep * (0.0 if viscous is None else viscous)
         if self._constraint is not None:
             self._constraint.implicit[...] = self._implicit
-        values = np.broadcast_to(self._implicit, self.qf.shape)
+        armature, damping = self._robot.own
+        values = {"dof_armature": np.maximum(armature + self._implicit, 0.0)}
+        if self.spec.mjcf is not None and self._variation.damping is not None:
+            values["dof_damping"] = np.maximum(damping + self._variation.damping, 0.0)
+        tables = {name: np.broadcast_to(table, self.qf.shape) for name, table in values.items()}
         for row in range(self.size) if rows is None else rows:
-            if not np.array_equal(self.models[row].dof_armature[self._robot.qvel], values[row]):
-                model = self._own_model(row)
-                model.dof_armature[self._robot.qvel] = values[row]
-                mujoco.mj_setConst(model, self._scratch)
+            for name, table in tables.items():
+                if not np.array_equal(getattr(self.models[row], name)[self._robot.qvel], table[row]):
+                    model = self._own_model(row)
+                    getattr(model, name)[self._robot.qvel] = table[row]
+                    mujoco.mj_setConst(model, self._scratch)
         self._share()
 
     def _share(self) -> None:
@@ -361,7 +389,7 @@ class MujocoPack(SingleOwner):
             if gravity is not None:
                 model.opt.gravity[:] = gravity[row]
             if friction is not None:
-                model.geom_friction[:, 0] = friction[row]
+                model.geom_friction[:, 0] = model.pair_friction[:, :2] = friction[row]
 
     def _change_masses(self, rows: Iterable[int]) -> None:
         if not self._masses_vary:
@@ -370,7 +398,7 @@ class MujocoPack(SingleOwner):
             model = self._own_model(row)
             for name, body in self._bodies.items():
                 inertia = varied_inertia(body, self._variation, row)
-                set_inertia(model, self._robot.bodies[name], inertia)
+                set_inertia(model, self._robot, name, inertia)
                 self._added[name][row] = spatial_matrix(inertia) - spatial_matrix(self._nominal[name])
             mujoco.mj_setConst(model, self._scratch)
         if "_joint_model" in self.__dict__:
@@ -433,9 +461,10 @@ class MujocoPack(SingleOwner):
                 begin += len(field)
         self._update(range(self.size))
 
-    def read_poses(self) -> list[NDArray[np.float32]]:
-        """Return an empty list: the scenes have no content besides the robots."""
-        return []
+    def read_poses(self, names: Sequence[str] | None = None) -> list[NDArray[Any]]:
+        """Return the poses of bodies of the file, by name, in each env (names, 7)."""
+        numbers = [self._robot.model.body(name).id for name in names or ()]
+        return [np.hstack([data.xpos[numbers], data.xquat[numbers]]) for data in self._data]
 
     def close(self) -> None:
         """Free the robots. The pack cannot be used afterwards."""
@@ -451,6 +480,7 @@ class MujocoPack(SingleOwner):
 
 
 _ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def _columns(indices: NDArray[np.intp]) -> Any:

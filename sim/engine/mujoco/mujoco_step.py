@@ -20,6 +20,7 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import Group, Mujoco
+from batchpid.task_space.spatial_inertia import rotation_matrix
 
 FUNCTIONS = {
     "step1": "mj_step1",
@@ -114,11 +115,12 @@ class MujocoStep:
         }
         arrays: dict[str, NDArray[Any]] = {name: np.array(rows, np.uint64) for name, rows in tables.items()}
         arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64), "qf": qf}
-        arrays["sensed"] = sensed
+        arrays |= {"turn": np.ascontiguousarray(rotation_matrix(robot.turn)), "sensed": sensed}
         if drives is not None:
             arrays |= zip(("stiffness", "rate_gain"), drives, strict=True)
         robots = Mujoco(**addresses, **{name: array.ctypes.data for name, array in arrays.items()})
         robots.sensor_size = sensed.shape[1]
+        robots.base_qpos, robots.base_qvel = robot.base or (0, 0)
         robots.clearance = None if clearance is None else clearance.address
         limit = None if speed_limit is None else np.broadcast_to(speed_limit, qf.shape[1:]).astype(np.float64)
         self._group = Group(

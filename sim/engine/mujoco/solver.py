@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class MujocoSolver:
-    """Settings of MuJoCo's constraint solver, which acts on contacts and joint limits alone.
+    """Settings of MuJoCo's constraint solver, which acts on contacts and joint limits, and on constraints of a file.
 
     The integrator is always semi-implicit Euler, as PhysX's is. See "Computation" in MuJoCo's documentation.
     """
@@ -19,7 +19,8 @@ class MujocoSolver:
     elliptic: bool = True
     """Whether friction cones are elliptic, not pyramids, which are faster and slip a little."""
     limit_time: float = 0.0
-    """Time constant of joint limits [s]; at least two sim steps, which are the hardest limits that MuJoCo simulates."""
+    """Time constant of joint limits [s]; at least two sim steps, which are the hardest limits that MuJoCo simulates.
+    An MJCF file has time constants of its own, for contacts too."""
     contact_time: float = 0.005
     """Time constant of contacts [s], at least two sim steps."""
 

@@ -188,8 +188,8 @@ inline void turn_back(double const *q, double const *v, double *out) {
 inline bool write_base_states(Group const &group, double *pose, double *twist) {
   bool near = true;
   for (std::int64_t row = 0; row < group.robots; ++row, pose += 7, twist += 6) {
-    double const *qvel = group.mujoco->qvel[row];
-    std::copy_n(group.mujoco->qpos[row], 7, pose);
+    double const *qvel = group.mujoco->qvel[row] + group.mujoco->base_qvel;
+    std::copy_n(group.mujoco->qpos[row] + group.mujoco->base_qpos, 7, pose);
     std::copy_n(qvel, 3, twist);
     double const back[4] = {pose[3], -pose[4], -pose[5], -pose[6]};
     turn_back(back, qvel + 3, twist + 3);
@@ -204,8 +204,8 @@ inline void write_bases(Group const &group, double const *gravity, double *out) 
   for (std::int64_t row = 0; row < group.robots; ++row, out += BASE_SIZE) {
     double q[4], turning[3];
     if (group.mujoco != nullptr) {
-      std::copy_n(group.mujoco->qpos[row] + 3, 4, q);
-      std::copy_n(group.mujoco->qvel[row] + 3, 3, turning);
+      std::copy_n(group.mujoco->qpos[row] + group.mujoco->base_qpos + 3, 4, q);
+      std::copy_n(group.mujoco->qvel[row] + group.mujoco->base_qvel + 3, 3, turning);
     } else {
       Functions const &call = group.gateway->functions;
       Articulation *robot = group.gateway->robots[static_cast<std::size_t>(row)];
@@ -215,8 +215,16 @@ inline void write_bases(Group const &group, double const *gravity, double *out) 
       double const world[3] = {rate.x, rate.y, rate.z};
       turn_back(q, world, turning);
     }
-    turn_back(q, gravity, out);
-    std::copy_n(turning, 3, out + 3);
+    double own[3];
+    turn_back(q, gravity, own);
+    double const *const turn = group.mujoco == nullptr ? nullptr : group.mujoco->turn;
+    for (int i = 0; i < 3; ++i) {
+      auto const in_link = [&](double const *v) {
+        return turn == nullptr ? v[i] : turn[3 * i] * v[0] + turn[3 * i + 1] * v[1] + turn[3 * i + 2] * v[2];
+      };
+      out[i] = in_link(own);
+      out[3 + i] = in_link(turning);
+    }
   }
 }
 

@@ -23,6 +23,7 @@ from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
+from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native.library import obstacle
 from batchpid.sim.engine.native_model import NativeModel, passive_force_of
 from batchpid.sim.engine.robot_model import turned_back
@@ -223,6 +224,12 @@ class Pack(SingleOwner):
         if self._constraint is None:
             self._calls.write_qf()
 
+    def strays(self) -> NDArray[np.bool_]:
+        """Return the robots (M,) whose floating base is not finite or beyond FARTHEST."""
+        if self.spec.fixed_base:
+            return np.zeros(self.size, bool)
+        return np.array(~(np.abs(self.read_base()) <= FARTHEST).all(1))
+
     def read_base(self) -> Float64:
         roots = np.array([read_root(robot) for robot in self.robots], np.float64)
         return self._moved_to_origin(range(self.size), roots, -1.0)
@@ -327,7 +334,7 @@ class Pack(SingleOwner):
         self._suspended = mask.copy()
         self._bind()
 
-    def read_poses(self) -> list[Float32]:
+    def read_poses(self, names: Sequence[str] | None = None) -> list[Float32]:
         """Return the poses of each scene's watched entities, (watched, 7) each."""
         return [content.poses() for content in self._contents]
 

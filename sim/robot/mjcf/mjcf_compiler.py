@@ -26,31 +26,32 @@ _CHECKED = (".stl", ".obj")
 """Formats of meshes that :func:`mesh_problem` and MuJoCo both read."""
 
 
-class _Attempt(NamedTuple):
+class Attempt(NamedTuple):
     """Model of a file, or None with MuJoCo's reason; collision meshes whose geoms are left out, with the reason.
 
-    ``weighing`` are the bodies whose mass depends on a geom that is left out, each with the mesh.
+    ``scene`` is the ``mujoco.MjSpec`` that was compiled, ``reading`` the way in which the file was read. ``weighing``
+    are the bodies whose mass depends on a geom that is left out, each with the mesh.
     """
 
-    model: Any | None
+    scene: Any
+    model: Any
+    reading: str
     missing: tuple[str, ...] = ()
     weighing: tuple[tuple[str, str], ...] = ()
     problem: str = ""
 
 
-def compile_file(
-    path: Path, fixed_base: bool, missing_meshes: str, findings: list[Finding]
-) -> tuple[Any, tuple[str, ...]]:
-    """Return the compiled model of a file, and the collision meshes that it is without.
+def compile_file(path: Path, fixed_base: bool, missing_meshes: str, findings: list[Finding]) -> Attempt:
+    """Return the compiled model of a file, with the collision meshes that it is without.
 
     Raises RobotError if MuJoCo refuses the file, a missing mesh has an unknown mass, or missing meshes are refused.
     """
-    first = _attempt(path, fixed_base, _unreadable)  # without geoms that are only drawn: their meshes take time to read
+    first = attempt(path, fixed_base, "unreadable")  # without geoms that are only drawn: their meshes take time to read
     if first.model is not None and not first.missing and not first.weighing:
-        return first.model, ()
-    whole = _attempt(path, fixed_base)  # something may refer to a removed geom, and a missing file be elsewhere
+        return first
+    whole = attempt(path, fixed_base, "whole")  # something may refer to a removed geom, and a missing file be elsewhere
     if whole.model is not None:
-        return whole.model, ()
+        return whole
     best = next(
         (each for each in _attempts(path, fixed_base, first, whole.problem) if each.model is not None or each.weighing),
         whole,
@@ -69,30 +70,32 @@ def compile_file(
     if names:
         text = f"collision meshes not found or not readable, simulated without: {names}"
         findings.append(Finding("warning", "missing-mesh", text, "put the files where the MJCF names them"))
-    return best.model, best.missing
+    return best
 
 
-def _attempts(path: Path, fixed_base: bool, first: _Attempt, problem: str) -> Iterator[_Attempt]:
+def _attempts(path: Path, fixed_base: bool, first: Attempt, problem: str) -> Iterator[Attempt]:
     """Yield compilations without missing meshes, then, if MuJoCo's problem is a mesh, without damaged ones."""
     yield first
-    yield _attempt(path, fixed_base, _unreadable, keeps_drawn=True)
+    yield attempt(path, fixed_base, "unreadable, drawn")
     if re.search("stl|obj|mesh|vert|face", problem, re.IGNORECASE):
-        yield _attempt(path, fixed_base, _damaged)
-        yield _attempt(path, fixed_base, _damaged, keeps_drawn=True)
+        yield attempt(path, fixed_base, "damaged")
+        yield attempt(path, fixed_base, "damaged, drawn")
 
 
-def _attempt(
-    path: Path, fixed_base: bool, problem_of: Callable[[Path], str | None] | None = None, keeps_drawn: bool = False
-) -> _Attempt:
-    """Return a compilation without the geoms of meshes that have a problem; of the whole file by default."""
+def attempt(path: Path, fixed_base: bool, reading: str) -> Attempt:
+    """Return a compilation of the "whole" file, or without the geoms of meshes that are "unreadable" or "damaged".
+
+    The latter is also without the geoms that are only drawn, unless ``reading`` ends with "drawn".
+    """
     left_out: tuple[Any, Any] = (), ()
+    problem_of, scene = {"unreadable": _unreadable, "damaged": _damaged}.get(reading.split(",")[0]), None
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        scene = mujoco.MjSpec.from_file(str(path))
         if problem_of is not None:
-            left_out = _strip(spec, path, fixed_base, problem_of, keeps_drawn)
-        return _Attempt(spec.compile(), *left_out)
+            left_out = _strip(scene, path, fixed_base, problem_of, reading.endswith("drawn"))
+        return Attempt(scene, scene.compile(), reading, *left_out)
     except _ERRORS as error:
-        return _Attempt(None, *left_out, " ".join(str(error).split()))
+        return Attempt(scene, None, reading, *left_out, " ".join(str(error).split()))
 
 
 def _strip(

@@ -17,7 +17,7 @@ import numpy as np
 
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.mjcf.mjcf_laws import Line, input_range, is_motor, line_of, servo_of, setpoint_range, unread
-from batchpid.sim.robot.mjcf.mjcf_names import Names, label
+from batchpid.sim.robot.mjcf.mjcf_names import ALONE, Names, label
 
 Couplings = dict[str, tuple[str, float, float]]
 """Leader, multiplier and offset of each follower, as in ``<mimic>``."""
@@ -62,24 +62,21 @@ def read_couplings(model: Any, names: Names, findings: list[Finding]) -> Couplin
         offset, multiplier, *higher = model.eq_data[equality, :5].tolist()
         problem = None
         if leader >= 0 and leader not in names.joints:
-            problem = f"an equality that couples the joint to {label(model.joint(leader))} is not simulated"
+            problem = f"{ALONE} an equality that couples the joint to {label(model.joint(leader))}"
         elif leader < 0:
-            problem = "an equality that holds the joint at a position is not simulated"
+            problem = f"{ALONE} an equality that holds the joint at a position"
         elif any(higher) or multiplier == 0:
-            problem = f"an equality that couples the joint to {names.joints[leader]!r} nonlinearly is not simulated"
+            problem = f"{ALONE} an equality that couples the joint to {names.joints[leader]!r} nonlinearly"
         elif name in couplings:
-            problem = "of several equalities of the joint the first is simulated"
+            problem = f"{ALONE} the second of several equalities of the joint"
         if problem is not None:
             findings.append(Finding("warning", "mimic", problem, "give the joint a setpoint of its own", name))
             continue
         rest, rest_of_leader = (float(model.qpos0[model.jnt_qposadr[joint]]) for joint in (follower, leader))
         couplings[name] = names.joints[leader], multiplier, rest + offset - multiplier * rest_of_leader
     if others:
-        listed = ", ".join(others)
-        text = (
-            f"equality constraints other than of the robot's joints are not simulated: {listed}; links move as a tree"
-        )
-        findings.append(Finding("warning", "equality", text, "expect closed loops to be open"))
+        text = f"{ALONE} equality constraints other than of the robot's joints: {', '.join(others)}"
+        findings.append(Finding("warning", "equality", text, "in SAPIEN expect closed loops to be open"))
     if inactive := [label(model.equality(int(equality))) for equality in np.flatnonzero(model.eq_active0 == 0)]:
         text = f"equality constraints that the file has switched off are left out: {', '.join(inactive)}"
         findings.append(Finding("note", "equality", text, "expect no effect"))
@@ -195,6 +192,22 @@ def _field(model: Any, name: str, index: int) -> float:
     return 0.0 if values is None else float(values[index])
 
 
+def roots_of_actuators(model: Any) -> set[int]:
+    """Return the bodies in the world that actuators move, or bodies below them."""
+    bodies: list[int] = []
+    for kind, target in zip(model.actuator_trntype.tolist(), model.actuator_trnid[:, 0].tolist(), strict=True):
+        if kind in (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT):
+            bodies.append(model.jnt_bodyid[target])
+        elif kind == _TRN.mjTRN_TENDON:
+            wraps = model.tendon_adr[target] + np.arange(model.tendon_num[target])
+            joints = wraps[model.wrap_type[wraps] == mujoco.mjtWrap.mjWRAP_JOINT]
+            sites = wraps[model.wrap_type[wraps] == mujoco.mjtWrap.mjWRAP_SITE]
+            bodies += [*model.jnt_bodyid[model.wrap_objid[joints]], *model.site_bodyid[model.wrap_objid[sites]]]
+        elif kind == _TRN.mjTRN_SITE:
+            bodies.append(model.site_bodyid[target])
+    return {int(model.body_rootid[body]) for body in bodies}
+
+
 def _arms(model: Any, actuator: int, names: Names) -> dict[str, float] | None:
     """Return the moment arms of an actuator on the joints that it acts on by a constant arm, by name; else None."""
     kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
@@ -257,9 +270,9 @@ def _tendons(model: Any) -> list[Finding]:
     idle = [tendon for tendon in range(model.ntendon) if tendon not in pulled and tendon not in acting]
     found = []
     if acting:
-        text = "springs, damping, friction, armature and limits of tendons are not simulated: "
+        text = f"{ALONE} springs, damping, friction, armature and limits of tendons: "
         text += ", ".join(label(model.tendon(tendon)) for tendon in acting)
-        found.append(Finding("warning", "tendon", text, "expect their joints to move freely"))
+        found.append(Finding("warning", "tendon", text, "in SAPIEN expect their joints to move freely"))
     if idle:
         text = f"tendons without an effect are left out: {', '.join(label(model.tendon(tendon)) for tendon in idle)}"
         found.append(Finding("note", "tendon", text, "expect no effect"))

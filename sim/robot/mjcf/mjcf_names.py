@@ -6,6 +6,8 @@ from typing import Any
 
 import mujoco
 
+ALONE = "engine 'mujoco' alone simulates"
+"""Beginning of what findings say of elements that have no equivalent in a URDF."""
 MOVING = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 """Types of joints with one degree of freedom."""
 
@@ -22,7 +24,8 @@ class Names:
     """
 
     def __init__(self, model: Any) -> None:
-        self._types, self._roots = model.jnt_type, model.body_rootid[model.jnt_bodyid]
+        self._types, self._bodies, self._roots = model.jnt_type, model.jnt_bodyid, model.body_rootid
+        self._left_out: set[int] = set()
         given = [model.body(body).name for body in range(1, model.nbody)]
         self._links, self._joints = {"world", *given}, {model.joint(joint).name for joint in range(model.njnt)}
         self.bodies = {0: "world"}
@@ -39,7 +42,12 @@ class Names:
 
     def leave_out(self, bodies: set[int]) -> None:
         """Remove the joints of ``bodies``, children of the world, and of the bodies below them."""
-        self.joints = {joint: name for joint, name in self.joints.items() if int(self._roots[joint]) not in bodies}
+        self._left_out = bodies
+        self.joints = {joint: name for joint, name in self.joints.items() if self.is_of_robot(self._bodies[joint])}
+
+    def is_of_robot(self, body: Any) -> bool:
+        """Return whether a body, the world included, is none of those that were left out, nor below one."""
+        return int(self._roots[body]) not in self._left_out
 
     def new_link(self, name: str) -> str:
         """Return ``name``, with a number if a link has it."""

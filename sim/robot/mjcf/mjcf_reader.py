@@ -9,20 +9,25 @@ import mujoco
 import numpy as np
 from lxml import etree
 
+from batchpid.arrays.digest import digest
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.mjcf.mjcf_compiler import compile_file
+from batchpid.sim.robot.mjcf.mjcf_compiler import Attempt, compile_file
 from batchpid.sim.robot.mjcf.mjcf_laws import plugin_name
 from batchpid.sim.robot.mjcf.mjcf_motors import Motors, read_couplings, read_motors
-from batchpid.sim.robot.mjcf.mjcf_names import Names
-from batchpid.sim.robot.mjcf.mjcf_shapes import excluded_pairs
+from batchpid.sim.robot.mjcf.mjcf_names import ALONE, Names, label
+from batchpid.sim.robot.mjcf.mjcf_shapes import PLANE, can_collide, excluded_pairs
 from batchpid.sim.robot.mjcf.mjcf_tree import Tree
+from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.self_collision import DisabledPair
 
 GRAVITY = (0.0, 0.0, -9.81)
+_EQ = mujoco.mjtEq
 _KEYFRAME = "home"
 """Keyframe with the start pose."""
-_FLAGS = ("GRAVITY", "CONTACT", "LIMIT", "EQUALITY", "FRICTIONLOSS", "DAMPER", "CONSTRAINT", "ACTUATION", "CLAMPCTRL")
-"""Parts of MuJoCo's physics that a file can disable, and that this package simulates nevertheless."""
+_FLAGS = ("CONTACT", "LIMIT", "EQUALITY", "FRICTIONLOSS", "DAMPER", "CONSTRAINT")
+"""Parts of MuJoCo's physics that a file can disable, and that SAPIEN simulates nevertheless."""
+_OURS = ("GRAVITY", "ACTUATION", "CLAMPCTRL")
+"""Parts that a file cannot disable in either engine."""
 
 
 class Mjcf(NamedTuple):
@@ -38,6 +43,7 @@ class Mjcf(NamedTuple):
     missing_meshes: tuple[str, ...]
     """Collision meshes that the robot is simulated without."""
     findings: tuple[Finding, ...]
+    file: MjcfFile
 
 
 def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> Mjcf:
@@ -47,18 +53,56 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> M
     ball joint or several robots, a missing mesh has an unknown mass, or missing meshes are refused.
     """
     findings: list[Finding] = []
-    model, missing = compile_file(path, fixed_base, missing_meshes, findings)
+    compiled = compile_file(path, fixed_base, missing_meshes, findings)
+    model, missing = compiled.model, compiled.missing
     names = Names(model)
     tree = Tree(model, names, path, fixed_base, findings)
     mimics = read_couplings(model, names, findings)
     motors = read_motors(model, names, mimics, findings)
     tree.write(motors, mimics)
     tree.root.set("name", name)
-    key = next((key for key in range(model.nkey) if model.key(key).name == _KEYFRAME), None)
+    key = home(model)
     findings += [*_in_radians(model, names), *_unused(model, names, key)]
     pose = model.qpos0 if key is None else model.key_qpos[key]
     start = {name: float(pose[model.jnt_qposadr[joint]]) for joint, name in names.joints.items()}
-    return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, missing, tuple(findings))
+    file = _file(path, compiled, names, fixed_base)
+    return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, missing, tuple(findings), file)
+
+
+def home(model: Any) -> int | None:
+    """Return the number of the keyframe with the start pose, None without one."""
+    return next((key for key in range(model.nkey) if model.key(key).name == _KEYFRAME), None)
+
+
+def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> MjcfFile:
+    """Return what the engine MuJoCo needs to know of the file."""
+    model, loops = compiled.model, []
+    for equality in np.flatnonzero(model.eq_active0):
+        at = [model.eq_obj1id[equality], model.eq_obj2id[equality]]
+        if int(model.eq_type[equality]) not in (_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD):
+            continue
+        if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
+            at = model.site_bodyid[at]
+        if all(names.is_of_robot(body) for body in at):
+            loops.append(label(model.equality(int(equality))))
+    free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    floats = any(names.is_of_robot(body) for body in free)
+    planes = np.flatnonzero((model.geom_bodyid == 0) & (model.geom_type == PLANE))
+    return MjcfFile(
+        path=str(path),
+        reading=compiled.reading,
+        content=content_of(compiled.scene),
+        bodies=tuple(names.bodies.values()),
+        falling=tuple(names.bodies[int(body)] for body in free if not names.is_of_robot(body)),
+        loops=tuple(loops),
+        is_alone=all(names.is_of_robot(body) for body in model.jnt_bodyid),
+        has_floor=any(can_collide(model, geom) for geom in planes) and not (floats and fixed_base),
+    )
+
+
+def content_of(scene: Any) -> str:
+    """Return the digest of a compiled ``mujoco.MjSpec``, the same on every machine."""
+    return digest(scene.to_xml())
 
 
 def _in_radians(model: Any, names: Names) -> list[Finding]:
@@ -82,28 +126,33 @@ def _unused(model: Any, names: Names, key: int | None) -> list[Finding]:
     if tuple(option.gravity) != GRAVITY:
         text = f"gravity {tuple(option.gravity.tolist())} of the file is not used: {GRAVITY} m/s^2 is"
         found.append(Finding("warning", "option", text, "expect other loads"))
-    if off := [name for name in _FLAGS if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}", 0)]:
-        text = f"<flag> of the file is not used, which disables: {', '.join(map(str.lower, off))}"
-        found.append(Finding("warning", "option", text, "expect all of these to act; remove them from the file"))
+    for where, flags in (("", _OURS), (" in SAPIEN", _FLAGS)):
+        if off := [name for name in flags if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}", 0)]:
+            text = f"<flag> of the file is not used{where}, which disables: {', '.join(map(str.lower, off))}"
+            found.append(Finding("warning", "option", text, "expect all of these to act; remove them from the file"))
+    if option.enableflags & int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)):
+        found.append(Finding("note", "option", "no body falls asleep, as the file has it", "expect slower steps"))
     if option.density or option.viscosity:
-        text = "drag of the medium (<option density= viscosity=>) is not simulated"
-        found.append(Finding("warning", "option", text, "expect less damping"))
+        text = f"{ALONE} drag of the medium (<option density= viscosity=>)"
+        found.append(Finding("warning", "option", text, "in SAPIEN expect less damping"))
     for joint, name in names.joints.items():
         if model.jnt_stiffness[joint] or np.any(getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[joint]):
-            text, remedy = "a spring acts on the joint in MuJoCo: it is not simulated", "add its effort in a controller"
+            text, remedy = f"{ALONE} the spring of the joint", "in SAPIEN add its effort in a controller"
             detail = f"{model.jnt_stiffness[joint]:g} {'N/m' if names.is_slide(joint) else 'N m/rad'}"
             found.append(Finding("warning", "spring", text, remedy, name, detail=detail))
         if np.any(getattr(model, "dof_dampingpoly", np.zeros((model.nv, 1)))[model.jnt_dofadr[joint]]):
-            text = "the damping grows with the speed in MuJoCo: the linear part alone is simulated"
+            text = f"{ALONE} damping that grows with the speed, SAPIEN its linear part"
             found.append(Finding("warning", "dynamics", text, "give the damping at the speeds of interest", name))
     for body in np.flatnonzero(model.body_gravcomp):
-        text = "gravity compensation of this body (gravcomp) is not simulated"
-        remedy = "keep the compensation of the controller on"
-        found.append(Finding("note", "gravcomp", text, remedy, link=names.bodies[int(body)]))
+        text, remedy = "gravity compensation of this body (gravcomp) is not simulated", "let the controller compensate"
+        if names.is_of_robot(body):
+            found.append(Finding("note", "gravcomp", text, remedy, link=names.bodies[int(body)]))
     for body in np.flatnonzero(model.body_plugin >= 0):
-        text = f"the plugin {plugin_name(model, model.body_plugin[body])!r} acts on the body: it is not simulated"
-        remedy = "expect the body to be rigid and to move freely"
+        text = f"{ALONE} the plugin {plugin_name(model, model.body_plugin[body])!r} of the body"
+        remedy = "in SAPIEN expect the body to be rigid and to move freely"
         found.append(Finding("warning", "unknown-element", text, remedy, link=names.bodies[int(body)]))
-    if model.nflex or model.nskin:
-        found.append(Finding("warning", "unknown-element", "flexible bodies are left out", "expect rigid links alone"))
+    if model.nflex:
+        found.append(Finding("warning", "unknown-element", f"{ALONE} flexible bodies", "in SAPIEN expect rigid links"))
+    if model.nskin:
+        found.append(Finding("note", "unknown-element", "skins are left out", "expect no effect"))
     return found

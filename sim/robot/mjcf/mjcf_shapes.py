@@ -21,7 +21,7 @@ from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.mjcf.mjcf_names import Names, label
+from batchpid.sim.robot.mjcf.mjcf_names import ALONE, Names, label
 from batchpid.sim.robot.self_collision import DisabledPair
 from batchpid.task_space.rotations import to_rpy
 
@@ -109,18 +109,18 @@ class ShapeWriter:
             self._plane(geom)
         if others:
             listed = ", ".join(label(self._model.geom(geom)) for geom in others)
-            text = f"shapes of the world beside a robot on a free joint are left out: {listed}"
-            self._found("warning", None, text, "add them with build= of Runner")
+            text = f"{ALONE} shapes of the world beside a robot on a free joint: {listed}"
+            self._found("warning", None, text, "in SAPIEN add them with build= of Runner")
 
     def _plane(self, geom: int) -> None:
         """Report a plane of the world, in place of which scenes have a ground."""
-        text = f"the plane {label(self._model.geom(geom))} of the file is left out"
+        text = f"{ALONE} the plane {label(self._model.geom(geom))} of the file"
         height, (_, x, y, _) = float(self._model.geom_pos[geom, 2]), self._model.geom_quat[geom]
         if height == 0 and x == y == 0:
-            self._found("note", None, text, "scenes have a ground at height 0")
+            self._found("note", None, text, "SAPIEN has a ground at height 0")
         else:
             remedy = (
-                "scenes have a ground at height 0 instead: add the plane with build= of Runner, or pass ground=False"
+                "SAPIEN has a ground at height 0 instead: add the plane with build= of Runner, or pass ground=False"
             )
             where = f"{text}, at height {height:g} m" if x == y == 0 else f"{text}, which is not level"
             self._found("warning", None, where, remedy)
@@ -141,14 +141,14 @@ class ShapeWriter:
                 self._files[mesh] = _write_mesh(*_hull(self._model, mesh))
             return etree.Element("mesh", filename=str(self._files[mesh]))
         if kind == _KIND.mjGEOM_ELLIPSOID:
-            text = "an ellipsoid collides as a polyhedron inscribed in it"
+            text = "an ellipsoid collides in SAPIEN as a polyhedron inscribed in it"
             self._found("note", body, text, "expect its surface up to 3 % of the radii farther inside")
             return etree.Element("mesh", filename=str(_write_mesh(*_ellipsoid(size))))
         if body == 0 and kind == PLANE:
             self._plane(geom)
         else:
             name = f"{'a plane' if kind == PLANE else 'a height field'} ({label(self._model.geom(geom))})"
-            self._found("warning", body, f"{name} is not a shape of a robot: left out", "add it with build= of Runner")
+            self._found("warning", body, f"{name} is a shape in MuJoCo alone", "in SAPIEN add it with build=")
         return None
 
     def _found(self, severity: str, body: int | None, text: str, remedy: str) -> None:

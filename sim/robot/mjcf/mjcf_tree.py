@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.link_repair import MOMENTS
-from batchpid.sim.robot.mjcf.mjcf_motors import Couplings, Motors
-from batchpid.sim.robot.mjcf.mjcf_names import Names
+from batchpid.sim.robot.mjcf.mjcf_motors import Couplings, Motors, roots_of_actuators
+from batchpid.sim.robot.mjcf.mjcf_names import ALONE, Names
 from batchpid.sim.robot.mjcf.mjcf_shapes import PLANE, ShapeWriter, can_collide, text_of
 from batchpid.task_space.rotations import about, multiply, rotate, to_rpy
 from batchpid.task_space.spatial_inertia import rotation_matrix
@@ -72,22 +72,28 @@ class Tree:
     def _find_base(self, fixed_base: bool) -> tuple[int, set[int]]:
         """Return the body of the root, 0 for the world, and the bodies directly in the world that are left out."""
         model, names = self._model, self._names.bodies
-        for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_BALL):
-            problem = f"the ball joint {model.joint(joint).name!r} has no single position to control"
-            of_body = names[int(model.jnt_bodyid[joint])]
-            raise RobotError(f"{self._path}: body {of_body!r}: {problem}; replace it by three hinges")
         tops = {body for body in range(1, model.nbody) if model.body_parentid[body] == 0}
-        free = {int(body) for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]}
+        free, balls = (
+            {int(root) for root in model.body_rootid[model.jnt_bodyid[model.jnt_type == kind]]}
+            for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
+        )
         moving = {int(model.body_rootid[model.jnt_bodyid[joint]]) for joint in self._names.joints}
+        if driven := moving & roots_of_actuators(model):
+            moving -= (moving & free) - driven
         floating = moving & free
         if len(floating) > 1 or (floating and moving - free):
             listed = ", ".join(repr(names[body]) for body in sorted(moving))
             raise RobotError(f"{self._path}: holds several robots, {listed}; leave one of them in the file")
         left_out = {body for body in tops if model.body_mocapid[body] >= 0} | (free - moving)
-        left_out |= tops - floating if floating else set()
+        left_out |= (tops - floating if floating else set()) | (balls - moving if moving else set())
+        for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_BALL):
+            of_body = int(model.jnt_bodyid[joint])
+            if model.body_rootid[of_body] not in left_out:
+                problem = f"the ball joint {model.joint(joint).name!r} has no single position to control"
+                raise RobotError(f"{self._path}: body {names[of_body]!r}: {problem}; replace it by three hinges")
         for body in sorted(left_out):
-            text = "is apart from the robot: left out"
-            self._findings.append(Finding("note", "loose-link", text, "add it with build= of Runner", link=names[body]))
+            text, remedy = f"is apart from the robot: {ALONE} it", "in SAPIEN add it with build= of Runner"
+            self._findings.append(Finding("note", "loose-link", text, remedy, link=names[body]))
         if floating:
             if fixed_base:
                 text = "the root has a free joint, but is fixed to the world"

@@ -134,10 +134,10 @@ def test_a_motion_that_is_explained_ends_in_a_file_whose_error_is_printed(batchp
     out.write_text(yaml.safe_dump(document))
     _, said, _ = batchpid(*judge)
     assert float(ERROR.search(said)[2]) > 5 * float(after)
-    document["joints"]["hinge"] = {"lag": 0.01}
+    document["joints"]["hinge"] = {"backlash": 0.01}
     out.write_text(yaml.safe_dump(document))
     status, _, error = batchpid(*judge)
-    assert (status, "lag" in error, "'hinge'" in error) == (2, True, True)
+    assert (status, "backlash" in error, "'hinge'" in error) == (2, True, True)
 
 
 @pytest.mark.usefixtures("short_search")

@@ -1,0 +1,150 @@
+"""MJCF file as MuJoCo simulates it here: with all that it holds, in place of a robot that is rebuilt from a URDF.
+
+Actuators, sensors, keyframes, and the gravity compensation of the robot's bodies are removed. Friction, damping and
+armature of the robot's joints are set later. Other elements are the file's, also friction and impedance of contacts
+and limits. Time step, integrator, solver and gravity are those of the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from batchpid.arrays.array_types import Float64
+from batchpid.errors import RobotError
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.merging import place_links
+from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.mjcf.mjcf_compiler import attempt
+from batchpid.sim.robot.mjcf.mjcf_names import Names
+from batchpid.sim.robot.mjcf.mjcf_reader import content_of, home
+from batchpid.sim.robot.mjcf.mjcf_tree import Tree
+from batchpid.sim.robot.parts import MjcfFile
+from batchpid.task_space.rotations import rotate
+
+_REMOVED = ("tuples", "sensors", "actuators", "keys", "cameras", "lights")
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+
+
+class BodyFrame(NamedTuple):
+    """Frame of a simulated link in the frame of its body, and the numbers of the bodies that are welded to that one."""
+
+    position: Float64
+    wxyz: Float64
+    welded: tuple[int, ...]
+
+
+class FileScene(NamedTuple):
+    """``mujoco.MjSpec`` of a file.
+
+    ``names``: body of each simulated link, and ``frames``: its frame there; ``root``: the body of a floating base, else
+    ""; ``own`` (2, dof): armature and damping of the joints besides those of the robot's description, where leaders
+    have their followers'.
+    """
+
+    scene: Any
+    names: dict[str, str]
+    frames: dict[str, BodyFrame]
+    root: str
+    own: Float64
+
+
+def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
+    """Return the scene of ``file``, without the options of ``spec``.
+
+    Raises RobotError if the file has changed since the robot was loaded.
+    """
+    compiled = attempt(Path(file.path), spec.fixed_base, file.reading)
+    scene, model = compiled.scene, compiled.model
+    if model is None or content_of(scene) != file.content:
+        problem = compiled.problem or "it has another content"
+        raise RobotError(f"{file.path}: has changed since the robot was loaded: {problem}; load the robot again")
+    names = Names(model)
+    Tree(model, names, Path(file.path), spec.fixed_base, [])  # leaves out what is apart from the robot
+    robot = {body: name for body, name in names.bodies.items() if names.is_of_robot(body)}
+    for joint in scene.joints:
+        joint.name = names.joints.get(joint.id, joint.name)
+    for body in scene.bodies[1:]:
+        body.name = names.bodies[body.id]
+        body.gravcomp *= body.id not in robot
+    for each in [each for kind in _REMOVED for each in getattr(scene, kind)]:
+        scene.delete(each)
+    root, start = "", _start(model)
+    for joint in scene.joints:
+        if joint.type != mujoco.mjtJoint.mjJNT_FREE or joint.parent.id not in robot:
+            continue
+        root = joint.parent.name
+        if spec.fixed_base:
+            start["qpos"] = np.delete(start["qpos"], model.jnt_qposadr[joint.id] + np.arange(7))
+            start["qvel"] = np.delete(start["qvel"], model.jnt_dofadr[joint.id] + np.arange(6))
+            scene.body(root).pos, root = np.zeros(3), ""
+            scene.delete(joint)
+    scene.add_key(name="start", **start)
+    _set_pairs(scene, spec.ignored, {*robot.values()})
+    number = {name: joint for joint, name in names.joints.items()}
+    dofs = model.jnt_dofadr[[number[joint.name] for joint in spec.joints]]
+    own = np.array([_of_followers(table[dofs], spec) for table in (model.dof_armature, model.dof_damping)])
+    bodies, frames = _frames(model, robot, spec)
+    return FileScene(scene, bodies, frames, root, own)
+
+
+def set_ground(scene: Any, ground: bool) -> None:
+    """Let the planes of the world collide or not; a scene without one gets one at height 0."""
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    planes = [each for each in scene.worldbody.geoms if each.type == plane and (each.contype or each.conaffinity)]
+    if ground and not planes:
+        scene.worldbody.add_geom(type=plane, size=[0, 0, 1])
+    for each in [] if ground else planes:
+        each.contype, each.conaffinity = 0, 0
+
+
+def _start(model: Any) -> dict[str, Any]:
+    """Return the keyframe of the start: the file's "home", else its reference pose."""
+    if (key := home(model)) is None:
+        return {"qpos": model.qpos0, "qvel": np.zeros(model.nv)}
+    return {name: getattr(model, f"key_{name}")[key].ravel() for name in ("qpos", "qvel", "mpos", "mquat")}
+
+
+def _set_pairs(scene: Any, ignored: Iterable[tuple[str, str]], robot: set[str]) -> None:
+    """Exclude the pairs of the robot's bodies that do not collide, and no others."""
+    for each in list(scene.excludes):
+        if {each.bodyname1, each.bodyname2} <= robot:
+            scene.delete(each)
+    for first, second in ignored:
+        if {first, second} <= robot:
+            scene.add_exclude(bodyname1=first, bodyname2=second)
+
+
+def _frames(model: Any, robot: dict[int, str], spec: SceneSpec) -> tuple[dict[str, str], dict[str, BodyFrame]]:
+    """Return the body of each simulated link, the first of the bodies that are merged into it, and its frame there.
+
+    A body's link has the body's axes, and its origin at the anchor of the body's last hinge.
+    """
+    placements, names = place_links(spec.urdf, spec.merge_fixed), dict[str, str]()
+    frames: dict[str, BodyFrame] = {}
+    for body, name in robot.items():
+        if name not in placements:  # the world, beside a robot that is a body in it
+            continue
+        link, position, wxyz = placements[name]
+        if link in frames:
+            frames[link] = frames[link]._replace(welded=(*frames[link].welded, body))
+            continue
+        joints = np.flatnonzero(model.jnt_bodyid == body)
+        hinges = joints[-1:][model.jnt_type[joints[-1:]] == mujoco.mjtJoint.mjJNT_HINGE]
+        anchor = model.jnt_pos[hinges[0]].copy() if len(hinges) else np.zeros(3)
+        back = wxyz * _CONJUGATE
+        names[link], frames[link] = name, BodyFrame(anchor - rotate(back, position), back, ())
+    return names, frames
+
+
+def _of_followers(values: Float64, spec: SceneSpec) -> Float64:
+    """Return the armature or damping (dof,) that moves from leaders to their followers: d_f and -m^2 d_f."""
+    coupling, own = coupling_of(spec.joints), np.zeros(len(values))
+    for follower in coupling.followers:
+        own[follower] += values[follower]
+        own[coupling.leader[follower]] -= coupling.multiplier[follower] ** 2 * values[follower]
+    return own

@@ -1,0 +1,328 @@
+"""Scenes of MJCF files in MuJoCo: all that a file holds moves as the file says, and belongs to the state of an env."""
+
+import dataclasses
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+mujoco = pytest.importorskip("mujoco")
+pytest.importorskip("mujoco.batch")
+
+from batchpid.errors import InvalidArgumentError, RobotError  # noqa: E402
+from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, Uniform  # noqa: E402
+from batchpid.task_space.rotations import multiply  # noqa: E402
+
+pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits")
+
+OPTION = '<option timestep="0.0005" cone="elliptic" iterations="100" tolerance="1e-8"/><compiler angle="radian"/>'
+BAR = '<geom type="capsule" fromto="0 0 0 {}" size=".01" contype="0" conaffinity="0"/>'
+FOUR_BAR = f"""
+<mujoco model="four_bar">{OPTION}
+  <worldbody>
+    <body name="crank" pos="0 0 1"><joint name="crank" axis="0 1 0" damping=".02" armature=".001"/>
+      {BAR.format("0 0 .1")}
+      <body name="coupler" pos="0 0 .1"><joint name="pin" axis="0 1 0" stiffness=".2" springref=".3"/>
+        {BAR.format(".3 0 .1")}</body></body>
+    <body name="rocker" pos=".3 0 1"><joint name="rocker" axis="0 1 0"/>{BAR.format("0 0 .2")}</body>
+  </worldbody>
+  <equality><connect name="loop" body1="coupler" body2="rocker" anchor=".3 0 .1"/></equality>
+  <actuator><motor joint="crank"/></actuator>
+</mujoco>"""
+FINGER = """<body name="finger{0}" pos="0 {0}.04 0"><joint name="finger{0}" type="slide" axis="0 {0}1 0" range="0 .04"
+  armature=".01" damping="{1}"/><geom type="box" size=".01 .005 .03"/></body>"""
+GRIPPER = f"""
+<mujoco model="gripper">{OPTION}
+  <worldbody>
+    <body name="wrist" pos="0 0 1"><joint name="wrist" axis="1 0 0" damping=".1" frictionloss="0"/>
+      <geom type="box" size=".05 .05 .02" pos="0 0 -.06"/>{FINGER.format("-", 2)}{FINGER.format("", 3)}</body>
+  </worldbody>
+  <equality><joint joint1="finger" joint2="finger-" polycoef="0 1 0 0 0"/></equality>
+  <tendon><fixed name="grasp" stiffness="30" damping="1" springlength=".02" range="0 .07" limited="true">
+    <joint joint="finger" coef="1"/><joint joint="finger-" coef="1"/></fixed></tendon>
+  <actuator><motor tendon="grasp"/><motor joint="wrist"/></actuator>
+</mujoco>"""
+LINK = '<geom type="capsule" fromto="0 0 0 .2 0 0" size=".02"/>'
+ARM = f"""
+<mujoco model="arm">{OPTION}
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 .1"/>
+    <body name="post"><geom type="cylinder" size=".03 .04" pos="0 0 .04"/>
+      <body name="upper" pos="0 0 .11"><joint name="turn" axis="0 0 1" damping=".5"/><joint name="lift" axis="0 1 0"/>
+        {LINK}
+        <body name="fore" pos=".2 0 0"><joint name="bend" axis="0 0 1" damping=".2" range="-2 2"/>{LINK}</body>
+      </body></body>
+    <body name="cube" pos=".3 .1 .05"><freejoint/><geom type="box" size=".04 .04 .04" density="200"/></body>
+    <body name="lamp" pos="-1 0 1"><joint type="ball"/><geom size=".05" pos="0 0 -.1"/></body>
+    <body name="chest" pos="0 1 .06"><freejoint/><geom type="box" size=".05 .05 .05"/>
+      <body name="lid" pos="0 0 .06"><joint name="lid" axis="1 0 0" pos="0 .05 0"/>
+        <geom type="box" size=".05 .05 .005"/></body></body>
+  </worldbody>
+  <actuator><motor joint="turn"/><motor joint="lift"/><motor joint="bend"/></actuator>
+  <keyframe><key name="home" qpos="0 0 .2 .3 .09 .05 1 0 0 0 1 0 0 0 0 1 .06 1 0 0 0 .2"/></keyframe>
+</mujoco>"""
+TEXTS = {"four-bar": FOUR_BAR, "gripper": GRIPPER, "arm": ARM}
+OBJECTS = ("cube", "lamp", "chest", "lid")
+
+
+@pytest.fixture
+def load(tmp_path):
+    """Function that loads the robot of an MJCF text."""
+
+    def load(text, **options):
+        path = tmp_path / "scene.xml"
+        path.write_text(text)
+        return Robot.load(path, **options)
+
+    return load
+
+
+def efforts(robot, ticks, scale=0.3):
+    """Return efforts (ticks, dof) on the actuated, independent joints, exact in float32."""
+    rows = np.zeros((ticks, robot.dof))
+    names = {"crank": 0.05, "finger-": 4.0, "wrist": 0.6, "turn": 0.4, "lift": -0.3, "bend": -0.3}
+    for joint, name in enumerate(robot.joint_names):
+        rows[:, joint] = names.get(name, 0.0) * np.sin(0.3 * np.arange(ticks) + joint)
+    return rows.astype(np.float32).astype(float)
+
+
+def in_mujoco(robot, model, rows, substeps):
+    """Return the poses of all bodies (ticks, bodies, 7) in MuJoCo's own steps of a model, from its start."""
+    data, poses = mujoco.MjData(model), []
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    for row in rows:
+        for name, effort in zip(robot.joint_names, row, strict=True):
+            data.qfrc_applied[model.joint(name).dofadr] = effort
+        for _ in range(substeps):
+            mujoco.mj_step(model, data)
+        mujoco.mj_kinematics(model, data)
+        poses.append(np.hstack([data.xpos, data.xquat]))
+    return np.array(poses)
+
+
+def run(runner, rows):
+    """Return the poses of the file's bodies (ticks, envs, bodies, 7) under setpoints (ticks, dof)."""
+    poses = []
+    for row in rows:
+        runner.step(row)
+        poses.append(runner.bodies(runner.robot.mjcf.bodies))
+    return np.array(poses)
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_moves_as_the_file_says(load, name):
+    robot = load(TEXTS[name], self_collision="urdf")
+    rows, model = efforts(robot, 40), mujoco.MjModel.from_xml_string(TEXTS[name])
+    with Runner(robot, 2, workers=0, engine="mujoco", control="effort", compensate="none", substeps=10) as runner:
+        ours = run(runner, rows)
+    theirs = in_mujoco(robot, model, rows, 10)
+    assert np.ptp(theirs, axis=0).max() > 0.03
+    np.testing.assert_allclose(ours, np.broadcast_to(theirs[:, None], ours.shape), rtol=0, atol=1e-10)
+
+
+def test_the_law_drives_the_joints_and_the_arm_pushes_the_cube(load):
+    robot = load(ARM)
+    assert robot.joint_names == ("turn", "lift", "bend")
+    with Runner(robot, 1, workers=0, engine="mujoco") as runner:
+        before = runner.bodies(["cube"])
+        for _ in range(200):
+            obs = runner.step([0.5, 0.1, 0.0])
+        after = runner.bodies(["cube"])
+    assert np.abs(obs.qpos - [0.5, 0.1, 0.0]).max() < 0.05
+    assert np.linalg.norm((after - before)[0, 0, :2]) > 0.03
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
+def test_workers_and_other_envs_change_no_bit(load):
+    robot = load(ARM)
+    targets = np.stack([np.linspace(0.2, 0.8, 5), np.full(5, 0.25), np.linspace(0, 0.3, 5)], axis=1)
+    kept = []
+    for workers in (0, 1, 2):
+        with Runner(robot, 5, workers=workers, engine="mujoco") as runner:
+            for _ in range(60):
+                obs = runner.step(targets)
+            kept.append((runner.bodies(OBJECTS), obs.qpos))
+    with Runner(robot, 1, workers=0, engine="mujoco") as runner:
+        for _ in range(60):
+            obs = runner.step(targets[3])
+        kept.append((runner.bodies(OBJECTS), obs.qpos))
+    assert np.ptp(kept[0][0][:, 0], axis=0).max() > 0.01  # the cubes differ
+    for one, other in pairwise(kept[:3]):
+        for ours, theirs in zip(one, other, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    for ours, theirs in zip(kept[0], kept[3], strict=True):
+        np.testing.assert_array_equal(ours[3], theirs[0])
+
+
+def test_objects_belong_to_snapshots_resets_and_faults(load, tmp_path):
+    robot = load(ARM)
+    push, wrong = np.tile([0.6, 0.25, 0.1], (3, 1)), np.tile([0.6, 0.25, 0.1], (3, 1))
+    wrong[1] = np.nan
+    with Runner(robot, 3, workers=0, engine="mujoco", on_invalid_input="contain") as runner:
+        start = runner.bodies(OBJECTS)
+        np.testing.assert_allclose(start[0, 0], [0.3, 0.09, 0.05, 1, 0, 0, 0])
+        for _ in range(40):
+            runner.step(push)
+        runner.snapshot().save(tmp_path / "kept.npz")
+
+        def go_on(tick=push):
+            seen = []
+            for each in (tick, push, push):
+                obs = runner.step(each)
+                seen.append((runner.bodies(OBJECTS), obs.qpos))
+            return seen, obs
+
+        first, _ = go_on()
+        runner.restore(Snapshot.load(tmp_path / "kept.npz"))
+        again, _ = go_on()
+        for one, other in zip(first, again, strict=True):
+            np.testing.assert_array_equal(one[0], other[0])
+        runner.restore(Snapshot.load(tmp_path / "kept.npz"))
+        runner.reset(mask=[False, True, False])
+        np.testing.assert_array_equal(runner.bodies(OBJECTS)[1], start[1])
+        runner.restore(Snapshot.load(tmp_path / "kept.npz"))
+        with pytest.warns(FaultWarning):
+            held, obs = go_on(wrong)
+        assert list(obs.ok) == [True, False, True]
+        for (poses, _), (expected, _) in zip(held, first, strict=True):
+            np.testing.assert_array_equal(poses[1], start[1])  # where a reset puts them
+            np.testing.assert_array_equal(poses[[0, 2]], expected[[0, 2]])
+
+
+def test_an_object_that_diverges_is_a_fault_of_its_env(load):
+    text = (
+        ARM.replace("<keyframe>", "<!--")
+        .replace("</keyframe>", "-->")
+        .replace('density="200"/>', 'density="200"/><site name="c"/>')
+    )
+    spring = '<tendon><spatial stiffness="1e14"><site site="c"/><site site="w"/></spatial></tendon>'
+    text = text.replace("</worldbody>", f'<site name="w" pos="0 0 3"/></worldbody>{spring}')
+    with Runner(load(text), 1, workers=0, engine="mujoco") as runner:
+        with pytest.warns(FaultWarning):
+            obs = runner.step(runner.robot.start)
+        assert not obs.ok.any()
+        assert runner.faults[0].cause == "state"
+        np.testing.assert_array_equal(runner.bodies(OBJECTS)[0, 0, :2], [0.3, 0.1])  # at its start
+
+
+def test_a_closed_loop_has_no_tree(load):
+    robot = load(FOUR_BAR)
+    options = {"num_envs": 1, "workers": 0, "engine": "mujoco"}
+    for given, argument in (({"control": "osc"}, "control"), ({"setpoint_space": "tool"}, "setpoint_space")):
+        with pytest.raises(InvalidArgumentError, match=f"^{argument}.*'loop'"):
+            Runner(robot, **options, **given)
+    with pytest.raises(InvalidArgumentError, match=r"gain_units.*'loop'"):
+        Runner(robot, params=robot.designed(), **options)
+    with Runner(robot, **options) as runner:  # its default gains need no tree
+        assert runner.params.gain_units is None
+        for _ in range(50):
+            obs = runner.step(np.zeros(3))
+        poses = dict(zip(("coupler", "rocker"), runner.bodies(["coupler", "rocker"])[0], strict=True))
+    assert obs.ok.all()
+    ends = []
+    for name, end in (("coupler", [0.3, 0, 0.1]), ("rocker", [0.0, 0, 0.2])):
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, poses[name][3:])
+        ends.append(poses[name][:3] + matrix.reshape(3, 3) @ end)
+    np.testing.assert_allclose(*ends, atol=2e-3)
+
+
+def test_what_a_scene_does_not_have_is_refused(load):
+    robot = load(ARM)
+    with pytest.raises(InvalidArgumentError, match=r"collisions.*cube, chest"):
+        Runner(robot, 1, workers=0, engine="mujoco", collisions=False)
+    with Runner(robot, 1, workers=0, engine="mujoco") as runner, pytest.raises(InvalidArgumentError, match="'ball'"):
+        runner.bodies(["ball"])
+    with (
+        Runner(load(GRIPPER), 1, workers=0, engine="sapien") as runner,
+        pytest.raises(InvalidArgumentError, match="names"),
+    ):
+        runner.bodies(["wrist"])
+    robot = load(ARM.replace('density="200"', 'density="100"'))
+    robot.path.write_text(ARM)
+    with pytest.raises(RobotError, match="has changed since the robot was loaded"):
+        Runner(robot, 1, workers=0, engine="mujoco")
+
+
+@pytest.mark.parametrize("merge_fixed", [True, False])
+def test_masses_and_damping_vary(load, merge_fixed):
+    """A randomized robot moves as the file with other numbers, also where several bodies are one link."""
+    tip = (
+        '<body name="tip" pos=".2 0 0" quat=".9 .1 .3 0"><inertial pos=".01 0 .02" mass="{}" diaginertia="{}"/></body>'
+    )
+    arm = ARM.replace(f"{LINK}</body>", f"{LINK}{{}}</body>")
+    robot = load(arm.format(tip.format(0.2, "1e-4 2e-4 2.5e-4")), merge_fixed=merge_fixed)
+    heavy = arm.format(tip.format(0.4, "2e-4 4e-4 5e-4")).replace('damping=".5"', 'damping="1"')
+    model = mujoco.MjModel.from_xml_string(heavy.replace('damping=".2"', 'damping=".4"'))
+    twice = Uniform(2.0, 2.0, operation="scale")
+    varied = Randomization(link_mass={"tip": twice}, damping=twice)
+    rows = efforts(robot, 15)  # without contacts, whose softness in MuJoCo depends on how mass is divided among bodies
+    options = {"control": "effort", "compensate": "none", "substeps": 10, "randomization": varied}
+    with Runner(robot, 2, workers=0, engine="mujoco", **options) as runner:
+        ours = run(runner, rows)
+    theirs = in_mujoco(robot, model, rows, 10)
+    np.testing.assert_allclose(ours, np.broadcast_to(theirs[:, None], ours.shape), rtol=0, atol=1e-8)
+
+
+WALKER = """
+<mujoco><worldbody>
+  <body name="ball" pos="3 0 .1"><freejoint/><geom size=".1"/></body>
+  <body name="trunk" pos="0 0 .5" quat="1 1 0 0"><freejoint/><geom type="box" size=".1 .1 .1"/>
+    <body name="leg" pos="0 0 .2"><joint name="hip" axis="0 1 0"/><geom type="box" size=".02 .02 .1"/></body></body>
+</worldbody><actuator><motor joint="hip"/></actuator></mujoco>"""
+
+
+def test_a_floating_base_behind_an_object(load):
+    """Pose and twist of a base are those of its link, wherever MuJoCo has them, and in both engines the same."""
+    robot = load(WALKER, fixed_base=False)
+    turn = np.array([1.0, 1.0, 0.0, 0.0]) / np.sqrt(2)
+    pose, twist = [0.1, 0.2, 3.0, 0.8, 0.0, 0.6, 0.0], [0.3, 0.1, 0.2, 1.0, 2.0, 3.0]
+    seen = []
+    cases = ("mujoco", "none"), ("sapien", "none"), ("mujoco", "gravity+coriolis"), ("rebuilt", "gravity+coriolis")
+    for engine, compensate in cases:
+        options = {"engine": "sapien" if engine == "sapien" else "mujoco", "compensate": compensate, "ground": False}
+        shown = dataclasses.replace(robot, mjcf=None) if engine == "rebuilt" else robot
+        with Runner(shown, 1, workers=0, control="effort", **options) as runner:
+            obs = runner.reset(base_pose=pose, base_twist=twist)
+            np.testing.assert_allclose(obs.base_pose[0], pose, atol=1e-6)
+            np.testing.assert_allclose(obs.base_twist[0], twist, atol=1e-5)
+            if engine == "mujoco":
+                np.testing.assert_allclose(runner.bodies(["trunk"])[0, 0, 3:], multiply(np.array(pose[3:]), turn))
+            for _ in range(20):
+                obs = runner.step([0.02])
+            seen.append(np.concatenate([obs.qpos[0], obs.base_pose[0], obs.base_twist[0]]))
+    np.testing.assert_allclose(*seen[:2], atol=1e-3)
+    np.testing.assert_allclose(*seen[2:], atol=1e-5)
+    assert np.abs(seen[0] - seen[2]).max() > 0.01
+
+
+def test_gains_of_the_law_are_those_of_the_user(load):
+    """The file's own servos do nothing."""
+    servo = ARM.replace('<motor joint="turn"/>', '<position joint="turn" kp="1000"/>')
+    robot, poses = load(servo), []
+    with Runner(robot, 1, workers=0, engine="mujoco", params=robot.params(kp=0.0), compensate="none") as runner:
+        for _ in range(5):
+            runner.step([1.0, 0.2, 0.2])
+        poses.append(runner.bodies(["upper"]))
+    with Runner(load(ARM), 1, workers=0, engine="mujoco", control="effort", compensate="none") as runner:
+        for _ in range(5):
+            runner.step(np.zeros(3))
+        poses.append(runner.bodies(["upper"]))
+    np.testing.assert_array_equal(*poses)
+
+
+def test_the_planes_of_the_file_are_the_ground(load):
+    """A floor below an arm that reaches under height 0 stays, and the runner's ground stands in for a missing one."""
+    low = ARM.replace('type="plane"', 'type="plane" pos="0 0 -.5"').replace(
+        '<body name="post">', '<body name="post" pos="0 0 -.2">'
+    )
+    heights = {}
+    for name, text, options in (("file", low, {}), ("off", low, {"ground": False}), ("ours", ARM, {})):
+        text = text if name != "ours" else text.replace('<geom name="floor" type="plane" size="1 1 .1"/>', "")
+        with Runner(load(text), 1, workers=0, engine="mujoco", **options) as runner:
+            for _ in range(100):
+                runner.step(runner.robot.start)
+            heights[name] = runner.bodies(["cube"])[0, 0, 2]
+    np.testing.assert_allclose((heights["file"], heights["ours"]), (-0.46, 0.04), atol=2e-3)
+    assert heights["off"] < -3
