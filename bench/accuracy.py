@@ -112,8 +112,6 @@ class Accuracy(NamedTuple):
     """[rad]"""
     rms: float
     """[rad]"""
-    over_time: Float64
-    """Largest over joints and envs at each sim step (steps,) [rad]."""
 
 
 def measure_errors(
@@ -137,8 +135,7 @@ def measure_errors(
         for name, run in runs.items():
             error = (run - reference)[..., revolute]
             error -= turn * np.round(error / (2 * np.pi))
-            largest = np.abs(error).max((1, 2))
-            result[name, other] = Accuracy(float(largest.max()), float(np.sqrt((error**2).mean())), largest)
+            result[name, other] = Accuracy(float(np.abs(error).max()), float(np.sqrt((error**2).mean())))
     return result
 
 
@@ -224,8 +221,6 @@ def limit_moves(robot: Robot, count: int, seed: int = 0) -> Moves:
 
 
 _MOVES = {"free": random_moves, "contact": contact_moves, "limit": limit_moves}
-EVERY = 20
-"""Sim steps from one written error to the next."""
 
 
 @dataclass(frozen=True)
@@ -255,10 +250,6 @@ def main(options: Options) -> None:
                         "reference": reference,
                         "max": error.largest,
                         "rms": error.rms,
-                        "over_time": {
-                            "seconds": EVERY * TIMESTEP,
-                            "max": [float(f"{value:.3g}") for value in error.over_time[EVERY - 1 :: EVERY]],
-                        },
                     }
                 )
     labels = ("robot", "motion", "physics", "reference")

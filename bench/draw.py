@@ -27,14 +27,26 @@ SETUPS = {
     "jaco2-accurate": "jaco2, accurate",
     "jaco2-fast": "jaco2, fast",
 }
-OURS, ENGINE, OTHER, FAST, FREE = "#2f6f9f", "#8a8a8a", "#c9b48a", "#e08a3c", "#5aa469"
+OURS, OTHER, FAST, FREE = "#2f6f9f", "#c9b48a", "#e08a3c", "#5aa469"
+DRAWN = {
+    # label in the picture: (setup, case); the table has all cases
+    "batchpid, MuJoCo": ("panda-accurate", "closed loop, MuJoCo"),
+    "MuJoCo alone, with its own PID, two threads": ("panda-accurate", "mujoco"),
+    'batchpid, SAPIEN, physics="fast"': ("panda-fast", "closed loop"),
+    "SAPIEN without control, robot by robot": ("panda-accurate", "bare engine, robot by robot"),
+    "batchpid, SAPIEN": ("panda-accurate", "closed loop"),
+    "SAPIEN's tutorial, two processes": ("panda-accurate", "tutorial, a process a core"),
+    "the tutorial under Gymnasium's vector env": ("panda-accurate", "gymnasium, all envs"),
+    "SAPIEN's tutorial, one process": ("panda-accurate", "tutorial"),
+}
 PHASES = {
-    "step": "#8a8a8a",
-    "passive": "#2f6f9f",
-    "control": "#e08a3c",
-    "read": "#5aa469",
-    "write": "#b45f82",
-    "waiting": "#d9d9d9",
+    # phase: (colour, meaning)
+    "step": ("#8a8a8a", "physics"),
+    "passive": ("#2f6f9f", "gravity, Coriolis"),
+    "control": ("#e08a3c", "control"),
+    "read": ("#5aa469", "reading"),
+    "write": ("#b45f82", "writing"),
+    "waiting": ("#d9d9d9", "waiting"),
 }
 PRESETS = ("accurate", "fast", "free")
 """Presets in the table of their errors; the cost of "free" is that without collision shapes."""
@@ -45,10 +57,10 @@ MOTIONS = {
     "slowest": "the slowest of them",
 }
 SCALING = {
-    # group of the benchmark: (its parameter, label of the axis)
-    "envs (2 workers)": ("num_envs", "envs (2 workers)"),
-    "workers (64 envs)": ("workers", "workers (64 envs; 0: in the caller's process)"),
-    "substeps (64 envs, 2 workers)": ("substeps", "sim steps in a tick (64 envs, 2 workers)"),
+    # group of the benchmark: (its parameter, label of the axis, value of the case that all groups have)
+    "envs (2 workers)": ("num_envs", "envs (2 workers, 20 sim steps in a tick)", 64),
+    "workers (64 envs)": ("workers", "workers (64 envs; 0: in the caller's process)", 2),
+    "substeps (64 envs, 2 workers)": ("substeps", "sim steps in a tick (64 envs, 2 workers)", 20),
 }
 RESOURCES = {
     # name in extra_info: (meaning, format)
@@ -107,7 +119,7 @@ def gather(folder: Path, old: dict[str, Any]) -> dict[str, Any]:
                 for row in benchmarks
                 if row["group"] == group
             }
-            for group, (parameter, _) in SCALING.items()
+            for group, (parameter, *_) in SCALING.items()
         }
         new["resources"] = {}
         for row in benchmarks:
@@ -130,42 +142,34 @@ def gather(folder: Path, old: dict[str, Any]) -> dict[str, Any]:
 
 
 def draw_speed(figures: dict[str, Any]) -> Figure:
-    """Draw the cases as bars, the phases of a step, and the scaling."""
-    figure = Figure(figsize=(11, 7.2), layout="constrained")
-    grid = figure.add_gridspec(2, 6, height_ratios=(1.25, 1))
+    """Draw the speed of the panda in each case, the phases of a step, and the scaling."""
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    grid = figure.add_gridspec(2, 6, height_ratios=(1.2, 1))
     draw_cases(figure.add_subplot(grid[0, :4]), figures["cases"])
     draw_phases(figure.add_subplot(grid[0, 4:]), figures["cases"])
-    for column, (group, (_, label)) in enumerate(SCALING.items()):
-        axes = figure.add_subplot(grid[1, 2 * column : 2 * column + 2])
-        draw_scaling(axes, figures["scaling"][group], label)
     machine = figures["machine"]
+    for column, (group, (_, label, shared)) in enumerate(SCALING.items()):
+        axes = figure.add_subplot(grid[1, 2 * column : 2 * column + 2])
+        rates = {int(at): rate for at, rate in figures["scaling"][group].items()}
+        if group.startswith("workers"):  # more workers than cores wait for each other
+            rates = {at: rate for at, rate in rates.items() if at <= machine["cores"]}
+        draw_scaling(axes, rates, label, shared)
     figure.suptitle(
-        f"PID, gravity and Coriolis compensation at every sim step of 0.5 ms, 64 envs on 2 cores "
-        f"({machine['processor']}, SAPIEN {machine['sapien']})",
-        fontsize=9,
+        f"64 Pandas under PID, gravity and Coriolis compensation at every sim step of 0.5 ms, on "
+        f"{machine['cores']} cores ({machine['processor']}, SAPIEN {machine['sapien']})",
+        fontsize=10,
     )
     return figure
 
 
 def draw_cases(axes: Axes, cases: dict[str, Any]) -> None:
-    """Draw thousand env-steps per second of every case: the panda, both presets."""
-    accurate, fast = cases["panda-accurate"]["rates"], cases["panda-fast"]["rates"]
-    names = list(accurate)[::-1]
-    for row, name in enumerate(names):
-        colour = OURS if "closed loop" in name else ENGINE if "bare engine" in name else OTHER
-        for rates, up, alpha in ((accurate, 0.2, 1.0), (fast, -0.2, 0.55)):
-            # A peer does not use the presets, and has one bar.
-            if name in rates and (name in fast or up > 0):
-                rate = rates[name] / 1e3
-                place = row + up if name in fast else row
-                axes.barh(place, rate, height=0.38, color=colour, alpha=alpha, lw=0)
-                axes.text(rate, place, f" {rate:.0f}", va="center", fontsize=7)
-    axes.set_yticks(range(len(names)), names, fontsize=8)
-    axes.set_title(
-        "panda: thousand env-steps/s (upper bar: physics accurate, lower, pale: fast)",
-        fontsize=8.5,
-        loc="left",
-    )
+    """Draw the speed of the cases of :data:`DRAWN`, the fastest first."""
+    rates = [(cases[name]["rates"][case] / 1e3, label) for label, (name, case) in DRAWN.items()]
+    for row, (rate, label) in enumerate(sorted(rates)):
+        axes.barh(row, rate, height=0.7, color=OURS if label.startswith("batchpid") else OTHER, lw=0)
+        axes.text(rate, row, f" {rate:.0f}", va="center", fontsize=8.5)
+    axes.set_yticks(range(len(rates)), [label for _, label in sorted(rates)])
+    axes.set_title("thousand sim steps per second, of all robots together", fontsize=9.5, loc="left")
     tidy(axes, "x")
 
 
@@ -173,68 +177,57 @@ def draw_phases(axes: Axes, cases: dict[str, Any]) -> None:
     """Draw the microseconds per env step of each phase, stacked."""
     for row, (name, label) in enumerate(reversed(SETUPS.items())):
         left = 0.0
-        for phase, colour in PHASES.items():
+        for phase, (colour, meaning) in PHASES.items():
             spent = cases[name]["phases"][phase]
-            axes.barh(row, spent, left=left, height=0.6, color=colour, lw=0, label=phase if row == 0 else None)
+            axes.barh(row, spent, left=left, height=0.6, color=colour, lw=0, label=meaning if row == 0 else None)
             left += spent
-        axes.text(0.3, row + 0.38, label, fontsize=7.5, va="center")
+        axes.text(0.3, row + 0.42, label, fontsize=8.5, va="center")
     axes.set_yticks([])
-    axes.set_ylim(-1.4, len(SETUPS) - 0.3)
-    axes.legend(loc="lower left", ncols=3, fontsize=7, frameon=False)
-    axes.set_title("closed loop: µs per env step in a worker", fontsize=8.5, loc="left")
+    axes.set_ylim(-1.6, len(SETUPS) - 0.3)
+    axes.legend(loc="lower left", ncols=2, fontsize=8, frameon=False)
+    axes.set_title("SAPIEN: µs per sim step", fontsize=9.5, loc="left")
     tidy(axes, "x")
 
 
-def draw_scaling(axes: Axes, rates: dict[str, float], label: str) -> None:
-    """Draw thousand env-steps per second over a parameter."""
-    at = [int(value) for value in rates]
-    if max(at) > 10:
+def draw_scaling(axes: Axes, rates: dict[int, float], label: str, shared: int) -> None:
+    """Draw the speed over a parameter, as a multiple of the speed at ``shared``, the case that all curves have."""
+    if max(rates) > 10:
         axes.set_xscale("log", base=2)
-        axes.set_xticks(at, [str(value) for value in at])
-        axes.minorticks_off()
-    else:
-        axes.set_xticks(at)
-    axes.plot(at, [rate / 1e3 for rate in rates.values()], "o-", color=OURS, ms=4, lw=1.4)
-    axes.set_ylim(0)
-    axes.set_xlabel(label, fontsize=8)
-    axes.set_ylabel("thousand env-steps/s", fontsize=8)
+    axes.set_xticks(list(rates), [str(at) for at in rates])
+    axes.minorticks_off()
+    axes.plot(list(rates), [rate / rates[shared] for rate in rates.values()], "o-", color=OURS, ms=5, lw=1.6)
+    axes.plot(shared, 1, "o", color=FAST, ms=8)
+    axes.set_ylim(0, 1.3)
+    axes.set_xlabel(label, fontsize=9)
+    axes.set_ylabel("speed (orange: 1)", fontsize=9)
     tidy(axes, "y")
 
 
 def draw_accuracy(rows: list[dict[str, Any]]) -> Figure:
-    """Draw the largest error over time, for each robot and kind of motion."""
+    """Draw the largest error of each preset, by robot, kind of motion and reference."""
     robots = list(dict.fromkeys(row["robot"] for row in rows))
-    motions = list(dict.fromkeys(row["motion"] for row in rows))
-    figure = Figure(figsize=(11, 5), layout="constrained")
-    panels = figure.subplots(len(robots), len(motions), sharex=True, sharey=True, squeeze=False)
+    kinds = list(dict.fromkeys((row["motion"], row["reference"]) for row in rows))[::-1]
+    figure = Figure(figsize=(10, 3.4), layout="constrained")
+    panels = figure.subplots(1, len(robots), sharex=True, sharey=True, squeeze=False)[0]
     for row in rows:
-        axes = panels[robots.index(row["robot"])][motions.index(row["motion"])]
-        spacing, errors = row["over_time"]["seconds"], row["over_time"]["max"]
-        time = [spacing * (index + 1) for index in range(len(errors))]
-        colour = {"accurate": OURS, "fast": FAST, "free": FREE}[row["physics"]]
-        dotted = row["reference"].startswith("TGS")
-        axes.semilogy(
-            time,
-            errors,
-            color=colour,
-            lw=1.3,
-            ls=":" if dotted else "-",
-            label=f"{row['physics']}, against {row['reference']}",
-        )
-    for robot, line in zip(robots, panels, strict=True):
-        for motion, axes in zip(motions, line, strict=True):
-            axes.set_title(f"{robot}, {motion}", fontsize=8.5, loc="left")
-            axes.legend(fontsize=6.5, frameon=False, loc="lower right")
-            tidy(axes, "y")
-        line[0].set_ylabel("largest error [rad]", fontsize=8)
-    for axes in panels[-1]:
-        axes.set_xlabel("time [s]", fontsize=8)
+        axes, preset = panels[robots.index(row["robot"])], PRESETS.index(row["physics"])
+        place = kinds.index((row["motion"], row["reference"])) - 0.22 * (preset - 1)
+        axes.plot(row["max"], place, "o", color=(OURS, FAST, FREE)[preset], ms=8, label=row["physics"])
+    for robot, axes in zip(robots, panels, strict=True):
+        axes.set_xscale("log")
+        axes.set_yticks(range(len(kinds)), [f"{motion}, against {reference}" for motion, reference in kinds])
+        axes.set_title(robot, fontsize=10, loc="left")
+        axes.set_xlabel("largest error of a joint [rad]", fontsize=9)
+        tidy(axes, "x")
+    handles, labels = panels[0].get_legend_handles_labels()
+    entries = dict(zip(labels, handles, strict=True))
+    figure.legend(entries.values(), entries, loc="outside upper right", ncols=3, fontsize=9, frameon=False)
     return figure
 
 
 def tidy(axes: Axes, grid: str) -> None:
     """Style ``axes``: small ticks, a faint grid behind, no frame on top and at the right."""
-    axes.tick_params(labelsize=7.5)
+    axes.tick_params(labelsize=8.5)
     axes.grid(axis=grid, color="#e6e6e6", lw=0.6)  # type: ignore[arg-type]
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

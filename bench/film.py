@@ -1,29 +1,24 @@
 """Film of four robots under two sets of gains, with the response of one joint: ``python bench/film.py``.
 
-It draws docs/images/two-gains.gif, the picture of the README, without a render device: triangles of the robots' shapes,
-sorted by depth. The gains are from docs/tutorial.md: designed, and chosen by hand. With ``--recording walk.h5 --out
-docs/images/walk.gif`` it draws four robots that walk, from a recording of ``examples/train_walk.py``.
+It draws docs/images/two-gains.gif, the picture of the README, without a render device. The gains are from
+docs/tutorial.md: designed, and chosen by hand.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-import batchpid.task_space as ts
-from batchpid.sim import Robot, Rollout, Runner, read_recording
-from batchpid.sim.robot.shapes import surfaces
-from batchpid.task_space.rotations import about, placed, rotate
+from batchpid.sim import Robot, Rollout, Runner
+from batchpid.sim.view.painter import Triangles, paint
 
 PICTURE = Path(__file__).resolve().parent.parent / "docs" / "images" / "two-gains.gif"
 GOAL = (0.5, 0.6, -0.5, -1.5, 0.5, 1.0)
@@ -37,10 +32,6 @@ SPACING = 1.05
 CAMERA = np.array([1.0, 0.45, 0.4]) / np.linalg.norm([1.0, 0.45, 0.4])
 """Direction from the robots to the camera."""
 RIGHT = np.cross([0.0, 0.0, 1.0], CAMERA) / np.linalg.norm(np.cross([0.0, 0.0, 1.0], CAMERA))
-AHEAD = np.r_[0.0, 0.0, 0.0, about(np.array([0.0, 0.0, 1.0]), 1.8)]
-"""Pose of the world for robots that walk: its x axis points to the right of the picture, and a little to the back."""
-LIGHT = np.array([0.5, 0.2, 0.85]) / np.linalg.norm([0.5, 0.2, 0.85])
-"""Direction to the light."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +44,6 @@ class Options:
     """Length [s]."""
     interval: float = 0.05
     """Time between two pictures [s]."""
-    recording: Path | None = None
-    """Recording of robots with a floating base, such as of ``examples/train_walk.py --record``, to film instead."""
 
 
 def simulate(robot: Robot, seconds: float, num_envs: int = 4) -> dict[str, Rollout]:
@@ -71,37 +60,13 @@ def simulate(robot: Robot, seconds: float, num_envs: int = 4) -> dict[str, Rollo
     return found
 
 
-def triangles(
-    robot: Robot, qpos: NDArray[Any], base: NDArray[Any] | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners (triangles, 3, 3) [m] and the colours (triangles, 3) of robots at ``qpos`` (envs, dof).
-
-    ``base`` (envs, 7) are the poses of floating bases.
-    """
-    drawn = surfaces(robot, deviation=8e-3)
-    poses = ts.link_poses(robot.rigid_tree, qpos, [surface.link for surface in drawn])
-    if base is not None:
-        poses = placed(base[:, None], poses)
-    corners, colours = [], []
-    for env, pose_of in enumerate(poses):
-        aside = SPACING * (env - (len(qpos) - 1) / 2) * RIGHT
-        for surface, pose in zip(drawn, pose_of, strict=True):
-            vertices = rotate(pose[3:], surface.vertices) + pose[:3] + aside
-            corners.append(vertices[surface.faces])
-            colours.append(np.tile(surface.rgba[:3], (len(surface.faces), 1)))
-    return np.concatenate(corners), np.concatenate(colours)
-
-
-def draw_robots(axes: Any, robot: Robot, qpos: NDArray[Any], base: NDArray[Any] | None = None) -> None:
-    """Draw robots at ``qpos`` (envs, dof) side by side, the faces nearest to the camera last."""
-    corners, colours = triangles(robot, qpos, base)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    bright = 0.55 + 0.45 * np.clip(normals @ LIGHT, 0, 1)
+def draw_robots(axes: Any, robot: Robot, qpos: NDArray[np.float64]) -> None:
+    """Draw robots at ``qpos`` (envs, dof) side by side, without perspective."""
+    triangles, count = Triangles(robot), len(qpos)
+    aside = SPACING * (np.arange(count) - (count - 1) / 2)[:, None] * RIGHT
+    corners = triangles.corners(qpos, aside).reshape(-1, 3, 3)
     places = np.stack([corners @ RIGHT, corners @ np.cross(CAMERA, RIGHT)], axis=-1)
-    order = np.argsort((corners @ CAMERA).mean(axis=1))
-    shaded = np.clip(colours * bright[:, None], 0, 1)[order]
-    axes.add_collection(PolyCollection(places[order], facecolors=shaded, edgecolors=shaded, linewidths=0.3))
+    paint(axes, corners, np.tile(triangles.colours, (count, 1)), places, -(corners @ CAMERA).mean(axis=1))
 
 
 def draw_frame(robot: Robot, moves: dict[str, Rollout], at: int) -> Image.Image:
@@ -124,28 +89,6 @@ def draw_frame(robot: Robot, moves: dict[str, Rollout], at: int) -> Image.Image:
     responses.set_xlabel("time [s]", fontsize=8)
     responses.tick_params(labelsize=8)
     responses.spines[["top", "right"]].set_visible(False)
-    return image_of(figure)
-
-
-def draw_walk(robot: Robot, walk: Rollout, at: int) -> Image.Image:
-    """Return the picture of one tick of robots with a floating base, of which the camera follows the first ones."""
-    figure = Figure(figsize=(8.4, 3.0), dpi=100)
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    assert walk.base_pose is not None
-    base = placed(AHEAD, walk.base_pose[at, :4].astype(float))
-    lines = [[(x, -9.0, 0.0), (x, 9.0, 0.0)] for x in np.arange(-5.0, 10.0, 0.5)]  # on the floor, across the way
-    for ends in rotate(AHEAD[3:], np.array(lines)) @ np.stack([RIGHT, np.cross(CAMERA, RIGHT)], axis=-1):
-        axes.plot(*ends.T, color="#c9ced6", lw=1.0, zorder=0)
-    draw_robots(axes, robot, walk.qpos[at, :4], base)
-    middle = base[:, :3].mean(0) @ RIGHT
-    axes.set(xlim=(middle - 2.1, middle + 2.1), ylim=(-0.6, 0.9), aspect="equal")
-    axes.text(0.02, 0.9, f"{walk.time[at]:.1f} s", transform=axes.transAxes, fontsize=10)
-    axes.axis("off")
-    return image_of(figure)
-
-
-def image_of(figure: Figure) -> Image.Image:
-    """Return the picture of a figure."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
@@ -153,15 +96,11 @@ def image_of(figure: Figure) -> Image.Image:
 
 def main(options: Options) -> None:
     """Write the film; its last picture stays for a second."""
-    if options.recording is None:
-        robot, rate = Robot.load("panda"), 100
-        moves = simulate(robot, options.seconds)
-        draw = partial(draw_frame, robot, moves)
-    else:
-        walk = read_recording(options.recording)
-        rate = round(1 / (walk.time[1] - walk.time[0]))
-        draw = partial(draw_walk, Robot.load(walk.info.robot, fixed_base=False), walk)
-    frames = [draw(at) for at in range(0, round(options.seconds * rate), round(options.interval * rate))]
+    robot = Robot.load("panda")
+    moves = simulate(robot, options.seconds)
+    every = round(options.interval * 100)
+    ticks = [*range(0, round(options.seconds * 100), every)]
+    frames = [draw_frame(robot, moves, at) for at in ticks]
     palette = frames[-1].quantize(48, dither=Image.Dither.NONE)
     few = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     options.out.parent.mkdir(parents=True, exist_ok=True)

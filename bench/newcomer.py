@@ -3,9 +3,10 @@
     python bench/newcomer.py --out out/newcomer
 
 Needs network. Every command of their shell blocks runs as it stands there, in order, in an environment that ``make
-demo`` builds. A command whose error names an extra is repeated after that extra was installed. Commands of batchpid
-that have not ended after ``--limit`` seconds, such as ``batchpid view``, are ended as by Ctrl-C. Two files of a user
-are supplied: the bundled panda as arm.urdf, and a log of it from MuJoCo.
+demo`` builds. Program and command of the README also run in the folder that holds the clone, where Python finds the
+clone as a namespace package, and in an unrelated one. A command whose error names an extra is repeated after that extra
+was installed. Commands of batchpid that have not ended after ``--limit`` seconds, such as ``batchpid view``, are ended
+as by Ctrl-C. Two files of a user are supplied: the bundled panda as arm.urdf, and a log of it from MuJoCo.
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ import shlex
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,9 +70,17 @@ def commands(folder: Path) -> list[str]:
     return [command for command in found if command not in LEFT_OUT]
 
 
-def run(command: str, folder: Path, limit: float | None) -> Step:
-    """Run a command in ``folder``, with the environment that ``make demo`` has made there."""
-    variables = os.environ | {"PATH": f"{folder / '.venv' / 'bin'}{os.pathsep}{os.environ['PATH']}"}
+def readme_again(folder: Path) -> list[str]:
+    """Return the program of the README of a checkout, as Python reads it from its input, and its last command."""
+    text = (folder / "README.md").read_text()
+    program, *_ = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    return [f"python - << 'END'\n{program}END", re.findall(r"```sh\n(.*?)\n```", text, re.DOTALL)[-1]]
+
+
+def run(command: str, folder: Path, limit: float | None, clone: Path | None = None) -> Step:
+    """Run a command in ``folder``, with the environment that ``make demo`` has made there or in ``clone``."""
+    programs = (clone or folder) / ".venv" / "bin"
+    variables = os.environ | {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}
     variables.pop("PYTHONPATH", None)
     start = time.monotonic()
     process = subprocess.Popen(
@@ -110,8 +121,17 @@ def main(options: Options) -> int:
     wanted.insert(1, FILES)
     identify = next(at for at, command in enumerate(wanted) if command.startswith("batchpid identify"))
     wanted.insert(identify, LOG)
+    first, *others = wanted
+    with tempfile.TemporaryDirectory() as unrelated:
+        places = folder, folder.parent, Path(unrelated)
+        again = (run(command, place, None, folder) for place in places for command in readme_again(folder))
+        return report(chain([run(first, folder, None)], again, follow(others, folder, options.limit)))
+
+
+def report(steps: Iterable[Step]) -> int:
+    """Print the seconds of each step and of all; return the number of steps that failed without a remedy."""
     total, failed = 0.0, 0
-    for step in follow(wanted, folder, options.limit):
+    for step in steps:
         total += step.seconds
         problem = step.status != 0 and not step.stopped and step.extra is None
         failed += problem

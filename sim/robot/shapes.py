@@ -1,13 +1,12 @@
 """Visible surfaces of a robot: the shapes of its URDF as coloured triangles, for a view that has no SAPIEN renderer.
 
 A link is drawn by its ``<visual>`` elements; where it has none, or one of their mesh files cannot be read, by its
-collision shapes. Unreadable files are reported. The triangles are made, or read from mesh files, by ``trimesh`` (extra
-"view").
+collision shapes. Unreadable files are reported. A robot of which nothing can be drawn is drawn by rods between its
+joints. The triangles are made, or read from mesh files, by ``trimesh``.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import zlib
 from typing import Any, NamedTuple
@@ -16,7 +15,6 @@ import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
-from batchpid.errors import MissingDependencyError
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.meshes import find_mesh, mesh_problem
@@ -28,6 +26,7 @@ Rgba = tuple[float, ...]
 
 DEVIATION = 2e-3  # default distance allowed between a chord and its arc [m]
 FEWEST, MOST = 6, 48  # bounds of the number of segments of a circle
+_ROD = 0.08  # thickness of a rod, as a share of the longest one
 _PALETTE = ((0.62, 0.65, 0.70, 1.0), (0.42, 0.46, 0.53, 1.0), (0.80, 0.81, 0.83, 1.0))
 _CYLINDER = ((0.0, -0.5), (1.0, -0.5), (1.0, -0.5), (1.0, 0.5), (1.0, 0.5), (0.0, 0.5))  # (radius, z), rims twice
 
@@ -52,15 +51,11 @@ def surfaces(
 
     Raises
     ------
-    MissingDependencyError
-        The package ``trimesh`` is missing.
     RobotError
         A visual element is malformed.
     """
-    try:
-        from trimesh.util import concatenate
-    except ImportError:
-        raise MissingDependencyError("trimesh", "drawing a robot", "view") from None
+    from trimesh.util import concatenate
+
     original, sanitised = parse_xml(robot.path), etree.fromstring(robot.urdf.encode())
     if is_mjcf(original):  # drawn by its collision shapes
         original = sanitised
@@ -91,12 +86,30 @@ def surfaces(
                     parts.setdefault(_colour(element, colours, name, where), []).append(mesh)
                 break
         if findings is not None:
-            shown = "collision shapes are drawn instead" if parts else "nothing is drawn"
+            shown = "collision shapes are drawn instead" if parts else "it is not drawn"
             findings += [error.finding(name, shown) for error in unreadable]
         for rgba, same in parts.items():
             joined: Any = concatenate(same)
             result.append(Surface(name, rgba, np.asarray(joined.vertices), np.asarray(joined.faces)))
-    return result
+    return result or _rods(robot)
+
+
+def _rods(robot: RobotDescription) -> list[Surface]:
+    """Return a rod from the frame of each link to each joint on it, from the last links to their centers of mass."""
+    from trimesh import creation
+
+    tree = robot.rigid_tree
+    ends = [(parent, tree.position[link]) for link, parent in enumerate(tree.parent) if parent >= 0]
+    ends += [(link, tree.center[link]) for link in range(len(tree.links)) if link not in tree.parent]
+    lengths = [float(np.linalg.norm(end)) for _, end in ends]
+    thickness = _ROD * max(lengths)
+    rods = []
+    for (link, end), length in zip(ends, lengths, strict=True):
+        if length > thickness:
+            name = tree.links[link]
+            rod: Any = creation.cylinder(thickness / 2, segment=[np.zeros(3), end], sections=FEWEST)
+            rods.append(Surface(name, _default_colour(name), np.asarray(rod.vertices), np.asarray(rod.faces)))
+    return rods
 
 
 def segments_of(radius: float, deviation: float) -> int:
@@ -135,9 +148,6 @@ def _read_mesh(name: str, robot: RobotDescription) -> Any:
         loaded: Any = load(path, force="mesh", process=False)
     except Exception as error:  # trimesh raises errors of many types
         loaded, problem = None, f"{type(error).__name__}: {error}"
-        if path.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
-            reason, remedy = "in COLLADA needs the package pycollada", "pip install 'batchpid[view]'"
-            raise _UnreadableMesh(name, reason, remedy) from error
     if loaded is None or not len(loaded.faces):
         raise _UnreadableMesh(name, f"cannot be read ({mesh_problem(path) or problem})", "repair the file")
     factor, _, unit = str(loaded.metadata.get("units", "")).partition(" * ")  # of COLLADA: "0.01 * meters"
@@ -185,8 +195,12 @@ def _colour(element: etree._Element, colours: dict[str | None, Rgba], link: str,
     material = element.find("material")
     if material is not None and material.find("color") is not None:
         return _rgba(material.find("color"), where)
-    default = _PALETTE[zlib.crc32(link.encode()) % len(_PALETTE)]  # the same in every run, unlike hash()
+    default = _default_colour(link)
     return default if material is None else colours.get(material.get("name"), default)
+
+
+def _default_colour(link: str) -> Rgba:
+    return _PALETTE[zlib.crc32(link.encode()) % len(_PALETTE)]  # the same in every run, unlike hash()
 
 
 def _rgba(color: etree._Element, where: str) -> Rgba:

@@ -29,9 +29,8 @@ class Charts:
         names = data.groups if len(data.groups) > 1 else ("",)
 
         def chart(title: str, *series: dict[str, Any]) -> Any:
-            empty = np.array([-HISTORY_SECONDS, 0.0])
             return gui.add_uplot(
-                (empty,) * (len(series) + 1),
+                (np.array([-HISTORY_SECONDS, 0.0]), *[np.zeros(2)] * len(series)),  # flat until the first update
                 ({"label": "s"}, *series),
                 title=title,
                 scales=_SCALES,

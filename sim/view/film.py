@@ -1,4 +1,7 @@
-"""Films of recorded runs and SAPIEN's window, drawn by SAPIEN's renderer, which needs a Vulkan device."""
+"""Films of recorded runs, and SAPIEN's window.
+
+Films are drawn by SAPIEN's renderer, which needs a Vulkan device, and without one by Matplotlib.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,9 @@ from batchpid.errors import MissingDependencyError
 from batchpid.io.files import replacing
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.view import renderer
 from batchpid.sim.view.layout import FIELD_OF_VIEW, MAX_ROBOTS
+from batchpid.sim.view.painter import PaintedScene
 from batchpid.sim.view.playback import had_ground, rows_at
 from batchpid.sim.view.renderer import RenderError, RenderScene, check_renderer
 
@@ -42,6 +47,9 @@ def write_film(
 ) -> Path:
     """Write a film of ``rollout`` in real time, all envs next to each other, and return its path.
 
+    Where SAPIEN cannot render, Matplotlib draws the robots, plainer: see
+    :func:`batchpid.sim.view.renderer.render_problem`.
+
     Parameters
     ----------
     out
@@ -60,15 +68,15 @@ def write_film(
     MissingDependencyError
         The package imageio-ffmpeg is missing.
     RenderError
-        SAPIEN cannot render on this machine, or the film cannot be written.
+        The film cannot be written.
     """
     path = file_path("out", out, FORMATS)
     rate = number("fps", fps, 1.0, 120.0, "frames per second")
     size = integer("width", width, 16, 8192), integer("height", height, 16, 8192)
     integer("num_envs", rollout.num_envs, 1, MAX_ROBOTS)
     ffmpeg = _ffmpeg()
-    check_renderer()
-    scene = _scene_of(rollout, robot)
+    robot, kind = _robot_of(rollout, robot), PaintedScene if renderer.render_problem() else RenderScene
+    scene = kind(robot, rollout.num_envs, had_ground(rollout, robot))
     picture = scene.add_camera(*size)
     rows = film_rows(rollout, rate).tolist()
 
@@ -151,7 +159,8 @@ def show_window(rollout: Rollout, *, robot: Robot | None = None, seconds: float 
     check_renderer()
     from sapien.utils import Viewer
 
-    scene = _scene_of(rollout, robot)
+    robot = _robot_of(rollout, robot)
+    scene = RenderScene(robot, rollout.num_envs, had_ground(rollout, robot))
     try:
         viewer = Viewer()
     except RuntimeError as error:
@@ -168,7 +177,5 @@ def show_window(rollout: Rollout, *, robot: Robot | None = None, seconds: float 
     viewer.close()
 
 
-def _scene_of(rollout: Rollout, robot: Robot | None) -> RenderScene:
-    """Return a scene with a robot for each env, and the floor of the run."""
-    robot = Robot.load(rollout.info.robot) if robot is None else robot
-    return RenderScene(robot, rollout.num_envs, had_ground(rollout, robot))
+def _robot_of(rollout: Rollout, robot: Robot | None) -> Robot:
+    return Robot.load(rollout.info.robot) if robot is None else robot

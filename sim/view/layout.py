@@ -24,6 +24,8 @@ _PITCH = 1.3
 """Distance between neighbours, in reaches: two robots overlap only when both stretch out."""
 _GAP = 0.6
 """Extra distance between two groups, in pitches."""
+_FILM_DISTANCE = 0.85
+"""Distance of the camera of a film, as a share of that in the browser."""
 _CAMERA_DIRECTION = np.array([-0.62, -0.80, 0.52]) / np.linalg.norm([-0.62, -0.80, 0.52])
 
 
@@ -37,6 +39,11 @@ class RobotLayout(NamedTuple):
     target: Float64
     reach: float
     floor: float
+
+    @property
+    def film_eye(self) -> Float64:
+        """Position of the camera of a film (3,) [m]: nearer, as there no panels cover the sides of the picture."""
+        return self.target + _FILM_DISTANCE * (self.camera - self.target)
 
     @property
     def corners(self) -> tuple[Float64, Float64]:

@@ -25,8 +25,6 @@ sapien: Any = import_sapien()
 
 _LINE = 4e-3
 """Half the width of a line of the grid [m]."""
-_CLOSER = 0.72
-"""Distance of the camera as a share of that in the browser, where panels cover the sides of the picture."""
 
 TEST_PROGRAM = """
 import os, sapien
@@ -39,7 +37,7 @@ print("rendered", flush=True)
 os._exit(0)
 """
 """Program that prints "rendered" where SAPIEN can render."""
-_REMEDY = (
+REMEDY = (
     "it needs a Vulkan driver: that of the GPU, or Mesa's software one, version 25 or newer (Debian 12: "
     "apt-get install -t bookworm-backports mesa-vulkan-drivers). Without one, look at the same in a browser: "
     "batchpid view"
@@ -69,7 +67,7 @@ def render_problem(program: str = TEST_PROGRAM) -> str | None:
 def check_renderer() -> None:
     """Raise :class:`RenderError` unless SAPIEN can render on this machine."""
     if (problem := render_problem()) is not None:
-        raise RenderError(f"SAPIEN cannot render on this machine ({problem}); {_REMEDY}")
+        raise RenderError(f"SAPIEN cannot render on this machine ({problem}); {REMEDY}")
 
 
 def add_floor(scene: Any, layout: RobotLayout, ground: bool, material: Any) -> None:
@@ -107,7 +105,7 @@ class RenderScene:
 
     def __init__(self, robot: Robot, count: int, ground: bool) -> None:
         layout = arrange_robots(robot, 1, count, ground)
-        eye = layout.target + _CLOSER * (layout.camera - layout.target)
+        eye = layout.film_eye
         x, y, z = layout.target - eye  # a camera looks along its x axis
         self.camera_pose = sapien.Pose(eye, from_rpy([0.0, math.atan2(-z, math.hypot(x, y)), math.atan2(y, x)]))
         self.scene = sapien.Scene()

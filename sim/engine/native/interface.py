@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 
-from batchpid.native.extensions import ROUNDED, Extension
+from batchpid.native.extensions import ROUNDED, VECTORIZED_ONLY, Extension
 from batchpid.native.operations import PROGRAMS
 from batchpid.native.task_space_extension import CALL, COUPLING, LANES, RIGID_BODY, TABLES
 
@@ -187,6 +187,6 @@ EXTENSIONS = {
             TABLES,
             *PROGRAMS,
         ),
-        (*ROUNDED, "-pthread", "-Wno-psabi"),
+        (*ROUNDED, *VECTORIZED_ONLY, "-pthread", "-Wno-psabi"),
     ),
 }

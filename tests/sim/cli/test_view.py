@@ -88,7 +88,7 @@ def test_a_mesh_that_cannot_be_read_is_named_on_the_page_and_in_the_terminal(bat
     status, _, err = batchpid("view", path, *SHORT, "--time-limit", 0.1)
     assert status == 0
     assert err.splitlines() == [
-        "batchpid: warning: link 'base' ('no.stl'): mesh not found: nothing is drawn; put the file next to the URDF, "
+        "batchpid: warning: link 'base' ('no.stl'): mesh not found: it is not drawn; put the file next to the URDF, "
         "or pass package_dirs=[...] to Robot.load (--package-dirs)",
         "batchpid: warning: link 'arm' ('<b>.stl'): mesh cannot be read (a git-lfs pointer instead of the mesh: run "
         "git lfs pull): collision shapes are drawn instead; repair the file",

@@ -39,6 +39,15 @@ def draw(jaco2):
     return draw
 
 
+def test_charts_are_flat_before_the_first_update(jaco2):
+    ok = np.ones((2, 1), bool)
+    rest = np.zeros((2, 1, jaco2.dof), np.float32)
+    gui = Gui()
+    seen = Observation(rest, rest, rest, rest > 0, ok, rest > 0)
+    Charts(gui, Playback(Rollout(np.array([0.1, 0.2]), 0.0 * rest, seen, 0.1, jaco2.run_info()), jaco2))
+    assert all(np.ptp(curve) == 0 for chart in gui.charts for curve in chart.data[1:])
+
+
 @pytest.mark.parametrize("height", [1e-7, 0.3, 18.0])
 def test_curves_are_finite_one_for_each_series(draw, height):
     charts = draw(height)

@@ -1,4 +1,4 @@
-"""SAPIEN's renderer: films where it works, and an error with a remedy where it does not."""
+"""Films, by SAPIEN's renderer where it works and by Matplotlib where it does not; and its window."""
 
 import os
 import subprocess
@@ -10,6 +10,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Runner
 from batchpid.sim.cli import main
 from batchpid.sim.view import film, renderer
+from batchpid.sim.view.painter import PaintedScene
 
 
 @pytest.fixture(scope="module")
@@ -18,14 +19,46 @@ def rollout(panda):
         return runner.rollout(np.broadcast_to(panda.settings.target, (20, panda.dof)))
 
 
-def test_without_a_device_the_error_gives_the_remedy(rollout, tmp_path, monkeypatch):
-    pytest.importorskip("imageio_ffmpeg")
+@pytest.fixture
+def no_device(monkeypatch):
     monkeypatch.setattr(renderer, "render_problem", lambda: "RuntimeError: failed to find a rendering device")
+
+
+def test_without_a_device_the_error_gives_the_remedy(rollout, no_device):
     with pytest.raises(
         renderer.RenderError, match=r"failed to find a rendering device.*mesa-vulkan-drivers.*batchpid view"
     ):
-        film.write_film(rollout, tmp_path / "film.mp4")
-    assert not list(tmp_path.iterdir())
+        film.show_window(rollout)
+
+
+def test_without_a_device_a_film_is_painted_and_says_so(tmp_path, monkeypatch, capsys, no_device):
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.chdir(tmp_path)
+    assert main(["rollout", "--num-envs", "2", "--seconds", "0.2", "--workers", "0", "--out", "run.npz"]) == 0
+    assert main(["render", "run.npz", "--out", "film.mp4", "--width", "320", "--height", "180"]) == 0
+    assert "drawn by Matplotlib; SAPIEN's renderer does not work" in capsys.readouterr().out
+    frames = read_film("film.mp4", 320, 180)
+    assert 6 <= len(frames) <= 7
+    assert frames[0].std() > 5  # not empty
+    assert np.abs(frames[-1].astype(int) - frames[0]).max() > 40  # the robots move
+
+
+@pytest.mark.parametrize("ground", [False, True])
+def test_a_painted_robot_stands_where_it_is(panda, ground):
+    scene = PaintedScene(panda, 2, ground)
+    picture = scene.add_camera(160, 90)
+    poses = np.array([panda.start, panda.settings.target])
+    scene.place(poses)
+    first = picture()
+    scene.place(np.array([panda.settings.target, np.full(panda.dof, np.nan)]))  # the second keeps its pose
+    second = picture()
+    scene.place(np.array([panda.start, panda.start]))
+    third = picture()
+    scene.place(poses)
+    changed = [(first != other).any(-1) for other in (second, third)]
+    assert (first == picture()).all()
+    assert all(each.any() for each in changed)
+    assert not (changed[0] & changed[1]).any()  # each robot in its own place
 
 
 @pytest.mark.parametrize(
@@ -60,7 +93,7 @@ def test_a_film_shows_a_recorded_run(tmp_path, monkeypatch):
     if renderer.render_problem() is not None:
         pytest.skip("needs a Vulkan device")
     monkeypatch.chdir(tmp_path)
-    assert main(["rollout", "--num-envs", "2", "--seconds", "0.3", "--workers", "0", "--out", "run.npz"]) == 3
+    assert main(["rollout", "--num-envs", "2", "--seconds", "0.3", "--workers", "0", "--out", "run.npz"]) == 0
     assert main(["render", "run.npz", "--out", "film.mp4", "--width", "320", "--height", "180"]) == 0
     frames = read_film("film.mp4", 320, 180)
     assert frames.shape[1:] == (180, 320, 3)
@@ -79,7 +112,7 @@ class Slides:
         noise = np.random.default_rng(0).random((height, width, 3))
         return lambda: (255 * np.clip(noise * self._level, 0, 1)).astype(np.uint8)
 
-    def place(self, qpos):
+    def place(self, qpos, base_pose):
         self._level += 0.04
 
 
