@@ -4,9 +4,9 @@
 
 Needs network. Every command of their shell blocks runs as it stands there, in order, in an environment that ``make
 demo`` builds. Program and command of the README also run in the folder that holds the clone, where Python finds the
-clone as a namespace package, and in an unrelated one. A command whose error names an extra is repeated after that extra was installed. Commands of batchpid
-that have not ended after ``--limit`` seconds, such as ``batchpid view``, are ended as by Ctrl-C. Two files of a user
-are supplied: the bundled panda as arm.urdf, and a log of it from MuJoCo.
+clone as a namespace package, and in an unrelated one. A command whose error names an extra is repeated after that extra
+was installed. Commands of batchpid that have not ended after ``--limit`` seconds, such as ``batchpid view``, are ended
+as by Ctrl-C. Two files of a user are supplied: the bundled panda as arm.urdf, and a log of it from MuJoCo.
 """
 
 from __future__ import annotations

@@ -27,8 +27,10 @@ from batchpid.checks.validate import choice, flag, instance, integer, joint_spee
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.inputs import check_drive
+from batchpid.motors.friction import Friction
 from batchpid.sim.command import CommandSpec, joint_command, own_command
 from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.engine.joint_friction import added_friction
 from batchpid.sim.engine.protocol import Capability, Engine, require
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
@@ -301,7 +303,7 @@ class RunnerOptions:
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
-        added = actuators is not None and (actuators.coulomb is not None or actuators.static is not None)
+        added = actuators is not None and added_friction(Friction(), actuators).coulomb is not None
         return bool(self.robot.friction.any()) or added or getattr(self.randomization, "friction", None) is not None
 
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:

@@ -15,7 +15,6 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.export.exported import Exported
 from batchpid.export.pd_drive import Drive
 from batchpid.law.params import PIDParams
-from batchpid.motors.actuator_fields import JOINT_SIDE
 from batchpid.motors.actuators import Actuators
 
 CLASSES = {
@@ -24,6 +23,8 @@ CLASSES = {
     "dc_motor": "DCMotorCfg",
     "delayed_pd": "DelayedPDActuatorCfg",
 }
+JOINT_FIELDS = ("armature", "coulomb", "static", "viscous")
+"""Effects of actuators that Isaac Lab has for each joint."""
 NO_LIMIT = 1e9
 """No limit, as in Isaac Lab. Without a number it takes the USD file's limit; in a dict, 0 for a joint without a key."""
 
@@ -92,7 +93,7 @@ def to_isaac_lab(
     if model == "delayed_pd":
         whole |= dict.fromkeys(("min_delay", "max_delay"), found.delay_steps())
     has = {"dc_motor": ("saturation_effort",), "delayed_pd": ("command_delay",)}.get(model, ())
-    found.lack_motors((*has, *JOINT_SIDE))
+    found.lack_motors((*has, *JOINT_FIELDS))
     groups: dict[tuple[Any, ...], list[int]] = {}
     for at, key in enumerate(zip(*whole.values(), strict=True) if whole else [()] * len(found.joints)):
         groups.setdefault(key, []).append(at)

@@ -34,7 +34,7 @@ def to_maniskill(
     identifier("name", name)
     found = Drive(params, joint_names, dt, inertia, actuators, implicit=True)
     problem = "friction of PhysX is a coefficient, not an effort"
-    found.lack_motors((), coulomb=problem, static=problem)
+    found.lack_motors((), coulomb=problem, static=problem, load_friction=problem)
     lists = {
         "joint_names": found.joints,
         "lower": None,

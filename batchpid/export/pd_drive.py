@@ -19,7 +19,11 @@ from batchpid.motors.actuators import Actuators
 Float64 = NDArray[np.float64]
 EFFECTS = {name: field for name, field in FIELDS.items() if name not in ("no_load_speed", "effort_limit")}
 """Effects of actuators that a target may lack."""
-_PROBLEMS = {"saturation_effort": "no torque-speed line", "static": "friction at rest is that of motion"}
+_PROBLEMS = {
+    "saturation_effort": "no torque-speed line",
+    "static": "friction at rest is that of motion",
+    "load_friction": "friction does not grow with the effort",
+}
 
 
 class Drive(Differences):

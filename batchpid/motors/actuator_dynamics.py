@@ -6,7 +6,7 @@ effort u that the controller asks for::
     x      = q + min(max(x' - q, -B/2), B/2)               backlash: the sensor is dragged along
     v_x    = v, 0 within the play
     y, v_y = x(t - d_s), v_x(t - d_s)                      sensor delay
-    y      = r rint((y + sigma z) / r)                     noise, resolution; of v_y likewise
+    y      = r rint((y + o + sigma z) / r)                 offset, noise, resolution; of v_y likewise
 
     m      = s u(t - d_c) + b                              command delay, strength, bias
     e      = min(max(m, low(q, v)), high(q, v))            envelope: batchpid.motors.envelope
@@ -55,6 +55,8 @@ class Coefficients(NamedTuple):
     bias: Any = None
     play: Any = None
     """B / 2."""
+    position_offset: Any = None
+    """o."""
     position_resolution: Any = None
     velocity_resolution: Any = None
     position_noise: Any = None
@@ -144,6 +146,7 @@ def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: in
         strength=a.strength,
         bias=a.bias,
         play=None if a.backlash is None else 0.5 * a.backlash,
+        position_offset=a.position_offset,
         position_resolution=_step(a.position_resolution, xp),
         velocity_resolution=_step(a.velocity_resolution, xp),
         position_noise=a.position_noise,
@@ -231,8 +234,12 @@ def _play(k: Coefficients, encoder: Any, qpos: Any, qvel: Any) -> tuple[Any, Any
 
 
 def _encode(k: Coefficients, qpos: Any, qvel: Any, position: Any, velocity: Any) -> tuple[Any, Any]:
-    """Return position and velocity with noise, ``position`` and ``velocity`` or None, in steps of the resolution."""
+    """Return position and velocity as encoded: with offset and noise, in steps of the resolution.
+
+    ``position`` and ``velocity`` are the noise, or None.
+    """
     xp = namespace(qpos, qvel)
+    qpos = qpos if k.position_offset is None else qpos + k.position_offset
     qpos = qpos if position is None else qpos + position
     qvel = qvel if velocity is None else qvel + velocity
     if k.position_resolution is not None:

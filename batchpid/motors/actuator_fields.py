@@ -21,12 +21,17 @@ MOTOR_SIDE = {
 JOINT_SIDE = {
     "coulomb": Field("N m or N"),
     "static": Field("N m or N"),
+    "stribeck": Field("rad/s or m/s"),
+    "load_friction": Field("1", high=1.0),
     "viscous": Field("N m s/rad or N s/m"),
     "armature": Field("kg m^2 or kg"),
 }
 """Numbers that act on the joint and not on the signals: :class:`batchpid.sim.Runner` gives them to the simulator."""
+DRIVEN = tuple(name for name in JOINT_SIDE if name != "load_friction")
+"""Effects that joints under drives of the engine have; friction by load needs the motor's effort, which is unknown."""
 SENSOR_SIDE = {
     "sensor_delay": Field("s", high=MAX_DELAY),
+    "position_offset": Field("rad or m", low=-math.inf),
     "backlash": Field("rad or m"),
     "position_resolution": Field("rad or m"),
     "velocity_resolution": Field("rad/s or m/s"),

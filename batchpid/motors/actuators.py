@@ -41,8 +41,11 @@ class Actuators(NamedTuple):
     """L_k (1, joints, points)."""
     coulomb: Any = None
     static: Any = None
+    stribeck: Any = None
+    load_friction: Any = None
     viscous: Any = None
     armature: Any = None
+    position_offset: Any = None
     backlash: Any = None
     position_resolution: Any = None
     velocity_resolution: Any = None
@@ -145,8 +148,11 @@ def make_actuators(
     position_limit: tuple[Any, Any] | None = None,
     coulomb: Any = None,
     static: Any = None,
+    stribeck: Any = None,
+    load_friction: Any = None,
     viscous: Any = None,
     armature: Any = None,
+    position_offset: Any = None,
     backlash: Any = None,
     position_resolution: Any = None,
     velocity_resolution: Any = None,
@@ -190,8 +196,15 @@ def make_actuators(
     static
         Friction that holds the joint at rest, where that is more than while it moves [N m or N]: >= ``coulomb``, also
         in addition to the description's. 0: as much as while it moves.
+    stribeck
+        Speed >= 0 at which the friction of a joint that slides has fallen half way from ``static`` to ``coulomb``
+        [rad/s or m/s]. 0: it has fallen as soon as the joint slides.
+    load_friction
+        Friction that grows with the load, as in gears: from 0 to 1, over the motor's effort.
     armature
         Reflected inertia of the motor >= 0 [kg m^2 or kg].
+    position_offset
+        Error of the encoder's zero, added to measured positions [rad or m].
     backlash
         Play >= 0 between the joint and its sensor, from one end to the other [rad or m].
     position_resolution, velocity_resolution
@@ -233,6 +246,12 @@ def make_actuators(
         coulomb = 0.0 if leaves["coulomb"] is None else leaves["coulomb"]
         good = is_traced(coulomb) or (static >= coulomb) | (static == 0)
         entries("static", static, good, "is less than coulomb", joint_names, remedy="give at least coulomb, or 0")
+    if leaves["stribeck"] is not None and static is None:
+        if given["static"] is None:
+            raise InvalidArgumentError(
+                "stribeck", "has no effect without static", remedy="give static, or leave it out"
+            )
+        leaves["stribeck"] = None
     points, efforts = _table(build, position_limit)
     noisy = leaves["position_noise"] is not None or leaves["velocity_noise"] is not None
     words = integer("seed", seed, 0, 2**64 - 1)

@@ -23,7 +23,12 @@ models", IROS 2005)::
   2002). The yield by clipping is the return mapping of J. C. Simo and T. J. R. Hughes, Computational Inelasticity
   (1998), section 1.4.
 
-With a static friction F_s > F the bound is F_s until the joint yields, and F until it holds again.
+With a static friction F_s > F the bound is F_s until the joint yields. While it slides the bound falls with the speed
+from F_s to F, half way at the Stribeck velocity v_s, and at once if that is 0 (D. P. Hess and A. Soom, "Friction at a
+lubricated line contact operating at oscillating sliding velocities", Journal of Tribology 112, 1990). In gears friction
+grows with the effort that they transmit; here that is the motor's::
+
+    bound = F + (F_s - F) / (1 + (v / v_s)^2) + mu |tau|
 
 With K = J / dt one joint stops in one step (deadbeat), and up to 4/3 of that is stable. Coupled joints share it: with
 the correlations C_ij = A_ij / sqrt(A_ii A_jj) of A = (M + dt B)^-1, J_j = 1 / (A_jj sum_i |C_ij|) keeps the eigenvalues
@@ -35,7 +40,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from batchpid.arrays.display import array_summary
-from batchpid.arrays.elementwise import clip, namespace
+from batchpid.arrays.elementwise import clip, namespace, tiny_of
 from batchpid.checks.validate import check_time_step
 
 SHARE = 0.7
@@ -53,6 +58,16 @@ class Friction(NamedTuple):
     """B >= 0 [N m s/rad or N s/m]."""
     static: Any = None
     """F_s >= F, which holds the joint at rest; 0: F [N m or N]."""
+    stribeck: Any = None
+    """v_s >= 0 [rad/s or m/s]."""
+    load: Any = None
+    """mu, from 0 to 1."""
+
+    @property
+    def most(self) -> Any:
+        """Array that is positive where a joint has friction other than viscous; None without such joints."""
+        parts = [leaf for leaf in (self.coulomb, self.static, self.load) if leaf is not None]
+        return sum(parts[1:], parts[0]) if parts else None
 
 
 class FrictionState(NamedTuple):
@@ -109,7 +124,7 @@ def refresh(
     if friction.coulomb is None:
         return state
     xp = namespace(mass_matrix, *friction)
-    rubs = xp.zeros_like(state.effort) + friction.coulomb > 0
+    rubs = xp.zeros_like(state.effort) + friction.most > 0
     implicit = (0.0 if friction.viscous is None else friction.viscous) + damping + dt * stiffness
     implicit = xp.zeros_like(state.effort) + implicit
     diagonal = implicit[:, :, None] * xp.eye(implicit.shape[-1], dtype=implicit.dtype)[None]
@@ -131,9 +146,8 @@ def advance(friction: Friction, state: FrictionState, effort: Any, velocity: Any
     total = effort
     if friction.coulomb is not None:
         xp = namespace(effort, velocity, *state)
-        held, bound = state.effort - state.gain * velocity + state.memory * state.velocity, friction.coulomb
-        if friction.static is not None:
-            bound = xp.where(state.sliding > 0, bound, xp.maximum(bound, friction.static))
+        held = state.effort - state.gain * velocity + state.memory * state.velocity
+        bound = bound_of(friction, state.sliding, effort, velocity)
         total = xp.minimum(xp.maximum(held, effort - bound), effort + bound)
         if friction.static is not None:
             state = state._replace(sliding=(total != held).astype(total.dtype))
@@ -141,6 +155,25 @@ def advance(friction: Friction, state: FrictionState, effort: Any, velocity: Any
     if friction.viscous is not None:
         total = total - friction.viscous * velocity
     return state, total
+
+
+def bound_of(friction: Friction, sliding: Any, effort: Any, velocity: Any) -> Any:
+    """Return the largest friction other than viscous (envs, joints) [N m or N] under the motors' ``effort``.
+
+    ``sliding`` is positive where the friction had yielded before.
+    """
+    bound = friction.coulomb
+    if friction.static is not None:
+        xp = namespace(bound, friction.static, velocity)
+        rest = xp.maximum(bound, friction.static)
+        if friction.stribeck is not None:
+            square = friction.stribeck * friction.stribeck
+            both = xp.maximum(square + velocity * velocity, tiny_of(velocity.dtype))
+            bound = bound + (rest - bound) * (square / both)
+        bound = xp.where(sliding > 0, bound, rest)
+    if friction.load is not None:
+        bound = bound + friction.load * namespace(effort).abs(effort)
+    return bound
 
 
 def compensation(coulomb: Any, error: Any, rate: Any, band: Any) -> Any:

@@ -28,10 +28,11 @@ def own_friction(spec: SceneSpec, variation: Variation | None = None) -> Frictio
 def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
     """Return ``own`` friction and damping plus the actuators' friction and damping."""
     added = Actuators() if actuators is None else actuators
-    static = added.static
+    static, load = added.static, added.load_friction
     both = zip(own[:2], (added.coulomb, added.viscous), strict=True)
     coulomb, viscous = (one if more is None else more if one is None else one + more for one, more in both)
     if static is not None:
         static = static if own.coulomb is None else static + own.coulomb
-        coulomb = np.zeros_like(static) if coulomb is None else coulomb
-    return Friction(coulomb, viscous, static)
+    if coulomb is None and (rubs := Friction(None, None, static, load=load).most) is not None:
+        coulomb = np.zeros_like(rubs)
+    return Friction(coulomb, viscous, static, added.stribeck, load)

@@ -117,7 +117,7 @@ class NativeRefresh:
         self._native = native.extension("_gateway")
         shape = (size, armature.shape[1])
         viscous = 0.0 if friction.viscous is None else friction.viscous
-        named = {"armature": armature, "coulomb": friction.coulomb, "viscous": viscous}
+        named = {"armature": armature, "coulomb": friction.most, "viscous": viscous}
         named |= dict(zip(("damping", "stiffness"), drive, strict=True))
         arrays = {name: np.array(np.broadcast_to(rows, shape), np.float64, order="C") for name, rows in named.items()}
         arrays |= coupling.native()

@@ -3,11 +3,15 @@
 Efforts that jump from step to step are smoothed by a delay of a fractional number of steps, but not by a whole number.
 So the likelihood may have a maximum between any two steps, and a fit finds the nearest. It is repeated one step earlier
 and later.
+
+Effects beside those of every fit are added one after the other, from the fit without them, and kept at the joints whose
+error on the held-out part falls.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +19,17 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.fit import LEAST_GAIN, Solution, Step, fit
 from batchpid.sim.identification.fit_history import History, State
-from batchpid.sim.identification.problem import Problem
+from batchpid.sim.identification.plant import plants_of
+from batchpid.sim.identification.problem import Evaluation, Problem
+from batchpid.sim.identification.regression import Regression
+from batchpid.sim.identification.unknowns import LAW
 
 NEIGHBOURS, NEIGHBOUR_EVALUATIONS = 6, 8
 """Most fits at other delays, and most evaluations of each."""
+EXTRA_EVALUATIONS = 12
+"""Most evaluations of a fit with further unknowns."""
+ACCEPTED = 0.99
+"""Largest error on the held-out part with further unknowns that are kept, over the error without."""
 
 
 class Progress:
@@ -58,6 +69,54 @@ def search(
         begin = None
     number, best = min(done, key=lambda each: each[1].cost)
     return problems[number], best
+
+
+def extended(problem: Problem, best: Solution, kinds: tuple[str, ...]) -> tuple[Problem, Solution]:
+    """Return the fit with further ``kinds`` of unknowns at the joints where the error on the held-out part falls."""
+    sizes, joints = _typical(problem, best), list(range(len(problem.joints)))
+    while joints:
+        unknowns = problem.unknowns.plus(kinds, joints, sizes)
+        wider = replace(problem, unknowns=unknowns)
+        tried = unknowns.tries(best.theta, kinds, sizes)
+        if not set(LAW).isdisjoint(kinds):  # with another law other motors explain the motion
+            tried = np.concatenate([tried, [_regressed(wider, point) for point in tried]])
+        costs = wider.costs(wider.sizes(wider.residuals(tried))).mean(1)
+        found = fit(wider, Step.first(tried[int(costs.argmin())], EXTRA_EVALUATIONS))
+        before, after = (errors_of(wider, each.windows) for each in (best, found))
+        if np.linalg.norm(after) < ACCEPTED * np.linalg.norm(before):
+            return wider, found
+        fewer = [joint for joint in joints if after[joint] < ACCEPTED * before[joint]]
+        joints = fewer if len(fewer) < len(joints) else []
+    return problem, best
+
+
+def _regressed(problem: Problem, point: Float64) -> Float64:
+    """Return ``point`` with the motors that a regression gives for the law at ``point``."""
+    unknowns, both = problem.unknowns, zip(problem.logs, problem.motions, strict=True)
+    logs, motions = map(list, zip(*(each for each in both if not each[0].settings.held_out), strict=True))
+    plants = plants_of(problem.robot, problem.joints, problem.drive, logs)
+    motors, payload = unknowns.motors(point[None]), ("payload", None) in unknowns.names
+    law = {name: motors[name] for name in LAW if name in motors}
+    start = Regression(plants, logs, motions, payload, "gain" not in law, law)
+    return unknowns.clip(unknowns.point(motors | start.best.motors))
+
+
+def _typical(problem: Problem, best: Solution) -> dict[str, Float64]:
+    """Return typical values (joints,) for further unknowns."""
+    motions = problem.motions
+    sizes = {
+        "speed": np.max([np.abs(motion.qvel).max(0) for motion in motions], axis=0),
+        "error": np.max([np.abs(motion.command - motion.qpos).max(0) for motion in motions], axis=0),
+        "friction": problem.unknowns.motors(best.theta[None])["friction"][0],
+    }
+    return {name: np.maximum(size, 1e-3) for name, size in sizes.items()}
+
+
+def errors_of(problem: Problem, windows: list[Evaluation]) -> Float64:
+    """Return the root mean square of the residuals of each joint on the held-out rows (joints,) [rad or m]."""
+    kept = [each.residual[~window.fitted] for each, window in zip(windows, problem.windows, strict=True)]
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.nan_to_num(np.sqrt((np.concatenate(kept) ** 2).mean(0)), nan=np.inf)
 
 
 def _stage(problems: list[Problem], done: list[tuple[int, Solution]], evaluations: int) -> tuple[int, Step] | None:

@@ -67,10 +67,12 @@ def held_out_error(
     assumed = _assumed(source, documents.read(source))
     _check_modelled(source, own, robot, joints)
     motors = motors_of(own, robot, joints, float(assumed["stopping"]), float(assumed["payload"]))
+    if (slew := _slew(source, assumed, [robot.joint_names[joint] for joint in joints])) is not None:
+        motors["slew"] = slew
     one = np.ones(len(joints))
-    unknowns = Unknowns.of(one, one, one, one, payload=True).without(
-        {"lag": motors.pop("lag")} if "lag" in motors else {}
-    )
+    more = [name for name in motors if name in ADDED]
+    sizes = {"speed": one, "error": one, "friction": one}
+    unknowns = Unknowns.of(one, one, one, one, payload=True).plus(more, range(len(joints)), sizes)
     motions = [smooth(log, inputs.drive.timestep) for log in inputs.logs]
     ways = [each for way in hypotheses(inputs.drive, payload=True) for each in variants(way, motions)]
     stated = [way for way in ways if way.assumptions.items() <= assumed.items()]
@@ -113,7 +115,7 @@ def motors_of(
         if kind.field is None or (name in ADDED and leaf is None):
             continue
         row = np.full((1, len(own)), kind.neutral) if leaf is None else np.array(leaf, float)[:1, own]
-        row = row + getattr(robot, name)[own] if name in DESCRIBED else row
+        row = row + getattr(robot, DESCRIBED[name])[own] if name in DESCRIBED else row
         motors[name] = row if kind.per_joint else row[:, :1]
     return motors
 
@@ -128,6 +130,17 @@ def _assumed(source: str, document: Any) -> dict[str, Any]:
             remedy = f"give a number from {low:g} to {high:g}, or leave out {ASSUMED}"
             raise InvalidArgumentError(f"{source}: {name}", "is out of range", value=found[name], remedy=remedy)
     return found
+
+
+def _slew(source: str, assumed: dict[str, Any], joints: list[str]) -> Float64 | None:
+    """Return the limits of the setpoints' rate that an actuators file states (1, joints); None without such limits."""
+    if "slew" not in assumed:
+        return None
+    rates = assumed["slew"] if isinstance(assumed["slew"], dict) else {}
+    if not all(documents.is_number(rates.get(joint)) and rates[joint] > 0 for joint in joints):
+        remedy = f"give a number > 0 by joint: {', '.join(joints)}"
+        raise InvalidArgumentError(f"{source}: slew", "is not valid", value=assumed["slew"], remedy=remedy)
+    return np.array([[float(rates[joint]) for joint in joints]])
 
 
 def _check_modelled(source: str, actuators: bp.Actuators, robot: Robot, joints: tuple[int, ...]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
@@ -16,14 +16,16 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
-from batchpid.checks.validate import flag, integer
+from batchpid.checks.validate import choice, flag, integer
+from batchpid.errors import InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.motors.actuator_files import dumps_actuators, loads_actuators
 from batchpid.native.availability import obstacle
+from batchpid.sim.identification.diagnosis import diagnose
 from batchpid.sim.identification.effort_ratios import EffortRatios, effort_ratios
 from batchpid.sim.identification.fit import Solution, Step
 from batchpid.sim.identification.fit_history import History, State
-from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, search
+from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, extended, search
 from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_of, residuals_of_ideal
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.logged_control import Drive
@@ -34,7 +36,7 @@ from batchpid.sim.identification.regression import Motion, Regression, best_driv
 from batchpid.sim.identification.result import Fit, Identification, actuators_at
 from batchpid.sim.identification.start import begin
 from batchpid.sim.identification.statistics import EXPLAINED, misfits, uncertainty
-from batchpid.sim.identification.unknowns import KINDS, Motors, Unknowns
+from batchpid.sim.identification.unknowns import EXTRAS, KINDS, LAW, Motors, Unknowns
 from batchpid.sim.identification.windows import rows_of
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Compensation
@@ -50,6 +52,7 @@ def identify(
     sim_steps: int = 1,
     payload: bool = True,
     hold: bool = False,
+    extras: Sequence[str] = (),
     evaluations: int = 25,
     seed: int = 0,
     workers: int | None = None,
@@ -61,7 +64,8 @@ def identify(
     Parameters
     ----------
     logs
-        Files (:mod:`batchpid.sim.identification.logs`), or logs that were read.
+        Files (:mod:`batchpid.sim.identification.logs`), lists of logs with settings of their own
+        (:mod:`batchpid.sim.identification.runs`), or logs that were read.
     params
         Params of the PID law that drove the robot, of all its joints or of those in the logs: the setpoints of the logs
         are used. None: the efforts.
@@ -76,9 +80,16 @@ def identify(
         control, as a real robot under control at 500 Hz or less. Otherwise half the difference of the steps counts as
         delay.
     payload
-        Find a payload at the tool, too.
+        Find a payload at the tool, too. Efforts that were measured then count as exact; otherwise their scale is found
+        as strength.
     hold
         Commands hold from row to row of a file: :func:`batchpid.sim.identification.logs.read_logs`.
+    extras
+        Effects to try beside those of every fit, by name. Each is kept at the joints whose error on the held-out part
+        falls: "load_friction", "stribeck" (friction at rest and the speed at which it has fallen), "offset" (of the
+        encoder); and of the law in the robot, for logs of setpoints, "saturation" (its effort limit), "slew" (the limit
+        of the setpoints' rate), "kd" (a factor of that gain). "gain" is a factor of all gains of a law of which only
+        the form is known; the strength, which has the same effect, is then 1.
     evaluations
         Largest number of evaluations of each fit, with and without noise in the law. An evaluation simulates the robot
         and, for each unknown, a perturbed robot.
@@ -107,8 +118,13 @@ def identify(
     evaluations, seed = integer("evaluations", evaluations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
     if workers is not None:
         integer("workers", workers, 0, 1024)
-    payload = flag("payload", payload)
+    payload, gains_known = flag("payload", payload), "gain" not in extras
+    for name in extras:
+        choice("extras", name, [*EXTRAS, "gain"])
     resting, found, assumed, still = inputs = read_inputs(robot, logs, params, compensate, timestep, sim_steps, hold)
+    if params is None and (of_law := [name for name in extras if name in LAW]):
+        remedy = "leave it out, or give the params of the law"
+        raise InvalidArgumentError("extras", "is of a law, and the logs hold efforts", value=of_law[0], remedy=remedy)
     joints, params, timestep = inputs.joints, assumed.params, assumed.timestep
     settings = {
         **resting.describe(),
@@ -122,6 +138,7 @@ def identify(
         "timestep": assumed.timestep * assumed.substeps,
         "sim_steps": assumed.substeps,
         "payload": payload,
+        "extras": [*extras],
         "evaluations": evaluations,
         "seed": seed,
         "native": not obstacle(),
@@ -131,8 +148,10 @@ def identify(
     motions = [smooth(log, timestep) for log in found]
     fitted = [log for log in found if not log.settings.held_out]
     fitted_motions = [each for each, log in zip(motions, found, strict=True) if not log.settings.held_out]
-    drive, regression = best_drive(resting, joints, assumed, fitted, fitted_motions, payload)
-    unknowns = _unknowns(resting, joints, drive, regression.best.motors, motions, payload)
+    drive, regression = best_drive(resting, joints, assumed, fitted, fitted_motions, payload, gains_known)
+    unknowns = _unknowns(resting, joints, drive, regression, motions, payload)
+    if not gains_known:
+        unknowns = unknowns.plus(["gain"], range(len(joints)), {})
     ratios = None if found[0].measured is None else effort_ratios(inputs)
     unknowns = unknowns.without(_known(found[0], payload, ratios))
     ideal = ideal_motors(robot, joints)
@@ -155,9 +174,14 @@ def identify(
         if misfits(*fits_of_ways[0]).max() > EXPLAINED:  # then the regression may have chosen the wrong compensation
             for way in hypotheses(assumed, payload):
                 if way.compensation != drive.compensation:
-                    other = Regression(plants_of(resting, joints, way, fitted), fitted, fitted_motions, payload)
+                    plants = plants_of(resting, joints, way, fitted)
+                    other = Regression(plants, fitted, fitted_motions, payload, gains_known)
                     fits_of_ways.append(fit_under(way, other, History(None, settings)))
         problem, best = min(fits_of_ways, key=lambda each: each[1].cost)
+        for name in extras:
+            if name in EXTRAS:
+                problem, best = extended(problem, best, EXTRAS[name])
+        unknowns = problem.unknowns
         before, after = residuals_of_ideal(problem, robot), [window.residual for window in best.windows]
         sure = uncertainty(problem, best)
         saved = problem.residuals(_saved(robot, joints, unknowns, best.theta)[None])
@@ -170,6 +194,9 @@ def identify(
     )
     errors_of_fit = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
     noise = np.sqrt((errors_of_fit**2).mean(0))
+    if problem.drive.compensation != drive.compensation:
+        regression = Regression(plants_of(resting, joints, problem.drive, fitted), fitted, fitted_motions, payload)
+    diagnosis = diagnose(regression, fitted, [robot.joint_names[joint] for joint in joints])
     estimate = best.theta
     if ratios is not None:
         own = [at for at, (kind, _) in enumerate(ratios.names) if kind in unknowns.known]
@@ -188,6 +215,7 @@ def identify(
         problem.drive,
         settings,
         fits,
+        diagnosis,
     )
 
 
@@ -198,7 +226,7 @@ def _known(log: Log, payload: bool, ratios: EffortRatios | None) -> Motors:
     Behind the gear they are free of the motor's inertia and friction.
     """
     if ratios is not None:
-        return ratios.values("strength", "delay", "lag")
+        return ratios.values(("strength", "delay", "lag"))
     if not log.is_measured:
         return {}
     of_motor = ("armature", "damping", "friction") if log.sensor == "link" else ()
@@ -207,10 +235,10 @@ def _known(log: Log, payload: bool, ratios: EffortRatios | None) -> Motors:
 
 
 def _unknowns(
-    robot: Robot, joints: tuple[int, ...], drive: Drive, motors: Motors, motions: list[Motion], payload: bool
+    robot: Robot, joints: tuple[int, ...], drive: Drive, start: Regression, motions: list[Motion], payload: bool
 ) -> Unknowns:
     """Return the unknowns with typical sizes from the motion."""
-    plant = Plant(robot, joints, drive)
+    plant, motors = Plant(robot, joints, drive), start.best.motors
     qpos = np.concatenate([motion.qpos[::200] for motion in motions])
     matrix = plant.mass_matrix(qpos, np.zeros((len(qpos), 1)))
     links, armature = np.diagonal(matrix, axis1=1, axis2=2).mean(0), motors["armature"][0]
@@ -221,7 +249,8 @@ def _unknowns(
     )
     speed = np.maximum(speed, 1e-3)
     effort = np.maximum(inertia * acceleration + motors["friction"][0], inertia * 0.1)
-    return Unknowns.of(links, armature, effort, speed, payload)
+    known = np.flatnonzero(start.ratios_only) if start.gains_known else range(len(joints))
+    return Unknowns.of(links, armature, effort, speed, payload, [*known])
 
 
 def _saved(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Float64) -> Float64:
@@ -229,4 +258,5 @@ def _saved(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Flo
     text = dumps_actuators(actuators_at(robot, joints, unknowns, theta), robot.joint_names)
     found = unknowns.motors(theta[None])
     common = float(found["stopping"][0, 0]), float(found["payload"][0, 0])
-    return unknowns.point(motors_of(loads_actuators(text, robot.joint_names)[0], robot, joints, *common))
+    motors = motors_of(loads_actuators(text, robot.joint_names)[0], robot, joints, *common)
+    return unknowns.point(motors | {name: found[name] for name in LAW if name in found})

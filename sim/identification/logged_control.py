@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -12,14 +12,17 @@ import numpy as np
 import batchpid as bp
 from batchpid import motors as actuator_model
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.elementwise import namespace
+from batchpid.arrays.elementwise import TURN, namespace
+from batchpid.motors import guard as guard_model
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
+from batchpid.motors.guard import Guard
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
 from batchpid.native.tracing import Trace, trace_trees
 from batchpid.native.trees import leaves, mapped, structure
+from batchpid.sim.identification.unknowns import LAW, Motors
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import control_step, mass_matrix
 from batchpid.sim.loop.pid_law import PIDLaw, half_way
@@ -46,11 +49,32 @@ class Drive:
     """Sim steps in one step of the law, during which its effort is constant."""
     measured_rate: bool = False
     """True if the law is given the joint velocity, False if it takes differences of positions."""
+    guard: Guard | None = None
+    """Limit of the setpoints' rate."""
 
     @property
     def compensation(self) -> tuple[str, bool, bool]:
         """Hypothesis about the compensation."""
         return self.compensate, self.through, self.knows_payload
+
+    def of(self, motors: Motors) -> Drive:
+        """Return the drive with gains, saturation and limit of the setpoints' rate of n candidates (n, joints)."""
+        params = self.params
+        if params is None or motors.keys().isdisjoint(LAW):
+            return self
+        gain, damping = motors.get("gain", 1.0), motors.get("kd", 1.0)
+        factors = {"kp": gain, "ki": gain, "kd": gain * damping}
+        gains = {
+            name: getattr(params, name) * each for name, each in factors.items() if getattr(params, name) is not None
+        }
+        params = params._replace(**gains)
+        if "saturation" in motors:
+            most = params.kp * motors["saturation"]
+            params = params._replace(effort_min=-most, effort_max=most)
+        if "slew" not in motors:
+            return replace(self, params=params)
+        turns = None if params.continuous is None else params.continuous / TURN
+        return replace(self, params=params, guard=Guard(rate=motors["slew"], turns=turns))
 
     @property
     def assumptions(self) -> dict[str, str | bool]:
@@ -93,10 +117,16 @@ class Control:
             params = params._replace(measurement_rate=None)  # the log's loop decides, not the params
             control, k = "pid", bp.discretise(params, dt * drive.substeps, len(qpos))
             first = bp.init(params, qpos)
-            state = StepState(first if drive.substeps == 1 else (first, np.zeros_like(qpos)))
+            guarded = None if drive.guard is None else guard_model.init(drive.guard, qpos)
+            state = StepState(first if drive.substeps == 1 else (first, np.zeros_like(qpos)), guard=guarded)
         self._layout = Layout(control, law)
         constants = Constants(
-            dt, (None, None), Coupling.of(qpos.shape[1]), k, friction=Friction(viscous=actuators.viscous)
+            dt,
+            (None, None),
+            Coupling.of(qpos.shape[1]),
+            k,
+            friction=Friction(viscous=actuators.viscous),
+            guard=drive.guard,
         )
         if not actuators._replace(**dict.fromkeys(actuator_model.JOINT_SIDE)).is_ideal:
             latest = None if asked is None else asked[0]

@@ -23,6 +23,7 @@ followers move with their leaders.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -32,6 +33,8 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.coupling import Coupling, Follower
+from batchpid.motors.friction import Friction, bound_of
+from batchpid.sim.engine.joint_friction import added_friction
 from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.logged_control import Control, Drive
@@ -106,6 +109,17 @@ class Plant:
         """Return the mass matrices (n, joints, joints) of the logged joints at ``qpos`` (n, joints)."""
         return self.at(qpos, np.zeros_like(qpos), payload).matrix
 
+    @property
+    def tree(self) -> RigidTree:
+        """Rigid tree of the logged joints, with a link without mass for the payload."""
+        return self._tree
+
+    def with_tree(self, tree: RigidTree) -> Plant:
+        """Return this plant with other masses, those of ``tree``."""
+        other = copy(self)
+        other._tree = tree
+        return other
+
     def passive(self, qpos: Float64, qvel: Float64, payload: Float64) -> Float64:
         """Return gravity and Coriolis forces (n, joints) [N m or N]."""
         found = self.at(qpos, qvel, payload)
@@ -159,14 +173,21 @@ class Plant:
             found = at_rest()
         return found.force + found.payload_force if self.drive.knows_payload else found.force
 
-    def control(self, actuators: Actuators, qpos: Float64, qvel: Float64, asked: Float64 | None = None) -> Control:
-        """Return the control of robots at ``qpos`` and ``qvel`` (n, joints), with their motors."""
+    def control(
+        self,
+        actuators: Actuators,
+        qpos: Float64,
+        qvel: Float64,
+        asked: Float64 | None = None,
+        drive: Drive | None = None,
+    ) -> Control:
+        """Return the control of robots at ``qpos`` and ``qvel`` (n, joints), with their motors; default: its drive."""
         unloaded = np.zeros((len(qpos), 1))
 
         def model(qpos: Float64) -> Float64:
             return self.mass_matrix(qpos, unloaded)
 
-        return Control(self.drive, actuators, qpos, qvel, asked, self._damping, model)
+        return Control(drive or self.drive, actuators, qpos, qvel, asked, self._damping, model)
 
     def simulate(self, motors: Motors, segments: list[Segment], past: int) -> Float64:
         """Return the positions (n, steps + 1, joints) of candidate i in segment i, the start included.
@@ -186,8 +207,10 @@ class Plant:
             forward = np.stack(rows, axis=1)
         actuators = actuators_of(motors, q.shape[1])
         held = self.compensation(q, v, payload) if drive.through else None
+        if (offset := motors.get("offset")) is not None:
+            q -= offset
         asked = np.zeros((1, *q.shape)) if drive.params is not None else command[max(past - 1, 0) :: -1]
-        control = self.control(actuators, q, v, asked if held is None else asked + held)
+        control = self.control(actuators, q, v, asked if held is None else asked + held, drive.of(motors))
         motion = _Motion(self, actuators, motors)
         dynamics, at_rest = self._dynamics(q, v, payload), self._at_rest(q, payload)
         out = np.empty((len(q), len(command) - past + 1, q.shape[1]))
@@ -205,13 +228,13 @@ class Plant:
                 if forward is not None:
                     inside = forward[now] if inside is None else inside + forward[now]
                 shake = noise[now] if drive.noisy else None
-                effort = control.advance(command[now], q, v, inside, shake) - passive.force - passive.payload_force
+                effort = control.advance(command[now], q, v, inside, shake)
                 if outside is not None:
-                    effort += outside
-                motion.step(q, v, passive.matrix, effort)
+                    effort = effort + outside
+                motion.step(q, v, passive.matrix, effort, passive.force + passive.payload_force)
                 out[:, step + 1] = q
         out[:, -1] = np.where(np.abs(out[:, -1]) <= DIVERGED, out[:, -1], np.inf)
-        return out
+        return out if offset is None else out + offset[:, None]
 
 
 def plants_of(robot: Robot, joints: tuple[int, ...], drive: Drive, logs: list[Log]) -> list[Plant]:
@@ -249,21 +272,25 @@ class _Motion:
         self.friction = np.zeros(shape)
         """Efforts of friction in the last step (n, joints) [N m or N]."""
         self._added = actuators.armature + dt * actuators.viscous
-        self._coulomb, self._static, self._slides = actuators.coulomb, actuators.static, np.zeros(shape, bool)
+        self._friction, self._slides = added_friction(Friction(), actuators), np.zeros(shape)
         keep = np.maximum(1 - dt / np.maximum(stopping, dt), 0.0)
         creep = np.where(stopping > dt, _CREEP * dt * np.diagonal(own, axis1=1, axis2=2), 0.0)
         self._constants = keep, creep, plant.low, plant.high
 
-    def step(self, qpos: Float64, qvel: Float64, matrix: Float64, effort: Float64) -> None:
-        """Change positions and velocities (n, joints) to those after a step; ``effort`` excludes friction."""
-        limit = self._coulomb
-        if self._static is not None:
-            limit = np.where(self._slides, limit, np.maximum(limit, self._static))
-        arrays = qpos, qvel, self.friction, matrix, effort, self._added, limit, *self._constants
+    def step(self, qpos: Float64, qvel: Float64, matrix: Float64, effort: Float64, force: Float64) -> None:
+        """Change positions and velocities (n, joints) to those after a step.
+
+        ``effort`` are the motors' efforts less viscous friction, ``force`` the robot's gravity and Coriolis forces.
+        """
+        model, motor = self._friction, effort
+        if model.load is not None:
+            motor = effort + model.viscous * qvel
+        limit = bound_of(model, self._slides, motor, qvel)
+        arrays = qpos, qvel, self.friction, matrix, effort - force, self._added, limit, *self._constants
         if not native_rows.move(self._dt, SWEEPS, *arrays):
             _move(self._dt, *arrays)
-        if self._static is not None:
-            self._slides = np.abs(self.friction) >= limit
+        if model.static is not None:
+            self._slides = (np.abs(self.friction) >= limit).astype(float)
 
 
 def _move(dt: float, *arrays: Float64) -> None:

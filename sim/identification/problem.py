@@ -6,8 +6,10 @@ likelihood is, over the number of rows and joints::
 
     mean over rows and joints of log(sigma_bj),     sigma_bj^2 = f_j^2 + mean over the rows of b of r_j^2
 
-f is twice the noise of the sensor. Where the model fails, for example where a joint slips a little sooner or later in
-the simulation, the size is large and the stretch has little weight.
+f^2 is the sum of the squares of twice the noise of the sensor, and of twice the root mean square of r_j in a stretch,
+on average over all: no model is exact, and a stretch in which the robot hardly moves would have all the weight. Where
+the model fails, for example where a joint slips a little sooner or later in the simulation, the size is large and the
+stretch has less weight.
 
 Motion by unknown disturbances, such as sensor noise between the rows, is removed from residuals and Jacobian
 (:mod:`batchpid.sim.identification.wander`); the simulated motion is the mean over several draws of them.
@@ -45,6 +47,8 @@ STRETCH = 0.5
 """Length of the stretches of a log [s], about."""
 NOISES = 2
 """Least size of residuals, over the noise of the sensor."""
+MODEL_ERROR = 2
+"""Least size of residuals, over their root mean square in a stretch, on average over the stretches."""
 LEAST_NOISE = 1e-6
 """Least noise of a sensor, over the range of the motion."""
 WORST = 1e6
@@ -151,7 +155,9 @@ class Problem:
                 for residual, stretches in zip(residuals, self.stretches, strict=True)
                 for rows in stretches
             ]
-            return np.sqrt(np.stack(squares, axis=-2) + self.noise**2)
+            stretches = np.stack(squares, axis=-2)
+            mean = np.average(np.sqrt(stretches), axis=-2, weights=self._rows)[..., None, :]
+            return np.sqrt(stretches + self.noise**2 + (MODEL_ERROR * mean) ** 2)
 
     def costs(self, sizes: Float64, determinants: Float64 | float = 0.0) -> Float64:
         """Return the negative logarithms of the likelihood (..., joints) for ``sizes`` (..., stretches, joints).

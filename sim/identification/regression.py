@@ -43,6 +43,11 @@ EVIDENCE = 0.3
 """Least decrease of the logarithm of a joint's mean square that counts, on average over the joints."""
 _PRIOR = 0.005
 """Weight of the prior at ideal motors, over the effort's size."""
+STRENGTHS, GAINS, TAKEN = (0.2, 3.0), (1e-3, 1e3), (1.0, 1.0 + 1e-9)
+"""Bounds of the strength; where the gains of the law are not known, so that it is their factor; and where it is 1."""
+LEAST_SHARE = 0.05
+"""Least share of a joint's effort that moves the links, which the description knows, for a strength to be found. Below
+it an error of the model of a twentieth of the effort hides the links, and only ratios to the strength are known."""
 NO_PRIOR, WEAK, STRONG = 1e-3, 0.1, 3.0
 """Weights of the prior at strength 1; the strong one is safe where the log hardly shows the strengths."""
 
@@ -97,7 +102,16 @@ def smooth(log: Log, timestep: float) -> Motion:
 class Regression:
     """Efforts that the motions required and commanded efforts, with the same filter, for regressions at any delay."""
 
-    def __init__(self, plants: list[Plant], logs: list[Log], motions: list[Motion], payload: bool) -> None:
+    def __init__(
+        self,
+        plants: list[Plant],
+        logs: list[Log],
+        motions: list[Motion],
+        payload: bool,
+        gains_known: bool = True,
+        law: Motors | None = None,
+    ) -> None:
+        """Take ``motions`` of ``logs``; ``law`` are values (1, joints) of the law's unknowns, by kind."""
         from scipy.signal import butter, sosfiltfilt
 
         drive, dt = plants[0].drive, plants[0].drive.timestep
@@ -105,13 +119,15 @@ class Regression:
         sections = butter(4, min(CUTOFF, 0.2 / period), fs=1 / dt, output="sos")
         blocks: list[tuple[Float64, ...]] = []
         late: list[Float64] = []
+        self.plants, self.motions, self.rows = plants, motions, list[Any]()
         for plant, log, motion in zip(plants, logs, motions, strict=True):
             edge = min(round(EDGE / dt), len(motion.qpos) // 5)
             rows = np.arange(edge, len(motion.qpos) - edge, max(1, round(_EVERY / dt)))
+            self.rows.append(rows)
             v, a = motion.qvel[rows], motion.qacc[rows]
             known = log.settings.payload
             empty, loaded = (_required(plant, motion, rows, known + kg) for kg in (0.0, 1.0 if payload else 0.0))
-            effort = motion.command if drive.params is None else _law_efforts(plant, motion)
+            effort = motion.command if drive.params is None else _law_efforts(plant, motion, law or {})
             unloaded = np.full((len(motion.qpos), 1), known)
             if drive.through and (held := plant.compensation(motion.qpos, motion.qvel, unloaded)) is not None:
                 effort = effort + held
@@ -129,25 +145,38 @@ class Regression:
         fast = np.abs(speeds := self._columns[3]) > MOVES * np.sqrt((speeds**2).mean(0))
         self._moves = fast | (fast.sum(0) < LEAST_ROWS)
         self._payload = payload
+        self.gains_known, self._bounds = gains_known, [GAINS] * len(fast.T)
+        self.ratios_only = np.zeros(len(fast.T), bool)
+        """Joints (joints,) of which only ratios to the strength are known; it is 1 there."""
+        if gains_known:
+            links, efforts = ((table**2).mean(0) for table in (self._columns[0], self._efforts[0]))
+            self.ratios_only = links < LEAST_SHARE**2 * efforts
+            self._bounds = [TAKEN if each else STRENGTHS for each in self.ratios_only]
 
     def at(self, delay: float, kg: float = 0.0, strength_prior: float | Float64 = WEAK) -> Start:
         """Return the motors that explain the efforts best at a ``delay`` [s], with a payload.
 
         ``strength_prior`` is the weight of the prior at strength 1, of all joints or of each (joints,).
         """
-        empty, per_kg, a, v, sign = self._columns
-        place = np.clip(delay / DELAY_STEP, 0.0, len(self._efforts) - 1.001)
-        below, share = int(place), place % 1.0
-        effort = (1 - share) * self._efforts[below] + share * self._efforts[below + 1]
-        tables = empty + kg * per_kg, a, v, sign, effort
+        tables = self.tables(delay, kg)
+        empty = tables[0]
         priors = np.broadcast_to(strength_prior, empty.shape[1])
         both = []
         for joint, rows in enumerate(self._moves.T):
             required, *columns = (table[rows, joint] for table in tables)
-            both.append(_solve_joint(required, columns, float(priors[joint])))
+            prior, bounds = float(priors[joint]), self._bounds[joint]
+            both.append(_solve_joint(required, columns, NO_PRIOR if bounds == GAINS else prior, bounds))
         cost = float(sum(np.log(mean + 1e-30) for mean, _ in both))
         values = [*np.array([found for _, found in both]).T[:, None], *np.array([delay, kg])[:, None, None]]
         return Start(dict(zip(FOUND, values, strict=True)), cost)
+
+    def tables(self, delay: float, kg: float) -> tuple[Float64, ...]:
+        """Return required efforts, acceleration, velocity, its sign, and the efforts so far, all (rows, joints)."""
+        empty, per_kg, a, v, sign = self._columns
+        place = np.clip(delay / DELAY_STEP, 0.0, len(self._efforts) - 1.001)
+        below, share = int(place), place % 1.0
+        effort = (1 - share) * self._efforts[below] + share * self._efforts[below + 1]
+        return empty + kg * per_kg, a, v, sign, effort
 
     @cached_property
     def best(self) -> Start:
@@ -170,10 +199,10 @@ def explains_better(special: Start, plain: Start) -> bool:
     return plain.cost - special.cost > EVIDENCE * plain.motors["armature"].shape[1]
 
 
-def _law_efforts(plant: Plant, motion: Motion) -> Float64:
+def _law_efforts(plant: Plant, motion: Motion, law: Motors) -> Float64:
     """Return the efforts (steps, joints) of the law along a measured ``motion``, without compensation."""
     rows = [(q[None], v[None], u[None]) for q, v, u in zip(motion.qpos, motion.qvel, motion.command, strict=True)]
-    control = plant.control(Actuators(), *rows[0][:2])
+    control = plant.control(Actuators(), *rows[0][:2], drive=plant.drive.of(law))
     efforts = np.array([control.advance(u, q, v, None)[0].copy() for q, v, u in rows])
     return efforts if motion.feedforward is None else efforts + motion.feedforward
 
@@ -187,10 +216,12 @@ def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float6
     return effort if held is None else effort - held
 
 
-def _solve_joint(required: Float64, motion: list[Float64], strength_prior: float) -> tuple[float, Float64]:
+def _solve_joint(
+    required: Float64, motion: list[Float64], strength_prior: float, bounds: tuple[float, float] = STRENGTHS
+) -> tuple[float, Float64]:
     """Return the mean square of the residual, and armature, damping, friction, strength and bias of a joint.
 
-    ``motion`` is acceleration, velocity, its sign, and the commanded effort (rows,).
+    ``motion`` is acceleration, velocity, its sign, and the commanded effort (rows,); ``bounds`` are of the strength.
     """
     from scipy.optimize import lsq_linear
 
@@ -203,8 +234,8 @@ def _solve_joint(required: Float64, motion: list[Float64], strength_prior: float
     information = matrix.T @ matrix + np.diag(prior)
     target = -matrix.T @ required + prior * np.array([0, 0, 0, size[3], 0])
     root = np.linalg.cholesky(information + 1e-12 * np.eye(5))
-    low = np.array([0, 0, 0, 0.2, -np.inf]) * size
-    high = np.array([np.inf, np.inf, np.inf, 3.0, np.inf]) * size
+    low = np.array([0, 0, 0, bounds[0], -np.inf]) * size
+    high = np.array([np.inf, np.inf, np.inf, bounds[1], np.inf]) * size
     found = lsq_linear(root.T, np.linalg.solve(root, target), (low, high)).x
     return float(((matrix @ found + required) ** 2).mean()), found / size
 
@@ -235,11 +266,19 @@ def variants(drive: Drive, motions: list[Motion]) -> list[Drive]:
 
 
 def best_drive(
-    robot: Any, joints: tuple[int, ...], drive: Drive, logs: list[Log], motions: list[Motion], payload: bool
+    robot: Any,
+    joints: tuple[int, ...],
+    drive: Drive,
+    logs: list[Log],
+    motions: list[Motion],
+    payload: bool,
+    gains_known: bool = True,
 ) -> tuple[Drive, Regression]:
     """Return the drive that explains the logs best, with its regression."""
     ways = hypotheses(drive, payload)
-    found = [(Regression(plants_of(robot, joints, each, logs), logs, motions, payload), each) for each in ways]
+    found = [
+        (Regression(plants_of(robot, joints, each, logs), logs, motions, payload, gains_known), each) for each in ways
+    ]
     best, chosen = found[0]
     for other, way in found[1:]:
         if explains_better(other.best, best.best):

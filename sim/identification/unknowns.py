@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +22,8 @@ class Kind(NamedTuple):
     """Kind of unknown, in SI units."""
 
     field: str | None
-    """Field of :class:`batchpid.Actuators`; None: of the plant, :mod:`batchpid.sim.identification.plant`."""
+    """Field of :class:`batchpid.Actuators`; None: of the plant, :mod:`batchpid.sim.identification.plant`, or of the
+    law, :meth:`batchpid.sim.identification.logged_control.Drive.of`."""
     per_joint: bool
     low: float
     high: float
@@ -30,11 +33,15 @@ class Kind(NamedTuple):
     """Standard deviation of the prior, over the typical size."""
     start: float = 0.0
     """Mean of the prior, and value at the start of a fit where the regression does not give it."""
+    off: float = 0.0
+    """Value without effect, of kinds without field."""
+    tries: tuple[float, ...] = ()
+    """Values that are tried first, over the typical size, of kinds that are added to a fit."""
 
     @property
     def neutral(self) -> float:
         """Value of ideal motors."""
-        return 0.0 if self.field is None else FIELDS[self.field].neutral
+        return self.off if self.field is None else FIELDS[self.field].neutral
 
 
 KINDS = {
@@ -48,10 +55,39 @@ KINDS = {
     "payload": Kind(None, False, 0.0, np.inf, 0.2, 50.0),
 }
 """Kinds of unknowns. A line here is all that an effect of :mod:`batchpid.motors` needs to be identified."""
-ADDED = {"lag": Kind("lag", True, 0.0, 0.1, 5e-3, 20.0)}
-"""Kinds that a fit has only where it is asked for them; they stay out of simulations otherwise."""
-DESCRIBED = ("damping", "friction")
-"""Kinds of which the robot's description states a share, under the same name; here they are the whole."""
+ADDED = {
+    "lag": Kind("lag", True, 0.0, 0.1, 5e-3, 20.0),
+    "load_friction": Kind("load_friction", True, 0.0, 0.9, 0.1, 5.0, tries=(0.5, 2.0)),
+    "static": Kind("static", True, 0.0, np.inf, "friction", 10.0, tries=(1.3, 2.0)),
+    "stribeck": Kind("stribeck", True, 0.0, np.inf, "speed", 2.0, tries=(0.03, 0.2)),
+    "offset": Kind("position_offset", True, -np.inf, np.inf, 0.01, 20.0, tries=(0.0,)),
+    "gain": Kind(None, True, 1e-3, 1e3, 1.0, 100.0, 1.0, off=1.0),
+    "kd": Kind(None, True, 0.0, 1e3, 1.0, 10.0, 1.0, off=1.0, tries=(0.5, 2.0)),
+    "saturation": Kind(
+        None, True, 1e-4, np.inf, "error", 10.0, off=np.inf, tries=(0.1, 0.15, 0.2, 0.3, 0.45, 0.65, 0.9)
+    ),
+    "slew": Kind(None, True, 1e-3, np.inf, "speed", 10.0, off=np.inf, tries=(0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2)),
+}
+"""Kinds that a fit has only where it is asked for them; they stay out of simulations otherwise.
+
+"gain" is a factor of all gains of the law, and "kd" of that gain alone; "saturation" is the law's effort limit over its
+kp [rad or m], and "slew" the limit of its setpoints' rate [rad/s or m/s].
+"""
+LAW = ("gain", "kd", "saturation", "slew")
+"""Kinds of the law."""
+EXTRAS = {
+    "load_friction": ("load_friction",),
+    "stribeck": ("static", "stribeck"),
+    "offset": ("offset",),
+    "kd": ("kd",),
+    "saturation": ("saturation",),
+    "slew": ("slew",),
+}
+"""Kinds that are added to a fit together, and kept where the error on the held-out part falls."""
+DESCRIBED = {"damping": "damping", "friction": "friction", "static": "friction"}
+"""Kinds of which the robot's description states a share, and its name there; here they are the whole."""
+SCALES, SCALED = ("strength", "gain"), ("armature", "damping", "friction", "static", "bias")
+"""Kinds that scale a joint's efforts, and kinds that, if they grow with these, leave its motion as it is."""
 _STEP = 2e-3
 """Change of an unknown for a finite difference, in units of its scale."""
 _STRENGTH_STEP = 1e-2
@@ -95,22 +131,51 @@ class Unknowns:
     """Values (1, joints or 1) of kinds that are known, in place of ideal ones."""
 
     @classmethod
-    def of(cls, links: Float64, armature: Float64, effort: Float64, speed: Float64, payload: bool) -> Unknowns:
+    def of(
+        cls,
+        links: Float64,
+        armature: Float64,
+        effort: Float64,
+        speed: Float64,
+        payload: bool,
+        known_strength: Sequence[int] = (),
+    ) -> Unknowns:
         """Return the unknowns of joints.
 
         Parameters are typical values (joints,): inertia of the links and of the motor, and root mean squares of effort
-        and speed.
+        and speed. Joints in ``known_strength`` have strength 1.
         """
         typical = {"inertia": links + armature, "damping": effort / speed, "effort": effort}
         names, scale = list[tuple[str, int | None]](), list[float]()
         for name, kind in KINDS.items():
             if name == "payload" and not payload:
                 continue
-            numbers = range(len(links)) if kind.per_joint else [None]
-            size = typical[kind.size] if isinstance(kind.size, str) else kind.size
-            names += [(name, number) for number in numbers]
-            scale += np.broadcast_to(size, len(numbers)).tolist()
-        return cls(len(links), tuple(names), np.exp2(np.round(np.log2(np.array(scale)))), links)
+            numbers = [each for each in range(len(links)) if name != "strength" or each not in known_strength]
+            size = np.broadcast_to(typical[kind.size] if isinstance(kind.size, str) else kind.size, len(links))
+            names += [(name, number) for number in numbers] if kind.per_joint else [(name, None)]
+            scale += size[numbers].tolist() if kind.per_joint else [size[0]]
+        return cls(len(links), tuple(names), _rounded(np.array(scale)), links)
+
+    def plus(self, kinds: Sequence[str], joints: Sequence[int], sizes: Mapping[str, Float64]) -> Unknowns:
+        """Return more unknowns: ``kinds`` of :data:`ADDED` of ``joints``; ``sizes`` are typical values (joints,)."""
+        names = [(name, joint) for name in kinds for joint in joints]
+        scale = np.array([self._size(name, sizes)[joint] for name, joint in names])
+        return replace(self, names=(*self.names, *names), scale=np.append(self.scale, _rounded(scale)))
+
+    def tries(self, theta: Float64, kinds: Sequence[str], sizes: Mapping[str, Float64]) -> Float64:
+        """Return the points (n, unknowns) that are tried first for ``kinds`` beside the others' ``theta``."""
+        rows = []
+        for factors in product(*(ADDED[name].tries for name in kinds)):
+            values = [
+                (factor * self._size(name, sizes))[self.joints_of(name)]
+                for name, factor in zip(kinds, factors, strict=True)
+            ]
+            rows.append(np.concatenate([theta, *values]))
+        return self.clip(np.array(rows))
+
+    def _size(self, name: str, sizes: Mapping[str, Float64]) -> Float64:
+        size = kind_of(name).size
+        return np.broadcast_to(sizes[size] if isinstance(size, str) else size, self.joints)
 
     def without(self, known: Motors) -> Unknowns:
         """Return the unknowns without the kinds in ``known``, whose values (1, joints or 1) are taken as they are."""
@@ -148,12 +213,16 @@ class Unknowns:
 
     @property
     def per_joint(self) -> list[str]:
-        """Kinds of unknowns of each joint."""
-        return [kind for kind, joint in self.names if joint == 0]
+        """Kinds of unknowns of joints."""
+        return list(dict.fromkeys(kind for kind, joint in self.names if joint is not None))
 
     def of_kind(self, name: str) -> NDArray[np.intp]:
         """Return the places of the unknowns of a kind in a point."""
         return np.flatnonzero([kind == name for kind, _ in self.names])
+
+    def joints_of(self, name: str) -> list[int]:
+        """Return the joints that have an unknown of a kind; 0 for a kind that all share."""
+        return [joint or 0 for kind, joint in self.names if kind == name]
 
     def changes(self, theta: Float64) -> Float64:
         """Return the changes (changes, unknowns) for finite differences at ``theta``.
@@ -163,13 +232,13 @@ class Unknowns:
         coupling.
         """
         steps = np.maximum(_STEP * np.abs(theta), 0.5 * _STEP * self.scale)
-        table, strengths = np.diag(steps), self.of_kind("strength")
-        table[strengths, strengths] = _STRENGTH_STEP * theta[strengths]
-        for kind in ("armature", "damping", "friction", "bias"):
-            own = self.of_kind(kind)
-            if len(own) != len(strengths):
-                continue
-            table[strengths, own] = _STRENGTH_STEP * (theta[own] + (self.inertia if kind == "armature" else 0.0))
+        table, places = np.diag(steps), {name: at for at, name in enumerate(self.names)}
+        for (kind, joint), at in places.items():
+            if kind in SCALES and joint is not None:
+                table[at, at] = _STRENGTH_STEP * theta[at]
+                for own in [places[name, joint] for name in SCALED if (name, joint) in places]:
+                    inertia = self.inertia[joint] if self.names[own][0] == "armature" else 0.0
+                    table[at, own] = _STRENGTH_STEP * (theta[own] + inertia)
         return table
 
     def clip(self, theta: Float64) -> Float64:
@@ -179,13 +248,26 @@ class Unknowns:
     def point(self, motors: Motors) -> Float64:
         """Return the point of one candidate; unknowns that it lacks are those at the start of a fit."""
         point = self.prior
+        if "gain" not in motors and "strength" in motors:  # a regression calls it so
+            motors = motors | {"gain": motors["strength"]}
         for kind, values in motors.items():
-            own = self.of_kind(kind)
-            point[own] = values[0, : len(own)]
+            joints = self.joints_of(kind)
+            point[self.of_kind(kind)] = values[0][joints] if values.shape[1] > 1 else values[0]
         return point
 
     def motors(self, points: Float64) -> Motors:
         """Return the candidates at ``points`` (n, unknowns), ideal in what is not an unknown."""
-        ideal = {name: np.full((len(points), 1), kind.neutral) for name, kind in KINDS.items()}
-        known = {name: np.repeat(values, len(points), axis=0) for name, values in self.known.items()}
-        return ideal | known | {kind: points[:, self.of_kind(kind)] for kind in dict(self.names)}
+        named = {*dict(self.names), *self.known}
+        kinds = KINDS | {name: kind for name, kind in ADDED.items() if name in named}
+        found = {}
+        for name, kind in kinds.items():
+            joints = self.joints_of(name)
+            ideal = np.full((1, self.joints if kind.per_joint and joints else 1), kind.neutral)
+            found[name] = np.repeat(self.known.get(name, ideal), len(points), axis=0)
+            found[name][:, joints] = points[:, self.of_kind(name)]
+        return found
+
+
+def _rounded(sizes: Float64) -> Float64:
+    """Return the nearest powers of 2."""
+    return np.exp2(np.round(np.log2(sizes)))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
-from batchpid.motors import JOINT_SIDE
+from batchpid.motors import DRIVEN
 from batchpid.motors.actuator_fields import FIELDS, TABLE
 from batchpid.sim.randomization.fields import PHYSICAL, START, Field, elements, nominal_values, parts
 from batchpid.sim.randomization.randomization import Randomization
@@ -64,8 +64,8 @@ def prepared_actuators(
     """
     if not randomization.actuators:
         return actuators
-    if control == "drive" and (bypassed := sorted(randomization.actuators.keys() - set(JOINT_SIDE))):
-        remedy = f"use control 'pid', or draw only {', '.join(JOINT_SIDE)}"
+    if control == "drive" and (bypassed := sorted(randomization.actuators.keys() - set(DRIVEN))):
+        remedy = f"use control 'pid', or draw only {', '.join(DRIVEN)}"
         raise InvalidArgumentError(f"actuators.{bypassed[0]}", "has no effect on PhysX's drives", remedy=remedy)
     known = bp.Actuators() if actuators is None else actuators
     delay = 0.0 if known.max_delay is None else float(known.max_delay[0, 0])

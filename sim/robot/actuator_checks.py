@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
-from batchpid.motors import JOINT_SIDE, check_actuators
+from batchpid.motors import DRIVEN, JOINT_SIDE, check_actuators
 from batchpid.sim.robot.description import RobotDescription
 
 BAND = {"rad": 1e-4, "m": 2e-5}
@@ -69,11 +69,11 @@ def fit_actuators(actuators: bp.Actuators, robot: RobotDescription, num_envs: in
     """
     instance("actuators", actuators, bp.Actuators, "build them with make_actuators()")
     check_actuators(actuators, num_envs, robot.joint_names)
-    if control == "drive" and (actuators.measures or actuators.delivers):
+    if control == "drive" and (actuators.measures or actuators.delivers or actuators.load_friction is not None):
         raise InvalidArgumentError(
             "actuators",
-            "act on efforts and measurements, and PhysX's drives bypass both",
-            remedy=f"use control 'pid', or leave only {', '.join(JOINT_SIDE)}",
+            "act on efforts and measurements, or need the effort, and PhysX's drives bypass all three",
+            remedy=f"use control 'pid', or leave only {', '.join(DRIVEN)}",
         )
     if actuators.num_joints is None:
         return actuators

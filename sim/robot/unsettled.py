@@ -63,7 +63,7 @@ CAUSES: dict[str, Words] = {
     "setpoint-not-finite": Words("bad input", "was given a number that is not finite", "correct the input"),
     "unstable": Words(
         "unstable",
-        "the gains are beyond the stability bound of the sampled loop: the effort alternates from step to step",
+        "the gains are beyond the stability bound of the sampled loop: the effort alternates, or oscillates",
         "use at most half the gains that reach the bound, a derivative_filter_time, {implicit}or robot.designed()",
     ),
     "setpoint-limits": Words(
@@ -476,8 +476,8 @@ class _Run:
 
     @cached_property
     def _collides(self) -> bool:
-        """Whether contacts were simulated, at poses that are known."""
-        return self.rollout.info.collisions is not False and self.robot.fixed_base
+        """Whether contacts were simulated."""
+        return self.rollout.info.collisions is not False
 
     @cached_property
     def _times(self) -> dict[tuple[str, ...], int]:
@@ -485,8 +485,11 @@ class _Run:
         return defaultdict(int)
 
     def _near(self, qpos: Float64, within: float = TOUCH) -> dict[tuple[str, ...], float]:
-        """Return the distances [m] below ``within`` of pairs of links, of one link to the ground, nearest first."""
-        pairs = self.robot.dynamics(self.rollout.info.ground).near(qpos, within)
+        """Return the distances [m] below ``within`` of pairs of links, of one link to the ground, nearest first.
+
+        A robot on a floating base stands on the ground: there only pairs of links count.
+        """
+        pairs = self.robot.dynamics(self.rollout.info.ground if self.robot.fixed_base else False).near(qpos, within)
         found: dict[tuple[str, ...], float] = {}
         for first, second, distance in pairs:
             links = tuple(name for name in (first, second) if name)
@@ -519,10 +522,9 @@ class _Run:
         info = self.rollout.info
         if info.control != "pid" or info.params is None or info.timestep is None:
             return None
-        actuators = info.actuators
-        armature = 0.0 if actuators is None or actuators.armature is None else _row(actuators.armature, env)
+        motors = None if info.actuators is None else info.actuators.for_envs(slice(env, env + 1))
         try:
-            return stability_report(self.robot, _env(info.params, env), qpos, info.timestep, armature)
+            return stability_report(self.robot, _env(info.params, env), qpos, info.timestep, actuators=motors)
         except BatchPIDError:  # a mass matrix that is not positive definite
             return None
 

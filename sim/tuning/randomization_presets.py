@@ -13,7 +13,7 @@ import batchpid.task_space as ts
 from batchpid.checks.validate import file_path, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.motors import JOINT_SIDE
+from batchpid.motors import DRIVEN
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.checks import check_robot
 from batchpid.sim.randomization.distributions import Uniform
@@ -88,7 +88,7 @@ def at_the_joints(randomization: Randomization | None) -> Randomization | None:
     """Return ``randomization`` with only the actuator fields that affect PhysX's drives: friction and inertia."""
     if randomization is None:
         return None
-    fields = {name: each for name, each in randomization.actuators.items() if name in JOINT_SIDE}
+    fields = {name: each for name, each in randomization.actuators.items() if name in DRIVEN}
     return replace(randomization, actuators=fields)
 
 

@@ -10,6 +10,7 @@ All candidates run in one runner: the setpoint of each env holds the pose and th
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -66,6 +67,7 @@ class SearchedSpace(OperationalSpace):
 
     def __init__(self, robot: Robot, link: str, **options: Any) -> None:
         super().__init__(robot, link, **options)
+        self.pose_command = self.command
         units, values = zip(*GAINS.values(), strict=True)
         names = (*self.command.names, *GAINS)
         neutral = (*np.array(self.command.neutral).tolist(), *values)
@@ -152,14 +154,19 @@ class ToolCandidates:
         """Return the GAINS (n, 5) of ``points`` (n, 5)."""
         return np.array([value for _, value in GAINS.values()]) * np.exp(SPREAD * points)
 
-    def evaluate(self, runner: Runner, gains: Float64) -> tuple[tuple[float, ...], StepMetrics]:
-        """Run all moves under each of ``gains`` (n, 5); return costs (n,), and metrics of the axes (n x moves, 6)."""
+    def evaluate(self, runner: Runner, gains: Float64) -> tuple[tuple[float, ...], StepMetrics, Rollout]:
+        """Run all moves under each of ``gains`` (n, 5).
+
+        Return the costs (n,), metrics of the axes (n x moves, 6), and the rollout, whose setpoints are poses.
+        """
         count, w, lead = len(gains), self.weights, (len(gains), len(self.moves.goal))
         goal, start = np.tile(self.moves.goal, (count, 1)), np.tile(self._start, (count, 1))
         setpoint = np.concatenate([goal, np.repeat(gains, lead[1], axis=0)], axis=1)
         ticks = max(2, round(self.seconds / (runner.timestep * runner.substeps)))
         runner.reset(np.tile(self.moves.joints.start, (count, 1)))
         rollout = runner.rollout(np.broadcast_to(setpoint, (ticks, *setpoint.shape)))
+        info = replace(rollout.info, own_command=self.control.pose_command)
+        poses = replace(rollout, setpoint=rollout.setpoint[..., :7], info=info)
         metrics = tool_metrics(rollout, goal, start)
         m = StepMetrics(*(bounded(figure).reshape(*lead, 6) for figure in metrics))
         settling = np.minimum(m.settling_time, 1.5 * self.seconds)
@@ -172,7 +179,7 @@ class ToolCandidates:
         total = cost.mean(1) + cost.max(1) + w.late * np.log1p(late / 0.05).mean(1)
         lasted = rollout.ok.mean(0).reshape(lead)
         total = np.where(lasted.min(1) < 1, DIVERGED_COST * (2 - lasted.mean(1)), np.minimum(total, DIVERGED_COST))
-        return tuple((total + stability_penalty(gains, runner.timestep)).tolist()), metrics
+        return tuple((total + stability_penalty(gains, runner.timestep)).tolist()), metrics, poses
 
 
 def stability_penalty(gains: Float64, dt: float) -> Float64:

@@ -17,6 +17,7 @@ import numpy as np
 
 from batchpid.arrays.digest import digest
 from batchpid.metrics import StepMetrics
+from batchpid.sim.robot.findings import Findings
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
@@ -45,6 +46,8 @@ class ToolTuning(NamedTuple):
     """Metrics of the six axes on the moves of the final round (moves, 6): of the default gains, and of the result."""
     settings: dict[str, Any]
     """Seed, moves, options and versions, for the record."""
+    findings: Findings
+    """Causes for which moves of the final round do not settle under the result."""
     rejected: str | None = None
     """Criterion by which the default gains beat all candidates, with both figures; None if a candidate was best."""
 
@@ -121,7 +124,7 @@ def tune_tool(
         finalists = points[[0, *[index for index in ranking if index][:FINALISTS]]]
         with Runner(robot, len(finalists) * FINAL_MOVES, control=full, **options) as runner:
             gains = judge.gains(finalists)
-            finals, metrics = judge.evaluate(runner, gains)
+            finals, metrics, rollout = judge.evaluate(runner, gains)
             best = int(np.argmin(finals))
     rejected = None
     if not best:
@@ -132,5 +135,6 @@ def tune_tool(
         (finals[0], finals[best]),
         (each[0], each[1]),
         {**settings, "generations": len(costs), "costs": [finals[0], finals[best]]},
+        rollout.for_envs(slice(best * FINAL_MOVES, (best + 1) * FINAL_MOVES)).findings(robot),
         rejected,
     )

@@ -321,6 +321,35 @@ def test_a_joint_sticks_up_to_its_static_friction_and_slides_under_coulombs():
     assert speed[-1] < speed[4400], "it is braked, and does not stick at once"
 
 
+def accelerations(model, efforts, inertia=0.1):
+    """Return the accelerations of a joint from rest under ``efforts`` (steps,), and its speeds before the steps."""
+    v, mass, rows = np.zeros((1, 1)), np.array([[[inertia]]]), []
+    state = friction.init(model, v, v, mass, DT)
+    for effort in efforts:
+        state, total = friction.advance(model, state, np.full((1, 1), effort), v)
+        rows.append((total.item() / inertia, v.item()))
+        v = v + DT * total / inertia
+    return np.array(rows).T
+
+
+def test_friction_falls_with_the_speed_to_half_way_at_the_stribeck_velocity():
+    one = np.ones((1, 1))
+    found, speed = accelerations(friction.Friction(one, None, 3 * one, 0.5 * one), np.full(400, 3.5))
+    half = np.interp(0.5, speed, 3.5 - 0.1 * found)
+    np.testing.assert_allclose([half, 3.5 - 0.1 * found[1]], [2.0, 3.0], rtol=2e-3)
+    assert np.all(np.diff(found[2:]) >= 0)
+
+
+def test_friction_grows_with_the_effort_of_the_motor():
+    one = np.ones((1, 1))
+    for effort in (2.0, 8.0, -8.0):
+        found, _ = accelerations(friction.Friction(one, None, None, None, 0.1 * one), np.full(50, effort))
+        np.testing.assert_allclose(0.1 * found[5:], np.sign(effort) * (0.9 * abs(effort) - 1.0))
+    found, speed = accelerations(friction.Friction(0 * one, None, None, None, 0.1 * one), np.zeros(50))
+    assert not found.any()
+    assert not speed.any()
+
+
 ALL = {
     "command_delay": 0.0017,
     "sensor_delay": [[0.0008, 0.002, 0.0, 0.0013]],
@@ -331,6 +360,7 @@ ALL = {
     "no_load_speed": 4.0,
     "effort_limit": 6.0,
     "position_limit": ([-1.0, 0.0, 1.0], [4.0, 7.0, 5.0]),
+    "position_offset": 0.03,
     "backlash": 0.01,
     "position_noise": 1e-3,
     "velocity_noise": 1e-2,

@@ -28,6 +28,8 @@ DT = 1 / 2000
         ({"saturation_effort": 0.0, "no_load_speed": 1.0}, "saturation_effort, joint 0: must be > 0"),
         ({"armature": np.inf}, "armature"),
         ({"coulomb": np.ones((2, 2))}, "coulomb: has shape"),
+        ({"stribeck": 0.1, "coulomb": 0.2}, "stribeck: has no effect without static"),
+        ({"load_friction": 1.1}, "load_friction, joint 0: out of range"),
         ({"bias": "much"}, "bias: cannot be read"),
     ],
 )

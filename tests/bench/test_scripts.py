@@ -95,6 +95,11 @@ def test_newcomer(tmp_path, capfd):
     assert [(step.status, step.stopped, step.extra) for step in steps[:2]] == [(0, False, None), (2, False, "tune")]
     assert steps[-1].stopped
     assert (tmp_path / "got").read_text() == ".[tune]\n"
+    program, command = newcomer.readme_again(ROOT)
+    assert program.startswith("python - <<")
+    assert "Runner(" in program
+    assert command.startswith("batchpid ")
+    assert newcomer.report(newcomer.run(f"exit {status}", tmp_path, None) for status in (0, 1)) == 1
 
 
 @pytest.mark.slow

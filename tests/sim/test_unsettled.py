@@ -30,11 +30,10 @@ def bar(length: float, mass: float = 1.0) -> str:
     )
 
 
-def arm(
-    axis: str = "0 1 0", effort: float = 60.0, friction: float = 0.0, low: float = -3.0, height: float = 0.5
-) -> Robot:
-    """Return an arm of three bars, 0.3 m each, that turn about y, on a base at a height; ``axis`` is the elbow's."""
-    parts = ['<link name="base"/>']
+def arm(axis: str = "0 1 0", effort: float = 60.0, friction: float = 0.0, fixed_base: bool = True) -> Robot:
+    """Return an arm of three bars, 0.3 m each, that turn about y, 0.5 m above its base; ``axis`` is the elbow's."""
+    mass = '<mass value="50"/><inertia ixx="9" iyy="9" izz="9" ixy="0" ixz="0" iyz="0"/>'
+    parts = [f'<link name="base"><inertial>{mass}</inertial></link>']
     for number, (name, turns) in enumerate([("shoulder", "0 1 0"), ("elbow", axis), ("wrist", "0 1 0")]):
         above, at = ("base", "0 0 0.5") if number == 0 else (f"bar{number}", "0.3 0 0")
         parts.append(f'<link name="bar{number + 1}">{bar(0.3)}</link>')
@@ -44,7 +43,7 @@ def arm(
             f'<limit lower="-3" upper="3" effort="{effort if name == "elbow" else 60}" velocity="9"/></joint>'
         )
     with tempfile.TemporaryDirectory() as folder:
-        return Robot.load(write(Path(folder), f'<robot name="arm">{"".join(parts)}</robot>'))
+        return Robot.load(write(Path(folder), f'<robot name="arm">{"".join(parts)}</robot>'), fixed_base=fixed_base)
 
 
 class Case(NamedTuple):
@@ -143,6 +142,13 @@ def test_links_that_touch_are_named_with_the_time_and_depth():
     assert found.time == pytest.approx(rollout.time[first], abs=0.05)
     assert "at the setpoint" in found.detail
     assert "is pressed into the ground" in str(found)
+
+
+def test_links_that_touch_are_named_on_a_floating_base():
+    """The robot falls freely, so that its motors need no effort against gravity."""
+    case = CASES["links that touch"]._replace(robot={"fixed_base": False}, options={"ground": False})
+    first = run(case, "mujoco").findings()[0]
+    assert (first.code, first.link) == ("links", "bar1")
 
 
 def test_without_collisions_there_is_no_contact_to_name():

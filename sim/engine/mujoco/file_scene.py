@@ -144,7 +144,7 @@ def _frames(model: Any, robot: dict[int, str], spec: SceneSpec) -> tuple[dict[st
 def _of_followers(values: Float64, spec: SceneSpec) -> Float64:
     """Return the armature or damping (dof,) that moves from leaders to their followers: d_f and -m^2 d_f."""
     coupling, own = coupling_of(spec.joints), np.zeros(len(values))
-    for follower in coupling.followers:
-        own[follower] += values[follower]
-        own[coupling.leader[follower]] -= coupling.multiplier[follower] ** 2 * values[follower]
+    follower = coupling.followers
+    own[follower] = values[follower]
+    np.subtract.at(own, coupling.leader[follower], coupling.multiplier[follower] ** 2 * values[follower])
     return own

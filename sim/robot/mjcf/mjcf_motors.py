@@ -194,18 +194,10 @@ def _field(model: Any, name: str, index: int) -> float:
 
 def roots_of_actuators(model: Any) -> set[int]:
     """Return the bodies in the world that actuators move, or bodies below them."""
-    bodies: list[int] = []
-    for kind, target in zip(model.actuator_trntype.tolist(), model.actuator_trnid[:, 0].tolist(), strict=True):
-        if kind in (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT):
-            bodies.append(model.jnt_bodyid[target])
-        elif kind == _TRN.mjTRN_TENDON:
-            wraps = model.tendon_adr[target] + np.arange(model.tendon_num[target])
-            joints = wraps[model.wrap_type[wraps] == mujoco.mjtWrap.mjWRAP_JOINT]
-            sites = wraps[model.wrap_type[wraps] == mujoco.mjtWrap.mjWRAP_SITE]
-            bodies += [*model.jnt_bodyid[model.wrap_objid[joints]], *model.site_bodyid[model.wrap_objid[sites]]]
-        elif kind == _TRN.mjTRN_SITE:
-            bodies.append(model.site_bodyid[target])
-    return {int(model.body_rootid[body]) for body in bodies}
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    dofs = data.moment_colind[: data.moment_rownnz.sum()]
+    return {int(body) for body in model.body_rootid[model.dof_bodyid[dofs]]}
 
 
 def _arms(model: Any, actuator: int, names: Names) -> dict[str, float] | None:

@@ -24,10 +24,10 @@ GRAVITY = (0.0, 0.0, -9.81)
 _EQ = mujoco.mjtEq
 _KEYFRAME = "home"
 """Keyframe with the start pose."""
-_FLAGS = ("CONTACT", "LIMIT", "EQUALITY", "FRICTIONLOSS", "DAMPER", "CONSTRAINT")
-"""Parts of MuJoCo's physics that a file can disable, and that SAPIEN simulates nevertheless."""
 _OURS = ("GRAVITY", "ACTUATION", "CLAMPCTRL")
-"""Parts that a file cannot disable in either engine."""
+"""Parts of MuJoCo's physics that a file cannot disable in either engine."""
+_OTHERS = ("CONTACT", "LIMIT", "EQUALITY", "FRICTIONLOSS", "DAMPER", "CONSTRAINT")
+"""Parts that it can disable in MuJoCo."""
 
 
 class Mjcf(NamedTuple):
@@ -117,7 +117,7 @@ def _in_radians(model: Any, names: Names) -> list[Finding]:
 def _unused(model: Any, names: Names, key: int | None) -> list[Finding]:
     """Return findings for content that is not simulated, apart from motors, couplings, shapes and keyframe ``key``."""
     found = []
-    counts = {"site": model.nsite, "sensor": model.nsensor, "camera": model.ncam}
+    counts = {"site": model.nsite, "sensor": model.nsensor, "camera": model.ncam, "skin": model.nskin}
     counts["keyframe"] = model.nkey - (key is not None)
     if listed := [f"{count} {kind}{'s' * (count > 1)}" for kind, count in counts.items() if count]:
         text = f"elements that the simulation does not use are left out: {', '.join(listed)}"
@@ -126,15 +126,22 @@ def _unused(model: Any, names: Names, key: int | None) -> list[Finding]:
     if tuple(option.gravity) != GRAVITY:
         text = f"gravity {tuple(option.gravity.tolist())} of the file is not used: {GRAVITY} m/s^2 is"
         found.append(Finding("warning", "option", text, "expect other loads"))
-    for where, flags in (("", _OURS), (" in SAPIEN", _FLAGS)):
-        if off := [name for name in flags if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}", 0)]:
-            text = f"<flag> of the file is not used{where}, which disables: {', '.join(map(str.lower, off))}"
-            found.append(Finding("warning", "option", text, "expect all of these to act; remove them from the file"))
+    ours, others = (
+        [name.lower() for name in flags if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}", 0)]
+        for flags in (_OURS, _OTHERS)
+    )
+    if ours:
+        text = f"<flag> of the file is not used, which disables: {', '.join(ours)}"
+        found.append(Finding("warning", "option", text, "expect all of these to act; remove them from the file"))
     if option.enableflags & int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)):
         found.append(Finding("note", "option", "no body falls asleep, as the file has it", "expect slower steps"))
-    if option.density or option.viscosity:
-        text = f"{ALONE} drag of the medium (<option density= viscosity=>)"
-        found.append(Finding("warning", "option", text, "in SAPIEN expect less damping"))
+    special = {
+        f"the absence of what <flag> disables: {', '.join(others)}": others,
+        "drag of the medium (<option density= viscosity=>)": option.density or option.viscosity,
+        "flexible bodies": model.nflex,
+    }
+    remedy = "expect another motion in SAPIEN"
+    found += [Finding("warning", "option", f"{ALONE} {text}", remedy) for text, there in special.items() if there]
     for joint, name in names.joints.items():
         if model.jnt_stiffness[joint] or np.any(getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[joint]):
             text, remedy = f"{ALONE} the spring of the joint", "in SAPIEN add its effort in a controller"
@@ -151,8 +158,4 @@ def _unused(model: Any, names: Names, key: int | None) -> list[Finding]:
         text = f"{ALONE} the plugin {plugin_name(model, model.body_plugin[body])!r} of the body"
         remedy = "in SAPIEN expect the body to be rigid and to move freely"
         found.append(Finding("warning", "unknown-element", text, remedy, link=names.bodies[int(body)]))
-    if model.nflex:
-        found.append(Finding("warning", "unknown-element", f"{ALONE} flexible bodies", "in SAPIEN expect rigid links"))
-    if model.nskin:
-        found.append(Finding("note", "unknown-element", "skins are left out", "expect no effect"))
     return found

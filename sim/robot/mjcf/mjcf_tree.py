@@ -78,6 +78,8 @@ class Tree:
             for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
         )
         moving = {int(model.body_rootid[model.jnt_bodyid[joint]]) for joint in self._names.joints}
+        soft = {int(body) for body in getattr(model, "flex_vertbodyid", ()) if not model.body_geomnum[body]} & tops
+        moving -= soft  # three slides for each vertex of a flexible body
         if driven := moving & roots_of_actuators(model):
             moving -= (moving & free) - driven
         floating = moving & free
@@ -85,13 +87,13 @@ class Tree:
             listed = ", ".join(repr(names[body]) for body in sorted(moving))
             raise RobotError(f"{self._path}: holds several robots, {listed}; leave one of them in the file")
         left_out = {body for body in tops if model.body_mocapid[body] >= 0} | (free - moving)
-        left_out |= (tops - floating if floating else set()) | (balls - moving if moving else set())
+        left_out |= (tops - floating if floating else set()) | (balls - moving if moving else set()) | soft
         for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_BALL):
             of_body = int(model.jnt_bodyid[joint])
             if model.body_rootid[of_body] not in left_out:
                 problem = f"the ball joint {model.joint(joint).name!r} has no single position to control"
                 raise RobotError(f"{self._path}: body {names[of_body]!r}: {problem}; replace it by three hinges")
-        for body in sorted(left_out):
+        for body in sorted(left_out - soft):
             text, remedy = f"is apart from the robot: {ALONE} it", "in SAPIEN add it with build= of Runner"
             self._findings.append(Finding("note", "loose-link", text, remedy, link=names[body]))
         if floating:

@@ -243,11 +243,14 @@ def test_nothing_is_lost_that_is_not_listed(params, target):
 EVERY_EFFECT = {name: 0.25 for name in EFFECTS} | {"no_load_speed": 9.0, "position_limit": ([0.0, 1.0], [5.0, 6.0])}
 
 
+ISAAC_JOINT = set(JOINT_SIDE) - {"stribeck", "load_friction"}
+
+
 @pytest.mark.parametrize(
     ("to", "options", "has"),
     [
-        (to_isaac_lab, {"model": "implicit"}, set(JOINT_SIDE)),
-        (to_isaac_lab, {"model": "dc_motor"}, {*JOINT_SIDE, "saturation_effort"}),
+        (to_isaac_lab, {"model": "implicit"}, ISAAC_JOINT),
+        (to_isaac_lab, {"model": "dc_motor"}, {*ISAAC_JOINT, "saturation_effort"}),
         (to_maniskill, {}, set()),
         (to_newton, {}, {"armature", "viscous", "coulomb", "saturation_effort", "position_limit"}),
     ],

@@ -22,6 +22,7 @@ EFFECTS = {
     "strength": 0.9,
     "bias": 0.1,
     "effort_limit": 40.0,
+    "position_offset": 0.1,
     "backlash": 0.1,
     "position_resolution": 1e-2,
     "velocity_resolution": 1e-2,

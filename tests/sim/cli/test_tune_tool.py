@@ -21,6 +21,8 @@ def test_tune_writes_gains_that_rollout_reads(batchpid, tmp_path, monkeypatch):
     status, said, error = batchpid("tune", "panda", *short, *flags)
     assert status == 0, error
     assert "as tuned" in said
+    assert "Not settled under the gains written" in said  # in so short a time
+    assert "WHY: " in said
     assert ts.load_osc_options(out).keys() == {"stiffness", "damping_ratio", "posture_stiffness"}
     assert not out.with_suffix(".search.json").exists()
     command = shlex.split(said.splitlines()[-1].removeprefix("next: "))

@@ -61,7 +61,17 @@ ARM = f"""
   <actuator><motor joint="turn"/><motor joint="lift"/><motor joint="bend"/></actuator>
   <keyframe><key name="home" qpos="0 0 .2 .3 .09 .05 1 0 0 0 1 0 0 0 0 1 .06 1 0 0 0 .2"/></keyframe>
 </mujoco>"""
-TEXTS = {"four-bar": FOUR_BAR, "gripper": GRIPPER, "arm": ARM}
+CLOTH = (
+    ARM.replace("<keyframe>", "<!--")
+    .replace("</keyframe>", "-->")
+    .replace(
+        "</worldbody>",
+        """<flexcomp name="cloth" type="grid" count="3 3 1" spacing=".1 .1 .1" radius=".01" dim="2"
+          pos=".3 .1 .3" mass=".1">
+      <edge equality="true"/></flexcomp></worldbody>""",
+    )
+)
+TEXTS = {"four-bar": FOUR_BAR, "gripper": GRIPPER, "arm": ARM, "cloth": CLOTH}
 OBJECTS = ("cube", "lamp", "chest", "lid")
 
 
@@ -121,16 +131,17 @@ def test_moves_as_the_file_says(load, name):
     np.testing.assert_allclose(ours, np.broadcast_to(theirs[:, None], ours.shape), rtol=0, atol=1e-10)
 
 
-def test_the_law_drives_the_joints_and_the_arm_pushes_the_cube(load):
+@pytest.mark.parametrize("control", ["pid", "drive"])
+def test_the_law_drives_the_joints_and_the_arm_pushes_the_cube(load, control):
     robot = load(ARM)
     assert robot.joint_names == ("turn", "lift", "bend")
-    with Runner(robot, 1, workers=0, engine="mujoco") as runner:
+    with Runner(robot, 1, workers=0, engine="mujoco", control=control) as runner:
         before = runner.bodies(["cube"])
         for _ in range(200):
             obs = runner.step([0.5, 0.1, 0.0])
         after = runner.bodies(["cube"])
-    assert np.abs(obs.qpos - [0.5, 0.1, 0.0]).max() < 0.05
-    assert np.linalg.norm((after - before)[0, 0, :2]) > 0.03
+    assert np.abs(obs.qpos - [0.5, 0.1, 0.0]).max() < (0.05 if control == "pid" else 0.1)  # a drive has no integral
+    assert np.linalg.norm((after - before)[0, 0, :2]) > 0.01
 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
@@ -239,7 +250,15 @@ def test_what_a_scene_does_not_have_is_refused(load):
         pytest.raises(InvalidArgumentError, match="names"),
     ):
         runner.bodies(["wrist"])
+    with Runner(robot, 1, workers=0, engine="mujoco") as runner:
+        kept = runner.snapshot()
     robot = load(ARM.replace('density="200"', 'density="100"'))
+    with (
+        Runner(robot, 1, workers=0, engine="mujoco") as runner,
+        pytest.raises(InvalidArgumentError, match="another mjcf"),
+    ):
+        runner.restore(kept)
+    robot = load(ARM.replace('density="200"', 'density="150"'))
     robot.path.write_text(ARM)
     with pytest.raises(RobotError, match="has changed since the robot was loaded"):
         Runner(robot, 1, workers=0, engine="mujoco")

@@ -26,8 +26,10 @@ SCALES = {
     "saturation_effort": 80.0,
     "no_load_speed": 3.0,
     "coulomb": 0.5,
+    "load_friction": 0.02,
     "viscous": 1.0,
     "armature": 0.1,
+    "position_offset": 0.01,
     "backlash": 0.01,
     "position_resolution": 1e-3,
     "velocity_resolution": 1e-2,
@@ -44,6 +46,7 @@ def random_actuators(seed, dof):
     options = {name: SCALES[name] * 10.0 ** rng.uniform(-4, 1, (ENVS, dof)) for name in sorted(on)}
     if "coulomb" in on and rng.random() < 0.5:
         options["static"] = options["coulomb"] * rng.uniform(1, 3, (ENVS, dof))
+        options["stribeck"] = rng.choice([0.0, 0.01, 0.3], (ENVS, dof))
     if rng.random() < 0.5:
         options["position_limit"] = np.sort(rng.normal(size=5)), rng.uniform(0, 90, 5)
     return bp.make_actuators(dof, **options, seed=seed)

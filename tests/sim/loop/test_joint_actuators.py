@@ -206,7 +206,7 @@ def test_actuators_that_do_not_fit_are_refused_before_anything_changes(panda, wr
 
 
 def test_drives_take_friction_and_armature_alone(panda):
-    with pytest.raises(InvalidArgumentError, match="drives bypass both"):
+    with pytest.raises(InvalidArgumentError, match="drives bypass all three"):
         Runner(panda, 1, workers=0, control="drive", actuators=bp.make_actuators(panda.dof, strength=0.9))
     heavy = bp.make_actuators(panda.dof, armature=1.0)
     with Runner(panda, 1, workers=0, control="drive") as runner:

@@ -122,7 +122,11 @@ EFFECTS = {
     "effort_limit": 60.0,
     "saturation_effort": 90.0,
     "coulomb": 0.5,
+    "static": 0.4,
+    "stribeck": 0.05,
+    "load_friction": 0.1,
     "armature": 0.05,
+    "position_offset": 0.01,
     "sensor_delay": 0.003,
     "backlash": 0.001,
     "position_resolution": 1e-4,
@@ -137,6 +141,10 @@ def random_options(robot, rng):
     control = str(rng.choice(["pid", "pid", "effort", "drive"]))
     names = [name for name in EFFECTS if rng.random() < 0.5 and (control != "drive" or name in ("coulomb", "armature"))]
     effects = {name: EFFECTS[name] * rng.uniform(0.2, 1.0, (N, robot.dof)) for name in names}
+    if "static" in effects:
+        effects["static"] = effects["static"] + effects.get("coulomb", 0.0)
+    else:
+        effects.pop("stribeck", None)
     if "saturation_effort" in effects:
         effects["no_load_speed"] = 4.0
     if control != "drive" and rng.random() < 0.5:

@@ -486,6 +486,7 @@ FINDINGS = {
     "spring": (two_links('<joint name="j" stiffness="3"/>'), "spring", "j"),
     "gravity": (two_links(rest='<option gravity="0 0 0"/>'), "option", None),
     "flag": (two_links(rest='<option><flag contact="disable"/></option>'), "option", None),
+    "sleep": (two_links(rest='<option><flag sleep="enable"/></option>'), "option", None),
     "medium": (two_links(rest='<option density="1.2"/>'), "option", None),
     "gravcomp": (two_links().replace('name="b"', 'name="b" gravcomp="1"'), "gravcomp", None),
     "site": (two_links().replace(BOX, f'{BOX}<site name="s"/>', 1), "unknown-element", None),

@@ -14,7 +14,7 @@ from batchpid.native.availability import SWITCH
 from batchpid.sim import Robot
 from batchpid.sim.identification.logged_control import Control, Drive
 from batchpid.sim.identification.plant import Plant, Segment
-from batchpid.sim.identification.unknowns import KINDS, Motors
+from batchpid.sim.identification.unknowns import ADDED, KINDS, Motors
 from batchpid.task_space import native_rows
 
 DT, ROWS = 5e-4, 5
@@ -75,6 +75,20 @@ def test_native_code_gives_what_numpy_gives(name, joints, kind, tmp_path, monkey
         plant.simulate(motors_of(len(joints)), segments_of(arm, joints, past), past) for _ in both(monkeypatch)
     )
     assert np.abs(fast - fast[:, :1]).max() > 1e-3
+    np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-9)
+
+
+@needs_extension
+@pytest.mark.parametrize("names", [(name,) for name in ADDED if name != "stribeck"] + [tuple(ADDED)], ids="+".join)
+def test_effects_that_are_added_change_the_motion_alike_natively(names, panda, monkeypatch):
+    params = bp.make_params(2, kp=40.0, ki=5.0, kd=3.0)
+    plant = Plant(panda, (1, 3), Drive(DT, params, "none"))
+    motors, segments = motors_of(2), segments_of(panda, (1, 3), 0)
+    values = {"static": 9.0, "stribeck": 0.01, "saturation": 1e-3, "slew": 0.1}
+    added = {name: np.full((ROWS, 2), values.get(name, 0.5)) for name in names}
+    plain = plant.simulate(motors, segments, 0)
+    fast, slow = (plant.simulate(motors | added, segments, 0) for _ in both(monkeypatch))
+    assert np.abs(fast - plain).max() > 1e-6
     np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-9)
 
 
