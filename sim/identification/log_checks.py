@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 
+from batchpid.checks.warn import warn
 from batchpid.sim.identification.columns import error
 from batchpid.sim.identification.gaps import MIN_ROWS, MIN_SECONDS, divided
 from batchpid.sim.identification.log import Log, LogWarning
@@ -72,9 +72,7 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
         wrapped |= dict.fromkeys(found)
     if stopped := [name for name in wrapped if not robot.continuous[robot.joint_names.index(name)]]:
         problem = f"{log.source}: the positions of {', '.join(stopped)} jump by whole turns, and were unwrapped"
-        warnings.warn(
-            f"{problem}; in the robot's file the type is not continuous: correct it", LogWarning, stacklevel=3
-        )
+        warn(f"{problem}; in the robot's file the type is not continuous: correct it", LogWarning)
     return parts
 
 

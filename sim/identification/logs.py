@@ -23,7 +23,6 @@ each env is a log.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -32,6 +31,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, file_path
+from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification import bags, runs
 from batchpid.sim.identification.columns import QUANTITIES, Reading, error, read_csv, read_hdf5_columns, time_column
@@ -123,7 +123,7 @@ def _named(robot: Robot, source: str, columns: dict[str, Float64], reading: Read
         raise error(source, f"has none of the robot's joints, but {', '.join(others)}", remedy)
     if others:
         message = f"{source}: {', '.join(others)}: no joint of the robot, left out"
-        warnings.warn(message, LogWarning, stacklevel=4)
+        warn(message, LogWarning)
     return {name: values for name, values in columns.items() if name.partition(":")[2] not in others}
 
 
@@ -153,7 +153,7 @@ def logs_of_rollout(
         raise InvalidArgumentError(source, problem, remedy=remedy)
     if info.rates is None and not info.complete and found == "setpoint":
         problem = f"{source}: was cut short, before it said whether setpoints had rates"
-        warnings.warn(f"{problem}; it is fitted as a run without: if it had them, record another", LogWarning, 2)
+        warn(f"{problem}; it is fitted as a run without: if it had them, record another", LogWarning)
     if not rollout.ok.all():
         env = int(np.argmin(rollout.ok.all(0)))
         raise InvalidArgumentError(source, "has failed", env=env, remedy="record a run without faults")
@@ -220,7 +220,7 @@ def _build(
     parts = checked(robot, log, lines)
     if fast := too_fast(robot, parts):
         message = f"{source}: {fast} moves {SPEEDING:g} times as fast as its limit of velocity or more"
-        warnings.warn(f"{message}: positions look like degrees (option degrees)", LogWarning, stacklevel=4)
+        warn(f"{message}: positions look like degrees (option degrees)", LogWarning)
     return parts
 
 
@@ -247,7 +247,7 @@ def _choose(
     found = kind or kinds[0]
     if found == "setpoint" and by["measured_effort"]:
         message = f"{source}: measured efforts are not used with setpoints; without gains they are"
-        warnings.warn(message, LogWarning, stacklevel=5)
+        warn(message, LogWarning)
         by["measured_effort"], sensor = {}, None
     if found == "effort" and by["feedforward"]:
         remedy = "give the gains of the law that it was added to, or leave the column out"

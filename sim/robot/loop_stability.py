@@ -15,7 +15,6 @@ friction of the motors are counted, each where it is known.
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +22,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.choices import PerInertia, PerMassMatrix
+from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.gains.stability import Oscillation, oscillation
 from batchpid.law.implicit import as_explicit
@@ -219,20 +219,19 @@ class StabilityCheck:
         self._robot, self._timestep = robot, timestep
         self._has_warned = False
 
-    def check(self, params: bp.PIDParams, actuators: bp.Actuators | None, stacklevel: int = 3) -> None:
-        """Warn if ``params`` pass the bound, ``stacklevel`` frames up."""
+    def check(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
+        """Warn if ``params`` pass the bound."""
         report = self._beyond(params, bp.Actuators() if actuators is None else actuators)
         if report is not None and not self._has_warned:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
             rows = max(params.num_envs, 1 if actuators is None else actuators.num_envs)
             env = f", env {report.env}" if rows > 1 else ""
-            warnings.warn(
+            warn(
                 f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the sampled PID loop, "
                 f"mostly of joint {joint!r}{env}, at the start pose with a time step of {self._timestep:g} s: "
                 f"{report.effect}; {report.remedy}, a derivative_filter_time, "
                 f"{'' if report.late else implicit_remedy(params)}or robot.designed()",
                 StabilityWarning,
-                stacklevel=stacklevel,
             )
         self._has_warned = report is not None
 

@@ -103,8 +103,8 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
 
 def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Finding]:
     if not robot.fixed_base:
-        text = "SAPIEN's passive force does not compensate gravity on a floating base"
-        yield Finding("warning", "floating-base", text, "load with fixed_base=True, or expect no compensation")
+        text = "gravity compensation carries the links as if the base were held; the law has to carry the base"
+        yield Finding("note", "floating-base", text, "use designed gains, which count the load of the base")
     if left_over := robot.self_contact.left_over:
         text = f"{len(left_over)} pairs that should not collide do, since PhysX's filter cannot hold them all"
         yield Finding("note", "pairs-left-over", text, "disable fewer pairs in the .srdf")
