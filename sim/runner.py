@@ -1,31 +1,75 @@
 """Runner: N robots in N headless scenes, stepped by worker processes under one batch controller.
 
+Each method makes a command of its arguments (:mod:`batchpid.sim.commands`), which :meth:`Runner._execute` carries out.
+
 Longer than 300 lines because the public signatures and their documentation are spelled out for editors and readers.
 """
 
 from __future__ import annotations
 
-import warnings
+import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import cached_property
 from inspect import Parameter, Signature, signature
-from typing import ClassVar, Unpack
+from operator import itemgetter
+from pathlib import Path
+from time import strftime
+from typing import Any, ClassVar, Protocol, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.checks.single_owner import SingleOwner
+from batchpid.checks.validate import choice, instance, integer
+from batchpid.checks.warn import warn
+from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError
+from batchpid.io.versions import package_versions
 from batchpid.sim.command import CommandSpec
+from batchpid.sim.commands import (
+    ChangeActuators,
+    ChangeParams,
+    GoBack,
+    MakeSnapshot,
+    Read,
+    ResetEnvs,
+    RunnerCommand,
+    RunnerState,
+    RunTicks,
+    count_ticks,
+    read_command,
+    restored,
+    snapshot_of,
+)
 from batchpid.sim.loop.backend import describe
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
-from batchpid.sim.observation import Observation, Rollout, RunInfo
+from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation
 from batchpid.sim.options import RunnerOptions, default_params, keyword_parameters
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.run_warnings import RunWarnings
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE, RunnerKeywords
-from batchpid.sim.session import Session, TickRecorder
 from batchpid.sim.workers.contact_log import MissedContact
 from batchpid.sim.workers.node import NodeInfo
+from batchpid.sim.workers.one_call import OneCall
+from batchpid.sim.workers.pool import Outcome, WorkerPool
+from batchpid.sim.workers.requests import ReadPoses, ReadStateSizes, Restore
+
+
+class TickRecorder(Protocol):
+    """Receives every tick of a runner; :class:`batchpid.sim.Recorder` is one."""
+
+    path: Path
+
+    def wait(self) -> None:
+        """Return, or raise, before the next tick begins: whether it can be recorded."""
+
+    def append(self, time_: float, setpoint: NDArray[Any], observation: Observation, has_rates: bool) -> None:
+        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size), with rates or without.
+
+        It must return soon, and without an error: Ctrl-C waits for it.
+        """
 
 
 class Runner(SingleOwner):
@@ -60,7 +104,7 @@ class Runner(SingleOwner):
         **options: Unpack[RunnerKeywords],
     ) -> None:
         if "engine" not in options and DEFAULT_ENGINE != "sapien":
-            warnings.warn(f"SAPIEN is not installed: the engine is {DEFAULT_ENGINE!r}", stacklevel=2)
+            warn(f"SAPIEN is not installed: the engine is {DEFAULT_ENGINE!r}", UserWarning)
         self.options = checked = RunnerOptions(robot, num_envs, **options)
         """Options, checked."""
         self.robot, self.num_envs, self.control = checked.robot, checked.num_envs, checked.control
@@ -68,12 +112,42 @@ class Runner(SingleOwner):
         params = checked.check_params(
             default_params(robot, checked.control, checked.loops) if params is None else params
         )
-        self._session = Session(checked, params)
+        self.recorder: TickRecorder | None = None
+        """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
+        self._call, self._warnings = OneCall(), RunWarnings(checked)
+        self._tool_pose = checked.tool_pose
+        self._checkpoint_steps = math.inf if checked.checkpoint_steps is None else checked.checkpoint_steps
+        self._state = RunnerState.first(checked, params)
+        self._sent: RunTicks | None = None  # and not completed yet
+        self._unreceived: Observation | None = None
+        self._cause: BaseException | None = None  # of the end
         try:
-            self._session.open()
+            self._open()
         except BaseException:
-            self.close()
+            if hasattr(self, "_pool"):
+                self.close()
             raise
+
+    def _open(self) -> None:
+        """Start the workers, and reset all envs."""
+        state, options = self._state, self.options
+        seed = None if options.randomization is None else 0
+        start = ResetEnvs.read(options, state, self._warnings.limits, (None, None), None, seed, (None, None))
+        self._call.begin()
+        try:
+            self._call.waits = True
+            self._pool = WorkerPool(options, state.params)
+            self._pool.open()
+            outcome = self._pool.run(start.request(state))
+            if outcome.failure is not None:
+                raise outcome.failure.error
+            self._state = state = start.committed(state, outcome)
+        finally:
+            self._call.end()
+        self._warnings.issue(state.faults, state.contacts, self._pool.messages)
+        self._warnings.check_stability(state.params, state.actuators)
+        self._warnings.set_gains(state.params, state.actuators)
+        self._warnings.check_controller()
 
     def __repr__(self) -> str:
         options, workers, nodes = self.options, len(self.pids), len(self.nodes)
@@ -124,7 +198,10 @@ class Runner(SingleOwner):
             The observation of a tick that was sent has not been received, as for :meth:`step`, :meth:`rollout` and
             :meth:`restore`.
         """
-        return self._session.reset(qpos, qvel, mask, seed, base_pose, base_twist)
+        self._ready("reset")
+        limits, base = self._warnings.limits, (base_pose, base_twist)
+        self._execute(ResetEnvs.read(self.options, self._state, limits, (qpos, qvel), mask, seed, base))
+        return self._pool.present.observation.copied(self._tool_pose)
 
     def step(
         self,
@@ -161,7 +238,18 @@ class Runner(SingleOwner):
         substeps
             Sim steps of this tick; default the runner's.
         """
-        return self._session.step(setpoint, setpoint_rate, setpoint_acceleration, feedforward, substeps)
+        if self._sent is not None or self._unreceived is not None or self._pool.closed:
+            self._ready("step")
+        given = {
+            "setpoint": setpoint,
+            "setpoint_rate": setpoint_rate,
+            "setpoint_acceleration": setpoint_acceleration,
+            "feedforward": feedforward,
+        }
+        command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
+        count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
+        self._execute(RunTicks(command, count, self.timestep))
+        return self._pool.present.observation.copied(self._tool_pose)
 
     def send(
         self,
@@ -183,7 +271,16 @@ class Runner(SingleOwner):
         CallOrderError
             The observation of the last tick that was sent has not been received.
         """
-        self._session.send(setpoint, setpoint_rate, setpoint_acceleration, feedforward, substeps)
+        self._ready("send")
+        given = {
+            "setpoint": setpoint,
+            "setpoint_rate": setpoint_rate,
+            "setpoint_acceleration": setpoint_acceleration,
+            "feedforward": feedforward,
+        }
+        command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
+        count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
+        self._begin(RunTicks(command, count, self.timestep))
 
     def recv(self) -> Observation:
         """Wait for the end of the tick that :meth:`send` began; return its observation.
@@ -193,7 +290,11 @@ class Runner(SingleOwner):
         CallOrderError
             No tick was sent since the last call.
         """
-        return self._session.recv()
+        self._ready()
+        observation, self._unreceived = self._unreceived, None
+        if observation is None:
+            raise CallOrderError("recv: no tick was sent; call send(setpoint) first")
+        return observation
 
     def rollout(
         self,
@@ -215,11 +316,40 @@ class Runner(SingleOwner):
         progress
             Wraps the range of ticks, e.g. ``tqdm.tqdm``.
         """
-        return self._session.rollout(setpoints, setpoint_rates, setpoint_accelerations, feedforwards, progress)
+        self._ready("rollout")
+        given = {
+            "setpoints": setpoints,
+            "setpoint_rates": setpoint_rates,
+            "setpoint_accelerations": setpoint_accelerations,
+            "feedforwards": feedforwards,
+        }
+        options, ticks = self.options, count_ticks(self.options, setpoints)
+        command = read_command(options, self._state, self._warnings.setpoint_limits, given, ticks)
+        robot, tick, done = options.robot, options.substeps * options.timestep, 0
+        seen = empty_observation(ticks, self.num_envs, robot.dof, observed=options.observed)
+        times = (self._state.steps + options.substeps * np.arange(1.0, ticks + 1)) * options.timestep
+        info = replace(self.info, rates=command.setpoint_rate is not None)
+        shown = iter(range(ticks) if progress is None else progress(range(ticks)))
+        for number in range(ticks):  # not over ``shown``, which may yield anything
+            next(shown, None)
+            if number == done:
+                done = min(ticks, number + self._max_ticks())
+                part = slice(number, done)
+                rows = command.map(itemgetter(part))
+                self._execute(RunTicks(rows, options.substeps, options.timestep))
+                for name in options.observed:
+                    getattr(seen, name)[part] = getattr(self._pool.arrays.observation, name)[: done - number]
+        next(shown, None)  # the end
+        if options.tool_pose is not None:
+            seen = seen._replace(tool_pose=options.tool_pose(seen.qpos))
+        if (faults := self._state.faults.faults) is not info.faults:
+            info = replace(info, faults=faults)
+        return Rollout(times, command.setpoint, seen, tick, info)
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
-        return self._session.observe()
+        self._ready()
+        return self._pool.present.observation.copied(self._tool_pose)
 
     def poses(self) -> NDArray[np.float32]:
         """Return the poses of the entities that ``build`` returned (envs, entities, 7): x, y, z [m], w, x, y, z.
@@ -229,7 +359,14 @@ class Runner(SingleOwner):
         InvalidArgumentError
             There is no ``build``, or it returned more entities for one env than for another.
         """
-        return self._session.poses()
+        self._ready()
+        rows = [row for part in self._execute(Read(ReadPoses())).results for row in part]
+        counts = [len(row) for row in rows]
+        if not rows or len(set(counts)) > 1:
+            problem = f"returned {sorted(set(counts))} entities, by env" if rows else "was not given"
+            remedy = "let build(scene, env) return as many entities for every env"
+            raise InvalidArgumentError("build", problem, remedy=remedy)
+        return np.stack(rows)
 
     def bodies(self, names: Sequence[str]) -> NDArray[np.float64]:
         """Return the poses of bodies of an MJCF file (envs, names, 7), in the engine "mujoco".
@@ -242,16 +379,25 @@ class Runner(SingleOwner):
         InvalidArgumentError
             The robot is not from an MJCF file, the engine is another, or the file has no such body.
         """
-        return self._session.bodies(names)
+        self._ready()
+        if self.options.mjcf is None:
+            problem, remedy = "are those of an MJCF file in the engine 'mujoco'", "use robot.kinematic_tree() for links"
+            raise InvalidArgumentError("names", problem, remedy=remedy)
+        chosen = tuple([choice("names", name, self.options.mjcf.bodies) for name in names])
+        return np.stack([row for part in self._execute(Read(ReadPoses(chosen))).results for row in part])
 
     @property
     def params(self) -> bp.PIDParams:
         """PID parameters; assign new ones to change gains, limits or times in flight (bumpless in the integral)."""
-        return self._session.state.params
+        return self._settled().params
 
     @params.setter
     def params(self, params: bp.PIDParams) -> None:
-        self._session.set_params(params)
+        self._ready()
+        checked = self.options.check_params(params)
+        self._execute(ChangeParams(checked))
+        self._warnings.check_stability(checked, self._state.actuators)
+        self._warnings.set_gains(checked, self._state.actuators)
 
     @property
     def actuators(self) -> bp.Actuators | None:
@@ -259,18 +405,22 @@ class Runner(SingleOwner):
 
         As in the option, assign None for the robot's own actuators, and ``bp.Actuators()`` for ideal ones.
         """
-        return self._session.state.actuators
+        return self._settled().actuators
 
     @actuators.setter
     def actuators(self, actuators: bp.Actuators | None) -> None:
-        self._session.set_actuators(actuators)
+        self._ready()
+        checked = self.options.check_actuators(actuators)
+        self._execute(ChangeActuators(checked))
+        self._warnings.set_gains(self._state.params, checked)
 
     def snapshot(self) -> Snapshot:
         """Return the state of all envs, physics and controller, for :meth:`restore`.
 
         It is a barrier: this runner, too, goes on as if restored from it, so that both are bit-identical from here on.
         """
-        return self._session.snapshot()
+        self._ready()
+        return self._take_snapshot()
 
     def restore(self, snapshot: Snapshot) -> Observation:
         """Put all envs into the state of ``snapshot``, with its params and actuators.
@@ -290,21 +440,43 @@ class Runner(SingleOwner):
         InvalidArgumentError
             It is of another robot, number of envs, timestep, control, ...; the message names the options.
         """
-        return self._session.restore(snapshot)
+        self._ready("restore")
+        instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()").check(self.options.describe())
+        sizes = [size for part in self._execute(Read(ReadStateSizes())).results for size in part]
+        request = restored(self.options, snapshot, sizes)
+        self._execute(GoBack(request))
+        self._pool.start_replay_from(request)
+        self._warnings.set_gains(self._state.params, self._state.actuators)
+        return self._pool.present.observation.copied(self._tool_pose)
 
     def settle(self) -> None:
-        """Complete a command whose call was interrupted (Ctrl-C), as every other method does first.
-
-        A closed runner passes completed ticks on to the recorder.
-        """
-        self._session.settle()
+        """Complete a tick that :meth:`send` began, as every other method does first."""
+        if self._sent is not None and not self.closed:
+            self._execute(self._sent)
 
     # -- properties ------------------------------------------------------------------------------------------------
 
     @property
     def info(self) -> RunInfo:
         """Robot, options and origin of a run that starts now."""
-        return self._session.info()
+        start, state, options = self.observe().qpos, self._state, self.options
+        draws = None if options.randomization is None else state.draws
+        return options.robot.run_info(
+            **options.values_for("recording"),
+            own_command=options.own_command,
+            params=state.params,
+            actuators=state.actuators,
+            start=start,
+            versions=dict(self._versions),
+            begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
+            faults=state.faults.faults,
+            draws=None if draws is None else {name: rows.copy() for name, rows in draws.values.items()},
+            episodes=None if draws is None else draws.episodes.copy(),
+        )
+
+    @cached_property
+    def _versions(self) -> dict[str, str]:
+        return package_versions()
 
     @property
     def command(self) -> CommandSpec:
@@ -313,34 +485,25 @@ class Runner(SingleOwner):
         return self.options.command if tool is None else tool.command
 
     @property
-    def recorder(self) -> TickRecorder | None:
-        """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
-        return self._session.recorder
-
-    @recorder.setter
-    def recorder(self, recorder: TickRecorder | None) -> None:
-        self._session.recorder = recorder
-
-    @property
     def faults(self) -> tuple[Fault, ...]:
         """Envs that failed, latest last: the last ten thousand."""
-        return self._session.state.faults.faults
+        return self._settled().faults.faults
 
     @property
     def missed_contacts(self) -> tuple[MissedContact, ...]:
         """First contact that each robot would have had since its reset, without collisions; latest last."""
-        contacts = self._session.state.contacts
+        contacts = self._settled().contacts
         return () if contacts is None else tuple(contacts.contacts)
 
     @property
     def draws(self) -> dict[str, NDArray[np.float64]]:
         """Draws of the randomization for the present episodes, by field: (envs, joints or links), as copies."""
-        return {name: rows.copy() for name, rows in self._session.state.draws.values.items()}
+        return {name: rows.copy() for name, rows in self._settled().draws.values.items()}
 
     @property
     def episodes(self) -> NDArray[np.int64]:
         """Stream and number of the present episode of each env (envs, 2); (0, 2) without a randomization."""
-        return self._session.state.draws.episodes.copy()
+        return self._settled().draws.episodes.copy()
 
     @property
     def backend(self) -> str:
@@ -350,37 +513,39 @@ class Runner(SingleOwner):
     @property
     def time(self) -> float:
         """Simulated time since the start [s]."""
-        return self._session.state.steps * self.timestep
+        return self._settled().steps * self.timestep
 
     @property
     def work_seconds(self) -> NDArray[np.float64]:
         """Seconds of work of each worker in the last tick; after a rollout, the mean over the ticks of one request."""
-        seconds, ticks = self._session.state.work
+        seconds, ticks = self._settled().work
         return np.array(seconds) / ticks
 
     @property
     def recoveries(self) -> int:
         """Number of lost workers that were replaced."""
-        return self._session.pool.recoveries
+        return self._pool.recoveries
 
     @property
     def pids(self) -> tuple[int, ...]:
         """Process ids of the workers."""
-        return tuple(worker.pid for worker in self._session.pool.workers if worker.pid is not None)
+        return tuple(worker.pid for worker in self._pool.workers if worker.pid is not None)
 
     @property
     def nodes(self) -> tuple[NodeInfo, ...]:
         """Machines of a cluster, in the order of their envs; empty without ``cluster``."""
-        return self._session.pool.nodes
+        return self._pool.nodes
 
     def close(self) -> None:
         """End the workers and free the scenes. May be called again, as after an interrupt."""
-        self._session.close()
+        self._pool.closed = True
+        if not (self._call.in_use and self._pool.is_local):  # its scenes are in use until the call ends
+            self._pool.close()
 
     @property
     def closed(self) -> bool:
         """True after :meth:`close`, or after a worker was lost for good."""
-        return self._session.pool.closed
+        return self._pool.closed
 
     def __enter__(self) -> Runner:
         return self
@@ -389,8 +554,140 @@ class Runner(SingleOwner):
         self.close()
 
     def __del__(self) -> None:
-        if hasattr(self, "_session"):  # its options were right
+        if hasattr(self, "_pool"):  # its options were right
             self.close()
+
+    # -- execution of commands -------------------------------------------------------------------------------------
+
+    def _ready(self, call: str | None = None) -> None:
+        """Complete a tick that was sent.
+
+        ``call`` is the name of a method that changes the observation.
+
+        Raises
+        ------
+        ClosedError
+            The runner is closed.
+        CallOrderError
+            The observation of a tick that was sent has not been received, and ``call`` would change it.
+        InUseError
+            Another call is in progress, or the runner belongs to another process.
+        """
+        if self._pool.closed:
+            cause, reason = self._cause, ""
+            if cause is not None:
+                reason = f", since a call failed ({(str(cause).splitlines() or [type(cause).__name__])[0]})"
+            raise ClosedError(f"this Runner is closed{reason}; make a new one")
+        self._call.check()
+        if self._sent is not None:
+            self._execute(self._sent)
+        if self._unreceived is not None and call is not None:
+            problem = "the observation of the last tick that was sent has not been received"
+            raise CallOrderError(f"{call}: {problem}; call recv() first")
+
+    def _settled(self) -> RunnerState:
+        """Return the state after the last command; during a call, and after the end, after the last completed one."""
+        if self._sent is not None and not (self._call.in_use or self._pool.closed):
+            self._execute(self._sent)
+        return self._state
+
+    def _begin(self, command: RunTicks) -> None:
+        """Send the request of ticks, for :meth:`_execute` to complete."""
+        self._prepare_ticks()
+        self._call.begin()
+        try:
+            self._call.waits = True
+            self._pool.begin(command.request(self._state))
+            self._sent = command
+        except BaseException as error:
+            self._fail(error)
+            raise
+        finally:
+            if self._pool.closed:
+                self._pool.close()
+            self._call.end()
+
+    def _execute(self, command: RunnerCommand) -> Outcome:
+        """Execute a command, or complete the one that was sent; then warn of what was found.
+
+        Ctrl-C does not interrupt it between the request and the new state. The runner is closed if the workers cannot
+        complete the request, or if a second Ctrl-C ends it.
+        """
+        call, pool, is_sent = self._call, self._pool, command is self._sent
+        ticks = command if isinstance(command, RunTicks) else None
+        is_due = self.recorder is not None or self._state.steps_since_checkpoint >= self._checkpoint_steps
+        if is_due and ticks is not None and not is_sent:
+            self._prepare_ticks()
+        call.begin()
+        try:
+            call.waits, before = True, self._state
+            if not is_sent:
+                pool.begin(command.request(before))
+            outcome = pool.finish()
+            call.waits = False
+            if outcome.failure is None or ticks is not None:
+                self._state = command.committed(before, outcome)
+            if ticks is not None and self.recorder is not None:
+                self._record(self.recorder, ticks, before, outcome)
+            if is_sent:
+                self._sent, self._unreceived = (
+                    None,
+                    None if outcome.failure else self._pool.present.observation.copied(self._tool_pose),
+                )
+            if outcome.failure is not None and command.changes_loops:
+                self._fail(outcome.failure.error)
+        except BaseException as error:
+            self._fail(error)
+            raise
+        finally:
+            if pool.closed:
+                pool.close()
+            call.end()
+        if outcome.failure is not None:
+            raise outcome.failure.error
+        if ticks is not None and self._warnings.is_watching:
+            seconds, seen = ticks.substeps * ticks.timestep, outcome.ticks.arrays.observation
+            self._warnings.see(ticks.command, seen, outcome.num_ticks, seconds)
+        faults, contacts = self._state.faults, self._state.contacts
+        if pool.messages or faults.faults or contacts is not None:
+            self._warnings.issue(faults, contacts, pool.messages)
+        return outcome
+
+    def _prepare_ticks(self) -> None:
+        """Take a checkpoint if one is due, and wait while the recorder lags."""
+        if self._state.steps_since_checkpoint >= self._checkpoint_steps:
+            self._take_snapshot()
+        if self.recorder is not None:
+            self.recorder.wait()
+
+    def _record(self, recorder: TickRecorder, ticks: RunTicks, before: RunnerState, outcome: Outcome) -> None:
+        """Pass completed ticks on to the recorder."""
+        rated = ticks.command.setpoint_rate is not None
+        for number, arrays in enumerate(outcome.completed, start=1):
+            time = (before.steps + number * ticks.substeps) * ticks.timestep
+            recorder.append(time, arrays.command.setpoint.copy(), arrays.observation.copied(self._tool_pose), rated)
+
+    def _fail(self, error: BaseException) -> None:
+        """End the runner, which cannot complete a command."""
+        self._call.waits = False
+        if not isinstance(error, ClosedError):
+            self._cause = error
+        self._pool.closed = True
+
+    def _take_snapshot(self) -> Snapshot:
+        """Return a snapshot, from which the runner goes on, and a replacement of a lost worker begins."""
+        state = self._state
+        snapshot = snapshot_of(self.options, state, self._execute(MakeSnapshot()).results)
+        self._pool.start_replay_from(Restore(snapshot, state.draws))
+        return snapshot
+
+    def _max_ticks(self) -> int:
+        """Return the number of ticks that one request may have: none beyond the next checkpoint."""
+        most, every = len(self._pool.ticks), self.options.checkpoint_steps
+        if every is None:
+            return most
+        left = every - self._state.steps_since_checkpoint % every
+        return min(most, -(-left // self.options.substeps))
 
 
 _NAMED = [each for each in signature(Runner).parameters.values() if each.kind != Parameter.VAR_KEYWORD]

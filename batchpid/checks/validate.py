@@ -196,10 +196,13 @@ def array(
     ``names`` holds the name of each column. ``kind`` is the type of a column: a joint, or an entry of a command.
     """
     remedy = f"the last axis counts the {'joints' if kind == 'joint' else 'entries'} {', '.join(names)}"
-    result = read_array(argument, value)
+    is_read = type(value) is np.ndarray and value.dtype == np.float64  # nearly always
+    result: NDArray[Any] = value if is_read else read_array(argument, value)  # type: ignore[assignment]
     if result.ndim and result.shape[-1] != shape[-1]:  # one number for all joints is a scalar, not an array of one
         raise InvalidArgumentError(argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy)
-    given, result = result.reshape(-1), _broadcast(argument, result, shape, remedy)
+    given = result.reshape(-1)
+    if not is_read or result.shape != shape:
+        result = _broadcast(argument, result, shape, remedy)
     # The sum of squares costs a third, and is finite for most; BLAS uses threads for a longer one.
     is_sound = given.size < 10_000 and math.isfinite(given.dot(given))
     if finite and not is_sound and not (good := np.isfinite(result)).all():

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-import warnings
 from functools import cache
 
+from batchpid.checks.warn import warn
 from batchpid.native.array_program import interpreter
 from batchpid.native.extensions import Extension, StaleExtensionError, load
 from batchpid.native.operations import PROGRAM
@@ -32,7 +32,7 @@ def _fault(extensions: tuple[Extension, ...]) -> str:
             load(extension)
         interpreter()
     except StaleExtensionError as error:
-        warnings.warn(f"native code is not used, only Python: {error}", RuntimeWarning, stacklevel=3)
+        warn(f"native code is not used, only Python: {error}", RuntimeWarning)
         return str(error)
     except ModuleNotFoundError as error:
         return str(error)

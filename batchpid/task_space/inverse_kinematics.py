@@ -18,7 +18,6 @@ back at the end.
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.display import array_summary
 from batchpid.checks.validate import array, broadcast, choice, entries, integer, positive
+from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import pose_error, pose_of
@@ -298,4 +298,4 @@ def _report(found: IKResult, how: str) -> None:
     )
     if how == "raise":
         raise error
-    warnings.warn(str(error), InverseKinematicsWarning, stacklevel=3)
+    warn(str(error), InverseKinematicsWarning)

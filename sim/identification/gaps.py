@@ -6,7 +6,6 @@ proportion to the length of the gap.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -15,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
+from batchpid.checks.warn import warn
 from batchpid.sim.identification.columns import error
 from batchpid.sim.identification.log import Log, LogWarning
 
@@ -76,7 +76,7 @@ def divided(log: Log, row: Callable[[int], str]) -> list[Log]:
         ranges = ", ".join(f"{row(each.start)} to {row(each.stop - 1)}" for each in found.left_out[:5])
         problem = f"{len(found.left_out)} stretches between gaps in time are too short and left out"
         more = ", ..." if len(found.left_out) > 5 else ""
-        warnings.warn(f"{log.source}: {problem}: {ranges}{more}", LogWarning, stacklevel=2)
+        warn(f"{log.source}: {problem}: {ranges}{more}", LogWarning)
     if found.rows == [slice(0, len(log.time))]:
         return [log]
     parts = []

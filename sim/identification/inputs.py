@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from importlib.util import find_spec
@@ -13,6 +12,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.checks.validate import choice, flag, instance, integer, number
+from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.logs import Log, LogWarning, at_limits, checked, read_logs
@@ -111,7 +111,7 @@ def _logs(robot: Robot, logs: Iterable[Any], kind: Any, hold: bool) -> list[Log]
             raise InvalidArgumentError(log.source, problem, remedy="fit them one by one")
         if stopped := at_limits(log.settings.robot or robot, log):
             message = "; ".join(stopped) + ": stops are not part of the model; record between the limits"
-            warnings.warn(message, LogWarning, stacklevel=4)
+            warn(message, LogWarning)
     return found
 
 
@@ -139,7 +139,7 @@ def _without_still(robot: Robot, logs: list[Log]) -> tuple[list[Log], Robot, lis
         if these.any():
             listed = _quoted([name for name, each in zip(names, these, strict=True) if each])
             message = f"{listed} did not {fault}: left out, and held where the logs have it"
-            warnings.warn(f"{message}; its motor cannot be identified", LogWarning, stacklevel=4)
+            warn(f"{message}; its motor cannot be identified", LogWarning)
     start = robot.start
     start[[joint for joint, each in zip(joints, moves, strict=True) if not each]] = qpos.mean(0)[~moves]
 

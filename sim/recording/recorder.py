@@ -6,8 +6,9 @@ most a second's ticks, however slow the disk. The file grows as ``NAME.partial``
 an existing file of that name is not touched before. See :mod:`batchpid.sim.recording.recording_files` for its
 content.
 
-A signal handler (Ctrl-C) can interrupt the calls at any moment, but not the thread. So the calls take no lock that the
-thread needs: they put items into queues that are written in C, and wait in ways that can be repeated.
+The runner gives a completed tick to :meth:`Recorder.append`, which only queues it, and calls :meth:`Recorder.wait`
+before the next: Ctrl-C interrupts the wait, in which nothing has begun, and loses no tick. It can interrupt the other
+calls at any moment, but not the thread. So they take no lock that the thread needs, and can be repeated.
 """
 
 from __future__ import annotations
@@ -124,17 +125,24 @@ class Recorder(SingleOwner):
             self._finish_with(PartialFile.discard)
             raise
 
-    def append(self, time_: float, setpoint: NDArray[Any], observation: Observation, has_rates: bool) -> None:
-        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size), with rates or without.
+    def wait(self) -> None:
+        """Return when the next tick may begin: the oldest row that is not on disk is not too old. The runner calls it.
 
-        The runner calls it.
-
-        Repeated with the same ``observation``, after an interrupt, it has no effect.
+        Raises
+        ------
+        RecordingError
+            The ticks before could not be written.
         """
         while not self._writing.done and (self._is_full() or time.monotonic() - self._oldest > MAX_LAG):
             self._wake.put(None)
             time.sleep(_RETRY)
         self._check()
+
+    def append(self, time_: float, setpoint: NDArray[Any], observation: Observation, has_rates: bool) -> None:
+        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size), with rates or without.
+
+        The runner calls it, and Ctrl-C waits until it has returned.
+        """
         self._faults, episodes = self._runner.faults, self._runner.episodes
         for env in np.flatnonzero((episodes != self._episodes).any(1)).tolist():
             self._redraws.append(Redraw(time_, env, *episodes[env].tolist()))
@@ -200,19 +208,13 @@ class Recorder(SingleOwner):
             file = self._creation.result()
         except Exception:
             return  # the constructor raises it
-        last: Observation | None = None
         try:
             while (first := self._rows.get()) is not None:
                 self._oldest = first.recorded
                 self._pause()
-                rows = []
-                for row in (first, *self._take_rows()):
-                    if row.observation is not last:  # otherwise the first of two calls was interrupted
-                        rows.append((row.time, row.setpoint, *row.observation))
-                    last = row.observation
-                if rows:
-                    columns = zip(("time", *RECORDED), zip(*rows, strict=True), strict=True)
-                    file.append({name: np.array(column) for name, column in columns if column[0] is not None})
+                rows = [(row.time, row.setpoint, *row.observation) for row in (first, *self._take_rows())]
+                columns = zip(("time", *RECORDED), zip(*rows, strict=True), strict=True)
+                file.append({name: np.array(column) for name, column in columns if column[0] is not None})
                 self._oldest = math.inf
         except RecordingError as error:
             self._error = error

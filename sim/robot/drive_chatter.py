@@ -14,7 +14,6 @@ the error is at most (d w - L) / kp. (This is also so for MuJoCo's own servos wi
 from __future__ import annotations
 
 import math
-import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
+from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.observation import Observation
 from batchpid.sim.robot.description import RobotDescription
@@ -58,7 +58,8 @@ class DriveChatterCheck:
         self._robot, self._timestep = robot, timestep
         self._speed: Float64 | None = None
         self._window: _Window | None = None
-        self._found: tuple[int, int] | None = None
+        self.found: tuple[int, int] | None = None
+        """Env and joint that chatters."""
         self._has_warned = False
 
     def set_gains(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
@@ -98,24 +99,23 @@ class DriveChatterCheck:
         moved, covered, ticks = np.abs(qpos - window.start), window.distance + distance, window.ticks + 1
         chatters = alike & ((moved < _PROGRESS * covered) | (ticks < TICKS))
         long = chatters & (ticks >= TICKS) & (ticks * seconds >= DURATION)
-        if self._found is None and long.any():
+        if self.found is None and long.any():
             env, joint = np.argwhere(long)[0]
-            self._found = int(env), int(joint)
+            self.found = int(env), int(joint)
         self._window = _Window(
             np.where(chatters, window.start, qpos), np.where(chatters, covered, 0.0), np.where(chatters, ticks, 0)
         )
 
-    def warn(self, stacklevel: int) -> None:
+    def warn(self) -> None:
         """Warn, once, if a joint was found to chatter."""
-        if self._found is None or self._has_warned:
+        if self.found is None or self._has_warned:
             return
         self._has_warned = True
-        env, joint = self._found
-        warnings.warn(
+        env, joint = self.found
+        warn(
             f"env {env}, joint {self._robot.joint_names[joint]!r}: its drive alternates between its effort limits from "
             f"step to step, and the joint sticks: a force at its limit is not implicit in MuJoCo, and the damping is "
             f"too large for the joint's inertia at a time step of {self._timestep:g} s; lower kd and kp, raise the "
             "effort limit, reduce the time step, give the joint armature, or use engine='sapien'",
             StabilityWarning,
-            stacklevel=stacklevel,
         )

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.checks.warn import warn
 from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 
 LISTED = 4
@@ -33,10 +33,8 @@ class SetpointCheck:
         self._low, self._high = robot.lower - LIMIT_TOLERANCE, robot.upper + LIMIT_TOLERANCE
         self._warned: set[tuple[str, int]] = set()
 
-    def check(
-        self, argument: str, positions: NDArray[Any], envs: NDArray[np.bool_] | None = None, stacklevel: int = 3
-    ) -> None:
-        """Warn of finite ``positions`` (..., envs, dof) [rad or m] outside the limits, ``stacklevel`` frames up.
+    def check(self, argument: str, positions: NDArray[Any], envs: NDArray[np.bool_] | None = None) -> None:
+        """Warn of finite ``positions`` (..., envs, dof) [rad or m] outside the limits.
 
         One warning names all joints, each with its worst position and its envs; ``envs`` (envs,) masks those to check.
         """
@@ -55,10 +53,9 @@ class SetpointCheck:
             return
         self._warned.update((argument, joint) for joint in new)
         found = "; ".join(self._describe(joint, positions[..., joint], outside[..., joint]) for joint in new)
-        warnings.warn(
+        warn(
             f"{argument} is outside the joint limits, where no joint can follow: {found}; move it inside",
             SetpointWarning,
-            stacklevel=stacklevel,
         )
 
     def _describe(self, index: int, positions: NDArray[Any], outside: NDArray[np.bool_]) -> str:
@@ -84,8 +81,14 @@ class MovingSetpointCheck:
         self._lag: NDArray[np.float64] | None = None
         self._last: NDArray[np.float64] | None = None
         self._moved: Any = 0.0  # seconds, of each env
+        self._has_warned = False
         self.found: int | None = None
         """Joint with such a setpoint, once there is one; no other is looked for."""
+
+    @property
+    def is_watching(self) -> bool:
+        """False where no joint lags, and after the warning: :meth:`see` then has nothing to find."""
+        return self._lag is not None and not self._has_warned
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Find the lags of these gains."""
@@ -121,15 +124,16 @@ class MovingSetpointCheck:
                 self.found = int(np.where(change[long][0] > 0, self._lag, 0.0).argmax())
                 return
 
-    def warn(self, stacklevel: int) -> None:
-        """Warn, once, of the setpoints that were found."""
+    def warn(self) -> None:
+        """Warn of the setpoints that were found, if there are some, and only once."""
+        if self.found is None or self._has_warned:
+            return
         assert self._lag is not None
-        assert self.found is not None
+        self._has_warned = True
         joint, lag = self._robot.joint_names[self.found], self._lag[self.found]
-        warnings.warn(
+        warn(
             f"setpoint moves in every tick without its rate: under these gains joint {joint!r} follows {1e3 * lag:.0f} "
             "ms behind (kp (1 - b) / ki); pass setpoint_rate, such as the change over a tick by the tick, or use gains "
             "with setpoint_weight=1",
             MovingSetpointWarning,
-            stacklevel=stacklevel,
         )

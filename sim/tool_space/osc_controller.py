@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from batchpid.arrays.display import summary
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.leaves import frozen
 from batchpid.checks.validate import array, choice, flag, instance, names
+from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.command import POSE_UNITS, CommandSpec
@@ -253,8 +253,8 @@ class OperationalSpace:
         other._friction = self._known_friction if "friction" in compensate.split("+") else None
         return other
 
-    def check_stability(self, stacklevel: int = 2) -> None:
-        """Warn, ``stacklevel`` frames up, if explicit gains are unstable at the time step: kp dt^2 + 2 kd dt > 4."""
+    def check_stability(self) -> None:
+        """Warn if explicit gains are unstable at the time step: kp dt^2 + 2 kd dt > 4."""
         p, dt = self._params, self._timestep
         if p.discretization is not None or isinstance(p.decoupling, NoDecoupling):
             return
@@ -264,12 +264,11 @@ class OperationalSpace:
         ):
             ratio = (kp * dt * dt + 2 * kd * dt)[0] / 4
             if ratio[worst := int(ratio.argmax())] > 1:
-                warnings.warn(
+                warn(
                     f"{name}, {columns[worst]!r}: {kp[0, worst]:g} with damping {kd[0, worst]:g} is {ratio[worst]:.3g} "
                     f"times the stability bound of the sampled loop at a time step of {dt:g} s; use less, a smaller "
                     f"timestep, or discretization='implicit'",
                     StabilityWarning,
-                    stacklevel=stacklevel + 1,
                 )
 
     def tool_pose(self, qpos: Any) -> NDArray[np.float32]:

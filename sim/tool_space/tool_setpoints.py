@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.read_only import read_only
 from batchpid.checks.validate import array, entries, read_array
+from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.command import POSE_UNITS, CommandSpec
 from batchpid.sim.robot.robot import Robot
@@ -65,9 +65,7 @@ class ToolSetpoints:
         """Return the poses of the link (..., 7) at ``qpos`` (..., dof)."""
         return tool_pose(self._tree, self.link, None, qpos)
 
-    def joints(
-        self, name: str, setpoint: Any, last: Float64, finite: bool, ticks: int | None, stacklevel: int
-    ) -> Float64:
+    def joints(self, name: str, setpoint: Any, last: Float64, finite: bool, ticks: int | None) -> Float64:
         """Return joint setpoints (envs, dof), or (ticks, envs, dof), for poses after ``last`` (envs, dof).
 
         Setpoints have 7 entries, or all entries of :attr:`command`; with 7 the other joints keep their setpoint. A
@@ -101,7 +99,7 @@ class ToolSetpoints:
             if good.any():
                 solved = ts.inverse_kinematics(self._tree, self.link, unit, start[good], starts=1, on_failure="return")
                 found[tick, good] = solved.qpos
-                self._warn(name, np.flatnonzero(good)[~solved.success], solved, stacklevel + 1)
+                self._warn(name, np.flatnonzero(good)[~solved.success], solved)
             last = np.where(good[:, None], found[tick], last)
         return read_only(found.reshape(*lead, -1))
 
@@ -127,7 +125,7 @@ class ToolSetpoints:
         found[..., self._others[: len(names) - 6]] = rows[..., 6:]
         return read_only(found)
 
-    def _warn(self, name: str, failed: Any, found: ts.IKResult, stacklevel: int) -> None:
+    def _warn(self, name: str, failed: Any, found: ts.IKResult) -> None:
         """Warn of the first env whose pose was not reached, once."""
         if not len(failed) or self._has_warned:
             return
@@ -137,4 +135,4 @@ class ToolSetpoints:
             f"{found.rotation_error[row] * 1e3:.3g} mrad are left; the nearest pose is used, without further warning"
         )
         error = InvalidArgumentError(name, problem, env=int(failed[0]), remedy="keep setpoints within reach")
-        warnings.warn(str(error), ts.InverseKinematicsWarning, stacklevel=stacklevel + 1)
+        warn(str(error), ts.InverseKinematicsWarning)

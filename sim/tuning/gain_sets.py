@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import difflib
-import warnings
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 import batchpid as bp
+from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.exported import Imported
 from batchpid.export.ros2_control_reader import from_ros2_control, is_ros2_control
@@ -74,7 +74,7 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     else:
         return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])
     for each in found.differences:
-        warnings.warn(f"{path}: {each}", stacklevel=2)
+        warn(f"{path}: {each}", UserWarning)
     return GainSet(path.name, found.params.for_joints(robot.coupling.of_all(np.arange(len(own)))))
 
 

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.arrays.digest import digest
 from batchpid.checks.validate import array, file_path, integer, read_array
+from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.sim.loop.faults import FaultWarning
@@ -157,7 +158,7 @@ def _warn(kind: type[Warning], events: Sequence[Any], envs: slice) -> None:
     if events:
         first = events[0]._replace(env=envs.start + events[0].env)
         text = f"{len(events)} in envs {envs.start} to {envs.stop - 1}, the first: {first}"
-        warnings.warn(text, kind, stacklevel=3)
+        warn(text, kind)
 
 
 def _ticks(name: str, value: ArrayLike | None, num_envs: int) -> NDArray[Any] | None:

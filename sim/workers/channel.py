@@ -37,14 +37,15 @@ class Channel:
             except BlockingIOError:
                 self._wait(select.POLLOUT)
 
-    def receive(self) -> bytes:
-        """Wait for the next message and return it.
+    def receive(self, begun: bytes = b"") -> bytes:
+        """Wait for the next message and return it; ``begun`` was received before.
 
         Raises
         ------
         EOFError, OSError
             The other side is closed.
         """
+        self._unread += begun
         if not self._unread:
             try:
                 self._unread = data = self._socket.recv(_MIN_READ)

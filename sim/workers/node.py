@@ -85,12 +85,11 @@ class Node:
         """Answer, also during a request."""
 
     def _run(self, request: Request) -> Answer:
-        results = self._pool.run(request)
-        failure, tick = self._pool.failure, request.observed_tick
-        if failure is not None:
-            ticks = failure.ticks if request.counts_ticks else 0
-            return Answer(None, failure.portable(), self._pool.arrays.at(slice(ticks)))
-        return Answer(request.join(results), None, None if tick is None else self._pool.arrays.at(slice(tick + 1)))
+        outcome = self._pool.run(request)
+        if outcome.failure is not None:
+            return Answer(None, outcome.failure.portable(), self._pool.arrays.at(slice(outcome.num_ticks)))
+        arrays = self._pool.arrays.at(slice(outcome.num_ticks)) if outcome.num_ticks else None
+        return Answer(request.join(outcome.results), None, arrays)
 
 
 def _answer(act: Callable[[], Answer]) -> Answer:

@@ -67,7 +67,6 @@ class NodeWorker(Worker):
 
     def send(self, request: Request) -> None:
         self._ticks = request.ticks if isinstance(request, Run) else 0
-        request.write(self._arrays, self._envs)  # for a recorder
         part = request.for_envs(self._envs)
         BACKGROUND.call(lambda: self._begin(self._actor.execute.remote(part)))
 

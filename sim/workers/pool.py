@@ -5,10 +5,8 @@ last checkpoint and all later requests. At a checkpoint all workers rebuild thei
 (:mod:`batchpid.sim.loop.snapshot`), so the replayed envs are bit-identical. Each worker has its own queue of requests,
 so that one can catch up while the others continue.
 
-An exception of a signal handler (Ctrl-C) can end a call at any moment. The state of the pool always shows the progress
-of each worker, and a worker with a partly sent or received message is replaced, so that the call can be repeated.
-
-Longer than 300 lines, to keep in one place everything that can happen to a worker during a request.
+A request is completed once it was begun: an exception other than WorkerLost, such as one of a signal handler, leaves
+the pool in no valid state, so that its owner must close it.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import batchpid as bp
 from batchpid.checks.single_owner import SingleOwner
@@ -27,7 +25,6 @@ from batchpid.errors import ClosedError
 from batchpid.sim.loop.arrays import Arrays, Ticks
 from batchpid.sim.loop.failure import Failure, order
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.processes.background import BACKGROUND
 from batchpid.sim.workers.cluster import NODE_STEPS, Cluster
 from batchpid.sim.workers.memory import check_memory
 from batchpid.sim.workers.node import NodeInfo, Share
@@ -43,6 +40,8 @@ _POLL_INTERVAL = 0.1  # seconds between two checks of workers that do not answer
 _MAX_STEPS = 8000
 """Largest number of sim steps times envs of one request to a worker, except for one tick: a fifth of a second."""
 
+_CLOSED = "this Runner was closed during a call"
+_ALL = slice(None)
 _QUEUE, _RESULT, _FAILURE = map(attrgetter, ("queue", "result", "failure"))  # C functions, for the path of a tick
 
 
@@ -50,22 +49,43 @@ class RecoveryWarning(UserWarning):
     """A worker was lost and replaced."""
 
 
+class Outcome(NamedTuple):
+    """What the workers did for a request."""
+
+    results: list[Any]
+    """Result of each worker; None of one that failed."""
+    failure: Failure | None
+    """First failure of a loop."""
+    num_ticks: int
+    """Ticks with observations that all envs completed."""
+    ticks: Ticks
+    """Input and output of the ticks."""
+
+    @property
+    def completed(self) -> list[Arrays]:
+        """Ticks that all envs completed."""
+        return self.ticks.first(self.num_ticks)
+
+    @property
+    def present(self) -> Arrays:
+        """The last of them."""
+        return self.ticks[self.num_ticks - 1]
+
+
 @dataclass
 class _Slot:
-    """Worker, its env slice and its pending requests."""
+    """Worker, its env slice and its pending requests, of which it has been sent the first."""
 
     start: Start
     worker: Worker
     queue: list[Request] = field(default_factory=list)
-    phase: Literal["idle", "transfer", "waiting"] = "transfer"
-    """Phase of the first request. An interrupt during a transfer leaves the worker unusable."""
-    limit: float = field(init=False)
-    """Seconds that the first request may take, known after the first check."""
+    limit: float = 0.0
+    """Seconds that the first request may take; 0 until the first check."""
     result: Any = None
     failure: Failure | None = None
     losses: int = 0
     cause: str = ""
-    lost_at: float = field(init=False)
+    lost_at: float = 0.0
     descriptor: int | None = None
     """File descriptor of the worker's results."""
     poller: select.poll = field(init=False)
@@ -102,21 +122,17 @@ class WorkerPool(SingleOwner):
         self._request: Request | None = None
         self.closed = False
         """True if the running call must end, and no other may begin."""
-        self.failure: Failure | None
-        """First failure of a loop in the last request."""
         self.recoveries = 0
         """Number of lost workers that were replaced."""
         ticks = ticks or max(1, most_steps // (options.substeps * widest))
-        layout = Arrays.layout(ticks, num_envs, options.robot.dof, options.command.size, options.robot.fixed_base)
-        self._shared = BACKGROUND.call(lambda: SharedArrays(layout))
+        layout = Arrays.layout(ticks, num_envs, options.robot.dof, options.command.size, options.observed)
+        self._shared = SharedArrays(layout)
         self.arrays = Arrays.from_fields(self._shared.arrays)
         """Input and output of a request (ticks, envs, ...)."""
         self.ticks = Ticks(self.arrays)
         """Input and output of each tick."""
-        self.present: Arrays
+        self.present = self.ticks[0]
         """Tick with the present observation."""
-        self.completed: list[Arrays]
-        """Ticks that all envs completed in the last request with observations."""
 
     def open(self) -> None:
         """Start the workers and wait until all are ready."""
@@ -124,9 +140,9 @@ class WorkerPool(SingleOwner):
             start = Start(index, envs, self._options, self._params.for_envs(envs), self._first_env)
             self._slots.append(_Slot(start, self._make_worker(start, self._shared)))
             self._start(self._slots[-1])
-        self._serve()
-        if self.failure is not None:
-            raise self.failure.error
+        failure = self.finish().failure
+        if failure is not None:
+            raise failure.error
 
     @property
     def workers(self) -> list[Worker]:
@@ -139,17 +155,8 @@ class WorkerPool(SingleOwner):
         infos = (worker.info for worker in self.workers if isinstance(worker, NodeWorker))
         return tuple(info for info in infos if info is not None)
 
-    def begin(self, request: Request) -> None:
-        """Send every worker its part of ``request``; :meth:`run` completes it.
-
-        A loop in this process executes it at once. Raises WorkerError if a lost worker cannot be replaced.
-        """
-        self._serve(request, wait=False)
-
-    def run(self, request: Request) -> list[Any]:
-        """Execute ``request`` on all workers; return their results, unless there is a :attr:`failure`.
-
-        If :meth:`begin` has sent the request, or an earlier call with it was interrupted, this call completes it.
+    def run(self, request: Request) -> Outcome:
+        """Execute ``request`` on all workers.
 
         Raises
         ------
@@ -158,17 +165,57 @@ class WorkerPool(SingleOwner):
         ClosedError
             The pool was closed meanwhile.
         """
-        self._serve(request)
-        tick = request.observed_tick
-        if self.failure is not None:
-            self.completed = self.ticks.first(self.failure.ticks if request.counts_ticks else 0)
-        else:
-            if request.changes_loop and self._options.recover and not (self._replay and self._replay[-1] is request):
+        self.begin(request)
+        return self.finish()
+
+    def begin(self, request: Request) -> None:
+        """Send every worker its part of ``request``; :meth:`finish` waits for the end. Raises as :meth:`run`.
+
+        A loop in this process executes it at once.
+        """
+        if self.closed:
+            raise ClosedError(_CLOSED)
+        self._request = request
+        for slot in self._slots:
+            slot.queue, slot.failure, slot.limit = [request], None, 0.0
+        request.write(self.arrays, _ALL)
+        for slot in self._slots:
+            try:
+                slot.worker.send(request)
+            except WorkerLost as error:
+                self._replace(slot, error)
+
+    def finish(self) -> Outcome:
+        """Wait until every worker has executed its queue, and return what they did. Raises as :meth:`run`."""
+        self._next_check = time.monotonic() + _POLL_INTERVAL
+        while not self.closed and (busy := list(filter(_QUEUE, self._slots))):
+            try:
+                for slot in self._wait(busy):
+                    slot.result = slot.worker.receive()
+                    del slot.queue[0]
+                    if slot.queue or slot.losses or isinstance(slot.result, Failure):
+                        self._go_on(slot)
+            except WorkerLost as error:
+                self._replace(slot, error)
+            except Exception as error:
+                if self.closed:
+                    raise ClosedError(_CLOSED) from error
+                raise  # a signal handler raised it
+        if self.closed:
+            raise ClosedError(_CLOSED)
+        request, slots, count = self._request, self._slots, 0
+        failure = min(filter(None, map(_FAILURE, slots)), key=order, default=None)
+        if request is not None and failure is None:
+            count = request.ticks
+            if request.changes_loop and self._options.recover:
                 self._replay.append(request)
-            if tick is not None:
-                self.completed = self.ticks.first(tick + 1)
-                self.present = self.completed[tick]
-        return list(map(_RESULT, self._slots))
+        elif request is not None and failure is not None and request.counts_ticks:
+            count = failure.ticks
+        if count:
+            made = self.ticks.made
+            self.present = made[count - 1] if count <= len(made) else self.ticks[count - 1]
+        self._request = None
+        return Outcome(list(map(_RESULT, slots)), failure, count, self.ticks)
 
     def start_replay_from(self, request: Request) -> None:
         """Drop the kept requests, because ``request`` brings a new worker to the present state."""
@@ -188,7 +235,7 @@ class WorkerPool(SingleOwner):
         for slot in list(self._slots):
             slot.worker.close(0.0 if slot.queue else patience)
         self._slots = []
-        for name in ("arrays", "ticks", "present", "completed"):  # views that would keep the memory and its descriptor
+        for name in ("arrays", "ticks", "present"):  # views that would keep the memory and its descriptor
             vars(self).pop(name, None)
         self._shared.close()
 
@@ -198,56 +245,19 @@ class WorkerPool(SingleOwner):
 
     # -- one request, until every worker has executed it -----------------------------------------------------------
 
-    def _serve(self, request: Request | None = None, wait: bool = True) -> None:
-        """Queue ``request`` for every worker, unless that was done before, and serve the queues until all are empty.
-
-        Without ``wait`` return when the first request of each queue is sent.
-        """
-        if request is not None and self._request is not request:
-            for slot in self._slots:
-                slot.queue, slot.failure = [request], None
-            self._request = request  # last, so that an interrupted call can begin again: nothing is sent before
-        self._next_check = time.monotonic() + _POLL_INTERVAL
-        while not self.closed and (busy := list(filter(_QUEUE, self._slots))):
-            for slot in busy:
-                if slot.phase == "transfer":
-                    self._replace(slot, None)
-            try:
-                for slot in busy:
-                    if slot.phase == "idle":
-                        self._send(slot)
-                if not wait:
-                    return
-                for slot in self._wait(busy):
-                    self._receive(slot)
-            except WorkerLost as error:
-                self._replace(slot, error)
-            except Exception as error:
-                if self.closed:
-                    raise ClosedError("this Runner was closed during a call") from error
-                raise  # a signal handler raised it
-        if self.closed:
-            raise ClosedError("this Runner was closed during a call")
-        self.failure = min(filter(None, map(_FAILURE, self._slots)), key=order, default=None)
-
-    def _send(self, slot: _Slot) -> None:
-        slot.phase, slot.limit = "transfer", 0.0
-        slot.worker.send(slot.queue[0])
-        slot.phase = "waiting"
-
-    def _receive(self, slot: _Slot) -> None:
-        slot.phase = "transfer"
-        slot.result = slot.worker.receive()
+    def _go_on(self, slot: _Slot) -> None:
+        """Note the end of a request that failed, or of a replay; send the next request of the worker's queue."""
         if isinstance(slot.result, Failure):
             slot.failure, slot.result = slot.result, None
-        slot.queue.pop(0)
-        if not slot.queue and slot.losses:
+        if slot.queue:
+            slot.limit = 0.0
+            slot.queue[0].write(self.arrays, slot.start.envs)
+            slot.worker.send(slot.queue[0])
+        elif slot.losses:
             self.recoveries += 1
-            if slot.cause:
-                seconds = time.monotonic() - slot.lost_at
-                self.messages[RecoveryWarning] = f"{slot.cause}; replaced and replayed in {seconds:.1f} s"
+            seconds = time.monotonic() - slot.lost_at
+            self.messages[RecoveryWarning] = f"{slot.cause}; replaced and replayed in {seconds:.1f} s"
             slot.losses = 0
-        slot.phase = "idle"
 
     def _wait(self, busy: list[_Slot]) -> list[_Slot]:
         """Wait until a worker has answered or died, or the pool is closed; return the slots of such workers.
@@ -289,25 +299,19 @@ class WorkerPool(SingleOwner):
 
     # -- lost workers ----------------------------------------------------------------------------------------------
 
-    def _replace(self, slot: _Slot, error: WorkerLost | None) -> None:
-        """Replace a lost worker, or without ``error`` an interrupted one, and queue the requests to replay."""
+    def _replace(self, slot: _Slot, error: WorkerLost) -> None:
+        """Replace a lost worker, and queue the requests to replay."""
         if self.closed:
-            raise ClosedError("this Runner was closed during a call") from error
+            raise ClosedError(_CLOSED) from error
         if not self._options.recover:
-            raise WorkerLost(
-                f"{error or f'worker {slot.start.index} was interrupted'}; its envs are lost, because recovery is off: "
-                "pass recover=True"
-            ) from error
-        if error is not None:
-            slot.losses += 1
-            if slot.losses >= MAX_LOSSES:
-                raise WorkerLost(
-                    f"{error}; lost {MAX_LOSSES} times during the same request: run these envs with workers=0 to see "
-                    "why"
-                ) from error
-            if slot.losses == 1:
-                slot.cause, slot.lost_at = str(error), time.monotonic()
-        slot.phase = "transfer"
+            problem = "its envs are lost, because recovery is off: pass recover=True"
+            raise WorkerLost(f"{error}; {problem}") from error
+        slot.losses += 1
+        if slot.losses >= MAX_LOSSES:
+            remedy = "run these envs with workers=0 to see why"
+            raise WorkerLost(f"{error}; lost {MAX_LOSSES} times during the same request: {remedy}") from error
+        if slot.losses == 1:
+            slot.cause, slot.lost_at = str(error), time.monotonic()
         slot.worker.close(0.0)
         slot.worker = slot.worker.successor()
         self._start(slot)
@@ -320,11 +324,10 @@ class WorkerPool(SingleOwner):
         slot.descriptor = slot.worker.fileno()
         slot.poller = _poller_of([slot])
         self._poller = _poller_of(self._slots)
-        request, replay = self._request, self._replay
-        again = [] if request is None or (replay and replay[-1] is request) else [request]
-        slot.queue = [slot.start, *replay, *again]
+        slot.queue = [slot.start, *self._replay]
+        if self._request is not None:
+            slot.queue.append(self._request)
         slot.failure, slot.limit = None, 0.0
-        slot.phase = "waiting"
 
 
 def _poller_of(slots: list[_Slot]) -> select.poll:

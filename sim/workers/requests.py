@@ -6,8 +6,9 @@ import pickle
 import struct
 from abc import ABC, abstractmethod
 from copy import deepcopy
-from dataclasses import dataclass, replace
-from operator import itemgetter
+from dataclasses import dataclass, field, replace
+from itertools import repeat
+from operator import is_not, itemgetter
 from typing import Any, Self
 
 import numpy as np
@@ -31,13 +32,10 @@ class Request(ABC):
     """Seconds for which a worker may be asleep meanwhile: ``build`` may wait for something."""
     changes_loop = True
     """True if the replacement of a lost worker repeats the request, and an error in it closes the pool."""
+    ticks = 0
+    """Ticks of the arrays that hold observations afterwards; 0: the observation does not change."""
     counts_ticks = False
     """True if the ticks that every env completed before an error are kept."""
-
-    @property
-    def observed_tick(self) -> int | None:
-        """Tick of the arrays that holds the observation afterwards; None: the observation does not change."""
-        return None
 
     def limit(self, num_envs: int) -> float:
         """Return an upper bound of the request's time for ``num_envs`` envs [s]."""
@@ -77,7 +75,7 @@ def decode(message: bytes) -> Request:
     """Return the request of a message from :meth:`Request.encode`."""
     if message[:1] == b"R":
         _, ticks, substeps, *given = _RUN.unpack(message)
-        return Run(ticks, substeps, tuple(given))
+        return Run(ticks, substeps, given=tuple(given))
     request: Request = pickle.loads(message)
     return request
 
@@ -120,7 +118,7 @@ class Reset(Request):
     qvel: NDArray[np.float64]
     draws: Draws = NOTHING
     base: NDArray[np.float64] | None = None
-    observed_tick = 0
+    ticks = 1
 
     def apply(self, loop: Loop) -> None:
         loop.reset(self.mask, self.qpos, self.qvel, self.draws, self.base)
@@ -130,17 +128,13 @@ class Reset(Request):
 class Run(Request):
     """Run ``ticks`` of ``substeps`` sim steps under ``command`` (ticks, envs, dof), which travels in the arrays."""
 
-    ticks: int
-    substeps: int
-    given: tuple[bool, ...]
-    """Which arrays of the command are used."""
+    ticks: int = field()
+    substeps: int = field()
     command: Command = Command(None)  # noqa: RUF009  (immutable)
+    given: tuple[bool, ...] | None = None
+    """Which arrays of the command are used; None: those of ``command``, which a worker process does not have."""
     counts_ticks = True
     idle_limit = 0.7  # it only computes
-
-    @property
-    def observed_tick(self) -> int:
-        return self.ticks - 1
 
     def limit(self, num_envs: int) -> float:
         return 1e-3 * self.ticks * self.substeps * num_envs  # a sim step of an env takes about 20 us
@@ -154,10 +148,10 @@ class Run(Request):
                 table[: self.ticks, envs] = rows[:, envs]
 
     def encode(self, envs: slice) -> bytes:
-        return _RUN.pack(b"R", self.ticks, self.substeps, *self.given)
+        return _RUN.pack(b"R", self.ticks, self.substeps, *map(is_not, self.command, repeat(None)))
 
     def apply(self, loop: Loop) -> float:
-        return loop.run(self.ticks, self.substeps, self.given)
+        return loop.run(self.ticks, self.substeps, self.command.given if self.given is None else self.given)
 
     def join(self, results: list[float]) -> float:
         return max(results)
@@ -203,7 +197,7 @@ class Restore(Request):
 
     snapshot: Snapshot
     draws: Draws = NOTHING
-    observed_tick = 0
+    ticks = 1
 
     def apply(self, loop: Loop) -> None:
         loop.restore(self.snapshot, self.draws)

@@ -20,7 +20,9 @@ from batchpid.sim.workers.channel import Channel
 from batchpid.sim.workers.requests import decode
 from batchpid.sim.workers.shared_memory import SharedArrays
 
-DONE = struct.Struct("<cd")  # b"D", seconds of work: the answer on the hot path, all others are pickled
+_DONE = struct.Struct("<cd")  # b"D", seconds of work: the answer on the hot path, all others are pickled
+ANSWER, ANSWER_TAG = struct.Struct("<Qcd"), slice(8, 9)
+"""That answer as it comes from the socket, after its length, and the place of the letter."""
 _SPIN_SECONDS = 2e-4
 """Seconds of spinning for the next request before blocking: waking up takes 30 us."""
 
@@ -62,4 +64,4 @@ def _serve(connection: Channel, memory: int) -> None:
 
 
 def _success(result: Any) -> bytes:
-    return DONE.pack(b"D", result) if isinstance(result, float) else pickle.dumps(result)
+    return _DONE.pack(b"D", result) if isinstance(result, float) else pickle.dumps(result)

@@ -31,13 +31,13 @@ from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.failure import Failure, failure_of
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.processes.background import BACKGROUND, Job
+from batchpid.sim.processes.background import BACKGROUND
 from batchpid.sim.processes.descriptors import standard_streams_occupied
 from batchpid.sim.processes.fork_server import Child, fork
 from batchpid.sim.workers.channel import Channel
 from batchpid.sim.workers.liveness import Liveness
 from batchpid.sim.workers.requests import Request, Start
-from batchpid.sim.workers.serve import DONE
+from batchpid.sim.workers.serve import ANSWER, ANSWER_TAG
 from batchpid.sim.workers.shared_memory import MemoryFile, SharedArrays
 
 _TRANSFER_LIMITS = (10.0, 60.0)
@@ -64,7 +64,7 @@ class Worker(SingleOwner, ABC):
 
     @abstractmethod
     def send(self, request: Request) -> None:
-        """Start the part of a request for the envs of this worker."""
+        """Start the part of a request for the envs of this worker, whose rows are in the arrays."""
 
     @abstractmethod
     def receive(self) -> Any:
@@ -118,7 +118,6 @@ class LocalWorker(Worker):
 
     def send(self, request: Request) -> None:
         assert self._loop is not None
-        request.write(self._loop.arrays, self._start.envs)
         try:
             self._result = request.apply(self._loop)
         except Exception as error:
@@ -145,20 +144,20 @@ class ProcessWorker(Worker):
         self._message = pickled((start, shared.layout), start.options) if message is None else message
         self._name = f"worker {start.index} (envs {start.numbers.start} to {start.numbers.stop - 1})"
         self._owner, self._memory = os.getpid(), shared.fd
-        self._arrays, self._envs = Arrays.from_fields(shared.arrays), start.envs
+        self._envs = start.envs
         self._is_unchecked = False  # since the last request was sent
-        self._opening: Job[None] | None = None
+        self._is_opening = False
         self._process: Child | None = None
 
     def open(self) -> None:
-        self._opening = Job(self._open)
-        BACKGROUND.put(self._opening)
+        self._is_opening = True
         try:
-            self._opening.result()
+            BACKGROUND.call(self._open)
         except OSError as error:
             raise WorkerError(
                 f"{self._name} cannot be started: {error}; pass a smaller workers=, 0 for none"
             ) from error
+        self._is_opening = False
         with contextlib.suppress(OSError):  # it died: the first receive reports that
             self._channel.send(self._message)
 
@@ -178,6 +177,7 @@ class ProcessWorker(Worker):
             undo.pop_all()
         self._name = self._name.replace("(", f"(pid {process.pid}, ")
         self._liveness = Liveness(Path(f"/proc/{process.pid}/stat"))
+        self._connection = ours
         self._channel = Channel(ours, lambda: self.check_alive(*_TRANSFER_LIMITS))
         self._process, self.pid = process, process.pid
 
@@ -185,7 +185,6 @@ class ProcessWorker(Worker):
         return self._channel.fileno()
 
     def send(self, request: Request) -> None:
-        request.write(self._arrays, self._envs)
         self._is_unchecked = True
         try:
             self._channel.send(request.encode(self._envs))
@@ -194,12 +193,15 @@ class ProcessWorker(Worker):
 
     def receive(self) -> Any:
         try:
-            message = self._channel.receive()
+            try:
+                answer = self._connection.recv(ANSWER.size)
+            except BlockingIOError:
+                answer = b""
+            if len(answer) == ANSWER.size and answer[ANSWER_TAG] == b"D":  # nearly always
+                return ANSWER.unpack(answer)[2]
+            result = pickle.loads(self._channel.receive(answer))
         except (EOFError, OSError) as error:
             raise self._death() from error
-        if message[:1] == b"D":
-            return DONE.unpack(message)[1]
-        result = pickle.loads(message)
         return result.of_worker(self._name) if isinstance(result, Failure) else result
 
     def check_alive(self, idle_limit: float, limit: float) -> None:
@@ -213,9 +215,8 @@ class ProcessWorker(Worker):
             raise self._lost(f"is stuck: no answer within {limit:.0f} s; raise timeout= if that was too short")
 
     def close(self, patience: float) -> None:
-        if self._opening is not None and not self._opening.done and not sys.is_finalizing():
-            BACKGROUND.call(lambda: None)  # the call that opened it was interrupted
-        self._opening = None  # it refers to this worker, whose files a cycle would keep open
+        if self._is_opening and not sys.is_finalizing():  # a second Ctrl-C ended the call that opened it
+            BACKGROUND.call(lambda: None)
         if self._process is None:
             return
         self._channel.close()

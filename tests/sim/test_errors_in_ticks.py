@@ -52,6 +52,9 @@ class ListRecorder:
     def __init__(self):
         self.rows = []
 
+    def wait(self):
+        pass
+
     def append(self, time_, setpoint, observation, has_rates):
         self.rows.append((time_, setpoint, observation))
 

@@ -11,7 +11,7 @@ from robots import load_bundled
 from batchpid.sim import Runner
 
 PANDA = load_bundled("panda")
-CALLS, LEVELS = 38, 9
+CALLS, LEVELS = 26, 6
 
 
 def python_calls(act):
@@ -38,13 +38,13 @@ def test_calls_are_counted():
     assert python_calls(lambda: np.median(np.zeros(3)))[0] > python_calls(lambda: pytest.approx)[0] == 0
 
 
-@pytest.mark.parametrize("shape", [(64, PANDA.dof), (PANDA.dof,)])
-def test_python_calls_of_a_tick(shape):
+@pytest.mark.parametrize(("shape", "more"), [((64, PANDA.dof), 0), ((PANDA.dof,), 1)])
+def test_python_calls_of_a_tick(shape, more):
     """The least of some ticks: 0.1 s of waiting adds two or three, which look whether the worker is alive."""
     setpoint = np.broadcast_to(PANDA.settings.target, shape).copy()
     with Runner(PANDA, 64, workers=1, substeps=2) as runner:
         for _ in range(2):
             runner.step(setpoint)
-        count, levels = min(python_calls(lambda: runner.step(setpoint)) for _ in range(5))
-    assert 10 < count <= CALLS
+        count, levels = min(python_calls(lambda: runner.step(setpoint)) for _ in range(20))
+    assert 10 < count <= CALLS + more
     assert 3 < levels <= LEVELS

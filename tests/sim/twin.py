@@ -6,7 +6,6 @@ import contextlib
 import gc
 import os
 import signal
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -20,7 +19,6 @@ from identical import assert_identical
 from processes import children, have_ended, shared_memory
 from robots import load_bundled
 
-import batchpid.sim.runner
 from batchpid.errors import CallOrderError
 from batchpid.sim import Recorder, RecoveryWarning, Runner, Snapshot, read_recording
 from batchpid.sim.processes.background import start_thread
@@ -28,12 +26,6 @@ from batchpid.sim.processes.background import start_thread
 ROBOT = load_bundled("panda")
 N = 2
 SUBSTEPS = 5
-ROOT = Path(batchpid.sim.runner.__file__).parent
-MODULES = tuple(
-    str(ROOT / part) for part in ("runner.py", "session.py", "arguments.py", "workers", "recording/recorder.py")
-)
-
-_MOMENTS = ("call", "c_call", "c_return")
 
 Disturbance = Callable[[Callable[[], object]], None]
 """Calls a function and disturbs it; raises nothing that the disturbance made the function raise."""
@@ -44,42 +36,6 @@ def undisturbed(act: Callable[[], object]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RecoveryWarning)
         act()
-
-
-class Interrupt(BaseException):
-    """Exception of a signal handler."""
-
-
-class InterruptAt:
-    """Disturbance: an exception at the n-th moment at which Python can run a signal handler in the modules under test.
-
-    Such moments are calls, and returns from functions written in C.
-    """
-
-    def __init__(self, moment: int) -> None:
-        self._left = moment
-        self.happened = False
-        self.where = ""
-
-    def __call__(self, act: Callable[[], object]) -> None:
-        gc.disable()  # an exception is lost, too, in the __del__ of a runner that a test before has left
-        try:
-            sys.setprofile(self._on_event)
-            undisturbed(act)
-        except Interrupt:
-            self.happened = True
-        finally:
-            sys.setprofile(None)
-            gc.enable()
-
-    def _on_event(self, frame: Any, event: str, argument: Any) -> None:
-        code = frame.f_code  # an exception in a generator that is being freed is lost
-        if event in _MOMENTS and code.co_filename.startswith(MODULES) and code.co_name != "<genexpr>":
-            self._left -= 1
-            if self._left == 0:
-                sys.setprofile(None)
-                self.where = f"{event} {argument} in {code.co_qualname}, line {frame.f_lineno}"
-                raise Interrupt
 
 
 class CtrlC:

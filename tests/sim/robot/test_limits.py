@@ -53,5 +53,5 @@ def test_envs_that_are_not_reset_are_not_checked(arm):
 def test_positions_that_are_not_finite_are_left_to_others(arm):
     bad = np.array([[np.nan, np.inf]])
     assert warned(lambda: SetpointCheck(arm).check("setpoint", bad)) == []
-    (message,) = warned(lambda: SetpointCheck(arm).check("qpos", np.array([[np.nan, 2.0]]), stacklevel=2))
+    (message,) = warned(lambda: SetpointCheck(arm).check("qpos", np.array([[np.nan, 2.0]])))
     assert message.endswith("no joint can follow: joint 'two' at 2 rad, not in [-1, 1]; move it inside")

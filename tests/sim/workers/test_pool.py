@@ -1,4 +1,4 @@
-"""The pool, with workers that answer, fail, die or are interrupted as a test says: no process and no physics."""
+"""The pool, with workers that answer, fail or die as a test says: no process and no physics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from robots import load_bundled
 
 from batchpid.errors import ClosedError
 from batchpid.sim import RecoveryWarning, RunnerOptions
-from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.failure import Failure
 from batchpid.sim.workers.pool import WorkerPool
 from batchpid.sim.workers.requests import ReadPoses, Run, SetParams, Start
@@ -26,7 +25,7 @@ N = 8
 
 
 def run(ticks=1):
-    return Run(ticks, 20, Command(0).given, Command(None))
+    return Run(ticks, 20)
 
 
 def dies():
@@ -111,12 +110,12 @@ def make_pool(workers=2, **options):
     return pool
 
 
-def test_begin_sends_at_once_and_run_collects(stage):
+def test_begin_sends_at_once_and_finish_collects(stage):
     pool, request = make_pool(), run()
     pool.begin(request)
     assert [stage.of("send", index) for index in (0, 1)] == [[request]] * 2
     assert len(stage.of("receive")) == 1  # of the start
-    assert pool.run(request) == [0, 1]
+    assert pool.finish().results == [0, 1]
     assert [stage.of("send", index) for index in (0, 1)] == [[request]] * 2
 
 
@@ -124,8 +123,9 @@ def test_the_last_tick_of_a_request_holds_the_present_observation(stage):
     pool = make_pool()
     pool.arrays.observation.qpos[:] = np.arange(len(pool.ticks))[:, None, None]
     for ticks in (3, 1, 2):
-        pool.run(run(ticks))
-        assert len(pool.completed) == ticks
+        outcome = pool.run(run(ticks))
+        assert len(outcome.completed) == ticks
+        assert outcome.present is pool.present
         assert pool.present.observation.qpos[0, 0] == ticks - 1
     pool.run(ReadPoses())  # observes nothing
     assert pool.present.observation.qpos[0, 0] == 1
@@ -134,15 +134,13 @@ def test_the_last_tick_of_a_request_holds_the_present_observation(stage):
 def test_of_two_failures_the_earlier_counts_with_the_ticks_before_it(stage):
     pool, failure = make_pool(), Failure(40, 0, 2, ValueError("late"))
     stage.next("receive", lambda: failure)
-    results = pool.run(run(3))
-    assert results == [None, 1]
-    assert pool.failure is failure
-    assert len(pool.completed) == 2
+    outcome = pool.run(run(3))
+    assert outcome.results == [None, 1]
+    assert outcome.failure is failure
+    assert len(outcome.completed) == 2
     stage.next("receive", lambda: failure)
-    pool.run(SetParams(PARAMS))  # of which no tick counts
-    assert pool.completed == []
-    pool.run(run())
-    assert pool.failure is None
+    assert pool.run(SetParams(PARAMS)).completed == []  # of which no tick counts
+    assert pool.run(run()).failure is None
 
 
 def test_a_failure_at_the_start_is_raised(stage):
@@ -156,7 +154,7 @@ def test_a_lost_worker_is_given_what_the_others_have_done(stage):
     for request in (first, reading):
         pool.run(request)
     stage.next("receive", dies)
-    assert pool.run(second) == [0, 1]
+    assert pool.run(second).results == [0, 1]
     # Reading is not repeated.
     assert stage.of("send") == [first, reading, second, first, second]
     assert stage.of("send", 1) == [first, reading, second]
@@ -189,41 +187,10 @@ def test_without_recovery_a_loss_is_an_error(stage):
     stage.next("receive", dies)
     with pytest.raises(WorkerLost, match=r"died.*recover=True"):
         pool.run(run())
-    pool = make_pool(recover=False)
-    stage.next("receive", interrupt)
-    request = run()
-    with pytest.raises(KeyboardInterrupt):
-        pool.run(request)
-    with pytest.raises(WorkerLost, match=r"worker 0 was interrupted.*recover=True"):
-        pool.run(request)
-
-
-@pytest.mark.parametrize("moment", ["send", "receive"])
-def test_a_worker_with_half_a_message_is_replaced_by_the_next_call(stage, moment):
-    pool, request = make_pool(), run()
-    stage.next(moment, interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        pool.run(request)
-    assert len(stage.made) == 2
-    assert pool.run(request) == [0, 1]
-    assert len(stage.made) == 3
-    assert pool.recoveries == 0  # it was not lost
-
-
-def test_a_worker_whose_replacement_was_interrupted_is_replaced_by_the_next_call(stage):
-    pool, request = make_pool(), run()
-    stage.next("answer", lambda: "none")
-    stage.next("check", dies)
-    stage.next("close", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        pool.run(request)
-    assert len(stage.made) == 2
-    assert pool.run(request) == [0, 1]
-    assert len(stage.made) == 3
 
 
 def test_a_silent_worker_is_checked_by_the_limits_of_its_request(stage):
-    pool, request = make_pool(timeout=5.0), Run(1, 20_000, False, False)
+    pool, request = make_pool(timeout=5.0), Run(1, 20_000)
     stage.next("answer", *[lambda: "none"] * 2)  # neither to the request, nor when its replacement starts
     stage.next("check", lambda: None, dies, dies)
     pool.run(request)

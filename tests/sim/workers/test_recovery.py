@@ -331,53 +331,20 @@ def test_an_error_in_a_loop_is_raised_with_its_traceback():
 def test_a_runner_works_on_after_ctrl_c_in_a_rollout(workers):
     with make_runner(workers=workers) as runner, warnings.catch_warnings():
         warnings.simplefilter("ignore", RecoveryWarning)
-        for delay in (0.02, 0.07, 0.11):
-            with later(delay, lambda: signal.raise_signal(signal.SIGINT)), pytest.raises(KeyboardInterrupt):
-                runner.rollout(setpoints(2000))
+        for tick in (0, 1, 150):
+            interrupt = at_ticks({tick: lambda: signal.raise_signal(signal.SIGINT)})
+            with pytest.raises(KeyboardInterrupt):
+                runner.rollout(setpoints(200), progress=interrupt)
         ended, steps = runner.observe(), round(runner.time * 2000)
         again = runner.rollout(setpoints(3))
-    assert 0 < steps < 3 * 2000 * 20
+    assert 0 < steps < 3 * 200 * 20
     assert ended.ok.all()
     assert again.ok.all()
 
 
-def test_a_tick_whose_call_ends_after_the_workers_answers_is_replayed_once(monkeypatch):
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    with make_runner(workers=1) as runner, make_runner(workers=0) as model:
-        with monkeypatch.context() as patched:
-            patched.setattr("batchpid.sim.session.MovingSetpointCheck.see", interrupt)
-            with pytest.raises(KeyboardInterrupt):
-                runner.step(setpoints()[0])
-        assert_identical(runner.observe(), model.step(setpoints()[0]))
-        send(runner.pids[0], signal.SIGKILL)
-        with pytest.warns(RecoveryWarning):
-            assert_identical(runner.step(setpoints()[1]), model.step(setpoints()[1]))
-
-
-def test_a_tick_whose_recording_was_interrupted_is_recorded_by_the_next_call():
-    class Tape:
-        times, interrupts = (), 1
-
-        def append(self, time_, setpoint, observation, has_rates):
-            if self.interrupts:
-                self.interrupts = 0
-                raise KeyboardInterrupt
-            self.times += (time_,)
-
-    with make_runner(workers=0) as runner:
-        tape = runner.recorder = Tape()
-        with pytest.raises(KeyboardInterrupt):
-            runner.step(setpoints()[0])
-        assert tape.times == ()
-        runner.observe()
-        assert tape.times == (runner.time,)
-
-
 @pytest.mark.quick_rows(1)
 @pytest.mark.parametrize("workers", [0, 2])
-def test_an_interrupted_tick_is_finished_before_the_next_call(workers):
+def test_an_interrupted_tick_is_done_completely(workers):
     results = []
     for interrupted in (False, True):
         with make_runner(workers=workers if interrupted else 0) as runner:

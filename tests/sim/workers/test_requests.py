@@ -32,13 +32,13 @@ def test_the_part_of_a_reset_has_the_rows_of_its_envs():
 def test_a_run_writes_the_commands_of_some_envs_and_no_others():
     layout = Arrays.layout(4, N, DOF)
     arrays = Arrays.from_fields({name: np.full(shape, 7, dtype) for name, (shape, dtype) in layout.items()})
-    run = Run(3, 20, command().given, command(ticks=3))
+    run = Run(3, 20, command(ticks=3))
     run.write(arrays, ENVS)
     expected = np.full((4, N, DOF), 7.0)
     expected[:3, ENVS] = command().setpoint[:, ENVS]
     np.testing.assert_array_equal(arrays.command.setpoint, expected)
     assert (arrays.command.setpoint_rate == 7).all()
-    assert (run.ticks, run.substeps, run.observed_tick) == (3, 20, 2)
+    assert (run.ticks, run.substeps) == (3, 20)
 
 
 def test_the_part_of_params_has_the_rows_of_its_envs(panda):
@@ -50,12 +50,11 @@ def test_the_part_of_params_has_the_rows_of_its_envs(panda):
 @pytest.mark.parametrize("rate", [None, command().setpoint])
 def test_the_message_of_a_run_is_short_and_holds_all_but_the_commands(rate):
     given = command()._replace(setpoint_rate=rate)
-    request = Run(3, 7, given.given, given)
+    request = Run(3, 7, given)
     message = request.encode(ENVS)
     assert len(message) < 20
     received = decode(message)
-    for name in ("ticks", "substeps", "given"):
-        assert getattr(received, name) == getattr(request, name)
+    assert (received.ticks, received.substeps, received.given) == (3, 7, given.given)
 
 
 def test_other_messages_hold_the_whole_request():

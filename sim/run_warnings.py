@@ -1,0 +1,84 @@
+"""Warnings of a runner about its gains, its setpoints and what happens to its robots."""
+
+from __future__ import annotations
+
+from operator import itemgetter
+
+import batchpid as bp
+from batchpid.checks.warn import warn
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.faults import FaultLog, FaultWarning
+from batchpid.sim.observation import Observation
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.robot.drive_chatter import DriveChatterCheck
+from batchpid.sim.robot.limits import MovingSetpointCheck, SetpointCheck
+from batchpid.sim.robot.loop_stability import StabilityCheck
+from batchpid.sim.tool_space.osc_controller import OperationalSpace
+from batchpid.sim.workers.contact_log import MissedContactLog, MissedContactWarning
+
+
+class RunWarnings:
+    """Checks of one runner that warn, most of them once."""
+
+    def __init__(self, options: RunnerOptions) -> None:
+        robot, timestep, control = options.robot, options.timestep, options.control
+        self.limits = SetpointCheck(robot)
+        """Check of start poses, and of setpoints, against the limits of the joints."""
+        self.setpoint_limits = self.limits if options.sets_positions and options.guard is None else None
+        self.is_watching = False
+        """False where :meth:`see` can find nothing in any tick."""
+        self._control = control
+        self._stability = StabilityCheck(robot, timestep) if control == "pid" else None
+        self._moving = MovingSetpointCheck(robot) if control == "pid" else None
+        self._chatter = (
+            DriveChatterCheck(robot, timestep) if control == "drive" and options.engine == "mujoco" else None
+        )
+        self._has_warned_of_fault = self._has_warned_of_contact = False
+
+    def check_stability(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
+        """Warn of gains beyond the stability bound of the sampled loop."""
+        if self._stability is not None:
+            self._stability.check(params, actuators)
+
+    def check_controller(self) -> None:
+        """Warn of such gains of operational-space control."""
+        if isinstance(self._control, OperationalSpace):
+            self._control.check_stability()
+
+    def set_gains(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
+        """Watch the next ticks for what these gains may lead to."""
+        if self._moving is not None:
+            self._moving.set_params(params)
+        if self._chatter is not None:
+            self._chatter.set_gains(params, actuators)
+        self._update()
+
+    def see(self, command: Command, observation: Observation, num_ticks: int, seconds: float) -> None:
+        """Look at the first ticks of a command (ticks, envs, ...), of ``seconds`` each, and warn of what is found."""
+        if self._moving is not None:
+            self._moving.see(command.setpoint[:num_ticks], command.setpoint_rate is not None, seconds)
+            if self._moving.found is not None:
+                self._moving.warn()
+                self._update()
+        if self._chatter is not None:
+            self._chatter.see(observation.map(itemgetter(slice(num_ticks))), seconds)
+            if self._chatter.found is not None:
+                self._chatter.warn()
+                self._update()
+
+    def issue(self, faults: FaultLog, contacts: MissedContactLog | None, messages: dict[type[Warning], str]) -> None:
+        """Warn of lost workers (``messages``, which are removed), faults and missed contacts."""
+        while messages:
+            category, message = messages.popitem()
+            warn(message, category)
+        if faults.faults and not self._has_warned_of_fault:
+            self._has_warned_of_fault = True
+            more = "see runner.faults for more, of which there is no further warning"
+            warn(f"{faults.faults[0]}; {more}", FaultWarning)
+        if contacts is not None and contacts.contacts and not self._has_warned_of_contact:
+            self._has_warned_of_contact = True
+            warn(contacts.message(), MissedContactWarning)
+
+    def _update(self) -> None:
+        checks = (self._moving, self._chatter)
+        self.is_watching = any(check is not None and check.is_watching for check in checks)

@@ -1,0 +1,82 @@
+"""Call of a runner that is in progress: one at a time, and Ctrl-C waits until its request has ended."""
+
+from __future__ import annotations
+
+import _signal  # the module signal takes 20 us to make enums of handlers
+import os
+import threading
+from signal import SIGINT
+from types import FrameType
+from typing import Any
+
+from batchpid.errors import InUseError
+
+
+class OneCall:
+    """Use of a runner by one call at a time, from :meth:`begin` to :meth:`end`.
+
+    In the main thread SIGINT is held back meanwhile: its handler, which may raise KeyboardInterrupt, is called in
+    :meth:`end`. So a request to the workers is done completely, with the change of the runner's state that belongs to
+    it. A second SIGINT is not held back while :attr:`waits` is set; if its handler raises, the request is not
+    completed, and the runner must be closed.
+    """
+
+    def __init__(self) -> None:
+        self.waits = False
+        """True while the call waits for workers, or runs the loop in this process."""
+        self._owner, self._main = os.getpid(), threading.main_thread().ident
+        self._user = 0  # the thread in a call
+        self._handler: Any = None  # of SIGINT, while it is replaced
+        self._is_held = False
+
+    @property
+    def in_use(self) -> bool:
+        """True during a call, and in a forked child."""
+        return self._user != 0 or os.getpid() != self._owner
+
+    def check(self) -> None:
+        """Raise InUseError if another call is in progress, or the runner belongs to another process."""
+        if self.in_use:
+            raise self._refusal(threading.get_ident(), os.getpid())
+
+    def begin(self) -> None:
+        """Begin a call. Raises as :meth:`check`."""
+        me, process = threading.get_ident(), os.getpid()
+        if self._user or process != self._owner:
+            raise self._refusal(me, process)
+        # Nothing is called between the check and here, so that neither a thread nor a signal can come in between.
+        self._user, self._handler, self._is_held = me, None, False
+        if me == self._main and _signal.getsignal(SIGINT) is not None:  # None: it is not one of Python
+            try:
+                self._handler = _signal.signal(SIGINT, self._on_interrupt)
+            except BaseException:  # of the handler, for a SIGINT that came before
+                self._user = 0
+                raise
+
+    def end(self) -> None:
+        """End the call; then call the handler of a SIGINT that was held back."""
+        self._user, self.waits, handler = 0, False, self._handler
+        if handler is not None:
+            _signal.signal(SIGINT, handler)
+            if self._is_held:
+                _signal.raise_signal(SIGINT)
+
+    def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
+        is_second, self._is_held = self._is_held, True
+        if is_second and self.waits:
+            self._is_held = False
+            if callable(self._handler):
+                self._handler(number, frame)
+            else:  # the system's, which ends the process
+                _signal.signal(SIGINT, self._handler)
+                _signal.raise_signal(SIGINT)
+
+    def _refusal(self, me: int, process: int) -> InUseError:
+        if process != self._owner:
+            problem = f"belongs to process {self._owner}, from which this one was forked"
+            return InUseError(f"this Runner {problem}; use it there, or make one here")
+        if self._user == me:
+            remedy = "let a signal handler set a flag, or close it"
+            return InUseError(f"this Runner is in a call that this one interrupted; {remedy}")
+        remedy = "take turns, or make one for each thread"
+        return InUseError(f"this Runner is in a call from another thread; {remedy}")
