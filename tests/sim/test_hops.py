@@ -40,7 +40,7 @@ def test_calls_are_counted():
 
 @pytest.mark.parametrize(("shape", "more"), [((64, PANDA.dof), 0), ((PANDA.dof,), 1)])
 def test_python_calls_of_a_tick(shape, more):
-    """The first of some ticks without waiting: 0.1 s of it adds two or three, which look whether the worker is alive."""
+    """A tick that did not wait: 0.1 s of it adds two or three, which look whether the worker is alive."""
     setpoint = np.broadcast_to(PANDA.settings.target, shape).copy()
     with Runner(PANDA, 64, workers=1, substeps=2) as runner:
         for _ in range(2):
