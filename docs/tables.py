@@ -19,7 +19,7 @@ from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.field_tables import Field
 from batchpid.law.params import FIELDS as PARAMS
 from batchpid.motors.actuator_fields import FIELDS as ACTUATORS
-from batchpid.sim.randomization.fields import PHYSICAL, START
+from batchpid.sim.randomization.fields import EVENTS, PHYSICAL, START
 from batchpid.sim.randomization.randomization import Randomization
 
 DOCS = Path(__file__).parent
@@ -83,7 +83,7 @@ def tables() -> dict[tuple[str, str], str]:
         ("law.md", "params"): table(numpydoc(bp.make_params), PARAMS, without),
         ("actuators.md", "actuators"): table(numpydoc(bp.make_actuators), ACTUATORS, without),
         ("randomization.md", "randomization"): table(
-            attributes(Randomization), PHYSICAL | START, ("seed", "each"), off=False
+            attributes(Randomization), PHYSICAL | START | EVENTS, ("seed", "each"), off=False
         ),
     }
 

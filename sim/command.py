@@ -17,6 +17,10 @@ POSE_UNITS = {"x": "m", "y": "m", "z": "m", "qw": "", "qx": "", "qy": "", "qz": 
 """Names and units of the numbers in a pose: position and quaternion (w, x, y, z)."""
 TWIST_UNITS = {"vx": "m/s", "vy": "m/s", "vz": "m/s", "wx": "rad/s", "wy": "rad/s", "wz": "rad/s"}
 """Names and units of the numbers in a twist: linear and angular velocity."""
+FORCE_UNITS = {"fx": "N", "fy": "N", "fz": "N"}
+"""Names and units of the numbers in a force."""
+WRENCH_UNITS = FORCE_UNITS | {"tx": "N m", "ty": "N m", "tz": "N m"}
+"""Names and units of the numbers in a wrench: force and torque."""
 
 
 @dataclass(frozen=True)

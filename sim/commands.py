@@ -24,6 +24,7 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.custom import initial_state
 from batchpid.sim.loop.faults import FARTHEST, ORIGIN, FaultLog
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
+from batchpid.sim.observation import untouched
 from batchpid.sim.options import IDEAL, RunnerOptions
 from batchpid.sim.randomization.draws import NOTHING, Draws
 from batchpid.sim.robot.limits import SetpointCheck
@@ -287,6 +288,8 @@ def restored(options: RunnerOptions, snapshot: Snapshot, sizes: list[int]) -> Re
         options.guard is not None,
         sizes,
         options.command.size,
+        untouched(options.num_envs, options.observed),
+        options.has_pushes,
     )
     return Restore(replace(snapshot, params=params, actuators=actuators), draws).copy()
 

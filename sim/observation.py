@@ -16,7 +16,7 @@ from batchpid.arrays.display import html_table, span
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
-from batchpid.sim.command import POSE_UNITS, TWIST_UNITS, CommandSpec, joint_command
+from batchpid.sim.command import FORCE_UNITS, POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec, joint_command
 
 _load_plot: list[Callable[[], Callable[..., Any]]] = []
 _find: list[Callable[..., Any]] = []
@@ -35,7 +35,8 @@ def register_findings(find: Callable[..., Any]) -> None:
 class Quantity(NamedTuple):
     """Observed quantity: its dtype, meaning, unit ("rad|m" is the joint's own), and whether there is one per joint.
 
-    If not, ``columns`` are names and units of its columns, if it has any.
+    If not, ``columns`` are names and units of its columns, if it has any. ``option`` is the option of a runner that
+    lists links, with a row for each; ``links`` are these links.
     """
 
     dtype: Any
@@ -43,10 +44,13 @@ class Quantity(NamedTuple):
     unit: str = "1"
     per_joint: bool = True
     columns: Mapping[str, str] = MappingProxyType({})
+    option: str = ""
+    links: tuple[str, ...] = ()
 
     def shape(self, joints: tuple[int, ...]) -> tuple[int, ...]:
         """Return the shape of this quantity where that of a quantity per joint is ``joints`` (..., envs, dof)."""
-        return joints if self.per_joint else (*joints[:-1], *([len(self.columns)] if self.columns else ()))
+        rows = [len(self.links)] if self.option else []
+        return joints if self.per_joint else (*joints[:-1], *rows, *([len(self.columns)] if self.columns else ()))
 
     def unit_for(self, position: str) -> str:
         """Return the unit for a joint whose position is in ``position``, "rad" or "m"."""
@@ -65,6 +69,12 @@ class Observation(NamedTuple):
     ``base_pose`` (envs, 7) is the pose of the robot's root link in the world, where the base floats, and ``base_twist``
     (envs, 6) the velocity of that link's origin and its angular velocity [m/s, rad/s], along the axes of the world;
     else None.
+
+    ``contact_force`` (envs, links, 3) is the net force of all contacts on each link of the option ``contacts`` [N],
+    along the axes of the world, as the mean over the sim steps of the tick, and ``touching`` (envs, links) whether it
+    had a contact in one of them. ``wrench`` (envs, links, 6) is the mean force and torque that its parent exerts on
+    each link of the option ``wrenches`` [N, N m], at the origin and along the axes of the link's frame. They are 0
+    after a reset, and None without these options.
     """
 
     qpos: Annotated[Float32, Quantity(np.float32, "joint position", "rad|m")]
@@ -77,6 +87,14 @@ class Observation(NamedTuple):
     base_pose: Annotated[Float32 | None, Quantity(np.float32, "pose of the base", "m|1", False, POSE_UNITS)] = None
     base_twist: Annotated[
         Float32 | None, Quantity(np.float32, "twist of the base", "m/s|rad/s", False, TWIST_UNITS)
+    ] = None
+    contact_force: Annotated[
+        Float32 | None, Quantity(np.float32, "contact force on the link", "N", False, FORCE_UNITS, "contacts")
+    ] = None
+    touching: Annotated[Bool | None, Quantity(np.bool_, "link had a contact", "1", False, option="contacts")] = None
+    wrench: Annotated[
+        Float32 | None,
+        Quantity(np.float32, "wrench of the parent on the link", "N|N m", False, WRENCH_UNITS, "wrenches"),
     ] = None
 
     def for_envs(self, envs: slice | Any) -> Observation:
@@ -109,7 +127,7 @@ class Observation(NamedTuple):
 
 _TOOL_POSE = Observation._fields.index("tool_pose")
 _SEEN = {name: hint.__metadata__[0] for name, hint in get_type_hints(Observation, include_extras=True).items()}
-OPTIONAL = ("tool_pose", "base_pose", "base_twist")
+OPTIONAL = ("tool_pose", "base_pose", "base_twist", "contact_force", "touching", "wrench")
 """Fields of :class:`Observation` that may be None."""
 OBSERVED: dict[str, Quantity] = {name: quantity for name, quantity in _SEEN.items() if name not in OPTIONAL}
 """Quantity of each other field."""
@@ -119,15 +137,26 @@ RECORDED = {"setpoint": Quantity(np.float64, "setpoint", "rad|m")} | _SEEN
 """Quantity of each array of a :class:`Rollout`, ``time`` aside."""
 
 
-def observed_by_loop(fixed_base: bool) -> dict[str, Quantity]:
-    """Return the quantities that a loop observes, by name: :data:`OBSERVED`, and those of a floating base."""
-    return OBSERVED if fixed_base else OBSERVED | BASE
+def observed_by_loop(fixed_base: bool | None, **links: tuple[str, ...] | None) -> dict[str, Quantity]:
+    """Return the quantities that a loop observes, by name.
+
+    These are :data:`OBSERVED`, those of a floating base, and those of ``links``: the options that list some.
+    """
+    found = dict(OBSERVED) if fixed_base is not False else OBSERVED | BASE
+    for name, quantity in _SEEN.items():
+        if names := links.get(quantity.option):
+            found[name] = quantity._replace(links=names)
+    return found
 
 
-def empty_observation(*shape: int, fixed_base: bool = True) -> Observation:
+def empty_observation(*shape: int, observed: Mapping[str, Quantity] = OBSERVED) -> Observation:
     """Return unset arrays for observations of ``shape`` (..., envs, dof)."""
-    fields = observed_by_loop(fixed_base).items()
-    return Observation(**{name: np.empty(each.shape(shape), each.dtype) for name, each in fields})
+    return Observation(**{name: np.empty(each.shape(shape), each.dtype) for name, each in observed.items()})
+
+
+def untouched(num_envs: int, observed: Mapping[str, Quantity]) -> dict[str, NDArray[Any]]:
+    """Return the quantities of links in ``observed`` before the first tick, 0."""
+    return {name: np.zeros(each.shape((num_envs, 0)), each.dtype) for name, each in observed.items() if each.option}
 
 
 class Redraw(NamedTuple):
@@ -187,6 +216,10 @@ class RunInfo:
     """False if the robots had no collision shapes."""
     ground: bool | None = None
     """True if the scenes had a ground at height 0."""
+    contacts: tuple[str, ...] | None = None
+    """Links whose contact forces were observed."""
+    wrenches: tuple[str, ...] | None = None
+    """Links with a wrench sensor."""
     rates: bool | None = None
     """True if setpoints were given with rates, and moved within the ticks; None if unknown, as after a kill."""
     params: PIDParams | None = None
@@ -232,8 +265,9 @@ class RunInfo:
     @property
     def recorded(self) -> dict[str, Quantity]:
         """Quantities of :data:`RECORDED` that this run has."""
-        lacking = {*(() if self.tool is not None else ("tool_pose",)), *(() if self.fixed_base is False else BASE)}
-        return {name: each for name, each in RECORDED.items() if name not in lacking}
+        seen = observed_by_loop(self.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
+        present = {"setpoint", *seen, *(() if self.tool is None else ("tool_pose",))}
+        return {name: each for name, each in (RECORDED | seen).items() if name in present}
 
     def units_of(self, name: str) -> tuple[str, ...]:
         """Return the unit of each column of the quantity ``name`` of :data:`RECORDED`; none if it has no columns."""
@@ -243,9 +277,11 @@ class RunInfo:
         return tuple(map(quantity.unit_for, self.units)) if quantity.per_joint else tuple(quantity.columns.values())
 
     def row_shape(self, name: str, num_envs: int) -> tuple[int, ...]:
-        """Return the shape of the quantity ``name`` of :data:`RECORDED` after a tick: (envs, columns) or (envs,)."""
-        quantity = RECORDED[name]
-        return (num_envs, len(self.units_of(name))) if quantity.per_joint or quantity.columns else (num_envs,)
+        """Return the shape of the quantity ``name`` of :attr:`recorded` after a tick: (envs, columns) or (envs,).
+
+        A quantity of links has their number in between.
+        """
+        return self.recorded[name].shape((num_envs, len(self.units_of(name))))
 
     def for_envs(self, envs: slice | Any) -> RunInfo:
         """Return the info of some envs (a slice or an index array)."""

@@ -23,7 +23,7 @@ from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
 from batchpid.checks.keywords import check_keywords
-from batchpid.checks.validate import AxisKind, choice, flag, instance, integer, joint_speeds, number
+from batchpid.checks.validate import AxisKind, choice, flag, instance, integer, joint_speeds, names, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.inputs import check_drive
@@ -33,10 +33,12 @@ from batchpid.sim.command import CommandSpec, joint_command, own_command
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.joint_friction import added_friction
 from batchpid.sim.engine.protocol import Capability, Engine, require
+from batchpid.sim.observation import Quantity, observed_by_loop
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
+from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
@@ -133,6 +135,8 @@ class RunnerOptions:
     )
     collisions: bool = field(default=True, metadata=_in("snapshot", "recording", "scene"))
     ground: bool = field(default=_DERIVED, metadata=_in("snapshot", "recording", "scene"))
+    contacts: tuple[str, ...] | None = field(default=None, metadata=_in("scene", "recording", snapshot="contact_list"))
+    wrenches: tuple[str, ...] | None = field(default=None, metadata=_in("scene", "recording", snapshot="wrench_list"))
     build: Callable[[Any, int], Any] | None = field(default=None, metadata=_in("scene", snapshot="build_digest"))
     on_fault: FaultAction = field(default="hold", metadata=_in("snapshot"))
     speed_limit: NDArray[np.float64] | None = field(default=None, metadata=_in(snapshot="speed_limits"))
@@ -194,10 +198,13 @@ class RunnerOptions:
         if self.randomization is not None:
             remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
             check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
+            self._check_world(self.randomization)
         self._check_tree()
         own["guard"] = fit_guard(given["guard"], robot, self.num_envs, self.control_name, self.sets_positions)
         own["actuators"] = self.check_actuators(given["actuators"])
         self._check_collisions()
+        for name in ("contacts", "wrenches"):
+            own[name] = self._sensed_links(name, given[name])
         for name in ("controller_digest", "build_digest"):  # of the objects as they are now
             getattr(self, name)
 
@@ -250,6 +257,56 @@ class RunnerOptions:
         if not self.robot.fixed_base:
             problem = f"are False, and nothing holds the floating base of {self.robot.name!r}"
             raise InvalidArgumentError("collisions", problem, remedy="load the robot with fixed_base=True")
+
+    def _check_world(self, randomization: Randomization) -> None:
+        """Raise InvalidArgumentError for draws of the world that this runner's scenes do not take."""
+        if randomization.ground_friction is not None and not self.collisions:
+            raise InvalidArgumentError("ground_friction", "has no effect without collisions", remedy="leave it out")
+        if randomization.gravity is not None and self.build is not None:
+            problem = "cannot change in scenes with content of build: SAPIEN's systems keep their gravity"
+            raise InvalidArgumentError("gravity", problem, remedy="leave out one of them")
+
+    def _sensed_links(self, option: str, given: Any) -> tuple[str, ...] | None:
+        """Return the links of the option "contacts" or "wrenches"; None without any.
+
+        Raises InvalidArgumentError for a link that is unknown, or has no sensor of this kind.
+        """
+        robot, known = self.robot, [link.name for link in self.robot.links]
+        if not (links := () if given is None else tuple(names(option, given))):
+            return None
+        if option == "contacts" and not self.collisions:
+            raise InvalidArgumentError(option, "need collisions, which are off", remedy="leave out collisions=False")
+        if self.engine_name == "sapien" and robot.dissipation == "sapien":
+            problem = "need a robot without SAPIEN's link damping, which acts like a contact"
+            raise InvalidArgumentError(option, problem, remedy="load the robot with dissipation='urdf'")
+        bodies = place_links(robot.urdf, robot.merge_fixed)
+        root = next(at.link for at in bodies.values())
+        for link in links:
+            if link not in known:
+                remedy = f"use links of {robot.name!r}: {', '.join(known)}"
+                raise InvalidArgumentError(option, f"names an unknown link {link!r}", remedy=remedy)
+            if bodies[link].link == root and (option == "wrenches" or robot.fixed_base):
+                problem = f"names {link!r}, which no joint moves"
+                raise InvalidArgumentError(option, problem, remedy="name a link further along the robot")
+            if option == "wrenches" and bodies[link].link != link:
+                problem = f"names {link!r}, which is simulated as one with {bodies[link].link!r}"
+                raise InvalidArgumentError(option, problem, remedy="load the robot with merge_fixed=False")
+        return links
+
+    @cached_property
+    def observed(self) -> dict[str, Quantity]:
+        """Quantities that the loop observes."""
+        return observed_by_loop(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
+
+    @property
+    def contact_list(self) -> list[str] | None:
+        """The option ``contacts`` as plain values."""
+        return None if self.contacts is None else list(self.contacts)
+
+    @property
+    def wrench_list(self) -> list[str] | None:
+        """The option ``wrenches`` as plain values."""
+        return None if self.wrenches is None else list(self.wrenches)
 
     @property
     def solver(self) -> Physics | MujocoSolver:
@@ -317,6 +374,11 @@ class RunnerOptions:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
         added = actuators is not None and added_friction(Friction(), actuators).coulomb is not None
         return bool(self.robot.friction.any()) or added or getattr(self.randomization, "friction", None) is not None
+
+    @property
+    def has_pushes(self) -> bool:
+        """True if floating bases are pushed."""
+        return self.randomization is not None and self.randomization.push is not None
 
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
         """Return ``params``, as a read-only copy, if they fit the robot, the number of envs and the control.
@@ -519,4 +581,4 @@ def default_params(
         if settings is None:
             return robot.designed("effort").replace(ki=0.0, setpoint_weight=None, derivative_filter_time=None)
         return robot.params(kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None)
-    return robot.tuned() if robot.has_tuned else robot.designed("effort" if loops else "mass_matrix")
+    return robot.tuned() if robot.has_tuned else robot.designed("effort" if loops else None)

@@ -45,7 +45,7 @@ from batchpid.sim.commands import (
 from batchpid.sim.loop.backend import describe
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
-from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation, observed_by_loop
+from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation
 from batchpid.sim.options import RunnerOptions, default_params, keyword_parameters
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.run_warnings import RunWarnings
@@ -326,7 +326,7 @@ class Runner(SingleOwner):
         options, ticks = self.options, count_ticks(self.options, setpoints)
         command = read_command(options, self._state, self._warnings.setpoint_limits, given, ticks)
         robot, tick, done = options.robot, options.substeps * options.timestep, 0
-        seen = empty_observation(ticks, self.num_envs, robot.dof, fixed_base=robot.fixed_base)
+        seen = empty_observation(ticks, self.num_envs, robot.dof, observed=options.observed)
         times = (self._state.steps + options.substeps * np.arange(1.0, ticks + 1)) * options.timestep
         info = replace(self.info, rates=command.setpoint_rate is not None)
         shown = iter(range(ticks) if progress is None else progress(range(ticks)))
@@ -337,7 +337,7 @@ class Runner(SingleOwner):
                 part = slice(number, done)
                 rows = command.map(itemgetter(part))
                 self._execute(RunTicks(rows, options.substeps, options.timestep))
-                for name in observed_by_loop(robot.fixed_base):
+                for name in options.observed:
                     getattr(seen, name)[part] = getattr(self._pool.arrays.observation, name)[: done - number]
         next(shown, None)  # the end
         if options.tool_pose is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict
 
@@ -100,7 +100,8 @@ class RunnerKeywords(TypedDict, total=False):
     compensate: Compensation
     """Passive force, and the known Coulomb friction on the way to the setpoint, added at every sim step.
     ``"gravity+coriolis+friction"``, the default, or a part of it; under control "effort" friction is not
-    compensated."""
+    compensated. On a floating base the passive force is the joints' own share, as if the base were held where it is:
+    what the legs carry of the base depends on their contacts, and is left to the law."""
     engine: EngineName
     """Physics engine: ``"sapien"``, the reference and the default where it is installed, or ``"mujoco"``, several times
     as fast (docs/two-engines.md)."""
@@ -115,6 +116,13 @@ class RunnerKeywords(TypedDict, total=False):
     """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
     so low that other links reach the ground at its start pose. With engine "mujoco" the planes in the world of an MJCF
     file take its place, by default as in the file."""
+    contacts: Sequence[str] | None
+    """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``. Links that fixed joints join
+    are one body, and count as one. Default none. The links must move; with SAPIEN the robot has
+    ``dissipation="urdf"``."""
+    wrenches: Sequence[str] | None
+    """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``. Default none. A
+    link that a fixed joint holds needs a robot with ``merge_fixed=False``."""
     build: Callable[[Any, int], Any] | None
     """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
     that code written for a screen runs unchanged. It may return the entities that :meth:`batchpid.sim.Runner.poses`

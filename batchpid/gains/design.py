@@ -108,6 +108,7 @@ def design_gains(
     gain_units: str = "effort",
     discretization: str = "explicit",
     margin: float = 0.5,
+    load: ArrayLike = 0.0,
     **options: Any,
 ) -> PIDParams:
     """Return params for ``robot`` from its inertia alone.
@@ -136,6 +137,9 @@ def design_gains(
         that the bandwidth is kept and the derivative is not filtered.
     margin
         Share of the stability range that may be used, in [0.001, 0.999].
+    load
+        Least inertia that the joints are designed for, with gain_units "effort" (dof,) [kg m^2 or kg], such as that of
+        a base that legs carry.
     options
         Options of ``robot.params``; they replace the designed ones.
 
@@ -158,7 +162,8 @@ def design_gains(
     coupling = getattr(robot, "coupling", Coupling.of(mass.shape[-1]))
     mass, viscous = coupling.reduced(mass), coupling.reduced_damping(robot.damping)
     own = np.diagonal(mass, axis1=1, axis2=2)
-    inertia = {"effort": own.max(0), "inertia": np.ones(own.shape[1]), "mass_matrix": np.ones(own.shape[1])}[gain_units]
+    carried = np.maximum(own.max(0), coupling.reduced_damping(np.broadcast_to(load, robot.damping.shape)))
+    inertia = {"effort": carried, "inertia": np.ones(own.shape[1]), "mass_matrix": np.ones(own.shape[1])}[gain_units]
     # The loop with the whole mass matrix compensates the joints' damping.
     damping = {"effort": viscous, "inertia": viscous / own.max(0), "mass_matrix": 0.0}[gain_units]
     while True:

@@ -16,27 +16,44 @@ and ratio = 1 is the boundary, not only a bound on it. On one joint of inertia I
 kd dt / I + kp dt^2 / (2 I) < 2. On a chain it is the *coupled* inertia that counts: with axes nearly in line (an arm
 stretched upright), joints that turn against each other move much less than the diagonal of M says.
 
+Where efforts or measurements are late, by a delay d and a first-order lag T, the loop becomes unstable at a lower
+frequency. With the plant G(z) and the law C(z) of the equations above, the loop and its limit are::
+
+    L(z) = G(z) D(z) C(z),     ratio = max |lambda|     over the eigenvalues lambda of L(e^iw) with phase -180 degrees
+
+because s times the gains are at the limit where s lambda = -1 (the generalised Nyquist criterion: A. G. J. MacFarlane
+and I. Postlethwaite, "The generalized Nyquist stability criterion and multivariable root loci", Int. J. Control 25,
+1977). The phase has to fall through -180 degrees there; if it begins below, no gains are stable and the ratio is
+infinite. A delay between two steps is interpolated, as :mod:`batchpid.motors.delay` does.
+
 The integral, which is slow, is not in the ratio; :func:`spectral_radius` and :func:`oscillation` include it.
 E. I. Jury, Theory and Application of the z-Transform Method (Wiley, 1964).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import at_least, broadcast, positive, read_array, time_step
 from batchpid.errors import InvalidArgumentError
+
+_FREQUENCIES = 100
+"""Number of frequencies below and above 1 / 4 of the highest at which a late loop is evaluated; between two of them the
+loci are interpolated."""
+_SLOWEST = 0.01
+"""Lowest of them, over 1 / (delay + lag)."""
 
 
 class StabilityBound(NamedTuple):
     """Share of the sampled loop's stability range that is used."""
 
     ratio: Float64
-    """(...): below 1 the loop is stable, above 1 it diverges, with alternating signs from step to step."""
+    """(...): below 1 the loop is stable, above 1 it diverges; without delay and lag with alternating signs from step to
+    step."""
     participation: Float64
     """(..., joints): share of each joint in the least stable mode; sums to 1."""
 
@@ -60,6 +77,9 @@ def stability_bound(
     *,
     filter_time: ArrayLike = 0.0,
     damping: ArrayLike = 0.0,
+    delay: ArrayLike = 0.0,
+    lag: ArrayLike = 0.0,
+    model: ArrayLike | None = None,
 ) -> StabilityBound:
     """Return the distance of PD gains to the sampled loop's stability limit.
 
@@ -75,6 +95,11 @@ def stability_bound(
         Time constant of the derivative's first-order low-pass [s], shaped as kp.
     damping
         Viscous damping of the joints, which the simulator integrates implicitly [N m s/rad or N s/m], shaped as kp.
+    delay, lag
+        Delay of efforts and measurements together, and time constant of the efforts' first-order lag [s], shaped as kp.
+    model
+        Mass matrix by which the law multiplies its output, where that is an acceleration, shaped as ``mass_matrix``.
+        None: the output is an effort.
 
     Raises
     ------
@@ -82,11 +107,76 @@ def stability_bound(
         A shape that does not fit, a mass matrix that is not positive definite, or a dt above 1 s.
     """
     m, p, c, tau, b = _columns(mass_matrix, dt, kp=kp, kd=kd, filter_time=filter_time, damping=damping)
+    late, slow = _columns(mass_matrix, dt, delay=delay, lag=lag)[1:]
+    if model is not None or late.any() or slow.any():
+        unit = np.eye(m.shape[-1]) if model is None else read_array("model", model).astype(np.float64)
+        return _late_bound(m, np.broadcast_to(unit, m.shape), [p, c, tau, b, late, slow], dt)
     passed = dt / (dt + 2 * tau)
     weight = np.sqrt(passed * dt * c + 0.5 * dt**2 * p)
     inverse = np.linalg.inv(m + 0.5 * dt * b[..., None] * np.eye(m.shape[-1]))
     values, vectors = np.linalg.eigh(weight[..., :, None] * inverse * weight[..., None, :])
     return StabilityBound(ratio=0.5 * values[..., -1], participation=vectors[..., -1] ** 2)
+
+
+def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) -> StabilityBound:
+    """Return the bound of loops whose efforts are late; ``columns`` are those of :func:`_loop` (..., joints)."""
+    ratio, participation = np.zeros(m.shape[:-2]), np.zeros(m.shape[:-1])
+    for at in np.ndindex(*m.shape[:-2]):
+        own = [column[at] for column in columns]
+        slowest = _SLOWEST / (1 + float(np.max(own[-2] + own[-1])) / dt)
+        slow = np.geomspace(slowest, np.pi / 4, _FREQUENCIES)
+        z = np.exp(1j * np.append(slow, np.linspace(np.pi / 4, np.pi, _FREQUENCIES)[1:]))
+        loop = _loop(z, m[at], unit[at], own, dt)
+        ratio[at], where = _crossing(z, np.linalg.eigvals(loop))
+        values, vectors = np.linalg.eig(loop[where])
+        # The mode that crosses there; kinetic energy, apart from the coupling of joints.
+        mode = vectors[:, np.argmax(np.where(values.real < 0, np.abs(values), 0.0))]
+        energy = np.abs(mode) ** 2 * np.diagonal(m[at])
+        participation[at] = energy / energy.sum()
+    return StabilityBound(ratio, participation)
+
+
+def _loop(z: NDArray[Any], m: Float64, unit: Float64, columns: list[Float64], dt: float) -> NDArray[Any]:
+    """Return L (frequencies, joints, joints) of one loop at the points ``z`` (frequencies,) of the unit circle.
+
+    ``columns`` are kp, kd, filter time, damping, delay and lag (joints,).
+    """
+    p, c, tau, b, delay, lag = columns
+    each = z[:, None]
+    law = p + c * (each - 1) / ((tau + dt) * each - tau)
+    whole = np.floor(delay / dt)
+    part = delay / dt - whole
+    intake = -np.expm1(-dt / np.maximum(lag, 1e-3 * dt))
+    late = each**-whole * (1 - part + part / each) * intake / (1 - (1 - intake) / each)
+    plant = (z - 1)[:, None, None] * m + dt * z[:, None, None] * (b * np.eye(len(b)))
+    moved: NDArray[Any] = np.linalg.solve(plant, late[..., None] * unit * law[:, None, :])
+    return moved * (dt**2 * z / (z - 1))[:, None, None]
+
+
+def _crossing(z: NDArray[Any], values: NDArray[Any]) -> tuple[float, int]:
+    """Return the largest modulus at which a locus falls through -180 degrees, and the number of its frequency.
+
+    ``values`` (frequencies, joints) are the eigenvalues of L at ``z``. The loci begin below the negative real axis
+    where the loop is stable with small gains.
+    """
+    values = values.copy()
+    values[-1] = values[-1].real  # at z = -1 it is real, but for rounding
+    # Each eigenvalue goes on from the nearest one at the frequency before, apart from the fall of all with frequency.
+    own = values * np.abs(z - 1)[:, None] ** 2
+    nearest = np.abs(own[1:, :, None] - own[:-1, None, :]).argmin(2)
+    now, then = np.take_along_axis(values[:-1], nearest, 1), values[1:]
+    first = values[0]
+    if ((first.real < 0) & (first.imag > 0)).any():
+        return np.inf, 0
+    falls = (now.real < 0) & (then.real < 0) & (now.imag < 0) & (then.imag >= 0)
+    if not falls.any():
+        return 0.0, len(values) - 1
+    above, below = (-each.imag / np.where(falls, -each.real, 1.0) for each in (now, then))
+    share = np.where(falls, above / np.where(falls, above - below, 1.0), 0.0)
+    sizes = [np.log(np.maximum(np.abs(each), 1e-300)) for each in (now, then)]
+    crossed = np.where(falls, np.exp(sizes[0] + share * (sizes[1] - sizes[0])), 0.0)
+    row = int(crossed.max(1).argmax())
+    return float(crossed.max()), row
 
 
 def spectral_radius(

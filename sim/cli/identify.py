@@ -86,6 +86,9 @@ class IdentifyCommand:
     """Actuators file to write: .yaml or .json. Default: out/ROBOT.actuators.yaml."""
     json: flags.Json = None
     """Estimates with their 95 % intervals to write: .json."""
+    corrected_urdf: flags.OptionalPath = None
+    """URDF to write with the masses of the links that seem heavier or lighter than described: .urdf. Identify again
+    with it."""
     picture: flags.OptionalPath = None
     """Position errors before and after, to draw: .png or .svg. Default: NAME-fit.png, next to the
     actuators file."""
@@ -99,6 +102,8 @@ class IdentifyCommand:
 
     def run(self) -> None:
         """Run the command."""
+        import batchpid as bp
+        from batchpid.io.files import write_atomically
         from batchpid.sim import plots
         from batchpid.sim.identification.identification import identify
         from batchpid.sim.identification.runs import gains_of
@@ -112,6 +117,7 @@ class IdentifyCommand:
         outputs = Outputs(force=self.force, inputs=(None if self.gains is None else Path(self.gains), *self.logs))
         out = outputs.path("out", out, (".yaml", ".yml", ".json"))
         details = outputs.path("json", self.json, (".json",))
+        corrected = outputs.path("corrected_urdf", self.corrected_urdf, (".urdf",))
         picture = outputs.path("picture", self.picture or beside(out, "fit"), plots.FORMATS)
         history = outputs.history(out.with_suffix(".fit.json"), resume=self.resume)
         params = None if self.gains is None else gains_of(robot, self.gains)
@@ -137,9 +143,18 @@ class IdentifyCommand:
             raise InvalidArgumentError("logs", problem, remedy=remedy)
         found.save(out)
         print(f"\nwritten: {out}")
+        if found.finds_gains and (gains := found.gains()) is not None:
+            path = beside(out, "gains").with_suffix(".yaml")
+            bp.save_params(path, gains, [robot.joint_names[joint] for joint in found.joints])
+            print(f"gains that were found, for --gains: {path}")
         if details is not None:
             write_figures(details, found.document())
             print(f"written: {details}")
+        if corrected is not None and found.diagnosis.links:
+            write_atomically(corrected, found.corrected_urdf())
+            print(f"written: {corrected}; identify again with it")
+        elif corrected is not None:
+            print(f"not written: {corrected}; no link's mass seems off")
         names, units = ([table[joint] for joint in found.joints] for table in (robot.joint_names, robot.units))
         errors = [plots.FitErrors(*fit[1:]) for fit in found.fits if fit.log == 0]
         title = f"{robot.name}: position error, shaded where it was not fitted"
@@ -155,7 +170,7 @@ class IdentifyCommand:
             remedy = "add --evaluations 0 to print the error of the file, or leave it out to fit"
             raise InvalidArgumentError("actuators", "are not the start of a fit", value=actuators, remedy=remedy)
         defaults = {each.name: each.default for each in fields(self)}
-        for name in ("no_payload", "seed", "workers", "resume", "out", "json", "picture"):
+        for name in ("no_payload", "seed", "workers", "resume", "out", "json", "corrected_urdf", "picture"):
             if (value := getattr(self, name)) != defaults[name]:
                 problem = "is for a fit, and --evaluations 0 fits nothing"
                 raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
@@ -185,18 +200,19 @@ class IdentifyCommand:
             remedy = "give 1 or more, name an actuators file as --actuators, or a log with measured efforts too"
             raise InvalidArgumentError("evaluations", "is 0, and there is no file", value=0, remedy=remedy)
         found = measured_motors(robot, logs, timestep=self.timestep, hold=self.hold)
-        rows = []
-        for index, (kind, joint) in enumerate(found.names):
-            value, low, high = found.row(index)
-            name = "all joints" if joint is None else robot.joint_names[found.joints[joint]]
-            rows.append([name, kind, f"{value:.4g} ± {max(high - value, value - low):.1g}"])
+        document = found.document(robot)
+        rows = [
+            [joint, kind, f"{value:.4g} ± {high - value:.1g}"]
+            for joint, kinds in document.items()
+            for kind, (value, _, high) in kinds.items()
+        ]
         print(table(rows, ["joint", "95 % intervals, SI units", "value"], "llr"))
         print(f"\nerror of the effort on the part that was kept: up to {found.error.max():.2g} of the effort")
         out.parent.mkdir(parents=True, exist_ok=True)
-        found.save(out, [log.source for log in logs])
+        found.save(out, robot)
         print(f"written: {out}")
         if details is not None:
-            write_figures(details, found.document())
+            write_figures(details, document)
             print(f"written: {details}")
 
 
@@ -223,6 +239,8 @@ def report(found: Identification) -> str:
     taken = found.strength_taken
     rows = [[name, *(cell(kind, joint) for kind in kinds)] for joint, name in enumerate(names)]
     text = [table(rows, ["95 % intervals, SI units", *kinds], "l" + len(kinds) * "r"), ""]
+    if "slew" in kinds:
+        text.append("slew is the limit of the setpoints' rate: simulate with guard=robot.guard(rate=...)")
     if taken:
         text.append(f"strength taken as 1, because the logs show only ratios to it: {', '.join(taken)}")
     if ("delay", None) in found.unknowns.names:
@@ -239,6 +257,7 @@ def report(found: Identification) -> str:
         way = "through its motors" if found.drive.through else "apart from its motors"
         text.append(f"the robot compensates {found.drive.compensate} {way}")
     text.append(_errors(*found.held_out_error))
+    text += found.diagnosis.sentences()
     if found.misfit > EXPLAINED:
         text.append(
             f"the error there is up to {found.misfit:.2g} times the noise of the sensors, at {found.worst_joint!r}: "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -20,6 +20,12 @@ from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.weights import Weights
 from batchpid.task_space import save_osc_options
 
+if TYPE_CHECKING:
+    from batchpid.sim.identification.confidence_region import DrawnMotors
+    from batchpid.sim.tuning.within import Within
+
+DRAWS, MOVES_WITHIN = 100, 4
+"""Motors that ``--within`` draws, and random moves that are made with each."""
 SUFFIXES = ".yaml", ".yml", ".json"
 """Formats of a params file."""
 
@@ -62,6 +68,9 @@ class TuneCommand:
     cluster: flags.Cluster = None
     time_limit: flags.TimeLimit = None
     actuators: flags.Actuators = None
+    within: flags.Switch = False
+    """Tune for all motors in the confidence region that `batchpid identify` wrote into the file of --actuators: 100 are
+    drawn, the worst counts, and what holds for all of them is printed."""
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     resume: flags.Switch = False
     """Continue a search with the same options that was stopped."""
@@ -89,6 +98,7 @@ class TuneCommand:
             return self._tune_tool(robot, named, outputs)
         if self.tool is not None:
             raise InvalidArgumentError("tool", "is for --control osc", value=self.tool, remedy="leave it out")
+        drawn = self._draw(robot)
         out = outputs.path("out", self.out or named.with_suffix(".tuned.yaml"), SUFFIXES)
         picture = outputs.path("picture", self.picture or beside(named, "tune"), plots.FORMATS)
         history = outputs.history(out.with_suffix(".search.json"), resume=self.resume)
@@ -100,6 +110,7 @@ class TuneCommand:
             seconds=self.seconds,
             randomization=randomization,
             history=history,
+            motors=None if drawn is None else drawn.actuators,
             progress=bar("tuning", unit="generation"),
             **flags.chosen(self, "seed generations population gain_units per_joint weights time_limit"),
             **flags.chosen(self, "workers cluster engine physics collisions ground"),
@@ -115,7 +126,9 @@ class TuneCommand:
         )
         print(evaluation_table(robot, evaluations))
         arm = arm_joints(robot)
-        rejected = found.rejected or evaluations[1].drawback(evaluations[0], arm)
+        rejected, of_all = found.rejected or evaluations[1].drawback(evaluations[0], arm), None
+        if drawn is not None:
+            rejected, of_all = self._judge_within(robot, sets, drawn)
         chosen = 0 if rejected else 1
         judged = evaluations[chosen]
         worst, followed = judged.metrics.worst(), judged.following_error
@@ -127,6 +140,7 @@ class TuneCommand:
             "start_cost": found.start_cost,
             "gains": sets[chosen].name,
             **({"rejected": rejected} if rejected else {}),
+            **({} if of_all is None else {"within": _figures(of_all)}),
             "judged": {
                 "moves": len(judged.moves.start),
                 "seed": self.seed + 1,
@@ -144,13 +158,45 @@ class TuneCommand:
             print(f"SHORT of the usual demands: {text}")
         print(f"next: {self._next_command(out)}")
 
+    def _draw(self, robot: Robot) -> DrawnMotors | None:
+        """Return the motors that ``--within`` draws; None without it."""
+        from batchpid.sim.identification.confidence_region import draw_motors
+
+        if not self.within:
+            return None
+        if self.actuators is None:
+            remedy = "name the file of `batchpid identify` as --actuators"
+            raise InvalidArgumentError("within", "needs a confidence region", remedy=remedy)
+        return draw_motors(self.actuators, robot, DRAWS, self.seed)
+
+    def _judge_within(
+        self, robot: Robot, sets: tuple[GainSet, GainSet], drawn: DrawnMotors
+    ) -> tuple[str | None, Within]:
+        """Print what holds for all drawn motors; return why the designed gains are better, if so, and the figures."""
+        from batchpid.sim.tuning.moves import random_moves, tutorial_move
+        from batchpid.sim.tuning.within import within
+
+        moves = tutorial_move(robot) + random_moves(robot, MOVES_WITHIN, self.seed + 1)
+        options = flags.chosen(self, "workers cluster engine physics collisions ground")
+        designed, tuned = (within(robot, each.params, drawn.actuators, moves, **options) for each in sets)
+        rejected = None
+        if tuned.rank > designed.rank:
+            worst = [
+                f"{each.name} {found.settling.max():.3g} s" for each, found in zip(sets, (designed, tuned), strict=True)
+            ]
+            rejected = f"settling with the worst of the drawn motors: {', '.join(worst)}"
+        found = designed if rejected else tuned
+        print(f"\nwithin the confidence region of {self.actuators}, {DRAWS} draws of motors:")
+        print("\n".join(f"  {line}" for line in within_report(robot, found, drawn)))
+        return rejected, found
+
     def _tune_tool(self, robot: Robot, named: Path, outputs: Outputs) -> None:
         """Tune operational-space control: print a table and write the options."""
         from batchpid.sim.cli.report import cause_lines, gains_table
         from batchpid.sim.tuning.tool_search import tune_tool
 
         defaults = {each.name: each.default for each in fields(self)}
-        for name in ("gain_units", "per_joint", "randomize", "variation", "cluster", "actuators", "picture"):
+        for name in ("gain_units", "per_joint", "randomize", "variation", "cluster", "actuators", "within", "picture"):
             if (value := getattr(self, name)) != defaults[name]:
                 problem = "is not available with --control osc"
                 raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
@@ -192,3 +238,34 @@ class TuneCommand:
         if self.meshes.package_dirs:
             words += ["--package-dirs", *map(str, self.meshes.package_dirs)]
         return shlex.join(words)
+
+
+def within_report(robot: Robot, found: Within, drawn: DrawnMotors) -> list[str]:
+    """Return lines that say what holds for all drawn motors."""
+    import numpy as np
+
+    stability, worst = found.stability, found.binding
+    ratio, at = stability.robot_ratio, robot.joint_names[int(np.argmax(stability.participation))]
+    where = f"with draw {stability.env} ({drawn.describe(stability.env, at)})"
+    stable = "all are stable at their delay" if ratio < 1 else "NOT ALL ARE STABLE at their delay"
+    never = int(np.isinf(found.settling).sum())
+    settle = f"{never} DO NOT SETTLE" if never else "all settle"
+    slowest, typical = found.settling.max(), np.median(found.settling)
+    return [
+        f"{stable}: at most {ratio:.2g} times the bound, by {at!r}, {where}",
+        f"{settle}: within {slowest:.3g} s, half of them within {typical:.3g} s",
+        f"binding corner: draw {worst}, joint {found.joints[worst]!r} in move {found.moves[worst]!r}: "
+        f"{drawn.describe(worst, found.joints[worst])}",
+    ]
+
+
+def _figures(found: Within) -> dict[str, Any]:
+    """Return what holds for all drawn motors, for the record."""
+    return {
+        "draws": len(found.settling),
+        "holds": found.holds,
+        "stability_ratio": found.stability.robot_ratio,
+        "settling_time": float(found.settling.max()),
+        "binding_draw": found.binding,
+        "binding_joint": found.joints[found.binding],
+    }

@@ -18,7 +18,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import Model, Refresh
+from batchpid.sim.engine.native.interface import BASES, Model, Refresh
 from batchpid.sim.engine.protocol import CompiledModel
 from batchpid.sim.engine.robot_model import passive_force, scene_tree
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -26,10 +26,10 @@ from batchpid.task_space.rigid_tree import RigidTree
 
 
 class NativeModel:
-    """Model of the robots of ``spec``, on a base that ``floats``, or is held."""
+    """Model of the robots of ``spec``, on a base of this kind of :data:`BASES`."""
 
-    def __init__(self, spec: SceneSpec, floats: bool = False) -> None:
-        self._spec, self._floats, self._native = spec, floats, native.extension("_gateway")
+    def __init__(self, spec: SceneSpec, base: str = "fixed") -> None:
+        self._spec, self._base, self._native = spec, base, native.extension("_gateway")
         self._inertias: Float64 | None = None
 
     @cached_property
@@ -42,7 +42,7 @@ class NativeModel:
         inertias = self._tree.inertias()[None] if self._inertias is None else self._inertias
         arrays: dict[str, NDArray[Any]] = {"tree": tree, "rows": rows, "inertias": inertias}
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
-        numbers = {"dof": len(tree), "varies": self._inertias is not None, "floats": self._floats}
+        numbers = {"dof": len(tree), "varies": self._inertias is not None, "base": BASES.index(self._base)}
         return Model(gravity=self._spec.gravity, **numbers, **addresses), arrays
 
     @property
@@ -70,13 +70,14 @@ class NativeModel:
         return out
 
     def passive_force(
-        self, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool, turning: Float64 | None = None
+        self, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool, base: Float64 | None = None
     ) -> Float64:
         """Return the efforts (n, dof) [N m or N] that cancel gravity, and Coriolis and centrifugal forces.
 
-        A floating base turns at ``turning`` (n, 3) [rad/s], in its own axes.
+        ``base`` (n, 6) are gravity [m/s^2] and the rate [rad/s] at which a base that is not fixed turns, in its own
+        axes: :meth:`batchpid.sim.engine.protocol.EnginePack.read_base_motion`.
         """
-        state = [None if each is None else np.ascontiguousarray(each, np.float64) for each in (qpos, qvel, turning)]
+        state = [None if each is None else np.ascontiguousarray(each, np.float64) for each in (qpos, qvel, base)]
         out = np.empty(qpos.shape)
         self._native.forces(self.address, gravity, coriolis, *state, out, len(out))
         return out
@@ -149,13 +150,13 @@ def mass_matrix_of(spec: SceneSpec, natively: bool) -> Callable[[Float64], Float
     return lambda qpos: ts.mass_matrix(tree(), qpos)
 
 
-def passive_force_of(spec: SceneSpec, natively: bool) -> Callable[[Float64, Float64, bool, bool], Float64]:
-    """Return the function of positions, velocities, gravity and coriolis that computes a robot's passive forces.
+def passive_force_of(spec: SceneSpec, natively: bool) -> Callable[..., Float64]:
+    """Return the function of positions, velocities, gravity, coriolis and base that computes a robot's passive forces.
 
-    The base is held. ``natively`` says whether the extension is used; then every executor takes them from it, since the
-    engines' and NumPy's differ in the last bits.
+    The base is fixed, or held where it is. ``natively`` says whether the extension is used; then every executor takes
+    them from it, since the engines' and NumPy's differ in the last bits.
     """
     if natively:
-        return NativeModel(spec).passive_force
+        return NativeModel(spec, "fixed" if spec.fixed_base else "held").passive_force
     tree = cache(lambda: scene_tree(spec).held)
     return lambda *state: passive_force(tree(), *state)

@@ -23,12 +23,13 @@ from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.task_space.rigid_tree import RigidTree
 
-Capability = Literal["drive", "build", "compiled_steps", "partial_force", "sapien_dissipation"]
+Capability = Literal["drive", "build", "compiled_steps", "partial_force", "base_state", "sapien_dissipation"]
 """
 - ``"drive"``: packs are :class:`DrivenPack`, for the control "drive";
 - ``"build"``: the user's function ``build`` adds content to scenes;
 - ``"compiled_steps"``: packs are :class:`CompiledPack`, for programs of XLA;
-- ``"partial_force"``: compiled steps read gravity or Coriolis forces alone, and forces of floating bases;
+- ``"partial_force"``: compiled steps read gravity or Coriolis forces alone;
+- ``"base_state"``: compiled steps read state and passive force of robots on a floating base;
 - ``"sapien_dissipation"``: SAPIEN's own friction and damping in place of the URDF's.
 """
 FAILED = 1 << STATUS.index("failed")
@@ -73,7 +74,8 @@ class EnginePack(Protocol):
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N].
 
-        They come from the model of ``spec`` at the present state, without the pack's variation.
+        They come from the model of ``spec`` at the present state, without the pack's variation. On a floating base they
+        are those of the joints alone, as if the base were held where it is: no effort of a joint carries the base.
         """
 
     def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
@@ -98,6 +100,22 @@ class EnginePack(Protocol):
         """Return pose and twist of floating bases in the world (M, 13), a new array: those of the root link's origin.
 
         Position [m], quaternion (w, x, y, z), linear and angular velocity [m/s, rad/s].
+        """
+
+    def read_base_motion(self) -> Float64 | None:
+        """Return gravity and the rate at which floating bases turn [m/s^2, rad/s], both in their own axes (M, 6).
+
+        Gravity is that of ``spec``. None for fixed bases.
+        """
+
+    def push(self, rows: Sequence[int], twists: Float64) -> None:
+        """Add ``twists`` (len(rows), 6) [m/s, rad/s] to those of floating bases, as :meth:`read_base` has them."""
+
+    def take_sensed(self) -> dict[str, Float64]:
+        """Return what the sensors of links summed up in all sim steps since the last call, and begin again.
+
+        ``contact_force`` (M, links, 3), ``touching`` (M, links), 0 without a contact, and ``wrench`` (M, links, 6), as
+        :class:`batchpid.sim.Observation` describes them; of robots that were placed meanwhile, since then.
         """
 
     def write_state(

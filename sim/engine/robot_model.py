@@ -22,6 +22,7 @@ from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.robot_tree import rigid_tree
 from batchpid.sim.robot.simulated_links import body_inertias, simulated
+from batchpid.task_space.frames import matrix_of, rotate
 from batchpid.task_space.rigid_tree import RigidTree
 
 
@@ -55,6 +56,40 @@ class RobotModel:
         Followers move with their leaders.
         """
         return np.asarray(ts.forward_dynamics(self._coupled, qpos, qvel, effort), np.float64)
+
+    def standing_inertia(self, qpos: NDArray[Any]) -> Float64:
+        """Return the inertia (dof,) that each joint moves at one pose (dof,) if the base floats and its feet stand.
+
+        The feet F are pinned. Velocities q' of the joints move the base at V = A q', A = -J_b^+ J_j, where J_b and J_j
+        are the Jacobians of F with respect to the base and the joints. The mass matrix of this motion is the sum of
+        J^T I J of all bodies, with J = J_j + J_b A. The result is the sum of the absolute values in each of its rows:
+        diagonal gains for these sums are at least as stiff as gains for the matrix (Gershgorin's theorem).
+        """
+        tree, joints = self.tree.held, np.asarray(qpos, np.float64)
+
+        def jacobians(link: str, point: Float64) -> tuple[Float64, Float64]:
+            """Return the Jacobians of a point of the world in a link (6, dof), and with respect to the base (6, 6)."""
+            x, y, z = point
+            crossed = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # -(p x)
+            of_base = np.block([[np.eye(3), crossed], [np.zeros((3, 3)), np.eye(3)]])
+            pose = ts.link_poses(tree, joints, (link,))[0]
+            local = matrix_of(pose[3:]).T @ (point - pose[:3])
+            return np.asarray(ts.jacobian(tree, joints, link, point=local)), of_base
+
+        feet = [jacobians(link, point) for link, point in self._contacts.feet(joints)]
+        follow = np.zeros((6, tree.dof))
+        if feet:
+            of_joints, of_base = (np.concatenate([each[:3] for each in part]) for part in zip(*feet, strict=True))
+            follow = -np.linalg.pinv(of_base, rcond=1e-3) @ of_joints
+        matrix = np.zeros((tree.dof, tree.dof))
+        for at, link in enumerate(tree.links):
+            pose = ts.link_poses(tree, joints, (link,))[0]
+            turn = matrix_of(pose[3:])
+            of_joints, of_base = jacobians(link, pose[:3] + turn @ tree.center[at])
+            moving = of_joints + of_base @ follow
+            linear, angular = moving[:3], moving[3:]
+            matrix += tree.mass[at] * linear.T @ linear + angular.T @ turn @ tree.inertia[at] @ turn.T @ angular
+        return np.abs(matrix).sum(1)
 
     @cached_property
     def _coupled(self) -> RigidTree:
@@ -91,19 +126,28 @@ class RobotModel:
 
 
 def passive_force(
-    tree: RigidTree, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool, turning: Any = None
+    tree: RigidTree, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool, base: Float64 | None = None
 ) -> Float64:
     """Return the gravity part of :func:`batchpid.task_space.bias` (n, dof), its velocity part, or both.
 
-    A floating base turns at ``turning`` (n, 3) [rad/s]; its gravity part is 0.
+    ``base`` (n, 6) are gravity and the rate at which the base turns, in its own axes, of one that floats, or with a
+    tree on a fixed base of one that is held where it is. The gravity part of a floating base is 0.
     """
-    zero = np.zeros_like(np.asarray(qpos, np.float64))
+    zero, turning, bodies = np.zeros_like(np.asarray(qpos, np.float64)), None, None
+    if base is not None:
+        turning = base[:, 3:]
+        bodies = tree.bodies._replace(gravity=base[:, None, :3])
     force = zero
     if coriolis or (gravity and tree.fixed_base):
-        force = ts.bias(tree, qpos, qvel if coriolis else zero, turning if coriolis else None)
+        force = ts.bias(tree, qpos, qvel if coriolis else zero, turning if coriolis else None, bodies=bodies)
     if coriolis and not gravity and tree.fixed_base:
-        force = force - ts.bias(tree, qpos, zero)
+        force = force - ts.bias(tree, qpos, zero, bodies=bodies)
     return np.asarray(force, np.float64)
+
+
+def turned_back(wxyz: Float64, vectors: Any) -> Float64:
+    """Return vectors of the world (..., 3) in the axes of bases with these quaternions (n, 4), as native code does."""
+    return np.asarray(rotate(np.swapaxes(matrix_of(wxyz), 1, 2), np.broadcast_to(vectors, (len(wxyz), 3))))
 
 
 @lru_cache(maxsize=16)

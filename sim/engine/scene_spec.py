@@ -28,8 +28,8 @@ class SceneSpec:
     collide; ``joints`` are the degrees of freedom, in the order of all arrays. ``physics`` are the solver
     settings of ``engine``, in the engine's type. With ``merge_fixed`` each rigid body is one link
     (:mod:`batchpid.sim.robot.merging`). Without ``collisions`` scenes have no collision shapes and no ground, but the
-    same masses and inertias. ``mjcf`` is the file that MuJoCo compiles in place of ``urdf``. Specs that differ in
-    ``build`` alone are equal.
+    same masses and inertias. ``mjcf`` is the file that MuJoCo compiles in place of ``urdf``. ``contacts`` and
+    ``wrenches`` are links with sensors. Specs that differ in ``build`` alone are equal.
     """
 
     urdf: str
@@ -45,6 +45,8 @@ class SceneSpec:
     build: Build | None = field(default=None, compare=False)
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     engine: str = "sapien"
+    contacts: tuple[str, ...] | None = None
+    wrenches: tuple[str, ...] | None = None
     mjcf: MjcfFile | None = None
 
     @property
@@ -69,6 +71,10 @@ class Variation(NamedTuple):
     """Viscous damping of the joints (envs, dof) [N m s/rad or N s/m]."""
     armature: Float64 | None = None
     """Reflected inertia of the motors (envs, dof) [kg m^2 or kg]."""
+    ground_friction: Float64 | None = None
+    """Coefficient of sliding friction of the ground and all shapes of the robot (envs,)."""
+    gravity: Float64 | None = None
+    """(envs, 3) [m/s^2]"""
 
 
 def varied_inertia(body: Body, variation: Variation, row: int) -> SpatialInertia:

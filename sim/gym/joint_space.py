@@ -14,6 +14,9 @@ Float64 = NDArray[np.float64]
 MAX_SPEED = 100.0
 """Joint speed that PhysX allows, and bound of the observed one [rad/s or m/s]."""
 
+FARTHEST = 1000.0
+"""Bound of the observed position of a base that floats [m]."""
+
 
 class JointSpace:
     """Independent joints of ``robot`` (:attr:`batchpid.sim.Robot.independent`), with a finite range each.
@@ -23,7 +26,7 @@ class JointSpace:
     """
 
     def __init__(self, robot: Robot) -> None:
-        self._dof = robot.dof
+        self._dof, self._floats = robot.dof, not robot.fixed_base
         self.index = np.flatnonzero(robot.independent)
         """Numbers of the joints in the robot (joints,)."""
         self.names = tuple(robot.joint_names[joint] for joint in self.index)
@@ -40,14 +43,20 @@ class JointSpace:
         """Upper ends of the ranges (joints,) [rad or m]."""
 
     def bounds(self) -> tuple[Float64, Float64]:
-        """Return bounds of what :meth:`observe` returns (2 joints,); positions may be pi beyond a limit."""
+        """Return bounds of what :meth:`observe` returns; positions may be pi beyond a limit."""
         beyond, speed = np.where(self.continuous, 0.0, np.pi), np.full(len(self.index), MAX_SPEED)
-        return np.concatenate([self.low - beyond, -speed]), np.concatenate([self.high + beyond, speed])
+        base = np.repeat([FARTHEST, 1.0, MAX_SPEED], [3, 4, 6]) if self._floats else np.zeros(0)
+        low, high = (self.low - beyond, -speed, -base), (self.high + beyond, speed, base)
+        return np.concatenate(low), np.concatenate(high)
 
     def observe(self, observed: Observation) -> Float64:
-        """Return positions and velocities (envs, 2 joints); positions of continuous joints are in [-pi, pi]."""
+        """Return positions and velocities (envs, 2 joints), then pose and twist (envs, 13) of a base that floats.
+
+        Positions of continuous joints are in [-pi, pi].
+        """
         qpos = wrap(observed.qpos[:, self.index].astype(np.float64), self.turns, np)
-        return np.concatenate([qpos, observed.qvel[:, self.index]], axis=1)
+        base = [] if observed.base_pose is None else [observed.base_pose, observed.base_twist]
+        return np.concatenate([qpos, observed.qvel[:, self.index], *base], axis=1)
 
     def of_robot(self, positions: Float64) -> Float64:
         """Return positions (..., joints) for all joints of the robot (..., dof); followers have 0."""

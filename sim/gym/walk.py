@@ -105,8 +105,7 @@ class WalkVectorEnv(RobotVectorEnv):
         self._command[env] = random.uniform(*self.commands)
         self._clock[env] = random.uniform()
         self.action[env] = 0.0
-        start = self.posture + random.uniform(-0.1, 0.1, self.robot.dof)
-        return np.clip(start, self.robot.lower, self.robot.upper)
+        return np.clip(self.posture + random.uniform(-0.1, 0.1, self.robot.dof), self.robot.lower, self.robot.upper)
 
     def command(self, action: Float64, setpoint: Float64) -> Float64:
         """Return the setpoints of the gait, with the actions added."""

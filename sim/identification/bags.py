@@ -7,6 +7,7 @@ measurements count as measured; the positions of the topic of the commands are s
 from __future__ import annotations
 
 from collections import defaultdict
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,7 @@ def _columns(source: str, messages: list[Any], names: dict[str, str], begin: int
     if not groups:
         raise error(source, "has no messages", "choose another topic")
     joints, rows = max(groups.items(), key=lambda group: len(group[1]))
+    rows.sort(key=itemgetter(0))  # a bag has them as they arrived
     columns = {"time": np.array([stamp - begin for stamp, _ in rows]) / 1e9}
     for field, quantity in names.items():
         values = [getattr(message, field) for _, message in rows]

@@ -5,15 +5,15 @@ Behind the motor m is what the motor delivers; behind the gear it lacks what the
     m = s e + b,     m = s e + b - A q'' - B q' - F sgn(q')     (sensor at the link)
     e_k = e_{k-1} + (1 - exp(-dt / T)) (u(t_k - d) - e_{k-1})
 
-The delay d, common to all joints, and the lags T are found on a grid and refined by Gauss-Newton steps; the others are
-linear. A lag is accepted where it lowers the error on the last quarter of the logs.
+The delay d, common to all joints, and the lags T are found on a grid, where the others are linear; then all are refined
+by least squares. Lags are accepted if they lower the error on the held-out rows.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,77 +23,57 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.inputs import Inputs, read_inputs
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.regression import CUTOFF, DELAYS, EDGE, smooth
+from batchpid.sim.identification.result import actuators_at
 from batchpid.sim.identification.statistics import INTERVAL, LEAST_DEVIATION, PARTS, variance_between
-from batchpid.sim.identification.unknowns import KINDS, Motors, kind_of
+from batchpid.sim.identification.unknowns import KINDS, Motors, Unknowns
 from batchpid.sim.identification.windows import share_fitted
 from batchpid.sim.robot.robot import Robot
 
 LAGS = np.r_[0.0, np.geomspace(5e-4, 0.1, 12)]
 """Lags that are tried [s]."""
-STEPS, STEP = 8, 1e-4
-"""Gauss-Newton steps, and change of a time for a finite difference [s]."""
 GAIN = 0.99
-"""Largest error with a lag that is accepted, over the error without."""
+"""Largest error with lags that are accepted, over the error without."""
 OF_MOTOR, OF_LINK = ("strength", "bias"), ("strength", "bias", "armature", "damping", "friction")
 
 
 class EffortRatios(NamedTuple):
-    """Values that measured efforts show."""
+    """Motors that measured efforts show."""
 
-    robot: Robot
     joints: tuple[int, ...]
     names: tuple[tuple[str, int | None], ...]
     """Kind and joint of each value."""
     estimate: Float64
+    """Values (values,)."""
     deviation: Float64
-    """Standard deviations (values,)."""
+    """Standard deviations (values,): the scatter of estimates from parts of the logs."""
     error: Float64
-    """Root mean squares of the error on the last quarter of the logs, over those of the efforts (joints,)."""
+    """Root mean squares of the error on the held-out rows, over those of the efforts (joints,)."""
 
-    def values(self, *kinds: str) -> Motors:
+    def values(self, kinds: Iterable[str]) -> Motors:
         """Return the values of ``kinds``, (1, joints) or (1, 1), of those that were found."""
-        return {
-            kind: np.array([[self.estimate[at] for at, name in enumerate(self.names) if name[0] == kind]])
-            for kind in kinds
-            if kind in dict(self.names)
-        }
+        own = {kind: [at for at, name in enumerate(self.names) if name[0] == kind] for kind in kinds}
+        return {kind: self.estimate[None, places] for kind, places in own.items() if places}
 
-    def row(self, index: int) -> tuple[float, float, float]:
-        """Return estimate, lower and upper end of the 95 % interval of a value."""
-        value, half = float(self.estimate[index]), INTERVAL * float(self.deviation[index])
-        kind = kind_of(self.names[index][0])
-        return value, max(value - half, kind.low), min(value + half, kind.high)
+    def document(self, robot: Robot) -> dict[str, dict[str, list[float]]]:
+        """Return estimate, lower and upper end of the 95 % interval by joint and kind; the delay is of "all joints"."""
+        found: dict[str, dict[str, list[float]]] = {}
+        for (kind, joint), value, half in zip(self.names, self.estimate, INTERVAL * self.deviation, strict=True):
+            place = found.setdefault("all joints" if joint is None else robot.joint_names[self.joints[joint]], {})
+            place[kind] = [float(value), float(value - half), float(value + half)]
+        return found
 
-    def actuators(self) -> bp.Actuators:
-        """Return the actuators of the robot; other joints are ideal."""
-        options = dict[str, Any]()
-        for kind, values in self.values(*dict(self.names)).items():
-            field = str(kind_of(kind).field)
-            options[field] = np.full(self.robot.dof, kind_of(kind).neutral)
-            options[field][list(self.joints) if kind_of(kind).per_joint else slice(None)] = values[0]
-        return bp.make_actuators(self.robot.dof, **options, joint_names=self.robot.joint_names)
-
-    def document(self) -> dict[str, Any]:
-        """Return the values with their 95 % intervals, by joint and kind."""
-        joints: dict[str, Any] = {self.robot.joint_names[joint]: {} for joint in self.joints}
-        common = dict[str, Any]()
-        for index, (kind, joint) in enumerate(self.names):
-            place = common if joint is None else joints[self.robot.joint_names[self.joints[joint]]]
-            place[kind] = list(self.row(index))
-        return {"joints": joints, **common, "effort_error": self.error.tolist()}
-
-    def save(self, path: str | os.PathLike[str], logs: list[str]) -> None:
-        """Write the actuators, with their intervals and the names of the logs, to a .yaml or .json file."""
-        about = {"identified_from": logs, "intervals": self.document(), "method": "measured over commanded efforts"}
-        bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
+    def save(self, path: str | os.PathLike[str], robot: Robot) -> None:
+        """Write the actuators of ``robot``, with their intervals, to a .yaml or .json file; the others are ideal."""
+        nothing = np.zeros(len(self.names))
+        motors = actuators_at(
+            robot, self.joints, Unknowns(len(self.joints), self.names, nothing, nothing), self.estimate
+        )
+        about = {"intervals": self.document(robot), "effort_error": self.error.tolist()}
+        bp.save_actuators(path, motors, robot.joint_names, about)
 
 
 def measured_motors(
-    robot: Robot,
-    logs: Iterable[str | os.PathLike[str] | Log],
-    *,
-    timestep: float | None = None,
-    hold: bool = False,
+    robot: Robot, logs: Iterable[str | os.PathLike[str] | Log], *, timestep: float | None = None, hold: bool = False
 ) -> EffortRatios:
     """Return the motors that efforts show which are both commanded and measured; the robot may be in contact.
 
@@ -109,44 +89,35 @@ def effort_ratios(inputs: Inputs) -> EffortRatios:
         remedy = "add columns effort:JOINT and measured_effort:JOINT"
         raise InvalidArgumentError("logs", "lack efforts that are both commanded and measured", remedy=remedy)
     tables = _Tables(inputs)
-    without, with_lag = tables.solve(lag=False), tables.solve(lag=True)
-    best = with_lag if with_lag.error.mean() < GAIN * without.error.mean() else without
-    return EffortRatios(inputs.robot, inputs.joints, *best)
-
-
-class _Solution(NamedTuple):
-    names: tuple[tuple[str, int | None], ...]
-    estimate: Float64
-    deviation: Float64
-    error: Float64
+    without, with_lags = (tables.solve(lags) for lags in (LAGS[:1], LAGS))
+    return with_lags if with_lags.error.mean() < GAIN * without.error.mean() else without
 
 
 class _Tables:
     """Commands on the grid of the sim steps, and measured efforts and motions at the rows of all logs."""
 
     def __init__(self, inputs: Inputs) -> None:
-        self._dt, self._joints = inputs.drive.timestep, len(inputs.joints)
+        self._dt, self._joints = inputs.drive.timestep, inputs.joints
         self._links = inputs.logs[0].sensor == "link"
         self._commands, self._index, rows = list[Float64](), [], []
         for log in inputs.logs:
             motion = smooth(log, self._dt)
             grid = log.time[0] + self._dt * np.arange(len(motion.qpos))
-            kept = (log.time > log.time[0] + EDGE) & (log.time < log.time[-1] - EDGE)
-            step = np.ceil((log.time[kept] - log.time[0]) / self._dt - 1e-6).astype(int) - 1
+            time = log.time[(log.time > log.time[0] + EDGE) & (log.time < log.time[-1] - EDGE)]
             self._commands.append(self._filtered(log.commands_at(grid)))
-            self._index.append(np.clip(step, 0, len(grid) - 1))
+            # A row holds the effort of the step that ends there.
+            self._index.append(np.ceil((time - log.time[0]) / self._dt - 1e-6).astype(int) - 1)
             assert log.measured is not None
-            measured = self._filtered(np.stack([np.interp(grid, log.time, m) for m in log.measured.T], 1))
-            at = self._index[-1] + 1 if self._links else None
-            table = log.measured[kept] if at is None else measured[np.minimum(at, len(grid) - 1)]
-            speed = 0.01 * np.abs(motion.qvel).max(0) + 1e-9
-            sign = self._filtered(np.clip(motion.qvel / speed, -1, 1))
-            own = (motion.qacc, motion.qvel, sign) if self._links else ()
-            held = log.time[kept] > log.time[0] + share_fitted(log) * log.seconds
-            rows.append((table, held[:, None], *(-each[self._index[-1]] for each in own)))
-        self._measured, self._held_out, *self._motion = (np.concatenate(each) for each in zip(*rows, strict=True))
+            measured = np.stack([np.interp(grid, log.time, column) for column in log.measured.T], axis=1)
+            sign = self._filtered(np.clip(motion.qvel / (0.01 * np.abs(motion.qvel).max(0) + 1e-9), -1, 1))
+            own = [-motion.qacc, -motion.qvel, -sign] if self._links else []
+            fitted = time <= log.time[0] + share_fitted(log) * log.seconds
+            tables = [each[self._index[-1] + 1] for each in (self._filtered(measured), *own)]
+            rows.append([fitted, *tables])
+        self._fitted, self._measured, *self._motion = (np.concatenate(each) for each in zip(*rows, strict=True))
 
     def _filtered(self, table: Float64) -> Float64:
+        """Return ``table`` with the filter of the motion, which only a sensor at the link needs."""
         from scipy.signal import butter, sosfiltfilt
 
         return sosfiltfilt(butter(4, CUTOFF, fs=1 / self._dt, output="sos"), table, axis=0) if self._links else table
@@ -160,61 +131,59 @@ class _Tables:
             step = np.arange(len(command))
             late = np.interp(step - delay / self._dt, step, command[:, joint])
             if lag > 0:
-                a = 1 - np.exp(-self._dt / lag)
-                late = lfilter([a], [1, a - 1], late, zi=[(1 - a) * late[0]])[0]
+                keep = np.exp(-self._dt / lag)
+                late = lfilter([1 - keep], [1, -keep], late, zi=[keep * late[0]])[0]
             parts.append(late[index])
         effort = np.concatenate(parts)
         return np.stack([effort, np.ones_like(effort), *(each[:, joint] for each in self._motion)], axis=1)
 
-    def _residual(self, delay: float, lag: float, joint: int) -> tuple[Float64, Float64, Float64]:
-        """Return columns, linear unknowns and residual of a joint."""
-        fitted, columns = ~self._held_out[:, 0], self._columns(delay, lag, joint)
-        found = np.linalg.lstsq(columns[fitted], self._measured[fitted, joint], rcond=None)[0]
-        return columns, found, self._measured[:, joint] - columns @ found
+    def _linear(self, delay: float, lag: float, joint: int) -> tuple[float, Float64]:
+        """Return the logarithm of the fitted rows' mean square, and the linear unknowns of a joint."""
+        columns, wanted = self._columns(delay, lag, joint)[self._fitted], self._measured[self._fitted, joint]
+        found = np.linalg.lstsq(columns, wanted, rcond=None)[0]
+        return float(np.log(((wanted - columns @ found) ** 2).mean() + 1e-30)), found
 
-    def solve(self, lag: bool) -> _Solution:
-        """Return the solution with lags or without."""
-        fitted, joints = ~self._held_out[:, 0], range(self._joints)
+    def solve(self, lags: Float64) -> EffortRatios:
+        """Return the solution with ``lags`` to try."""
+        from scipy.optimize import least_squares
 
-        def size(delay: float, lag: float, joint: int) -> float:
-            return float(np.log((self._residual(delay, lag, joint)[2][fitted] ** 2).mean() + 1e-30))
+        joints, kinds = range(len(self._joints)), (*(OF_LINK if self._links else OF_MOTOR), "lag")
+        grid = np.array([[[self._linear(d, lag, j)[0] for lag in lags] for j in joints] for d in DELAYS[::2]])
+        first = int(grid.min(2).sum(1).argmin())
+        delay, at = DELAYS[::2][first], lags[grid[first].argmin(1)]
+        start = [np.r_[self._linear(delay, at[j], j)[1], at[j]] for j in joints]
+        names = [("delay", None), *((kind, joint) for joint in joints for kind in kinds)]
+        free = np.array([len(lags) > 1 or kind != "lag" for kind, _ in names])
+        x = np.r_[delay, np.concatenate(start)]
+        sizes = np.exp(0.5 * grid[first].min(1))
 
-        lags = LAGS if lag else LAGS[:1]
-        costs = np.array([[[size(d, each, joint) for each in lags] for joint in joints] for d in DELAYS[::2]])
-        first = int(costs.min(2).sum(1).argmin())
-        times = np.r_[DELAYS[::2][first], lags[costs[first].argmin(1)]]
-        kinds = OF_LINK if self._links else OF_MOTOR
-        names = [("delay", None), *((kind, joint) for joint in joints for kind in ((*kinds, "lag") if lag else kinds))]
-        for _ in range(STEPS):
-            jacobian, residual, found = self._linear(times, lag)
-            change = np.linalg.lstsq(
-                jacobian[:, fitted].reshape(-1, len(names)), residual[:, fitted].ravel(), rcond=None
-            )[0]
-            shift = np.r_[change[0], change[1 + len(kinds) :: len(kinds) + 1] if lag else np.zeros(self._joints)]
-            times = np.clip(times + shift, 0.0, [KINDS["delay"].high, *[LAGS[-1]] * self._joints])
-        jacobian, residual, found = self._linear(times, lag)
-        estimate = np.r_[times[0], (np.column_stack([found, times[1:]]) if lag else found).ravel()]
-        tables = [jacobian[:, rows].reshape(-1, len(names)) for rows in np.array_split(np.flatnonzero(fitted), PARTS)]
-        pulls = [residual[:, rows].ravel() for rows in np.array_split(np.flatnonzero(fitted), PARTS)]
-        parts = [(table.T @ table, table.T @ pull) for table, pull in zip(tables, pulls, strict=True)]
-        deviation = np.hypot(np.sqrt(variance_between(parts, np.full(len(names), 1e-9))), LEAST_DEVIATION * estimate)
-        scale = np.sqrt((self._measured[~fitted] ** 2).mean(0))
-        error = np.array([self._residual(times[0], times[1 + j], j)[2] for j in joints])[:, ~fitted]
-        return _Solution(tuple(names), estimate, deviation, np.sqrt((error**2).mean(1)) / scale)
+        def errors(unknown: Float64) -> Float64:
+            values = x.copy()
+            values[free] = unknown
+            table = values[1:].reshape(len(joints), -1)
+            modelled = [self._columns(values[0], own[-1], j) @ own[:-1] for j, own in zip(joints, table, strict=True)]
+            return (np.stack(modelled, axis=1) - self._measured) / sizes
 
-    def _linear(self, times: Float64, lag: bool) -> tuple[Float64, Float64, Float64]:
-        """Return Jacobian (joints, rows, values), residuals (joints, rows), over their sizes, and linear unknowns."""
-        fitted, blocks, residuals, linear = ~self._held_out[:, 0], [], [], []
-        for joint in range(self._joints):
-            columns, found, residual = self._residual(times[0], times[1 + joint], joint)
-            size = np.sqrt((residual[fitted] ** 2).mean()) + 1e-12
-            later = self._columns(times[0] + STEP, times[1 + joint], joint) @ found
-            slower = self._columns(times[0], times[1 + joint] + STEP, joint) @ found
-            own = [*columns.T, *([(slower - columns @ found) / STEP] if lag else [])]
-            table = np.zeros((len(residual), 1 + len(own) * self._joints))
-            table[:, 0] = (later - columns @ found) / STEP
-            table[:, 1 + joint * len(own) : 1 + (joint + 1) * len(own)] = np.stack(own, axis=1)
-            blocks.append(table / size)
-            residuals.append(residual / size)
-            linear.append(found)
-        return np.array(blocks), np.array(residuals), np.array(linear)
+        times = np.array([kind in ("delay", "lag") for kind, _ in names])[free]
+        low, high = np.where(times, 0.0, -np.inf), np.where(times, KINDS["delay"].high, np.inf)
+        scale = np.where(times, 1e-3, np.maximum(np.abs(x[free]), 1e-3))
+
+        def residuals(unknown: Float64) -> Float64:
+            return errors(unknown)[self._fitted].ravel()
+
+        def jacobian(unknown: Float64) -> Float64:
+            steps, begin = 0.1 * scale, residuals(unknown)
+            return np.stack([(residuals(unknown + h) - begin) / h.sum() for h in np.diag(steps)], axis=1)
+
+        begin = np.clip(x[free], low, high)
+        found = least_squares(residuals, begin, jacobian, (low, high), x_scale=scale, max_nfev=20)
+        error = errors(found.x)
+        parts = []
+        for rows in np.array_split(np.arange(len(found.fun)), PARTS):
+            slopes = found.jac[rows]
+            parts.append((slopes.T @ slopes, -slopes.T @ found.fun[rows]))
+        deviation = np.sqrt(variance_between(parts, np.full(free.sum(), 1e-9)))
+        share = np.sqrt((error[~self._fitted] ** 2).mean(0) / (self._measured[~self._fitted] ** 2).mean(0)) * sizes
+        chosen = tuple(name for name, own in zip(names, free, strict=True) if own)
+        deviation = np.hypot(deviation, LEAST_DEVIATION * np.abs(found.x))
+        return EffortRatios(self._joints, chosen, found.x, deviation, share)

@@ -21,6 +21,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.motors.actuator_files import dumps_actuators, loads_actuators
 from batchpid.native.availability import obstacle
+from batchpid.sim.identification.diagnosis import diagnose
 from batchpid.sim.identification.effort_ratios import EffortRatios, effort_ratios
 from batchpid.sim.identification.fit import Solution, Step
 from batchpid.sim.identification.fit_history import History, State
@@ -63,7 +64,8 @@ def identify(
     Parameters
     ----------
     logs
-        Files (:mod:`batchpid.sim.identification.logs`), or logs that were read.
+        Files (:mod:`batchpid.sim.identification.logs`), lists of logs with settings of their own
+        (:mod:`batchpid.sim.identification.runs`), or logs that were read.
     params
         Params of the PID law that drove the robot, of all its joints or of those in the logs: the setpoints of the logs
         are used. None: the efforts.
@@ -78,7 +80,8 @@ def identify(
         control, as a real robot under control at 500 Hz or less. Otherwise half the difference of the steps counts as
         delay.
     payload
-        Find a payload at the tool, too.
+        Find a payload at the tool, too. Efforts that were measured then count as exact; otherwise their scale is found
+        as strength.
     hold
         Commands hold from row to row of a file: :func:`batchpid.sim.identification.logs.read_logs`.
     extras
@@ -191,6 +194,9 @@ def identify(
     )
     errors_of_fit = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
     noise = np.sqrt((errors_of_fit**2).mean(0))
+    if problem.drive.compensation != drive.compensation:
+        regression = Regression(plants_of(resting, joints, problem.drive, fitted), fitted, fitted_motions, payload)
+    diagnosis = diagnose(regression, fitted, [robot.joint_names[joint] for joint in joints])
     estimate = best.theta
     if ratios is not None:
         own = [at for at, (kind, _) in enumerate(ratios.names) if kind in unknowns.known]
@@ -209,6 +215,7 @@ def identify(
         problem.drive,
         settings,
         fits,
+        diagnosis,
     )
 
 
@@ -219,7 +226,7 @@ def _known(log: Log, payload: bool, ratios: EffortRatios | None) -> Motors:
     Behind the gear they are free of the motor's inertia and friction.
     """
     if ratios is not None:
-        return ratios.values("strength", "delay", "lag")
+        return ratios.values(("strength", "delay", "lag"))
     if not log.is_measured:
         return {}
     of_motor = ("armature", "damping", "friction") if log.sensor == "link" else ()

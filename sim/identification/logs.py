@@ -23,9 +23,8 @@ each env is a log.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,9 +35,9 @@ from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification import bags, runs
 from batchpid.sim.identification.columns import QUANTITIES, Reading, error, read_csv, read_hdf5_columns, time_column
-from batchpid.sim.identification.gaps import MIN_ROWS, MIN_SECONDS, commands_of, divided
-from batchpid.sim.identification.log import CommandKind, Log, LogWarning
-from batchpid.sim.identification.turns import unwrapped
+from batchpid.sim.identification.gaps import commands_of
+from batchpid.sim.identification.log import CommandKind, Log, LogWarning, Sensor
+from batchpid.sim.identification.log_checks import SPEEDING, at_limits, checked, too_fast
 from batchpid.sim.observation import Rollout
 from batchpid.sim.recording.recording_files import HDF5, read_recording
 from batchpid.sim.robot.robot import Robot
@@ -46,12 +45,6 @@ from batchpid.sim.robot.robot import Robot
 __all__ = ["CommandKind", "Log", "LogWarning", "at_limits", "checked", "logs_of_rollout", "read_logs"]
 
 SUFFIXES = (".csv", ".txt", ".npz", *HDF5, *bags.SUFFIXES)
-AT_LIMIT = 1e-3
-"""Distance to a joint limit at which a joint counts as stopped by it, over its range."""
-SPEEDING = 4.0
-"""Speed of nearly all rows, over the joint's velocity limit, from which positions may be in degrees."""
-BEYOND = {"rad": 0.3, "m": 0.05}
-"""Distance beyond a joint limit at which a position counts as given in another unit."""
 
 
 def read_logs(
@@ -192,32 +185,11 @@ def _build(
     time = time_column(source, columns, reading.time_unit)
     command_time = time if commands is None else commands["time"]
     by = _by_quantity(robot, source, columns if commands is None else columns | commands, reading)
-    sensor = reading.measured if by["effort"] or by["measured_effort"] else None
-    if by["measured_effort"]:
-        sensor = sensor or "motor"
-    elif sensor is not None:
-        by["measured_effort"], by["effort"] = by["effort"], {}
     if not by["qpos"]:
         raise error(
             source, "has no column qpos:JOINT", "measured positions are needed, e.g. qpos:" + robot.joint_names[0]
         )
-    measured_alone = kind != "setpoint" and not by["effort"] and by["measured_effort"] and (kind or not by["setpoint"])
-    if measured_alone:
-        by["effort"], by["measured_effort"] = by["measured_effort"], {}
-    kinds: list[CommandKind] = [each for each in ("effort", "setpoint") if by[each]]
-    if not kinds or (kind is not None and kind not in kinds):
-        wanted = kind or "setpoint"
-        raise error(
-            source, f"has no column {wanted}:JOINT", f"commands are needed, e.g. {wanted}:{robot.joint_names[0]}"
-        )
-    found = kind or kinds[0]
-    if found == "setpoint" and by["measured_effort"]:
-        message = f"{source}: measured efforts are not used with setpoints; without gains they are"
-        warn(message, LogWarning)
-        by["measured_effort"], sensor = {}, None
-    if found == "effort" and by["feedforward"]:
-        remedy = "give the gains of the law that it was added to, or leave the column out"
-        raise error(source, "has a feedforward, which efforts include", remedy)
+    found, sensor = _choose(robot, source, by, kind, reading)
     needed = [found, *(q for q in ("feedforward", "measured_effort") if by[q])]
     for joint in {name for q in needed for name in by[q].keys() ^ by["qpos"].keys()}:
         lacking = next(q for q in ("qpos", *needed) if joint not in by[q])
@@ -246,10 +218,41 @@ def _build(
         lines = None if lines is None else [lines[row] for row in rows]
         log = log.part(rows, commands_of(time[rows], command_time))
     parts = checked(robot, log, lines)
-    if fast := _in_degrees(robot, parts):
+    if fast := too_fast(robot, parts):
         message = f"{source}: {fast} moves {SPEEDING:g} times as fast as its limit of velocity or more"
         warn(f"{message}: positions look like degrees (option degrees)", LogWarning)
     return parts
+
+
+def _choose(
+    robot: Robot, source: str, by: dict[str, dict[str, Float64]], kind: CommandKind | None, reading: Reading
+) -> tuple[CommandKind, Sensor | None]:
+    """Return the kind of command, and where efforts were measured; leave in ``by`` the columns that are used.
+
+    Measured efforts take the place of commanded ones where a file has no commands.
+    """
+    sensor = reading.measured if by["effort"] else None
+    if by["measured_effort"]:
+        sensor = reading.measured or "motor"
+    elif sensor is not None:
+        by["measured_effort"], by["effort"] = by["effort"], {}
+    if kind != "setpoint" and not by["effort"] and (kind == "effort" or not by["setpoint"]):
+        by["effort"], by["measured_effort"] = by["measured_effort"], {}
+    kinds: list[CommandKind] = [each for each in ("effort", "setpoint") if by[each]]
+    if not kinds or (kind is not None and kind not in kinds):
+        wanted = kind or "setpoint"
+        raise error(
+            source, f"has no column {wanted}:JOINT", f"commands are needed, e.g. {wanted}:{robot.joint_names[0]}"
+        )
+    found = kind or kinds[0]
+    if found == "setpoint" and by["measured_effort"]:
+        message = f"{source}: measured efforts are not used with setpoints; without gains they are"
+        warn(message, LogWarning)
+        by["measured_effort"], sensor = {}, None
+    if found == "effort" and by["feedforward"]:
+        remedy = "give the gains of the law that it was added to, or leave the column out"
+        raise error(source, "has a feedforward, which efforts include", remedy)
+    return found, sensor if found == "effort" else None
 
 
 def _by_quantity(
@@ -271,89 +274,3 @@ def _by_quantity(
             factor *= (reading.scale or {}).get(joint, 1.0)
         by[quantity][joint] = factor * (np.radians(values) if reading.degrees and angle else values)
     return by
-
-
-def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[Log]:
-    """Return the stretches of ``log``, if its times increase and its values are finite and in SI units.
-
-    ``lines`` are the numbers of its rows in a file.
-    """
-
-    def row(index: int) -> str:
-        return f"row {index + 1}" if lines is None else f"line {lines[index]}"
-
-    names = [robot.joint_names[joint] for joint in log.joints]
-    tables = (("qpos", log.qpos), (log.kind, log.command), ("qvel", log.qvel))
-    for quantity, table in (*tables, ("feedforward", log.feedforward), ("measured_effort", log.measured)):
-        if table is not None and not np.isfinite(table).all():
-            index, joint = (int(n) for n in np.argwhere(~np.isfinite(table))[0])
-            remedy = "remove the row, or give the number"
-            raise error(log.source, f"{row(index)}, column '{quantity}:{names[joint]}' is empty or not finite", remedy)
-    if not np.isfinite(log.time).all():
-        index = int(np.argmin(np.isfinite(log.time)))
-        raise error(log.source, f"{row(index)}, column 'time' is empty or not finite", "remove the row")
-    if (log.time[1:] <= log.time[:-1]).any():
-        index = int(np.argmax(log.time[1:] <= log.time[:-1])) + 1
-        raise error(log.source, f"{row(index)}: time does not increase", "sort the rows, and give each time once")
-    if len(log.time) < MIN_ROWS or log.seconds < MIN_SECONDS:
-        problem = f"has {len(log.time)} rows of {log.seconds:.3g} s"
-        raise error(log.source, problem, f"record {MIN_ROWS} rows and {MIN_SECONDS} s at least; time is in seconds")
-    with np.errstate(over="ignore"):
-        period = float(np.median(np.diff(log.time)))
-    if period > 0.05:
-        remedy = "record at 100 Hz or more; time is in seconds"
-        raise error(log.source, f"has one row per {period:.3g} s, too few to see friction and delay", remedy)
-    reach = np.array([BEYOND[robot.units[joint]] for joint in log.joints])
-    free = robot.continuous[list(log.joints)]
-    low, high = (limit[list(log.joints)] for limit in (robot.lower, robot.upper))
-    beyond = ((log.qpos < low - reach) | (log.qpos > high + reach)) & ~free
-    if beyond.any():
-        index, joint = (int(n) for n in np.argwhere(beyond)[0])
-        problem = f"{row(index)}, column 'qpos:{names[joint]}' is far beyond the joint's limits"
-        unit = robot.units[log.joints[joint]]
-        remedy = f"positions are in {unit}, or degrees as an option; the limits are {low[joint]:g} to {high[joint]:g}"
-        if np.isclose(high[joint] - low[joint], 2 * np.pi, rtol=0.01):
-            remedy += "; a joint that turns freely is of type continuous"
-        raise error(log.source, problem, remedy, float(log.qpos[index, joint]))
-    parts, wrapped = [], dict[str, None]()
-    for part in divided(log, row):
-        first = int(np.searchsorted(log.time, part.time[0]))
-        whole, found = unwrapped(robot, part, partial(_row_from, row, first))
-        parts.append(whole)
-        wrapped |= dict.fromkeys(found)
-    if stopped := [name for name in wrapped if not robot.continuous[robot.joint_names.index(name)]]:
-        problem = f"{log.source}: the positions of {', '.join(stopped)} jump by whole turns, and were unwrapped"
-        warn(f"{problem}; in the robot's file the type is not continuous: correct it", LogWarning)
-    return parts
-
-
-def _in_degrees(robot: Robot, logs: list[Log]) -> str:
-    """Return the names of the joints that move too fast for positions in rad, without rare jumps."""
-    rates = [np.abs(np.diff(log.qpos, axis=0)) / np.diff(log.time)[:, None] for log in logs]
-    speeds, own = np.concatenate(rates), list(logs[0].joints)
-    typical = np.sqrt((np.minimum(speeds, np.quantile(speeds, 0.95, axis=0)) ** 2).mean(0))
-    limit = robot.velocity_limit[own]
-    fast = (limit > 0) & (typical > SPEEDING * limit) & (np.array(robot.units)[own] == "rad")
-    return ", ".join(robot.joint_names[joint] for joint, each in zip(own, fast, strict=True) if each)
-
-
-def _row_from(row: Callable[[int], str], first: int, index: int) -> str:
-    """Return the name of the row ``index`` of a part that begins at the row ``first``."""
-    return row(first + index)
-
-
-def at_limits(robot: Robot, log: Log) -> list[str]:
-    """Return a line for each joint that ``log`` shows at a limit, where a stop acts and not the motor alone."""
-    lines = []
-    for column, joint in zip(log.qpos.T, log.joints, strict=True):
-        low, high = robot.lower[joint], robot.upper[joint]
-        if robot.continuous[joint] or not np.isfinite(high - low):
-            continue
-        if (column < low - BEYOND["rad"]).any() or (column > high + BEYOND["rad"]).any():
-            continue  # unwrapped: it turns freely
-        touching = (column < low + AT_LIMIT * (high - low)) | (column > high - AT_LIMIT * (high - low))
-        if touching.any():
-            limits = f"limits {low:g} to {high:g} {robot.units[joint]}"
-            place = f"{log.source}: joint {robot.joint_names[joint]!r} is at its limit"
-            lines.append(f"{place} in {touching.mean():.2g} of the rows ({limits})")
-    return lines

@@ -23,6 +23,7 @@ followers move with their leaders.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -107,6 +108,17 @@ class Plant:
     def mass_matrix(self, qpos: Float64, payload: Float64) -> Float64:
         """Return the mass matrices (n, joints, joints) of the logged joints at ``qpos`` (n, joints)."""
         return self.at(qpos, np.zeros_like(qpos), payload).matrix
+
+    @property
+    def tree(self) -> RigidTree:
+        """Rigid tree of the logged joints, with a link without mass for the payload."""
+        return self._tree
+
+    def with_tree(self, tree: RigidTree) -> Plant:
+        """Return this plant with other masses, those of ``tree``."""
+        other = copy(self)
+        other._tree = tree
+        return other
 
     def passive(self, qpos: Float64, qvel: Float64, payload: Float64) -> Float64:
         """Return gravity and Coriolis forces (n, joints) [N m or N]."""

@@ -119,9 +119,11 @@ class Regression:
         sections = butter(4, min(CUTOFF, 0.2 / period), fs=1 / dt, output="sos")
         blocks: list[tuple[Float64, ...]] = []
         late: list[Float64] = []
+        self.plants, self.motions, self.rows = plants, motions, list[Any]()
         for plant, log, motion in zip(plants, logs, motions, strict=True):
             edge = min(round(EDGE / dt), len(motion.qpos) // 5)
             rows = np.arange(edge, len(motion.qpos) - edge, max(1, round(_EVERY / dt)))
+            self.rows.append(rows)
             v, a = motion.qvel[rows], motion.qacc[rows]
             known = log.settings.payload
             empty, loaded = (_required(plant, motion, rows, known + kg) for kg in (0.0, 1.0 if payload else 0.0))
@@ -156,11 +158,8 @@ class Regression:
 
         ``strength_prior`` is the weight of the prior at strength 1, of all joints or of each (joints,).
         """
-        empty, per_kg, a, v, sign = self._columns
-        place = np.clip(delay / DELAY_STEP, 0.0, len(self._efforts) - 1.001)
-        below, share = int(place), place % 1.0
-        effort = (1 - share) * self._efforts[below] + share * self._efforts[below + 1]
-        tables = empty + kg * per_kg, a, v, sign, effort
+        tables = self.tables(delay, kg)
+        empty = tables[0]
         priors = np.broadcast_to(strength_prior, empty.shape[1])
         both = []
         for joint, rows in enumerate(self._moves.T):
@@ -170,6 +169,14 @@ class Regression:
         cost = float(sum(np.log(mean + 1e-30) for mean, _ in both))
         values = [*np.array([found for _, found in both]).T[:, None], *np.array([delay, kg])[:, None, None]]
         return Start(dict(zip(FOUND, values, strict=True)), cost)
+
+    def tables(self, delay: float, kg: float) -> tuple[Float64, ...]:
+        """Return required efforts, acceleration, velocity, its sign, and the efforts so far, all (rows, joints)."""
+        empty, per_kg, a, v, sign = self._columns
+        place = np.clip(delay / DELAY_STEP, 0.0, len(self._efforts) - 1.001)
+        below, share = int(place), place % 1.0
+        effort = (1 - share) * self._efforts[below] + share * self._efforts[below + 1]
+        return empty + kg * per_kg, a, v, sign, effort
 
     @cached_property
     def best(self) -> Start:

@@ -12,11 +12,14 @@ import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, integer
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.identification.confidence_region import KEY, Region
+from batchpid.sim.identification.diagnosis import Diagnosis
 from batchpid.sim.identification.held_out import ASSUMED
 from batchpid.sim.identification.logged_control import Drive
 from batchpid.sim.identification.statistics import INTERVAL, Uncertainty
 from batchpid.sim.identification.unknowns import ADDED, DESCRIBED, KINDS, Unknowns, kind_of
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.urdf_export import to_urdf
 
 SHORT = 30.0
 """Length of a log [s] below which intervals hold for its motion only."""
@@ -60,6 +63,8 @@ class Identification(NamedTuple):
     """Logs, options and versions, for the record."""
     fits: tuple[Fit, ...]
     """Errors along each stretch of the logs that was simulated."""
+    diagnosis: Diagnosis
+    """Links whose masses seem off, and the stretch of the logs that disagrees most."""
 
     def interval(self, kind: str, joint: int | None = None) -> tuple[float, float, float] | None:
         """Return estimate, lower and upper end of the 95 % interval; None if the logs do not identify the unknown.
@@ -126,6 +131,7 @@ class Identification(NamedTuple):
             | ({"slew": dict(zip(names, motors["slew"][0].tolist(), strict=True))} if "slew" in motors else {}),
             "intervals": document["joints"]
             | {kind: document[kind] for kind, joint in self.unknowns.names if joint is None and kind in document},
+            KEY: self.region.to_dict(),
             "not_well_determined": of_joints | ({"all joints": others} if others else {}),
             "did_not_move_hence_ideal": self.settings["still"],
             "not_in_the_logs_hence_ideal": [
@@ -133,6 +139,28 @@ class Identification(NamedTuple):
             ],
         }
         bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
+
+    @property
+    def region(self) -> Region:
+        """Joint confidence region of all unknowns."""
+        joints = [self.robot.joint_names[number] for number in self.joints]
+        names = tuple((kind, None if joint is None else joints[joint]) for kind, joint in self.unknowns.names)
+        return Region(names, self.estimate, self.uncertainty.deviation, self.uncertainty.correlation)
+
+    def corrected_urdf(self) -> str:
+        """Return the URDF of the robot with the masses of :attr:`diagnosis`, and tensors in proportion.
+
+        Raises
+        ------
+        InvalidArgumentError
+            No link's mass seems off.
+        RobotError
+            The robot's file cannot be read, or has changed since.
+        """
+        if not self.diagnosis.links:
+            remedy = "leave the option out; the robot's description is as good as these logs tell"
+            raise InvalidArgumentError("corrected_urdf", "no link's mass seems off", remedy=remedy)
+        return to_urdf(self.robot, mass_factors=self.diagnosis.links).text
 
     def document(self) -> dict[str, Any]:
         """Return the result as plain values: for each unknown the estimate and its 95 % interval, however wide.
@@ -159,6 +187,7 @@ class Identification(NamedTuple):
             "strength_taken_as_1": self.strength_taken,
             "singular_values": self.uncertainty.singular_values.tolist(),
             "noise": self.noise.tolist(),
+            "diagnosis": self.diagnosis.to_dict(),
             "compensation": "through the motors" if self.drive.through else self.drive.compensate,
             "about": self.settings,
         }
@@ -170,6 +199,11 @@ class Identification(NamedTuple):
             return []
         known = self.unknowns.joints_of("strength") + self.unknowns.joints_of("gain")
         return [self.robot.joint_names[number] for at, number in enumerate(self.joints) if at not in known]
+
+    @property
+    def finds_gains(self) -> bool:
+        """True if :meth:`gains` differ from the params of the law that were given."""
+        return not {"gain", "kd", "saturation"}.isdisjoint(self.unknowns.per_joint)
 
     def gains(self) -> bp.PIDParams | None:
         """Return the params of the law that was found, of the logged joints; None for logs of efforts."""

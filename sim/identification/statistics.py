@@ -56,12 +56,18 @@ class Uncertainty(NamedTuple):
     """Joints (joints,) that the motion moves, and not only the noise of their sensor."""
     singular_values: Float64
     """Singular values of the Jacobian in units of typical sizes, over the largest, descending."""
+    correlation: Float64
+    """Correlations of the estimates (unknowns, unknowns)."""
 
     def plus(self, kinds: list[str], estimate: Float64, deviation: Float64) -> Uncertainty:
         """Return the uncertainty with further values (n,) of some ``kinds``."""
-        more = _resolved(kinds, estimate, deviation)
+        more, own = _resolved(kinds, estimate, deviation), len(self.deviation)
+        correlation = np.eye(own + len(kinds))
+        correlation[:own, :own] = self.correlation
         return self._replace(
-            deviation=np.append(self.deviation, deviation), identified=np.append(self.identified, more)
+            deviation=np.append(self.deviation, deviation),
+            identified=np.append(self.identified, more),
+            correlation=correlation,
         )
 
 
@@ -101,7 +107,9 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     moves = _motion(problem) > LEAST_MOTION * problem.noise / NOISES
     known = np.array([joint is None or moves[joint] for _, joint in unknowns.names])
     identified = known & _resolved([kind for kind, _ in unknowns.names], point.theta, deviation)
-    return Uncertainty(deviation, identified, moves, values / max(values[0], 1e-300))
+    raised = covariance + np.diag(variance - np.diagonal(covariance))
+    correlation = raised / np.sqrt(np.outer(variance, variance))
+    return Uncertainty(deviation, identified, moves, values / max(values[0], 1e-300), correlation)
 
 
 def _resolved(kinds: list[str], estimate: Float64, deviation: Float64) -> NDArray[np.bool_]:

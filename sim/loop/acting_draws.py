@@ -41,8 +41,9 @@ def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variati
             nominal = np.nan_to_num(nominal_values(name, robot), nan=1.0)  # an unknown mass can be scaled alone
             rows = np.tile(nominal, (size, 1)) if draws is None else randomization.apply(name, nominal, draws, robot)
             values[name] = rows / nominal if name == "link_mass" else rows
-    if "payload" in values:
-        values["payload"] = values["payload"][:, 0]
+    for name in ("payload", "ground_friction"):
+        if name in values:
+            values[name] = values[name][:, 0]
     return Variation(**values)
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.sim.observation import Observation, observed_by_loop
+from batchpid.sim.observation import OBSERVED, Observation, Quantity
 
 Layout = dict[str, tuple[tuple[int, ...], Any]]
 """Name -> (shape, dtype)."""
@@ -68,13 +68,19 @@ class Arrays(NamedTuple):
     fault: FaultArrays
 
     @staticmethod
-    def layout(ticks: int, num_envs: int, dof: int, command_size: int | None = None, fixed_base: bool = True) -> Layout:
+    def layout(
+        ticks: int,
+        num_envs: int,
+        dof: int,
+        command_size: int | None = None,
+        observed: Mapping[str, Quantity] = OBSERVED,
+    ) -> Layout:
         """Return the layout of all fields, for :meth:`from_fields`; a setpoint has ``command_size`` (dof) numbers."""
         row, table = (ticks, num_envs), (ticks, num_envs, dof)
         setpoint = table if command_size is None else (*row, command_size)
         sizes = Command(setpoint, setpoint, setpoint, table)
         layout: Layout = {f"command.{name}": (shape, np.float64) for name, shape in sizes._asdict().items()}
-        for name, quantity in observed_by_loop(fixed_base).items():
+        for name, quantity in observed.items():
             layout[f"observation.{name}"] = (quantity.shape(table), quantity.dtype)
         return layout | {f"fault.{name}": (row, np.int64) for name in FaultArrays._fields}
 

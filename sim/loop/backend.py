@@ -32,11 +32,12 @@ def _engine_obstacle(engine: Engine) -> str:
 
 def _force_obstacle(engine: Engine, options: RunnerOptions) -> str:
     """Return why the engine's native sim steps do not read the passive force; "" if they do."""
-    if "gravity" in options.compensate and "partial_force" not in engine.capabilities:
-        if not options.robot.fixed_base:
-            return f"{engine.title} needs NumPy for the passive force of a floating base"
-        if "coriolis" not in options.compensate:
-            return f"{engine.title} needs NumPy for gravity without Coriolis forces"
+    if "gravity" not in options.compensate:
+        return ""
+    if not options.robot.fixed_base and "base_state" not in engine.capabilities:
+        return f"{engine.title} needs NumPy for the passive force of a floating base"
+    if "coriolis" not in options.compensate and "partial_force" not in engine.capabilities:
+        return f"{engine.title} needs NumPy for gravity without Coriolis forces"
     return ""
 
 

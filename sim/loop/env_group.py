@@ -24,11 +24,13 @@ from batchpid.sim.loop.native_executor import NativeExecutor
 from batchpid.sim.loop.native_ticks import Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor, Span, passive_forces, with_model
 from batchpid.sim.loop.pid_law import PIDLaw
+from batchpid.sim.loop.pushes import Pushes
 from batchpid.sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
 from batchpid.sim.loop.step_constants import make_constants, make_layout
 from batchpid.sim.loop.step_state import init_motors, reset_friction, reset_guard, with_friction, with_params
 from batchpid.sim.loop.step_values import StepState
 from batchpid.sim.loop.xla_executor import XLAExecutor
+from batchpid.sim.observation import untouched
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.draws import Draws
 
@@ -59,6 +61,11 @@ class EnvGroup:
         self._motor = np.zeros((pack.size, pack.dof), np.float32)
         self._saturated, self._guarded = (np.zeros((pack.size, pack.dof), bool) for _ in range(2))
         self._table: Table | None = None
+        self._sensed = untouched(pack.size, options.observed)
+        self._pushes = Pushes(options, pack.size) if options.has_pushes else None
+        reads_base = "base_state" in options.load_engine().capabilities and pack.spec.mjcf is None
+        observed = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
+        self._observes_natively = observed and not self._sensed and self._pushes is None
         self._steps = 0
         collides, ground = options.collisions, options.robot.has_ground
         self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
@@ -157,6 +164,8 @@ class EnvGroup:
         if base is not None:
             containment.start_base[good] = base[good]
         self._place(mask, containment.start_qpos, containment.start_qvel)
+        for sensed in self._sensed.values():
+            sensed[mask] = 0
         for cause, entries in bad.items():
             containment.fail(entries, cause, steps, containment.start_qpos)
         self._place_failed()
@@ -170,9 +179,13 @@ class EnvGroup:
         containment, command = self._containment, ticks[first].command.with_only(given)
         containment.failed, table = containment.suspended.copy(), None
         self._steps = steps
+        if self._sensed:
+            self.pack.take_sensed()
+        if self._pushes is not None:
+            self._push(self._pushes, substeps)
         if containment.suspended.any() or not finite(*command):
             command = self._without_faults(command)
-        elif self._contacts is None and self.pack.spec.is_alone:
+        elif self._contacts is None and self._observes_natively:
             if self._table is None:
                 fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
                 self._table = Table(ticks.arrays, self._motor, self._saturated, self._guarded, fault)
@@ -190,8 +203,22 @@ class EnvGroup:
                 self._contain(self._qpos, substeps, None)
         if self._contacts is not None:
             self._contacts.look(self._qpos, self._steps + substeps, containment.missed_contact)
+        if self._sensed:
+            for name, rows in self.pack.take_sensed().items():
+                sensed = self._sensed[name]
+                sensed[...] = rows > 0 if sensed.dtype == bool else rows / substeps
+                sensed[containment.failed] = 0
         self.observe(ticks[tick])
         return tick + 1
+
+    def _push(self, pushes: Pushes, substeps: int) -> None:
+        """Push the bases that are due before a tick."""
+        assert self.draws is not None
+        rows, twists = pushes.due(self._containment.suspended, self.draws.episodes)
+        if rows:
+            self.pack.push(rows, twists)
+            self._measured = self._executor.measure()
+        pushes.advance(substeps)
 
     def _execute(self, command: Command, span: Span, table: Table | None) -> tuple[int, int]:
         """Run sim steps and handle an event; return the first tick that is not observed, and its steps done."""
@@ -221,6 +248,8 @@ class EnvGroup:
         observation.ok[...] = ~containment.failed
         if observation.base_pose is not None and observation.base_twist is not None:
             observation.base_pose[...], observation.base_twist[...] = np.split(self.pack.read_base(), [7], axis=1)
+        for name, values in self._sensed.items():
+            getattr(observation, name)[...] = values
         fault = rows.fault
         fault.step[...], fault.joint[...], fault.cause[...] = containment.step, containment.joint, containment.cause
         fault.missed_contact[...] = containment.missed_contact
@@ -245,6 +274,8 @@ class EnvGroup:
             actuators={} if state.motors is None else {**state.motors.leaves(), EPISODE: self._episode.copy()},
             guard={} if state.guard is None else {**state.guard._asdict(), CHANGED: self._guarded.copy()},
             containment=self._containment.read(),
+            sensors={name: rows.copy() for name, rows in self._sensed.items()},
+            pushes={} if self._pushes is None else {name: rows.copy() for name, rows in self._pushes.counts.items()},
         )
 
     def write(self, pack: EnginePack, states: EnvStates) -> None:
@@ -258,6 +289,10 @@ class EnvGroup:
         pack.write_qf(states.effort)
         state = StepState(states.controller if self._controller else bp.PIDState(**states.controller))
         self._saturated[...], self._motor[...] = states.saturated, states.effort
+        for name, rows in states.sensors.items():
+            self._sensed[name][...] = rows
+        if self._pushes is not None:
+            self._pushes.counts = {name: rows.copy() for name, rows in states.pushes.items()}
         if states.friction:
             leaves = (states.friction[name] for name in FrictionState._fields)
             state = state._replace(friction=FrictionState(*leaves), age=states.friction[AGE])
@@ -338,6 +373,8 @@ class EnvGroup:
         pack.write_state(rows.tolist(), qpos[rows], qvel[rows], base)
         pack.suspend(self._containment.suspended)
         self._motor[mask], self._saturated[mask], self._guarded[mask] = 0.0, False, False
+        if self._pushes is not None and self.draws is not None:
+            self._pushes.begin(mask, self.draws.episodes)
         self._measured = self._executor.measure()
         if self._contacts is not None:
             self._contacts.place(mask)

@@ -12,7 +12,6 @@ import numpy as np
 
 from batchpid.native.operations import MOST_SUMMED
 from batchpid.native.trees import leaves, mapped
-from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.protocol import FAILED, CompiledModel, CompiledPack, CompiledStep, DrivenPack
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.native_ticks import NativeTicks, Table
@@ -35,9 +34,7 @@ class NativeExecutor(NumPyExecutor):
         self._reads_qvel = True  # for the observation
         self._steps_read_force = pack.steps_read_force(self._gravity, self._coriolis)
         self._force: CompiledModel | None = None
-        if layout.measures and self._gravity:
-            self._force = NativeModel(pack.spec)
-        elif self._reads_force and not self._steps_read_force:
+        if (layout.measures and self._gravity) or (self._reads_force and not self._steps_read_force):
             self._force = pack.force_model()
         has_own_law = options.backend == "numpy" or layout.law is None  # under "jax" the law is XLA's
         if layout.control == "custom":

@@ -235,6 +235,11 @@ class NativeTicks:
                 add("read", table, row)
         for table, row in ((seen.qpos, self._reading.qpos), (seen.qvel, self._reading.qvel)):
             add("write_floats", table, row)
+        if seen.base_pose is not None and seen.base_twist is not None:
+            rows = {name: np.zeros((self._shape[0], size)) for name, size in _BASE.items()}
+            self._place(**rows)
+            add("write_floats", seen.base_pose, rows["base_pose"])
+            add("write_floats", seen.base_twist, rows["base_twist"])
         add("write_floats", seen.effort, outputs.motor)
         add("write_floats", own.effort[None], outputs.motor, 0)
         none = np.zeros(self._shape, bool)
@@ -355,6 +360,8 @@ _NATIVE = {
 """Stages that are no programs, or have a native function."""
 
 _NO_NOISE = 1 << interface.STATUS.index("no_noise")
+_BASE = {"base_pose": 7, "base_twist": 6}
+"""Numbers of each quantity of a floating base."""
 _TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
 """Dtypes of arrays that are not float64."""
 

@@ -155,7 +155,8 @@ def with_model(
         )
     if gravity:
         force = passive_force_of(pack.spec, _is_native(pack))
-        model = model._replace(passive_force=lambda qpos, qvel: force(qpos, qvel, gravity, coriolis))
+        parts = gravity, coriolis
+        model = model._replace(passive_force=lambda qpos, qvel: force(qpos, qvel, *parts, pack.read_base_motion()))
     return layout._replace(model=model)
 
 

@@ -27,7 +27,9 @@ from batchpid.io.npz import read_npz
 from batchpid.motors.friction import FrictionState
 from batchpid.motors.guard import GuardState
 from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, ORIGIN, FaultContainment
+from batchpid.sim.loop.pushes import COUNTS
 from batchpid.sim.loop.tables import flatten, nest, widen
+from batchpid.sim.observation import observed_by_loop, untouched
 
 EPISODE = "episode"
 """Name of the resets of each env with actuators (envs,)."""
@@ -66,6 +68,10 @@ class EnvStates:
     """Leaves of :class:`batchpid.motors.guard.GuardState`, and :data:`CHANGED`; none without guard."""
     containment: dict[str, NDArray[Any]]
     """See :class:`batchpid.sim.loop.faults.FaultContainment`."""
+    sensors: dict[str, NDArray[Any]]
+    """Quantities of :class:`batchpid.sim.Observation` from the sensors of links; none without such sensors."""
+    pushes: dict[str, NDArray[np.int64]]
+    """Counts of :class:`batchpid.sim.loop.pushes.Pushes`; none without pushes."""
 
     def for_envs(self, envs: slice) -> EnvStates:
         """Return the state of some envs, as copies."""
@@ -88,11 +94,14 @@ class EnvStates:
         guard: bool,
         engine_sizes: Sequence[int],
         command_size: int,
+        sensors: dict[str, NDArray[Any]],
+        pushes: bool,
     ) -> None:
         """Check the states' envs and joints, and the number of engine values of each env, ``engine_sizes`` (envs,).
 
         ``controller`` is a state of the control, ``actuators`` one of the actuators; ``friction`` tells whether joints
-        have Coulomb friction, ``guard`` whether there is a guard. ``command_size`` is the size of a setpoint.
+        have Coulomb friction, ``guard`` whether there is a guard. ``command_size`` is the size of a setpoint,
+        ``sensors`` are quantities of links, ``pushes`` tells whether bases are pushed.
 
         Raises
         ------
@@ -109,6 +118,8 @@ class EnvStates:
             actuators=actuators,
             guard={**dict.fromkeys(GuardState._fields, double), CHANGED: table > 0} if guard else {},
             containment=FaultContainment(num_envs, dof, "hold").read(),
+            sensors=sensors,
+            pushes=dict.fromkeys(COUNTS, row.astype(np.int64)) if pushes else {},
         )
         ours, theirs = flatten(vars(expected)), flatten(vars(self))
         for name in sorted(ours | theirs):
@@ -277,8 +288,13 @@ class Snapshot:
         motors = initial_actuators(actuators, num_envs, dof, about["timestep"])
         if (about.get("randomization") or {}).get("actuators"):
             motors = states.actuators  # the runner that restores it checks them
+        links = {name: tuple(about.get(name) or ()) for name in ("contacts", "wrenches")}
+        pushes = "push" in (about.get("randomization") or {})
+        sensors = untouched(num_envs, observed_by_loop(True, **links))
         size = dof if about.get("command") is None else len(names("command", about["command"]))
-        states.check(num_envs, dof, controller, bool(states.friction), motors, bool(states.guard), (), size)
+        states.check(
+            num_envs, dof, controller, bool(states.friction), motors, bool(states.guard), (), size, sensors, pushes
+        )
         if motion is not None and (motion.shape != (2, num_envs, dof) or motion.dtype != np.float64):
             raise ValueError(f"its motion is not a setpoint and a rate of {num_envs} envs of {dof} joints")
         return cls(about, steps, params, states, actuators, episodes, targets, motion)

@@ -19,7 +19,9 @@ def flatten(groups: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
 
 def nest(tables: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     """Return the groups of :func:`flatten`."""
-    groups: dict[str, Any] = {"controller": {}, "friction": {}, "actuators": {}, "guard": {}, "containment": {}}
+    groups: dict[str, Any] = {
+        name: {} for name in ("controller", "friction", "actuators", "guard", "containment", "sensors", "pushes")
+    }
     for name, rows in tables.items():
         group, dot, leaf = name.partition(".")
         if dot:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN
 from batchpid.motors.actuator_fields import FIELDS, TABLE
-from batchpid.sim.randomization.fields import PHYSICAL, START, Field, elements, nominal_values, parts
+from batchpid.sim.randomization.fields import EVENTS, PHYSICAL, START, Field, elements, nominal_values, parts
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 
@@ -26,6 +27,7 @@ def check_robot(randomization: Randomization, robot: Robot) -> None:
             _check_range(name, each, robot)
         elif name in START:
             list(parts(name, each, robot.joint_names))
+    _check_pushes(randomization, robot)
     if randomization.damping is not None and robot.dissipation != "urdf":
         remedy = "load the robot with dissipation='urdf'"
         raise InvalidArgumentError(
@@ -33,6 +35,29 @@ def check_robot(randomization: Randomization, robot: Robot) -> None:
         )
     if randomization.payload_link is not None:
         choice("payload_link", randomization.payload_link, [link.name for link in robot.links])
+
+
+def _check_pushes(randomization: Randomization, robot: Robot) -> None:
+    """Check that pushes have intervals, longer than 0, and a base that floats."""
+    events = randomization.events
+    if not events:
+        return
+    for name in EVENTS:
+        if name not in events:
+            other = next(iter(events))
+            raise InvalidArgumentError(name, f"is missing, and there is a {other}", remedy="give both, or none")
+    if robot.fixed_base:
+        remedy = "load it with fixed_base=False"
+        raise InvalidArgumentError("push", f"needs a floating base, which {robot.name!r} does not have", remedy=remedy)
+    list(parts("push", events["push"], elements("push", robot)))
+    interval, push = randomization.push_interval, events["push"]
+    assert interval is not None
+    if any(each.operation == "scale" for each in (interval, *(push.values() if isinstance(push, Mapping) else [push]))):
+        problem, remedy = "and push_interval have no nominal value that could be scaled", "leave out the operation"
+        raise InvalidArgumentError("push", problem, remedy=remedy)
+    if not interval.support[0] > 0:
+        problem = f"may become {interval.support[0]:.3g}, but must be > 0"
+        raise InvalidArgumentError("push_interval", problem, value=interval.to_dict(), remedy="change the bounds")
 
 
 def check_params(randomization: Randomization, params: bp.PIDParams, robot: Robot) -> None:

@@ -43,13 +43,16 @@ NOTHING = Draws(np.zeros((0, 2), np.int64), {})
 """Draws of a runner without randomization."""
 
 
-def generators(seed: int, name: str, episodes: Episodes, constant: bool) -> Iterator[np.random.Generator]:
-    """Yield a generator for each env, of the draws of one field."""
+def generators(
+    seed: int, name: str, episodes: Episodes, constant: bool, number: Any = 0
+) -> Iterator[np.random.Generator]:
+    """Yield a generator for each env, of the draws of one field, with this ``number`` among those of an episode."""
     digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
     bits = np.random.Philox(key=np.array([seed, int.from_bytes(digest, "little")], np.uint64))
     state: Any = bits.state
     generator = np.random.Generator(bits)
-    for stream, episode in episodes.tolist():
-        state["state"]["counter"][:] = 0, 0, 0 if constant else episode, stream
+    numbers = np.broadcast_to(number, len(episodes)).tolist()
+    for (stream, episode), at in zip(episodes.tolist(), numbers, strict=True):
+        state["state"]["counter"][:] = 0, at, 0 if constant else episode, stream
         bits.state = state  # of a new generator: the buffer is empty
         yield generator

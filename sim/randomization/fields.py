@@ -11,7 +11,9 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.field_tables import Field as Bounds
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.command import TWIST_UNITS
 from batchpid.sim.randomization.distributions import Distribution, read_distribution
+from batchpid.sim.robot.dissipation import CONTACT_FRICTION
 from batchpid.sim.robot.robot import Robot
 
 Field = Distribution | Mapping[str, Distribution]
@@ -24,20 +26,31 @@ PHYSICAL = {
     "friction": Bounds("N m or N"),
     "damping": Bounds("N m s/rad or N s/m"),
     "armature": Bounds("kg m^2 or kg"),
+    "ground_friction": Bounds("1"),
+    "gravity": Bounds("m/s^2", low=-np.inf),
 }
 """Fields that change the simulated robot."""
 MASSES = frozenset({"payload", "link_mass", "center_of_mass"})
 """Those by which its masses differ from the model."""
 START = {"qpos": Bounds("rad or m", low=-np.inf), "qvel": Bounds("rad/s or m/s", low=-np.inf)}
 """Fields that change the state at a reset."""
+EVENTS = {"push": Bounds("m/s or rad/s", low=-np.inf), "push_interval": Bounds("s", above=True)}
+"""Fields that change the state during an episode."""
 GROUPS = ("params", "actuators")
 """Fields that are mappings, by name of a further field."""
 
+SINGLE = ("payload", "ground_friction", "push_interval")
+"""Fields of one value."""
+
 
 def elements(name: str, robot: Robot) -> Sequence[str]:
-    """Return the names of a field's values: joints, links, axes of links, or the payload."""
-    if name == "payload":
-        return ("payload",)
+    """Return the names of a field's values: joints, links, axes of links or of the world, or its own name."""
+    if name in SINGLE:
+        return (name,)
+    if name == "gravity":
+        return ("x", "y", "z")
+    if name == "push":
+        return tuple(TWIST_UNITS)
     if name == "center_of_mass":
         return [f"{link}.{axis}" for link in elements("link_mass", robot) for axis in "xyz"]
     if name == "link_mass":
@@ -61,7 +74,8 @@ def nominal_values(name: str, robot: Robot) -> Float64:
     if name == "link_mass":
         masses = {link.name: link.mass for link in robot.links}
         return np.array([masses[link] for link in elements(name, robot)], np.float64)  # None is NaN
-    known = {"friction": robot.friction, "damping": robot.damping}
+    known = {"friction": robot.friction, "damping": robot.damping, "gravity": np.array([0.0, 0.0, -9.81])}
+    known |= {"ground_friction": np.array([CONTACT_FRICTION])}
     return known.get(name, np.zeros(len(elements(name, robot))))
 
 

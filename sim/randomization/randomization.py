@@ -22,7 +22,18 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
 from batchpid.sim.randomization.distributions import Distribution
 from batchpid.sim.randomization.draws import Draws, generators
-from batchpid.sim.randomization.fields import GROUPS, PHYSICAL, START, Field, elements, mapping, parts, read_field
+from batchpid.sim.randomization.fields import (
+    EVENTS,
+    GROUPS,
+    PHYSICAL,
+    SINGLE,
+    START,
+    Field,
+    elements,
+    mapping,
+    parts,
+    read_field,
+)
 from batchpid.sim.robot.robot import Robot
 
 LARGEST = 2**63 - 1
@@ -68,6 +79,16 @@ class Randomization:
     """Position at a reset [rad or m], within the joint limits; nominal the argument of ``reset``."""
     qvel: Field | None = None
     """Velocity at a reset [rad/s or m/s]."""
+    ground_friction: Distribution | None = None
+    """Coefficient of sliding friction of the ground and of all shapes of the robot; nominal 0.3."""
+    gravity: Field | None = None
+    """Gravity along the axes x, y and z of the world [m/s^2]; nominal 0, 0 and -9.81. The compensation has the nominal
+    one."""
+    push: Field | None = None
+    """Velocity change of a floating base, along the axes of the world: vx, vy, vz [m/s], wx, wy, wz [rad/s]; nominal
+    0. Pushes come at the beginning of the first tick after each ``push_interval``."""
+    push_interval: Distribution | None = None
+    """Time from the reset to the first push, and from each to the next [s]."""
     params: Mapping[str, Field] = field(default_factory=dict)
     """Fields of :class:`batchpid.PIDParams` that the runner's params have, e.g. ``{"kp": ...}``."""
     actuators: Mapping[str, Field] = field(default_factory=dict)
@@ -81,12 +102,12 @@ class Randomization:
             chosen = mapping(group, getattr(self, group))
             chosen = {name: dict(each) if isinstance(each, Mapping) else each for name, each in chosen.items()}
             object.__setattr__(self, group, chosen)
-        for name in (*PHYSICAL, *START):
+        for name in (*PHYSICAL, *START, *EVENTS):
             if isinstance(each := getattr(self, name), Mapping):
                 object.__setattr__(self, name, dict(each))
         remedy = "pass e.g. Uniform(0, 0.5), or a mapping of names to such"
-        for name, each in self.given.items():
-            given = list(each.values()) if isinstance(each, Mapping) and name != "payload" else [each]
+        for name, each in (self.given | self.events).items():
+            given = list(each.values()) if isinstance(each, Mapping) and name not in SINGLE else [each]
             for part in given or [None]:
                 if not isinstance(part, Distribution):
                     raise InvalidArgumentError(name, "is not a distribution", value=part, remedy=remedy)
@@ -97,6 +118,12 @@ class Randomization:
         known = {name: getattr(self, name) for name in (*PHYSICAL, *START)}
         for group in GROUPS:
             known |= {f"{group}.{name}": each for name, each in getattr(self, group).items()}
+        return {name: each for name, each in known.items() if each is not None}
+
+    @property
+    def events(self) -> dict[str, Field]:
+        """Given fields of events during an episode, by name."""
+        known = {name: getattr(self, name) for name in EVENTS}
         return {name: each for name, each in known.items() if each is not None}
 
     @property
@@ -112,17 +139,32 @@ class Randomization:
 
     def draw(self, robot: Robot, episodes: NDArray[Any]) -> Draws:
         """Return the draws for envs with these streams and episodes (envs, 2)."""
-        values, episodes = {}, episodes.astype(np.int64)
-        for name, each in self.given.items():
-            columns = elements(name, robot)
-            rows = np.full((len(episodes), len(columns)), np.nan)
-            for part, chosen, distribution in parts(name, each, columns):
-                each_env = generators(self.seed, part, episodes, self.each == "env")
-                size = 1 if distribution.shared else len(chosen)
-                for row, generator in zip(rows, each_env, strict=True):
-                    row[chosen] = distribution.sample(generator, size)
-            values[name] = rows
-        return Draws(episodes, values)
+        episodes = episodes.astype(np.int64)
+        return Draws(episodes, {name: self._draw(name, each, robot, episodes) for name, each in self.given.items()})
+
+    def _draw(self, name: str, each: Field, robot: Robot, episodes: NDArray[np.int64], number: Any = 0) -> Float64:
+        """Return draws of a field (envs, elements), NaN where nothing is drawn; see :func:`generators`."""
+        columns = elements(name, robot)
+        rows = np.full((len(episodes), len(columns)), np.nan)
+        for part, chosen, distribution in parts(name, each, columns):
+            each_env = generators(self.seed, part, episodes, self.each == "env", number)
+            size = 1 if distribution.shared else len(chosen)
+            for row, generator in zip(rows, each_env, strict=True):
+                row[chosen] = distribution.sample(generator, size)
+        return rows
+
+    def next_push(
+        self, robot: Robot, episodes: NDArray[np.int64], number: NDArray[np.int64]
+    ) -> tuple[Float64, Float64]:
+        """Return the time (n,) [s] from push ``number`` (n,) of these episodes (n, 2) to the next, and that one (n, 6).
+
+        Number 0 is the reset.
+        """
+        assert self.push is not None
+        assert self.push_interval is not None
+        drawn = [self._draw(name, each, robot, episodes, number) for name, each in self.events.items()]
+        twists, intervals = drawn
+        return intervals[:, 0], np.nan_to_num(twists)
 
     def first(self, robot: Robot, num_envs: int, first_env: int = 0) -> Draws:
         """Return the draws for the first episode of each env, of the stream of its number, from ``first_env`` on."""
@@ -223,7 +265,7 @@ class Randomization:
         known = mapping("randomization", known)
         names = [each.name for each in fields(cls)]
         values = {choice("randomization", name, names): value for name, value in known.items()}
-        for name in (*PHYSICAL, *START):
+        for name in (*PHYSICAL, *START, *EVENTS):
             if name in values:
                 values[name] = read_field(name, values[name])
         for group in GROUPS:

@@ -20,7 +20,8 @@ def to_dataset(rollout: Rollout) -> xarray.Dataset:
 
     Coordinates: ``time`` [s], ``env``, ``joint`` (names) and ``unit`` (rad or m, by joint). Every variable has a
     ``long_name`` and ``units``; "rad|m" means the joint's own ``unit``. The setpoint of a control with a command of its
-    own has the dimension ``entry`` in place of ``joint``, with the units ``entry_unit``. The arrays are not copied.
+    own has the dimension ``entry`` in place of ``joint``, with the units ``entry_unit``. Quantities of links have the
+    dimension ``contacts`` or ``wrenches`` (names). The arrays are not copied.
 
     Raises
     ------
@@ -45,8 +46,11 @@ def to_dataset(rollout: Rollout) -> xarray.Dataset:
         units["setpoint"] = units["effort"]
     for name, quantity in quantities.items():
         if quantity.columns:
-            part = name.rpartition("_")[2]  # "pose" or "twist"
+            _, has_part, part = name.rpartition("_")  # "pose", "twist" or "force"
+            part = part if has_part else "component"
             columns[name], entries[part] = (part,), list(quantity.columns)
+        if quantity.option:
+            columns[name], entries[quantity.option] = (quantity.option, *columns[name]), list(quantity.links)
     return xarray.Dataset(
         {
             name: (

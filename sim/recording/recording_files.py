@@ -239,7 +239,8 @@ def redraws_text(redraws: Iterable[Redraw]) -> str:
 def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
     """Return the known fields of ``info`` as numbers, texts, and arrays of them."""
     known = {name: value for name, value in vars(info).items() if value is not None and name != "description"}
-    known |= {"joint_names": list(info.joint_names), "units": list(info.units), "faults": faults_text(info.faults)}
+    known |= {name: list(value) for name, value in known.items() if isinstance(value, tuple)}
+    known["faults"] = faults_text(info.faults)
     if (command := known.pop("own_command", None)) is not None:
         known |= {_COMMAND_NAMES: list(command.names), _COMMAND_UNITS: list(command.units)}
     if info.params is not None:
@@ -272,7 +273,7 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
     texts = ("robot", "urdf", "dissipation", "control", "tool", "compensate", "engine", "physics", "begun")
     decode: dict[str, Callable[[Any], Any]] = {
         **dict.fromkeys(texts, str),
-        **dict.fromkeys(("joint_names", "units"), lambda value: tuple(map(str, value))),
+        **dict.fromkeys(("joint_names", "units", "contacts", "wrenches"), lambda value: tuple(map(str, value))),
         **dict.fromkeys(("lower", "upper", "effort_limit", "start", "episodes"), _numbers),
         "timestep": float,
         "substeps": int,

@@ -148,6 +148,17 @@ class Contacts:
             of = range(len(self._shapes)) if base_too else np.flatnonzero(self._body >= 0).tolist()
             return min((self._lowest(index) for index in of), default=np.inf)
 
+    def feet(self, qpos: NDArray[Any], within: float = 0.01) -> list[tuple[str, Float64]]:
+        """Return the links on which the robot stands at a pose (dof,), each with the point (3,) [m] that touches.
+
+        It belongs to a shape whose lowest point is at most ``within`` [m] above that of the robot.
+        """
+        with self._lock:
+            centers = self._move(qpos)
+            heights = np.array([self._lowest(index) for index in range(len(centers))])
+            lowest = np.flatnonzero(heights <= heights.min(initial=np.inf) + within).tolist()
+            return [(self.links[self._link[at]], np.array([*centers[at, :2], heights[at]])) for at in lowest]
+
     def _move(self, qpos: NDArray[Any]) -> Float64:
         """Place the shapes; return their centers (shapes, 3)."""
         if not self._shapes:

@@ -52,6 +52,9 @@ class Dynamics(Protocol):
     def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> Float64:
         """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort``, gravity included."""
 
+    def standing_inertia(self, qpos: NDArray[Any]) -> Float64:
+        """Return the inertia (dof,) that each joint moves at one pose (dof,) if the base floats and its feet stand."""
+
     def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> Bool:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,)."""
 

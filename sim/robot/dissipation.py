@@ -1,8 +1,11 @@
-"""Choices of the dissipation in the engine."""
+"""Choices of the dissipation in the engine, and the friction of its contacts."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
+
+CONTACT_FRICTION = 0.3
+"""Coefficient of sliding friction of every shape and of the ground: SAPIEN's default material."""
 
 
 class Dissipation(NamedTuple):

@@ -11,6 +11,8 @@ from batchpid.sim.robot.findings import Finding, finding_of
 from batchpid.sim.robot.parts import MOVING_TYPES
 from batchpid.sim.robot.xml import readable
 
+FREE_TYPES = ("floating", "planar")
+"""Types of a joint at the root that make a floating base."""
 GIVE_RANGE = "give <limit lower= upper=>"
 """Remedy for position limits that are missing or unreadable."""
 
@@ -35,6 +37,27 @@ def ends_of(joint: etree._Element) -> tuple[str | None, str | None]:
     return parent, child
 
 
+def free_joint_of(root: etree._Element) -> etree._Element | None:
+    """Return the floating or planar joint that leads from a link without mass and shapes at the root to all others.
+
+    None without one. Such a joint and link say that the base is free to move.
+    """
+    joints = root.findall("joint")
+    children = {ends_of(joint)[1] for joint in joints}
+    at_root = [joint for joint in joints if ends_of(joint)[0] not in children]
+    link = next((link for link in root.findall("link") if at_root and link.get("name") == ends_of(at_root[0])[0]), None)
+    if len(at_root) != 1 or at_root[0].get("type") not in FREE_TYPES or link is None:
+        return None
+    return None if link.find("inertial") is not None or link.find("collision") is not None else at_root[0]
+
+
+def free_base(root: etree._Element, joint: etree._Element) -> None:
+    """Remove the joint of :func:`free_joint_of`, and the link at the root, from the robot."""
+    parent = ends_of(joint)[0]
+    for element in (joint, *(link for link in root.findall("link") if link.get("name") == parent)):
+        root.remove(element)
+
+
 def _type(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
     """Fix joints of types that SAPIEN lacks."""
     kind = joint.get("type", "")
@@ -43,7 +66,7 @@ def _type(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
         return
     joint.set("type", "fixed")
     parent = ends_of(joint)[0]
-    at_root = kind == "floating" and all(ends_of(other)[1] != parent for other in root.findall("joint"))
+    at_root = kind in FREE_TYPES and all(ends_of(other)[1] != parent for other in root.findall("joint"))
     severity, remedy = "warning", "use revolute, continuous or prismatic joints"
     if at_root:
         severity, remedy = "note", "load with fixed_base=False for a robot that is free to move"

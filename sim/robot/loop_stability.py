@@ -8,11 +8,14 @@ shows while all others are free, 1 / (M^-1)_jj, and tau the derivative's filter 
 and the whole robot :func:`batchpid.stability_bound` < 1, which is never below the largest of these: joints with axes
 nearly in line turn against each other with less inertia than either has. With params of discretization "implicit"
 the ratio, at the gains of the same law at this time step, is below 1 for any gains and time step.
+
+Motors that are late lower the bound. Their delay and lag, the sensors' delay, and strength, armature and viscous
+friction of the motors are counted, each where it is known.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +26,7 @@ from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.gains.stability import Oscillation, oscillation
 from batchpid.law.implicit import as_explicit
+from batchpid.sim.robot.actuator_checks import known_joints
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.dissipation import DISSIPATION
 
@@ -43,14 +47,32 @@ class StabilityReport(NamedTuple):
     robot_ratio: float
     participation: Float64
     env: int
-    """Env of the params that is the least stable."""
+    """Env of the params and actuators that is the least stable."""
+    late: bool
+    """True if efforts or measurements are late."""
+
+    @property
+    def effect(self) -> str:
+        """Motion of a robot beyond the bound."""
+        if self.late:
+            return "with motors as late as these the joint oscillates or diverges"
+        return "efforts alternate from step to step, and the joint chatters or diverges"
+
+    @property
+    def remedy(self) -> str:
+        """Gains that would be stable."""
+        if np.isinf(self.robot_ratio):
+            return "use a kd that is larger than kp times the delay and lag"
+        return f"use at most {0.5 / self.robot_ratio:.1g} times these gains"
 
 
 class Gains(NamedTuple):
-    """Gains and plant as the law acts on it at one pose: in units of ``matrix`` (n, n), for independent joints (n,).
+    """Gains and plant as the law acts on it at one pose: in units of ``matrix``, for independent joints (n,).
 
-    kp, ki, kd and the derivative's filter time are (envs, n) or (1, n), of the explicit law; ``damping`` is the viscous
-    damping of the joints.
+    ``matrix``, ``model`` and ``damping`` are (1 or rows, n, n) and (1 or rows, n); kp, ki, kd, the derivative's filter
+    time, ``delay`` and ``lag`` are (1 or rows, n), of the explicit law, rows being those of the params or of the
+    actuators. ``model`` (1 or rows, n, n) multiplies the law's output; None: it is an effort. The motors' strength is
+    part of the gains, or of the model.
     """
 
     matrix: Float64
@@ -59,28 +81,57 @@ class Gains(NamedTuple):
     ki: Float64
     kd: Float64
     filter_time: Float64
+    delay: Float64
+    lag: Float64
+    model: Float64 | None
 
 
 def gains_at(
-    robot: RobotDescription, params: bp.PIDParams, qpos: Float64, timestep: float, armature: Float64 | float = 0.0
+    robot: RobotDescription,
+    params: bp.PIDParams,
+    qpos: Float64,
+    timestep: float,
+    armature: Float64 | float = 0.0,
+    actuators: bp.Actuators | None = None,
 ) -> Gains:
     """Return ``params`` and the robot at ``qpos`` (dof,); ``armature`` (dof,) is inertia of motors [kg m^2 or kg].
 
-    Implicit params become params of the explicit law at ``timestep`` [s].
+    Implicit params become params of the explicit law at ``timestep`` [s]. ``actuators`` are the motors, instead of
+    their armature alone.
     """
-    params = as_explicit(params, timestep)
-    leaves = params.kp, params.ki, params.kd, params.derivative_filter_time
-    columns = [np.zeros((1, robot.dof)) if leaf is None else np.asarray(leaf, np.float64) for leaf in leaves]
-    coupling, damping = robot.coupling, robot.damping
-    columns = [np.broadcast_to(leaf, (len(leaf), robot.dof))[:, coupling.independent] for leaf in columns]
-    if isinstance(params.gain_units, PerMassMatrix):
-        joints = columns[0].shape[1]
-        return Gains(np.eye(joints), np.zeros(joints), *columns)
-    matrix = robot.mass_matrix(qpos) + np.diag(np.broadcast_to(armature, robot.dof))
-    matrix, damping = coupling.reduced(matrix), coupling.reduced_damping(damping)
+    params, motors, independent = as_explicit(params, timestep), actuators or bp.Actuators(), robot.coupling.independent
+
+    def column(leaf: Any, neutral: float = 0.0) -> Float64:
+        rows = np.full((1, robot.dof), neutral) if leaf is None else np.asarray(leaf, np.float64)
+        return np.broadcast_to(rows, (len(rows), robot.dof))
+
+    kp, ki, kd, tau = (
+        column(leaf)[:, independent] for leaf in (params.kp, params.ki, params.kd, params.derivative_filter_time)
+    )
+    delay = column(motors.command_delay) + column(motors.sensor_delay)
+    late, lag = delay[:, independent], column(motors.lag)[:, independent]
+    strength = column(motors.strength, 1.0)[:, independent]
+    armature = np.broadcast_to(armature, (1, robot.dof)) + column(motors.armature)
+    of_mass, joints = isinstance(params.gain_units, PerMassMatrix), late.shape[1]
+    if of_mass and actuators is None:  # the law knows the plant
+        return Gains(np.eye(joints)[None], np.zeros((1, joints)), kp, ki, kd, tau, late, lag, None)
+    matrix, damping = _matrix(robot, qpos, armature), robot.damping + column(motors.viscous)
+    damping = np.stack([robot.coupling.reduced_damping(row) for row in damping])
     if isinstance(params.gain_units, PerInertia):
-        columns[:3] = [leaf * np.diagonal(matrix[0]) for leaf in columns[:3]]
-    return Gains(matrix[0], damping, *columns)
+        strength = strength * np.diagonal(_matrix(robot, qpos, known_joints(robot).armature[None])[0])
+    if not of_mass:
+        return Gains(matrix, damping, strength * kp, strength * ki, strength * kd, tau, late, lag, None)
+    # The law knows the damping, too, as part of its matrix.
+    known, eye = known_joints(robot), np.eye(joints)
+    model = _matrix(robot, qpos, known.armature[None])
+    model = model + timestep * eye * robot.coupling.reduced_damping(robot.damping + known.viscous)
+    matrix = matrix + timestep * eye * damping[:, None, :]
+    return Gains(matrix, np.zeros_like(damping), kp, ki, kd, tau, late, lag, strength[..., None] * model)
+
+
+def _matrix(robot: RobotDescription, qpos: Float64, armature: Float64) -> Float64:
+    """Return the mass matrices (rows, n, n) of independent joints with ``armature`` (rows, dof)."""
+    return robot.coupling.reduced(robot.mass_matrix(qpos) + armature[:, None, :] * np.eye(robot.dof))
 
 
 def stability_report(
@@ -89,26 +140,34 @@ def stability_report(
     qpos: Float64,
     timestep: float,
     armature: Float64 | float = 0.0,
+    actuators: bp.Actuators | None = None,
 ) -> StabilityReport:
-    """Return the share of the stability range that ``params`` (their least stable env) use at ``qpos`` (dof,)."""
-    gains = gains_at(robot, params, qpos, timestep, armature)
-    dt, damping, inverse = (
-        timestep,
-        gains.damping,
-        np.linalg.inv(gains.matrix + 0.5 * timestep * np.diag(gains.damping)),
+    """Return the share of the stability range that ``params`` (their least stable env) use at ``qpos`` (dof,).
+
+    ``actuators`` are motors and sensors, of which delay, lag, strength, armature and viscous friction count; rows are
+    envs, as of the params.
+    """
+    gains, dt = gains_at(robot, params, qpos, timestep, armature, actuators), timestep
+    rows = max(len(leaf) for leaf in gains if leaf is not None)
+    matrices, damping, kp, _, kd, tau, delay, lag = (
+        np.broadcast_to(leaf, (rows, *leaf.shape[1:])) for leaf in gains[:8]
     )
-    rows = max(len(leaf) for leaf in gains[2:])
-    kp, _, kd, tau = (np.broadcast_to(leaf, (rows, len(damping))) for leaf in gains[2:])
-    matrices = np.broadcast_to(gains.matrix, (rows, *gains.matrix.shape))
-    bound = bp.stability_bound(matrices, kp, kd, dt, filter_time=tau, damping=damping)
+    late = {"filter_time": tau, "damping": damping, "delay": delay, "lag": lag}
+    bound = bp.stability_bound(matrices, kp, kd, dt, model=gains.model, **late)
     worst = int(np.argmax(bound.ratio))
-    inertia = 1 / np.diagonal(inverse)
+    inertia = 1 / np.diagonal(np.linalg.inv(matrices[worst] + 0.5 * dt * np.diag(damping[worst])))
     kp, kd, tau = kp[worst], kd[worst], tau[worst]
+    if gains.model is not None:
+        unit = np.diagonal(gains.model[min(worst, len(gains.model) - 1)])
+        kp, kd = unit * kp, unit * kd
     kd_dt, kp_dt2 = kd * dt / inertia * dt / (dt + 2 * tau), kp * dt**2 / inertia
-    joint_ratio = 0.5 * (kd_dt + 0.5 * kp_dt2)
+    alone = {"filter_time": tau, "delay": delay[worst], "lag": lag[worst]}  # the inertia includes the damping
+    columns = {name: leaf[:, None] for name, leaf in alone.items()}
+    joint_ratio = bp.stability_bound(inertia[:, None, None], kp[:, None], kd[:, None], dt, **columns).ratio
     figures = inertia, kd_dt, kp_dt2, joint_ratio, bound.participation[worst]
     inertia, kd_dt, kp_dt2, joint_ratio, participation = map(robot.coupling.of_all, figures)
-    return StabilityReport(inertia, kd_dt, kp_dt2, joint_ratio, float(bound.ratio[worst]), participation, worst)
+    ratio, is_late = float(bound.ratio[worst]), bool(delay.any() or lag.any())
+    return StabilityReport(inertia, kd_dt, kp_dt2, joint_ratio, ratio, participation, worst, is_late)
 
 
 def slow_oscillation(
@@ -116,8 +175,8 @@ def slow_oscillation(
 ) -> Oscillation:
     """Return the least damped oscillation that lasts, of one env's ``params`` at ``qpos`` (dof,)."""
     gains = gains_at(robot, params.for_envs(slice(env, env + 1)), qpos, timestep)
-    kp, ki, kd, tau = (leaf[0] for leaf in gains[2:])
-    found = oscillation(gains.matrix, kp, ki, kd, timestep, filter_time=tau, damping=gains.damping)
+    matrix, damping, kp, ki, kd, tau = (leaf[0] for leaf in gains[:6])
+    found = oscillation(matrix, kp, ki, kd, timestep, filter_time=tau, damping=damping)
     return found._replace(participation=robot.coupling.of_all(found.participation))
 
 
@@ -131,11 +190,20 @@ def implicit_remedy(params: bp.PIDParams) -> str:
 class StabilityWarning(UserWarning):
     """The gains pass the stability bound of the sampled PID loop, see :mod:`batchpid.sim.robot.loop_stability`.
 
-    The bound holds for ideal motors at the start pose, with the armature of actuators. Actuators that delay or limit
-    efforts, or measure with errors, have other bounds, and ``dissipation="sapien"`` adds friction that is not in the
-    formula: in these cases there is no warning. Under control "drive" in MuJoCo the warning names the first joint that
-    sticks, see :mod:`batchpid.sim.robot.drive_chatter`.
+    The bound holds at the start pose, and counts delays, lag, strength, armature and viscous friction of the actuators.
+    Noise and limits of efforts are not in it: beyond it, a joint with limits oscillates instead of diverging. With
+    ``dissipation="sapien"``, which adds friction that is not in the formula, there is no warning. Under control "drive"
+    in MuJoCo the warning names the first joint that sticks, see :mod:`batchpid.sim.robot.drive_chatter`.
     """
+
+
+MOST = 64
+"""Envs with late motors that are checked one by one, once the extreme of all of them is beyond the bound."""
+_LEAST_STABLE_GAINS = {"kp": np.max, "kd": np.max, "derivative_filter_time": np.min}
+_LATEST = {name: np.max for name in ("command_delay", "sensor_delay", "lag", "strength")} | {
+    name: np.min for name in ("armature", "viscous")
+}
+"""Ends of the ranges at which a loop is the least stable."""
 
 
 class StabilityCheck:
@@ -156,35 +224,53 @@ class StabilityCheck:
         report = self._beyond(params, bp.Actuators() if actuators is None else actuators)
         if report is not None and not self._has_warned:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
-            env = f", env {report.env}" if params.num_envs > 1 else ""
+            rows = max(params.num_envs, 1 if actuators is None else actuators.num_envs)
+            env = f", env {report.env}" if rows > 1 else ""
             warn(
                 f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the sampled PID loop, "
-                f"mostly of joint {joint!r}{env}, at the start pose with a time step of {self._timestep:g} s: efforts "
-                f"alternate from step to step, and the joint chatters or diverges; use at most "
-                f"{0.5 / report.robot_ratio:.1g} times these gains, a derivative_filter_time, "
-                f"{implicit_remedy(params)}or robot.designed()",
+                f"mostly of joint {joint!r}{env}, at the start pose with a time step of {self._timestep:g} s: "
+                f"{report.effect}; {report.remedy}, a derivative_filter_time, "
+                f"{'' if report.late else implicit_remedy(params)}or robot.designed()",
                 StabilityWarning,
             )
         self._has_warned = report is not None
 
     def _beyond(self, params: bp.PIDParams, actuators: bp.Actuators) -> StabilityReport | None:
         """Return the report of params beyond the bound; None for others, and where the bound does not hold."""
-        armature = actuators.armature
-        if actuators.measures or actuators.delivers or not DISSIPATION[self._robot.dissipation].modelled:
+        if not DISSIPATION[self._robot.dissipation].modelled:
             return None
-        if armature is not None and isinstance(params.gain_units, PerMassMatrix):
-            return None  # of which the law may not know
+        motors = None if actuators.is_ideal else actuators
+        envs = np.arange(max(params.num_envs, actuators.num_envs))
         try:
-            # The ratio grows with kp and kd, and falls with the filter time: the largest of all envs first.
-            largest = (None if leaf is None else leaf.max(0, keepdims=True) for leaf in (params.kp, params.kd))
-            tau = params.derivative_filter_time
-            worst = dict(zip(("kp", "kd"), largest, strict=True))
-            worst["derivative_filter_time"] = None if tau is None else tau.min(0, keepdims=True)
-            for each in (params._replace(ki=None, **worst), params):
-                least = 0.0 if armature is None else armature.min(0)
-                report = stability_report(self._robot, each, self._robot.start, self._timestep, least)
-                if report.robot_ratio < 1:
-                    return None
+            report = self._report(
+                _extreme(params, _LEAST_STABLE_GAINS), None if motors is None else _extreme(motors, _LATEST)
+            )
+            if report.robot_ratio < 1 or len(envs) == 1:
+                return report if report.robot_ratio >= 1 else None
+            if motors is not None and len(envs) > MOST:
+                envs = envs[np.argsort(_urgency(params, motors), kind="stable")[-MOST:]]
+            report = self._report(params.for_envs(envs), None if motors is None else motors.for_envs(envs))
         except InvalidArgumentError:  # the robot's mass matrix is not positive definite
             return None
-        return report
+        return report._replace(env=int(envs[report.env])) if report.robot_ratio >= 1 else None
+
+    def _report(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> StabilityReport:
+        return stability_report(self._robot, params, self._robot.start, self._timestep, actuators=actuators)
+
+
+def _extreme(record: Any, ends: dict[str, Any]) -> Any:
+    """Return params or actuators of one env with the end of the range of all envs that is the least stable."""
+    leaves = {name: getattr(record, name) for name in ends}
+    found = {name: ends[name](leaf, 0, keepdims=True) for name, leaf in leaves.items() if leaf is not None}
+    return record.for_envs(slice(0, 1))._replace(**found)
+
+
+def _urgency(params: bp.PIDParams, motors: bp.Actuators) -> Float64:
+    """Return a figure (envs,) that grows with gains and delays over their means; the largest are checked."""
+    late = (motors.command_delay, motors.sensor_delay, motors.strength)
+    found = np.zeros((max(params.num_envs, motors.num_envs), 1))
+    for leaf in (params.kp, params.kd, *late):
+        if leaf is not None:
+            found = found + np.asarray(leaf, np.float64) / (np.mean(leaf, 0) + 1e-300)
+    urgency: Float64 = found.max(1)
+    return urgency

@@ -103,8 +103,8 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
 
 def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Finding]:
     if not robot.fixed_base:
-        text = "SAPIEN's passive force does not compensate gravity on a floating base"
-        yield Finding("warning", "floating-base", text, "load with fixed_base=True, or expect no compensation")
+        text = "gravity compensation carries the links as if the base were held; the law has to carry the base"
+        yield Finding("note", "floating-base", text, "use designed gains, which count the load of the base")
     if left_over := robot.self_contact.left_over:
         text = f"{len(left_over)} pairs that should not collide do, since PhysX's filter cannot hold them all"
         yield Finding("note", "pairs-left-over", text, "disable fewer pairs in the .srdf")
@@ -180,7 +180,7 @@ def _strength(robot: RobotDescription) -> Iterator[Finding]:
 def _stability(
     robot: RobotDescription, params: bp.PIDParams, start: NDArray[np.float64], timestep: float
 ) -> Iterator[Finding]:
-    report = stability_report(robot, params, start, timestep)
+    report = stability_report(robot, params, start, timestep, actuators=robot.actuators)
     if report.robot_ratio < 1:
         yield from _ringing(robot, params, start, timestep, report.env)
     if report.robot_ratio < NEAR_BOUND:
@@ -194,13 +194,12 @@ def _stability(
         return
     unstable = report.robot_ratio >= 1
     severity, code = ("warning", "unstable") if unstable else ("note", "near-unstable")
-    effect = "it diverges, alternating from step to step" if unstable else "it may diverge in other poses"
+    diverges = "it oscillates or diverges" if report.late else "it diverges, alternating from step to step"
+    effect = diverges if unstable else "it may diverge in other poses"
     text = f"the sampled PID loop is at {report.robot_ratio:.3g} times its stability bound at the start pose: {effect}"
-    other = implicit_remedy(params)
-    times = f"use at most {0.5 / report.robot_ratio:.1g} times"
-    yield Finding(
-        severity, code, text, f"{times} these gains, a derivative_filter_time, {other}or gain_units='inertia'"
-    )
+    other = "" if report.late else implicit_remedy(params)
+    remedy = f"{report.remedy}, a derivative_filter_time, {other}or gain_units='inertia'"
+    yield Finding(severity, code, text, remedy)
     for index in np.flatnonzero(robot.independent & (report.joint_ratio >= NEAR_BOUND)):
         joint, ratio = robot.joints[index], report.joint_ratio[index]
         unit = "kg" if joint.type == "prismatic" else "kg m^2"

@@ -22,6 +22,7 @@ from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.findings import Findings
+from batchpid.sim.robot.joint_repair import free_base, free_joint_of
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.mimics import couple
 from batchpid.sim.robot.parts import FileDefaults, Joint, Settings
@@ -38,6 +39,8 @@ _ASSETS = Path(assets.__file__).parent
 MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
 DESIGN_HZ = 1.7
 """Bandwidth of :meth:`Robot.designed` with the mass matrix."""
+STANDING_HZ = 3.0
+"""Bandwidth of :meth:`Robot.designed` for a robot that stands: its weight sinks by about g / (2 pi STANDING_HZ)^2."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,7 +55,7 @@ class Robot(RobotDescription):
         package_dirs: Sequence[str | Path] = (),
         missing_meshes: str = "skip",
         dissipation: str = "urdf",
-        fixed_base: bool = True,
+        fixed_base: bool | None = None,
         merge_fixed: bool = True,
         self_collision: str = "auto",
         actuators: bp.Actuators | str | Path | None = None,
@@ -71,7 +74,8 @@ class Robot(RobotDescription):
             :mod:`batchpid.motors.friction`; no link damping. ``"sapien"``: SAPIEN's defaults, PhysX's joint friction
             0.05 and link damping 0.05, for comparison with its tutorial.
         fixed_base
-            True to fix the root link to the world.
+            True to fix the root link to the world. Default True, unless the root of a URDF is a link without mass and
+            shapes and its only joint is floating or planar: then the base floats, and the root is that joint's child.
         merge_fixed
             True to simulate links that are joined by fixed joints as one, with the exact inertia: fewer links, faster
             steps. False keeps every link, and contacts between links that are joined through other links.
@@ -101,15 +105,19 @@ class Robot(RobotDescription):
         choice("missing_meshes", missing_meshes, ("error", "skip"))
         choice("dissipation", dissipation, DISSIPATION)
         choice("self_collision", self_collision, SELF_COLLISION)
-        fixed_base, strict = flag("fixed_base", fixed_base), flag("strict", strict)
-        merge_fixed = flag("merge_fixed", merge_fixed)
+        fixed_base = None if fixed_base is None else flag("fixed_base", fixed_base)
+        strict, merge_fixed = flag("strict", strict), flag("merge_fixed", merge_fixed)
         if not isinstance(package_dirs, list | tuple):
             problem = "must be a list of folders"
             raise InvalidArgumentError("package_dirs", problem, value=package_dirs, remedy="pass a list of paths")
         # Options are checked before a file is read, so that a wrong one is not hidden by a fault of the file.
         path = _find(name_or_path)
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
-        root, repairs, mjcf = read_source(path, fixed_base, missing_meshes)
+        root, repairs, mjcf = read_source(path, fixed_base is not False, missing_meshes)
+        free_joint = free_joint_of(root)
+        fixed_base = free_joint is None if fixed_base is None else fixed_base
+        if free_joint is not None and not fixed_base:
+            free_base(root, free_joint)
         urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
         if mjcf is not None:
             urdf = replace(urdf, missing_meshes=(*mjcf.missing_meshes, *urdf.missing_meshes))
@@ -181,7 +189,7 @@ class Robot(RobotDescription):
             params = self.params()
         return check(self, params, qpos, setpoint, timestep, control)
 
-    def designed(self, gain_units: str = "mass_matrix") -> bp.PIDParams:
+    def designed(self, gain_units: str | None = None) -> bp.PIDParams:
         """Return params designed from the robot's inertia alone; a search for gains starts from them.
 
         With the mass matrix the poles lie between the poles of Bessel's prototype s^3 + 6 s^2 + 15 s + 15 (W. E.
@@ -193,15 +201,20 @@ class Robot(RobotDescription):
         Parameters
         ----------
         gain_units
-            ``"mass_matrix"``, ``"inertia"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`.
+            ``"mass_matrix"``, ``"inertia"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
+            ``"mass_matrix"``; on a floating base ``"effort"``, for legs that carry the base at the start pose: the mass
+            matrix is that of legs in the air, a twentieth.
 
         Raises
         ------
         InvalidArgumentError
             Unknown gain_units, or a mass matrix that is not positive definite.
         """
-        choice("gain_units", gain_units, CHOICES["gain_units"])
+        chosen = ("mass_matrix" if self.fixed_base else "effort") if gain_units is None else gain_units
+        gain_units = choice("gain_units", chosen, CHOICES["gain_units"])
         options: dict[str, Any] = {"gain_units": gain_units, "measurement_rate": "measured"}
+        if gain_units == "effort" and not self.fixed_base:
+            return bp.design_gains(self, STANDING_HZ, load=self.dynamics().standing_inertia(self.start), **options)
         if gain_units != "mass_matrix":
             return bp.design_gains(self, 2.25, **options)
         return bp.design_gains(self, DESIGN_HZ, 0.82, integral_time=4.5 / (2 * np.pi * DESIGN_HZ), **options)

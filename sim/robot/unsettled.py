@@ -63,7 +63,7 @@ CAUSES: dict[str, Words] = {
     "setpoint-not-finite": Words("bad input", "was given a number that is not finite", "correct the input"),
     "unstable": Words(
         "unstable",
-        "the gains are beyond the stability bound of the sampled loop: the effort alternates from step to step",
+        "the gains are beyond the stability bound of the sampled loop: the effort alternates, or oscillates",
         "use at most half the gains that reach the bound, a derivative_filter_time, {implicit}or robot.designed()",
     ),
     "setpoint-limits": Words(
@@ -522,10 +522,9 @@ class _Run:
         info = self.rollout.info
         if info.control != "pid" or info.params is None or info.timestep is None:
             return None
-        actuators = info.actuators
-        armature = 0.0 if actuators is None or actuators.armature is None else _row(actuators.armature, env)
+        motors = None if info.actuators is None else info.actuators.for_envs(slice(env, env + 1))
         try:
-            return stability_report(self.robot, _env(info.params, env), qpos, info.timestep, armature)
+            return stability_report(self.robot, _env(info.params, env), qpos, info.timestep, actuators=motors)
         except BatchPIDError:  # a mass matrix that is not positive definite
             return None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from pathlib import Path
 
@@ -20,7 +20,9 @@ from batchpid.sim.robot.source import read_source
 from batchpid.sim.robot.urdf import read_urdf, repair_urdf
 
 
-def to_urdf(robot: RobotDescription, folder: Path | None = None) -> Exported:
+def to_urdf(
+    robot: RobotDescription, folder: Path | None = None, mass_factors: Mapping[str, float] | None = None
+) -> Exported:
     """Return the URDF of ``robot`` with its repairs, which need none again, and a list of them.
 
     Links, joints, numbers and mimics are copied from the file unless repaired; visuals and other elements
@@ -32,6 +34,8 @@ def to_urdf(robot: RobotDescription, folder: Path | None = None) -> Exported:
         Its file is read again.
     folder
         Of the new file: paths of meshes are relative to it. Default: absolute paths.
+    mass_factors
+        Factors of the masses and inertia tensors of some links.
 
     Raises
     ------
@@ -48,6 +52,8 @@ def to_urdf(robot: RobotDescription, folder: Path | None = None) -> Exported:
     found = [sentence.partition(": ")[2] for sentence in summary(robot.repairs)]
     found += _copy_unused(source, root, path, packages)
     found += _lacking(robot)
+    for link, factor in (mass_factors or {}).items():
+        _scale_mass(root, link, factor)
     if folder is not None:
         for mesh in root.iter("mesh"):
             if os.path.isabs(name := mesh.get("filename", "")):
@@ -56,6 +62,15 @@ def to_urdf(robot: RobotDescription, folder: Path | None = None) -> Exported:
     etree.cleanup_namespaces(root)
     text = etree.tostring(root, encoding="unicode")
     return Exported(f'<?xml version="1.0"?>\n{text}\n', tuple(found))
+
+
+def _scale_mass(root: etree._Element, link: str, factor: float) -> None:
+    """Multiply mass and inertia tensor of a link by ``factor``."""
+    owner = next(each for each in root.findall("link") if each.get("name") == link)
+    for tag in ("mass", "inertia"):
+        for each in owner.iterfind(f"inertial/{tag}"):
+            for key, value in each.attrib.items():
+                each.set(key, repr(factor * float(value)))
 
 
 def _copy_unused(source: etree._Element, root: etree._Element, path: Path, packages: tuple[Path, ...]) -> list[str]:

@@ -134,6 +134,16 @@ class Candidates:
         """Number of envs of a candidate."""
         return len(self._moves)
 
+    def drawn(self, motors: bp.Actuators | None, count: int, step: int = 1) -> dict[str, bp.Actuators]:
+        """Return the option ``actuators`` of a runner for ``count`` candidates: each move has its row of ``motors``.
+
+        With ``step`` -1 the rows are counted from the last one.
+        """
+        if motors is None:
+            return {}
+        rows = (step * (1 + self._moves)) % motors.num_envs
+        return {"actuators": motors.for_envs(np.tile(rows, count))}
+
     def points(self, gains: Sequence[Float64]) -> Float64:
         """Return the points (n, dimension) of ``gains``: (ki, kp, kd) each, per unit of inertia.
 

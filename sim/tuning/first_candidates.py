@@ -18,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
+from batchpid.motors.actuators import Actuators
 from batchpid.sim.randomization.checks import prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
@@ -32,9 +33,12 @@ FASTEST = 6.0
 _DRAWS = 100
 
 
-def loop_delay(robot: Robot, randomization: Randomization | None, own: float) -> float:
-    """Return the delay of the slowest joint's loop [s]: its motor's and sensor's, lag included, and ``own``."""
-    actuators = robot.actuators
+def loop_delay(robot: Robot, randomization: Randomization | None, own: float, motors: Actuators | None = None) -> float:
+    """Return the delay of the slowest joint's loop [s]: its motor's and sensor's, lag included, and ``own``.
+
+    ``motors`` replace the robot's actuators.
+    """
+    actuators = robot.actuators if motors is None else motors
     if randomization is not None and randomization.actuators:
         prepared = prepared_actuators(randomization, actuators, robot)
         actuators = randomization.randomized_actuators(prepared, randomization.first(robot, _DRAWS), robot)

@@ -90,6 +90,7 @@ def tune(
     weights: Weights | None = None,
     moves: Moves | None = None,
     randomization: Randomization | None = None,
+    motors: bp.Actuators | None = None,
     workers: int | None = None,
     cluster: Literal["ray"] | Ray | None = None,
     time_limit: float | None = None,
@@ -121,6 +122,9 @@ def tune(
         replace them, with collisions, since they may touch something. There is then no final round.
     randomization
         The robot of each move is drawn from it, the same for all candidates. None: the robot as described.
+    motors
+        Actuators of which one is the true one, a row each: every move is made with another row, the same for all
+        candidates, and the worst move counts as much as the mean. The controller knows the robot's own actuators.
     workers, cluster
         Number of processes, or a cluster: as for :class:`batchpid.sim.Runner`. The result does not depend on them.
     time_limit
@@ -144,7 +148,8 @@ def tune(
     seed, generations, population, seconds = checked_effort(seed, generations, population, seconds)
     weights = Weights() if weights is None else weights
     final = random_moves(robot, FINAL_MOVES, seed + _FINAL_SEED) if moves is None else None
-    is_varied = randomization is not None or robot.actuators is not None
+    is_varied = randomization is not None or robot.actuators is not None or motors is not None
+    of_mean = is_varied and motors is None
     if moves is None and is_varied:
         moves = tutorial_move(robot) + random_moves(robot, VARIED_MOVES, seed)
     moves = search_moves(robot, seed) if moves is None else moves
@@ -164,24 +169,25 @@ def tune(
         "weights": dataclasses.asdict(weights),
         "headroom": HEADROOM,
         "randomization": None if randomization is None else randomization.to_dict(),
+        **({} if motors is None else {"motors": digest(motors)}),
         **plain_options(runner_options, history is not None),
         "search_physics": SEARCH_PHYSICS if is_free else None,
     }
     record = HistoryFile(history, "search", settings)
     search = Candidates(
-        robot, gain_units, per_joint, moves, seconds, weights, headroom=1.0 if is_varied else HEADROOM, varied=is_varied
+        robot, gain_units, per_joint, moves, seconds, weights, headroom=1.0 if is_varied else HEADROOM, varied=of_mean
     )
 
     start = search.params(np.zeros((1, search.dimension)))
     firsts = [np.zeros(search.dimension)]  # the designed gains
     if is_varied:
         dt = float(runner_options.get("timestep", RunnerOptions.timestep))
-        delay = loop_delay(robot, randomization, dt + float(np.max(start.derivative_filter_time)))
+        delay = loop_delay(robot, randomization, dt + float(np.max(start.derivative_filter_time)), motors)
         firsts += [*search.points(first_gains(delay))][: population - 1]
     where = {"workers": workers, "cluster": cluster, "randomization": reseeded(randomization, seed)}
     options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, **where} | runner_options
     search_options = options | {"ground": None, **SEARCH_PHYSICS} if is_free else options
-    with Runner(robot, population * search.envs, **search_options) as runner:
+    with Runner(robot, population * search.envs, **search_options | search.drawn(motors, population)) as runner:
         points, costs = evolve(
             lambda points: search.costs(runner, points),
             firsts,
@@ -200,9 +206,9 @@ def tune(
     if final is not None and best:
         ranking = [int(index) for index in np.argsort(every, kind="stable")[:FINALISTS] if index]
         finalists = [*dict.fromkeys([*ranking, 0])]  # 0: the designed gains
-        judge = Candidates(robot, gain_units, per_joint, final, seconds, weights, headroom=1.0, varied=is_varied)
+        judge = Candidates(robot, gain_units, per_joint, final, seconds, weights, headroom=1.0, varied=of_mean)
         options["randomization"] = reseeded(randomization, seed + _FINAL_SEED)
-        with Runner(robot, judge.envs * len(finalists), **options) as runner:
+        with Runner(robot, judge.envs * len(finalists), **options | judge.drawn(motors, len(finalists), -1)) as runner:
             finals = judge.costs(runner, points[finalists])
         best = finalists[int(np.argmin(finals))]
         if not best:

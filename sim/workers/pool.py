@@ -125,7 +125,7 @@ class WorkerPool(SingleOwner):
         self.recoveries = 0
         """Number of lost workers that were replaced."""
         ticks = ticks or max(1, most_steps // (options.substeps * widest))
-        layout = Arrays.layout(ticks, num_envs, options.robot.dof, options.command.size, options.robot.fixed_base)
+        layout = Arrays.layout(ticks, num_envs, options.robot.dof, options.command.size, options.observed)
         self._shared = SharedArrays(layout)
         self.arrays = Arrays.from_fields(self._shared.arrays)
         """Input and output of a request (ticks, envs, ...)."""

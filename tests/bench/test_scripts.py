@@ -10,6 +10,8 @@ from PIL import Image
 from robots import load_bundled
 from scripts import ROOT, load_script
 
+from batchpid.sim import Robot, Runner, write_recording
+
 TESTED = {"accuracy", "circles", "cluster", "draw", "film", "measure", "motions", "newcomer", "scale"}
 TESTED |= {"trajectories", "view"}
 
@@ -59,6 +61,21 @@ def test_film(tmp_path):
             shown.append(np.asarray(pictures.convert("L"))[:, :500])
     assert all((picture < 200).mean() > 0.02 for picture in shown)
     assert (shown[0] != shown[1]).any()
+
+
+def test_film_of_a_recording(tmp_path):
+    """Robots with a floating base are drawn where they are: the second picture is of robots that fell."""
+    film, path, robot = load_script("film"), tmp_path / "fall.gif", Robot.load("quadruped", fixed_base=False)
+    with Runner(robot, 4, params=robot.params(kp=1.0), workers=0, compensate="none") as runner:
+        write_recording(runner.rollout(np.tile(robot.start, (31, 1))), tmp_path / "fall.npz")
+    film.main(film.Options(path, seconds=0.31, interval=0.3, recording=tmp_path / "fall.npz"))
+    with Image.open(path) as pictures:
+        heights = []
+        for at in range(pictures.n_frames):
+            pictures.seek(at)
+            heights.append(np.nonzero((np.asarray(pictures.convert("L")) < 100)[50:].any(1))[0].min())
+    assert len(heights) == 2
+    assert heights[1] > heights[0] + 10
 
 
 def test_newcomer(tmp_path, capfd):

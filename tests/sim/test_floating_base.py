@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import mujoco
 import numpy as np
 import pytest
@@ -177,3 +179,178 @@ def test_a_fixed_base_has_no_pose(panda):
         assert runner.observe().base_pose is None
         with pytest.raises(InvalidArgumentError, match=r"base_twist.*fixed"):
             runner.reset(base_twist=np.zeros(6))
+
+
+WORLD = {
+    "ground_friction": Uniform(0.1, 0.9, operation="abs"),
+    "gravity": {"x": Uniform(-1, 1), "z": Uniform(-1, 1)},
+    "link_mass": {"trunk": Uniform(0.5, 1.5, operation="scale")},
+    "center_of_mass": {"trunk": Uniform(-0.05, 0.05)},
+}
+PUSHES = {"push": {"vx": Uniform(0.5, 1.0), "wz": Uniform(-2, 2)}, "push_interval": Uniform(0.02, 0.06)}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_pushes_of_the_same_seeds_are_the_same_falls(quadruped, engine, workers):
+    """For any number of workers, from a snapshot on, and again after a reset to the same seeds."""
+    options = {"engine": engine, "params": quadruped.params(**GAINS), "contacts": ["foot0"]}
+    options["randomization"] = Randomization(**WORLD, **PUSHES)
+    table, runs = np.tile(quadruped.start, (12, 1)), []
+    for count in (0, workers):
+        with Runner(quadruped, 5, workers=count, **options) as runner:
+            runner.reset(seed=3)
+            first = runner.rollout(table)
+            kept = runner.snapshot()
+            runs += [first, runner.rollout(table)]
+            if not count:
+                runner.restore(kept)
+                assert_identical(runs[-1], runner.rollout(table))
+                runner.reset(seed=3)
+                assert_identical(first, runner.rollout(table), skip=["time"])
+    assert_identical(runs[0], runs[2])
+    assert_identical(runs[1], runs[3])
+    assert np.ptp(runs[1].base_pose[-1, :, 0]) > 1e-3
+
+
+def test_a_push_changes_the_twist_of_the_base_at_a_tick(quadruped, engine):
+    push = {"vx": Uniform(0.5, 1.0), "vy": Uniform(-1, 1), "wx": Uniform(2, 3), "wz": Uniform(-2, 2)}
+    randomization = Randomization(push=push, push_interval=Uniform(0.055, 0.055))
+    options = {"control": "effort", "compensate": "none", "workers": 0, "ground": False, "engine": engine}
+    with Runner(quadruped, 2, randomization=randomization, **options) as runner:
+        runner.reset(base_pose=[0, 0, 0, 0.9, 0.1, 0.3, 0.2])
+        still = runner.rollout(np.zeros((6, 4)))
+        assert np.abs(still.base_twist[..., [0, 1, 3, 4, 5]]).max() < 1e-4
+        before, after = still.base_twist[-1], runner.step(np.zeros(4), substeps=1).base_twist
+        assert (after[:, 0] - before[:, 0] > 0.49).all()
+        assert (after[:, 3] > 1.9).all()
+        assert np.ptp(after[:, 0]) > 1e-3
+        assert np.abs(runner.rollout(np.zeros((4, 4))).base_twist[-1, :, 0] - after[:, 0]).max() < 0.2
+
+
+def test_a_block_slides_down_a_slope_as_it_should(tmp_path, engine):
+    """Tilted gravity makes a slope: the acceleration is g (sin a - mu cos a), the force of friction mu m g cos a."""
+    path = tmp_path / "block.urdf"
+    path.write_text(BLOCK)
+    block = Robot.load(path, fixed_base=False)
+    angle, friction = 0.5, 0.2
+    down = {"x": GRAVITY * np.sin(angle), "z": GRAVITY * (1 - np.cos(angle))}
+    world = Randomization(
+        gravity={axis: Uniform(value, value) for axis, value in down.items()},
+        ground_friction=Uniform(friction, friction, operation="abs"),
+    )
+    options = {"params": block.params(kp=200, ki=0, kd=5), "randomization": world, "contacts": ["block"]}
+    with Runner(block, 1, workers=0, engine=engine, **options) as runner:
+        slide = runner.rollout(np.tile(block.start, (60, 1)))
+    speeds = slide.base_twist[20:, 0, 0].astype(float)
+    found = (speeds[-1] - speeds[0]) / (slide.time[-1] - slide.time[20])
+    np.testing.assert_allclose(found, GRAVITY * (np.sin(angle) - friction * np.cos(angle)), rtol=0.01)
+    normal = 2.1 * GRAVITY * np.cos(angle)
+    np.testing.assert_allclose(
+        slide.contact_force[30:, 0].mean((0, 1)), [-friction * normal, 0, normal], atol=0.01 * normal
+    )
+
+
+BLOCK = """<robot name="block">
+  <link name="block"><inertial><mass value="2"/>
+    <inertia ixx="0.02" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><box size="0.4 0.4 0.05"/></geometry></collision></link>
+  <link name="knob"><inertial><mass value="0.1"/>
+    <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="turn" type="revolute"><parent link="block"/><child link="knob"/><axis xyz="0 0 1"/>
+    <limit lower="-1" upper="1" effort="5" velocity="5"/></joint></robot>"""
+
+
+def test_gravity_is_compensated_as_if_the_base_were_held(quadruped, engine):
+    """Each leg is carried by its own effort, however the trunk stands; Coriolis forces of a turning base included."""
+    with Runner(
+        quadruped, 1, params=quadruped.params(kp=0, ki=0, kd=0), workers=0, engine=engine, ground=False
+    ) as runner:
+        for pose in ([0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 1, 0, 0], [0, 0, 0, 0.8, 0.6, 0, 0]):
+            runner.reset(base_pose=pose)
+            upright = 1 - 2 * (pose[4] ** 2 + pose[5] ** 2)
+            effort = runner.step(quadruped.start, substeps=1).effort[0]
+            np.testing.assert_allclose(effort, 0.3 * GRAVITY * upright, atol=1e-4)
+        runner.reset(base_twist=[0, 0, 0, 3.0, 0, 0])
+        effort = runner.step(quadruped.start, substeps=1).effort[0]
+        np.testing.assert_allclose(effort, 0.3 * (GRAVITY + 9.0 * 0.2), rtol=1e-4)
+    assert "floating-base" in {each.code for each in quadruped.check() if each.severity == "note"}
+
+
+@pytest.mark.parametrize(
+    ("world", "text"),
+    [
+        ({"push": Uniform(0, 1)}, "push_interval.*is missing"),
+        ({"push": Uniform(0, 1), "push_interval": Uniform(0, 1)}, "push_interval: may become 0"),
+        ({"push": {"vq": Uniform(0, 1)}, "push_interval": Uniform(1, 2)}, "push.*vq"),
+        ({"ground_friction": Uniform(-1, 1)}, "ground_friction.*>= 0"),
+    ],
+    ids=str,
+)
+def test_wrong_worlds_are_refused(quadruped, world, text):
+    with pytest.raises(InvalidArgumentError, match=text):
+        Runner(quadruped, 1, workers=0, engine="mujoco", randomization=Randomization(**world))
+
+
+def test_pushes_need_a_floating_base_and_friction_contacts(panda):
+    with pytest.raises(InvalidArgumentError, match=r"push: needs a floating base"):
+        Runner(panda, 1, workers=0, engine="mujoco", randomization=Randomization(**PUSHES))
+    world = Randomization(ground_friction=Uniform(0.1, 1))
+    with pytest.raises(InvalidArgumentError, match=r"ground_friction: has no effect without collisions"):
+        Runner(panda, 1, workers=0, engine="mujoco", collisions=False, randomization=world)
+
+
+LIMB = """
+  <link name="{1}{0}"><inertial><origin xyz="0 0 -0.1"/><mass value="{2}"/>
+    <inertia ixx="2e-3" iyy="2e-3" izz="2e-4" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin xyz="0 0 -0.2"/><geometry><sphere radius="0.02"/></geometry></collision></link>
+  <joint name="{1}_joint{0}" type="revolute"><parent link="{3}"/><child link="{1}{0}"/><origin xyz="{4}" rpy="0 {5} 0"/>
+    <axis xyz="0 1 0"/><limit lower="-1.5" upper="1.5" effort="60" velocity="20"/></joint>"""
+
+
+def limbs(number, x, y):
+    thigh = LIMB.format(number, "thigh", 1.0, "trunk", f"{x} {y} 0", 0.6)
+    return thigh + LIMB.format(number, "calf", 0.2, f"thigh{number}", "0 0 -0.2", -1.2)
+
+
+TRUNK = TABLE.partition('<link name="foot0">')[0]
+DOG = f"{TRUNK}{''.join(limbs(number, *place) for number, place in enumerate(PLACES))}</robot>"
+
+
+def test_designed_gains_carry_the_base(tmp_path, engine):
+    """By default a dog on bent legs stands; with gains for legs in the air it sinks down."""
+    path = tmp_path / "dog.urdf"
+    path.write_text(DOG)
+    dog, sinks = Robot.load(path, fixed_base=False), []
+    for params in (None, dog.designed("inertia")):
+        with Runner(dog, 1, workers=0, engine=engine, params=params) as runner:
+            start = runner.observe().base_pose[0]
+            stood = runner.rollout(np.tile(dog.start, (60, 1)))
+        sinks.append(np.abs(stood.base_pose[:, 0, :3] - start[:3]).max())
+        tilts = np.degrees(2 * np.hypot(*stood.base_pose[:, 0, 4:6].T))
+        assert params is not None or tilts.max() < 3
+    assert sinks[0] < 0.02
+    assert sinks[1] > 2 * sinks[0]
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_a_free_joint_at_the_root_makes_a_floating_base(tmp_path, kind):
+    path = tmp_path / "table.urdf"
+    free = f'<link name="world"/><joint name="free" type="{kind}"><parent link="world"/><child link="trunk"/></joint>'
+    path.write_text(TABLE.replace("</robot>", free + "</robot>"))
+    table, held = Robot.load(path), Robot.load(path, fixed_base=True)
+    assert (table.fixed_base, held.fixed_base) == (False, True)
+    assert {link.name for link in held.links} - {link.name for link in table.links} == {"world"}
+    with Runner(table, 1, params=table.params(**GAINS), workers=0, engine="mujoco") as runner:
+        np.testing.assert_allclose(runner.observe().base_pose[0, :3], [0, 0, 0.35], atol=1e-6)
+    assert "joint-type" in {each.code for each in held.check()}
+    assert "joint-type" not in {each.code for each in table.check()}
+
+
+def test_tasks_observe_the_base(quadruped):
+    gym = pytest.importorskip("batchpid.sim.gym")
+    with contextlib.closing(gym.ReachVectorEnv(2, quadruped, workers=0, engine="mujoco")) as env:
+        observation, _ = env.reset(seed=0)
+        seen = env.runner.observe()
+        np.testing.assert_array_equal(observation[:, 8:15], seen.base_pose)
+        np.testing.assert_array_equal(observation[:, 15:21], seen.base_twist)
+        assert env.single_observation_space.shape == observation.shape[1:] == (8 + 13 + 4,)

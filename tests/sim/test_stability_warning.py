@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 
 import numpy as np
@@ -71,7 +72,8 @@ def test_the_env_is_named_and_the_remedy_works(arm):
         {"params": BAD, "control": "drive"},
         {"params": BAD, "control": "effort"},
         {"params": BAD | {"derivative_filter_time": 10.0}},
-        {"params": BAD, "actuators": {"lag": 0.01}},
+        {"params": BAD, "actuators": {"strength": 1e-3}},
+        {"params": GOOD, "actuators": {"command_delay": 0.01}},
         {"params": BAD, "actuators": {"armature": 100.0}},
     ],
     ids=str,
@@ -81,6 +83,28 @@ def test_there_is_none_within_the_bound_and_where_it_does_not_hold(arm, options)
     if "actuators" in options:
         options["actuators"] = bp.make_actuators(2, **options["actuators"])
     runner, none = warned(lambda: make(arm, **options))
+    runner.close()
+    assert none == []
+
+
+@pytest.mark.parametrize("late", ["command_delay", "sensor_delay"])
+def test_motors_that_are_late_lower_the_bound(arm, late):
+    """Gains within the bound of ideal motors; the env with late motors is named, and the remedy works."""
+    delays = np.zeros((3, 2))
+    delays[2] = 0.01
+    bad, motors = {"kp": 500.0, "ki": 0.0, "kd": 300.0}, bp.make_actuators(2, **{late: delays})
+    runner, none = warned(lambda: make(arm, 3, params=arm.params(**bad)))
+    runner.close()
+    assert none == []
+    runner, (message,) = warned(lambda: make(arm, 3, params=arm.params(**bad), actuators=motors))
+    runner.close()
+    assert "env 2" in message
+    assert "oscillates" in message
+    real = dataclasses.replace(arm, actuators=motors.for_envs(slice(2, 3)))
+    assert any(each.code == "unstable" for each in real.check(params=arm.params(**bad)))
+    scale = float(message.split("use at most ")[1].split(" times")[0])
+    good = {name: scale * gain for name, gain in bad.items()}
+    runner, none = warned(lambda: make(arm, 3, params=arm.params(**good), actuators=motors))
     runner.close()
     assert none == []
 

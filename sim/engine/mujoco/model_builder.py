@@ -26,17 +26,17 @@ from numpy.typing import NDArray
 
 from batchpid.errors import RobotError
 from batchpid.sim.engine.mujoco.file_scene import BodyFrame, file_scene, set_ground
+from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
 from batchpid.sim.engine.mujoco.solver import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import add_geom, link_shapes
+from batchpid.sim.robot.dissipation import CONTACT_FRICTION
 from batchpid.sim.robot.parts import MOVING_TYPES, MjcfFile
 from batchpid.sim.robot.simulated_links import body_inertias, simulated
 from batchpid.sim.robot.xml import numbers
 from batchpid.task_space.rotations import from_rpy
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
-_FRICTION = 0.3
-"""Coefficient of sliding friction of every shape, as in SAPIEN's default material."""
 FLOATING = 6
 """Degrees of freedom of a floating base, which come first in MuJoCo's arrays."""
 LARGEST_FORCE = 1e10
@@ -111,13 +111,14 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     found = file_scene(spec, file)
     scene, off = found.scene, mujoco.mjtDisableBit
     option = scene.option
-    option.disableflags &= ~(off.mjDSBL_GRAVITY | off.mjDSBL_ACTUATION | off.mjDSBL_CLAMPCTRL)
+    option.disableflags &= ~(off.mjDSBL_GRAVITY | off.mjDSBL_ACTUATION | off.mjDSBL_CLAMPCTRL | off.mjDSBL_SENSOR)
     option.enableflags &= ~(_NOT_KEPT)
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     _set_options(scene, spec)
     if not spec.collisions:
         option.disableflags |= off.mjDSBL_CONTACT
     set_ground(scene, spec.ground)
+    add_link_sensors(scene, spec, found.names, found.frames)
     if drives:
         _add_drives(scene, spec)
     try:
@@ -153,6 +154,7 @@ def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[An
         names = _add_links(scene, spec, inertias)
         if spec.collisions:
             _add_shapes(scene, spec, names)
+        add_link_sensors(scene, spec, names, {})
     except ValueError as error:
         raise _refusal(error) from error
     return scene, names
@@ -278,7 +280,7 @@ def _add_drives(scene: Any, spec: SceneSpec) -> None:
 
 
 def _contact(spec: SceneSpec) -> dict[str, Any]:
-    return {"friction": [_FRICTION, 0.005, 0.0001], "solref": [spec.physics.contact_time, 1.0]}
+    return {"friction": [CONTACT_FRICTION, 0.005, 0.0001], "solref": [spec.physics.contact_time, 1.0]}
 
 
 def set_inertia(model: Any, robot: RobotMj, link: str, inertia: SpatialInertia) -> None:

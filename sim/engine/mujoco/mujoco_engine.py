@@ -18,7 +18,7 @@ class MujocoEngine:
     """MuJoCo on the CPU. Implements :class:`batchpid.sim.engine.protocol.Engine`."""
 
     name, title = "mujoco", "MuJoCo"
-    capabilities: frozenset[Capability] = frozenset({"drive", "compiled_steps"})
+    capabilities: frozenset[Capability] = frozenset({"drive", "compiled_steps", "base_state"})
     physics: Mapping[str, Any] = SOLVERS
     group_size = 64
 

@@ -20,12 +20,13 @@ from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.data_pool import DataPool
+from batchpid.sim.engine.mujoco.link_sensors import LinkSensors
 from batchpid.sim.engine.mujoco.model_builder import FLOATING, LARGEST_FORCE, RobotMj, robot_model, set_inertia
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.protocol import FAILED
-from batchpid.sim.engine.robot_model import passive_force, scene_tree
+from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_back
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation, varied_inertia
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.simulated_links import varied_bodies
@@ -66,6 +67,7 @@ class MujocoPack(SingleOwner):
         self.dof, self._variation = len(spec.joints), variation or Variation()
         varied = self._variation
         self._masses_vary = any(each is not None for each in (varied.payload, varied.link_mass, varied.center_of_mass))
+        self._worlds_vary = varied.ground_friction is not None or varied.gravity is not None
         varies_links = varied.link_mass is not None or varied.center_of_mass is not None
         self._bodies = (
             varied_bodies(spec.urdf, spec.merge_fixed, carrier, links if varies_links else [])
@@ -86,9 +88,8 @@ class MujocoPack(SingleOwner):
             self._constraint = ConstraintEfforts(size, coupling, np.zeros(self.dof, bool), spec.timestep)
             self._constraint.implicit[...] = self._implicit
             if self.steps_natively:
-                self._constraint.use(
-                    self._joint_model, None if self.steps_read_force(True, True) else self._force_model
-                )
+                reads = spec.fixed_base and self.steps_read_force(True, True)
+                self._constraint.use(self._joint_model, None if reads else self._bias_model)
         self._stiffness = self._rate_gain = self._target_rate = np.zeros((1, self.dof))
         self._make_data(robot_model(spec))
         if variation is not None:
@@ -99,8 +100,11 @@ class MujocoPack(SingleOwner):
         if robot not in self._workspace:
             self._workspace[robot] = DataPool(robot)
         self._robot, self._pool = robot, self._workspace[robot]
+        self._sensors = LinkSensors(self.spec, robot.model, robot.bodies)
+        self._sensed = np.zeros((self.size, self._sensors.size))
         self.models, self.rows = [self._pool.model] * self.size, self._pool.initial(self.size)
         self._at, self._moves = _columns(robot.qpos), _columns(robot.qvel)
+        self._change_world(range(self.size))
         self._change_masses(range(self.size))
         self._update(range(self.size))
 
@@ -142,11 +146,12 @@ class MujocoPack(SingleOwner):
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N], by the model."""
         if self.steps_read_force(gravity, coriolis):
             return np.array([data.qfrc_bias[self._moves] for data in self._data], dtype)
-        turning = None if self.spec.fixed_base else rotate(self._robot.turn, self._bases()[:, 10:])
-        state = self.read_qpos(), self.read_qvel(), gravity, coriolis, turning
-        if self.steps_natively:
-            return self._force_model.passive_force(*state).astype(dtype)
-        return passive_force(self._tree, *state).astype(dtype)
+        return self._model_force(self._force_model, self._tree.held, gravity, coriolis).astype(dtype)
+
+    def _model_force(self, model: NativeModel, tree: RigidTree, gravity: bool, coriolis: bool) -> Float64:
+        """Return the passive force of a native model, or of a tree without native code."""
+        state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
+        return model.passive_force(*state) if self.steps_natively else passive_force(tree, *state)
 
     @cached_property
     def _tree(self) -> RigidTree:
@@ -158,7 +163,12 @@ class MujocoPack(SingleOwner):
 
     @cached_property
     def _force_model(self) -> NativeModel:
-        return NativeModel(self.spec, not self.spec.fixed_base)
+        return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "held")
+
+    @cached_property
+    def _bias_model(self) -> NativeModel:
+        """Model of the forces in the equations of motion of the joints, for constraint efforts."""
+        return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
 
     def joint_model(self) -> NativeModel:
         """Return the model of :meth:`joint_mass_matrix` in native code."""
@@ -166,7 +176,7 @@ class MujocoPack(SingleOwner):
 
     @cached_property
     def _joint_model(self) -> NativeModel:
-        model = NativeModel(self.spec, not self.spec.fixed_base)
+        model = NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
         if self._masses_vary:
             model.vary(range(self.size), self.size, self._added)
         return model
@@ -202,6 +212,7 @@ class MujocoPack(SingleOwner):
                 model, data = self.models[row], everyone[row]
                 data.qfrc_applied[self._moves] = effort[row]
                 mujoco.mj_step2(model, data)
+                self._sensed[row] += data.sensordata
                 if (np.abs(data.qpos[self._at]) <= FARTHEST).all():
                     mujoco.mj_step1(model, data)
         finally:
@@ -209,7 +220,7 @@ class MujocoPack(SingleOwner):
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether a compiled step reads this part of the passive force."""
-        return gravity and coriolis and self.spec.fixed_base and not self._masses_vary
+        return gravity and coriolis and not self._masses_vary and self._variation.gravity is None
 
     @property
     def calls(self) -> object:
@@ -233,20 +244,23 @@ class MujocoPack(SingleOwner):
         constraint, arrays = None if self._constraint is None else self._constraint.address, (self.qf, self._suspended)
         moving = (self._stiffness, self._rate_gain) if drives else None
         return MujocoStep(
-            self._robot, self.models, lambda: self._data, *arrays, reads_force, speed_limit, constraint, moving
+            *(self._robot, self.models, lambda: self._data, *arrays, reads_force, speed_limit, constraint, moving),
+            sensed=self._sensed,
         )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
         """Give the constraint efforts of robots ``rows`` the present mass matrix and passive force."""
         if self._constraint is not None:
-            self._constraint.update(self.joint_mass_matrix, self.read_qpos(), self.passive_force(True, True), rows)
+            bias = self._model_force(self._bias_model, self._tree, True, True)
+            self._constraint.update(self.joint_mass_matrix, self.read_qpos(), bias, rows)
 
     # -- changes -----------------------------------------------------------------------------------------------
 
     def read_base(self) -> Float64:
         """Return pose and twist of floating bases (M, 13), as :class:`batchpid.sim.engine.protocol.EnginePack` says."""
         rows, turn = self._bases(), self._robot.turn
-        rows[:, 10:] = np.einsum("eij,ej->ei", matrix_of(rows[:, 3:7]), rows[:, 10:])  # MuJoCo's are in the body's axes
+        inverse = rows[:, 3:7] * _CONJUGATE
+        rows[:, 10:] = turned_back(inverse, rows[:, 10:])  # MuJoCo's are in the body's axes
         if turn[0] != 1.0:
             rows[:, 3:7] = multiply(rows[:, 3:7], turn * _CONJUGATE)
         return rows
@@ -262,6 +276,29 @@ class MujocoPack(SingleOwner):
         if self._robot.model.nq == self.dof:
             return np.zeros(self.size, bool)
         return ~np.array([np.abs(data.qpos).max() <= FARTHEST for data in self._data])
+
+    def take_sensed(self) -> dict[str, Float64]:
+        """Return the sums of the links' sensors since the last call, as EnginePack says, and begin again."""
+        sums = self._sensors.quantities(self._sensed) if self._sensors.size else {}
+        self._sensed[...] = 0.0
+        return sums
+
+    def read_base_motion(self) -> Float64 | None:
+        """Return gravity and the rate at which floating bases turn, in their own axes (M, 6); None for fixed ones."""
+        if self.spec.fixed_base:
+            return None
+        rows, turn = self._bases(), self._robot.turn
+        parts = turned_back(rows[:, 3:7], np.array(self.spec.gravity)), rows[:, 10:]
+        return np.concatenate([rotate(turn, part) for part in parts], axis=1)
+
+    def push(self, rows: Sequence[int], twists: Float64) -> None:
+        """Add ``twists`` (len(rows), 6) to the twists of floating bases, as :meth:`read_base` has them."""
+        data, turns = self._data, matrix_of(self._bases()[rows, 3:7])
+        _, at = self._robot.base or (0, 0)
+        for row, twist, turn in zip(rows, twists, turns, strict=True):
+            data[row].qvel[at : at + 3] += twist[:3]
+            data[row].qvel[at + 3 : at + FLOATING] += turn.T @ twist[3:]
+        self._evaluate(rows)
 
     def write_state(
         self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], base: Float64 | None = None
@@ -284,6 +321,7 @@ class MujocoPack(SingleOwner):
             data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = position, velocity
             data.ctrl[:] = ctrl
             self.qf[row] = 0.0
+            self._sensed[row] = 0.0
         self._evaluate(rows)
         self.update_constraint(list(rows))  # within a tick, the robots may have failed
 
@@ -315,12 +353,16 @@ class MujocoPack(SingleOwner):
         self._share()
 
     def _share(self) -> None:
-        """Return to one shared model if neither masses nor armature nor drives of the robots differ."""
+        """Return to one shared model if neither masses nor worlds nor armature nor drives of the robots differ."""
         first = self.models[0]
-        if not self._masses_vary and all(
-            np.array_equal(getattr(first, field), getattr(model, field))
-            for model in self.models[1:]
-            for field in _JOINTS
+        if (
+            not self._masses_vary
+            and not self._worlds_vary
+            and all(
+                np.array_equal(getattr(first, field), getattr(model, field))
+                for model in self.models[1:]
+                for field in _JOINTS
+            )
         ):
             self.models = [first] * self.size
         self._update(range(self.size))
@@ -335,8 +377,19 @@ class MujocoPack(SingleOwner):
         for mine, new in zip(self._variation, variation, strict=True):
             if mine is not None:
                 mine[rows] = new
+        self._change_world(rows)
         self._change_masses(rows)
         self._update(rows)
+
+    def _change_world(self, rows: Iterable[int]) -> None:
+        """Set the gravity and friction that the scenes of robots ``rows`` have."""
+        gravity, friction = self._variation.gravity, self._variation.ground_friction
+        for row in rows if self._worlds_vary else ():
+            model = self._own_model(row)
+            if gravity is not None:
+                model.opt.gravity[:] = gravity[row]
+            if friction is not None:
+                model.geom_friction[:, 0] = model.pair_friction[:, :2] = friction[row]
 
     def _change_masses(self, rows: Iterable[int]) -> None:
         if not self._masses_vary:

@@ -32,6 +32,7 @@ FUNCTIONS = {
 CLOCK = "mjcb_time"
 """Variable of the library that holds its clock."""
 FIELDS = {"qpos": "qpos", "qvel": "qvel", "applied": "qfrc_applied", "bias": "qfrc_bias", "ctrl": "ctrl"}
+FIELDS |= {"sensors": "sensordata"}
 """Arrays of ``mujoco.MjData``, by field."""
 
 
@@ -81,6 +82,8 @@ class MujocoStep:
         Joint speed beyond which the status says so (dof,), or None.
     constraint
         Address of the constraint of coupled joints, or None.
+    sensed
+        Sums of the sensors over sim steps (robots, values).
     drives
         Stiffness and rate gain of the drives (robots, dof), if the targets move within a tick.
     """
@@ -96,6 +99,8 @@ class MujocoStep:
         speed_limit: NDArray[np.float64] | None,
         constraint: int | None = None,
         drives: tuple[NDArray[Any], ...] | None = None,
+        *,
+        sensed: NDArray[np.float64],
     ) -> None:
         found, data = functions(), take_data()
         assert found is not None
@@ -110,11 +115,12 @@ class MujocoStep:
         }
         arrays: dict[str, NDArray[Any]] = {name: np.array(rows, np.uint64) for name, rows in tables.items()}
         arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64), "qf": qf}
-        arrays["turn"] = np.ascontiguousarray(rotation_matrix(robot.turn))
+        arrays |= {"turn": np.ascontiguousarray(rotation_matrix(robot.turn)), "sensed": sensed}
         if drives is not None:
             arrays |= zip(("stiffness", "rate_gain"), drives, strict=True)
         robots = Mujoco(**addresses, **{name: array.ctypes.data for name, array in arrays.items()})
-        robots.base = 0 if robot.base is None else robot.base[1]
+        robots.sensor_size = sensed.shape[1]
+        robots.base_qpos, robots.base_qvel = robot.base or (0, 0)
         robots.clearance = None if clearance is None else clearance.address
         limit = None if speed_limit is None else np.broadcast_to(speed_limit, qf.shape[1:]).astype(np.float64)
         self._group = Group(

@@ -37,9 +37,9 @@ PyObject *make_gateway(PyObject *, PyObject *arguments) {
   if (!pointers(functions, addresses) || !pointers(robots, gateway->robots) || !pointers(systems, gateway->systems)) {
     return nullptr;
   }
-  static_assert(sizeof(Functions) == 7 * sizeof(void *));
-  if (addresses.size() != 7 || gateway->systems.size() != gateway->robots.size()) {
-    PyErr_SetString(PyExc_ValueError, "needs seven functions, and a system for each robot");
+  static_assert(sizeof(Functions) == 9 * sizeof(void *));
+  if (addresses.size() != 9 || gateway->systems.size() != gateway->robots.size()) {
+    PyErr_SetString(PyExc_ValueError, "needs nine functions, and a system for each robot");
     return nullptr;
   }
   std::memcpy(&gateway->functions, addresses.data(), sizeof(Functions));
@@ -220,15 +220,15 @@ PyObject *joint_matrices(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   return without_gil([&] { write_joint_matrices(*model, rows, arrays[0].as<double>(), arrays[1].as<double>()); });
 }
 
-// forces(address of a Model, gravity, coriolis, qpos, qvel, turning or None, out, rows)
+// forces(address of a Model, gravity, coriolis, qpos, qvel, base or None, out, rows)
 PyObject *forces(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto const *model = structure<Model>(arguments[0]);
   if (model == nullptr) return nullptr;
   Parts const parts{PyObject_IsTrue(arguments[1]) == 1, PyObject_IsTrue(arguments[2]) == 1};
   Py_ssize_t const rows = PyLong_AsSsize_t(arguments[7]), count = rows * model->dof;
-  Py_ssize_t const turning = arguments[5] == Py_None ? 0 : 3 * rows;
+  Py_ssize_t const base = arguments[5] == Py_None ? 0 : BASE_SIZE * rows;
   Buffer arrays[4];
-  if (!open_doubles(arguments + 3, {count, count, turning, count}, 3, arrays)) return nullptr;
+  if (!open_doubles(arguments + 3, {count, count, base, count}, 3, arrays)) return nullptr;
   return without_gil([&] {
     write_forces(*model, parts, rows, arrays[0].as<double>(), arrays[1].as<double>(), arrays[2].as<double>(),
                  arrays[3].as<double>());

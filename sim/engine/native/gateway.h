@@ -32,6 +32,14 @@ struct VectorXf {
   ~VectorXf() { std::free(data); }
 };
 
+// Pose of the root link, and an angular velocity, in the world.
+struct RootPose {
+  float wxyz[4], position[3];
+};
+struct Vec3 {
+  float x, y, z;
+};
+
 // Exported functions: SYMBOLS in interface.py.
 struct Functions {
   VectorXf (*get_qpos)(Articulation *);
@@ -41,6 +49,8 @@ struct Functions {
   void (*step)(System *);
   void (*set_drive_position)(Joint *, float);
   void (*set_drive_velocity)(Joint *, float);
+  RootPose (*get_root_pose)(Articulation *);
+  Vec3 (*get_root_angular_velocity)(Articulation *);
 };
 
 struct Gateway {

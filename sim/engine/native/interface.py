@@ -20,8 +20,12 @@ SYMBOLS = (
     "_ZN6sapien5physx14PhysxSystemCpu4stepEv",
     "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetPositionEf",
     "_ZN6sapien5physx22PhysxArticulationJoint22setDriveTargetVelocityEf",
+    "_ZN6sapien5physx17PhysxArticulation11getRootPoseEv",
+    "_ZN6sapien5physx17PhysxArticulation22getRootAngularVelocityEv",
 )
 """Functions of SAPIEN, in the order of Functions in gateway.h."""
+BASES = ("fixed", "free", "held")
+"""Kinds of the base of a :class:`Model`, as Base in model.h."""
 STATUS = ("not_finite", "too_fast", "failed", "no_noise")
 """Bits of the status of a sim step: reasons to stop a loop over sim steps, as Status in sim_step.h."""
 STAGES = ("program", "force", "inertia", "mass_matrix", "controller", "targets", "constraint", "engine")
@@ -37,7 +41,7 @@ class Group(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("gateway", "qf", "skip", "speed_limit")),
-        *((name, ctypes.c_void_p) for name in ("mujoco", "constraint", "joints")),
+        *((name, ctypes.c_void_p) for name in ("mujoco", "constraint", "joints", "sense")),
         ("robots", ctypes.c_int64),
         ("dof", ctypes.c_int64),
         ("gravity", ctypes.c_int32),
@@ -75,8 +79,8 @@ class Mujoco(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("models", "data")),
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")),
         *((name, ctypes.c_void_p) for name in ("ctrl", "stiffness", "rate_gain")),
-        *((name, ctypes.c_void_p) for name in ("clearance", "turn")),
-        ("base", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("clearance", "sensors", "sensed", "turn")),
+        *((name, ctypes.c_int64) for name in ("sensor_size", "base_qpos", "base_qvel")),
     ]
 
 
@@ -101,7 +105,7 @@ class Model(ctypes.Structure):
         ("gravity", 3 * ctypes.c_double),
         ("dof", ctypes.c_int64),
         ("varies", ctypes.c_int32),
-        ("floats", ctypes.c_int32),
+        ("base", ctypes.c_int32),
     ]
 
 
@@ -136,7 +140,8 @@ class Tick(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping")),
         *((name, ctypes.c_void_p) for name in ("leader", "multiplier", "matrix", "control")),
         *((name, ctypes.c_void_p) for name in ("measured_force", "read_force", "refresh")),
-        *((name, ctypes.c_void_p) for name in ("gain", "memory", "age", "target", "target_rate", "left")),
+        *((name, ctypes.c_void_p) for name in ("gain", "memory", "age", "target", "target_rate")),
+        *((name, ctypes.c_void_p) for name in ("base_pose", "base_twist", "left")),
         ("noise", 2 * ctypes.c_void_p),
         ("timestep", ctypes.c_double),
         *((name, ctypes.c_int64) for name in ("dof", "stage_count", "transfer_count")),

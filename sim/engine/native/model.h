@@ -18,6 +18,12 @@ struct Bodies {
   T const *rows;
 };
 
+// Base of robots: fixed at the origin of the world; free to move; or held where it is, at the rate at which it turns.
+enum class Base : std::int32_t { FIXED, FREE, HELD };
+
+// Numbers of a base that is not fixed, in its own axes: gravity, and the rate at which it turns.
+constexpr std::int64_t BASE_SIZE = 6;
+
 // Robots of one kind that may differ in their masses; Python fills in the fields (Model in interface.py).
 struct Model {
   std::int32_t const *tree;  // (dof, 2)
@@ -26,7 +32,7 @@ struct Model {
   double gravity[3];
   std::int64_t dof;
   std::int32_t varies;       // each robot has its own inertias
-  std::int32_t floats;       // the base moves freely
+  Base base;
 };
 
 // WIDTH robots at a pose.
@@ -109,7 +115,7 @@ inline __attribute__((always_inline)) void joint_matrix(Model const &of, std::in
                                                         double const *qpos, Posed &posed, Lanes *matrix) {
   Inertia<Lanes> const base = posed.pose(of, first, rows, qpos);
   composite_mass_matrix(of.dof, of.tree, posed.bodies.data(), matrix);
-  if (!of.floats) return;
+  if (of.base != Base::FREE) return;
   Floating const floating(of, posed, base);
   for (std::int64_t i = 0; i < of.dof; ++i) {
     Lanes const *own = &floating.couples[static_cast<std::size_t>(6 * i)];
@@ -137,11 +143,10 @@ struct Parts {
   bool gravity, coriolis;
 };
 
-// Write the efforts (rows, dof) that cancel gravity, and Coriolis and centrifugal forces, at qpos and qvel. `turning`
-// (rows, 3) is the velocity of a floating base in its own axes; null: the base is held. On a floating base gravity, a
-// velocity and an acceleration of the base cancel.
+// Write the efforts (rows, dof) that cancel gravity, and Coriolis and centrifugal forces, at qpos and qvel. `bases` (rows,
+// BASE_SIZE) are those that are not fixed. On a free base gravity, a velocity and an acceleration of the base cancel.
 FOR_EACH_PROCESSOR static void write_forces(Model const &of, Parts parts, std::int64_t rows, double const *qpos,
-                                            double const *qvel, double const *base_turning, double *out) {
+                                            double const *qvel, double const *bases, double *out) {
   std::int64_t const dof = of.dof;
   Posed posed(dof);
   std::vector<BodyMotion<Lanes>> motions(static_cast<std::size_t>(dof));
@@ -150,17 +155,15 @@ FOR_EACH_PROCESSOR static void write_forces(Model const &of, Parts parts, std::i
     Inertia<Lanes> const base = posed.pose(of, first, rows, qpos);
     auto const add = [&](bool moves, double sign) {
       BodyMotion<Lanes> root{};
-      if (base_turning == nullptr) {
-        root.moving_change = {Lanes(-of.gravity[0]), Lanes(-of.gravity[1]), Lanes(-of.gravity[2])};
-      } else if (moves) {
-        auto const along = [&](int axis) { return gather(base_turning, 3, axis, first, rows); };
-        root.turning = {along(0), along(1), along(2)};
-      }
+      auto const along = [&](int at) { return gather(bases, BASE_SIZE, at, first, rows); };
+      if (of.base == Base::FIXED) root.moving_change = {Lanes(-of.gravity[0]), Lanes(-of.gravity[1]), Lanes(-of.gravity[2])};
+      if (of.base == Base::HELD) root.moving_change = {-along(0), -along(1), -along(2)};
+      if (of.base != Base::FIXED && moves) root.turning = {along(3), along(4), along(5)};
       for (std::int64_t j = 0; j < dof; ++j) posed.qvel[j] = moves ? gather(qvel, dof, j, first, rows) : Lanes{};
       move_bodies(dof, of.tree, posed.bodies.data(), posed.qvel.data(), root, motions.data());
       for (std::int64_t j = 0; j < dof; ++j) motions[j].accelerate(posed.bodies[j].inertia);
       efforts_of_wrenches(dof, of.tree, posed.bodies.data(), motions.data(), effort.data());
-      if (base_turning != nullptr) {
+      if (of.base == Base::FREE) {
         root.accelerate(base);
         for (std::int64_t j = dof - 1; j >= 0; --j) {
           if (of.tree[2 * j] >= 0) {
@@ -178,7 +181,7 @@ FOR_EACH_PROCESSOR static void write_forces(Model const &of, Parts parts, std::i
       for (std::int64_t j = 0; j < dof; ++j) force[j] += sign * effort[j];
     };
     for (auto &each : force) each = Lanes{};
-    bool const held = base_turning == nullptr;
+    bool const held = of.base != Base::FREE;
     if (parts.coriolis || (parts.gravity && held)) add(parts.coriolis, 1.0);
     if (parts.coriolis && !parts.gravity && held) add(false, -1.0);
     for (std::int64_t j = 0; j < dof; ++j) scatter(force[j], out, dof, j, first, rows);

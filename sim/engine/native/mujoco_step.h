@@ -38,8 +38,11 @@ struct Mujoco {
   double *const *ctrl;                      // (robots,): arrays of their mjData, (dof,) each with drives
   double const *stiffness, *rate_gain;      // (robots, dof): gains of the drives, or null if no target changes
   Clearance const *clearance;               // or null: collision detection of all shapes in every sim step
+  double const *const *sensors;             // (robots,): arrays of their mjData, (sensor_size,) each
+  double *sensed;                           // (robots, sensor_size): sums of the sensors over sim steps
   double const *turn;                       // (3, 3): axes of the body of a floating base in its link
-  std::int64_t base;                        // index of that base in qvel
+  std::int64_t sensor_size;
+  std::int64_t base_qpos, base_qvel;        // indices of that base
 };
 
 // Handler of MuJoCo's messages while this thread steps. After an error MuJoCo would end the process: the handler jumps
@@ -101,6 +104,9 @@ inline bool advance(Mujoco const &mujoco, std::int64_t row, std::int64_t dof, do
     return false;
   }
   mujoco.step2(mujoco.models[row], mujoco.data[row]);
+  for (std::int64_t i = 0; i < mujoco.sensor_size; ++i) {
+    mujoco.sensed[row * mujoco.sensor_size + i] += mujoco.sensors[row][i];
+  }
   bool finite = true;
   for (std::int64_t joint = 0; joint < dof; ++joint) {
     double const q = mujoco.qpos[row][mujoco.qpos_at[joint]];

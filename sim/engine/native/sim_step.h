@@ -27,6 +27,7 @@ struct Group {
   Mujoco const *mujoco;              // robots in MuJoCo, or null; then there is no gateway
   Constraint const *constraint;      // of coupled joints, or null
   Joint *const *joints;              // (robots, dof): in SAPIEN, or null without targets of drives that move
+  void (*sense)(std::int64_t row);   // reads the sensors of a robot's links in SAPIEN after a sim step, or null
   std::int64_t robots, dof;
   std::int32_t gravity, coriolis;    // parts of the passive force; without both it is zero
   std::int32_t velocities, unused;   // whether to read velocities; otherwise they are zero
@@ -72,6 +73,7 @@ std::int32_t sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos,
     if (group.constraint != nullptr) constrain_row(group, row, qf);
     if (!group.skip[row]) apply(call, robot, qf, dof);
     call.step(gateway.systems[row]);
+    if (group.sense != nullptr) group.sense(static_cast<std::int64_t>(row));
     VectorXf const position = call.get_qpos(robot);
     copy_row(position, qpos + at, dof);
     if (group.velocities || group.speed_limit) copy_row(call.get_qvel(robot), qvel + at, dof);
@@ -172,22 +174,67 @@ inline void write_targets(Group const &group, double const *target, double const
   }
 }
 
-// Write the velocities (robots, 3) at which bases in MuJoCo turn, in the axes of their links.
-inline void write_turning(Group const &group, double *out) {
-  double const *const turn = group.mujoco->turn;
-  for (std::int64_t at = 0; at < 3 * group.robots; ++at) {
-    double const *const own = group.mujoco->qvel[at / 3] + group.mujoco->base + 3, *const axis = turn + 3 * (at % 3);
-    out[at] = axis[0] * own[0] + axis[1] * own[1] + axis[2] * own[2];
+// Write R^T v for the rotation R of a quaternion (w, x, y, z), as turned_back in robot_model.py.
+inline void turn_back(double const *q, double const *v, double *out) {
+  double const w = q[0], x = q[1], y = q[2], z = q[3], s = 2 / (w * w + x * x + y * y + z * z);
+  double const rows[3][3] = {{1 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)},
+                             {s * (x * y - w * z), 1 - s * (x * x + z * z), s * (y * z + w * x)},
+                             {s * (x * z + w * y), s * (y * z - w * x), 1 - s * (x * x + y * y)}};
+  for (int i = 0; i < 3; ++i) out[i] = rows[i][0] * v[0] + rows[i][1] * v[1] + rows[i][2] * v[2];
+}
+
+// Write poses (robots, 7) and twists (robots, 6) of floating bases in MuJoCo, as read_base in mujoco_pack.py. Return
+// whether all are finite, and not too far.
+inline bool write_base_states(Group const &group, double *pose, double *twist) {
+  bool near = true;
+  for (std::int64_t row = 0; row < group.robots; ++row, pose += 7, twist += 6) {
+    double const *qvel = group.mujoco->qvel[row] + group.mujoco->base_qvel;
+    std::copy_n(group.mujoco->qpos[row] + group.mujoco->base_qpos, 7, pose);
+    std::copy_n(qvel, 3, twist);
+    double const back[4] = {pose[3], -pose[4], -pose[5], -pose[6]};
+    turn_back(back, qvel + 3, twist + 3);
+    for (int i = 0; i < 7; ++i) near = near && std::fabs(pose[i]) <= FARTHEST;
+    for (int i = 0; i < 6; ++i) near = near && std::fabs(twist[i]) <= FARTHEST;
+  }
+  return near;
+}
+
+// Write gravity and the rates at which bases turn, in their own axes (robots, BASE_SIZE).
+inline void write_bases(Group const &group, double const *gravity, double *out) {
+  for (std::int64_t row = 0; row < group.robots; ++row, out += BASE_SIZE) {
+    double q[4], turning[3];
+    if (group.mujoco != nullptr) {
+      std::copy_n(group.mujoco->qpos[row] + group.mujoco->base_qpos + 3, 4, q);
+      std::copy_n(group.mujoco->qvel[row] + group.mujoco->base_qvel + 3, 3, turning);
+    } else {
+      Functions const &call = group.gateway->functions;
+      Articulation *robot = group.gateway->robots[static_cast<std::size_t>(row)];
+      RootPose const pose = call.get_root_pose(robot);
+      Vec3 const rate = call.get_root_angular_velocity(robot);
+      std::copy_n(pose.wxyz, 4, q);
+      double const world[3] = {rate.x, rate.y, rate.z};
+      turn_back(q, world, turning);
+    }
+    double own[3];
+    turn_back(q, gravity, own);
+    double const *const turn = group.mujoco == nullptr ? nullptr : group.mujoco->turn;
+    for (int i = 0; i < 3; ++i) {
+      auto const in_link = [&](double const *v) {
+        return turn == nullptr ? v[i] : turn[3 * i] * v[0] + turn[3 * i + 1] * v[1] + turn[3 * i + 2] * v[2];
+      };
+      out[i] = in_link(own);
+      out[3 + i] = in_link(turning);
+    }
   }
 }
 
 // Write a part of the passive force (robots, dof) of a model at a state of the robots.
 inline void write_force(Group const &group, Model const &model, Parts parts, double const *qpos, double const *qvel,
                         double *out) {
-  thread_local std::vector<double> turning;
-  turning.resize(static_cast<std::size_t>(3 * group.robots));
-  if (model.floats) write_turning(group, turning.data());
-  write_forces(model, parts, group.robots, qpos, qvel, model.floats ? turning.data() : nullptr, out);
+  thread_local std::vector<double> bases;
+  bases.resize(static_cast<std::size_t>(BASE_SIZE * group.robots));
+  if (model.base != Base::FIXED) write_bases(group, model.gravity, bases.data());
+  write_forces(model, parts, group.robots, qpos, qvel, bases.data(), out);
 }
 
 // Give the constraint efforts the present mass matrices and passive forces; qpos and qvel (robots, dof) are the present.

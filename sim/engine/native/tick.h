@@ -62,6 +62,7 @@ struct Tick {
   double *gain, *memory;          // of the friction model
   std::int64_t *age;              // (robots,)
   double const *target, *target_rate;  // outputs of a program: targets of drives, or null; the rate may be null for 0
+  double *base_pose, *base_twist;  // (robots, 7) and (robots, 6) in MuJoCo after a tick, or null
   double *left;                   // time from the moment of the law's setpoint to the end of the tick [s], or null
   double const *noise[2];         // (steps, robots, dof): noise of the sensors in the next steps, or null
   double timestep;
@@ -122,7 +123,7 @@ inline std::int32_t run_stage(Stage const &stage, BoundProgram *const *programs,
       return 0;
     }
     case StageKind::FORCE:
-      write_forces(*tick.measured_force, parts, robots, tick.pose, tick.rate, nullptr, tick.passive);
+      write_force(group, *tick.measured_force, parts, tick.pose, tick.rate, tick.passive);
       return 0;
     case StageKind::INERTIA:
       refresh(*tick.refresh, robots, tick.qpos, tick.gain, tick.memory, tick.age);
@@ -199,6 +200,7 @@ inline std::int32_t run_ticks(BoundProgram *const *programs, Tick const &tick, G
       if (status != 0) return status;
     }
     if (!whole || !are_finite(tick.qvel, group.robots * group.dof)) return 0;
+    if (tick.base_pose != nullptr && !write_base_states(group, tick.base_pose, tick.base_twist)) return 0;
     write_observation(tick, place.tick);
   }
   return 0;

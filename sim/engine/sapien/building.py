@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache
 from threading import RLock
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
@@ -18,12 +20,14 @@ from batchpid.sim.engine.lazy_module import imported_lazily
 from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_groups import link_groups
-from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.dissipation import CONTACT_FRICTION, DISSIPATION
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.meshes import note_meshes
 from batchpid.sim.robot.simulated_links import simulated
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
+RESTITUTION = 0.1
+"""Of SAPIEN's default material."""
 _building = RLock()
 """Lock of the thread that builds a robot: SAPIEN's settings are process-wide, and builders are shared."""
 
@@ -112,7 +116,7 @@ def _engine_settings(spec: SceneSpec) -> Iterator[None]:
     physx.set_scene_config(gravity=gravity, enable_tgs=spec.physics.solver == "TGS")
     physx.set_body_config(spec.physics.position_iterations, spec.physics.velocity_iterations, sleep_threshold=0.0)
     physx.set_shape_config()
-    physx.set_default_material(0.3, 0.3, 0.1)
+    physx.set_default_material(CONTACT_FRICTION, CONTACT_FRICTION, RESTITUTION)
     try:
         yield
     finally:
@@ -122,9 +126,9 @@ def _engine_settings(spec: SceneSpec) -> Iterator[None]:
         physx.set_default_material(material.static_friction, material.dynamic_friction, material.restitution)
 
 
-def new_system(spec: SceneSpec) -> Any:
-    """Return a new PhysX system, which has the solver, gravity and time step of ``spec``."""
-    with engine_settings(spec):
+def new_system(spec: SceneSpec, gravity: NDArray[np.float64] | None = None) -> Any:
+    """Return a new PhysX system, which has the solver and time step of ``spec``, and its or another gravity (3,)."""
+    with engine_settings(spec if gravity is None else replace(spec, gravity=tuple(gravity.tolist()))):
         system = physx.PhysxCpuSystem()
     system.timestep = spec.timestep
     return system

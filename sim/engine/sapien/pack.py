@@ -9,7 +9,7 @@ lines because that is the whole interface between loop and engine.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -25,10 +25,12 @@ from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native.library import obstacle
-from batchpid.sim.engine.native_model import NativeModel
+from batchpid.sim.engine.native_model import NativeModel, passive_force_of
+from batchpid.sim.engine.robot_model import turned_back
 from batchpid.sim.engine.sapien.building import build_scene, engine_settings, link_frames, new_system
 from batchpid.sim.engine.sapien.built_tree import scene_tree
 from batchpid.sim.engine.sapien.calls import EngineCalls
+from batchpid.sim.engine.sapien.link_sensors import LinkSensors
 from batchpid.sim.engine.sapien.native_calls import engine_calls
 from batchpid.sim.engine.sapien.sim_step import NativeStep
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, refuse_shapes, write_root
@@ -58,7 +60,7 @@ class Pack(SingleOwner):
 
     def __init__(self, spec: SceneSpec, size: int, first_env: int = 0) -> None:
         self.spec, self.first_env, self.steps_natively = spec, first_env, not obstacle()
-        self.systems = [new_system(spec) for _ in range(size)]
+        self.systems = [self._system(row) for row in range(size)]
         built = [self._build(row, system) for row, system in enumerate(self.systems)]
         # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.
         self._scenes, self.robots = map(list, zip(*built, strict=True))
@@ -90,7 +92,12 @@ class Pack(SingleOwner):
             self._constraint.implicit[...] = self._implicit
             if self.steps_natively:
                 self._constraint.use(self._joint_model, None)
+        self._sensors = LinkSensors(spec, self.robots, self.systems) if spec.contacts or spec.wrenches else None
         self._bind()
+
+    def _system(self, row: int) -> Any:
+        """Return a new system for ``row``."""
+        return new_system(self.spec)
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
         """Return a new scene in ``system`` and the robot in it, for ``row``."""
@@ -116,6 +123,9 @@ class Pack(SingleOwner):
             self._calls.write_qf()
         self._stepped[...] = True
         self._calls.step()
+        if self._sensors is not None:
+            for row in range(self.size):
+                self._sensors.add(row)
 
     @property
     def calls(self) -> EngineCalls:
@@ -124,7 +134,7 @@ class Pack(SingleOwner):
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether :meth:`compiled_step` reads this part of the force of :meth:`passive_force`."""
-        return True
+        return self.spec.fixed_base
 
     def compiled_step(
         self,
@@ -137,7 +147,8 @@ class Pack(SingleOwner):
         """Return the sim step as one native call, which holds for the present :attr:`calls`."""
         constraint = None if self._constraint is None else self._constraint.address
         reads, joints = (gravity, coriolis, velocities), self._joints if drives else None
-        return NativeStep(self.calls, self._stepped, *reads, speed_limit, constraint, joints)
+        sense = None if self._sensors is None else self._sensors.add
+        return NativeStep(self.calls, self._stepped, *reads, speed_limit, constraint, joints, sense)
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
         """Give the constraint efforts of robots ``rows`` the present mass matrix and passive force."""
@@ -151,11 +162,11 @@ class Pack(SingleOwner):
 
     @cached_property
     def _joint_model(self) -> NativeModel:
-        return NativeModel(self.spec, not self.spec.fixed_base)
+        return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
 
     def force_model(self) -> NativeModel:
         """Return the model of the passive force where compiled steps do not read it."""
-        return NativeModel(self.spec)
+        return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "held")
 
     def _renew(self, rows: Sequence[int]) -> None:
         """Rebuild the robots ``rows`` in new systems, in which earlier contacts have no influence on the next ones.
@@ -173,7 +184,7 @@ class Pack(SingleOwner):
             self._scenes[row].clear()
             self._scenes[row] = self.robots[row] = self.systems[row] = None
         for row in used:
-            self.systems[row] = new_system(self.spec)
+            self.systems[row] = self._system(row)
         for row, settings in zip(used, drives, strict=True):
             self._scenes[row], robot = self._build(row, self.systems[row])
             for joint, (drive, target, rate, armature) in zip(robot.active_joints, settings, strict=True):
@@ -199,7 +210,14 @@ class Pack(SingleOwner):
         return ts.mass_matrix(scene_tree(self.spec), qpos)
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
-        return self._calls.passive_force(gravity, coriolis, dtype)
+        if self.steps_read_force(gravity, coriolis):
+            return self._calls.passive_force(gravity, coriolis, dtype)
+        state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
+        return self._passive_force(*state).astype(dtype)
+
+    @cached_property
+    def _passive_force(self) -> Callable[..., Float64]:
+        return passive_force_of(self.spec, self.steps_natively)
 
     def write_qf(self, effort: NDArray[Any]) -> None:
         self.qf[...] = effort
@@ -213,17 +231,39 @@ class Pack(SingleOwner):
         return np.array(~(np.abs(self.read_base()) <= FARTHEST).all(1))
 
     def read_base(self) -> Float64:
-        return self._moved_to_origin(np.array([read_root(robot) for robot in self.robots], np.float64), -1.0)
+        roots = np.array([read_root(robot) for robot in self.robots], np.float64)
+        return self._moved_to_origin(range(self.size), roots, -1.0)
 
-    def _moved_to_origin(self, roots: Float64, sign: float) -> Float64:
-        """Return ``roots`` (n, 13) with the velocity of the link's origin for that of its center of mass, or back.
+    def read_base_motion(self) -> Float64 | None:
+        if self.spec.fixed_base:
+            return None
+        roots = np.array([read_root(robot) for robot in self.robots], np.float64)
+        parts = np.array(self.spec.gravity), roots[:, 10:]
+        return np.concatenate([turned_back(roots[:, 3:7], part) for part in parts], axis=1)
+
+    def push(self, rows: Sequence[int], twists: Float64) -> None:
+        bases = self.read_base()[rows]
+        bases[:, 7:] += twists
+        for row, base in zip(rows, self._moved_to_origin(rows, bases, 1.0).astype(np.float32), strict=True):
+            _, moving, turning = np.split(base, [7, 10])
+            self.robots[row].set_root_linear_velocity(moving)
+            self.robots[row].set_root_angular_velocity(turning)
+        if self._sensors is not None:
+            self._sensors.place(rows)
+
+    def _moved_to_origin(self, rows: Sequence[int], roots: Float64, sign: float) -> Float64:
+        """Return ``roots`` (n, 13) of robots ``rows`` with the velocity of the link's origin for that of its center of
+        mass, or back.
 
         PhysX gives the velocity of the center of mass c: v_c = v + w x (R c), subtracted with ``sign`` -1.
         """
-        center = np.asarray(self.robots[0].links[0].cmass_local_pose.p, np.float64)
-        arm = matrix_of(roots[:, 3:7]) @ center
+        centers = np.array([self.robots[row].links[0].cmass_local_pose.p for row in rows], np.float64)
+        arm = (matrix_of(roots[:, 3:7]) @ centers[..., None])[..., 0]
         velocity = roots[:, 7:10] + sign * np.cross(roots[:, 10:], arm)
         return np.concatenate([roots[:, :7], velocity, roots[:, 10:]], axis=1)
+
+    def take_sensed(self) -> dict[str, Float64]:
+        return {} if self._sensors is None else self._sensors.take()
 
     def write_state(
         self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], base: Float64 | None = None
@@ -231,7 +271,7 @@ class Pack(SingleOwner):
         """Place robots ``rows``: positions and velocities (len(rows), dof), the root at ``base``; their efforts become
         zero, and the content of their scenes is reset.
         """
-        bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else self._moved_to_origin(base, 1.0)
+        bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else self._moved_to_origin(rows, base, 1.0)
         self._place(rows, qpos, qvel, bases.astype(np.float32))
         self.update_constraint(list(rows))  # within a tick, the robots may have failed
 
@@ -252,6 +292,8 @@ class Pack(SingleOwner):
                 self._contents[row].reset()
         if self._constraint is not None:
             self._constraint.place(rows, qpos)
+        if self._sensors is not None:
+            self._sensors.place(rows)
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
         """Raise TypeError: the robots of this pack equal the model; see :mod:`batchpid.sim.engine.sapien.variation`."""

@@ -15,10 +15,10 @@ from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 
 
 class SapienEngine:
-    """SAPIEN with PhysX on the CPU, with all capabilities. Implements :class:`batchpid.sim.engine.protocol.Engine`."""
+    """SAPIEN with PhysX on the CPU. Implements :class:`batchpid.sim.engine.protocol.Engine`."""
 
     name, title = "sapien", "SAPIEN"
-    capabilities: frozenset[Capability] = frozenset(get_args(Capability))
+    capabilities: frozenset[Capability] = frozenset(get_args(Capability)) - {"base_state"}
     physics: Mapping[str, Any] = PHYSICS
     group_size = 16
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from batchpid.sim.engine.native.interface import Group
 from batchpid.sim.engine.sapien.calls import EngineCalls
 from batchpid.sim.engine.sapien.native_calls import NativeCalls, gateway_address, gateway_sim_step, pointer
+
+_SENSE = ctypes.CFUNCTYPE(None, ctypes.c_int64)
 
 
 class NativeStep:
@@ -33,6 +35,8 @@ class NativeStep:
         Address of the constraint of coupled joints, or None.
     joints
         Joints of all robots, if the targets of their drives move within a tick.
+    sense
+        Function that reads the sensors of the links of a robot after its sim step, or None.
     """
 
     def __init__(
@@ -45,6 +49,7 @@ class NativeStep:
         speed_limit: NDArray[np.float64] | None,
         constraint: int | None = None,
         joints: Sequence[Any] | None = None,
+        sense: Callable[[int], None] | None = None,
     ) -> None:
         assert isinstance(calls, NativeCalls)
         count, dof = calls.qf.shape
@@ -63,7 +68,9 @@ class NativeStep:
             constraint=constraint,
             **{name: array.ctypes.data for name, array in arrays.items()},
         )
-        self._stepped, self._kept = stepped, (calls, arrays)
+        sensing = None if sense is None else _SENSE(sense)
+        self._group.sense = None if sensing is None else ctypes.cast(sensing, ctypes.c_void_p)
+        self._stepped, self._kept = stepped, (calls, arrays, sensing)
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension or of XLA that does a sim step."""

@@ -8,20 +8,20 @@ with one exception: a new center of mass moves the frames of the joints by round
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sapien import Pose
+from sapien import Pose, physx
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.joint_friction import own_friction
-from batchpid.sim.engine.native_model import NativeModel, passive_force_of
-from batchpid.sim.engine.sapien.building import set_inertia
+from batchpid.sim.engine.native_model import NativeModel
+from batchpid.sim.engine.sapien.building import RESTITUTION, new_system, set_inertia
 from batchpid.sim.engine.sapien.built_tree import scene_tree
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation, varied_inertia
@@ -52,6 +52,7 @@ class VariedPack(Pack):
         )
         self._models = {name: total([part.inertia for part in body.parts]) for name, body in self._bodies.items()}
         self._added = {name: np.zeros((size, 6, 6)) for name in self._bodies}  # spatial inertias, to the models'
+        self._shapes: dict[int, list[Any]] = {}
         self._frames: list[tuple[Pose, Pose] | None] = []
         super().__init__(spec, size, first_env)
         if variation.armature is not None:
@@ -62,8 +63,12 @@ class VariedPack(Pack):
         for mine, new in zip(self._variation, variation, strict=True):
             if mine is not None:
                 mine[rows] = new
+        if self._variation.gravity is not None:  # a system keeps its gravity
+            self._stepped[rows] = True
+            self._renew(rows)
         for row in rows:
             self._change_masses(self.robots[row], row)
+            self._change_friction(row)
         if self._bodies and "_joint_model" in self.__dict__:
             self._joint_model.vary(rows, self.size, self._added)
 
@@ -74,6 +79,10 @@ class VariedPack(Pack):
             model.vary(range(len(self.qf)), len(self.qf), self._added)
         return model
 
+    def _system(self, row: int) -> Any:
+        gravity = self._variation.gravity
+        return new_system(self.spec, None if gravity is None else gravity[row])
+
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
         """Return a new scene and the robot in it, with its masses."""
         scene, robot = super()._build(row, system)
@@ -82,7 +91,17 @@ class VariedPack(Pack):
             pairs = zip(robot.joints, moves, strict=True)
             self._frames = [(joint.pose_in_parent, joint.pose_in_child) if move else None for joint, move in pairs]
         self._change_masses(robot, row)
+        owners = *robot.links, *system.rigid_static_components
+        self._shapes[row] = [shape for owner in owners for shape in owner.collision_shapes]
+        self._change_friction(row)
         return scene, robot
+
+    def _change_friction(self, row: int) -> None:
+        """Set the friction of the robot's shapes and of the ground."""
+        if (friction := self._variation.ground_friction) is not None:
+            material = physx.PhysxMaterial(friction[row], friction[row], RESTITUTION)
+            for shape in self._shapes[row]:
+                shape.set_physical_material(material)
 
     def _change_masses(self, robot: Any, row: int) -> None:
         if not self._bodies:
@@ -101,20 +120,11 @@ class VariedPack(Pack):
         """Return the friction and damping of the joints."""
         return own_friction(self.spec, self._variation)
 
-    @cached_property
-    def _passive_force(self) -> Callable[..., Float64]:
-        return passive_force_of(self.spec, self.steps_natively)
-
     def _joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
         tree = scene_tree(self.spec)
         return ts.mass_matrix(tree, qpos, tree.varied(self._added) if self._added else None)
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether compiled steps read the force of the model: not where a mass differs from it."""
-        return not self._bodies
-
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
-        """Return the passive force of the model at the measured positions."""
-        if not self._bodies:
-            return super().passive_force(gravity, coriolis, dtype)
-        return self._passive_force(self.read_qpos(), self.read_qvel(), gravity, coriolis).astype(dtype)
+        own = not self._bodies and self._variation.gravity is None
+        return own and super().steps_read_force(gravity, coriolis)

@@ -13,6 +13,7 @@ from tiny_urdf import one_joint, write
 import batchpid as bp
 from batchpid.sim import Robot
 from batchpid.sim.cli import parse
+from batchpid.sim.identification.confidence_region import KEY, Region
 from batchpid.sim.tuning.moves import random_moves
 from batchpid.sim.tuning.search import tune
 from batchpid.sim.tuning.weights import Weights
@@ -64,6 +65,30 @@ def test_tune_resumes_an_interrupted_search_and_writes_params_with_settings_and_
     assert {"sapien", "numpy", "cmaes"} <= about["versions"].keys()
     assert (tmp_path / "panda-tune.png").stat().st_size > 10_000
     assert not history.exists()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_tune_within_prints_what_holds_for_all_drawn_motors(batchpid, tmp_path, monkeypatch):
+    monkeypatch.setattr("batchpid.sim.cli.tune.DRAWS", 5)
+    monkeypatch.setattr("batchpid.sim.cli.tune.MOVES_WITHIN", 1)
+    urdf, motors, out = write(tmp_path, one_joint()), tmp_path / "motors.yaml", tmp_path / "tuned.yaml"
+    robot = Robot.load(urdf)
+    (joint,) = robot.joint_names
+    names, ends = (("strength", joint), ("delay", None)), (np.array([0.9, 3e-3]), np.array([0.05, 5e-4]))
+    known = Region(names, *ends, np.eye(2)).to_dict()
+    bp.save_actuators(motors, bp.make_actuators(1, command_delay=3e-3, strength=0.9), [joint], {KEY: known})
+    status, said, _ = batchpid("tune", urdf, *SHORT, "--actuators", motors, "--within", "--out", out)
+    assert status == 0
+    assert "5 draws of motors" in said
+    assert "all are stable at their delay" in said
+    assert "binding corner: draw" in said
+    within = bp.load_about(out)["within"]
+    assert within["draws"] == 5
+    assert within["stability_ratio"] < 1
+    for arguments, problem in (((), "needs a confidence region"), (("--control", "osc"), "is not available")):
+        status, _, complaint = batchpid("tune", urdf, *SHORT, "--within", *arguments, "--out", tmp_path / "other.yaml")
+        assert status == 2
+        assert problem in complaint
 
 
 @pytest.mark.slow

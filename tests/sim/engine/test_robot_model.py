@@ -80,7 +80,7 @@ def test_the_dynamics_are_mujocos(name, fixed_base, native, tmp_path, monkeypatc
     pack.write_state(range(len(qpos)), qpos, qvel)
     turning = None if fixed_base else np.random.default_rng(1).normal(size=(len(qpos), 3))
     tree, joints = scene_tree(spec), pack._robot.qvel
-    matrices, forces = [], []
+    matrices, forces, held = [], [], []
     for row, (model, data) in enumerate(zip(pack.models, pack._data, strict=True)):
         if turning is not None:
             data.qvel[3:6] = turning[row]
@@ -92,10 +92,13 @@ def test_the_dynamics_are_mujocos(name, fixed_base, native, tmp_path, monkeypatc
         falls = np.linalg.solve(full[np.ix_(base, base)], full[np.ix_(base, joints)])
         matrices.append(full[np.ix_(joints, joints)] - full[np.ix_(joints, base)] @ falls)
         forces.append(data.qfrc_bias[joints] - falls.T @ data.qfrc_bias[base])
+        held.append(data.qfrc_bias[joints].copy())
     close(ts.mass_matrix(tree, qpos), matrices, 1e-12)
-    close(passive_force(tree, qpos, qvel, True, True, turning), forces, 1e-12)
+    motion = None if fixed_base else np.hstack([np.tile(spec.gravity, (len(qpos), 1)), turning])
+    close(passive_force(tree, qpos, qvel, True, True, motion), forces, 1e-12)
+    close(passive_force(tree.held, qpos, qvel, True, True, motion), held, 1e-12)
     close(pack.joint_mass_matrix(qpos), matrices, 1e-12)
-    close(pack.passive_force(True, True), forces, 1e-12)
+    close(pack.passive_force(True, True), held, 1e-12)
 
 
 def test_masses_that_differ_are_those_of_another_tree(tmp_path):

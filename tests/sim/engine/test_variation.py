@@ -36,6 +36,8 @@ def random_variation(robot, seed, rows=1):
         friction=rng.uniform(0, 1, (rows, dof)),
         damping=rng.uniform(0, 1, (rows, dof)),
         armature=rng.uniform(0, 0.1, (rows, dof)),
+        ground_friction=rng.uniform(0.1, 1, rows),
+        gravity=rng.uniform(-1, 1, (rows, 3)) - [0, 0, 9.81],
     )
 
 

@@ -72,7 +72,7 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
     ),
     "planar": (robot(BASE, ARM, TIP, HINGE, joint("k", "arm", "tip", "planar")), "joint-type", "'planar'.*: fixed"),
     "floating base": (
-        robot(link("world", ""), BASE, ARM, HINGE, joint("k", "world", "base", "floating")),
+        robot(link("pedestal"), BASE, ARM, HINGE, joint("k", "pedestal", "base", "floating")),
         "joint-type",
         "'k': .*'floating'.*: fixed instead; load with fixed_base=False",
     ),

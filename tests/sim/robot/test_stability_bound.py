@@ -1,6 +1,8 @@
-"""Closed-form stability bound against the engine: gains at 0.8 of it are stable, at 1.5 of it they diverge."""
+"""Stability bound against the engine: in closed form, and within 5 % for motors that are late."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.sim import Runner
+from batchpid.sim.robot.loop_stability import stability_report
 
 DT = 1 / 2000
 DIVERGED = 50.0  # rad/s; PhysX stops joints at 100 rad/s
@@ -45,3 +48,48 @@ def test_the_engine_becomes_unstable_at_the_bound(name, filter_time):
         fastest[factor] = np.nanmax(np.abs(np.where(rollout.ok[..., None], rollout.qvel, np.inf)), axis=(0, 2))
     assert (fastest[0.8] < DIVERGED / 5).all()
     assert (fastest[1.5] > DIVERGED).all()
+
+
+LATE = {
+    "a delay": {"command_delay": 0.005},
+    "a short delay and a sensor": {"command_delay": 0.0012, "sensor_delay": 0.0021},
+    "a lag": {"command_delay": 0.001, "lag": 0.004, "strength": 0.8},
+    "armature": {"command_delay": 0.003, "armature": 0.05, "viscous": 0.2},
+}
+
+
+@pytest.mark.quick_rows(3)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize(
+    ("units", "late", "name"),
+    [
+        ("mass_matrix", "a delay", "panda"),
+        ("effort", "a short delay and a sensor", "panda"),
+        ("mass_matrix", "armature", "panda"),
+        ("effort", "a lag", "panda"),
+        ("inertia", "armature", "panda"),
+        ("effort", "a delay", "jaco2"),
+    ],
+)
+def test_the_bound_of_late_motors_predicts_the_first_unstable_gain(units, late, name):
+    """With 0.95 of the gains at the bound a disturbance decays, with 1.05 it grows."""
+    robot = load_bundled(name)
+    motors = bp.make_actuators(robot.dof, **LATE[late])
+    known = replace(robot, actuators=bp.make_actuators(robot.dof, armature=0.03))
+    pose = robot.start
+    unit = np.diagonal(robot.mass_matrix(pose)[0]) if units == "effort" else np.ones(robot.dof)
+    gains = {"kp": 900 * unit, "kd": 60 * unit, "ki": None, "derivative_filter_time": 2e-3, "gain_units": units}
+    params = known.params(**gains, effort_limit=None)
+    ratio = stability_report(known, params, pose, DT, actuators=motors).robot_ratio
+    assert ratio > 1.2 * stability_report(known, params, pose, DT, actuators=motors.joint_side()).robot_ratio
+    grows = {}
+    for share in (0.95, 1.05):
+        scaled = params.replace(kp=params.kp * share / ratio, kd=params.kd * share / ratio)
+        options = {"workers": 0, "substeps": 1, "ground": False, "collisions": False, "dtype": "float64"}
+        with Runner(known, 1, params=scaled, actuators=motors, **options) as runner:
+            runner.reset(pose)
+            goal = pose + 1e-4 * np.random.default_rng(1).normal(size=pose.shape)
+            speed = np.abs(runner.rollout(np.broadcast_to(goal, (1600, 1, robot.dof))).qvel[:, 0]).max(1)
+        grows[share] = np.nanmax(speed[1200:]) / speed[400:800].max()
+    assert grows[0.95] < 1
+    assert grows[1.05] > 1

@@ -68,9 +68,10 @@ def test_an_effect_is_found_and_kept(pendulum, extra, made, kind, truth):
     assert found.document()["joints"]["servo"][kind][0] == pytest.approx(truth, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_search")
 def test_an_effect_that_is_not_there_is_not_kept(pendulum):
-    found = identify(pendulum, log_of(pendulum), params=GAINS, **OPTIONS, extras=["load_friction"], evaluations=4)
+    found = identify(pendulum, log_of(pendulum), params=GAINS, **OPTIONS, extras=["load_friction"])
     assert ("load_friction", 0) not in found.unknowns.names
 
 

@@ -89,7 +89,7 @@ def test_strength_and_delay_follow_from_both_efforts_without_a_model(tmp_path):
         if sensor == "link":
             assert values["armature", 0] == pytest.approx(0.02, rel=0.2)
             assert values["friction", 0] == pytest.approx(0.15, rel=0.2)
-        found.save(tmp_path / "motors.yaml", ["log"])
+        found.save(tmp_path / "motors.yaml", robot)
         assert bp.load_actuators(tmp_path / "motors.yaml", robot.joint_names)[0].strength[0, 0] == values["strength", 0]
     alone = replace(efforts(robot), measured=None, sensor=None)
     with pytest.raises(bp.InvalidArgumentError, match="lack efforts that are both"):

@@ -1,0 +1,75 @@
+"""Sensors of links in MuJoCo: contact forces, and wrenches between a link and its parent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.robot.merging import place_links
+
+_FOUND_AND_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND) | 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+_NET_FORCE = 3
+"""Reduction of all contacts to their net force along the axes of the world."""
+_CONTACT, _WRENCH = 4, 6
+"""Values of a sensor: number of contacts and force on the other body; force and torque."""
+
+
+def contact_bodies(spec: SceneSpec) -> list[str]:
+    """Return the simulated link of each link of ``spec.contacts``."""
+    bodies = place_links(spec.urdf, spec.merge_fixed)
+    return [bodies[link].link for link in spec.contacts or ()]
+
+
+def add_link_sensors(scene: Any, spec: SceneSpec, names: dict[str, str], frames: Mapping[str, Any]) -> None:
+    """Add sensors for the links of ``spec.contacts`` and ``spec.wrenches``.
+
+    ``names`` are the bodies of the links, ``frames`` frames of links in their bodies, where these differ.
+    """
+    kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
+    for link in dict.fromkeys(contact_bodies(spec)):
+        for part in _parts(scene.body(names[link]), {*names.values()}):
+            sensor = scene.add_sensor(type=kinds.mjSENS_CONTACT, objtype=objects.mjOBJ_BODY, objname=part.name)
+            sensor.intprm[:3] = _FOUND_AND_FORCE, _NET_FORCE, 1
+    for link in spec.wrenches or ():
+        site = f"{link} (wrench)"
+        place = {} if (frame := frames.get(link)) is None else {"pos": frame.position, "quat": frame.wxyz}
+        scene.body(names[link]).add_site(name=site, **place)
+        for kind in (kinds.mjSENS_FORCE, kinds.mjSENS_TORQUE):
+            scene.add_sensor(type=kind, objtype=objects.mjOBJ_SITE, objname=site)
+
+
+def _parts(body: Any, others: set[str]) -> Iterator[Any]:
+    """Yield the body of a link, and those below it that belong to it: they are not among the ``others``."""
+    yield body
+    for child in body.bodies:
+        if child.name not in others:
+            yield from _parts(child, others)
+
+
+class LinkSensors:
+    """Places of the sensors of ``spec`` in the ``size`` values of ``model``; ``bodies`` are the bodies of its links."""
+
+    def __init__(self, spec: SceneSpec, model: Any, bodies: dict[str, int]) -> None:
+        ids = model.sensor_objid[model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT]
+        owners = ids.copy()
+        while (lower := ~np.isin(owners, [*bodies.values()])).any():
+            owners[lower] = model.body_parentid[owners[lower]]
+        self._rows: Sequence[Any] = [np.flatnonzero(np.equal(owners, bodies[link])) for link in contact_bodies(spec)]
+        self._contacts, self._wrenches, self.size = len(owners), len(spec.wrenches or ()), int(model.nsensordata)
+
+    def quantities(self, values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+        """Return the quantities of :meth:`batchpid.sim.engine.protocol.EnginePack.take_sensed` in (M, size)."""
+        of_contacts, of_wrenches = np.split(values, [_CONTACT * self._contacts], axis=1)
+        found = {}
+        if self._rows:
+            parts = of_contacts.reshape(-1, self._contacts, _CONTACT)
+            rows = np.stack([parts[:, row].sum(1) for row in self._rows], axis=1)
+            found = {"contact_force": 0.0 - rows[..., 1:], "touching": rows[..., 0]}
+        if self._wrenches:
+            found["wrench"] = of_wrenches.reshape(-1, self._wrenches, _WRENCH).copy()
+        return found

@@ -1,0 +1,55 @@
+"""Pushes of floating bases at random times, as a randomization draws them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.arrays.array_types import Bool, Float64
+from batchpid.sim.options import RunnerOptions
+
+Int64 = NDArray[np.int64]
+COUNTS = ("steps", "due", "number")
+"""Sim steps since the reset, those at which the next push is due, and pushes so far."""
+
+
+class Pushes:
+    """Pushes of ``size`` envs under ``options``, whose randomization has some.
+
+    A push comes at the beginning of the first tick after its time, at most one in a tick.
+    """
+
+    def __init__(self, options: RunnerOptions, size: int) -> None:
+        self._options = options
+        self.counts: dict[str, Int64] = {name: np.zeros(size, np.int64) for name in COUNTS}
+        """Counts of each env (size,), by name of :data:`COUNTS`."""
+
+    def begin(self, mask: Bool, episodes: Int64) -> None:
+        """Begin the episodes (envs, 2) of the envs of ``mask`` (envs,)."""
+        for counts in self.counts.values():
+            counts[mask] = 0
+        self._take(np.flatnonzero(mask), episodes)
+
+    def due(self, suspended: Bool, episodes: Int64) -> tuple[list[int], Float64]:
+        """Return the envs that are pushed now, and the changes of their twists (n, 6)."""
+        rows = np.flatnonzero((self.counts["steps"] >= self.counts["due"]) & ~suspended)
+        twists = self._draw(rows, episodes)[1] if rows.size else np.zeros((0, 6))
+        self.counts["number"][rows] += 1
+        self._take(rows, episodes)
+        return rows.tolist(), twists
+
+    def advance(self, steps: int) -> None:
+        """Count ``steps`` sim steps of all envs."""
+        self.counts["steps"] += steps
+
+    def _take(self, rows: NDArray[np.intp], episodes: Int64) -> None:
+        """Set the time of the next push of envs ``rows``."""
+        if rows.size:
+            intervals, _ = self._draw(rows, episodes)
+            steps = np.ceil(np.minimum(intervals / self._options.timestep, 2.0**53))
+            self.counts["due"][rows] += steps.astype(np.int64)
+
+    def _draw(self, rows: NDArray[np.intp], episodes: Int64) -> tuple[Float64, Float64]:
+        randomization = self._options.randomization
+        assert randomization is not None
+        return randomization.next_push(self._options.robot, episodes[rows], self.counts["number"][rows])

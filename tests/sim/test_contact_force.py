@@ -1,0 +1,165 @@
+"""Contact forces and wrenches of links: equal in both engines, in observations, recordings and snapshots."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from identical import assert_identical
+
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim import Recorder, Robot, Runner, read_recording, write_recording
+from batchpid.sim.recording.dataset import to_dataset
+
+GRAVITY = 9.81
+BALL = '<collision><origin xyz="0 0 -0.3"/><geometry><sphere radius="0.03"/></geometry></collision>'
+LEG = """
+  <link name="leg{0}"><inertial><origin xyz="0 0 -0.15"/><mass value="0.2"/>
+    <inertia ixx="2e-3" iyy="2e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="slide{0}" type="prismatic"><parent link="trunk"/><child link="leg{0}"/><origin xyz="{1} {2} -0.05"/>
+    <axis xyz="0 0 1"/><limit lower="-0.1" upper="0.1" effort="200" velocity="5"/></joint>
+  <link name="foot{0}"><inertial><origin xyz="0 0 -0.3"/><mass value="0.1"/>
+    <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>{3}</link>
+  <joint name="ankle{0}" type="fixed"><parent link="leg{0}"/><child link="foot{0}"/><origin rpy="0 0 0.5"/></joint>"""
+PLACES = ((0.2, 0.15), (0.2, -0.15), (-0.2, 0.15), (-0.2, -0.15))
+STOOL = f"""<robot name="stool">
+  <link name="trunk"><inertial><origin xyz="0.02 0 0.01"/><mass value="10"/>
+    <inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><box size="0.5 0.3 0.1"/></geometry></collision></link>
+  {"".join(LEG.format(number, *place, BALL) for number, place in enumerate(PLACES))}
+</robot>"""
+WEIGHT = (10.0 + 4 * 0.3) * GRAVITY
+FEET = [f"foot{number}" for number in range(4)]
+GAINS = {"gain_units": "effort", "kp": 2e4, "ki": 0.0, "kd": 400.0}
+
+
+@pytest.fixture(params=["sapien", "mujoco"])
+def engine(request):
+    return request.param
+
+
+@pytest.fixture
+def stool(tmp_path):
+    """A trunk of 10 kg on four legs that slide, with balls as feet that a fixed joint holds."""
+    return load(tmp_path)
+
+
+def load(folder, **options):
+    path = folder / "stool.urdf"
+    path.write_text(STOOL)
+    return Robot.load(path, fixed_base=False, **options)
+
+
+def make_runner(robot, engine, num_envs=1, **options):
+    chosen = {"workers": 0, "contacts": [*FEET, "trunk"], "params": robot.params(**GAINS)} | options
+    return Runner(robot, num_envs, engine=engine, **chosen)
+
+
+def stand(robot, engine, ticks=60, **options):
+    with make_runner(robot, engine, **options) as runner:
+        return runner.rollout(np.tile(robot.start, (ticks, 1)))
+
+
+def test_contact_forces_of_a_standing_robot_carry_its_weight(stool, engine):
+    rollout = stand(stool, engine)
+    forces = rollout.contact_force[-1, 0]
+    np.testing.assert_allclose(forces[:, 2].sum(), WEIGHT, rtol=5e-3)
+    assert np.abs(forces[:, :2].sum(0)).max() < 5e-3 * WEIGHT
+    np.testing.assert_allclose(forces[:4, 2], 0.3 * GRAVITY - rollout.effort[-1, 0], rtol=5e-3)
+    assert rollout.touching[-1, 0].tolist() == [True] * 4 + [False]
+    assert (forces[4] == 0).all()
+
+
+def test_both_engines_report_the_same_forces(stool):
+    forces = [stand(stool, engine, 120).contact_force[-1, 0, :, 2] for engine in ("sapien", "mujoco")]
+    np.testing.assert_allclose(*forces, atol=0.01 * WEIGHT)
+
+
+def test_a_wrench_holds_the_links_behind_it(tmp_path, engine):
+    """Foot on the ground: its weight, the contact force, and the wrench of the leg cancel."""
+    robot = load(tmp_path, merge_fixed=False)
+    rollout = stand(robot, engine, wrenches=["foot1", "leg1"])
+    force, wrench = rollout.contact_force[-1, 0, 1].astype(float), rollout.wrench[-1, 0].astype(float)
+    turned = np.array([[np.cos(0.5), np.sin(0.5), 0], [-np.sin(0.5), np.cos(0.5), 0], [0, 0, 1]])
+    expected = -(turned @ force) + [0, 0, 0.1 * GRAVITY]
+    np.testing.assert_allclose(wrench[0, :3], expected, atol=0.05)
+    np.testing.assert_allclose(wrench[0, 3:], np.cross([0, 0, -0.33], -(turned @ force)), atol=0.05)
+    np.testing.assert_allclose(wrench[1, :3], -force + [0, 0, 0.3 * GRAVITY], atol=0.05)
+
+
+def test_nothing_touches_in_free_fall(stool, engine):
+    with make_runner(stool, engine, wrenches=["leg0"], control="effort", compensate="none") as runner:
+        begin = runner.reset(base_pose=[0, 0, 2.0, 0.9, 0.1, 0.2, 0.3], base_twist=[0.1, 0, 0, 1.0, 2.0, 3.0])
+        assert not begin.contact_force.any()
+        fall = runner.rollout(np.zeros((10, 4)))
+    assert not fall.contact_force.any()
+    assert not fall.touching.any()
+    assert fall.wrench.any()
+
+
+def test_an_observed_contact_changes_nothing(stool, engine):
+    first = stand(stool, engine, 30, contacts=None)
+    assert first.contact_force is None
+    assert_identical(first, stand(stool, engine, 30), skip=("contact_force", "touching"))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_forces_are_recorded_and_the_same_for_any_number_of_workers(stool, engine, workers, tmp_path):
+    table = stool.start + 0.02 * np.sin(np.arange(24.0))[:, None]
+    options = {"num_envs": 3, "wrenches": ["leg2"]}
+    with make_runner(stool, engine, **options) as runner:
+        runner.rollout(table[:12])
+        kept = runner.snapshot()
+        kept.save(tmp_path / "kept.npz")
+        alone = runner.rollout(table[12:])
+    with make_runner(stool, engine, workers=workers, **options) as runner:
+        runner.restore(type(kept).load(tmp_path / "kept.npz"))
+        np.testing.assert_array_equal(runner.observe().contact_force, kept.states.sensors["contact_force"])
+        with Recorder(tmp_path / "run.h5", runner):
+            assert_identical(alone, runner.rollout(table[12:]))
+    assert_identical(alone, read_recording(tmp_path / "run.h5"))
+    write_recording(alone, tmp_path / "run.npz")
+    again = read_recording(tmp_path / "run.npz")
+    assert_identical(alone, again)
+    assert (again.info.contacts, again.info.wrenches) == ((*FEET, "trunk"), ("leg2",))
+    assert again.info.units_of("wrench") == ("N",) * 3 + ("N m",) * 3
+    data = to_dataset(again)
+    assert data.contact_force.dims == ("time", "env", "contacts", "force")
+    assert float(data.contact_force.sel(contacts="foot0", force="fz")[-1, 0]) > 1.0
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
+def test_an_env_that_fails_has_no_force(stool, engine):
+    with make_runner(stool, engine, 2, on_invalid_input="contain") as runner:
+        bad = np.tile(stool.start, (2, 1))
+        for _ in range(30):
+            before = runner.step(bad)
+        bad[0] = np.nan
+        seen = runner.step(bad)
+    assert before.touching[:, :4].all()
+    assert seen.touching.any(1).tolist() == [False, True]
+    assert not seen.contact_force[0].any()
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"contacts": ["fot0"]}, "contacts.*unknown link 'fot0'.*foot0"),
+        ({"contacts": "foot0"}, "contacts: must be a list of names"),
+        ({"wrenches": ["foot0"]}, "wrenches.*'foot0'.*one with 'leg0'.*merge_fixed=False"),
+        ({"wrenches": ["trunk"]}, "wrenches.*'trunk', which no joint moves"),
+    ],
+    ids=str,
+)
+def test_a_link_without_a_sensor_is_refused(stool, engine, options, text):
+    with pytest.raises(InvalidArgumentError, match=text):
+        make_runner(stool, engine, **options)
+
+
+def test_snapshots_belong_to_the_sensors(stool):
+    with make_runner(stool, "mujoco") as runner:
+        kept = runner.snapshot()
+    with (
+        make_runner(stool, "mujoco", contacts=["trunk"]) as other,
+        pytest.raises(InvalidArgumentError, match="contacts"),
+    ):
+        other.restore(kept)
