@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.jax_settings import own_settings, require_jax
 from batchpid.law import pid
 from batchpid.law.coefficients import discretise
@@ -41,16 +42,16 @@ class NumPyBackend:
         self.coefficients = discretise(params, self.dt, 1 if self.native else shape[0])
         self._law = CompiledLaw(self.coefficients, shape[0], self.terms, self.threads) if self.native else None
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Document:
         return {**self.__dict__, "_law": None}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: Document) -> None:
         """Build the native program again, if this process has the extension."""
         self.__dict__.update(state)
         self.native = not obstacle()
         self.prepare(self.params, self.shape)
 
-    def array(self, value: Any) -> Any:
+    def array(self, value: Any) -> Array:
         """Return ``value`` as an array of this backend."""
         return np.asarray(value, dtype=self.params.dtype)
 
@@ -97,7 +98,7 @@ class JAXBackend:
             new, found = pid.advance(discretise(params, dt), state, *inputs)
             return new, found.effort, found.filled() if terms else None
 
-        def step_in_blocks(params: PIDParams, spare: PIDState, state: PIDState, *inputs: Any) -> Any:
+        def step_in_blocks(params: PIDParams, spare: PIDState, state: PIDState, *inputs: Any) -> Array:
             out = (spare, jax.numpy.zeros_like(inputs[1]))
             return blocks.advance_in_blocks(discretise(params, dt), state, *inputs, out=out)
 
@@ -127,7 +128,7 @@ class JAXBackend:
             self.packed = ((tree, is_shared), jnp.asarray(stacked), own)
         self.dtype, self._spare = self.packed[1].dtype, None
 
-    def array(self, value: Any) -> Any:
+    def array(self, value: Any) -> Array:
         """Return ``value`` as an array of this backend."""
         if isinstance(value, np.ndarray) or not isinstance(value, self.jax.Array):
             return np.asarray(value, dtype=self.dtype)
@@ -144,7 +145,7 @@ class JAXBackend:
             return self._compiled[function](*self.packed, *inputs, **named)
 
     def step(
-        self, state: PIDState, out: None, r: Any, y: Any, *rates: Any
+        self, state: PIDState, out: None, r: Array, y: Array, *rates: Array
     ) -> tuple[PIDState, Any, Terms | None, Callable[..., Any]]:
         """Return the new state, the effort, the terms if they are kept, and no fast call; ``out`` is None."""
         with own_settings(self.dtype):
@@ -155,6 +156,6 @@ class JAXBackend:
         self._spare = state
         return new, effort, None, declined
 
-    def _on_one_cpu(self, y: Any) -> bool:
+    def _on_one_cpu(self, y: Array) -> bool:
         devices = y.devices() if isinstance(y, self.jax.Array) else self.jax.local_devices()[:1]
         return [device.platform for device in devices] == ["cpu"]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
 from batchpid.backends import JAXBackend, NumPyBackend, declined
@@ -85,7 +86,7 @@ class BatchPID:
         backend = f"{self._backend!r}{' (native)' * self.native}"
         return f"BatchPID({envs} envs, {joints} joints, dt {self._dt:g} s, backend {backend}, {started})"
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Document:
         self._fast, self._lent = declined, True  # a shallow copy holds the same arrays
         return self.__dict__.copy()
 
@@ -152,14 +153,14 @@ class BatchPID:
 
     def __call__(
         self,
-        setpoint: Any,
-        measurement: Any,
-        measurement_rate: Any = None,
-        setpoint_rate: Any = None,
-        feedforward: Any = None,
+        setpoint: Array,
+        measurement: Array,
+        measurement_rate: Array = None,
+        setpoint_rate: Array = None,
+        feedforward: Array = None,
         *,
         out: Any = None,
-    ) -> Any:
+    ) -> Array:
         """Return the effort (envs, joints) [N m or N]; arguments as in :func:`batchpid.step`.
 
         ``measurement`` is (envs, joints); the others may be anything that broadcasts to that. ``out`` is an array to
@@ -183,7 +184,7 @@ class BatchPID:
         self._lent = False
         return effort
 
-    def reset(self, measurement: Any, mask: Any = None, *, keep_integral: bool = False) -> None:
+    def reset(self, measurement: Array, mask: Array = None, *, keep_integral: bool = False) -> None:
         """Restart the envs of ``mask`` (envs,) bool, or all, from ``measurement`` (envs, joints)."""
         y = self._array("measurement", measurement, exact=True)
         mask = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
@@ -192,12 +193,12 @@ class BatchPID:
 
     def track(
         self,
-        setpoint: Any,
-        measurement: Any,
-        effort: Any,
-        measurement_rate: Any = None,
-        setpoint_rate: Any = None,
-        feedforward: Any = None,
+        setpoint: Array,
+        measurement: Array,
+        effort: Array,
+        measurement_rate: Array = None,
+        setpoint_rate: Array = None,
+        feedforward: Array = None,
     ) -> None:
         """Make the next call on these same inputs return ``effort``: bumpless, as :func:`batchpid.track`."""
         r, y, u = (
@@ -209,7 +210,7 @@ class BatchPID:
         self._fast = declined
         self._state = self._engine.call(bumpless.track, self._started(y), r, y, u, dt=self._dt, **rest)
 
-    def _started(self, y: Any) -> PIDState:
+    def _started(self, y: Array) -> PIDState:
         """Return the state, begun at the first measurement, with every leaf that the params need."""
         if self._state is None:
             return self._engine.call(pid.init, y)
@@ -217,7 +218,7 @@ class BatchPID:
             self._state, self._stale = self._state.matched_to(self._engine.call(pid.init, y)), False
         return self._state
 
-    def _optional(self, **values: Any) -> dict[str, Any]:
+    def _optional(self, **values: Array) -> Document:
         return {name: None if value is None else self._array(name, value) for name, value in values.items()}
 
     def _check_out(self, out: Any) -> None:
@@ -234,7 +235,7 @@ class BatchPID:
             return
         raise InvalidArgumentError("out", problem, remedy=remedy)
 
-    def _array(self, name: str, value: Any, exact: bool = False) -> Any:
+    def _array(self, name: str, value: Any, exact: bool = False) -> Array:
         """Return ``value`` as an array of the backend that broadcasts to (envs, joints), or is ``exact``-ly that."""
         if isinstance(value, np.ndarray) or not hasattr(value, "dtype"):
             value = read_array(name, value)

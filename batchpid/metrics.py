@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.display import array_summary, html_table, span
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import broadcast, number, read_array, time_step
@@ -212,7 +212,7 @@ def _or_inf(figure: Float64) -> Float64:
     return np.where(np.isfinite(figure), figure, np.inf)
 
 
-def _row(table: Float64, k: NDArray[Any]) -> Float64:
+def _row(table: Float64, k: Rows) -> Float64:
     """Return ``table[k]`` for an index k per env and joint."""
     return np.take_along_axis(table, k[None], 0)[0]
 

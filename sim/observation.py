@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Bool, Float32, Float64
+from batchpid.arrays.array_types import Bool, DType, Float32, Float64, Rows
 from batchpid.arrays.display import html_table, span
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
@@ -39,7 +39,7 @@ class Quantity(NamedTuple):
     lists links, with a row for each; ``links`` are these links.
     """
 
-    dtype: Any
+    dtype: DType
     meaning: str
     unit: str = "1"
     per_joint: bool = True
@@ -101,11 +101,11 @@ class Observation(NamedTuple):
         """Return the observation of some envs (a slice or an index array)."""
         return self.map(itemgetter(envs))
 
-    def map(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> Observation:
+    def map(self, function: Callable[[Rows], Rows]) -> Observation:
         """Return an observation with ``function`` applied to each array that there is."""
         return Observation._make([None if array is None else function(array) for array in self])
 
-    def copied(self, tool_pose: Callable[[NDArray[Any]], NDArray[np.float32]] | None = None) -> Observation:
+    def copied(self, tool_pose: Callable[[Rows], NDArray[np.float32]] | None = None) -> Observation:
         """Return a copy with arrays of its own; ``tool_pose`` gives the pose of the tool at positions (..., dof)."""
         rows = list[Any]()
         for array in self:  # no comprehension, which is a call of Python in the path of a tick
@@ -151,10 +151,11 @@ def observed_by_loop(fixed_base: bool | None, **links: tuple[str, ...] | None) -
 
 def empty_observation(*shape: int, observed: Mapping[str, Quantity] = OBSERVED) -> Observation:
     """Return unset arrays for observations of ``shape`` (..., envs, dof)."""
-    return Observation(**{name: np.empty(each.shape(shape), each.dtype) for name, each in observed.items()})
+    rows: dict[str, Rows] = {name: np.empty(each.shape(shape), each.dtype) for name, each in observed.items()}
+    return Observation(**rows)
 
 
-def untouched(num_envs: int, observed: Mapping[str, Quantity]) -> dict[str, NDArray[Any]]:
+def untouched(num_envs: int, observed: Mapping[str, Quantity]) -> dict[str, Rows]:
     """Return the quantities of links in ``observed`` before the first tick, 0."""
     return {name: np.zeros(each.shape((num_envs, 0)), each.dtype) for name, each in observed.items() if each.option}
 
@@ -226,7 +227,7 @@ class RunInfo:
     """PID parameters at the start."""
     actuators: Actuators | None = None
     """Motors and sensors at the start, before draws of a randomization; None for ideal ones."""
-    start: NDArray[Any] | None = None
+    start: Rows | None = None
     """Positions before the first tick (envs, joints) [rad or m]."""
     seed: int | None = None
     """Seed of the run."""
@@ -326,10 +327,10 @@ class Rollout:
     info: RunInfo
     """Robot, options and origin of the run."""
 
-    def __getattr__(self, name: str) -> NDArray[Any]:
+    def __getattr__(self, name: str) -> Rows:
         if name not in _SEEN:
             raise AttributeError(f"a Rollout has no {name!r}; it has time, setpoint, tick, info, {', '.join(_SEEN)}")
-        array: NDArray[Any] = getattr(self.observation, name)
+        array: Rows = getattr(self.observation, name)
         return array
 
     @property
@@ -337,7 +338,7 @@ class Rollout:
         """Number of envs."""
         return int(self.qpos.shape[1])
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> dict[str, Rows]:
         """Return time, setpoint and every quantity that was observed, by name."""
         seen = {name: array for name, array in self.observation._asdict().items() if array is not None}
         return {"time": self.time, "setpoint": self.setpoint, **seen}
@@ -403,7 +404,7 @@ class Rollout:
         return html_table(f"{self!r}{own}", list(shown), zip(*shown.values(), strict=True))
 
     @staticmethod
-    def _spans(values: NDArray[Any], units: Sequence[str]) -> list[str]:
+    def _spans(values: Rows, units: Sequence[str]) -> list[str]:
         """Return the range of values (..., joints) of each joint, with its unit."""
         return [f"{span(values[..., joint])} {unit}" for joint, unit in enumerate(units)]
 

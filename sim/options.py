@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Array, Document, Rows
 from batchpid.arrays.choices import PerMassMatrix
 from batchpid.arrays.digest import digest, object_digest
 from batchpid.arrays.jax_settings import require_jax
@@ -155,7 +156,7 @@ class RunnerOptions:
     def __init__(self, robot: Robot, num_envs: int, **options: Unpack[RunnerKeywords]) -> None:
         check_keywords("Runner", options, [*RunnerKeywords.__annotations__, "params"])
         instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
-        given: dict[str, Any] = {each.name: each.default for each in fields(self)} | options
+        given: Document = {each.name: each.default for each in fields(self)} | options
         vars(self).update(given | {"robot": robot, "num_envs": integer("num_envs", num_envs, 1, 1_000_000)})
         own = vars(self)
         own |= {
@@ -357,7 +358,7 @@ class RunnerOptions:
         return self.robot.coupling if self.sets_positions and not self.robot.independent.all() else None
 
     @property
-    def tool_pose(self) -> Callable[[NDArray[Any]], NDArray[np.float32]] | None:
+    def tool_pose(self) -> Callable[[Rows], NDArray[np.float32]] | None:
         """Function from positions (..., dof) to poses of the tool (..., 7); None where setpoints are not poses."""
         if self.tool_setpoints is not None:
             return self.tool_setpoints.tool_pose
@@ -437,13 +438,13 @@ class RunnerOptions:
             fitted = prepared_actuators(self.randomization, fitted, self.robot, self.control)
         return None if fitted is None else frozen(fitted)
 
-    def with_values(self, **values: Any) -> RunnerOptions:
+    def with_values(self, **values: Array) -> RunnerOptions:
         """Return a copy with other ``values``, as the attributes hold them: they are not checked."""
         changed = copy.copy(self)
         vars(changed).update(values)
         return changed
 
-    def values_for(self, place: Place) -> dict[str, Any]:
+    def values_for(self, place: Place) -> Document:
         """Return the options that are marked with ``place``, by name.
 
         - "snapshot": plain values, which two runners must share to restore each other's snapshots;
@@ -453,7 +454,7 @@ class RunnerOptions:
         marked = [each for each in fields(self) if place in each.metadata]
         return {each.name: getattr(self, each.metadata[place] or each.name) for each in marked}
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Document:
         """Return robot and options that two runners must share to restore each other's snapshots, as plain values."""
         robot, own = self.robot, self.own_command
         return {
@@ -507,7 +508,7 @@ class RunnerOptions:
         return digest(self.guard is not None and self.guard)
 
     @property
-    def distributions(self) -> dict[str, Any] | None:
+    def distributions(self) -> Document | None:
         """The randomization as plain values."""
         return None if self.randomization is None else self.randomization.to_dict()
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
+from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import choice, flag, instance, integer
 from batchpid.errors import InvalidArgumentError
 
@@ -37,7 +38,7 @@ class Ray:
     accept_differences: bool = False
     """Accept machines whose processors or libraries round differently, with a warning. Results then depend on the
     machine that runs an env."""
-    runtime_env: dict[str, Any] | None = None
+    runtime_env: Document | None = None
     """Ray's ``runtime_env`` of the processes on the machines, such as ``{"working_dir": "."}``."""
 
     def __post_init__(self) -> None:

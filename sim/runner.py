@@ -15,12 +15,13 @@ from inspect import Parameter, Signature, signature
 from operator import itemgetter
 from pathlib import Path
 from time import strftime
-from typing import Any, ClassVar, Protocol, Unpack
+from typing import ClassVar, Protocol, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import choice, instance, integer
 from batchpid.checks.warn import warn
@@ -65,7 +66,7 @@ class TickRecorder(Protocol):
     def wait(self) -> None:
         """Return, or raise, before the next tick begins: whether it can be recorded."""
 
-    def append(self, time_: float, setpoint: NDArray[Any], observation: Observation, has_rates: bool) -> None:
+    def append(self, time_: float, setpoint: Rows, observation: Observation, has_rates: bool) -> None:
         """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size), with rates or without.
 
         It must return soon, and without an error: Ctrl-C waits for it.

@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict
 
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import batchpid as bp
+from batchpid.arrays.array_types import Rows
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.robot import Robot
@@ -40,10 +41,10 @@ class Controller(Protocol):
     def __call__(
         self,
         state: Any,
-        setpoint: NDArray[Any],
-        qpos: NDArray[Any],
-        qvel: NDArray[Any],
-        passive: NDArray[Any],
+        setpoint: Rows,
+        qpos: Rows,
+        qvel: Rows,
+        passive: Rows,
     ) -> tuple[Any, Any]:
         """Return the new state, and the joint efforts [N m or N], which the runner clips to the params' limits.
 

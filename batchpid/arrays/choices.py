@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from batchpid.arrays.array_types import Document
+
 
 class Choice(NamedTuple):
     """Base of choices. Equality depends on the type: as keys of a cache, plain empty tuples would all be equal."""
@@ -61,7 +63,7 @@ class ImplicitLaw(Choice):
     """P, I and D act on position and velocity at the end of the step, which the law predicts."""
 
 
-CHOICES: dict[str, dict[str, Any]] = {
+CHOICES: dict[str, Document] = {
     "integration": {"output_first": None, "integrate_first": IntegrateFirst()},
     "first_derivative": {"zero": None, "kick": DerivativeKick()},
     "weight_origin": {"zero": None, "start": WeightFromStart()},

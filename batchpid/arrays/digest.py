@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 
 DEPTH, OBJECTS = 60, 20_000
@@ -43,7 +44,7 @@ _OF_EVERY_CLASS = {
 """Attributes of a class that its calls do not depend on."""
 
 
-def digest(*values: Any) -> str:
+def digest(*values: Array) -> str:
     """Return the digest of ``values``, 64 hexadecimal digits.
 
     Values may be None, bools, numbers, strings, bytes, arrays, and sequences, sets, mappings, named tuples and
@@ -230,7 +231,7 @@ def _digest(value: Any, where: str) -> bytes:
     )
 
 
-def _of_array(array: Any, where: str) -> bytes:
+def _of_array(array: Array, where: str) -> bytes:
     array = np.asarray(array)
     dtype = array.dtype.newbyteorder("<")
     if dtype.kind not in _KINDS or dtype.itemsize > _WIDEST.get(dtype.kind, dtype.itemsize):

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.choices import CHOICE_TYPES, CHOICES
 from batchpid.checks.validate import is_traced
 
 WIDTH = 130
 
 
-def span(values: Any) -> str:
+def span(values: Array) -> str:
     """Return the range of an array's entries, as in "40 to 87"; "3 of 12" for bools."""
     if is_traced(values):
         return "traced"
@@ -73,7 +74,7 @@ def params_summary(params: Any) -> str:
     return summary(type(params).__name__, parts)
 
 
-def _limits(name: str, low: Any, high: Any) -> list[str]:
+def _limits(name: str, low: Array, high: Array) -> list[str]:
     if low is None or high is None:
         return [f"{name} {sign} {span(end)}" for sign, end in ((">=", low), ("<=", high)) if end is not None]
     try:
@@ -90,7 +91,7 @@ def _named(option: str, chosen: Any) -> str:
     return next(name for name, one in CHOICES[option].items() if type(one) is type(chosen))
 
 
-def _is_array(leaf: Any) -> bool:
+def _is_array(leaf: Array) -> bool:
     return leaf is not None and not isinstance(leaf, CHOICE_TYPES)
 
 

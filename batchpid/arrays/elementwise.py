@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, ArrayModule, DType
 from batchpid.arrays.choices import CHOICE_TYPES
 
 TURN = 2 * math.pi
 _NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *CHOICE_TYPES})
 
 
-def namespace(*leaves: Any) -> Any:
+def namespace(*leaves: Array) -> Array:
     """Return the array namespace in which all these leaves can be used: NumPy's, unless one belongs to another."""
     if not _NUMPY_OR_NEUTRAL.issuperset(map(type, leaves)):
         for leaf in leaves:
@@ -25,7 +26,7 @@ def namespace(*leaves: Any) -> Any:
     return np
 
 
-def clip(x: Any, low: Any, high: Any, xp: Any) -> Any:
+def clip(x: Array, low: Array, high: Array, xp: ArrayModule) -> Array:
     """Return x within [low, high], either of which may be None; NaN stays NaN."""
     x = x if low is None else xp.maximum(x, low)
     return x if high is None else xp.minimum(x, high)
@@ -36,7 +37,7 @@ def _recorded(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(function)
-        def call(*arrays: Any) -> Any:
+        def call(*arrays: Array) -> Array:
             record = getattr(arrays[0], "record", None)
             return function(*arrays) if record is None else record(name, *arrays)
 
@@ -46,25 +47,25 @@ def _recorded(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
 
 @_recorded("matrix_vector")
-def matrix_vector(matrix: Any, vector: Any) -> Any:
+def matrix_vector(matrix: Array, vector: Array) -> Array:
     """Return matrix @ vector for each env, with sums in one order for any number of envs."""
     return (matrix * vector[:, None, :]).sum(-1)
 
 
 @_recorded("row_minimum")
-def row_minimum(rows: Any) -> Any:
+def row_minimum(rows: Array) -> Array:
     """Return the minimum of each row (envs, 1)."""
     return rows.min(-1, keepdims=True)
 
 
 @_recorded("gather")
-def take_columns(rows: Any, columns: Any) -> Any:
+def take_columns(rows: Array, columns: Array) -> Array:
     """Return the columns of ``rows`` (..., joints) at the indices ``columns`` (joints,)."""
     return namespace(rows).take(rows, columns, axis=-1)
 
 
 @_recorded("push")
-def push_history(history: Any, *values: Any) -> Any:
+def push_history(history: Array, *values: Array) -> Array:
     """Return ``history`` (envs, samples, numbers) with ``values`` (envs, joints), side by side, as latest sample."""
     xp = namespace(history, *values)
     sample = values[0] if len(values) == 1 else xp.concatenate(values, axis=1)
@@ -72,35 +73,35 @@ def push_history(history: Any, *values: Any) -> Any:
 
 
 @_recorded("take")
-def read_history(history: Any, places: Any) -> Any:
+def read_history(history: Array, places: Array) -> Array:
     """Return the numbers of ``history`` at flat indices ``places`` (envs, joints)."""
     return history.take(places)
 
 
-def replace_envs(state: Any, fresh: Any, mask: Any) -> Any:
+def replace_envs(state: Any, fresh: Any, mask: Array) -> Array:
     """Return ``state``, a named tuple of arrays (envs, ...), with the envs of ``mask`` (envs,) bool as in ``fresh``."""
     xp = namespace(*state, mask)
     chosen = xp.asarray(mask)
 
-    def choose(new: Any, old: Any) -> Any:
+    def choose(new: Array, old: Array) -> Array:
         return None if old is None else xp.where(chosen.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
     return type(state)(*map(choose, fresh, state))
 
 
-def wrap(angle: Any, turns_per_rad: Any, xp: Any) -> Any:
+def wrap(angle: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:
     """Return an angle or a difference of angles, less its whole turns; ``turns_per_rad`` is 0 to keep them."""
     return angle if turns_per_rad is None else angle - TURN * xp.rint(angle * turns_per_rad)
 
 
-def nearest_turn(angle: Any, near: Any, turns_per_rad: Any, xp: Any) -> Any:
+def nearest_turn(angle: Array, near: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:
     """Return ``angle`` plus the whole turns that bring it within half a turn of ``near``; other arguments as in
     :func:`wrap`.
     """
     return angle if turns_per_rad is None else angle - TURN * xp.rint((angle - near) * turns_per_rad)
 
 
-def flush(x: Any, tiny: Any) -> Any:
+def flush(x: Array, tiny: Array) -> Array:
     """Return x rounded to a multiple of the last bit of ``tiny``, which leaves larger numbers unchanged.
 
     A decaying filter ends in denormal numbers, whose arithmetic is ten times slower. Adding and subtracting a tiny
@@ -110,7 +111,7 @@ def flush(x: Any, tiny: Any) -> Any:
 
 
 @cache
-def tiny_of(dtype: Any) -> float:
+def tiny_of(dtype: DType) -> float:
     """Return the square root of the smallest normal number of ``dtype``.
 
     Its last bit is far above the denormals, and the number itself far below the last bit of any relevant number.

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array
 from batchpid.checks.validate import at_least, entries, is_traced
 from batchpid.errors import InvalidArgumentError
 
@@ -29,7 +30,7 @@ class Field(NamedTuple):
     high: float = math.inf
     """Largest value."""
 
-    def checked(self, name: str, values: Any, joint_names: Sequence[str] | None, *, infinite: bool = False) -> Any:
+    def checked(self, name: str, values: Array, joint_names: Sequence[str] | None, *, infinite: bool = False) -> Any:
         """Return ``values`` (..., envs, joints), unless they are traced, if all are within the bounds.
 
         Raises InvalidArgumentError if an entry is out of bounds, or infinite where neither ``infinite`` nor ``neutral``

@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from typing import Any
 
+from batchpid.arrays.array_types import DType
 from batchpid.errors import MissingDependencyError
 
 NEEDED: dict[str, tuple[Any, ...]] = {
@@ -36,7 +37,7 @@ def require_jax() -> None:
 
 
 @contextmanager
-def own_settings(dtype: Any = None) -> Iterator[None]:
+def own_settings(dtype: DType = None) -> Iterator[None]:
     """Run a block under the settings that batchpid needs, with ``dtype`` "float64" or "float32" for its arrays.
 
     Settings with an accepted value are not touched: to enter a context for each takes longer than a small program.

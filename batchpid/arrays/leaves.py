@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, DType
 from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.field_tables import Field
@@ -38,7 +39,7 @@ def frozen(leaves: Leaves) -> Leaves:
 class LeafBuilder:
     """Builder of the leaves of one :class:`batchpid.PIDParams` or the like, which agree in joints, envs and dtype."""
 
-    def __init__(self, joints: int, joint_names: Sequence[str] | None, dtype: Any, values: Iterable[Any]) -> None:
+    def __init__(self, joints: int, joint_names: Sequence[str] | None, dtype: DType, values: Iterable[Any]) -> None:
         """Without a ``dtype``, use the dtype of the traced arrays among ``values``, else float64."""
         self.joints, self.num_envs = integer("joints", joints, 1, MOST_JOINTS), 1
         self.names = None if joint_names is None else names("joint_names", joint_names, self.joints)
@@ -48,13 +49,13 @@ class LeafBuilder:
             xp = namespace(*traced)
             dtype = xp.result_type(*floats) if floats else xp.asarray(0.0).dtype
         try:
-            self.dtype = np.dtype(dtype)
+            self.dtype: DType = np.dtype(dtype)
         except TypeError:
             self.dtype = np.dtype(object)
         if self.dtype not in (np.float32, np.float64):
             raise InvalidArgumentError("dtype", "unknown dtype", value=str(dtype), remedy="use float32 or float64")
 
-    def array(self, name: str, value: Any, field: Field) -> Any:
+    def array(self, name: str, value: Any, field: Field) -> Array:
         """Return ``value`` as (1 | envs, joints) with every entry within the bounds of ``field``; None stays."""
         if value is None:
             return None
@@ -67,7 +68,7 @@ class LeafBuilder:
         array = self.array(name, value, field)
         return None if _is_everywhere(array, field.neutral) else self.freeze(array)
 
-    def limits(self, name: str, symmetric: Any, low: Any, high: Any) -> tuple[Any, Any]:
+    def limits(self, name: str, symmetric: Any, low: Array, high: Array) -> tuple[Any, Any]:
         """Return the leaves of a lower and an upper limit, each None where it is infinite everywhere."""
         if symmetric is not None:
             if low is not None or high is not None:
@@ -88,7 +89,7 @@ class LeafBuilder:
         upper = None if _is_everywhere(upper, math.inf) else upper
         return lower, upper
 
-    def mask(self, name: str, value: Any) -> Any:
+    def mask(self, name: str, value: Any) -> Array:
         """Return a mask of 1.0 and 0.0, None where it is False everywhere."""
         if value is None:
             return None
@@ -125,7 +126,7 @@ class LeafBuilder:
         )
         return low, high
 
-    def tracking_time(self, value: Any, back: Any, kp: Any, ki: Any, kd: Any) -> Any:
+    def tracking_time(self, value: Any, back: Any, kp: Array, ki: Array, kd: Array) -> Any:
         """Return the leaf of back-calculation's time constant, inf where a joint is not ``back``."""
         if back is None:
             if value is not None:
@@ -144,13 +145,13 @@ class LeafBuilder:
         """Return the params entry of a named choice."""
         return CHOICES[name][choice(name, chosen, CHOICES[name])]
 
-    def freeze(self, array: Any) -> Any:
+    def freeze(self, array: Array) -> Any:
         """Return the leaf in the params' dtype and read-only: params are replaced, not edited."""
         if array is None or is_traced(array):
             return array
         return _read_only(np.array(array, dtype=self.dtype))
 
-    def _by_env_and_joint(self, name: str, array: Any) -> Any:
+    def _by_env_and_joint(self, name: str, array: Array) -> Any:
         """Return a scalar, (joints,) or (envs, joints) as (1 | envs, joints)."""
         expected = f"(), ({self.joints},) or (envs, {self.joints})"
         rows = array[None] if array.ndim == 1 else array
@@ -167,21 +168,21 @@ class LeafBuilder:
         )
 
 
-def _can_be_written(leaf: Any) -> bool:
+def _can_be_written(leaf: Array) -> bool:
     return isinstance(leaf, np.ndarray) and (leaf.flags.writeable or not leaf.flags.owndata)
 
 
-def _read_only(array: Any) -> Any:
+def _read_only(array: Array) -> Any:
     array.setflags(write=False)
     return array
 
 
-def _is_everywhere(array: Any, value: float) -> bool:
+def _is_everywhere(array: Array, value: float) -> bool:
     """Return whether an array is left out, or known to be ``value`` in all entries."""
     return array is None or (not is_traced(array) and bool((array == value).all()))
 
 
-def _rule_of_thumb(kp: Any, ki: Any, kd: Any) -> Any:
+def _rule_of_thumb(kp: Array, ki: Array, kd: Array) -> Any:
     """Return Tt = sqrt(Ti Td) = sqrt(kd/ki), or Ti = kp/ki without kd; inf, no correction, where ki is 0."""
     xp = namespace(kp, ki, kd)
     if ki is None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Document
 from batchpid.arrays.choices import MeasuredRate, PerInertia, PerMassMatrix
 from batchpid.checks.validate import choice, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
@@ -130,7 +131,7 @@ class Header:
         """Inputs of a step, in their order."""
         # init runs on a measurement of NaN: what is NaN afterwards is a copy of the measurement.
         nan = np.full((1, joints), math.nan, params.dtype)
-        started: dict[str, Any] = pid.init(params, nan).leaves()
+        started: Document = pid.init(params, nan).leaves()
         if guard is not None:
             started |= {"guarded_setpoint": nan, "guarded_rate": 0 * np.ones_like(nan)}
         self.started = started
@@ -164,9 +165,9 @@ class Header:
         tables = "".join(self.names.table(labels[at], constants[at][0]) for at in used)
         return self._frame(tables + body, body)
 
-    def _step(self, k: Coefficients, guard: Guard, state: dict[str, Any], given: dict[str, Any]) -> tuple[Any, Any]:
+    def _step(self, k: Coefficients, guard: Guard, state: Document, given: Document) -> tuple[Any, Any]:
         """Return the new state, by name, and the effort: the control step of one robot."""
-        new: dict[str, Any] = {}
+        new: Document = {}
         setpoint, rate = given["setpoint"], given.get("setpoint_rate")
         if self.guard is not None:
             before = GuardState(state["guarded_setpoint"], state["guarded_rate"])
@@ -273,7 +274,7 @@ class {p}_controller {{
 #endif
 """
 
-    def _started(self, leaves: dict[str, Any]) -> str:
+    def _started(self, leaves: Document) -> str:
         """Return the statements that start ``leaves`` of the state."""
         lines = []
         for name, leaf in leaves.items():

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array
 from batchpid.native.operations import OPERATIONS
 from batchpid.native.tracing import Trace
 
@@ -74,13 +75,13 @@ class Dialect(NamedTuple):
             return "-INFINITY" if value < 0 else "INFINITY"
         return f"{self.dtype.type(value).item()!r}{self.suffix}"
 
-    def table(self, name: str, values: Any) -> str:
+    def table(self, name: str, values: Array) -> str:
         """Return the statement of a constant table ``name``, an array ``values`` (joints, ...)."""
         rows = np.asarray(values)
         size = "".join(f"[{extent}]" for extent in (self.size, *rows.shape[1:]))
         return f"  static const {self.type} {name}{size} = {self._braces(rows)};\n"
 
-    def _braces(self, values: Any) -> str:
+    def _braces(self, values: Array) -> str:
         return "{" + ", ".join(self._braces(row) if row.ndim else self.number(float(row)) for row in values) + "}"
 
 

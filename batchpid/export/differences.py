@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.choices import IntegrateFirst, MeasuredRate, PerMassMatrix
 from batchpid.checks.validate import at_least, instance, names, read_array, time_step
 from batchpid.errors import InvalidArgumentError
@@ -169,12 +170,12 @@ def strategies(params: PIDParams) -> list[str]:
     return [str(each) for each in np.broadcast_to(params.options()["anti_windup"], (1, params.num_joints))[0]]
 
 
-def plain(leaf: Any, joint: int) -> float:
+def plain(leaf: Array, joint: int) -> float:
     """Return the number of a joint with the fewest digits that read back as the same number of its dtype."""
     return float(str(leaf[0, joint]))
 
 
-def _exact(leaf: Any) -> Float64:
+def _exact(leaf: Array) -> Float64:
     return np.asarray(leaf, np.float64)
 
 

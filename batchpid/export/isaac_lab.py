@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import choice, identifier, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.exported import Exported
@@ -76,7 +77,7 @@ def to_isaac_lab(
     if model == "dc_motor" and not has_line:
         remedy = "give actuators with saturation_effort and no_load_speed, or choose another model"
         raise InvalidArgumentError("model", "needs the motors' torque-speed line", value=model, remedy=remedy)
-    fields: dict[str, Any] = {"stiffness": found.value("kp"), "damping": found.value("kd")}
+    fields: Document = {"stiffness": found.value("kp"), "damping": found.value("kd")}
     fields["effort_limit_sim" if model == "implicit" else "effort_limit"] = np.minimum(found.effort_limit, NO_LIMIT)
     coulomb = found.motor("coulomb")
     joint_side = {
@@ -86,7 +87,7 @@ def to_isaac_lab(
         "viscous_friction": found.motor("viscous"),
     }
     fields |= {key: values for key, values in joint_side.items() if values.any()}
-    whole: dict[str, Any] = {}
+    whole: Document = {}
     if model == "dc_motor":
         whole["saturation_effort"] = found.motor("saturation_effort", math.inf)
         fields["velocity_limit"] = np.minimum(found.motor("no_load_speed", math.inf), NO_LIMIT)
@@ -110,7 +111,7 @@ def to_isaac_lab(
     return Exported(f"{found.opening('Actuators for Isaac Lab')}{imports}{name} = {{\n{body}}}\n", tuple(found))
 
 
-def _group(found: Drive, joints: list[int], fields: dict[str, Any], whole: dict[str, Any], cls: str) -> str:
+def _group(found: Drive, joints: list[int], fields: Document, whole: Document, cls: str) -> str:
     """Return the text of one configuration."""
     names = [re.escape(found.joints[at]) for at in joints]
     lines = [f"joint_names_expr={names!r}"]

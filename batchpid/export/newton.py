@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import identifier
 from batchpid.export.exported import Exported
 from batchpid.export.pd_drive import Drive
@@ -92,8 +92,8 @@ def _drive(found: Drive, at: int) -> str:
     return "DrivePID" if found.value("ki")[at] > 0 and found.integral_limit[at] > 0 else "DrivePD"
 
 
-def _gains(found: Drive, at: int) -> dict[str, Any]:
-    gains: dict[str, Any] = {"kp": float(found.value("kp")[at]), "kd": float(found.value("kd")[at])}
+def _gains(found: Drive, at: int) -> Document:
+    gains: Document = {"kp": float(found.value("kp")[at]), "kd": float(found.value("kd")[at])}
     if _drive(found, at) == "DrivePID":
         gains["ki"] = float(found.value("ki")[at])
         if math.isfinite(limit := found.integral_limit[at]):
@@ -101,10 +101,10 @@ def _gains(found: Drive, at: int) -> dict[str, Any]:
     return gains
 
 
-def _clamps(found: Drive, at: int) -> list[tuple[str, dict[str, Any]]]:
+def _clamps(found: Drive, at: int) -> list[tuple[str, Document]]:
     """Return the clamps of a joint, by the names of their classes."""
     limit, stall = (float(values[at]) for values in (found.effort_limit, found.motor("saturation_effort", math.inf)))
-    clamps: list[tuple[str, dict[str, Any]]] = []
+    clamps: list[tuple[str, Document]] = []
     if math.isfinite(limit):
         clamps.append(("ClampingMaxEffort", {"max_effort": limit}))
     if math.isfinite(stall):

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.choices import MeasuredRate
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
@@ -120,7 +121,7 @@ def to_ros2_control(
         raise InvalidArgumentError("dt", "is more than a second", value=dt, remedy="use a rate of at least 1 Hz")
     name = name or controller
     interfaces = ["position", "velocity"] if two else ["position"]
-    body: dict[str, Any]
+    body: Document
     if trajectory:
         body = {"joints": found.joints, "command_interfaces": ["effort"], "state_interfaces": interfaces}
     else:
@@ -132,11 +133,11 @@ def to_ros2_control(
     return Exported(f"{found.opening('PID gains')}{documents.render(document, 'yaml')}", tuple(found))
 
 
-def _gains(found: Differences, feedforward: str, two: bool) -> dict[str, dict[str, Any]]:
+def _gains(found: Differences, feedforward: str, two: bool) -> dict[str, Document]:
     """Return the gains of each joint, by name."""
     params, gains = found.params, {}
     for at, (joint, strategy) in enumerate(zip(found.joints, strategies(found.params), strict=True)):
-        own: dict[str, Any] = dict(NEUTRAL)
+        own: Document = dict(NEUTRAL)
         for key, leaf in LEAVES.items():
             if (values := getattr(params, leaf)) is not None:
                 own[key] = plain(values, at)
@@ -199,7 +200,7 @@ def _compare(found: Differences, two: bool, trajectory: bool) -> None:
     _compare_anti_windup(found, low, high, limited)
 
 
-def _compare_anti_windup(found: Differences, low: Any, high: Any, limited: Any) -> None:
+def _compare_anti_windup(found: Differences, low: Array, high: Array, limited: Any) -> None:
     params = found.params
     used = np.array(strategies(params))
     for key, sign in (("integral_min", 1), ("integral_max", -1)):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import choice, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.exported import Imported
@@ -15,7 +16,7 @@ from batchpid.export.ros2_control import LEAVES, NEUTRAL, STRATEGIES
 from batchpid.io import documents
 from batchpid.law.params import PIDParams, make_params
 
-_KNOWN: dict[str, Any] = {
+_KNOWN: Document = {
     **NEUTRAL,
     "ff_velocity_scale": 0.0,
     "feedforward_gain": 0.0,
@@ -58,7 +59,7 @@ def from_ros2_control(
     if not found:
         remedy = "give the YAML of a controller with gains" if controller is None else "check the controller's name"
         raise InvalidArgumentError("text", "holds no controller with gains", value=controller, remedy=remedy)
-    joints: dict[str, dict[str, Any]] = {}
+    joints: dict[str, Document] = {}
     inputs: dict[str, bool] = {}
     for name, body in found.items():
         for joint, gains in _joints(name, body).items():
@@ -87,7 +88,7 @@ def is_ros2_control(document: Any) -> bool:
     return any(True for _ in _controllers(document, ""))
 
 
-def _controllers(document: Any, name: str) -> Iterator[tuple[str, dict[str, Any]]]:
+def _controllers(document: Any, name: str) -> Iterator[tuple[str, Document]]:
     """Yield the controllers with gains below ``document``, which may be in namespaces."""
     if not isinstance(document, dict):
         return
@@ -99,7 +100,7 @@ def _controllers(document: Any, name: str) -> Iterator[tuple[str, dict[str, Any]
             yield from _controllers(inner, key)
 
 
-def _joints(name: str, body: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def _joints(name: str, body: Document) -> dict[str, Document]:
     """Return the checked gains of each joint of a controller."""
     trajectory = "joints" in body
     joints = names(f"{name}.{'joints' if trajectory else 'dof_names'}", body.get("joints", body.get("dof_names")))
@@ -118,7 +119,7 @@ def _joints(name: str, body: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return {joint: _gains(name, joint, body["gains"].get(joint), two) for joint in joints}
 
 
-def _gains(name: str, joint: str, gains: Any, two: bool) -> dict[str, Any]:
+def _gains(name: str, joint: str, gains: Any, two: bool) -> Document:
     where = f"{name}.gains"
     if not isinstance(gains, dict):
         raise InvalidArgumentError(where, "has no gains", joint=joint, remedy="give 'JOINT: {p: 1.0}'")
@@ -140,12 +141,12 @@ def _gains(name: str, joint: str, gains: Any, two: bool) -> dict[str, Any]:
     return own
 
 
-def _params(columns: dict[str, Any], order: list[str], two: bool, continuous: ArrayLike | None) -> PIDParams:
+def _params(columns: Document, order: list[str], two: bool, continuous: ArrayLike | None) -> PIDParams:
     d, i, p = (columns[key].astype(float) for key in ("d", "i", "p"))
     strategy = [_ANTI_WINDUP[each] for each in columns["antiwindup_strategy"]]
     # Back-calculation has no effect without i; make_params would let it move the integral.
     strategy = ["none" if s == "back_calculation" and not g else s for s, g in zip(strategy, i, strict=True)]
-    options: dict[str, Any] = {leaf: columns[key].astype(float) for key, leaf in LEAVES.items()}
+    options: Document = {leaf: columns[key].astype(float) for key, leaf in LEAVES.items()}
     options["anti_windup"] = strategy
     if "back_calculation" in strategy:
         given, safe = columns["tracking_time_constant"].astype(float), np.where(i > 0, i, 1.0)
@@ -166,7 +167,7 @@ def _params(columns: dict[str, Any], order: list[str], two: bool, continuous: Ar
     return make_params(len(order), **options, joint_names=order)
 
 
-def _differences(columns: dict[str, Any], order: list[str]) -> tuple[str, ...]:
+def _differences(columns: Document, order: list[str]) -> tuple[str, ...]:
     """Return the differences of the params from the file."""
     zone = columns["error_deadband"].astype(float)
     zone = columns["error_deadband"] = np.where(zone <= np.finfo(float).eps, 0.0, zone)  # a default of control_toolbox

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.elementwise import namespace
 from batchpid.law.params import PIDParams, make_params
 
 
 def tutorial(
-    joints: int, kp: Any = 0.0, ki: Any = 0.0, kd: Any = 0.0, *, kick: bool = True, **options: Any
+    joints: int, kp: Array = 0.0, ki: Array = 0.0, kd: Array = 0.0, *, kick: bool = True, **options: Any
 ) -> PIDParams:
     """Return params of SimplePID of SAPIEN's tutorial "Drive Robot with PID Controller".
 
@@ -30,9 +31,9 @@ def tutorial(
 
 def simple_pid(
     joints: int,
-    kp: Any = 1.0,
-    ki: Any = 0.0,
-    kd: Any = 0.0,
+    kp: Array = 1.0,
+    ki: Array = 0.0,
+    kd: Array = 0.0,
     *,
     output_limits: tuple[Any, Any] = (None, None),
     proportional_on_measurement: bool = False,
@@ -45,7 +46,7 @@ def simple_pid(
     first measurement. For angles use ``continuous=`` instead of its ``error_map``, whose derivative spikes.
     """
     low, high = output_limits
-    own: dict[str, Any] = {"effort_min": low, "effort_max": high, "integration": "integrate_first"}
+    own: Document = {"effort_min": low, "effort_max": high, "integration": "integrate_first"}
     if low is not None or high is not None:
         own["anti_windup"] = "clamp"
     if proportional_on_measurement:
@@ -57,9 +58,9 @@ def simple_pid(
 
 def control_toolbox(
     joints: int,
-    p: Any = 0.0,
-    i: Any = 0.0,
-    d: Any = 0.0,
+    p: Array = 0.0,
+    i: Array = 0.0,
+    d: Array = 0.0,
     *,
     u_max: Any = math.inf,
     u_min: Any = -math.inf,
@@ -84,7 +85,7 @@ def control_toolbox(
 
 
 def newton(
-    joints: int, kp: Any = 0.0, ki: Any = 0.0, kd: Any = 0.0, *, integral_max: Any = math.inf, **options: Any
+    joints: int, kp: Array = 0.0, ki: Array = 0.0, kd: Array = 0.0, *, integral_max: Any = math.inf, **options: Any
 ) -> PIDParams:
     """Return params of DrivePID of newton.actuators: I = clamp(I + e dt, +-integral_max), and rates as given.
 

@@ -32,12 +32,12 @@ E. I. Jury, Theory and Application of the z-Transform Method (Wiley, 1964).
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.checks.validate import at_least, broadcast, positive, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 
@@ -136,7 +136,7 @@ def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) ->
     return StabilityBound(ratio, participation)
 
 
-def _loop(z: NDArray[Any], m: Float64, unit: Float64, columns: list[Float64], dt: float) -> NDArray[Any]:
+def _loop(z: Rows, m: Float64, unit: Float64, columns: list[Float64], dt: float) -> Rows:
     """Return L (frequencies, joints, joints) of one loop at the points ``z`` (frequencies,) of the unit circle.
 
     ``columns`` are kp, kd, filter time, damping, delay and lag (joints,).
@@ -149,11 +149,11 @@ def _loop(z: NDArray[Any], m: Float64, unit: Float64, columns: list[Float64], dt
     intake = -np.expm1(-dt / np.maximum(lag, 1e-3 * dt))
     late = each**-whole * (1 - part + part / each) * intake / (1 - (1 - intake) / each)
     plant = (z - 1)[:, None, None] * m + dt * z[:, None, None] * (b * np.eye(len(b)))
-    moved: NDArray[Any] = np.linalg.solve(plant, late[..., None] * unit * law[:, None, :])
+    moved: Rows = np.linalg.solve(plant, late[..., None] * unit * law[:, None, :])
     return moved * (dt**2 * z / (z - 1))[:, None, None]
 
 
-def _crossing(z: NDArray[Any], values: NDArray[Any]) -> tuple[float, int]:
+def _crossing(z: Rows, values: Rows) -> tuple[float, int]:
     """Return the largest modulus at which a locus falls through -180 degrees, and the number of its frequency.
 
     ``values`` (frequencies, joints) are the eigenvalues of L at ``z``. The loci begin below the negative real axis

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from batchpid.arrays.array_types import Document, DType
 from batchpid.arrays.field_tables import Field
 from batchpid.checks.validate import choice, file_path
 from batchpid.errors import InvalidArgumentError
@@ -56,8 +57,8 @@ def write(path: str | os.PathLike[str], dump: Callable[[str], str]) -> None:
 
 
 def document(
-    schema: Schema, options: dict[str, Any], joint_names: Sequence[str], about: Mapping[str, Any] | None
-) -> dict[str, Any]:
+    schema: Schema, options: Document, joint_names: Sequence[str], about: Mapping[str, Any] | None
+) -> Document:
     """Return the document of the ``options`` of a constructor: arrays (1 | envs, joints), or one for all joints."""
     head = {name: options.pop(name) for name in schema.head if name in options}
     joints = {
@@ -69,9 +70,7 @@ def document(
     return {"format": schema.format, **kept, **head, "joints": joints}
 
 
-def build(
-    source: str, document: Any, schema: Schema, joints: dict[str, Any], make: Callable[..., T], **options: Any
-) -> T:
+def build(source: str, document: Any, schema: Schema, joints: Document, make: Callable[..., T], **options: Any) -> T:
     """Return the result of the constructor ``make`` for a document's ``joints``, in their order, and its head.
 
     Errors name the document and the key. ``options`` are further arguments.
@@ -99,7 +98,7 @@ def parse(source: str, text: str | bytes, format: str) -> Any:
         raise InvalidArgumentError(source, f"cannot be read: {said}", remedy="correct the file") from None
 
 
-def render(document: dict[str, Any], format: str) -> str:
+def render(document: Document, format: str) -> str:
     """Return a document as text in ``format``, "yaml" or "json"."""
     if choice("format", format, ("yaml", "json")) == "json":
         return json.dumps(_without_infinities(document), indent=2, allow_nan=False) + "\n"
@@ -108,7 +107,7 @@ def render(document: dict[str, Any], format: str) -> str:
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10_000)
 
 
-def check(source: str, document: Any, schema: Schema) -> dict[str, dict[str, Any]]:
+def check(source: str, document: Any, schema: Schema) -> dict[str, Document]:
     """Return the joints of ``document`` if it is of the form ``schema``."""
     if not isinstance(document, dict) or document.get("format") != schema.format:
         remedy = f"it must contain 'format: {schema.format}'"
@@ -146,9 +145,9 @@ def is_number(entry: Any) -> bool:
     return whole or isinstance(entry, float) or entry in ("inf", "-inf")
 
 
-def columns(source: str, joints: dict[str, dict[str, Any]], schema: Schema) -> dict[str, Any]:
+def columns(source: str, joints: dict[str, Document], schema: Schema) -> Document:
     """Return each option that some joint has, as an array (1 or envs, joints)."""
-    columns: dict[str, Any] = {}
+    columns: Document = {}
     for key, (_, neutral, *_) in schema.fields.items():
         if not any(key in options for options in joints.values()):
             continue
@@ -158,7 +157,7 @@ def columns(source: str, joints: dict[str, dict[str, Any]], schema: Schema) -> d
         for name, value in lists.items():
             if len(value) not in (1, envs):
                 raise error(source, key, f"has {len(value)} values, others {envs}", "give one per env", name)
-        dtype: Any = {float: float, bool: bool, str: object}[type(neutral)]
+        dtype: DType = {float: float, bool: bool, str: object}[type(neutral)]
         columns[key] = np.array([value * (envs // len(value)) for value in lists.values()], dtype=dtype).T
     return columns
 
@@ -186,7 +185,7 @@ def _without_infinities(value: Any) -> Any:
 
 
 def _parse_json(text: str) -> Any:
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    def unique(pairs: list[tuple[str, Any]]) -> Document:
         if len(dict(pairs)) < len(pairs):
             raise ValueError(f"a key is given twice among {[key for key, _ in pairs]}")
         return dict(pairs)

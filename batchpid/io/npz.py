@@ -7,16 +7,16 @@ import math
 import os
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from batchpid.arrays.array_types import Rows
 
 _END_RECORD = 22
 """Bytes of a zip file's last record, without its comment."""
 
 
-def read_npz(path: str | os.PathLike[str], max_bytes: int) -> dict[str, NDArray[Any]]:
+def read_npz(path: str | os.PathLike[str], max_bytes: int) -> dict[str, Rows]:
     """Return all arrays of an .npz file of numbers and texts, by name, each with its checksum (CRC-32) verified.
 
     Nothing is executed, and nothing is decompressed before it is known to fit.
@@ -31,7 +31,7 @@ def read_npz(path: str | os.PathLike[str], max_bytes: int) -> dict[str, NDArray[
     Exception
         The file is not an NPZ file. The libraries raise different types, mostly ValueError or ``zipfile.BadZipFile``.
     """
-    tables: dict[str, NDArray[Any]] = {}
+    tables: dict[str, Rows] = {}
     with Path(path).open("rb") as file, zipfile.ZipFile(file) as archive:
         members = archive.infolist()
         file.seek(-_END_RECORD - len(archive.comment), os.SEEK_END)
@@ -50,7 +50,7 @@ def read_npz(path: str | os.PathLike[str], max_bytes: int) -> dict[str, NDArray[
     return tables
 
 
-def _array(name: str, data: bytes) -> NDArray[Any]:
+def _array(name: str, data: bytes) -> Rows:
     """Return the array in the bytes of an .npy file."""
     file = io.BytesIO(data)
     if np.lib.format.read_magic(file) != (1, 0):
@@ -60,5 +60,5 @@ def _array(name: str, data: bytes) -> NDArray[Any]:
         raise ValueError(f"its {name} is of {dtype}")
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data) - file.tell():
         raise ValueError(f"its {name} has shape {shape}, which is not what it holds")
-    array: NDArray[Any] = np.ndarray(shape, dtype, data, file.tell(), order="F" if fortran else "C")
+    array: Rows = np.ndarray(shape, dtype, data, file.tell(), order="F" if fortran else "C")
     return array.astype(dtype.newbyteorder("="))

@@ -19,6 +19,7 @@ import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from batchpid.arrays.array_types import Document
 from batchpid.arrays.choices import CHOICES
 from batchpid.checks.validate import names
 from batchpid.errors import InvalidArgumentError
@@ -81,7 +82,7 @@ def load_params(path: str | os.PathLike[str], joint_names: Sequence[str] | None 
     return _build(str(path), documents.read(path), joint_names)
 
 
-def load_about(path: str | os.PathLike[str]) -> dict[str, Any]:
+def load_about(path: str | os.PathLike[str]) -> Document:
     """Return the ``about`` that :func:`save_params` wrote, or an empty dict. Raises as :func:`load_params`."""
     document = documents.read(path)
     documents.check(str(path), document, SCHEMA)

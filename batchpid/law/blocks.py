@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from batchpid.arrays.array_types import Array
 from batchpid.law.coefficients import Coefficients
 from batchpid.law.pid import advance
 from batchpid.law.state import PIDState
@@ -40,16 +41,16 @@ def advance_in_blocks(
         out = (jax.tree.map(jnp.zeros_like, state), jnp.zeros_like(measurement))
     block, total = rows * joints, envs * joints
 
-    def flat(x: Any) -> Any:  # a row that all envs share is repeated over a block
+    def flat(x: Array) -> Array:  # a row that all envs share is repeated over a block
         if jnp.ndim(x) < 2:
             return x
         return (jnp.tile(x, (rows, 1)) if x.shape[0] == 1 else x).reshape(-1)
 
-    def step(n: Any, out: Any) -> Any:
+    def step(n: Array, out: Any) -> Any:
         # The last block may repeat some rows of the one before.
         start = jnp.minimum(n * block, total - block)
 
-        def cut(x: Any) -> Any:
+        def cut(x: Array) -> Array:
             return jax.lax.dynamic_slice_in_dim(x, start, block) if jnp.shape(x) == (total,) else x
 
         new, terms = advance(*jax.tree.map(cut, given))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import discretise
@@ -16,14 +15,14 @@ from batchpid.law.state import PIDState
 def track(
     params: PIDParams,
     state: PIDState,
-    setpoint: Any,
-    measurement: Any,
-    effort: Any,
+    setpoint: Array,
+    measurement: Array,
+    effort: Array,
     *,
-    dt: Any = None,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
-    feedforward: Any = None,
+    dt: Array = None,
+    measurement_rate: Array = None,
+    setpoint_rate: Array = None,
+    feedforward: Array = None,
 ) -> PIDState:
     """Return the state whose next step, on these same inputs, gives ``effort``: its integral makes up the difference.
 

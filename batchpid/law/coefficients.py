@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, namespace, tiny_of
 from batchpid.law.implicit import as_explicit, implicit_gains
@@ -14,43 +15,43 @@ from batchpid.law.params import PIDParams
 class Coefficients(NamedTuple):
     """:class:`PIDParams` at one dt, in the symbols of :mod:`batchpid.law.pid`; None is off."""
 
-    kp: Any
-    ki_dt: Any
-    ki_dt2: Any
+    kp: Array
+    ki_dt: Array
+    ki_dt2: Array
     """ki dt^2 of the implicit law: weight in the integral of a given setpoint rate."""
-    kd: Any
-    per_dt: Any
+    kd: Array
+    per_dt: Array
     """1 / dt."""
-    decay: Any
+    decay: Array
     """tau / (tau + dt), the weight of the derivative's old value in its filter."""
-    intake: Any
+    intake: Array
     """dt / (tau + dt), the weight of the new one."""
-    effort_min: Any
-    effort_max: Any
-    effort_step: Any
+    effort_min: Array
+    effort_max: Array
+    effort_step: Array
     """Largest change of the effort in a step."""
-    integral_min: Any
-    integral_max: Any
-    b: Any
-    c: Any
-    c_given: Any
+    integral_min: Array
+    integral_max: Array
+    b: Array
+    c: Array
+    c_given: Array
     """Weight c of a given setpoint rate in the implicit law; None: c, or 1."""
-    origin_dt: Any
+    origin_dt: Array
     """dt, where a given setpoint rate moves the origin of setpoint weighting."""
-    acceleration_share: Any
+    acceleration_share: Array
     """Weight of a given setpoint acceleration in the implicit law; None: 1."""
-    deadband: Any
-    tracking: Any
+    deadband: Array
+    tracking: Array
     """dt / Tt, at most 1. Above 1, a step would correct more than the whole excess, and oscillate."""
     conditional: Any
-    turns: Any
+    turns: Array
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
-    tiny: Any
+    tiny: Array
     """Argument of :func:`batchpid.arrays.elementwise.flush`."""
     integration: Any
-    weight_origin: Any
+    weight_origin: Array
     non_finite: Any
-    measurement_rate: Any
+    measurement_rate: Array
     gain_units: Any
     """Unit of gains that :mod:`batchpid.law.computed_torque` turns into efforts; the law alone refuses them."""
 
@@ -58,7 +59,7 @@ class Coefficients(NamedTuple):
         return array_summary(self, "envs", "joints")
 
 
-def discretise(params: PIDParams, dt: Any, num_envs: int | None = None) -> Coefficients:
+def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coefficients:
     """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.advance`.
 
     With ``num_envs`` they have the shape of :func:`spread`. Raises InvalidArgumentError unless dt is positive and

@@ -33,6 +33,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.choices import Everywhere, PerMassMatrix
 from batchpid.arrays.elementwise import clip, matrix_vector, namespace, row_minimum
 from batchpid.errors import InvalidArgumentError
@@ -42,7 +43,7 @@ from batchpid.law.pid import advance
 from batchpid.law.state import PIDState, Terms
 
 
-def per_inertia(k: Coefficients, inertia: Any) -> Coefficients:
+def per_inertia(k: Coefficients, inertia: Array) -> Coefficients:
     """Return the coefficients ``k`` of an acceleration law times ``inertia`` (envs, joints), for an effort law."""
     return k._replace(
         gain_units=None,
@@ -56,13 +57,13 @@ def per_inertia(k: Coefficients, inertia: Any) -> Coefficients:
 def advance_with_mass_matrix(
     k: Coefficients,
     state: PIDState,
-    setpoint: Any,
-    measurement: Any,
-    mass_matrix: Any,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
-    setpoint_acceleration: Any = None,
-    feedforward: Any = None,
+    setpoint: Array,
+    measurement: Array,
+    mass_matrix: Array,
+    measurement_rate: Array = None,
+    setpoint_rate: Array = None,
+    setpoint_acceleration: Array = None,
+    feedforward: Array = None,
 ) -> tuple[PIDState, Terms]:
     """Advance the law in accelerations and return efforts; otherwise as :func:`batchpid.advance`.
 
@@ -83,7 +84,7 @@ def advance_with_mass_matrix(
     return new, Terms(p, i, d, given, unsaturated, effort)
 
 
-def given_acceleration(k: Coefficients, setpoint_acceleration: Any) -> Any:
+def given_acceleration(k: Coefficients, setpoint_acceleration: Array) -> Array:
     """Return what a given acceleration of the setpoint adds to the law's output; None for nothing."""
     if setpoint_acceleration is None or k.acceleration_share is None:
         return setpoint_acceleration
@@ -105,7 +106,7 @@ def check_gain_units(params: PIDParams) -> None:
             raise InvalidArgumentError(option, problem, remedy=f"use {remedy}, or gain_units 'inertia'")
 
 
-def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matrix: Any) -> PIDState:
+def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matrix: Array) -> PIDState:
     """Return ``state`` with the integral I in the unit that ``new`` has, for a bumpless change of gain_units.
 
     I is an acceleration with gain_units "mass_matrix" and an effort otherwise: an effort becomes M^-1 I, an
@@ -134,7 +135,7 @@ def _unlimited(k: Coefficients) -> Coefficients:
 
 
 def _to_effort(
-    k: Coefficients, old: PIDState, new: PIDState, a: Any, mass_matrix: Any, feedforward: Any
+    k: Coefficients, old: PIDState, new: PIDState, a: Array, mass_matrix: Array, feedforward: Array
 ) -> tuple[PIDState, Any, Any]:
     """Return the state, the effort of the acceleration ``a`` within the limits of ``k``, and without them."""
     xp, low, high = namespace(*k, a, mass_matrix), k.effort_min, k.effort_max
@@ -160,7 +161,7 @@ def _to_effort(
     return new, effort, unsaturated
 
 
-def _towards(effort: Any, last: Any, step: Any, xp: Any) -> Any:
+def _towards(effort: Array, last: Array, step: Any, xp: ArrayModule) -> Array:
     """Return the point nearest to ``effort`` on the line from ``last`` that no joint needs more than ``step`` for."""
     change = effort - last
     size = xp.abs(change)
@@ -170,7 +171,7 @@ def _towards(effort: Any, last: Any, step: Any, xp: Any) -> Any:
     return clip(xp.where(part < 1, last + part * change, effort), last - step, last + step, xp)
 
 
-def _share(wanted: Any, passive: Any, low: Any, high: Any, xp: Any) -> Any:
+def _share(wanted: Array, passive: Array, low: Array, high: Array, xp: ArrayModule) -> Array:
     """Return s (envs, 1): the share of ``wanted`` that fits between ``passive`` and the limits."""
     above, below = (xp.inf if high is None else high - passive), (xp.inf if low is None else passive - low)
     room, size = xp.where(wanted > 0, above, below), xp.abs(wanted)

@@ -41,6 +41,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import namespace
 from batchpid.law.params import PIDParams
 
@@ -48,19 +49,19 @@ from batchpid.law.params import PIDParams
 class ImplicitGains(NamedTuple):
     """Gains of the explicit law that make it implicit at one time step; None is off."""
 
-    kp: Any
-    ki: Any
-    kd: Any
-    b: Any
-    c: Any
+    kp: Array
+    ki: Array
+    kd: Array
+    b: Array
+    c: Array
     """c* of the setpoint's difference quotient, which no integral takes: c kd / (kd + dt kp + dt^2 ki)."""
-    c_given: Any
+    c_given: Array
     """c* of a setpoint rate that is given."""
-    acceleration_share: Any
+    acceleration_share: Array
     """1 / D: the weight of a setpoint acceleration that is given."""
 
 
-def implicit_gains(params: PIDParams, dt: Any) -> ImplicitGains:
+def implicit_gains(params: PIDParams, dt: Array) -> ImplicitGains:
     """Return the gains kp*, ki*, kd*, b* and c*, and 1 / D, of implicit ``params`` at ``dt`` [s]."""
     kp, ki, kd, b, c = params.kp, params.ki, params.kd, params.setpoint_weight, params.setpoint_weight_derivative
     xp = namespace(kp, ki, kd, b, c, dt)
@@ -70,7 +71,7 @@ def implicit_gains(params: PIDParams, dt: Any) -> ImplicitGains:
     per_step = 1 / (1 + dt * damping)
     on_rate = kd if c is None else c * kd
 
-    def share(part: Any, whole: Any, otherwise: Any) -> Any:
+    def share(part: Any, whole: Array, otherwise: Array) -> Array:
         has = whole > 0
         return xp.where(has, part / xp.where(has, whole, 1), otherwise)
 
@@ -85,7 +86,7 @@ def implicit_gains(params: PIDParams, dt: Any) -> ImplicitGains:
     )
 
 
-def as_explicit(params: PIDParams, dt: Any) -> PIDParams:
+def as_explicit(params: PIDParams, dt: Array) -> PIDParams:
     """Return ``params``; implicit ones as params of the explicit law with the same gains at ``dt`` [s].
 
     Their ``setpoint_weight_derivative`` is for a setpoint rate that is given.

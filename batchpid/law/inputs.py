@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, DType
 from batchpid.arrays.choices import CHOICES, HoldEffort
 from batchpid.checks.validate import instance, read_array, time_step
 from batchpid.errors import InvalidArgumentError
@@ -26,7 +27,7 @@ DRIVE_LACKS = {
 """Options that change P, D or the effort in a way that no target of a drive can, and their values for off."""
 
 
-def checked_inputs(params: PIDParams, state: PIDState, measurement: Any, **inputs: Any) -> list[Any]:
+def checked_inputs(params: PIDParams, state: PIDState, measurement: Array, **inputs: Any) -> list[Any]:
     """Return ``measurement`` and ``inputs`` as arrays that broadcast with the params and the state; None stays None."""
     instance("params", params, PIDParams, "build them with make_params")
     instance("state", state, PIDState, "begin with init(params, measurement)")
@@ -42,7 +43,7 @@ def checked_inputs(params: PIDParams, state: PIDState, measurement: Any, **input
     return list(arrays.values())
 
 
-def check_alone(law: Any, measurement_rate: Any) -> None:
+def check_alone(law: Any, measurement_rate: Array) -> None:
     """Raise InvalidArgumentError if params or coefficients need a mass matrix, or a measured rate that is not given."""
     if law.gain_units is not None:
         unit = next(name for name, each in CHOICES["gain_units"].items() if type(each) is type(law.gain_units))
@@ -109,7 +110,7 @@ def checked_state(state: PIDState, needed: PIDState) -> PIDState:
     return state
 
 
-def checked_mask(mask: Any, state: PIDState) -> Any:
+def checked_mask(mask: Array, state: PIDState) -> Array:
     """Return ``mask`` as bools, one for each env of ``state``."""
     array = _as_array("mask", mask, "b")
     if array.dtype.kind != "b":
@@ -120,7 +121,7 @@ def checked_mask(mask: Any, state: PIDState) -> Any:
     return array
 
 
-def checked_dt(dt: Any, dtype: Any) -> Any:
+def checked_dt(dt: Array, dtype: DType) -> Array:
     """Return ``dt`` if it is positive and finite, a number as a float, and NumPy's array in the params' ``dtype``.
 
     A number of NumPy would give its own dtype to the efforts. Values of JAX's arrays are not read.
@@ -135,7 +136,7 @@ def checked_dt(dt: Any, dtype: Any) -> Any:
     return dt if hasattr(dt, "__array_namespace__") else time_step("dt", dt)
 
 
-def _as_array(name: str, value: Any, kinds: str = "iuf") -> Any:
+def _as_array(name: str, value: Any, kinds: str = "iuf") -> Array:
     """Return ``value`` as an array of NumPy; arrays of JAX are returned unchanged."""
     is_own = type(value) is np.ndarray
     if (is_own and value.dtype.kind in kinds) or (not is_own and hasattr(value, "__array_namespace__")):

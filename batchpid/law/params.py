@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, Document, DType
 from batchpid.arrays.choices import CHOICES, Everywhere, PerMassMatrix
 from batchpid.arrays.display import params_summary
 from batchpid.arrays.field_tables import Field, check_leaves
@@ -51,33 +52,33 @@ class PIDParams(NamedTuple):
     fields have the meaning and the units of the options of :func:`make_params`; those with another form say so.
     """
 
-    kp: Any
-    ki: Any = None
-    kd: Any = None
-    effort_min: Any = None
-    effort_max: Any = None
-    effort_rate_limit: Any = None
-    integral_min: Any = None
-    integral_max: Any = None
-    derivative_filter_time: Any = None
-    setpoint_weight: Any = None
-    setpoint_weight_derivative: Any = None
-    deadband: Any = None
-    tracking_time: Any = None
+    kp: Array
+    ki: Array = None
+    kd: Array = None
+    effort_min: Array = None
+    effort_max: Array = None
+    effort_rate_limit: Array = None
+    integral_min: Array = None
+    integral_max: Array = None
+    derivative_filter_time: Array = None
+    setpoint_weight: Array = None
+    setpoint_weight_derivative: Array = None
+    deadband: Array = None
+    tracking_time: Array = None
     """inf on a joint without back-calculation."""
     conditional: Any = None
     """Conditional integration: Everywhere(), or 1.0 on the joints that have it, 0.0 on the others."""
-    continuous: Any = None
+    continuous: Array = None
     """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
     integration: Any = None
     """IntegrateFirst(); off: the effort is computed first, with the integral of the past errors."""
     first_derivative: Any = None
     """DerivativeKick(); off: the derivative of the first sample is 0."""
-    weight_origin: Any = None
+    weight_origin: Array = None
     """WeightFromStart(); off: setpoint weighting measures positions from 0."""
     non_finite: Any = None
     """ZeroEffort() or HoldEffort(); off: non-finite values propagate."""
-    measurement_rate: Any = None
+    measurement_rate: Array = None
     """MeasuredRate(): whoever runs the law on a robot gives it the measured rate; off: differences of measurements."""
     gain_units: Any = None
     """PerInertia() or PerMassMatrix(): whoever runs the law on a robot converts to efforts; off: efforts."""
@@ -95,7 +96,7 @@ class PIDParams(NamedTuple):
         return max(leaf.shape[-2] for leaf in self if _is_array(leaf))
 
     @property
-    def dtype(self) -> Any:
+    def dtype(self) -> DType:
         """Dtype of every leaf."""
         return self.kp.dtype
 
@@ -110,12 +111,12 @@ class PIDParams(NamedTuple):
     def __repr__(self) -> str:
         return params_summary(self)
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Document:
         """Return the options that are on, as arguments of :func:`make_params` that build these params again.
 
         "clamp" shows as the integral limits that it sets. Where its leaves are traced, anti_windup is left out.
         """
-        options: dict[str, Any] = {}
+        options: Document = {}
         for name, leaf in zip(self._fields, self, strict=True):
             if name in CHOICES:
                 (options[name],) = (n for n, chosen in CHOICES[name].items() if type(chosen) is type(leaf))
@@ -164,24 +165,24 @@ class PIDParams(NamedTuple):
 @known_keywords
 def make_params(
     joints: int,
-    kp: Any,
-    ki: Any = None,
-    kd: Any = None,
+    kp: Array,
+    ki: Array = None,
+    kd: Array = None,
     *,
-    effort_limit: Any = None,
-    effort_min: Any = None,
-    effort_max: Any = None,
-    effort_rate_limit: Any = None,
-    integral_limit: Any = None,
-    integral_min: Any = None,
-    integral_max: Any = None,
-    derivative_filter_time: Any = None,
-    setpoint_weight: Any = None,
-    setpoint_weight_derivative: Any = None,
-    deadband: Any = None,
+    effort_limit: Array = None,
+    effort_min: Array = None,
+    effort_max: Array = None,
+    effort_rate_limit: Array = None,
+    integral_limit: Array = None,
+    integral_min: Array = None,
+    integral_max: Array = None,
+    derivative_filter_time: Array = None,
+    setpoint_weight: Array = None,
+    setpoint_weight_derivative: Array = None,
+    deadband: Array = None,
     anti_windup: str | Sequence[Any] = "none",
-    tracking_time: Any = None,
-    continuous: Any = None,
+    tracking_time: Array = None,
+    continuous: Array = None,
     integration: str = "output_first",
     first_derivative: str = "zero",
     weight_origin: str = "zero",
@@ -190,7 +191,7 @@ def make_params(
     gain_units: str = "effort",
     discretization: str = "explicit",
     joint_names: Sequence[str] | None = None,
-    dtype: Any = None,
+    dtype: DType = None,
 ) -> PIDParams:
     """Build validated :class:`PIDParams`; a number may be a scalar, (joints,) or (envs, joints).
 
@@ -286,12 +287,12 @@ def make_params(
     )
 
 
-def _is_array(leaf: Any) -> bool:
+def _is_array(leaf: Array) -> bool:
     """Return whether an entry of the params is an array, neither off nor a choice."""
     return leaf is not None and not isinstance(leaf, tuple)
 
 
-def _check_implicit(gain_units: Any, filter_time: Any) -> None:
+def _check_implicit(gain_units: Any, filter_time: Array) -> None:
     """Raise InvalidArgumentError for options that the implicit law does not have."""
     if not isinstance(gain_units, PerMassMatrix):
         problem = "'implicit' predicts accelerations, which needs gain_units 'mass_matrix'"

@@ -29,6 +29,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.choices import Everywhere, HoldEffort
 from batchpid.arrays.elementwise import clip, flush, namespace, nearest_turn, replace_envs, wrap
 from batchpid.law.coefficients import Coefficients, discretise
@@ -37,7 +38,7 @@ from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
 
 
-def init(params: PIDParams, measurement: Any) -> PIDState:
+def init(params: PIDParams, measurement: Array) -> PIDState:
     """Return the state before the first step.
 
     The derivative starts from ``measurement`` (envs, joints) [rad or m]: the first step has no derivative kick,
@@ -51,7 +52,7 @@ def init(params: PIDParams, measurement: Any) -> PIDState:
     begun = {"measurement": y, "setpoint": y, "setpoint_seen": float(params.first_derivative is not None)}
     begun |= {"origin": 0.0 if params.weight_origin is None else y}
 
-    def filled(name: str) -> Any:  # no two leaves share a buffer: JAX donates each of them
+    def filled(name: str) -> Array:  # no two leaves share a buffer: JAX donates each of them
         value = begun.get(name, 0.0)
         return y.copy() if value is y else xp.full_like(y, value)
 
@@ -66,13 +67,13 @@ def init(params: PIDParams, measurement: Any) -> PIDState:
 def step(
     params: PIDParams,
     state: PIDState,
-    setpoint: Any,
-    measurement: Any,
-    dt: Any,
+    setpoint: Array,
+    measurement: Array,
+    dt: Array,
     *,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
-    feedforward: Any = None,
+    measurement_rate: Array = None,
+    setpoint_rate: Array = None,
+    feedforward: Array = None,
 ) -> tuple[PIDState, Any]:
     """Advance the law by ``dt`` seconds; return the state and the effort.
 
@@ -104,7 +105,7 @@ def step(
 
 
 def step_terms(
-    params: PIDParams, state: PIDState, setpoint: Any, measurement: Any, dt: Any, **inputs: Any
+    params: PIDParams, state: PIDState, setpoint: Array, measurement: Array, dt: Array, **inputs: Any
 ) -> tuple[PIDState, Terms]:
     """Advance the law as :func:`step`, with the same arguments; return the state and all terms, effort included."""
     state, terms = _step(params, state, setpoint, measurement, dt, **inputs)
@@ -112,7 +113,7 @@ def step_terms(
 
 
 def _step(
-    params: PIDParams, state: PIDState, setpoint: Any, measurement: Any, dt: Any, **inputs: Any
+    params: PIDParams, state: PIDState, setpoint: Array, measurement: Array, dt: Array, **inputs: Any
 ) -> tuple[PIDState, Terms]:
     """Check the arguments of a step and advance the law."""
     y, r, *rest = checked_inputs(params, state, measurement, setpoint=setpoint, **inputs)
@@ -123,11 +124,11 @@ def _step(
 def advance(
     k: Coefficients,
     state: PIDState,
-    setpoint: Any,
-    measurement: Any,
-    measurement_rate: Any = None,
-    setpoint_rate: Any = None,
-    feedforward: Any = None,
+    setpoint: Array,
+    measurement: Array,
+    measurement_rate: Array = None,
+    setpoint_rate: Array = None,
+    feedforward: Array = None,
 ) -> tuple[PIDState, Terms]:
     """Advance the law with given coefficients, for loops with constant params; return the state and the terms.
 
@@ -205,7 +206,9 @@ def advance(
     return new, Terms(p, i, d, 0.0 if ff is None else ff, u, effort, finite=finite)
 
 
-def reset(params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, keep_integral: bool = False) -> PIDState:
+def reset(
+    params: PIDParams, state: PIDState, measurement: Array, mask: Array, *, keep_integral: bool = False
+) -> PIDState:
     """Return the state with the envs of ``mask`` (envs,) bool restarted from ``measurement`` (envs, joints).
 
     ``keep_integral`` keeps their integral term, e.g. a learnt load. Raises InvalidArgumentError if a shape does not
@@ -219,19 +222,19 @@ def reset(params: PIDParams, state: PIDState, measurement: Any, mask: Any, *, ke
     return replace_envs(state, fresh, mask)
 
 
-def wrapped_error(k: Coefficients, r: Any, y: Any, xp: Any) -> Any:
+def wrapped_error(k: Coefficients, r: Array, y: Array, xp: ArrayModule) -> Array:
     """Return the wrapped error, less the dead zone."""
     error = wrap(r - y, k.turns, xp)
     return error if k.deadband is None else error - clip(error, -k.deadband, k.deadband, xp)
 
 
-def weighted_rate(k: Coefficients, r_rate: Any) -> Any:
+def weighted_rate(k: Coefficients, r_rate: Array) -> Array:
     """Return a given setpoint rate times its weight."""
     weight = k.c if k.c_given is None else k.c_given
     return r_rate if weight is None else weight * r_rate
 
 
-def origins(k: Coefficients, state: PIDState, y: Any, r_rate: Any, xp: Any) -> tuple[Any, Any]:
+def origins(k: Coefficients, state: PIDState, y: Array, r_rate: Array, xp: ArrayModule) -> tuple[Array, Array]:
     """Return the origins of setpoint weighting for this step and the next, moved by the whole turns that y jumped.
 
     A given rate moves it. The implicit law takes the setpoint, and so its origin, at the end of the step.
@@ -246,13 +249,13 @@ def origins(k: Coefficients, state: PIDState, y: Any, r_rate: Any, xp: Any) -> t
     return (origin if k.acceleration_share is None else moved), moved
 
 
-def proportional(k: Coefficients, error: Any, y: Any, origin: Any) -> Any:
+def proportional(k: Coefficients, error: Array, y: Array, origin: Array) -> Array:
     """Return kp (b e - (1 - b) (y - o)), which has no spike where y wraps."""
     return k.kp * (error if k.b is None else k.b * error - (1 - k.b) * (y - origin))
 
 
 def drive_target(
-    params: PIDParams, state: PIDState, setpoint: Any, measurement: Any, dt: Any, **inputs: Any
+    params: PIDParams, state: PIDState, setpoint: Array, measurement: Array, dt: Array, **inputs: Any
 ) -> tuple[PIDState, Any]:
     """Return ``(state, target)``: the position target that makes a PD drive of stiffness kp act as a PID::
 

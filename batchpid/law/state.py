@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import namespace
 
@@ -11,19 +12,19 @@ from batchpid.arrays.elementwise import namespace
 class PIDState(NamedTuple):
     """State of the law, arrays (envs, joints); None where no option needs it."""
 
-    integral: Any = None
+    integral: Array = None
     """I, in effort units."""
-    measurement: Any = None
+    measurement: Array = None
     """y of the last step [rad or m]."""
-    derivative: Any = None
+    derivative: Array = None
     """d, the filtered rate of c r - y [rad/s or m/s]."""
-    setpoint: Any = None
+    setpoint: Array = None
     """r of the last step [rad or m]."""
-    setpoint_seen: Any = None
+    setpoint_seen: Array = None
     """1.0 once ``setpoint`` holds a value to take a difference from, else 0.0."""
-    effort: Any = None
+    effort: Array = None
     """Effort of the last step [N m or N]."""
-    origin: Any = None
+    origin: Array = None
     """o: where setpoint weighting measures positions from [rad or m]."""
 
     def __repr__(self) -> str:
@@ -33,7 +34,7 @@ class PIDState(NamedTuple):
         """Return the state of some envs (a slice or an index array)."""
         return PIDState(*(None if leaf is None else leaf[envs] for leaf in self))
 
-    def leaves(self) -> dict[str, Any]:
+    def leaves(self) -> Document:
         """Return the arrays by name."""
         return {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
 
@@ -49,21 +50,21 @@ class Terms(NamedTuple):
     :func:`batchpid.advance` leaves out what :meth:`filled` computes: 0.0 is a term that is off, and None a mask.
     """
 
-    p: Any
+    p: Array
     """Proportional term [N m or N]."""
-    i: Any
+    i: Array
     """Integral term as it entered the effort."""
-    d: Any
+    d: Array
     """Derivative term."""
-    feedforward: Any
+    feedforward: Array
     """Feedforward as given."""
-    unsaturated: Any
+    unsaturated: Array
     """Their sum: the computed effort."""
-    effort: Any
+    effort: Array
     """The applied effort, after saturation."""
-    saturated: Any = None
+    saturated: Array = None
     """Bool: a limit (of the effort or its rate) changed the effort."""
-    finite: Any = None
+    finite: Array = None
     """Bool: every input of this env and joint was finite."""
 
     def filled(self) -> Terms:

@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, clip, namespace, push_history, wrap
 from batchpid.checks.validate import check_time_step
@@ -46,22 +47,22 @@ class Coefficients(NamedTuple):
     position_delay: delay.Delay | None = None
     """Delay of the sensor's positions, in its history of positions and velocities."""
     velocity_delay: delay.Delay | None = None
-    envelope: Any = Envelope()
-    commands: Any = Envelope()
+    envelope: Array = Envelope()
+    commands: Array = Envelope()
     """Envelope of the commands that the motor delivers unclipped."""
-    intake: Any = None
+    intake: Array = None
     """1 - exp(-dt / T)."""
-    strength: Any = None
-    bias: Any = None
-    play: Any = None
+    strength: Array = None
+    bias: Array = None
+    play: Array = None
     """B / 2."""
-    position_offset: Any = None
+    position_offset: Array = None
     """o."""
-    position_resolution: Any = None
-    velocity_resolution: Any = None
-    position_noise: Any = None
-    velocity_noise: Any = None
-    turns: Any = None
+    position_resolution: Array = None
+    velocity_resolution: Array = None
+    position_noise: Array = None
+    velocity_noise: Array = None
+    turns: Array = None
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
 
     def __repr__(self) -> str:
@@ -71,11 +72,11 @@ class Coefficients(NamedTuple):
 
 def init(
     actuators: Actuators,
-    qpos: Any,
+    qpos: Array,
     dt: float,
     *,
-    qvel: Any = None,
-    effort: Any = None,
+    qvel: Array = None,
+    effort: Array = None,
     envs: Any = None,
     episode: Any = 0,
     samples: int | None = None,
@@ -124,7 +125,7 @@ def init(
     return state._replace(effort=clip(_motor(k, asked), *limits(k.envelope, position, velocity), xp) + zeros)
 
 
-def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: int | None = None) -> Coefficients:
+def discretise(actuators: Actuators, state: ActuatorState, dt: Array, num_envs: int | None = None) -> Coefficients:
     """Return the coefficients at ``dt`` [s], for :func:`advance_effort` and :func:`advance_measurement`.
 
     With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches faster. Raises
@@ -156,7 +157,7 @@ def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: in
     if num_envs is None:
         return k
 
-    def spread(leaf: Any) -> Any:
+    def spread(leaf: Array) -> Array:
         if leaf is None or (leaf.ndim == 3 and leaf.shape[1] == num_envs):
             return leaf
         return xp.broadcast_to(leaf, (*leaf.shape[:-2], num_envs, leaf.shape[-1])).copy()
@@ -167,7 +168,7 @@ def discretise(actuators: Actuators, state: ActuatorState, dt: Any, num_envs: in
 
 
 def deliver(
-    actuators: Actuators, state: ActuatorState, effort: Any, qpos: Any, qvel: Any, dt: Any
+    actuators: Actuators, state: ActuatorState, effort: Array, qpos: Array, qvel: Array, dt: Array
 ) -> tuple[ActuatorState, Any]:
     """Advance the motors by ``dt`` seconds; return ``(state, effort)``, the effort delivered [N m or N].
 
@@ -178,7 +179,7 @@ def deliver(
 
 
 def measure(
-    actuators: Actuators, state: ActuatorState, qpos: Any, qvel: Any, dt: Any
+    actuators: Actuators, state: ActuatorState, qpos: Array, qvel: Array, dt: Array
 ) -> tuple[ActuatorState, Any, Any]:
     """Advance the sensors by ``dt`` seconds; return ``(state, qpos, qvel)`` as measured (envs, joints).
 
@@ -200,13 +201,13 @@ class Stages(NamedTuple):
     """Position, velocity and the noise of each -> both as measured."""
 
 
-def _motor(k: Coefficients, effort: Any) -> Any:
+def _motor(k: Coefficients, effort: Array) -> Array:
     """Return s u + b."""
     effort = effort if k.strength is None else k.strength * effort
     return effort if k.bias is None else effort + k.bias
 
 
-def _delivered(k: Coefficients, behind: Any, effort: Any, qpos: Any, qvel: Any) -> tuple[Any]:
+def _delivered(k: Coefficients, behind: Any, effort: Array, qpos: Array, qvel: Array) -> tuple[Array]:
     """Return s u + b within the envelope, after the lag; ``behind`` is the effort of the step before, None without."""
     xp = namespace(effort, qpos, qvel)
     low, high = limits(k.envelope, qpos, qvel)
@@ -216,7 +217,7 @@ def _delivered(k: Coefficients, behind: Any, effort: Any, qpos: Any, qvel: Any) 
     return (motor,)
 
 
-def command_limits(k: Coefficients, qpos: Any, qvel: Any) -> tuple[Any, Any]:
+def command_limits(k: Coefficients, qpos: Array, qvel: Array) -> tuple[Array, Array]:
     """Return the least and the largest effort to ask for that the motor does not clip at ``qpos`` and ``qvel``.
 
     They are those for the saturation and anti-windup of a law. Delay and lag do not enter: they are dynamics, and as a
@@ -225,7 +226,7 @@ def command_limits(k: Coefficients, qpos: Any, qvel: Any) -> tuple[Any, Any]:
     return limits(k.commands, qpos, qvel)
 
 
-def _play(k: Coefficients, encoder: Any, qpos: Any, qvel: Any) -> tuple[Any, Any]:
+def _play(k: Coefficients, encoder: Array, qpos: Array, qvel: Array) -> tuple[Array, Array]:
     """Return position and velocity behind the backlash; ``encoder`` is the position of the step before."""
     xp = namespace(qpos, qvel)
     behind = wrap(encoder - qpos, k.turns, xp)
@@ -233,7 +234,7 @@ def _play(k: Coefficients, encoder: Any, qpos: Any, qvel: Any) -> tuple[Any, Any
     return qpos + offset, qvel * (offset != behind).astype(qvel.dtype)
 
 
-def _encode(k: Coefficients, qpos: Any, qvel: Any, position: Any, velocity: Any) -> tuple[Any, Any]:
+def _encode(k: Coefficients, qpos: Array, qvel: Array, position: Array, velocity: Array) -> tuple[Array, Array]:
     """Return position and velocity as encoded: with offset and noise, in steps of the resolution.
 
     ``position`` and ``velocity`` are the noise, or None.
@@ -254,7 +255,7 @@ STAGES = Stages(_delivered, command_limits, _play, _encode)
 
 
 def advance_effort(
-    k: Coefficients, state: ActuatorState, effort: Any, qpos: Any, qvel: Any, stages: Stages = STAGES
+    k: Coefficients, state: ActuatorState, effort: Array, qpos: Array, qvel: Array, stages: Stages = STAGES
 ) -> tuple[ActuatorState, Any]:
     """Advance the motors with given coefficients, for loops with constant actuators; otherwise as :func:`deliver`."""
     xp = namespace(effort, qpos, qvel)
@@ -269,9 +270,9 @@ def advance_effort(
 def advance_measurement(
     k: Coefficients,
     state: ActuatorState,
-    qpos: Any,
-    qvel: Any,
-    drawn: tuple[Any, Any] | None = None,
+    qpos: Array,
+    qvel: Array,
+    drawn: tuple[Array, Array] | None = None,
     stages: Stages = STAGES,
 ) -> tuple[ActuatorState, Any, Any]:
     """Advance the sensors with given coefficients, for loops with constant actuators; otherwise as :func:`measure`.
@@ -293,7 +294,7 @@ def advance_measurement(
     return ActuatorState(command, effort, sensor, encoder, key, step), qpos, qvel
 
 
-def measurement_noise(k: Coefficients, key: Any, step: Any, like: Any, xp: Any) -> tuple[Any, Any]:
+def measurement_noise(k: Coefficients, key: Any, step: Any, like: Any, xp: ArrayModule) -> tuple[Array, Array]:
     """Return the noise of positions and of velocities (..., envs, joints) at ``step`` (..., envs); None for none.
 
     ``key`` is the key of the state, and ``like`` an array (envs, joints) of the same dtype.
@@ -304,6 +305,6 @@ def measurement_noise(k: Coefficients, key: Any, step: Any, like: Any, xp: Any) 
     return position, velocity
 
 
-def _step(resolution: Any, xp: Any) -> Any:
+def _step(resolution: Array, xp: ArrayModule) -> Array:
     """Return the step of a sensor; 2^-60, which is below the last bit that matters, without a resolution."""
     return None if resolution is None else xp.where(resolution > 0, resolution, 2.0**-60)

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.field_tables import Field
 from batchpid.checks.validate import names
 from batchpid.errors import InvalidArgumentError
@@ -103,7 +104,7 @@ def _build(source: str, document: Any, joint_names: Sequence[str] | None) -> tup
     return documents.build(source, document, _SCHEMA, ordered, make_actuators, **position_limit), order
 
 
-def _take_tables(source: str, document: Any) -> dict[str, Any]:
+def _take_tables(source: str, document: Any) -> Document:
     """Return the limits by position of a document by joint, removed from it."""
     joints = document.get("joints") if isinstance(document, dict) else None
     tables = {}
@@ -121,7 +122,7 @@ def _are_numbers(rows: list[list[Any]]) -> bool:
     return all(documents.is_number(entry) for row in rows for entry in row)
 
 
-def _joined(tables: Mapping[str, Any], order: Sequence[str]) -> tuple[Any, Any]:
+def _joined(tables: Mapping[str, Any], order: Sequence[str]) -> tuple[Array, Array]:
     """Return positions and efforts (joints, points), with the last point repeated; infinite efforts for no limit."""
     count = max(2, *(len(rows[0]) for rows in tables.values()))
     none = [list(range(count)), [np.inf] * count]

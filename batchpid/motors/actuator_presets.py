@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, Document
 from batchpid.checks.validate import integer, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.actuators import Actuators, make_actuators
 
 
 def dc_motor(
-    joints: int, saturation_effort: Any, velocity_limit: Any, effort_limit: Any = math.inf, **options: Any
+    joints: int, saturation_effort: Array, velocity_limit: Array, effort_limit: Array = math.inf, **options: Any
 ) -> Actuators:
     """Return the motor of DCMotor of Isaac Lab (isaaclab/actuators/actuator_pd.py), with the names of DCMotorCfg.
 
@@ -30,7 +31,7 @@ def dc_motor(
 
 
 def delayed_pd(
-    joints: int, timestep: float, min_delay: int, max_delay: int, effort_limit: Any = math.inf, **options: Any
+    joints: int, timestep: float, min_delay: int, max_delay: int, effort_limit: Array = math.inf, **options: Any
 ) -> Actuators:
     """Return the delay of DelayedPDActuator of Isaac Lab, with the names of DelayedPDActuatorCfg; here of the effort.
 
@@ -40,11 +41,11 @@ def delayed_pd(
     """
     time_step("timestep", timestep)
     low, high = integer("min_delay", min_delay, 0, 10**6), integer("max_delay", max_delay, min_delay, 10**6)
-    delay: dict[str, Any] = {"command_delay": low * timestep, "max_delay": high * timestep}
+    delay: Document = {"command_delay": low * timestep, "max_delay": high * timestep}
     return make_actuators(joints, **delay, effort_limit=effort_limit, **options)
 
 
-def remotized(joints: int, joint_parameter_lookup: Any, **options: Any) -> Actuators:
+def remotized(joints: int, joint_parameter_lookup: Array, **options: Any) -> Actuators:
     """Return the limit of RemotizedPDActuator of Isaac Lab: rows of angle, transmission ratio and largest effort.
 
     ``joint_parameter_lookup`` is (points, 3) [rad, 1, N m]; the ratio has no effect there either.
@@ -56,10 +57,10 @@ def remotized(joints: int, joint_parameter_lookup: Any, **options: Any) -> Actua
 def isaac_joint(
     joints: int,
     *,
-    armature: Any = None,
-    friction: Any = None,
-    dynamic_friction: Any = None,
-    viscous_friction: Any = None,
+    armature: Array = None,
+    friction: Array = None,
+    dynamic_friction: Array = None,
+    viscous_friction: Array = None,
     **options: Any,
 ) -> Actuators:
     """Return the joint side of Isaac Lab, with the names of ActuatorBaseCfg, as Isaac Sim 5.0 and later takes it.
@@ -74,14 +75,14 @@ def isaac_joint(
 def newton(
     joints: int,
     *,
-    delay_steps: Any = None,
+    delay_steps: Array = None,
     timestep: float | None = None,
-    max_effort: Any = math.inf,
-    saturation_effort: Any = None,
-    velocity_limit: Any = None,
-    max_motor_effort: Any = math.inf,
-    lookup_positions: Any = None,
-    lookup_efforts: Any = None,
+    max_effort: Array = math.inf,
+    saturation_effort: Array = None,
+    velocity_limit: Array = None,
+    max_motor_effort: Array = math.inf,
+    lookup_positions: Array = None,
+    lookup_efforts: Array = None,
     **options: Any,
 ) -> Actuators:
     """Return stages of newton.actuators: Delay, and clamping by MaxEffort, DCMotor and PositionBased.
@@ -108,11 +109,11 @@ def newton(
 def mujoco_joint(
     joints: int,
     *,
-    armature: Any = None,
-    frictionloss: Any = None,
-    damping: Any = None,
-    forcerange: Any = None,
-    dynprm: Any = None,
+    armature: Array = None,
+    frictionloss: Array = None,
+    damping: Array = None,
+    forcerange: Array = None,
+    dynprm: Array = None,
     **options: Any,
 ) -> Actuators:
     """Return a joint of MuJoCo with its motor, by the names of its XML.

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.display import array_summary
 
 
 class ActuatorState(NamedTuple):
     """State of actuators and sensors; None where no effect needs it. Every array has the envs as its first axis."""
 
-    command: Any = None
+    command: Array = None
     """Efforts asked for, latest first (envs, samples, joints) [N m or N]."""
-    effort: Any = None
+    effort: Array = None
     """Effort behind the lag (envs, joints) [N m or N]."""
-    sensor: Any = None
+    sensor: Array = None
     """Positions that the sensor was at, and its velocities, latest first (envs, samples, 2 joints)."""
-    encoder: Any = None
+    encoder: Array = None
     """Position of the sensor's side of the play (envs, joints) [rad or m]."""
     key: Any = None
     """Key of the noise, a hash of seed, env and episode (envs, 2) uint32."""
@@ -26,7 +27,7 @@ class ActuatorState(NamedTuple):
     def __repr__(self) -> str:
         return array_summary(self._replace(key=None, step=None), "envs", "joints")
 
-    def leaves(self) -> dict[str, Any]:
+    def leaves(self) -> Document:
         """Return the arrays by name."""
         return {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
 
@@ -40,7 +41,7 @@ class ActuatorState(NamedTuple):
         return ActuatorState(*matched)._replace(key=fresh.key)
 
 
-def _resized(old: Any, new: Any) -> Any:
+def _resized(old: Array, new: Array) -> Array:
     """Return a history of the length of another; other arrays as they are."""
     if old.ndim < 3 or old.shape == new.shape:
         return old

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, Document, DType
 from batchpid.arrays.display import span, summary
 from batchpid.arrays.field_tables import check_leaves
 from batchpid.arrays.leaves import LeafBuilder
@@ -27,33 +28,33 @@ class Actuators(NamedTuple):
     and the units of the options of :func:`make_actuators`.
     """
 
-    command_delay: Any = None
-    sensor_delay: Any = None
-    lag: Any = None
-    strength: Any = None
-    bias: Any = None
-    saturation_effort: Any = None
-    no_load_speed: Any = None
-    effort_limit: Any = None
-    limit_positions: Any = None
+    command_delay: Array = None
+    sensor_delay: Array = None
+    lag: Array = None
+    strength: Array = None
+    bias: Array = None
+    saturation_effort: Array = None
+    no_load_speed: Array = None
+    effort_limit: Array = None
+    limit_positions: Array = None
     """x_k of the limit that depends on the position (1, joints, points)."""
-    limit_efforts: Any = None
+    limit_efforts: Array = None
     """L_k (1, joints, points)."""
-    coulomb: Any = None
-    static: Any = None
-    stribeck: Any = None
-    load_friction: Any = None
-    viscous: Any = None
-    armature: Any = None
-    position_offset: Any = None
-    backlash: Any = None
-    position_resolution: Any = None
-    velocity_resolution: Any = None
-    position_noise: Any = None
-    velocity_noise: Any = None
-    continuous: Any = None
+    coulomb: Array = None
+    static: Array = None
+    stribeck: Array = None
+    load_friction: Array = None
+    viscous: Array = None
+    armature: Array = None
+    position_offset: Array = None
+    backlash: Array = None
+    position_resolution: Array = None
+    velocity_resolution: Array = None
+    position_noise: Array = None
+    velocity_noise: Array = None
+    continuous: Array = None
     """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
-    max_delay: Any = None
+    max_delay: Array = None
     """Length of the histories of delayed signals (1, 1) [s]; None without delays."""
     seed: Any = None
     """Of the noise: two words (1, 2) uint32, the lower one first; None without noise."""
@@ -97,7 +98,7 @@ class Actuators(NamedTuple):
         """Return the friction and reflected inertia alone, which also joints of ideal motors and sensors have."""
         return Actuators(**{name: getattr(self, name) for name in JOINT_SIDE})
 
-    def options(self) -> dict[str, Any]:
+    def options(self) -> Document:
         """Return the effects that are on, as arguments of :func:`make_actuators` that build these actuators again."""
         options = {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
         if self.continuous is not None:
@@ -137,32 +138,32 @@ class Actuators(NamedTuple):
 def make_actuators(
     joints: int,
     *,
-    command_delay: Any = None,
-    sensor_delay: Any = None,
-    lag: Any = None,
-    strength: Any = None,
-    bias: Any = None,
-    saturation_effort: Any = None,
-    no_load_speed: Any = None,
-    effort_limit: Any = None,
-    position_limit: tuple[Any, Any] | None = None,
-    coulomb: Any = None,
-    static: Any = None,
-    stribeck: Any = None,
-    load_friction: Any = None,
-    viscous: Any = None,
-    armature: Any = None,
-    position_offset: Any = None,
-    backlash: Any = None,
-    position_resolution: Any = None,
-    velocity_resolution: Any = None,
-    position_noise: Any = None,
-    velocity_noise: Any = None,
+    command_delay: Array = None,
+    sensor_delay: Array = None,
+    lag: Array = None,
+    strength: Array = None,
+    bias: Array = None,
+    saturation_effort: Array = None,
+    no_load_speed: Array = None,
+    effort_limit: Array = None,
+    position_limit: tuple[Array, Array] | None = None,
+    coulomb: Array = None,
+    static: Array = None,
+    stribeck: Array = None,
+    load_friction: Array = None,
+    viscous: Array = None,
+    armature: Array = None,
+    position_offset: Array = None,
+    backlash: Array = None,
+    position_resolution: Array = None,
+    velocity_resolution: Array = None,
+    position_noise: Array = None,
+    velocity_noise: Array = None,
     seed: int = 0,
     max_delay: float | None = None,
-    continuous: Any = None,
+    continuous: Array = None,
     joint_names: Sequence[str] | None = None,
-    dtype: Any = None,
+    dtype: DType = None,
 ) -> Actuators:
     """Build validated :class:`Actuators`; a number may be a scalar, (joints,) or (envs, joints).
 
@@ -230,7 +231,7 @@ def make_actuators(
     """
     given = locals()
     build = LeafBuilder(joints, joint_names, dtype, given.values())
-    leaves: dict[str, Any] = {name: build.option(name, given[name], field) for name, field in FIELDS.items()}
+    leaves: Document = {name: build.option(name, given[name], field) for name, field in FIELDS.items()}
     longest = MAX_DELAY if max_delay is None else number("max_delay", max_delay, 0.0, MAX_DELAY, "seconds")
     delays = [(name, delay) for name in ("command_delay", "sensor_delay") if (delay := leaves[name]) is not None]
     for name, delay in delays:
@@ -265,7 +266,7 @@ def make_actuators(
     )
 
 
-def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Any, Any]:
+def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Array, Array]:
     """Return the positions and efforts of a limit that depends on the position (1 | envs, joints, points)."""
     if table is None:
         return None, None

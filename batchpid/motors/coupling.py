@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.arrays.elementwise import namespace, take_columns
 from batchpid.arrays.read_only import read_only
 
@@ -35,18 +35,18 @@ class Follower(NamedTuple):
 class Share(NamedTuple):
     """Followers of the leaders, at most one for each leader; arrays (joints,)."""
 
-    exists: Any
+    exists: Array
     """Whether the joint has this follower."""
-    joint: Any
+    joint: Array
     """Index of the follower, 0 without it."""
-    multiplier: Any
+    multiplier: Array
 
 
 def _of_followers(method: Callable[[Coupling, Any], Any]) -> Callable[[Coupling, Any], Any]:
     """Return a method that returns its argument if no joint follows."""
 
     @wraps(method)
-    def call(self: Coupling, given: Any) -> Any:
+    def call(self: Coupling, given: Any) -> Array:
         return method(self, given) if self.shares else given
 
     return call
@@ -59,13 +59,13 @@ class Coupling(NamedTuple):
     the identity they return their argument.
     """
 
-    leader: Any
+    leader: Array
     """Index of the independent joint that each joint moves with: its own index if it is independent."""
-    multiplier: Any
+    multiplier: Array
     """Multiplier in ``q = multiplier * q[leader] + offset``: 1 for an independent joint."""
-    offset: Any
+    offset: Array
     """Offset there: 0 for an independent joint."""
-    independent: Any
+    independent: Array
     """True for the joints that are not followers."""
     shares: tuple[Share, ...] = ()
     """The first followers of all leaders, the second ones, and so on."""
@@ -122,17 +122,17 @@ class Coupling(NamedTuple):
         return read_only(whole[self.followers])
 
     @_of_followers
-    def positions(self, qpos: Any) -> Any:
+    def positions(self, qpos: Array) -> Array:
         """Return ``qpos`` with the followers moved to match their leaders."""
         return self.rates(qpos) + self.offset
 
     @_of_followers
-    def rates(self, qvel: Any) -> Any:
+    def rates(self, qvel: Array) -> Array:
         """Return ``qvel`` with the rates of followers computed from their leaders'."""
         return self.multiplier * self.of_leaders(qvel)
 
     @_of_followers
-    def efforts(self, effort: Any) -> Any:
+    def efforts(self, effort: Array) -> Array:
         """Return the efforts G^T u on the independent joints for u = ``effort``; zero for followers."""
         xp, acting = namespace(effort), self.of_independent(effort)
         for share in self.shares:  # the order of the sum is the same for any number of rows
@@ -141,22 +141,22 @@ class Coupling(NamedTuple):
         return acting
 
     @_of_followers
-    def of_independent(self, figures: Any) -> Any:
+    def of_independent(self, figures: Any) -> Array:
         """Return ``figures`` with 0 for followers."""
         return namespace(figures).where(self.independent, figures, 0.0)
 
     @_of_followers
-    def of_leaders(self, figures: Any) -> Any:
+    def of_leaders(self, figures: Any) -> Array:
         """Return ``figures`` in which followers take the figures of their leaders."""
         return take_columns(figures, self.leader)
 
     @_of_followers
-    def of_all(self, figures: Any) -> Any:
+    def of_all(self, figures: Any) -> Array:
         """Return ``figures`` (..., independent) for all joints (..., joints); followers have their leaders' values."""
         return figures[..., (np.cumsum(self.independent) - 1)[self.leader]]
 
     @_of_followers
-    def mass_matrix(self, matrix: Any) -> Any:
+    def mass_matrix(self, matrix: Array) -> Array:
         """Return G^T M G for M (..., joints, joints) in the rows and columns of the independent joints.
 
         Rows and columns of followers are rows and columns of the identity. ``fold`` in coupling.h is the same function.
@@ -166,16 +166,16 @@ class Coupling(NamedTuple):
         return self.efforts(rows) + xp.diag(xp.where(self.independent, 0.0, 1.0).astype(matrix.dtype))
 
     @_of_followers
-    def reduced(self, matrix: Any) -> Any:
+    def reduced(self, matrix: Array) -> Array:
         """Return M_r = G^T M G (..., independent, independent) of a mass matrix M (..., joints, joints)."""
         return self.mass_matrix(matrix)[..., self.independent, :][..., self.independent]
 
     @_of_followers
-    def reduced_damping(self, damping: Any) -> Any:
+    def reduced_damping(self, damping: Array) -> Array:
         """Return the diagonal of G^T B G (independent,) for viscous damping B = diag(damping) (joints,)."""
         return self.matrix.T**2 @ damping
 
-    def native(self) -> dict[str, NDArray[Any]]:
+    def native(self) -> dict[str, Rows]:
         """Return the arrays for coupling.h; none for the identity."""
         if self.is_identity:
             return {}

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace, read_history, wrap
 from batchpid.checks.validate import is_traced
 from batchpid.errors import InvalidArgumentError
@@ -27,11 +28,11 @@ class Delay(NamedTuple):
 
     index: Any
     """Flat indices of x_{k-n} in a history, and of x_{k-n-1} (1 or 2, envs, joints)."""
-    fraction: Any
+    fraction: Array
     """f (envs, joints); None: 0 everywhere."""
 
 
-def samples_of(longest: Any, dt: float) -> int:
+def samples_of(longest: Array, dt: float) -> int:
     """Return the samples that a history needs for delays up to ``longest`` (1, 1) [s].
 
     Raises InvalidArgumentError if it is traced by JAX, so that its size is not known, or it needs too many samples.
@@ -45,7 +46,7 @@ def samples_of(longest: Any, dt: float) -> int:
     return count
 
 
-def discretise(delay: Any, dt: Any, history: Any, begin: int = 0) -> Delay:
+def discretise(delay: Array, dt: Array, history: Array, begin: int = 0) -> Delay:
     """Return ``delay`` (1 | envs, joints) [s] at ``dt`` [s] for ``history`` (envs, samples, numbers), its longest.
 
     The joints' values are those from number ``begin`` of a sample on.
@@ -65,13 +66,13 @@ def discretise(delay: Any, dt: Any, history: Any, begin: int = 0) -> Delay:
     return Delay(xp.stack((later, later + numbers)), fraction)
 
 
-def start(value: Any, samples: int) -> Any:
+def start(value: Any, samples: int) -> Array:
     """Return a history (envs, samples, joints) that has been ``value`` (envs, joints) so far."""
     xp = namespace(value)
     return xp.broadcast_to(value[:, None], (value.shape[0], samples, value.shape[1])).copy()
 
 
-def read(history: Any, k: Delay, turns: Any, xp: Any) -> Any:
+def read(history: Array, k: Delay, turns: Array, xp: ArrayModule) -> Array:
     """Return the delayed value (envs, joints); ``turns`` is 1 / (2 pi) where it is an angle, 0 elsewhere, or None."""
     later = read_history(history, k.index[0])
     if k.fraction is None:

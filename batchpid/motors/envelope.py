@@ -19,8 +19,9 @@ from __future__ import annotations
 
 from functools import reduce
 from operator import add
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
 from batchpid.motors.actuators import Actuators
 
@@ -28,25 +29,25 @@ from batchpid.motors.actuators import Actuators
 class Envelope(NamedTuple):
     """Envelope in the symbols above; None is off."""
 
-    stall: Any = None
+    stall: Array = None
     """S."""
-    reverse: Any = None
+    reverse: Array = None
     """-S."""
-    slope: Any = None
+    slope: Array = None
     """S / v0."""
-    limit: Any = None
+    limit: Array = None
     """L."""
-    least: Any = None
+    least: Array = None
     """-L."""
-    offset: Any = None
+    offset: Array = None
     """Part of L(q) that is the same at every q (1 | envs, joints)."""
-    least_offset: Any = None
+    least_offset: Array = None
     """That of -L(q)."""
-    left: Any = None
+    left: Array = None
     """x_k (segments, 1 | envs, joints)."""
-    right: Any = None
+    right: Array = None
     """x_{k+1}."""
-    rise: Any = None
+    rise: Array = None
     """(L_{k+1} - L_k) / (x_{k+1} - x_k)."""
 
 
@@ -79,7 +80,7 @@ def command_envelope(actuators: Actuators) -> Envelope:
     k, strength, bias = envelope(actuators), actuators.strength, actuators.bias
     if strength is None and bias is None:
         return k
-    divisor: Any = 1.0 if strength is None else namespace(strength).maximum(strength, tiny_of(strength.dtype))
+    divisor: Array = 1.0 if strength is None else namespace(strength).maximum(strength, tiny_of(strength.dtype))
     shift = 0.0 if bias is None else bias
     ends = {name: getattr(k, name) for name in ("stall", "reverse", "limit", "least", "offset", "least_offset")}
     ends = {name: (end - shift) / divisor for name, end in ends.items() if end is not None}
@@ -88,7 +89,7 @@ def command_envelope(actuators: Actuators) -> Envelope:
     return k._replace(**ends, slope=slope, rise=rise)
 
 
-def limits(k: Envelope, qpos: Any, velocity: Any) -> tuple[Any, Any]:
+def limits(k: Envelope, qpos: Array, velocity: Array) -> tuple[Array, Array]:
     """Return the least and the largest effort, or command, at ``qpos`` and ``velocity`` (envs, joints), None for none.
 
     Both are None, or none is.

@@ -39,6 +39,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import clip, namespace, tiny_of
 from batchpid.checks.validate import check_time_step
@@ -52,19 +53,19 @@ LOOKAHEAD = 0.1
 class Friction(NamedTuple):
     """Friction and damping of joints, (envs, joints) or (1, joints); None for none."""
 
-    coulomb: Any = None
+    coulomb: Array = None
     """F >= 0 [N m or N]."""
-    viscous: Any = None
+    viscous: Array = None
     """B >= 0 [N m s/rad or N s/m]."""
-    static: Any = None
+    static: Array = None
     """F_s >= F, which holds the joint at rest; 0: F [N m or N]."""
-    stribeck: Any = None
+    stribeck: Array = None
     """v_s >= 0 [rad/s or m/s]."""
-    load: Any = None
+    load: Array = None
     """mu, from 0 to 1."""
 
     @property
-    def most(self) -> Any:
+    def most(self) -> Array:
         """Array that is positive where a joint has friction other than viscous; None without such joints."""
         parts = [leaf for leaf in (self.coulomb, self.static, self.load) if leaf is not None]
         return sum(parts[1:], parts[0]) if parts else None
@@ -73,15 +74,15 @@ class Friction(NamedTuple):
 class FrictionState(NamedTuple):
     """State of the model, arrays (envs, joints); None where there is no Coulomb friction."""
 
-    effort: Any = None
+    effort: Array = None
     """u of the last step, motor and Coulomb friction [N m or N]."""
-    velocity: Any = None
+    velocity: Array = None
     """v of the last step [rad/s or m/s]."""
-    gain: Any = None
+    gain: Array = None
     """K (1 + w - dt^2 k / J), with the stiffness k of an implicit drive; the factor of v [N m s/rad or N s/m]."""
-    memory: Any = None
+    memory: Array = None
     """K w: the factor of v' [N m s/rad or N s/m]."""
-    sliding: Any = None
+    sliding: Array = None
     """1.0 where the friction had yielded in the last step, else 0.0."""
 
     def __repr__(self) -> str:
@@ -89,7 +90,13 @@ class FrictionState(NamedTuple):
 
 
 def init(
-    friction: Friction, velocity: Any, load: Any, mass_matrix: Any, dt: float, damping: Any = 0.0, stiffness: Any = 0.0
+    friction: Friction,
+    velocity: Array,
+    load: Array,
+    mass_matrix: Array,
+    dt: float,
+    damping: Array = 0.0,
+    stiffness: Array = 0.0,
 ) -> FrictionState:
     """Return the state of joints that move at ``velocity`` (envs, joints), without Coulomb friction so far.
 
@@ -106,14 +113,19 @@ def init(
     return refresh(friction, started(velocity, load), mass_matrix, dt, damping, stiffness)
 
 
-def started(velocity: Any, load: Any) -> FrictionState:
+def started(velocity: Array, load: Array) -> FrictionState:
     """Return the state of :func:`init` without K and w, which :func:`refresh` sets."""
     zero = namespace(velocity, load).zeros_like(velocity)
     return FrictionState(load + zero, velocity + zero, zero, zero, zero)
 
 
 def refresh(
-    friction: Friction, state: FrictionState, mass_matrix: Any, dt: float, damping: Any = 0.0, stiffness: Any = 0.0
+    friction: Friction,
+    state: FrictionState,
+    mass_matrix: Array,
+    dt: float,
+    damping: Array = 0.0,
+    stiffness: Array = 0.0,
 ) -> FrictionState:
     """Return ``state`` with K and w at ``mass_matrix`` (envs, joints, joints) [kg m^2 or kg].
 
@@ -138,7 +150,7 @@ def refresh(
     return state._replace(gain=k * (1 + w - dt**2 * stiffness * mobility), memory=k * w)
 
 
-def advance(friction: Friction, state: FrictionState, effort: Any, velocity: Any) -> tuple[FrictionState, Any]:
+def advance(friction: Friction, state: FrictionState, effort: Array, velocity: Array) -> tuple[FrictionState, Any]:
     """Advance the model by one step; return the state and the effort to apply (envs, joints) [N m or N].
 
     The joints' armature has to be dt B. ``effort`` is the motors' effort at ``velocity``. Inputs are not modified.
@@ -157,7 +169,7 @@ def advance(friction: Friction, state: FrictionState, effort: Any, velocity: Any
     return state, total
 
 
-def bound_of(friction: Friction, sliding: Any, effort: Any, velocity: Any) -> Any:
+def bound_of(friction: Friction, sliding: Array, effort: Array, velocity: Array) -> Array:
     """Return the largest friction other than viscous (envs, joints) [N m or N] under the motors' ``effort``.
 
     ``sliding`` is positive where the friction had yielded before.
@@ -176,7 +188,7 @@ def bound_of(friction: Friction, sliding: Any, effort: Any, velocity: Any) -> An
     return bound
 
 
-def compensation(coulomb: Any, error: Any, rate: Any, band: Any) -> Any:
+def compensation(coulomb: Array, error: Array, rate: Array, band: Array) -> Array:
     """Return the feedforward that cancels friction on the way to r: F times (e + LOOKAHEAD r') / band in [-1, 1].
 
     It has the sign of the commanded motion, not of the velocity, so it cannot chatter: friction, which is at least as

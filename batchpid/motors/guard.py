@@ -22,6 +22,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from batchpid.arrays.array_types import Array, ArrayModule, DType
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, clip, namespace, wrap
 from batchpid.arrays.field_tables import Field, check_leaves
@@ -40,13 +41,13 @@ FIELDS = {
 class Guard(NamedTuple):
     """Limits of setpoints, (1, joints) or (envs, joints); None is off. Build one with :func:`make_guard`."""
 
-    lower: Any = None
-    upper: Any = None
-    rate: Any = None
+    lower: Array = None
+    upper: Array = None
+    rate: Array = None
     """V [rad/s or m/s]."""
-    acceleration: Any = None
+    acceleration: Array = None
     """A [rad/s^2 or m/s^2]."""
-    turns: Any = None
+    turns: Array = None
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
 
     def __repr__(self) -> str:
@@ -60,22 +61,22 @@ class Guard(NamedTuple):
 class GuardState(NamedTuple):
     """State of the guard (envs, joints)."""
 
-    setpoint: Any
+    setpoint: Array
     """g [rad or m]."""
-    rate: Any
+    rate: Array
     """v [rad/s or m/s]."""
 
 
 def make_guard(
     joints: int,
     *,
-    lower: Any = None,
-    upper: Any = None,
-    rate: Any = None,
-    acceleration: Any = None,
-    continuous: Any = None,
+    lower: Array = None,
+    upper: Array = None,
+    rate: Array = None,
+    acceleration: Array = None,
+    continuous: Array = None,
     joint_names: Sequence[str] | None = None,
-    dtype: Any = None,
+    dtype: DType = None,
 ) -> Guard:
     """Build a validated :class:`Guard`; a number may be a scalar, (joints,) or (envs, joints), None is off.
 
@@ -109,13 +110,13 @@ def make_guard(
     )
 
 
-def init(guard: Guard, qpos: Any) -> GuardState:
+def init(guard: Guard, qpos: Array) -> GuardState:
     """Return the state of a guard that starts at rest at ``qpos`` (envs, joints) [rad or m]."""
     zeros = namespace(*guard, qpos).zeros_like(qpos)
     return GuardState(zeros + qpos, zeros)
 
 
-def advance(guard: Guard, state: GuardState, setpoint: Any, dt: float) -> tuple[GuardState, Any]:
+def advance(guard: Guard, state: GuardState, setpoint: Array, dt: float) -> tuple[GuardState, Any]:
     """Advance the guard by ``dt`` [s]; return the state, with the guarded ``setpoint``, and a mask of the changes.
 
     ``setpoint`` (envs, joints) [rad or m] is the requested setpoint; it is not modified. The mask has the same shape.
@@ -137,7 +138,7 @@ def advance(guard: Guard, state: GuardState, setpoint: Any, dt: float) -> tuple[
     return GuardState(guarded, rate), guarded != setpoint
 
 
-def _stop(acceleration: Any, distance: Any, dt: float, xp: Any) -> Any:
+def _stop(acceleration: Array, distance: Array, dt: float, xp: ArrayModule) -> Array:
     """Return the largest rate that stops within ``distance``."""
     finite = xp.isfinite(acceleration)
     a = xp.where(finite, acceleration, 1.0)

@@ -17,14 +17,15 @@ from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from batchpid.arrays.array_types import Array, ArrayModule, DType, Rows
 
 _FACTOR, _SUMMAND = np.uint32(1664525), np.uint32(1013904223)
 _HALF = np.uint32(16)
 
 
 @cache
-def quantiles(dtype: Any) -> NDArray[Any]:
+def quantiles(dtype: DType) -> Rows:
     """Return the values of z in ascending order (65536,), read-only: all callers share them."""
     inverse = NormalDist().inv_cdf
     upper = np.array([inverse((i + 0.5) / 2**16) for i in range(2**15, 2**16)])
@@ -34,7 +35,7 @@ def quantiles(dtype: Any) -> NDArray[Any]:
     return table
 
 
-def pcg4d(x: Any, y: Any, z: Any, w: Any) -> tuple[Any, Any, Any, Any]:
+def pcg4d(x: Array, y: Array, z: Array, w: Array) -> tuple[Array, Array, Array, Array]:
     """Return four hashed words of uint32 arrays that broadcast against each other."""
     x, y, z, w = (word * _FACTOR + _SUMMAND for word in (x, y, z, w))
     for is_last in (False, True):
@@ -47,13 +48,13 @@ def pcg4d(x: Any, y: Any, z: Any, w: Any) -> tuple[Any, Any, Any, Any]:
     return x, y, z, w
 
 
-def keys(seed: Any, envs: Any, episode: Any, xp: Any) -> Any:
+def keys(seed: Any, envs: Any, episode: Any, xp: ArrayModule) -> Array:
     """Return the key of each env's noise (envs, 2) uint32, from a ``seed`` (1, 2) uint32 and numbers (envs,)."""
     words = (xp.asarray(number).astype(xp.uint32) for number in (envs, episode))
     return xp.stack(pcg4d(seed[:, 0], seed[:, 1], *words)[:2], axis=1)
 
 
-def normals(key: Any, step: Any, joints: int, dtype: Any, xp: Any) -> tuple[Any, Any]:
+def normals(key: Any, step: Any, joints: int, dtype: DType, xp: ArrayModule) -> tuple[Array, Array]:
     """Return two independent standard normal numbers for each step, env and joint.
 
     ``key`` is (envs, 2), ``step`` (..., envs) uint32; the results are (..., envs, joints).

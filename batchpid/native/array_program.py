@@ -14,8 +14,8 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import DType, Rows
 from batchpid.native.extensions import StaleExtensionError, load
 from batchpid.native.operations import PROGRAM
 from batchpid.native.tracing import Trace
@@ -60,7 +60,7 @@ class ArrayProgram:
         constants: Sequence[Any],
         inputs: int,
         shape: tuple[int, int],
-        dtype: Any = np.float64,
+        dtype: DType = np.float64,
         threads: int | None = None,
     ) -> None:
         self.shape, self.dtype, self.masks = shape, np.dtype(dtype), trace.masks
@@ -76,7 +76,7 @@ class ArrayProgram:
         self._run = interpreter().run
         self._threads = threads_for(shape[0] * shape[1], threads)
 
-    def __call__(self, *arrays: NDArray[Any], out: Sequence[NDArray[Any]] | None = None) -> Sequence[NDArray[Any]]:
+    def __call__(self, *arrays: Rows, out: Sequence[Rows] | None = None) -> Sequence[Rows]:
         """Return the results for the other inputs, in new arrays or in ``out``.
 
         An input is (rows, columns), (1, columns), (rows, 1) or (1, 1), or (rows, columns, columns) for products of
@@ -93,9 +93,7 @@ class ArrayProgram:
             self._run(self._program, self.shape[0], plain, tuple(map(np.asarray, out)), self._threads)
         return out
 
-    def bind(
-        self, inputs: Sequence[NDArray[Any]], outputs: Sequence[NDArray[Any]], given: int, full: int
-    ) -> Callable[..., Any]:
+    def bind(self, inputs: Sequence[Rows], outputs: Sequence[Rows], given: int, full: int) -> Callable[..., Any]:
         """Return a fast function with the first inputs, and all outputs but the last, fixed to these arrays.
 
         Its arguments are ``out`` and the further inputs, each an array or None. It returns ``out`` or a new array. If

@@ -7,8 +7,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import DType, Rows
 from batchpid.law.coefficients import Coefficients
 from batchpid.law.pid import advance
 from batchpid.law.state import PIDState, Terms
@@ -21,7 +21,7 @@ _MEASUREMENT = 1
 
 
 @lru_cache(maxsize=256)
-def _trace(structures: tuple[Any, ...], terms: bool, dtype: Any) -> tuple[Trace, tuple[int, ...]]:
+def _trace(structures: tuple[Any, ...], terms: bool, dtype: DType) -> tuple[Trace, tuple[int, ...]]:
     """Return the law's trace, and the indices of the state leaves that it returns before its other results.
 
     ``structures`` describe coefficients, state and inputs.
@@ -55,7 +55,7 @@ class CompiledLaw:
         return self._programs[key]
 
     def step(
-        self, state: PIDState, inputs: tuple[NDArray[Any] | None, ...], out: NDArray[Any] | None
+        self, state: PIDState, inputs: tuple[Rows | None, ...], out: Rows | None
     ) -> tuple[PIDState, Any, Terms | None, Callable[..., Any] | None]:
         """Advance the law; return the new state, the effort, the terms, and a fast function for the next steps.
 
@@ -77,6 +77,6 @@ class CompiledLaw:
         bits = sum((each is not None) << at for at, each in enumerate(inputs))
         return state, effort, None, program.bind(fixed, written, bits, 1 << _MEASUREMENT)
 
-    def _whole(self, leaf: NDArray[Any]) -> NDArray[Any]:
+    def _whole(self, leaf: Rows) -> Rows:
         """Return a leaf of the state as a contiguous array (envs, joints); a row that all envs share is repeated."""
         return np.ascontiguousarray(leaf if leaf.shape == self._shape else np.broadcast_to(leaf, self._shape))

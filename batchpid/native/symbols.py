@@ -7,6 +7,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, DType
 from batchpid.native.operations import MASKS, OPERATIONS
 
 _NAMES = {"abs": "absolute", "logical_and": "and", "logical_or": "or", "logical_not": "not"}
@@ -18,7 +19,7 @@ class Namespace:
 
     inf = np.inf
 
-    def __init__(self, dtype: Any = np.float64) -> None:
+    def __init__(self, dtype: DType = np.float64) -> None:
         self.dtype = np.dtype(dtype)
         self.noted: list[tuple[str, tuple[Symbol, ...], Symbol]] = []
         self.literals: dict[str, tuple[float, Symbol]] = {}
@@ -36,7 +37,7 @@ class Namespace:
             raise TypeError(f"a program of {self.dtype} cannot hold a scalar of {value.dtype}")
         return self.literals.setdefault(repr(float(value)), (float(value), Symbol(self)))[1]
 
-    def apply(self, name: str, *values: Any) -> Symbol:
+    def apply(self, name: str, *values: Array) -> Symbol:
         """Record an operation; return its result."""
         result = Symbol(self, name in MASKS or (name == "gather" and values[0].is_mask))
         self.noted.append((name, tuple(map(self.symbol, values)), result))
@@ -80,7 +81,7 @@ class Symbol:
         """Dtype of the array: bool for a mask, else the dtype of the trace."""
         return np.dtype(bool) if self.is_mask else self._namespace.dtype
 
-    def astype(self, dtype: Any) -> Symbol:
+    def astype(self, dtype: DType) -> Symbol:
         """Return a mask as numbers; return numbers unchanged."""
         assert np.dtype(dtype) == self._namespace.dtype
         return self.record("add", self, -0.0) if self.is_mask else self

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from batchpid.arrays.array_types import DType
 from batchpid.native.operations import OPERATIONS
 from batchpid.native.symbols import Namespace, Symbol
 from batchpid.native.trees import filled, leaves
@@ -30,7 +31,7 @@ class Trace(NamedTuple):
     """Trace of the operations on constants and literals only; its results are further constants."""
 
 
-def trace(function: Callable[..., Any], constants: int, inputs: int, dtype: Any = np.float64) -> Trace:
+def trace(function: Callable[..., Any], constants: int, inputs: int, dtype: DType = np.float64) -> Trace:
     """Return the trace of a function with this number of ``constants`` and ``inputs``, which returns a list of arrays.
 
     The constants are its first arguments.
@@ -59,7 +60,7 @@ def trace(function: Callable[..., Any], constants: int, inputs: int, dtype: Any 
     return _assembled(late, [*first, *shared, *given[constants:]], results, tuple(literals.values()), prelude)
 
 
-def trace_trees(function: Callable[..., Any], *structures: Any, dtype: Any = np.float64) -> Trace:
+def trace_trees(function: Callable[..., Any], *structures: Any, dtype: DType = np.float64) -> Trace:
     """Return the trace of a function of nested tuples, as :func:`trace` does.
 
     ``structures`` (:func:`batchpid.native.trees.structure`) describe its arguments; the first one has the constants.

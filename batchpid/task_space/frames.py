@@ -9,39 +9,40 @@ from __future__ import annotations
 
 from typing import Any
 
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import namespace
 
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
-def cross(a: Any, b: Any) -> Any:
+def cross(a: Array, b: Array) -> Array:
     """Return the cross product of (..., 3) and (..., 3)."""
     return a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT]
 
 
-def rotate(turn: Any, vector: Any) -> Any:
+def rotate(turn: Any, vector: Array) -> Array:
     """Return the vectors (..., 3) turned by matrices (..., 3, 3): R v."""
     return turn[..., 0] * vector[..., :1] + turn[..., 1] * vector[..., 1:2] + turn[..., 2] * vector[..., 2:3]
 
 
-def unrotate(turn: Any, vector: Any) -> Any:
+def unrotate(turn: Any, vector: Array) -> Array:
     """Return the vectors (..., 3) in the axes of matrices (..., 3, 3): R^T v."""
     return turn[..., 0, :] * vector[..., :1] + turn[..., 1, :] * vector[..., 1:2] + turn[..., 2, :] * vector[..., 2:3]
 
 
-def in_axes(turn: Any, twists: Any) -> Any:
+def in_axes(turn: Any, twists: Array) -> Array:
     """Return the columns of ``twists`` (..., 6, n) in the axes of matrices (..., 3, 3)."""
     xp, columns = namespace(turn, twists), namespace(twists).moveaxis(twists, -1, -2)
     halves = [unrotate(turn[..., None, :, :], part) for part in (columns[..., :3], columns[..., 3:])]
     return xp.moveaxis(xp.concatenate(halves, axis=-1), -1, -2)
 
 
-def multiply(a: Any, b: Any) -> Any:
+def multiply(a: Array, b: Array) -> Array:
     """Return the products of matrices (..., n, 3) and (..., 3, m)."""
     return a[..., :1] * b[..., :1, :] + a[..., 1:2] * b[..., 1:2, :] + a[..., 2:3] * b[..., 2:3, :]
 
 
-def turned(frame: Any, inner: Any) -> Any:
+def turned(frame: Any, inner: Any) -> Array:
     """Return the frames ``inner`` (..., 3, 4), given in ``frame`` (..., 3, 4), where the latter is given."""
     xp = namespace(frame, inner)
     product = multiply(frame[..., :3], inner)
@@ -49,7 +50,7 @@ def turned(frame: Any, inner: Any) -> Any:
     return product + xp.concatenate([shift, frame[..., 3:]], axis=-1)
 
 
-def matrix_of(wxyz: Any) -> Any:
+def matrix_of(wxyz: Array) -> Array:
     """Return the rotation matrices (..., 3, 3) of quaternions (..., 4) of any length but 0."""
     xp = namespace(wxyz)
     w, x, y, z = (wxyz[..., k] for k in range(4))
@@ -62,7 +63,7 @@ def matrix_of(wxyz: Any) -> Any:
     return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def wxyz_of(turn: Any) -> Any:
+def wxyz_of(turn: Any) -> Array:
     """Return the unit quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3).
 
     4 q q^T is linear in the entries of the matrix; its row with the largest diagonal entry is a multiple of q.
@@ -86,12 +87,12 @@ def wxyz_of(turn: Any) -> Any:
     return xp.where(q[..., :1] < 0, -q, q)
 
 
-def pose_of(frame: Any) -> Any:
+def pose_of(frame: Any) -> Array:
     """Return the poses (..., 7) of frames (..., 3, 4)."""
     return namespace(frame).concatenate([frame[..., 3], wxyz_of(frame[..., :3])], axis=-1)
 
 
-def rotation_error(goal: Any, wxyz: Any) -> Any:
+def rotation_error(goal: Array, wxyz: Array) -> Array:
     """Return the rotation vectors (..., 3) [rad] from ``wxyz`` to ``goal`` (..., 4) in the world, at most pi long.
 
     The quaternions need not have unit length: with (w, v) = goal * conjugate(wxyz) the angle is 2 atan2(|v|, w).
@@ -107,7 +108,7 @@ def rotation_error(goal: Any, wxyz: Any) -> Any:
     return v * xp.where(small, 2 / xp.where(small, w, 1.0), 2 * xp.atan2(length, w) / xp.where(small, 1.0, length))
 
 
-def pose_error(goal: Any, pose: Any) -> Any:
+def pose_error(goal: Array, pose: Array) -> Array:
     """Return the errors (..., 6) [m, rad] from ``pose`` to ``goal`` (..., 7), in the axes of the world."""
     turn = rotation_error(goal[..., 3:], pose[..., 3:])
     return namespace(goal, pose).concatenate([goal[..., :3] - pose[..., :3], turn], axis=-1)

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.display import array_summary
 from batchpid.checks.validate import array, broadcast, choice, entries, integer, positive
 from batchpid.checks.warn import warn
@@ -276,7 +277,7 @@ def _size(lengths: Float64, tolerance: Float64) -> Float64:
     return (lengths / tolerance).max(-1)
 
 
-def _replace(best: IKResult, left: Any, found: IKResult, start: int, tolerance: Float64) -> None:
+def _replace(best: IKResult, left: Array, found: IKResult, start: int, tolerance: Float64) -> None:
     """Write ``found`` over the rows ``left`` of ``best`` that have not succeeded, where it is nearer."""
     nearer = _size(_lengths(found, slice(None)), tolerance) < _size(_lengths(best, left), tolerance)
     rows = nearer & ~best.success[left]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Array
 from batchpid.native.task_space_extension import DECOUPLING, FRICTION, LAW
 from batchpid.task_space import native_rows
 from batchpid.task_space.osc_coefficients import OSCCoefficients
@@ -69,7 +70,7 @@ def friction(arrays: Mapping[str, Any]) -> Float64 | None:
 
 
 def bind(
-    tree: RigidTree, link: str, point: Any, k: OSCCoefficients, arrays: Mapping[str, Any]
+    tree: RigidTree, link: str, point: Array, k: OSCCoefficients, arrays: Mapping[str, Any]
 ) -> tuple[Any, int] | None:
     """Return an object that keeps ``arrays``, and the address of a Call (call.h) that runs :func:`law` on them.
 
@@ -88,7 +89,7 @@ def bind(
 
 
 def _of_tree(
-    native: Any, tree: RigidTree, link: str, point: Any, rows: int, k: OSCCoefficients
+    native: Any, tree: RigidTree, link: str, point: Array, rows: int, k: OSCCoefficients
 ) -> tuple[tuple[Any, ...], Float64]:
     """Return the arguments of ``step`` and ``bind`` before the arrays of the law, and the chain to the tool (dof,)."""
     own, index = native_rows.native_tree(native, tree), tree.index(link)

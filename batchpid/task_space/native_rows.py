@@ -17,6 +17,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Array
 from batchpid.native.availability import SWITCH, obstacle
 from batchpid.native.extensions import load
 from batchpid.native.task_space_extension import KINEMATICS, TASK_SPACE
@@ -41,19 +42,19 @@ class _NativeTree(NamedTuple):
 _trees: WeakKeyDictionary[RigidTree, _NativeTree] = WeakKeyDictionary()
 
 
-def in_use() -> Any:
+def in_use() -> Array:
     """Return the extension, or None where native code is not used."""
     return None if os.environ.get(SWITCH) == "0" else _extension()
 
 
 @cache
-def _extension() -> Any:
+def _extension() -> Array:
     return None if obstacle() else load(TASK_SPACE)
 
 
 def kinematics(
-    tree: RigidTree, wanted: tuple[str, ...], qpos: Any, qvel: Any = None, index: int = 0, point: Any = None
-) -> tuple[Any, ...] | None:
+    tree: RigidTree, wanted: tuple[str, ...], qpos: Array, qvel: Array = None, index: int = 0, point: Array = None
+) -> tuple[Array, ...] | None:
     """Return the ``wanted`` arrays (..., ...), of "pose", "jacobian", "jacobian_rate", "mass_matrix" and "bias".
 
     The first three belong to a ``point`` (3,) or (..., 3) of the link ``index``. "jacobian_rate" and "bias" need
@@ -85,7 +86,7 @@ def bound(
 
 
 def _arguments(
-    native: Any, tree: RigidTree, found: dict[str, Float64], inputs: Any, index: int, point: Any
+    native: Any, tree: RigidTree, found: dict[str, Float64], inputs: Any, index: int, point: Array
 ) -> list[Any]:
     """Return the arguments of ``kinematics`` in task_space.cpp."""
     own, rows = native_tree(native, tree), len(inputs[0])
@@ -102,11 +103,11 @@ def empty(wanted: tuple[str, ...], leading: tuple[int, ...], dof: int) -> dict[s
 def search(
     tree: RigidTree,
     index: int,
-    point: Any,
+    point: Array,
     limits: tuple[Float64, Float64],
-    goal: Any,
-    start: Any,
-    tolerance: Any,
+    goal: Array,
+    start: Array,
+    tolerance: Array,
     iterations: int,
 ) -> list[Float64] | None:
     """Search, from ``start`` (n, dof), for joint positions within ``limits`` (dof,) that bring a tool to the poses
@@ -137,7 +138,7 @@ def move(dt: float, sweeps: int, *arrays: Float64) -> bool:
     return True
 
 
-def tool(own: _NativeTree, index: int, point: Any) -> Float64:
+def tool(own: _NativeTree, index: int, point: Array) -> Float64:
     """Return the frames (1 | rows, 12) of a link in its body, with the origin at a ``point`` (3,) or (..., 3)."""
     tool = own.tools[index]
     if point is not None:
@@ -158,7 +159,7 @@ def native_tree(native: Any, tree: RigidTree) -> _NativeTree:
     return own
 
 
-def for_rows(like: Any, *arrays: Any) -> Any:
+def for_rows(like: Any, *arrays: Array) -> Array:
     """Return the extension if all arrays are NumPy's and ``like`` is (envs, columns), else None."""
     plain = _PLAIN.issuperset(map(type, arrays)) or all(x is None or isinstance(x, np.ndarray) for x in arrays)
     return in_use() if plain and like.ndim == 2 else None
@@ -172,5 +173,5 @@ def call(function: Callable[..., None], *arguments: Any) -> None:
         function(*[_contiguous(one) if isinstance(one, np.ndarray) else one for one in arguments])
 
 
-def _contiguous(array: Any) -> Any:
+def _contiguous(array: Array) -> Array:
     return None if array is None else np.ascontiguousarray(array, np.float64)

@@ -44,10 +44,11 @@ IEEE Journal on Robotics and Automation 3 (1987).
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import clip, namespace, wrap
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_law
@@ -67,7 +68,7 @@ from batchpid.task_space.projections import Projections, projections
 from batchpid.task_space.symmetric import product, quiet
 
 
-def init(params: OSCParams, qpos: Any) -> OSCState:
+def init(params: OSCParams, qpos: Array) -> OSCState:
     """Return the state before the first step: the posture is ``qpos`` (envs, dof) [rad or m], the integral 0."""
     xp = namespace(*params, qpos)
     posture = xp.zeros_like(qpos, dtype=xp.result_type(params.stiffness, qpos)) + qpos
@@ -75,7 +76,7 @@ def init(params: OSCParams, qpos: Any) -> OSCState:
     return OSCState(posture, integral)
 
 
-def reset(params: OSCParams, state: OSCState, qpos: Any, mask: Any) -> OSCState:
+def reset(params: OSCParams, state: OSCState, qpos: Array, mask: Array) -> OSCState:
     """Return the state with the envs of ``mask`` (envs,) bool restarted at ``qpos`` (envs, dof)."""
     xp, fresh = namespace(*state, qpos, mask), init(params, qpos)
     chosen = xp.asarray(mask)[:, None]
@@ -152,13 +153,13 @@ class Task(NamedTuple):
     """Error and motion of the tool, vectors (envs, 6) in the axes of the params' frame."""
 
     dynamics: TaskDynamics
-    error: Any
-    near: Any
+    error: Array
+    near: Array
     """Error with limited norms."""
-    tool_twist: Any
+    tool_twist: Array
     """J q'."""
-    twist: Any
-    acceleration: Any
+    twist: Array
+    acceleration: Array
 
 
 def in_frame(k: OSCCoefficients, d: TaskDynamics, inputs: OSCInputs) -> Task:
@@ -166,7 +167,7 @@ def in_frame(k: OSCCoefficients, d: TaskDynamics, inputs: OSCInputs) -> Task:
     xp = namespace(*k, *d, *inputs)
     error, limits = pose_error(inputs.setpoint, d.pose), (k.position_error_limit, k.rotation_error_limit)
     near = [_shortened(part, limit, xp) for part, limit in zip((error[..., :3], error[..., 3:]), limits, strict=True)]
-    vectors: tuple[Any, ...] = error, xp.concatenate(near, axis=-1), product(d.jacobian, inputs.qvel)
+    vectors: tuple[Array, ...] = error, xp.concatenate(near, axis=-1), product(d.jacobian, inputs.qvel)
     vectors += inputs.twist, inputs.acceleration
     if k.frame is not None:
         turn = matrix_of(d.pose[..., 3:])
@@ -175,14 +176,14 @@ def in_frame(k: OSCCoefficients, d: TaskDynamics, inputs: OSCInputs) -> Task:
     return Task(d, *vectors)
 
 
-def task_acceleration(k: OSCCoefficients, task: Task) -> Any:
+def task_acceleration(k: OSCCoefficients, task: Task) -> Array:
     """Return a (envs, 6) without I."""
     a = k.kp * task.near - k.kd * task.tool_twist
     a = a if task.twist is None else a + k.c * task.twist
     return a if task.acceleration is None else a + k.acceleration_share * task.acceleration
 
 
-def _integrated(k: OSCCoefficients, integral: Any, task: Task, held: Any) -> Any:
+def _integrated(k: OSCCoefficients, integral: Array, task: Task, held: Array) -> Array:
     """Return the integral after the step; it stays where it is ``held`` (envs, 6)."""
     xp = namespace(integral, task.near)
     new = integral + k.ki_dt * task.near
@@ -191,14 +192,16 @@ def _integrated(k: OSCCoefficients, integral: Any, task: Task, held: Any) -> Any
     return xp.where(held, integral, clip(new, -k.integral_limit, k.integral_limit, xp))
 
 
-def _shortened(vector: Any, limit: Any, xp: Any) -> Any:
+def _shortened(vector: Array, limit: Array, xp: ArrayModule) -> Array:
     """Return vectors (envs, 3), at most ``limit`` (1 | envs, 1) long."""
     length = xp.sqrt((vector * vector).sum(-1, keepdims=True))
     long = length > limit
     return vector * xp.where(long, limit / xp.where(long, length, 1.0), 1.0)
 
 
-def posture_acceleration(k: OSCCoefficients, d: TaskDynamics, posture: Any, q: Any, v: Any) -> tuple[Any, Any]:
+def posture_acceleration(
+    k: OSCCoefficients, d: TaskDynamics, posture: Array, q: Array, v: Array
+) -> tuple[Array, Array]:
     """Return a_n and its part a_s (envs, dof)."""
     xp = namespace(posture, q, v)
     springs = k.posture_kp * wrap(posture - q, k.turns, xp)
@@ -210,13 +213,13 @@ def posture_acceleration(k: OSCCoefficients, d: TaskDynamics, posture: Any, q: A
     return a + d.chain * (pushed - k.limit_kd * v * xp.abs(depth) / k.limit_margin), springs + d.chain * pushed
 
 
-def _saturated(p: Projections, low: Any, high: Any) -> tuple[Any, ...]:
+def _saturated(p: Projections, low: Array, high: Array) -> tuple[Array, ...]:
     """Return the efforts after and before saturation, s1 and s2, all (envs, dof)."""
     xp, base, task, null = namespace(*p, low, high), p.base, p.task, p.posture
     least, most = -math.inf if low is None else low, math.inf if high is None else high
     able = (base >= least) & (base <= most)
 
-    def share(effort: Any, at: Any) -> Any:
+    def share(effort: Array, at: Array) -> Array:
         room = xp.maximum(xp.where(effort > 0, most - at, at - least), 0.0)
         size = xp.abs(effort)
         limited = able & (size > room)

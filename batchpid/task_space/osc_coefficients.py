@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import namespace
 from batchpid.checks.validate import check_time_step
@@ -31,30 +32,30 @@ from batchpid.task_space.osc_params import OSCParams
 class OSCCoefficients(NamedTuple):
     """:class:`OSCParams` at one dt; None is off."""
 
-    kp: Any
-    kd: Any
-    c: Any
-    acceleration_share: Any
+    kp: Array
+    kd: Array
+    c: Array
+    acceleration_share: Array
     """g* (1 | envs, 6)."""
-    ki_dt: Any
-    ki_dt2: Any
-    posture_kp: Any
-    posture_kd: Any
-    limit_kp: Any
-    limit_kd: Any
-    limit_margin: Any
-    limit_low: Any
+    ki_dt: Array
+    ki_dt2: Array
+    posture_kp: Array
+    posture_kd: Array
+    limit_kp: Array
+    limit_kd: Array
+    limit_margin: Array
+    limit_low: Array
     """Positions (1 | envs, dof) from which joints are pushed back: limits less their margins."""
-    limit_high: Any
-    integral_limit: Any
-    position_error_limit: Any
-    rotation_error_limit: Any
-    smallest_eigenvalue: Any
+    limit_high: Array
+    integral_limit: Array
+    position_error_limit: Array
+    rotation_error_limit: Array
+    smallest_eigenvalue: Array
     axes: Any
     force_axes: Any
-    effort_min: Any
-    effort_max: Any
-    turns: Any
+    effort_min: Array
+    effort_max: Array
+    turns: Array
     decoupling: Any
     frame: Any
 
@@ -62,7 +63,7 @@ class OSCCoefficients(NamedTuple):
         return array_summary(self, "envs", "axes")
 
 
-def discretise(params: OSCParams, dt: Any) -> OSCCoefficients:
+def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
     """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.task_space.osc`.
 
     Raises
@@ -108,7 +109,7 @@ def discretise(params: OSCParams, dt: Any) -> OSCCoefficients:
     )
 
 
-def _implicit(kp: Any, kd: Any, dt: Any) -> tuple[Any, Any]:
+def _implicit(kp: Array, kd: Array, dt: Array) -> tuple[Array, Array]:
     """Return kp* and kd* of a law without integral."""
     share = 1 / (1 + dt * kd + dt * dt * kp)
     return kp * share, (kd + dt * kp) * share

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import choice
 from batchpid.io import documents
 from batchpid.task_space.osc_params import FIELDS, TASK_CHOICES
@@ -47,7 +48,7 @@ def save_osc_options(
     documents.write(path, lambda format: documents.render({"format": FORMAT, **kept, **plain}, format))
 
 
-def load_osc_options(path: str | os.PathLike[str]) -> dict[str, Any]:
+def load_osc_options(path: str | os.PathLike[str]) -> Document:
     """Return the options in a file, for :func:`batchpid.task_space.make_osc_params`, which checks their values.
 
     Raises

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.choices import CHOICES, Choice
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
@@ -55,7 +56,7 @@ class ToolFrame(Choice):
     """Gains, selected axes and wrenches are in the axes of the tool."""
 
 
-TASK_CHOICES: dict[str, dict[str, Any]] = {
+TASK_CHOICES: dict[str, Document] = {
     "decoupling": {"full": None, "partial": PartialDecoupling(), "none": NoDecoupling()},
     "frame": {"world": None, "tool": ToolFrame()},
     "discretization": CHOICES["discretization"],
@@ -70,43 +71,43 @@ class OSCParams(NamedTuple):
     Every leaf is a float64 array of one row or one per env; None is off.
     """
 
-    stiffness: Any
+    stiffness: Array
     """kp (1 | envs, 6) [1/s^2]; with decoupling "none" [N/m, N m/rad]."""
-    damping: Any
+    damping: Array
     """kd (1 | envs, 6) [1/s]; with decoupling "none" [N s/m, N m s/rad]."""
-    posture_stiffness: Any
+    posture_stiffness: Array
     """(1 | envs, dof) [1/s^2]."""
-    posture_damping: Any
+    posture_damping: Array
     """(1 | envs, dof) [1/s]."""
-    position_error_limit: Any
+    position_error_limit: Array
     """(1 | envs, 1) [m]."""
-    rotation_error_limit: Any
+    rotation_error_limit: Array
     """(1 | envs, 1) [rad]."""
-    smallest_eigenvalue: Any
+    smallest_eigenvalue: Array
     """s0 (1 | envs, 1) [1/kg, 1/(kg m^2)]."""
     axes: Any = None
     """1.0 for the axes whose motion is controlled (1 | envs, 6); None for all."""
     force_axes: Any = None
     """1.0 for further axes that the posture must not act on (1 | envs, 6)."""
-    effort_min: Any = None
+    effort_min: Array = None
     """(1 | envs, dof) [N m or N]."""
-    effort_max: Any = None
+    effort_max: Array = None
     decoupling: Any = None
     """None for "full", or a choice without fields."""
     frame: Any = None
     """None for "world", or a choice without fields."""
-    integral_gain: Any = None
+    integral_gain: Array = None
     """ki (1 | envs, 6) [1/s^3]; with decoupling "none" [N/(m s), N m/(rad s)]."""
-    integral_limit: Any = None
+    integral_limit: Array = None
     """(1 | envs, 6) [m/s^2, rad/s^2]; with decoupling "none" [N, N m]."""
-    limit_stiffness: Any = None
+    limit_stiffness: Array = None
     """(1 | envs, dof) [1/s^2]."""
-    limit_margin: Any = None
+    limit_margin: Array = None
     """(1 | envs, dof) [rad or m]."""
-    lower: Any = None
+    lower: Array = None
     """Position limits of the tree (1, dof) [rad or m]; None without ``limit_margin``."""
-    upper: Any = None
-    turns: Any = None
+    upper: Array = None
+    turns: Array = None
     """1 / (2 pi) for joints of the tree that turn without limits, whose posture is the one next to qpos, else 0
     (1, dof); None without such joints."""
     discretization: Any = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.display import array_summary
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import in_axes, matrix_of, pose_of
@@ -26,26 +27,26 @@ class Tool(NamedTuple):
 
     tree: RigidTree
     link: str
-    point: Any = None
+    point: Array = None
     """Point (3,) in the frame of the link [m]; None: its origin."""
 
 
 class OSCInputs(NamedTuple):
     """Inputs of one step, arrays (envs, ...), or (1, ...) for all envs; None: 0."""
 
-    setpoint: Any
+    setpoint: Array
     """Poses (envs, 7): position [m] and quaternion (w, x, y, z) of any length, in the world."""
-    qpos: Any
+    qpos: Array
     """(envs, dof) [rad or m]."""
-    qvel: Any
+    qvel: Array
     """(envs, dof) [rad/s or m/s]."""
-    twist: Any = None
+    twist: Array = None
     """V of the setpoint (envs, 6) [m/s, rad/s], in the axes of the world."""
-    acceleration: Any = None
+    acceleration: Array = None
     """V' of the setpoint (envs, 6) [m/s^2, rad/s^2], in these axes."""
-    wrench: Any = None
+    wrench: Array = None
     """Wrench of the tool on its surroundings (envs, 6) [N, N m], in the axes of the params' frame."""
-    feedforward: Any = None
+    feedforward: Array = None
     """Effort added (envs, dof), such as the effort of viscous damping [N m or N]."""
 
     def __repr__(self) -> str:
@@ -55,15 +56,15 @@ class OSCInputs(NamedTuple):
 class TaskDynamics(NamedTuple):
     """Dynamics of a robot and its tool at present positions and velocities, from :func:`task_dynamics` or an engine."""
 
-    pose: Any
+    pose: Array
     """Of the tool (envs, 7): position [m] and quaternion (w, x, y, z)."""
-    jacobian: Any
+    jacobian: Array
     """J of the tool (envs, 6, dof), in the axes of the world."""
-    jacobian_rate: Any
+    jacobian_rate: Array
     """J' q' (envs, 6)."""
-    mass_matrix: Any
+    mass_matrix: Array
     """M (envs, dof, dof) [kg m^2 or kg]."""
-    bias: Any
+    bias: Array
     """h (envs, dof): gravity, Coriolis and centrifugal forces [N m or N]."""
     chain: Any
     """1.0 for the joints between the base and the tool, else 0.0 (dof,)."""
@@ -72,9 +73,9 @@ class TaskDynamics(NamedTuple):
 class OSCState(NamedTuple):
     """State of the law."""
 
-    posture: Any
+    posture: Array
     """Positions (envs, dof) that the joints are drawn to, by the posture gains [rad or m]."""
-    integral: Any = None
+    integral: Array = None
     """I (envs, 6): acceleration of the task [m/s^2, rad/s^2]; with decoupling "none" a wrench [N, N m]. None without
     ``integral_gain``."""
 
@@ -85,23 +86,23 @@ class OSCState(NamedTuple):
 class OSCTerms(NamedTuple):
     """Terms of one step."""
 
-    error: Any
+    error: Array
     """Error of the pose (envs, 6) [m, rad], in the axes of the params' frame, before its norms are limited."""
-    wrench: Any
+    wrench: Array
     """Wrench F of the task (envs, 6) [N, N m], in these axes, before saturation."""
-    task: Any
+    task: Array
     """Efforts of F, J^T F (envs, dof)."""
-    posture: Any
+    posture: Array
     """Efforts of the posture, before saturation (envs, dof)."""
-    unsaturated: Any
+    unsaturated: Array
     """Sum of all efforts (envs, dof) [N m or N]."""
-    effort: Any
+    effort: Array
     """Efforts after saturation (envs, dof)."""
-    task_share: Any
+    task_share: Array
     """s1 (envs,): share of F that the limits allow."""
-    posture_share: Any
+    posture_share: Array
     """s2 (envs,): share of the posture's efforts."""
-    near_singular: Any
+    near_singular: Array
     """Bool (envs,): an eigenvalue of A is below s0, so that some direction has lost stiffness; True for NaN."""
 
     def __repr__(self) -> str:
@@ -109,7 +110,7 @@ class OSCTerms(NamedTuple):
 
 
 def task_dynamics(
-    tree: RigidTree, qpos: Any, qvel: Any, link: str, *, point: Any = None, bias: Any = None
+    tree: RigidTree, qpos: Array, qvel: Array, link: str, *, point: Array = None, bias: Array = None
 ) -> TaskDynamics:
     """Return the dynamics of ``tree`` with a tool: a ``point`` (3,) [m] of ``link``, default its origin.
 

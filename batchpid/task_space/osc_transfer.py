@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.operational_space import in_frame, posture_acceleration, task_acceleration
@@ -17,16 +16,16 @@ from batchpid.task_space.symmetric import product, quiet, solve
 def track(
     params: OSCParams,
     state: OSCState,
-    setpoint: Any,
-    qpos: Any,
-    qvel: Any,
-    effort: Any,
-    dt: Any,
+    setpoint: Array,
+    qpos: Array,
+    qvel: Array,
+    effort: Array,
+    dt: Array,
     dynamics: TaskDynamics,
     *,
-    twist: Any = None,
-    acceleration: Any = None,
-    feedforward: Any = None,
+    twist: Array = None,
+    acceleration: Array = None,
+    feedforward: Array = None,
 ) -> OSCState:
     """Return a state with which the next step, on the same inputs, gives ``effort`` (envs, dof) [N m or N].
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace
 from batchpid.task_space.osc_coefficients import OSCCoefficients
 from batchpid.task_space.osc_params import NoDecoupling, PartialDecoupling
@@ -20,30 +21,30 @@ SPRING_BOUND = 0.2
 class Projections(NamedTuple):
     """Efforts before saturation, arrays (envs, dof)."""
 
-    force: Any
+    force: Array
     """Wrench F of the task (envs, 6)."""
-    task: Any
+    task: Array
     """J^T F."""
-    posture: Any
+    posture: Array
     """N^T M_cc a_n of the chain: M_cc a_n - J^T (L_n J a_n + (L_s - L_n) J a_s)."""
-    base: Any
+    base: Array
     """h + M a_o + feedforward."""
-    task_of_others: Any
+    task_of_others: Array
     """M_oc M_cc^-1 task."""
-    posture_of_others: Any
+    posture_of_others: Array
     """M_oc M_cc^-1 posture."""
-    near_singular: Any
+    near_singular: Array
     """Whether L or L_n is bounded (envs,)."""
 
 
 def projections(
     k: OSCCoefficients,
     d: TaskDynamics,
-    a: Any,
-    a_n: Any,
-    wrench: Any = None,
-    feedforward: Any = None,
-    springs: Any = None,
+    a: Array,
+    a_n: Array,
+    wrench: Array = None,
+    feedforward: Array = None,
+    springs: Array = None,
 ) -> Projections:
     """Return the efforts of the accelerations ``a`` (envs, 6) of the task and ``a_n`` (envs, dof) of the posture.
 
@@ -69,14 +70,14 @@ def projections(
 
     inverse_root = y[..., 6:]
 
-    def of_others(effort: Any) -> Any:
+    def of_others(effort: Array) -> Array:
         moved = chain * gram(inverse_root, product(inverse_root, effort)[..., None])[..., 0]
         return (1 - chain) * product(m, moved)
 
     return Projections(f, task, null, base, of_others(task), of_others(null), singular)
 
 
-def _inertias(k: OSCCoefficients, mobility: Any, xp: Any) -> tuple[Any, Any, Any, Any]:
+def _inertias(k: OSCCoefficients, mobility: Array, xp: ArrayModule) -> tuple[Array, Array, Array, Array]:
     """Return L, None with decoupling "none", L_n and L_s of the mobility A (envs, 6, 6), and where any is bounded."""
     s0 = k.smallest_eigenvalue[..., 0]
     allowed = k.axes
@@ -95,7 +96,9 @@ def _inertias(k: OSCCoefficients, mobility: Any, xp: Any) -> tuple[Any, Any, Any
     return task, null, springs, near | bounded
 
 
-def _selected_inverse(mobility: Any, axes: Any, xp: Any, smallest: Any, *smooth: Any) -> tuple[Any, ...]:
+def _selected_inverse(
+    mobility: Array, axes: Any, xp: ArrayModule, smallest: Array, *smooth: Array
+) -> tuple[Array, ...]:
     """Return S^T (S A S^T)^-1 S, for each bound, with the selected ``axes`` (1 | envs, 6), and where it is bounded."""
     if axes is None:
         return bounded_inverse(mobility, smallest, *smooth)
@@ -107,5 +110,5 @@ def _selected_inverse(mobility: Any, axes: Any, xp: Any, smallest: Any, *smooth:
     return *[xp.where(both, inverse, xp.zeros_like(inverse)) for inverse in inverses], near
 
 
-def _selected(axes: Any, vector: Any) -> Any:
+def _selected(axes: Any, vector: Array) -> Array:
     return vector if axes is None else axes * vector

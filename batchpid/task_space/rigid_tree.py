@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.arrays.array_types import Array, Document, Rows
 from batchpid.arrays.display import summary
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.read_only import read_only
@@ -40,28 +41,28 @@ class Bodies(NamedTuple):
     from robot to robot: mass, center and tensor then have a leading axis (robots, ...).
     """
 
-    at_zero: Any
-    sine: Any
-    cosine: Any
-    slide: Any
-    slides: Any
+    at_zero: Array
+    sine: Array
+    cosine: Array
+    slide: Array
+    slides: Array
     """1.0 for a prismatic joint, else 0.0 (dof, 1)."""
-    mass: Any
+    mass: Array
     """(dof, 1) [kg]."""
-    center: Any
+    center: Array
     """Center of mass in the body's frame (dof, 3) [m]."""
-    tensor: Any
+    tensor: Array
     """Inertia tensor about the center of mass, in the body's axes (dof, 3, 3) [kg m^2]."""
-    moves: Any
+    moves: Array
     """1.0 where joint i moves body j (dof j, dof i)."""
-    link_frames: Any
+    link_frames: Array
     """Frames of the links in their bodies (links, 3, 4)."""
-    armature: Any
-    gravity: Any
-    base_mass: Any
+    armature: Array
+    gravity: Array
+    base_mass: Array
     """Mass of the base and the links fixed to it (1,) [kg]; center (3,) and tensor (3, 3) as for the bodies."""
-    base_center: Any
-    base_tensor: Any
+    base_center: Array
+    base_tensor: Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -126,7 +127,7 @@ class RigidTree:
         first = (parent < np.arange(count)) & (parent >= np.minimum(np.arange(count), 1) - 1)
         entries("parent", parent, first, "does not come before its child", links, kind="entry")
         shapes = {"position": (3,), "wxyz": (4,), "axis": (3,), "mass": (), "center": (3,), "inertia": (3, 3)}
-        tables: dict[str, NDArray[Any]] = {
+        tables: dict[str, Rows] = {
             name: _array(name, getattr(self, name), (count, *shape)) for name, shape in shapes.items()
         }
         for name in ("armature", "lower", "upper"):
@@ -218,7 +219,7 @@ class RigidTree:
             types[link] = "fixed"
         names = tuple(name for name, kept in zip(self.joint_names, moves, strict=True) if kept)
         rows = {name: getattr(self, name)[moves] for name in ("armature", "lower", "upper")}
-        places: dict[str, Any] = {"position": position, "wxyz": wxyz, "joint_types": tuple(types)}
+        places: Document = {"position": position, "wxyz": wxyz, "joint_types": tuple(types)}
         return replace(self, **places, **rows, joint_names=names, coupling=Coupling.of(len(names)))
 
     @property
@@ -230,11 +231,11 @@ class RigidTree:
         """Return ``qpos`` (..., dof) with the followers moved to match their leaders."""
         return self.coupling.positions(qpos)
 
-    def rates(self, qvel: Any) -> Any:
+    def rates(self, qvel: Array) -> Array:
         """Return ``qvel`` (..., dof) with the rates of followers computed from their leaders'."""
         return namespace(qvel).asarray(self.coupling.rates(qvel), dtype=qvel.dtype)
 
-    def efforts(self, effort: Any) -> Any:
+    def efforts(self, effort: Array) -> Array:
         """Return G^T u for u (..., dof), or J G for J (..., dof)."""
         return namespace(effort).asarray(self.coupling.efforts(effort), dtype=effort.dtype)
 

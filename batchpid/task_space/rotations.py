@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.arrays.array_types import Rows
 
-def multiply(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+
+def multiply(a: Rows, b: Rows) -> Rows:
     """Return the rotation b followed by a: Hamilton's product of (..., 4) and (..., 4)."""
     aw, ax, ay, az = (a[..., k] for k in range(4))
     bw, bx, by, bz = (b[..., k] for k in range(4))
@@ -17,20 +17,20 @@ def multiply(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
     return np.stack([w, x, y, z], axis=-1)
 
 
-def rotate(q: NDArray[Any], v: NDArray[Any]) -> NDArray[Any]:
+def rotate(q: Rows, v: Rows) -> Rows:
     """Return vectors v (..., 3) rotated by q (..., 4): v + 2 w (u x v) + 2 u x (u x v), with u the vector part."""
     w, u = q[..., :1], q[..., 1:]
     t = 2 * np.cross(u, v)
     return v + w * t + np.cross(u, t)
 
 
-def placed(base: NDArray[Any], poses: NDArray[Any]) -> NDArray[Any]:
+def placed(base: Rows, poses: Rows) -> Rows:
     """Return poses (..., 7) that are given in the frame of ``base`` (..., 7), in the frame of that one."""
     position = base[..., :3] + rotate(base[..., 3:], poses[..., :3])
     return np.concatenate([position, multiply(base[..., 3:], poses[..., 3:])], axis=-1)
 
 
-def about(axis: NDArray[Any], angle: NDArray[Any]) -> NDArray[Any]:
+def about(axis: Rows, angle: Rows) -> Rows:
     """Return the rotations (..., 4) by ``angle`` (...) [rad] about a unit ``axis`` (3,)."""
     half = np.asarray(angle) / 2
     return np.concatenate([np.cos(half)[..., None], np.sin(half)[..., None] * axis], axis=-1)
@@ -42,7 +42,7 @@ def from_rpy(rpy: ArrayLike) -> NDArray[np.float64]:
     return multiply(yaw, multiply(pitch, roll))
 
 
-def to_rpy(q: NDArray[Any]) -> NDArray[np.float64]:
+def to_rpy(q: Rows) -> NDArray[np.float64]:
     """Return the ``rpy`` [rad] of a rotation (4,), the inverse of :func:`from_rpy`, exact at pitch +-pi/2 too.
 
     With R = Rz(yaw) Ry(pitch) Rx(roll), yaw = atan2(R10, R00). Pitch and roll follow from Rz(-yaw) R = Ry(pitch)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import namespace
 from batchpid.errors import InvalidArgumentError
 
@@ -20,7 +21,7 @@ def quiet() -> np.errstate:
     return np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore")
 
 
-def whitened(matrix: Any, right: Any) -> Any:
+def whitened(matrix: Array, right: Array) -> Array:
     """Return L^-1 B (..., n, m) with Cholesky's factor L of ``matrix`` = L L^T, for B = ``right`` (..., n, m).
 
     A matrix that is not positive definite gives NaN.
@@ -32,11 +33,12 @@ def whitened(matrix: Any, right: Any) -> Any:
     factor = _cholesky(matrix)
     positive = sound & ~np.isnan(factor[..., :1, :1])
     # With rows and columns in reverse the factor is upper triangular, and its solution a substitution, without pivots.
-    reverse = np.where(positive, factor, _identity(matrix))[..., ::-1, ::-1]
+    sane: Array = np.where(positive, factor, _identity(matrix))
+    reverse = sane[..., ::-1, ::-1]
     return np.where(positive, np.linalg.solve(reverse, right[..., ::-1, :])[..., ::-1, :], np.nan)
 
 
-def _cholesky(matrix: Any) -> Any:
+def _cholesky(matrix: Array) -> Array:
     """Return Cholesky's factors (..., n, n), NaN where a matrix is not positive definite."""
     try:
         return np.linalg.cholesky(matrix)
@@ -44,13 +46,13 @@ def _cholesky(matrix: Any) -> Any:
         return np.full_like(matrix, np.nan) if matrix.ndim == 2 else np.stack([_cholesky(row) for row in matrix])
 
 
-def _sound(matrix: Any) -> tuple[Any, Any]:
+def _sound(matrix: Array) -> tuple[Array, Array]:
     """Return ``matrix`` with the identity for non-finite matrices, and the mask of finite ones (..., 1, 1)."""
     sound = np.isfinite(matrix).all((-2, -1), keepdims=True)
     return (matrix if sound.all() else np.where(sound, matrix, _identity(matrix))), sound
 
 
-def gram(factor: Any, other: Any) -> Any:
+def gram(factor: Array, other: Any) -> Array:
     """Return the products Y^T Z (..., m, k) of (..., n, m) and (..., n, k)."""
     total = factor[..., 0, :, None] * other[..., 0, None, :]
     for row in range(1, factor.shape[-2]):
@@ -58,18 +60,18 @@ def gram(factor: Any, other: Any) -> Any:
     return total
 
 
-def product(matrix: Any, vector: Any) -> Any:
+def product(matrix: Array, vector: Array) -> Array:
     """Return the products (..., n) of matrices (..., n, m) and vectors (..., m)."""
     return (matrix * vector[..., None, :]).sum(-1)
 
 
-def solve(matrix: Any, right: Any) -> Any:
+def solve(matrix: Array, right: Array) -> Array:
     """Return the solutions (..., n, m) of positive definite systems."""
     factor = whitened(matrix, _identity(matrix))
     return gram(factor, gram(namespace(right).swapaxes(factor, -1, -2), right))
 
 
-def bounded_inverse(matrix: Any, smallest: Any, *smooth: Any) -> tuple[Any, ...]:
+def bounded_inverse(matrix: Array, smallest: Array, *smooth: Array) -> tuple[Array, ...]:
     """Return the bounded inverses (..., n, n) of positive semidefinite matrices, and the mask of those that differ.
 
     An eigenvalue s becomes 1/s if s >= s0 = ``smallest`` (a number or (...)), else s/s0^2: continuous, at most 1/s0,
@@ -84,7 +86,7 @@ def bounded_inverse(matrix: Any, smallest: Any, *smooth: Any) -> tuple[Any, ...]
         values, vectors = eigen(matrix)
         positive, rows = xp.maximum(values, 0.0), xp.swapaxes(vectors, -1, -2)
 
-        def inverse_with(bound: Any, below: Any) -> Any:
+        def inverse_with(bound: Array, below: Array) -> Array:
             large = values >= bound
             scale = xp.where(large, 1 / xp.where(large, values, 1.0), below / (bound * bound))
             return gram(rows * scale[..., None], rows)
@@ -94,7 +96,7 @@ def bounded_inverse(matrix: Any, smallest: Any, *smooth: Any) -> tuple[Any, ...]
         return *inverses, ~(values >= s0).all(-1)
 
 
-def eigen(matrix: Any) -> tuple[Any, Any]:
+def eigen(matrix: Array) -> tuple[Array, Array]:
     """Return the eigenvalues (..., n), ascending, and eigenvectors (..., n, n), as columns, of symmetric matrices."""
     if namespace(matrix) is not np:
         return namespace(matrix).linalg.eigh(matrix)
@@ -103,7 +105,7 @@ def eigen(matrix: Any) -> tuple[Any, Any]:
     return np.where(sound[..., 0], values, np.nan), np.where(sound, vectors, np.nan)
 
 
-def _identity(matrix: Any) -> Any:
+def _identity(matrix: Array) -> Array:
     if matrix.shape[-1] != matrix.shape[-2]:
         raise InvalidArgumentError("matrix", f"has shape {matrix.shape}", remedy="give square matrices")
     return namespace(matrix).eye(matrix.shape[-1], dtype=matrix.dtype)

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import cross, multiply, rotate
@@ -43,7 +44,7 @@ from batchpid.task_space.tree_kinematics import (
 )
 
 
-def mass_matrix(tree: RigidTree, qpos: Any, bodies: Bodies | None = None) -> Any:
+def mass_matrix(tree: RigidTree, qpos: Array, bodies: Bodies | None = None) -> Array:
     """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof), armature included.
 
     ``bodies`` belong to robots that differ from the tree, one for each row: :meth:`RigidTree.varied`.
@@ -61,7 +62,7 @@ def mass_matrix(tree: RigidTree, qpos: Any, bodies: Bodies | None = None) -> Any
         return mass_matrix_of(tree, bodies or own, motions_of(tree, own, q, xp), xp)
 
 
-def bias(tree: RigidTree, qpos: Any, qvel: Any, turning: Any = None, *, bodies: Bodies | None = None) -> Any:
+def bias(tree: RigidTree, qpos: Array, qvel: Array, turning: Any = None, *, bodies: Bodies | None = None) -> Array:
     """Return h(q, q') (..., dof) [N m or N]: the efforts that cancel gravity and Coriolis and centrifugal forces.
 
     A floating base turns at ``turning`` (..., 3) [rad/s], in its own axes; default 0. ``bodies`` are as in
@@ -81,12 +82,12 @@ def bias(tree: RigidTree, qpos: Any, qvel: Any, turning: Any = None, *, bodies: 
         return effort_of(tree, bodies or own, motions, velocities_of(tree, motions, v, xp, turning), xp, turning)
 
 
-def gravity(tree: RigidTree, qpos: Any) -> Any:
+def gravity(tree: RigidTree, qpos: Array) -> Array:
     """Return the efforts (..., dof) [N m or N] that hold the robot at ``qpos`` (..., dof): h(q, 0)."""
     return bias(tree, qpos, 0 * qpos if hasattr(qpos, "shape") else [0 * entry for entry in qpos])
 
 
-def inverse_dynamics(tree: RigidTree, qpos: Any, qvel: Any, qacc: Any) -> Any:
+def inverse_dynamics(tree: RigidTree, qpos: Array, qvel: Array, qacc: Array) -> Array:
     """Return the efforts (..., dof) [N m or N] of the accelerations ``qacc`` (..., dof): M q'' + h.
 
     Raises
@@ -109,7 +110,7 @@ def inverse_dynamics(tree: RigidTree, qpos: Any, qvel: Any, qacc: Any) -> Any:
         return tree.efforts(effort_of(tree, bodies, motions, moving, xp) + bodies.armature * a)
 
 
-def forward_dynamics(tree: RigidTree, qpos: Any, qvel: Any, effort: Any) -> Any:
+def forward_dynamics(tree: RigidTree, qpos: Array, qvel: Array, effort: Array) -> Array:
     """Return the accelerations (..., dof) [rad/s^2 or m/s^2] under ``effort`` (..., dof): M^-1 (tau - h).
 
     Raises
@@ -142,17 +143,17 @@ def check_masses(tree: RigidTree) -> None:
 class _Composite(NamedTuple):
     """The bodies that each joint moves, as one rigid body, and the momenta under the motions of the joints."""
 
-    mass: Any
+    mass: Array
     """(..., dof, 1)"""
-    moment: Any
+    moment: Array
     """First moment about the origin (..., dof, 3)."""
-    tensor: Any
+    tensor: Array
     """Inertia tensor about the origin (..., dof, 3, 3)."""
-    momenta: Any
+    momenta: Array
     """Linear and angular (..., dof, 6)."""
 
 
-def _composite(tree: RigidTree, bodies: Bodies, motions: Motions, xp: Any) -> _Composite:
+def _composite(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayModule) -> _Composite:
     turn = motions.frames[..., :3]
     center = rotate(turn, bodies.center) + motions.frames[..., 3]
     moment = bodies.mass * center
@@ -167,13 +168,13 @@ def _composite(tree: RigidTree, bodies: Bodies, motions: Motions, xp: Any) -> _C
     return _Composite(mass, moment, tensor, xp.concatenate([linear, angular], axis=-1))
 
 
-def _about_origin(moment: Any, center: Any, xp: Any) -> Any:
+def _about_origin(moment: Array, center: Array, xp: ArrayModule) -> Array:
     """Return the inertia tensors (..., 3, 3) about the origin of points with first moments ``moment``."""
     square = (moment * center).sum(-1)[..., None, None] * xp.eye(3, dtype=center.dtype)
     return square - moment[..., :, None] * center[..., None, :]
 
 
-def _of_base(tree: RigidTree, bodies: Bodies, all_: _Composite, xp: Any) -> Any:
+def _of_base(tree: RigidTree, bodies: Bodies, all_: _Composite, xp: ArrayModule) -> Array:
     """Return M_bb (..., 6, 6), linear parts first: the momenta of the whole robot under the motions of its base."""
     roots = [joint for joint, above in enumerate(tree.body_parents) if above < 0]
     own = bodies.base_mass * bodies.base_center
@@ -187,7 +188,7 @@ def _of_base(tree: RigidTree, bodies: Bodies, all_: _Composite, xp: Any) -> Any:
     return xp.concatenate([upper, xp.concatenate([crossed, tensor + zero], axis=-1)], axis=-2)
 
 
-def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: Any) -> Any:
+def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayModule) -> Any:
     """Return the mass matrices (..., dof, dof) at given motions of the joints."""
     all_ = _composite(tree, bodies, motions, xp)
     s = xp.concatenate([motions.linear, motions.angular], axis=-1)
@@ -203,8 +204,8 @@ def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: Any) -
 
 
 def effort_of(
-    tree: RigidTree, bodies: Bodies, motions: Motions, rates: Velocities, xp: Any, turning: Any = None
-) -> Any:
+    tree: RigidTree, bodies: Bodies, motions: Motions, rates: Velocities, xp: ArrayModule, turning: Any = None
+) -> Array:
     """Return the efforts (..., dof) of given velocities and accelerations of the bodies, without armature.
 
     A floating base turns at ``turning`` (..., 3) [rad/s]; ``rates`` must include this rotation.
@@ -232,6 +233,6 @@ def effort_of(
     return tree.efforts(effort)
 
 
-def _in_world(turn: Any, tensor: Any, xp: Any) -> Any:
+def _in_world(turn: Any, tensor: Array, xp: ArrayModule) -> Array:
     """Return R I R^T."""
     return multiply(multiply(turn, tensor), xp.swapaxes(turn, -1, -2))

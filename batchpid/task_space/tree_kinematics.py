@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace
 from batchpid.checks.validate import choice, is_traced, read_array
 from batchpid.errors import InvalidArgumentError
@@ -39,22 +40,22 @@ class Motions(NamedTuple):
 
     frames: Any
     """(..., dof, 3, 4)."""
-    linear: Any
+    linear: Array
     """Velocity per rate of the joint, of the body's point that is at the origin of the world (..., dof, 3)."""
-    angular: Any
+    angular: Array
     """Angular velocity per rate of the joint (..., dof, 3)."""
 
 
 class Velocities(NamedTuple):
     """Velocities of the bodies, and their accelerations at q'' = 0, as fields about the origin (..., dof, 3)."""
 
-    linear: Any
-    angular: Any
-    linear_rate: Any
-    angular_rate: Any
+    linear: Array
+    angular: Array
+    linear_rate: Array
+    angular_rate: Array
 
 
-def link_poses(tree: RigidTree, qpos: Any, links: Sequence[str] | None = None, *, point: Any = None) -> Any:
+def link_poses(tree: RigidTree, qpos: Array, links: Sequence[str] | None = None, *, point: Array = None) -> Array:
     """Return the poses (..., links, 7) of ``links``, by default all, at ``qpos`` (..., dof) [rad or m].
 
     With a ``point`` (3,) in the frame of the links [m], the positions of this point.
@@ -79,7 +80,7 @@ def link_poses(tree: RigidTree, qpos: Any, links: Sequence[str] | None = None, *
         return xp.stack([pose_of(tool_frame(tree, bodies, frames, index, at)) for index in indices], axis=-2)
 
 
-def jacobian(tree: RigidTree, qpos: Any, link: str, *, point: Any = None, frame: str = "world") -> Any:
+def jacobian(tree: RigidTree, qpos: Array, link: str, *, point: Array = None, frame: str = "world") -> Array:
     """Return the Jacobian (..., 6, dof) of a point of ``link`` at ``qpos`` (..., dof).
 
     Parameters
@@ -107,7 +108,9 @@ def jacobian(tree: RigidTree, qpos: Any, link: str, *, point: Any = None, frame:
         return matrix if frame == "world" else in_axes(tool[..., :3], matrix)
 
 
-def jacobian_rate(tree: RigidTree, qpos: Any, qvel: Any, link: str, *, point: Any = None, frame: str = "world") -> Any:
+def jacobian_rate(
+    tree: RigidTree, qpos: Array, qvel: Array, link: str, *, point: Array = None, frame: str = "world"
+) -> Array:
     """Return J' q' (..., 6): the acceleration [m/s^2, rad/s^2] that a point of ``link`` has by velocities alone.
 
     ``qpos`` and ``qvel`` are (..., dof). With frame "tool" the same vectors are given in the axes of the link. Other
@@ -126,7 +129,7 @@ def jacobian_rate(tree: RigidTree, qpos: Any, qvel: Any, link: str, *, point: An
         return rate if frame == "world" else in_axes(tool[..., :3], rate[..., None])[..., 0]
 
 
-def prepared(tree: RigidTree, **arrays: Any) -> tuple[list[Any], Bodies, Any]:
+def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Any], Bodies, Any]:
     """Return checked arrays (..., dof) in one dtype, the tree's bodies in it, and their namespace."""
     xp = namespace(*arrays.values())
     checked, shape = [], None
@@ -146,7 +149,7 @@ def prepared(tree: RigidTree, **arrays: Any) -> tuple[list[Any], Bodies, Any]:
     return [a.astype(dtype) for a in checked], Bodies(*(xp.asarray(leaf, dtype) for leaf in tree.bodies)), xp
 
 
-def frames_of_bodies(tree: RigidTree, bodies: Bodies, qpos: Any, xp: Any) -> Any:
+def frames_of_bodies(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModule) -> Array:
     """Return the frames (..., dof, 3, 4) of the bodies in the world."""
     with quiet():
         q = qpos[..., None, None]
@@ -158,7 +161,7 @@ def frames_of_bodies(tree: RigidTree, bodies: Bodies, qpos: Any, xp: Any) -> Any
         return xp.stack(frames, axis=-3)
 
 
-def motions_of(tree: RigidTree, bodies: Bodies, qpos: Any, xp: Any) -> Motions:
+def motions_of(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModule) -> Motions:
     """Return the frames of the bodies and the motions of the joints."""
     frames = frames_of_bodies(tree, bodies, qpos, xp)
     axis = frames[..., 0]
@@ -166,7 +169,7 @@ def motions_of(tree: RigidTree, bodies: Bodies, qpos: Any, xp: Any) -> Motions:
     return Motions(frames, cross(frames[..., 3], turning) + axis * bodies.slides, turning)
 
 
-def velocities_of(tree: RigidTree, motions: Motions, qvel: Any, xp: Any, turning: Any = None) -> Velocities:
+def velocities_of(tree: RigidTree, motions: Motions, qvel: Array, xp: ArrayModule, turning: Any = None) -> Velocities:
     """Return the velocities of the bodies, and their accelerations at q'' = 0, on a base that turns at ``turning``."""
     linear, angular = motions.linear * qvel[..., None], motions.angular * qvel[..., None]
     v, w = from_base(tree, linear, xp), from_base(tree, angular, xp)
@@ -177,7 +180,7 @@ def velocities_of(tree: RigidTree, motions: Motions, qvel: Any, xp: Any, turning
     )
 
 
-def from_base(tree: RigidTree, steps: Any, xp: Any) -> Any:
+def from_base(tree: RigidTree, steps: Any, xp: ArrayModule) -> Array:
     """Return the sums of ``steps`` (..., dof, k) over the joints between the base and each body."""
     sums: list[Any] = []
     for joint, above in enumerate(tree.body_parents):
@@ -185,7 +188,7 @@ def from_base(tree: RigidTree, steps: Any, xp: Any) -> Any:
     return xp.stack(sums, axis=-2)
 
 
-def from_tips(tree: RigidTree, parts: Any, xp: Any) -> Any:
+def from_tips(tree: RigidTree, parts: Any, xp: ArrayModule) -> Array:
     """Return the sums of ``parts`` (..., dof, k) over the bodies that each joint moves."""
     sums = [parts[..., joint, :] for joint in range(tree.dof)]
     for joint, above in reversed(list(enumerate(tree.body_parents))):
@@ -194,7 +197,7 @@ def from_tips(tree: RigidTree, parts: Any, xp: Any) -> Any:
     return xp.stack(sums, axis=-2)
 
 
-def frame_of_link(tree: RigidTree, bodies: Bodies, frames: Any, index: int) -> Any:
+def frame_of_link(tree: RigidTree, bodies: Bodies, frames: Any, index: int) -> Array:
     """Return the frame (..., 3, 4) of a link, from the frames of the bodies."""
     body, own = tree.link_bodies[index], bodies.link_frames[index]
     if body >= 0:
@@ -202,7 +205,7 @@ def frame_of_link(tree: RigidTree, bodies: Bodies, frames: Any, index: int) -> A
     return own + namespace(frames).zeros_like(frames[..., 0, :, :])
 
 
-def tool_frame(tree: RigidTree, bodies: Bodies, frames: Any, index: int, point: Any) -> Any:
+def tool_frame(tree: RigidTree, bodies: Bodies, frames: Any, index: int, point: Array) -> Array:
     """Return the frame (..., 3, 4) of a link with its origin at ``point`` (..., 3) of the link."""
     frame = frame_of_link(tree, bodies, frames, index)
     if point is None:
@@ -212,7 +215,7 @@ def tool_frame(tree: RigidTree, bodies: Bodies, frames: Any, index: int, point: 
     return xp.concatenate([frame[..., :3], place[..., None]], axis=-1)
 
 
-def read_point(like: Any, point: Any) -> Any:
+def read_point(like: Any, point: Array) -> Array:
     """Return ``point`` as a checked array (3,) or (..., 3), where ``like`` is (..., n); None where it is None."""
     if point is None:
         return None
@@ -224,7 +227,7 @@ def read_point(like: Any, point: Any) -> Any:
     return at
 
 
-def jacobian_at(tree: RigidTree, bodies: Bodies, motions: Motions, index: int, place: Any) -> Any:
+def jacobian_at(tree: RigidTree, bodies: Bodies, motions: Motions, index: int, place: Any) -> Array:
     """Return the Jacobian (..., 6, dof) of a link's point at ``place`` (..., 3) in the world, J G of coupled joints."""
     xp, body = namespace(place), tree.link_bodies[index]
     linear = motions.linear + cross(motions.angular, place[..., None, :])
@@ -233,7 +236,7 @@ def jacobian_at(tree: RigidTree, bodies: Bodies, motions: Motions, index: int, p
     return tree.efforts(xp.moveaxis(xp.where(moved, columns, xp.zeros_like(columns)), -1, -2))
 
 
-def rate_at(tree: RigidTree, velocities: Velocities, index: int, place: Any) -> Any:
+def rate_at(tree: RigidTree, velocities: Velocities, index: int, place: Any) -> Array:
     """Return J' q' (..., 6) of a link's point at ``place`` (..., 3) in the world."""
     xp, body = namespace(place), tree.link_bodies[index]
     if body < 0:

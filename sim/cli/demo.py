@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
+from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
@@ -70,7 +70,7 @@ class DemoCommand:
         start = start_poses(robot, self.num_envs, self.spread, self.seed)
         gains = gain_set(robot, self.gains)
         title = f"{robot.name}: {self.num_envs} robots, {gains.control} at {settings.rate_hz:g} Hz, gains {gains.name}"
-        options: dict[str, Any] = {"params": gains.params, "control": gains.control}
+        options: Document = {"params": gains.params, "control": gains.control}
         options |= flags.chosen(self, "workers engine backend ground")
         with waiting(f"building {self.num_envs} robots"):
             made = Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options)

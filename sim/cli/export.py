@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from batchpid.arrays.array_types import Document
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import Outputs
@@ -154,7 +155,7 @@ class ExportCommand:
             exported = to(params, joints, dt, actuators=_motors(robot), inertia=inertia)
         return exported._replace(differences=(*exported.differences, *notes))
 
-    def _c_options(self, robot: Robot) -> dict[str, Any]:
+    def _c_options(self, robot: Robot) -> Document:
         """Return the options of the C header."""
         return {
             "joint_names": robot.joint_names,

@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from batchpid.arrays.array_types import Document
+
 
 def _flag(help: str | None = None, **options: Any) -> Any:
     """Return tyro's options of a flag; its help leaves out the defaults None, False, True and ()."""
@@ -18,7 +20,7 @@ def _flag(help: str | None = None, **options: Any) -> Any:
     return tyro.conf.arg(help=help, help_behavior_hint=hint, **options)
 
 
-def chosen(command: Any, names: str) -> dict[str, Any]:
+def chosen(command: Any, names: str) -> Document:
     """Return the values of some flags of a command, as arguments of the same names, which are separated by blanks."""
     values = {name: getattr(command, name) for name in names.split()}
     if "ground" in values and (ground := values.pop("ground")) is not None:

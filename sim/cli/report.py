@@ -6,12 +6,11 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from tabulate import tabulate
 
+from batchpid.arrays.array_types import Rows
 from batchpid.metrics import StepMetrics
 from batchpid.sim import Robot, Rollout, Runner
 from batchpid.sim.identification.setpoint_files import Setpoints
@@ -202,7 +201,7 @@ def _diverged_lines(rollout: Rollout) -> Iterator[str]:
         )
 
 
-def limit_lines(robot: Robot, setpoint: NDArray[Any]) -> Iterator[str]:
+def limit_lines(robot: Robot, setpoint: Rows) -> Iterator[str]:
     """Yield a line for each joint with setpoints (envs, dof) out of its limits, with the worst; one line if none."""
     beyond = np.maximum(robot.lower - setpoint, setpoint - robot.upper)
     violations = robot.limit_violations(setpoint)
@@ -274,7 +273,7 @@ def _of_settled(metrics: StepMetrics) -> StepMetrics:
     return metrics._replace(overshoot=np.where(unsettled, np.nan, metrics.overshoot))
 
 
-def _median_and_worst(figure: NDArray[Any], style: str, unit: str = "", infinite: str = "never") -> str:
+def _median_and_worst(figure: Rows, style: str, unit: str = "", infinite: str = "never") -> str:
     if np.isnan(figure).all():
         return "-"
     return " / ".join(

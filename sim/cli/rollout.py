@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from batchpid.arrays.array_types import Array
 from batchpid.checks.validate import array, file_path, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Recorder, Robot, write_recording
@@ -128,7 +129,7 @@ class RolloutCommand:
         else:
             center = None if setpoints is None else setpoints.start
             start = start_poses(robot, self.num_envs, self.spread, self.seed, center)
-            goal: Any = target if self.setpoint is None else self.setpoint
+            goal: Array = target if self.setpoint is None else self.setpoint
             setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
             gains = gain_set(robot, self.gains or ("drive" if self.control == "drive" else None))
             params, control = gains.params, "drive" if gains.control == "drive" else self.control

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Document, Rows
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, Runner, read_recording
@@ -58,11 +59,11 @@ class Parts:
     def __exit__(self, *_: object) -> None:
         """Nothing is open: each part has a runner of its own."""
 
-    def reset(self, qpos: NDArray[Any], *, seed: int | None = None) -> None:
+    def reset(self, qpos: Rows, *, seed: int | None = None) -> None:
         """Begin at ``qpos`` (envs, dof)."""
         self._sweep = partial(self._sweep, qpos=qpos, seed=seed)
 
-    def rollout(self, setpoints: NDArray[Any], *, progress: Any = None, **more: Any) -> Rollout:
+    def rollout(self, setpoints: Rows, *, progress: Any = None, **more: Any) -> Rollout:
         """Return the rollout, from the file as far as it is there."""
         found: Rollout = self._sweep(setpoints=setpoints, progress=bar("simulating", unit="part"), **more)
         return found
@@ -86,7 +87,7 @@ def start_poses(
     return robot.coupled(np.clip(poses, robot.lower, robot.upper))
 
 
-def hold_setpoint(runner: Runner, start: NDArray[Any], setpoint: NDArray[Any], seconds: float) -> tuple[Rollout, str]:
+def hold_setpoint(runner: Runner, start: Rows, setpoint: Rows, seconds: float) -> tuple[Rollout, str]:
     """Hold ``setpoint`` (dof,) from ``start`` (envs, dof) for ``seconds``; return the rollout and a report on it."""
     moves = Moves(start, np.broadcast_to(setpoint, start.shape), ("to the setpoint",) * len(start))
     began = time.perf_counter()
@@ -94,7 +95,7 @@ def hold_setpoint(runner: Runner, start: NDArray[Any], setpoint: NDArray[Any], s
     return rollout, run_report(runner, rollout, metrics, time.perf_counter() - began)
 
 
-def hold_pose(runner: Runner, start: NDArray[Any], goal: NDArray[Any], seconds: float) -> tuple[Rollout, str]:
+def hold_pose(runner: Runner, start: Rows, goal: Rows, seconds: float) -> tuple[Rollout, str]:
     """Hold the pose ``goal`` (7,) of a tool from ``start`` (envs, dof) for ``seconds``; return rollout and report."""
     began = time.perf_counter()
     runner.reset(start, seed=None if runner.options.randomization is None else 0)
@@ -103,7 +104,7 @@ def hold_pose(runner: Runner, start: NDArray[Any], goal: NDArray[Any], seconds: 
     return rollout, tool_report(runner, rollout, time.perf_counter() - began)
 
 
-def follow(runner: Runner, start: NDArray[Any], setpoints: Setpoints, rates: bool) -> tuple[Rollout, str]:
+def follow(runner: Runner, start: Rows, setpoints: Setpoints, rates: bool) -> tuple[Rollout, str]:
     """Follow setpoints of a file from ``start`` (envs, dof), with rates or without; return the rollout and a report."""
     began = time.perf_counter()
     runner.reset(start, seed=None if runner.options.randomization is None else 0)
@@ -116,12 +117,12 @@ def follow(runner: Runner, start: NDArray[Any], setpoints: Setpoints, rates: boo
     return rollout, trajectory_report(runner, rollout, setpoints if rates else None, time.perf_counter() - began)
 
 
-def run_figures(robot: Robot, rollout: Rollout) -> dict[str, Any]:
+def run_figures(robot: Robot, rollout: Rollout) -> Document:
     """Return the figures of a rollout for --json, lists by env: of steps, or of setpoints that move, or of a tool."""
     info, failed = rollout.info, np.flatnonzero(~rollout.ok.all(0))
     about = {name: getattr(info, name) for name in ("robot", "control", "engine", "physics")}
     seconds = rollout.tick * len(rollout.time)
-    figures: dict[str, Any] = about | {"num_envs": rollout.num_envs, "seconds": seconds, "failed": failed}
+    figures: Document = about | {"num_envs": rollout.num_envs, "seconds": seconds, "failed": failed}
     if rollout.tool_pose is not None:
         error = np.abs(pose_error(rollout.setpoint[-1, :, :7], rollout.tool_pose[-1].astype(float)))
         return figures | {"tool": info.tool, "final_error": dict(zip(AXES, error.T, strict=True))}

@@ -5,11 +5,12 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from batchpid import save_params
+from batchpid.arrays.array_types import Document
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
@@ -259,7 +260,7 @@ def within_report(robot: Robot, found: Within, drawn: DrawnMotors) -> list[str]:
     ]
 
 
-def _figures(found: Within) -> dict[str, Any]:
+def _figures(found: Within) -> Document:
     """Return what holds for all drawn motors, for the record."""
     return {
         "draws": len(found.settling),

@@ -22,12 +22,11 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.elementwise import TURN, matrix_vector
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.engine import native
@@ -73,7 +72,7 @@ class ConstraintEfforts:
         self._push, self._passive = np.zeros((robots, joints, len(followers))), np.zeros((robots, joints))
         self.implicit = np.zeros((robots, joints))
         self._model: NativeModel | None = None
-        arrays: dict[str, NDArray[Any]] = {
+        arrays: dict[str, Rows] = {
             "response": self._response,
             "push": self._push,
             "passive": self._passive,
@@ -130,7 +129,7 @@ class ConstraintEfforts:
         self._response[rows], self._passive[rows] = response, np.where(sound[:, 0], passive[rows], 0.0)
         self._push[rows] = jacobian.T @ np.linalg.inv(response @ jacobian.T)
 
-    def place(self, rows: Sequence[int], qpos: NDArray[Any]) -> None:
+    def place(self, rows: Sequence[int], qpos: Rows) -> None:
         """Put robots ``rows`` at positions ``qpos`` (len(rows), dof)."""
         self.unwrapped[rows] = qpos
 

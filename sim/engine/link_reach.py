@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Float64, Rows
 
 
 class LinkExtent(NamedTuple):
@@ -44,7 +43,7 @@ def link_reach(links: Sequence[LinkExtent], dof: int) -> Float64:
     return reach
 
 
-def closing_arms(first: Float64, second: Float64) -> NDArray[Any]:
+def closing_arms(first: Float64, second: Float64) -> Rows:
     """Return upper bounds of the closing speed of two links per unit speed of each joint, from their reach (..., dof).
 
     A joint above both links does not change their distance, so its bound is 0.

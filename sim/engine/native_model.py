@@ -11,10 +11,9 @@ from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
@@ -40,7 +39,7 @@ class NativeModel:
     def _structure(self) -> tuple[Model, Any]:
         tree, rows = self._tree.tables
         inertias = self._tree.inertias()[None] if self._inertias is None else self._inertias
-        arrays: dict[str, NDArray[Any]] = {"tree": tree, "rows": rows, "inertias": inertias}
+        arrays: dict[str, Rows] = {"tree": tree, "rows": rows, "inertias": inertias}
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
         numbers = {"dof": len(tree), "varies": self._inertias is not None, "base": BASES.index(self._base)}
         return Model(gravity=self._spec.gravity, **numbers, **addresses), arrays
@@ -62,7 +61,7 @@ class NativeModel:
         varied = self._tree.varied({name: each[picked] for name, each in added.items()})
         self._inertias[picked] = self._tree.inertias(varied)
 
-    def mass_matrix(self, qpos: NDArray[Any]) -> Float64:
+    def mass_matrix(self, qpos: Rows) -> Float64:
         """Return the mass matrices (n, dof, dof) [kg m^2 or kg] that the joints show at ``qpos`` (n, dof)."""
         rows = np.ascontiguousarray(qpos, np.float64)
         out = np.empty((*rows.shape, rows.shape[1]))

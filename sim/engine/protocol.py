@@ -13,9 +13,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Bool, Float64
+from batchpid.arrays.array_types import Bool, DType, Float64, Rows
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
@@ -61,30 +60,30 @@ class EnginePack(Protocol):
     size: int
     dof: int
     first_env: int
-    qf: NDArray[Any]
+    qf: Rows
     friction: Friction
     armature: Float64
 
-    def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
+    def read_qpos(self, dtype: DType = np.float64) -> Rows:
         """Return the joint positions [rad or m]."""
 
-    def read_qvel(self, dtype: Any = np.float64) -> NDArray[Any]:
+    def read_qvel(self, dtype: DType = np.float64) -> Rows:
         """Return the joint velocities [rad/s or m/s]."""
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
+    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N].
 
         They come from the model of ``spec`` at the present state, without the pack's variation. On a floating base they
         are those of the joints alone, as if the base were held where it is: no effort of a joint carries the base.
         """
 
-    def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
+    def joint_mass_matrix(self, qpos: Rows) -> Float64:
         """Return the joints' effective mass matrices at ``qpos`` (M, dof, dof) [kg m^2 or kg], variation included.
 
         On a floating base they are Schur complements: the base's six degrees of freedom are eliminated.
         """
 
-    def write_qf(self, effort: NDArray[Any]) -> None:
+    def write_qf(self, effort: Rows) -> None:
         """Apply joint efforts [N m or N]. They persist until written again."""
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
@@ -118,9 +117,7 @@ class EnginePack(Protocol):
         :class:`batchpid.sim.Observation` describes them; of robots that were placed meanwhile, since then.
         """
 
-    def write_state(
-        self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], base: Float64 | None = None
-    ) -> None:
+    def write_state(self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None) -> None:
         """Set positions and velocities (len(rows), dof) of the envs ``rows``, and zero efforts.
 
         A floating base is placed at ``base`` (len(rows), 13), as :meth:`read_base` returns it; None is the origin.
@@ -155,7 +152,7 @@ class EnginePack(Protocol):
         Rows may be longer, with more NaN at the end. The loop writes efforts and suspension afterwards.
         """
 
-    def read_poses(self, names: Sequence[str] | None = None) -> list[NDArray[Any]]:
+    def read_poses(self, names: Sequence[str] | None = None) -> list[Rows]:
         """Return the poses that ``build`` asked for in each env (poses, 7): x, y, z [m], quaternion w, x, y, z.
 
         With ``names``, those of these bodies of the file of ``spec``, in float64.
@@ -172,10 +169,10 @@ class EnginePack(Protocol):
 class DrivenPack(EnginePack, Protocol):
     """Pack whose joints have drives: PD control that the engine integrates implicitly."""
 
-    def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
+    def write_drive(self, stiffness: Rows, damping: Rows, force_limit: Rows) -> None:
         """Set the drive of every joint; each argument broadcasts to (M, dof) [N m/rad, N m s/rad, N m, or N/m, ...]."""
 
-    def write_drive_target(self, position: NDArray[Any], velocity: NDArray[Any] | None = None) -> None:
+    def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
 
 

@@ -10,10 +10,9 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Bool, Float64
+from batchpid.arrays.array_types import Array, Bool, Document, Float64, Rows
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import link_shapes
@@ -38,11 +37,11 @@ class RobotModel:
     def __reduce__(self) -> Any:  # a controller that keeps it can be sent to worker processes
         return scene_model, (self._spec,)
 
-    def mass_matrix(self, qpos: Any) -> Any:
+    def mass_matrix(self, qpos: Array) -> Array:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg], in NumPy or JAX as ``qpos``."""
         return ts.mass_matrix(self.tree.held, qpos)
 
-    def inverse_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]) -> Float64:
+    def inverse_dynamics(self, qpos: Rows, qvel: Rows, qacc: Rows) -> Float64:
         """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
         return np.asarray(ts.inverse_dynamics(self.tree.held, qpos, qvel, qacc), np.float64)
 
@@ -50,14 +49,14 @@ class RobotModel:
         """Return the efforts (n, dof) [N m or N] that cancel gravity and Coriolis and centrifugal forces."""
         return passive_force(self.tree.held, qpos, qvel, gravity, coriolis)
 
-    def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> Float64:
+    def forward_dynamics(self, qpos: Rows, qvel: Rows, effort: Rows) -> Float64:
         """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity included.
 
         Followers move with their leaders.
         """
         return np.asarray(ts.forward_dynamics(self._coupled, qpos, qvel, effort), np.float64)
 
-    def standing_inertia(self, qpos: NDArray[Any]) -> Float64:
+    def standing_inertia(self, qpos: Rows) -> Float64:
         """Return the inertia (dof,) that each joint moves at one pose (dof,) if the base floats and its feet stand.
 
         The feet F are pinned. Velocities q' of the joints move the base at V = A q', A = -J_b^+ J_j, where J_b and J_j
@@ -99,25 +98,25 @@ class RobotModel:
     def _contacts(self) -> Contacts:
         return contacts_of(self._spec, self._spec.ground)
 
-    def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> Bool:
+    def in_contact(self, qpos: Rows, clearance: float = 0.0) -> Bool:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,).
 
         Links that a fixed joint connects may touch, and the base and the links fixed to it may touch the ground.
         """
         return self._contacts.in_contact(qpos, clearance)
 
-    def near(self, qpos: NDArray[Any], within: float) -> list[Near]:
+    def near(self, qpos: Rows, within: float) -> list[Near]:
         """Return the pairs of shapes closer than ``within`` [m] to each other or to the ground, at one pose (dof,)."""
         return list(self._contacts.near(qpos, within))
 
-    def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
+    def nearest_links(self, qpos: Rows) -> tuple[str, ...]:
         """Return the two links of the URDF that are nearest to each other, or overlap most, at one pose (dof,).
 
         One link if the other is the ground; no link if none are near each other.
         """
         return self._contacts.nearest_links(qpos)
 
-    def height(self, qpos: NDArray[Any], base_too: bool = False) -> float:
+    def height(self, qpos: Rows, base_too: bool = False) -> float:
         """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes.
 
         With ``base_too`` the links that are fixed to the base count as well.
@@ -178,5 +177,5 @@ def scene_model(spec: SceneSpec) -> RobotModel:
 def robot_model(robot: RobotDescription, ground: bool | None = None) -> RobotModel:
     """Return the model of ``robot`` on a fixed base; ``ground`` at height 0, by default ``robot.has_ground``."""
     has_ground = robot.has_ground if ground is None else ground
-    options: dict[str, Any] = {"merge_fixed": robot.merge_fixed, "ground": has_ground}
+    options: Document = {"merge_fixed": robot.merge_fixed, "ground": has_ground}
     return scene_model(SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, None, **options))

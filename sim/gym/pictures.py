@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Rows
 from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.observation import Observation
@@ -79,7 +80,7 @@ class EnvPictures:
             if build is not None:
                 scene.add_content(build, env)
 
-    def draw(self, observed: Observation, poses: NDArray[Any] | None) -> tuple[NDArray[np.uint8], ...]:
+    def draw(self, observed: Observation, poses: Rows | None) -> tuple[NDArray[np.uint8], ...]:
         """Return a picture (height, width, 3) of each env at the observed joints and base, and content ``poses``."""
         pictures, base = [], observed.base_pose
         for env, (scene, camera) in enumerate(zip(self._scenes, self._cameras, strict=True)):

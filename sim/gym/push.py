@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Rows, SapienScene
 from batchpid.checks.validate import number
 from batchpid.sim.gym.robot_env import RobotEnv
 from batchpid.sim.gym.robot_vector_env import Bool, Float32, Float64
@@ -112,7 +113,7 @@ class PushVectorEnv(ToolVectorEnv):
         reward: Float64 = 1.0 * success - self._distance(observation) - NEAR_WEIGHT * np.hypot(*(box - tool).T)
         return reward
 
-    def info(self, observation: Float32) -> Mapping[str, NDArray[Any]]:
+    def info(self, observation: Float32) -> Mapping[str, Rows]:
         """Return the distance of the box to its goal [m]."""
         return {"distance": self._distance(observation)}
 
@@ -128,7 +129,7 @@ class _Box:
     def __init__(self, place: tuple[float, ...]) -> None:
         self.place = place
 
-    def __call__(self, scene: Any, env: int) -> Any:
+    def __call__(self, scene: SapienScene, env: int) -> Any:
         import sapien
 
         builder = scene.create_actor_builder()

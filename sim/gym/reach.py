@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Rows
 from batchpid.arrays.elementwise import TURN, wrap
 from batchpid.checks.validate import array, choice, entries, number
 from batchpid.errors import InvalidArgumentError
@@ -156,7 +157,7 @@ class ReachVectorEnv(RobotVectorEnv):
         reward: Float64 = 1.0 * success - (self._error(observation) / self._span).mean(1)
         return reward
 
-    def info(self, observation: Float32) -> Mapping[str, NDArray[Any]]:
+    def info(self, observation: Float32) -> Mapping[str, Rows]:
         """Return the largest error."""
         return {"error": self._error(observation).max(1)}
 

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.arrays.array_types import Document
 from batchpid.checks.keywords import check_keywords
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.sim.gym.pictures import RENDER_MODES
@@ -26,29 +27,27 @@ class RobotEnv(SingleOwner, gymnasium.Env):
     """
 
     instead = RobotVectorEnv.instead
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES}  # type: ignore[misc]
+    metadata: ClassVar[Document] = {"render_modes": RENDER_MODES}  # type: ignore[misc]
     task: ClassVar[type[RobotVectorEnv]]
     """Class of the task."""
 
     def __init__(self, robot: str | Robot | None = None, *, render_mode: str | None = None, **options: Any) -> None:
         check_keywords(type(self).__name__, options, [name for name in arguments_of(self.task) if name not in _FIXED])
         options |= {"workers": options.get("workers", 0), "autoreset_mode": AutoresetMode.DISABLED}
-        given: dict[str, Any] = {} if robot is None else {"robot": robot}
+        given: Document = {} if robot is None else {"robot": robot}
         self._envs = self.task(1, **given, max_episode_steps=None, render_mode=render_mode, **options)
         self.runner, self.render_mode = self._envs.runner, render_mode
         self.metadata = self._envs.metadata  # type: ignore[misc]
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Float32, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Document | None = None) -> tuple[Float32, Document]:
         """Begin a new episode."""
         super().reset(seed=seed)
         observation, info = self._envs.reset(seed=seed)
         return observation[0], self._single(info)
 
-    def step(self, action: ArrayLike) -> tuple[Float32, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Float32, float, bool, bool, Document]:
         """Apply an action (size,) for one step; return observation, reward, terminated, truncated and info."""
         observation, reward, terminated, truncated, info = self._envs.step(np.asarray(action)[None])
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._single(info)
@@ -63,6 +62,6 @@ class RobotEnv(SingleOwner, gymnasium.Env):
         self._envs.close()
 
     @staticmethod
-    def _single(info: dict[str, Any]) -> dict[str, Any]:
+    def _single(info: Document) -> Document:
         """Return the info of the first env."""
         return {key: value[0].item() for key, value in info.items() if not key.startswith("_")}

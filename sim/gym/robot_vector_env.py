@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.arrays.array_types import Document, DType, Rows
 from batchpid.checks.keywords import check_keywords
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import array, choice, env_mask, flag, integer, number
@@ -82,7 +83,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     """
 
     instead = "make another env with the same arguments"
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES}  # type: ignore[misc]
+    metadata: ClassVar[Document] = {"render_modes": RENDER_MODES}  # type: ignore[misc]
     picture_size: ClassVar[tuple[int, int]] = (640, 480)
     """Width and height of a picture of :meth:`render` [pixels]."""
 
@@ -227,15 +228,15 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """
         return success & self.terminate_on_success
 
-    def info(self, observation: Float32) -> Mapping[str, NDArray[Any]]:
+    def info(self, observation: Float32) -> Mapping[str, Rows]:
         """Return further entries of the info, arrays (envs,), between "success" and "diverged". Default: none."""
         return {}
 
     # -- the vector environment ------------------------------------------------------------------------------------
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Float32, dict[str, Any]]:
+        self, *, seed: int | Sequence[int | None] | None = None, options: Document | None = None
+    ) -> tuple[Float32, Document]:
         """Begin new episodes, in the envs of ``options["reset_mask"]`` (envs,) or in all.
 
         An int ``seed`` gives env k the seed + k; a sequence has one for each env, or None to go on with the last. What
@@ -274,7 +275,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._begin(mask, streams)
         return self._observation.copy(), self._info(mask)
 
-    def step(self, actions: ArrayLike) -> tuple[Float32, Float64, Bool, Bool, dict[str, Any]]:
+    def step(self, actions: ArrayLike) -> tuple[Float32, Float64, Bool, Bool, Document]:
         """Apply an action (envs, size) for one step; return observation, reward, terminated, truncated and info."""
         self.step_async(actions)
         return self.step_wait()
@@ -304,7 +305,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self.send(setpoint, rate)
         self.action, self._setpoint, self._is_stepping = action, setpoint, True
 
-    def step_wait(self) -> tuple[Float32, Float64, Bool, Bool, dict[str, Any]]:
+    def step_wait(self) -> tuple[Float32, Float64, Bool, Bool, Document]:
         """Wait for the step that :meth:`step_async` began; return what :meth:`step` returns.
 
         Raises
@@ -406,8 +407,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._success = observed.ok & success
 
     def _returned(
-        self, hook: str, value: ArrayLike, shape: tuple[int, ...], dtype: Any, ok: Bool | None = None
-    ) -> NDArray[Any]:
+        self, hook: str, value: ArrayLike, shape: tuple[int, ...], dtype: DType, ok: Bool | None = None
+    ) -> Rows:
         """Return a hook's value as an array; raise InvalidArgumentError for another shape, NaN or infinity.
 
         Where ``ok`` (envs,) is given, the rows of other envs are not checked.
@@ -430,7 +431,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if self._is_stepping:
             raise CallOrderError(f"{call}: a step is under way; call step_wait() first")
 
-    def _info(self, mask: Bool) -> dict[str, Any]:
+    def _info(self, mask: Bool) -> Document:
         """Return the info of the masked envs in Gymnasium's vector style: each key and, as _key, the mask."""
         own = {
             key: self._returned("info", value, (self.num_envs,), value.dtype)

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Document, Rows
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
 
@@ -57,11 +58,11 @@ class TaskVecEnv(VecEnv):
         self._reset_seeds()
         return observation
 
-    def step_async(self, actions: NDArray[Any]) -> None:
+    def step_async(self, actions: Rows) -> None:
         """Begin a step."""
         self.envs.step_async(actions)
 
-    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[Document]]:
         """Wait for the step; return observation, reward, ends of episodes, and an info for each env."""
         observation, reward, terminated, truncated, info = self.envs.step_wait()
         ends = terminated | truncated
@@ -103,7 +104,7 @@ class TaskVecEnv(VecEnv):
         """Return False for each env of ``indices``: single envs have no wrappers."""
         return [False for _ in self._get_indices(indices)]
 
-    def _of_env(self, info: dict[str, Any], env: int) -> dict[str, Any]:
+    def _of_env(self, info: Document, env: int) -> Document:
         """Return the entries of one env in an info of the task."""
         own = {key: rows[env].item() for key, rows in info.items() if key[0] != "_" and not key.startswith("final_")}
         return own | {"is_success": own["success"]}

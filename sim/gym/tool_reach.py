@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Rows
 from batchpid.checks.validate import number
 from batchpid.sim.gym.robot_env import RobotEnv
 from batchpid.sim.gym.robot_vector_env import Bool, Float32, Float64
@@ -88,7 +88,7 @@ class ToolReachVectorEnv(ToolVectorEnv):
         distance, angle = self._errors(observation)
         return 1.0 * success - distance - ANGLE_WEIGHT * angle
 
-    def info(self, observation: Float32) -> Mapping[str, NDArray[Any]]:
+    def info(self, observation: Float32) -> Mapping[str, Rows]:
         """Return distance [m] and angle [rad]."""
         return dict(zip(("distance", "angle"), self._errors(observation), strict=True))
 

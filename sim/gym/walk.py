@@ -7,8 +7,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Rows
 from batchpid.checks.validate import array, entries
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.gym.joint_space import MAX_SPEED
@@ -139,7 +140,7 @@ class WalkVectorEnv(RobotVectorEnv):
         fell = (np.asarray(self.observed.base_pose)[:, 2] < self.lowest) | (observation[:, 8] < 0.5)
         return fell | np.asarray(super().terminated(observation, success))
 
-    def info(self, observation: Float32) -> Mapping[str, NDArray[Any]]:
+    def info(self, observation: Float32) -> Mapping[str, Rows]:
         """Return the forward speed [m/s] and the distance along x [m]."""
         return {"speed": observation[:, 0], "distance": np.asarray(self.observed.base_pose)[:, 0]}
 

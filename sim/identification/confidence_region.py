@@ -12,12 +12,12 @@ Hilferty's ("The distribution of chi-square", PNAS 17, 1931).
 from __future__ import annotations
 
 import os
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.sim.identification.unknowns import DESCRIBED, KINDS
@@ -41,7 +41,7 @@ class Region(NamedTuple):
     correlation: Float64
     """(n, n)."""
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Document:
         """Return plain values, for :func:`read_region`; of the correlations the rows up to the diagonal."""
         rows = [[float(f"{each:.5f}") for each in row[: k + 1]] for k, row in enumerate(self.correlation)]
         return {

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.plant import Plant
 from batchpid.sim.identification.regression import Regression
@@ -73,7 +73,7 @@ class Diagnosis(NamedTuple):
     """Strengths (joints,) that explain the efforts as well as ``links``; None where they do not, or there are none."""
     disturbance: Disturbance | None
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Document:
         """Return plain values."""
         return {
             "effort_explained": list(self.explained),

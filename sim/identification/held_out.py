@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.motors.actuator_fields import FIELDS
@@ -120,7 +120,7 @@ def motors_of(
     return motors
 
 
-def _assumed(source: str, document: Any) -> dict[str, Any]:
+def _assumed(source: str, document: Any) -> Document:
     """Return the assumptions of an actuators file; stopping time and payload alone if it states none."""
     stated = document.get("about", {}).get(ASSUMED, {})
     found = {name: KINDS[name].start for name in ("stopping", "payload")} | (stated if isinstance(stated, dict) else {})
@@ -132,7 +132,7 @@ def _assumed(source: str, document: Any) -> dict[str, Any]:
     return found
 
 
-def _slew(source: str, assumed: dict[str, Any], joints: list[str]) -> Float64 | None:
+def _slew(source: str, assumed: Document, joints: list[str]) -> Float64 | None:
     """Return the limits of the setpoints' rate that an actuators file states (1, joints); None without such limits."""
     if "slew" not in assumed:
         return None

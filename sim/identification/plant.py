@@ -25,12 +25,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.coupling import Coupling, Follower
 from batchpid.motors.friction import Friction, bound_of
@@ -255,9 +255,7 @@ def _with_payload(tree: RigidTree, body: int, place: Float64) -> RigidTree:
     frame = tree.bodies.link_frames[carrier]
     more = {"position": frame[:, :3].T @ (place - frame[:, 3]), "wxyz": [1, 0, 0, 0], "axis": [1, 0, 0]}
     more |= {"parent": carrier, "mass": 0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}
-    tables: dict[str, Any] = {
-        name: np.concatenate([getattr(tree, name), np.array([row])]) for name, row in more.items()
-    }
+    tables: Document = {name: np.concatenate([getattr(tree, name), np.array([row])]) for name, row in more.items()}
     return replace(tree, links=(*tree.links, PAYLOAD), joint_types=(*tree.joint_types, "fixed"), **tables)
 
 

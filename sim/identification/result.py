@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import choice, integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.confidence_region import KEY, Region
@@ -59,7 +59,7 @@ class Identification(NamedTuple):
     """Root mean square of the residuals (joints,) [rad or m]."""
     drive: Drive
     """Control of the robot, as assumed or found."""
-    settings: dict[str, Any]
+    settings: Document
     """Logs, options and versions, for the record."""
     fits: tuple[Fit, ...]
     """Errors along each stretch of the logs that was simulated."""
@@ -162,7 +162,7 @@ class Identification(NamedTuple):
             raise InvalidArgumentError("corrected_urdf", "no link's mass seems off", remedy=remedy)
         return to_urdf(self.robot, mass_factors=self.diagnosis.links).text
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Document:
         """Return the result as plain values: for each unknown the estimate and its 95 % interval, however wide.
 
         "not_identified" names the unknowns that are not well determined.
@@ -173,7 +173,7 @@ class Identification(NamedTuple):
                 return [kind_of(kind).neutral] * 3
             return list(self._row(self.unknowns.names.index((kind, joint))))
 
-        document: dict[str, Any] = {
+        document: Document = {
             "joints": {
                 self.robot.joint_names[number]: {kind: row(kind, joint) for kind in self.unknowns.per_joint}
                 for joint, number in enumerate(self.joints)

@@ -25,9 +25,10 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import batchpid as bp
+from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import choice, flag, instance, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.ros2_control_reader import is_ros2_control
@@ -96,7 +97,7 @@ def _read(
     robot: Robot,
     read: Callable[..., list[Log]],
     kind: CommandKind | None,
-    entry: dict[str, Any],
+    entry: Document,
 ) -> list[Log]:
     """Return the stretches of one log of a list, with its settings."""
     own, params = robot, None
@@ -119,7 +120,7 @@ def _read(
     return [replace(log, settings=settings) for log in found]
 
 
-def _reading(where: str, robot: Robot, entry: dict[str, Any]) -> Reading:
+def _reading(where: str, robot: Robot, entry: Document) -> Reading:
     """Return the options of an entry that are fields of :class:`Reading`."""
     reading = Reading(**{key: entry[key] for key in Reading._fields})
     if reading.time_unit is not None:

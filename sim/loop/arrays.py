@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Array, Rows
 from batchpid.sim.observation import OBSERVED, Observation, Quantity
 
 Layout = dict[str, tuple[tuple[int, ...], Any]]
@@ -19,13 +20,13 @@ Layout = dict[str, tuple[tuple[int, ...], Any]]
 class Command(NamedTuple):
     """Command of one tick, (envs, ...), or of several, (ticks, envs, ...); None where nothing is given."""
 
-    setpoint: Any
+    setpoint: Array
     """(envs, size), as :attr:`batchpid.sim.RunnerOptions.command` describes it: for joints (envs, dof) [rad or m]."""
-    setpoint_rate: Any = None
+    setpoint_rate: Array = None
     """Rate of the setpoint, per second (envs, size)."""
-    setpoint_acceleration: Any = None
+    setpoint_acceleration: Array = None
     """Acceleration of the setpoint, per second squared (envs, size)."""
-    feedforward: Any = None
+    feedforward: Array = None
     """Joint effort added before saturation (envs, dof) [N m or N]."""
 
     def map(self, function: Any) -> Command:
@@ -85,7 +86,7 @@ class Arrays(NamedTuple):
         return layout | {f"fault.{name}": (row, np.int64) for name in FaultArrays._fields}
 
     @staticmethod
-    def from_fields(fields: Mapping[str, NDArray[Any]]) -> Arrays:
+    def from_fields(fields: Mapping[str, Rows]) -> Arrays:
         """Return the arrays of ``fields``, named as in :meth:`layout`."""
 
         def group(kind: Any, prefix: str) -> Any:

@@ -29,6 +29,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import batchpid as bp
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, nearest_turn, replace_envs, wrap
 from batchpid.motors import advance_effort, advance_measurement
 from batchpid.motors import friction as friction_model
@@ -64,7 +65,7 @@ def sim_step(
     return values
 
 
-def mass_matrix(layout: Layout, constants: Constants, qpos: Any) -> Any:
+def mass_matrix(layout: Layout, constants: Constants, qpos: Array) -> Array:
     """Return the law's mass matrix (M, dof, dof): M + known armature + dt B, for the leaders only."""
     xp, matrix = namespace(qpos), layout.model.mass_matrix(qpos)
     if constants.armature is not None:
@@ -74,7 +75,7 @@ def mass_matrix(layout: Layout, constants: Constants, qpos: Any) -> Any:
     return constants.coupling.mass_matrix(matrix)
 
 
-def refreshed(layout: Layout, constants: Constants, friction: FrictionState, qpos: Any) -> FrictionState:
+def refreshed(layout: Layout, constants: Constants, friction: FrictionState, qpos: Array) -> FrictionState:
     """Return the state of the friction model with the inertia at ``qpos``, for the leaders only."""
     if layout.model.refresh is not None:
         return layout.model.refresh(friction, qpos)
@@ -82,7 +83,7 @@ def refreshed(layout: Layout, constants: Constants, friction: FrictionState, qpo
     return friction_model.refresh(constants.friction, friction, matrix, constants.timestep, *constants.drive)
 
 
-def carried(command: Command, left: Any) -> Command:
+def carried(command: Command, left: Array) -> Command:
     """Return ``command`` at the time ``left`` before the end of its tick, where its rate is given::
 
         r <- r - left (r' - left r'' / 2)        r' <- r' - left r''
@@ -99,7 +100,7 @@ def carried(command: Command, left: Any) -> Command:
     return command._replace(setpoint=setpoint - left * (rate - 0.5 * change), setpoint_rate=rate - change)
 
 
-def feedforward(constants: Constants, command: Command, qpos: Any, passive: Any) -> Any:
+def feedforward(constants: Constants, command: Command, qpos: Array, passive: Array) -> Array:
     """Return the passive force plus the caller's feedforward and known friction, for the leaders; None for zero."""
     forward = _sum(passive, command.feedforward)
     forward = None if forward is None else constants.coupling.efforts(forward)
@@ -215,7 +216,7 @@ def _law(layout: Layout, constants: Constants, values: Values) -> Values:
     return values._replace(outputs=values.outputs._replace(motor=values.outputs.qf))
 
 
-def _pid(layout: Layout, constants: Constants, values: Values, limits: tuple[Any, Any]) -> Values:
+def _pid(layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]) -> Values:
     """qf = sat(PID(setpoint, qpos) + feedforward)."""
     seen, state, law = values.seen, values.state, layout.law
     assert law is not None
@@ -229,7 +230,7 @@ def _pid(layout: Layout, constants: Constants, values: Values, limits: tuple[Any
     return values._replace(state=state._replace(law=new), outputs=outputs)
 
 
-def _drive(layout: Layout, constants: Constants, values: Values, limits: tuple[Any, Any]) -> Values:
+def _drive(layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]) -> Values:
     """The engine's drives with stiffness kp and damping kd; qf = feedforward.
 
     With ki the drive's target moves by the integral over kp (:func:`batchpid.drive_target`), so that the drive acts as
@@ -248,13 +249,13 @@ def _drive(layout: Layout, constants: Constants, values: Values, limits: tuple[A
     return values._replace(state=state, outputs=outputs)
 
 
-def _effort(layout: Layout, constants: Constants, values: Values, limits: tuple[Any, Any]) -> Values:
+def _effort(layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]) -> Values:
     """qf = sat(the caller's effort + feedforward); the setpoint is the effort, and a follower's acts on its leader."""
     asked = constants.coupling.efforts(values.command.setpoint)
     return _saturated(constants, _sum(asked, values.seen.passive), values, limits)
 
 
-def _custom(layout: Layout, constants: Constants, values: Values, limits: tuple[Any, Any]) -> Values:
+def _custom(layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]) -> Values:
     """qf = sat(effort of the caller's own controller)."""
     values = _saturated(constants, constants.coupling.efforts(values.outputs.returned), values, limits)
     outputs = values.outputs
@@ -307,13 +308,13 @@ STAGES = (
 """Stages of a sim step, in order."""
 
 
-def _saturated(constants: Constants, total: Any, values: Values, limits: tuple[Any, Any]) -> Values:
+def _saturated(constants: Constants, total: Array, values: Values, limits: tuple[Array, Array]) -> Values:
     """Return ``values`` with the effort ``total`` clipped to the limits of motors and params."""
     xp = namespace(total, *limits)
     effort = clip(clip(total, *limits, xp), *constants.limits, xp)
     return values._replace(outputs=values.outputs._replace(qf=effort, saturated=effort != total))
 
 
-def _sum(first: Any, second: Any) -> Any:
+def _sum(first: Array, second: Array) -> Array:
     """Return the sum of two arrays, either of which may be None for zero."""
     return first if second is None else second if first is None else first + second

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Array, Document, Float64, Rows
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import ControllerError, InvalidArgumentError
@@ -31,9 +31,9 @@ class OwnController:
         self._options, self._controller = options, options.control
         self._reporting = options.control.reporting if isinstance(options.control, OperationalSpace) else None
         self._structure: Any = None
-        self._like: dict[str, Any] = {}
+        self._like: Document = {}
 
-    def init(self, envs: int) -> dict[str, NDArray[Any]]:
+    def init(self, envs: int) -> dict[str, Rows]:
         """Return a checked copy of the controller's initial state for ``envs`` envs.
 
         Raises InvalidArgumentError if an array of the state does not have the envs as its first axis.
@@ -49,7 +49,7 @@ class OwnController:
                 )
         return leaves
 
-    def reset(self, state: Mapping[str, Any], mask: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+    def reset(self, state: Mapping[str, Any], mask: NDArray[np.bool_]) -> dict[str, Rows]:
         """Return ``state`` with the envs of ``mask`` (M,) at their start."""
         rows = {name: np.array(leaf) for name, leaf in state.items()}
         with controller_errors(self._controller):
@@ -58,7 +58,7 @@ class OwnController:
             leaf[mask] = fresh[name][mask]
         return rows
 
-    def __call__(self, state: Mapping[str, Any], *inputs: Float64) -> tuple[Any, ...]:
+    def __call__(self, state: Mapping[str, Any], *inputs: Float64) -> tuple[Array, ...]:
         """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel and passive force.
 
         Operational-space control limits efforts itself; a third result are the joints with limited efforts (M, dof).
@@ -72,13 +72,13 @@ class OwnController:
         _check_effort(effort, inputs[1])
         return leaves, effort, *limited
 
-    def _called(self, *arguments: Any) -> tuple[Any, ...]:
+    def _called(self, *arguments: Any) -> tuple[Array, ...]:
         if self._reporting is not None:
             return self._reporting(*arguments)
         state, effort = self._controller(*arguments)
         return state, effort
 
-    def traced(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[Any, ...]:
+    def traced(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[Array, ...]:
         """Call the controller within a JAX program; arguments and results as in :meth:`__call__`.
 
         Raises InvalidArgumentError if JAX cannot trace the controller, or it returns an effort or a state of a wrong
@@ -101,7 +101,7 @@ class OwnController:
         return new, effort, *limited
 
 
-def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, NDArray[Any]]:
+def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, Rows]:
     """Return the initial state of the control of all envs, as arrays by name."""
     if not isinstance(options.control, str):
         return flatten(_begin(options, options.num_envs))
@@ -129,7 +129,7 @@ def _begin(options: RunnerOptions, envs: int) -> Any:
         return unflatten(state := start(), flatten(state))
 
 
-def _check_effort(effort: Any, qpos: Any) -> None:
+def _check_effort(effort: Array, qpos: Array) -> None:
     if effort.shape != qpos.shape:
         rows = effort.shape[:1] == qpos.shape[:1]  # the number of rows depends on the groups
         got, wanted = (f"(envs{''.join(f', {n}' for n in a.shape[1:])})" if rows else a.shape for a in (effort, qpos))
@@ -137,7 +137,7 @@ def _check_effort(effort: Any, qpos: Any) -> None:
         raise InvalidArgumentError("control", problem, remedy="return (state, effort), effort of shape (envs, dof)")
 
 
-def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> dict[str, Any]:
+def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
     """Return the arrays of a controller's state in the dtypes of ``before``.
 
     Raises InvalidArgumentError if names or shapes differ, or a dtype cannot be cast.
@@ -161,7 +161,7 @@ def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> dict[str, Any
     return new
 
 
-def flatten(state: Any, name: str = "", read: Callable[[Any], Any] = np.asarray) -> dict[str, Any]:
+def flatten(state: Any, name: str = "", read: Callable[[Any], Any] = np.asarray) -> Document:
     """Return the arrays of a nested state by name: keys of mappings and fields of tuples, joined by "/"."""
     if state is None:
         return {}
@@ -174,7 +174,7 @@ def flatten(state: Any, name: str = "", read: Callable[[Any], Any] = np.asarray)
     }
 
 
-def unflatten(like: Any, leaves: Mapping[str, NDArray[Any]], name: str = "") -> Any:
+def unflatten(like: Any, leaves: Mapping[str, Rows], name: str = "") -> Any:
     """Return a state of the structure of ``like`` with the arrays ``leaves``."""
     if like is None:
         return None

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Array, Float64
 from batchpid.arrays.elementwise import clip
 from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.motors.friction import FrictionState
@@ -234,7 +234,7 @@ class EnvGroup:
                 self._contain(rows(ran.before), ran.done, ran.outputs.returned)
         return ran.tick, ran.done
 
-    def _mask(self, array: Any) -> Any:
+    def _mask(self, array: Array) -> Array:
         return False if array is None else self._executor.rows(array)
 
     def observe(self, rows: Arrays) -> None:

@@ -9,12 +9,12 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Bool
+from batchpid.arrays.array_types import Array, Bool, Rows
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.step_values import Measured
@@ -94,7 +94,7 @@ class FaultLog:
         """Return a log that knows no last fault of the envs of ``mask`` (envs,), which were reset."""
         return self.restored(np.where(mask, -1, self._steps))
 
-    def restored(self, steps: NDArray[Any]) -> FaultLog:
+    def restored(self, steps: Rows) -> FaultLog:
         """Return a log that knows the steps of the envs' last faults (envs,)."""
         log = copy.copy(self)
         log._steps = steps.copy()
@@ -173,11 +173,11 @@ class FaultContainment:
         unplaced, self._unplaced = self._unplaced, np.zeros_like(self._unplaced)
         return unplaced
 
-    def read(self) -> dict[str, NDArray[Any]]:
+    def read(self) -> dict[str, Rows]:
         """Return the state by name, one row per env, for :meth:`write`."""
         return {name: getattr(self, name).copy() for name in self._STATE}
 
-    def write(self, state: dict[str, NDArray[Any]]) -> None:
+    def write(self, state: dict[str, Rows]) -> None:
         """Set the state that :meth:`read` returned."""
         for name in self._STATE:
             getattr(self, name)[...] = state[name]
@@ -196,12 +196,12 @@ def far(qpos: NDArray[np.float64]) -> Bool:
     return ~(np.abs(qpos) <= FARTHEST)
 
 
-def sound(measured: Measured, speed_limit: Any) -> bool:
+def sound(measured: Measured, speed_limit: Array) -> bool:
     """Return whether certainly no robot has failed."""
     return near(measured.qpos) and (speed_limit is None or bool((np.abs(measured.qvel) <= speed_limit).all()))
 
 
-def finite(*arrays: NDArray[Any] | None) -> bool:
+def finite(*arrays: Rows | None) -> bool:
     """Return whether all entries are finite and below 1e150, in one pass: otherwise a sum of squares is inf or NaN."""
     for array in arrays:  # noqa: SIM110  (twice as fast as all() of a generator)
         if array is not None and not math.isfinite(np.vdot(array, array)):

@@ -7,8 +7,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Pytree, Rows
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.pid_law import PIDLaw
@@ -26,14 +26,14 @@ def program_rows(envs: int) -> int:
     return -(-envs // ROWS) * ROWS
 
 
-def padded(rows: Any) -> NDArray[Any]:
+def padded(rows: Any) -> Rows:
     """Return ``rows`` (envs, ...) followed by copies of the first row, up to the number of rows in a program."""
     rows = np.asarray(rows)
     missing = program_rows(len(rows)) - len(rows)
     return np.concatenate([rows, np.repeat(rows[:1], missing, 0)]) if missing else rows
 
 
-def put(tree: Any) -> Any:
+def put(tree: Pytree) -> Any:
     """Return a structure of arrays as JAX arrays on the CPU."""
     import jax
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Rows
 from batchpid.errors import ControllerError
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -160,7 +161,7 @@ class Loop:
         """Return the number of values in the engine's state of each env."""
         return [size for group in self.groups for size in group.pack.state_sizes()]
 
-    def poses(self, names: Sequence[str] | None = None) -> list[NDArray[Any]]:
+    def poses(self, names: Sequence[str] | None = None) -> list[Rows]:
         """Return the poses of the entities that ``build`` returned for each env, or of bodies ``names``, (..., 7)."""
         return [rows for group in self.groups for rows in group.pack.read_poses(names)]
 

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Array, Rows
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.symbols import Symbol
 from batchpid.native.tracing import Trace, trace
@@ -180,7 +181,7 @@ class NativeTicks:
             self._tick.noise[place] = block.ctypes.data
         return min(map(len, noise))
 
-    def _draw(self) -> Any:
+    def _draw(self) -> Array:
         """Return the noise of positions and velocities in the next steps (steps, M, dof) each, or None."""
         if self.state.motors is None or not self._layout.measures:
             return None
@@ -198,7 +199,7 @@ class NativeTicks:
 
     # -- buffers -----------------------------------------------------------------------------------------------
 
-    def _place(self, **arrays: NDArray[Any] | None) -> None:
+    def _place(self, **arrays: Rows | None) -> None:
         """Let fields of the structure of native code point to these arrays."""
         for name, array in arrays.items():
             if array is None:
@@ -220,7 +221,7 @@ class NativeTicks:
     def _transfers_of(self, own: Table) -> ctypes.Array[interface.Transfer]:
         outputs, seen, transfers = self.outputs, own.arrays.observation, list[interface.Transfer]()
 
-        def add(kind: str, table: NDArray[Any], row: NDArray[Any], stride: int | None = None) -> None:
+        def add(kind: str, table: Rows, row: Rows, stride: int | None = None) -> None:
             dtype = {"read": np.float64, "write_floats": np.float32}.get(kind, row.dtype)
             is_fit = table.dtype == dtype and row.flags.c_contiguous and table[0].flags.c_contiguous
             if not is_fit or table.shape[1:] != row.shape:
@@ -378,7 +379,7 @@ class _Traced(NamedTuple):
     """Program of some stages."""
 
     program: Trace
-    values: Any
+    values: Array
     """Structure of the values after it."""
     places: tuple[_Place, ...]
     """Places of the arrays in these."""
@@ -437,6 +438,6 @@ def _copied(state: StepState) -> StepState:
     return state._replace(matrix=None, motors=motors)
 
 
-def _split(array: Any) -> Any:
+def _split(array: Array) -> Any:
     """Return an array (n, envs, dof) as a tuple of n arrays, and other arrays unchanged."""
     return tuple(array) if array.ndim == 3 else array

@@ -6,9 +6,8 @@ from functools import cached_property, partial
 from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.law.coefficients import spread
 from batchpid.motors import ActuatorState, Coefficients, measurement_noise
 from batchpid.native.compiled_stages import compiled_stages
@@ -126,7 +125,7 @@ class NumPyExecutor:
         self._failed = not sound(measured, self._speed_limit)
         return values._replace(measured=measured)
 
-    def rows(self, array: Any) -> NDArray[Any]:
+    def rows(self, array: Array) -> Rows:
         """Return an array of the executor as a NumPy array."""
         return array
 
@@ -180,14 +179,14 @@ class NoiseBlocks:
     def __init__(self) -> None:
         self._key: Any = None
         self._first = 0
-        self._block: tuple[Any, Any] = (None, None)
+        self._block: tuple[Array, Array] = (None, None)
 
-    def __call__(self, k: Coefficients, state: ActuatorState, like: Float64) -> tuple[Any, Any] | None:
+    def __call__(self, k: Coefficients, state: ActuatorState, like: Float64) -> tuple[Array, Array] | None:
         """Return the noise of positions and velocities; None for sensors without noise."""
         blocks = self.from_step(k, state, like)
         return None if blocks is None else (_first(blocks[0]), _first(blocks[1]))
 
-    def from_step(self, k: Coefficients, state: ActuatorState, like: Float64) -> tuple[Any, Any] | None:
+    def from_step(self, k: Coefficients, state: ActuatorState, like: Float64) -> tuple[Array, Array] | None:
         """Return the noise of the step of a state and the next ones (steps, M, dof), as far as it has been drawn.
 
         A reset replaces the key. While the key is the same, all envs advance by the same number of steps.
@@ -203,5 +202,5 @@ class NoiseBlocks:
         return None if position is None else position[at:], None if velocity is None else velocity[at:]
 
 
-def _first(block: Any) -> Any:
+def _first(block: Any) -> Array:
     return None if block is None else block[0]

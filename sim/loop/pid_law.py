@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import batchpid as bp
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.choices import PerInertia, PerMassMatrix
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.law.coefficients import Coefficients
@@ -50,14 +51,14 @@ class PIDLaw(NamedTuple):
         self,
         k: Coefficients,
         state: bp.PIDState,
-        command: tuple[Any, Any, Any],
-        qpos: Any,
-        qvel: Any,
-        feedforward: Any,
-        matrix: Any = None,
-        viscous: Any = None,
-        low: Any = None,
-        high: Any = None,
+        command: tuple[Array, Array, Array],
+        qpos: Array,
+        qvel: Array,
+        feedforward: Array,
+        matrix: Array = None,
+        viscous: Array = None,
+        low: Array = None,
+        high: Array = None,
     ) -> tuple[bp.PIDState, Any, Any]:
         """Return the new state, the effort, and the mask of saturated joints.
 
@@ -94,7 +95,7 @@ class PIDLaw(NamedTuple):
         return new, terms.effort, terms.effort != terms.unsaturated
 
 
-def half_way(qpos: Any, qvel: Any, steps: Any, timestep: float) -> Any:
+def half_way(qpos: Array, qvel: Array, steps: Any, timestep: float) -> Array:
     """Return the pose for the mass matrix of the next ``steps`` sim steps from ``qpos``: half way through them.
 
     The matrix error is then zero on average. With matrices 0.3 steps ahead, a jaco2 that is near upright, its axes

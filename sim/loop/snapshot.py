@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.choices import CHOICES, Everywhere
 from batchpid.checks.validate import file_path, integer, names
 from batchpid.errors import InvalidArgumentError
@@ -57,18 +58,18 @@ class EnvStates:
     than another (:meth:`batchpid.sim.engine.protocol.EnginePack.read_state`)."""
     effort: NDArray[np.float32]
     saturated: NDArray[np.bool_]
-    controller: dict[str, NDArray[Any]]
+    controller: dict[str, Rows]
     """Leaves of :class:`batchpid.PIDState`."""
-    friction: dict[str, NDArray[Any]]
+    friction: dict[str, Rows]
     """Leaves of :class:`batchpid.motors.friction.FrictionState`, and :data:`AGE`; none without Coulomb friction."""
-    actuators: dict[str, NDArray[Any]]
+    actuators: dict[str, Rows]
     """Leaves of :class:`batchpid.motors.ActuatorState`, and :data:`EPISODE`; none without effects on
     efforts or measurements."""
-    guard: dict[str, NDArray[Any]]
+    guard: dict[str, Rows]
     """Leaves of :class:`batchpid.motors.guard.GuardState`, and :data:`CHANGED`; none without guard."""
-    containment: dict[str, NDArray[Any]]
+    containment: dict[str, Rows]
     """See :class:`batchpid.sim.loop.faults.FaultContainment`."""
-    sensors: dict[str, NDArray[Any]]
+    sensors: dict[str, Rows]
     """Quantities of :class:`batchpid.sim.Observation` from the sensors of links; none without such sensors."""
     pushes: dict[str, NDArray[np.int64]]
     """Counts of :class:`batchpid.sim.loop.pushes.Pushes`; none without pushes."""
@@ -88,13 +89,13 @@ class EnvStates:
         self,
         num_envs: int,
         dof: int,
-        controller: dict[str, NDArray[Any]],
+        controller: dict[str, Rows],
         friction: bool,
-        actuators: dict[str, NDArray[Any]],
+        actuators: dict[str, Rows],
         guard: bool,
         engine_sizes: Sequence[int],
         command_size: int,
-        sensors: dict[str, NDArray[Any]],
+        sensors: dict[str, Rows],
         pushes: bool,
     ) -> None:
         """Check the states' envs and joints, and the number of engine values of each env, ``engine_sizes`` (envs,).
@@ -159,7 +160,7 @@ class EnvStates:
 class Snapshot:
     """State of all envs of a runner at one moment. It can be pickled, or kept in a file: :meth:`save`, :meth:`load`."""
 
-    about: dict[str, Any]
+    about: Document
     """Options that a runner must share to restore it: :meth:`batchpid.sim.RunnerOptions.describe`."""
     steps: int
     """Sim steps up to this moment."""
@@ -210,7 +211,7 @@ class Snapshot:
         choices = {name: type(leaf).__name__ for name, leaf in leaves.items() if isinstance(leaf, tuple)}
         arrays = {name: leaf for name, leaf in leaves.items() if name not in choices}
         head = {"format": _FORMAT, "about": self.about, "steps": self.steps, "markers": choices}
-        tables: dict[str, Any] = {
+        tables: Document = {
             "head": np.array(json.dumps(head)),
             **flatten({"params": arrays, _ACTUATORS: _options(self.actuators), **vars(self.states)}),
         }
@@ -242,7 +243,7 @@ class Snapshot:
             ) from error
 
     @classmethod
-    def _read(cls, tables: dict[str, NDArray[Any]]) -> Snapshot:
+    def _read(cls, tables: dict[str, Rows]) -> Snapshot:
         """Return the snapshot in the arrays of a file, if they agree with each other."""
         head = json.loads(str(tables.pop("head")))
         if head["format"] not in (_FORMAT, _AT_ORIGIN, _WITH_ISOLATION):
@@ -307,9 +308,7 @@ class Snapshot:
         )
 
 
-def initial_actuators(
-    actuators: bp.Actuators | None, num_envs: int, dof: int, timestep: float
-) -> dict[str, NDArray[Any]]:
+def initial_actuators(actuators: bp.Actuators | None, num_envs: int, dof: int, timestep: float) -> dict[str, Rows]:
     """Return a state of ``actuators`` by name, in its shapes for ``num_envs`` envs and ``dof`` joints."""
     if actuators is None or not (actuators.measures or actuators.delivers):
         return {}
@@ -319,7 +318,7 @@ def initial_actuators(
     return {name: np.broadcast_to(leaf, (num_envs, *leaf.shape[1:])) for name, leaf in state.items()}
 
 
-def _options(actuators: bp.Actuators | None) -> dict[str, NDArray[Any]]:
+def _options(actuators: bp.Actuators | None) -> dict[str, Rows]:
     """Return the arguments of :func:`batchpid.make_actuators` as arrays."""
     if actuators is None:
         return {}

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 import batchpid as bp
 from batchpid import motors as actuator_model
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import TURN
 from batchpid.motors import ActuatorState
 from batchpid.motors.coupling import Coupling
@@ -90,13 +89,13 @@ def _known_friction(options: RunnerOptions, pack: EnginePack) -> KnownFriction |
     return KnownFriction(friction, np.array([BAND[joint.unit] for joint in joints]), _turns(pack))
 
 
-def _turns(pack: EnginePack) -> Any:
+def _turns(pack: EnginePack) -> Array:
     """Return 1 / (2 pi) for continuous joints and 0 for others (dof,); None without continuous joints."""
     turns = np.array([joint.continuous / TURN for joint in pack.spec.joints])
     return turns if turns.any() else None
 
 
-def needs_qvel(layout: Layout, constants: Constants, speed_limit: Any) -> bool:
+def needs_qvel(layout: Layout, constants: Constants, speed_limit: Array) -> bool:
     """Return whether the joint velocities are needed at each sim step."""
     law = layout.law
     takes = law is not None and (law.measures_rate or law.needs_matrix)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid as bp
+from batchpid.arrays.array_types import Array
 from batchpid.law.coefficients import Coefficients
 from batchpid.motors import STAGES, ActuatorState, Stages
 from batchpid.motors.coupling import Coupling
@@ -28,17 +29,17 @@ class StepState(NamedTuple):
     motors: ActuatorState | None = None
     """Motors and sensors; None for ideal ones."""
     guard: GuardState | None = None
-    matrix: Any = None
+    matrix: Array = None
     """Mass matrix of the law (M, dof, dof), or its diagonal (M, dof). Each tick begins with a new one."""
 
 
 class Measured(NamedTuple):
     """Reading of the robots before a sim step, arrays (M, dof)."""
 
-    qpos: Any
-    qvel: Any
+    qpos: Array
+    qvel: Array
     """None where nothing needs it."""
-    passive: Any
+    passive: Array
     """Efforts that cancel gravity, and Coriolis and centrifugal forces; None without compensation."""
 
 
@@ -47,28 +48,28 @@ class Step(NamedTuple):
 
     index: Any
     """Sim steps of the tick before this one."""
-    end: Any
+    end: Array
     """Sim steps of the tick."""
-    left: Any = 0.0
+    left: Array = 0.0
     """:meth:`Layout.left`: time from the moment of the law's setpoint to the end of the tick [s]."""
 
 
 class Outputs(NamedTuple):
     """Results of a sim step, arrays (M, dof)."""
 
-    qf: Any = None
+    qf: Array = None
     """Effort to apply to the joints in the next step of the engine [N m or N]."""
     motor: Any = None
     """Effort of the motors."""
-    saturated: Any = None
+    saturated: Array = None
     """Joints whose effort was limited; None under control "drive"."""
-    guarded: Any = None
+    guarded: Array = None
     """Setpoints that the guard changed; None without guard."""
     returned: Any = None
     """Effort that the caller's own controller returned; None for other controls."""
-    target: Any = None
+    target: Array = None
     """Position target of the engine's drives [rad or m]; None without drives."""
-    target_rate: Any = None
+    target_rate: Array = None
 
 
 class Values(NamedTuple):
@@ -83,7 +84,7 @@ class Values(NamedTuple):
     """Reading as the sensors measure it, with the whole feedforward as its passive force from that stage on."""
     noise: Any = None
     """Noise of the sensors in this step, if it is drawn in advance."""
-    limited: Any = None
+    limited: Array = None
     """Joints whose effort the caller's own controller has limited (M, dof); None if it does not say."""
     outputs: Outputs = Outputs()
 
@@ -91,30 +92,30 @@ class Values(NamedTuple):
 class KnownFriction(NamedTuple):
     """Friction that the compensation cancels, arrays (dof,)."""
 
-    friction: Any
+    friction: Array
     """[N m or N]"""
-    band: Any
+    band: Array
     """Half width of the band of small errors in which the compensation is reduced [rad or m]."""
-    turns: Any
+    turns: Array
     """1 / (2 pi) on continuous joints, 0 elsewhere; None without such joints."""
 
 
 class Constants(NamedTuple):
     """Arrays that stay the same for many ticks, (M, dof) or (1, dof); None where they are not needed."""
 
-    timestep: Any
+    timestep: Array
     """[s]"""
-    limits: tuple[Any, Any]
+    limits: tuple[Array, Array]
     """Least and largest effort of the params [N m or N]."""
     coupling: Coupling
     k: Coefficients | None = None
     """Coefficients of the PID law."""
-    armature: Any = None
+    armature: Array = None
     """Armature of the motors that the law knows (dof,) [kg m^2 or kg]."""
-    damping: Any = None
+    damping: Array = None
     """Viscous damping B that a law with the mass matrix compensates (dof,) [N m s/rad or N s/m]."""
     friction: Friction = Friction()
-    drive: tuple[Any, Any] = (0.0, 0.0)
+    drive: tuple[Array, Array] = (0.0, 0.0)
     """Damping and stiffness of the engine's drives [N m s/rad, N m/rad]."""
     known: KnownFriction | None = None
     guard: Any = None
@@ -123,11 +124,11 @@ class Constants(NamedTuple):
     """:class:`batchpid.motors.Coefficients` of motors and sensors."""
     driven: bp.PIDParams | None = None
     """Params of the integral that moves the targets of drives."""
-    turns: Any = None
+    turns: Array = None
     """1 / (2 pi) on continuous joints with drives, 0 elsewhere; None without such joints."""
 
 
-def when(due: Any, function: Callable[[], Any], otherwise: Any) -> Any:
+def when(due: Any, function: Callable[[], Any], otherwise: Array) -> Any:
     """Return ``function()`` if ``due``, a bool or an array, has a True entry; else ``otherwise``."""
     return function() if np.any(due) else otherwise
 
@@ -135,9 +136,9 @@ def when(due: Any, function: Callable[[], Any], otherwise: Any) -> Any:
 class Model(NamedTuple):
     """Functions that an executor passes to the control step. Their results do not depend on the executor."""
 
-    mass_matrix: Any = None
+    mass_matrix: Array = None
     """qpos (M, dof) -> mass matrix of the description (M, dof, dof), as the law knows it."""
-    joint_mass_matrix: Any = None
+    joint_mass_matrix: Array = None
     """qpos -> effective mass matrix of the joints, armature of the motors included."""
     refresh: Any = None
     """state of the friction model, qpos -> the state with its inertia there; None: by :attr:`joint_mass_matrix`."""
@@ -166,7 +167,7 @@ class Layout(NamedTuple):
     """Whether the law takes the joints' state from sensors."""
     model: Model = Model()
 
-    def left(self, index: Any, end: Any, timestep: Any) -> Any:
+    def left(self, index: Any, end: Array, timestep: Array) -> Array:
         """Return the time from the law's setpoint in sim step ``index`` to the end of a tick of ``end`` steps [s].
 
         The explicit law takes its setpoint at the beginning of the step, the implicit law and drives at the end.

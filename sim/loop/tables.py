@@ -8,18 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Document, Rows
 
-def flatten(groups: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+
+def flatten(groups: Mapping[str, Any]) -> dict[str, Rows]:
     """Return all arrays by name; a group's arrays as "group.name"."""
-    tables: dict[str, NDArray[Any]] = {}
+    tables: dict[str, Rows] = {}
     for name, value in groups.items():
         tables |= {f"{name}.{leaf}": rows for leaf, rows in value.items()} if isinstance(value, dict) else {name: value}
     return tables
 
 
-def nest(tables: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+def nest(tables: Mapping[str, Rows]) -> Document:
     """Return the groups of :func:`flatten`."""
-    groups: dict[str, Any] = {
+    groups: Document = {
         name: {} for name in ("controller", "friction", "actuators", "guard", "containment", "sensors", "pushes")
     }
     for name, rows in tables.items():

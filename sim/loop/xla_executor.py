@@ -12,8 +12,8 @@ from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Array, Rows
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.native.trees import mapped
 from batchpid.sim.engine.native import xla
@@ -74,7 +74,7 @@ class XLAExecutor:
         needs_bodies = (law is not None and law.needs_matrix) or constants.friction.coulomb is not None
         tables = scene_tree(pack.spec).tables if needs_bodies else None
 
-        def spread(part: Any) -> Any:
+        def spread(part: Any) -> Array:
             return mapped(lambda array: padded(np.broadcast_to(array, (pack.size, pack.dof))), part)
 
         limits = (None, None) if law is not None else spread(constants.limits)
@@ -113,7 +113,7 @@ class XLAExecutor:
             raise RuntimeError(native.message)
         return Ran(carry.state, carry.outputs, carry.measured, carry.before, span.tick, done, bool(status))
 
-    def rows(self, array: Any) -> NDArray[Any]:
+    def rows(self, array: Array) -> Rows:
         """Return an array of the executor as a new NumPy array."""
         return np.array(array, bool if array.dtype == bool else np.float64)[: self._pack.size]
 
@@ -121,7 +121,7 @@ class XLAExecutor:
         """Return a state of the executor with NumPy arrays: float64, except for the caller's own controller."""
         import jax
 
-        def rows(leaf: Any, keep: bool = False) -> NDArray[Any]:
+        def rows(leaf: Array, keep: bool = False) -> Rows:
             array = np.array(leaf)[: self._pack.size]
             return array if keep or array.dtype.kind != "f" else array.astype(np.float64)
 
@@ -175,10 +175,10 @@ def tick(
     xp = jax.numpy
     end, address = span[1], lax.bitcast_convert_type(span[2:], np.uint32)
 
-    def mass_matrix(qpos: Any) -> Any:
+    def mass_matrix(qpos: Array) -> Array:
         return xla.mass_matrix(bodies.tree, bodies.table, qpos)
 
-    def when(due: Any, function: Any, otherwise: Any) -> Any:
+    def when(due: Any, function: Any, otherwise: Array) -> Any:
         return lax.cond(due.any(), function, lambda: otherwise)
 
     model = Model(mass_matrix, mass_matrix, when=when, controller=controller)

@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, to_rgba
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Rows
 from batchpid.sim.observation import OBSERVED, Rollout, RunInfo
 
 ENV = "#4c78a8"
@@ -26,7 +26,7 @@ SMALL = 7.0
 _NOTE: Any = {"fontsize": 6.5, "color": "#444444", "bbox": {"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6}}
 
 
-def draw_fan(axes: Axes, time: NDArray[Any], values: NDArray[Any], mark: int | None) -> None:
+def draw_fan(axes: Axes, time: Rows, values: Rows, mark: int | None) -> None:
     """Draw each env of ``values`` (ticks, envs) as a thin line, their median as a bold one, env ``mark`` in colour."""
     lines = np.empty((values.shape[1], len(time), 2))
     lines[..., 0], lines[..., 1] = time, values.T
@@ -40,7 +40,7 @@ def draw_fan(axes: Axes, time: NDArray[Any], values: NDArray[Any], mark: int | N
         axes.plot(time, values[:, mark], color=MARKED, lw=1.1)
 
 
-def draw_band(axes: Axes, time: NDArray[Any], values: NDArray[Any], colour: str) -> None:
+def draw_band(axes: Axes, time: Rows, values: Rows, colour: str) -> None:
     """Draw the median of the envs as a line, and 10 to 90 % of them as a band."""
     low, median, high = quantiles(values, 0.1, 0.5, 0.9)
     axes.fill_between(time, low, high, color=colour, alpha=0.2, lw=0)
@@ -58,7 +58,7 @@ def draw_setpoint(axes: Axes, run: Rollout, joint: int, band: float | None) -> N
         axes.axhspan(setpoint[-1, 0] - half, setpoint[-1, 0] + half, color=SETPOINT, alpha=0.2, lw=0)
 
 
-def draw_entry(axes: Axes, time: NDArray[Any], values: NDArray[Any]) -> bool:
+def draw_entry(axes: Axes, time: Rows, values: Rows) -> bool:
     """Draw one number of the setpoints (ticks, envs), as one line where all envs share it; return whether they do."""
     shared = bool((values == values[:, :1]).all())
     axes.plot(time, values[:, 0] if shared else values, color=SETPOINT, lw=1.1, ls="--", zorder=3)
@@ -125,7 +125,7 @@ def set_effort_range(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
     axes.set_ylabel(_effort_unit(info, joint), fontsize=SMALL)
 
 
-def quantiles(values: NDArray[Any], *at: float) -> NDArray[Any]:
+def quantiles(values: Rows, *at: float) -> Rows:
     """Return quantiles over the finite envs of ``values`` (ticks, envs), (len(at), ticks); NaN without finite envs."""
     finite = np.where(np.isfinite(values), values, np.nan)
     if not np.isnan(finite).any():  # nanquantile is many times slower
@@ -135,7 +135,7 @@ def quantiles(values: NDArray[Any], *at: float) -> NDArray[Any]:
         return np.nanquantile(finite, at, axis=1)
 
 
-def _joint_values(runs: Sequence[Rollout], name: str, joint: int) -> NDArray[Any]:
+def _joint_values(runs: Sequence[Rollout], name: str, joint: int) -> Rows:
     values = np.concatenate([getattr(run, name)[..., joint].ravel() for run in runs])
     return values[np.isfinite(values)]
 
@@ -144,7 +144,7 @@ def _effort_unit(info: RunInfo, joint: int) -> str:
     return OBSERVED["effort"].unit_for(info.units[joint])
 
 
-def _set_range(axes: Axes, values: NDArray[Any]) -> None:
+def _set_range(axes: Axes, values: Rows) -> None:
     if values.size:
         low, high = float(values.min()), float(values.max())
         margin = 0.08 * (high - low) or 0.05 * max(abs(high), 1e-3)

@@ -21,7 +21,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Array, Float64
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
@@ -196,7 +196,7 @@ def _blank_failed(rollout: Rollout) -> Rollout:
     return replace(rollout, setpoint=setpoint, observation=blank)
 
 
-def _like_setpoints(pose: Any, wxyz: Any) -> Any:
+def _like_setpoints(pose: Array, wxyz: Array) -> Any:
     """Return poses (..., 7) with the sign of the quaternion that is nearer to ``wxyz`` (..., 4)."""
     sign = np.where((pose[..., 3:] * wxyz).sum(-1, keepdims=True) < 0, -1.0, 1.0)
     return np.concatenate([pose[..., :3], sign * pose[..., 3:]], axis=-1)

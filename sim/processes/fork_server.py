@@ -31,8 +31,9 @@ import traceback
 from collections.abc import Sequence
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from batchpid.arrays.array_types import Document
 from batchpid.sim.processes.descriptors import is_open, standard_streams_occupied
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
@@ -275,7 +276,7 @@ def _serve_one(caller: socket.socket, children: dict[int, Connection]) -> bool:
     return True
 
 
-def _run_child(server: int, request: dict[str, Any], descriptors: list[int]) -> None:
+def _run_child(server: int, request: Document, descriptors: list[int]) -> None:
     """Take over the caller's settings, call the function, and end."""
     status = 1
     try:

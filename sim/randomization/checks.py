@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Rows
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN
@@ -94,7 +93,7 @@ def prepared_actuators(
         raise InvalidArgumentError(f"actuators.{bypassed[0]}", "has no effect on PhysX's drives", remedy=remedy)
     known = bp.Actuators() if actuators is None else actuators
     delay = 0.0 if known.max_delay is None else float(known.max_delay[0, 0])
-    values: dict[str, NDArray[Any]] = {}
+    values: dict[str, Rows] = {}
     for leaf, each in randomization.actuators.items():
         field = (FIELDS | TABLE)[choice("actuators", leaf, [*FIELDS, *TABLE])]
         nominal = getattr(known, leaf)

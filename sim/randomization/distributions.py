@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import choice, flag, number
 from batchpid.errors import InvalidArgumentError
 
@@ -55,7 +55,7 @@ class Distribution(ABC):
             return drawn + np.zeros_like(nominal)
         return nominal * drawn if self.operation == "scale" else nominal + drawn
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Document:
         """Return it as plain values: ``{"uniform": [low, high], "operation": "scale"}``."""
         values = [getattr(self, each.name) for each in fields(self) if not each.kw_only]
         options = [each for each in fields(self) if each.kw_only and getattr(self, each.name) != each.default]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.checks.validate import choice, integer, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
@@ -137,7 +137,7 @@ class Randomization:
 
     # -- draws -------------------------------------------------------------------------------------------------------
 
-    def draw(self, robot: Robot, episodes: NDArray[Any]) -> Draws:
+    def draw(self, robot: Robot, episodes: Rows) -> Draws:
         """Return the draws for envs with these streams and episodes (envs, 2)."""
         episodes = episodes.astype(np.int64)
         return Draws(episodes, {name: self._draw(name, each, robot, episodes) for name, each in self.given.items()})
@@ -242,7 +242,7 @@ class Randomization:
 
     # -- files -------------------------------------------------------------------------------------------------------
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Document:
         """Return the given fields as plain values, for :meth:`from_dict`."""
 
         def plain(each: Any) -> Any:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from batchpid.arrays.array_types import Document
 from batchpid.errors import MissingDependencyError
 from batchpid.sim.observation import Rollout
 from batchpid.sim.recording.recording_files import read_recording
@@ -35,7 +36,7 @@ def to_dataset(rollout: Rollout) -> xarray.Dataset:
     info, own, quantities = rollout.info, rollout.info.own_command, rollout.info.recorded
     columns = {name: ("joint",) if quantity.per_joint else () for name, quantity in quantities.items()}
     units = {name: quantity.unit for name, quantity in quantities.items()}
-    entries: dict[str, Any] = {}
+    entries: Document = {}
     if own is not None:
         columns["setpoint"], units["setpoint"] = ("entry",), "|".join(dict.fromkeys(own.units))
         entries = {

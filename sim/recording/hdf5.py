@@ -16,7 +16,8 @@ from collections.abc import Mapping, Sequence
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from batchpid.arrays.array_types import Rows
 
 SECONDS = 4.0
 """Time limit of the child, besides the time to read the file at :data:`SPEED`."""
@@ -37,7 +38,7 @@ READ_ATTEMPTS = 24
 
 def read_hdf5(
     path: str | os.PathLike[str], names: Sequence[str] | None, every: int, max_bytes: int
-) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
+) -> tuple[dict[str, Rows], dict[str, Rows]]:
     """Return the datasets ``names`` of a file, where it has them, and its attributes.
 
     Without ``names`` the file is read as a log: "time", and the columns of :data:`LOG_QUANTITIES`.
@@ -70,7 +71,7 @@ def read_hdf5(
     return arrays, {name: np.array(value, dtype) for name, (dtype, value) in head["attributes"].items()}
 
 
-def _receive(stream: IO[bytes], array: NDArray[Any]) -> bool:
+def _receive(stream: IO[bytes], array: Rows) -> bool:
     """Fill ``array`` from ``stream``; return whether the stream had so much."""
     return stream.readinto(array.reshape(-1).view(np.uint8)) == array.nbytes  # type: ignore[attr-defined]
 

@@ -8,10 +8,9 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from numpy.typing import NDArray
-
+from batchpid.arrays.array_types import Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.sim.observation import RunInfo
 from batchpid.sim.recording import recording_files as files
@@ -69,7 +68,7 @@ class PartialFile(SingleOwner):
                 partial.unlink(missing_ok=True)
             raise RecordingError(f"{partial}: cannot be made: {_cause(error)}") from error
 
-    def append(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+    def append(self, arrays: Mapping[str, Rows]) -> None:
         """Append rows, ticks first. Raises RecordingError if they cannot be written; the file is closed."""
         try:
             self._reserve(self._file.id.get_filesize(), sum(array.nbytes for array in arrays.values()))

@@ -21,11 +21,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import flag, instance, integer
 from batchpid.errors import BatchPIDError, ClosedError, InUseError, InvalidArgumentError
@@ -52,7 +52,7 @@ class _Row(NamedTuple):
     recorded: float
     """Time of the call [s]."""
     time: float
-    setpoint: NDArray[Any]
+    setpoint: Rows
     observation: Observation
 
 
@@ -138,7 +138,7 @@ class Recorder(SingleOwner):
             time.sleep(_RETRY)
         self._check()
 
-    def append(self, time_: float, setpoint: NDArray[Any], observation: Observation, has_rates: bool) -> None:
+    def append(self, time_: float, setpoint: Rows, observation: Observation, has_rates: bool) -> None:
         """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size), with rates or without.
 
         The runner calls it, and Ctrl-C waits until it has returned.

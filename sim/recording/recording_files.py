@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Document, Rows
 from batchpid.checks.validate import file_path, instance, integer
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import write_atomically
@@ -39,7 +40,7 @@ HDF5 = (".h5", ".hdf5")
 _DRAW = "draw."  # in front of the names of draws
 _COMMAND_NAMES, _COMMAND_UNITS = "command_names", "command_units"
 CHUNK_BYTES = 1 << 18  # approximate size of a chunk of an .h5 file
-DTYPES: dict[str, Any] = {"time": np.float64} | {name: quantity.dtype for name, quantity in RECORDED.items()}
+DTYPES: Document = {"time": np.float64} | {name: quantity.dtype for name, quantity in RECORDED.items()}
 """Dtype of each array of a recording."""
 
 
@@ -77,7 +78,7 @@ def write_recording(
 
     def write(file: Any) -> None:
         if h5py is None:
-            tables: dict[str, Any] = rollout.arrays() | _attributes(info, rollout.num_envs, rollout.tick)
+            tables: Document = rollout.arrays() | _attributes(info, rollout.num_envs, rollout.tick)
             np.savez_compressed(file, **tables)
             return
         whole = io.BytesIO()  # HDF5 can crash the process after a write that failed
@@ -200,7 +201,7 @@ def create_datasets(file: h5py.File, info: RunInfo, num_envs: int, tick: float) 
     return datasets
 
 
-def append_rows(datasets: Mapping[str, h5py.Dataset], arrays: Mapping[str, NDArray[Any]]) -> None:
+def append_rows(datasets: Mapping[str, h5py.Dataset], arrays: Mapping[str, Rows]) -> None:
     """Append ``arrays``, ticks first, to the datasets of their names; their checksums, which readers count, last."""
     arrays = {name: np.ascontiguousarray(arrays[name], dtype) for name, dtype in DTYPES.items() if name in datasets}
     for name, rows in (arrays | {"checksum": row_checksums(arrays)}).items():
@@ -211,7 +212,7 @@ def append_rows(datasets: Mapping[str, h5py.Dataset], arrays: Mapping[str, NDArr
         dataset.flush()
 
 
-def row_checksums(arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
+def row_checksums(arrays: Mapping[str, Rows]) -> NDArray[np.int64]:
     """Return the CRC-32 of each tick's rows of all ``arrays``, (ticks,)."""
     sums = np.zeros(len(arrays["time"]), np.int64)
     for tick, rows in enumerate(zip(*map(np.ascontiguousarray, arrays.values()), strict=True)):
@@ -236,7 +237,7 @@ def redraws_text(redraws: Iterable[Redraw]) -> str:
     return json.dumps([list(redraw) for redraw in redraws])
 
 
-def _attributes(info: RunInfo, num_envs: int, tick: float) -> dict[str, Any]:
+def _attributes(info: RunInfo, num_envs: int, tick: float) -> Document:
     """Return the known fields of ``info`` as numbers, texts, and arrays of them."""
     known = {name: value for name, value in vars(info).items() if value is not None and name != "description"}
     known |= {name: list(value) for name, value in known.items() if isinstance(value, tuple)}
@@ -299,13 +300,13 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
     )
 
 
-def _numbers(value: NDArray[Any]) -> NDArray[Any]:
+def _numbers(value: Rows) -> Rows:
     if value.dtype.kind not in "iuf":
         raise ValueError(f"it has {value.dtype} in place of numbers")
     return value
 
 
-def _check(arrays: Mapping[str, NDArray[Any]], tick: float, info: RunInfo) -> None:
+def _check(arrays: Mapping[str, Rows], tick: float, info: RunInfo) -> None:
     """Check that shapes agree and times are numbers."""
     ticks, dof = len(arrays["time"]), len(info.joint_names)
     envs = arrays["ok"].shape[-1] if arrays["ok"].ndim else 0

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from lxml import etree
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.arrays.digest import digest
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import RobotError
@@ -117,7 +117,7 @@ def mesh_vertices(filename: str) -> Float64:
     return read_only(vertices_in_file(model, graph[2 + count : 2 + 2 * count]))
 
 
-def vertices_in_file(model: Any, indices: Any) -> Float64:
+def vertices_in_file(model: MjModel, indices: Any) -> Float64:
     """Return vertices of the only mesh of a model in the frame of its file; MuJoCo's are in principal axes."""
     import mujoco
 

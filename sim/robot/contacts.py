@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from itertools import combinations
 from threading import RLock
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.sim.robot.collision_shapes import LinkShape, add_geom
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
@@ -84,7 +84,7 @@ class Contacts:
         self._pairs = np.array(pairs, np.intp).reshape(-1, 2)
         self._grounded = np.flatnonzero(self._body >= 0) if ground else np.empty(0, np.intp)
 
-    def near(self, qpos: NDArray[Any], within: float = NEAR) -> Iterator[Near]:
+    def near(self, qpos: Rows, within: float = NEAR) -> Iterator[Near]:
         """Yield the pairs of shapes that are closer than ``within`` [m], at one pose (dof,)."""
         apart, heights = self._apart(qpos, max(within, NEAR))
         owners = [shape.owner for shape in self._shapes]
@@ -104,7 +104,7 @@ class Contacts:
         centers = np.einsum("sij,sj->si", frames[:, :, :3], self._place) + frames[:, :, 3]
         return self._body, np.column_stack([centers, self._model.geom_rbound[: len(centers)]])
 
-    def least_distances(self, qpos: NDArray[Any]) -> dict[tuple[int, int], float]:
+    def least_distances(self, qpos: Rows) -> dict[tuple[int, int], float]:
         """Return a lower bound of the distance [m] of each pair of bodies that may touch, at one pose (dof,).
 
         It is exact where the bodies are near each other. The ground counts as the base, body -1.
@@ -119,7 +119,7 @@ class Contacts:
             found[first, second] = min(distance, found.get((first, second), np.inf))
         return found
 
-    def _apart(self, qpos: NDArray[Any], within: float) -> tuple[Float64, Float64]:
+    def _apart(self, qpos: Rows, within: float) -> tuple[Float64, Float64]:
         """Return lower bounds of the distances of the pairs (pairs,) [m], exact below ``within``, and the heights of
         the lowest points of the shapes that may touch the ground.
         """
@@ -132,23 +132,23 @@ class Contacts:
                 apart[row] = mujoco.mj_geomDistance(self._model, self._data, a, b, within, None)
             return apart, np.array([self._lowest(index) for index in self._grounded.tolist()])
 
-    def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> NDArray[np.bool_]:
+    def in_contact(self, qpos: Rows, clearance: float = 0.0) -> NDArray[np.bool_]:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,)."""
         return np.array([any(True for _ in self.near(row, clearance)) for row in np.asarray(qpos)])
 
-    def nearest_links(self, qpos: NDArray[Any]) -> tuple[str, ...]:
+    def nearest_links(self, qpos: Rows) -> tuple[str, ...]:
         """Return the two links nearest to each other; one if the other is the ground, none if none are near."""
         nearest = min(self.near(qpos), key=lambda each: each.distance, default=Near("", "", np.inf))
         return tuple(name for name in nearest[:2] if name)
 
-    def height(self, qpos: NDArray[Any], base_too: bool = False) -> float:
+    def height(self, qpos: Rows, base_too: bool = False) -> float:
         """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes."""
         with self._lock:
             self._move(qpos)
             of = range(len(self._shapes)) if base_too else np.flatnonzero(self._body >= 0).tolist()
             return min((self._lowest(index) for index in of), default=np.inf)
 
-    def feet(self, qpos: NDArray[Any], within: float = 0.01) -> list[tuple[str, Float64]]:
+    def feet(self, qpos: Rows, within: float = 0.01) -> list[tuple[str, Float64]]:
         """Return the links on which the robot stands at a pose (dof,), each with the point (3,) [m] that touches.
 
         It belongs to a shape whose lowest point is at most ``within`` [m] above that of the robot.
@@ -159,7 +159,7 @@ class Contacts:
             lowest = np.flatnonzero(heights <= heights.min(initial=np.inf) + within).tolist()
             return [(self.links[self._link[at]], np.array([*centers[at, :2], heights[at]])) for at in lowest]
 
-    def _move(self, qpos: NDArray[Any]) -> Float64:
+    def _move(self, qpos: Rows) -> Float64:
         """Place the shapes; return their centers (shapes, 3)."""
         if not self._shapes:
             return np.zeros((0, 3))

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import batchpid as bp
-from batchpid.arrays.array_types import Bool, Float64
+from batchpid.arrays.array_types import Bool, Document, Float64, Rows
 from batchpid.arrays.digest import digest
 from batchpid.arrays.display import html_table
 from batchpid.arrays.read_only import read_only
@@ -43,22 +43,22 @@ LIMIT_TOLERANCE = 1e-6  # rad or m
 class Dynamics(Protocol):
     """Dynamics and contacts of one robot at given poses (n, dof)."""
 
-    def mass_matrix(self, qpos: NDArray[Any]) -> Float64:
+    def mass_matrix(self, qpos: Rows) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
 
-    def inverse_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], qacc: NDArray[Any]) -> Float64:
+    def inverse_dynamics(self, qpos: Rows, qvel: Rows, qacc: Rows) -> Float64:
         """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
 
-    def forward_dynamics(self, qpos: NDArray[Any], qvel: NDArray[Any], effort: NDArray[Any]) -> Float64:
+    def forward_dynamics(self, qpos: Rows, qvel: Rows, effort: Rows) -> Float64:
         """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort``, gravity included."""
 
-    def standing_inertia(self, qpos: NDArray[Any]) -> Float64:
+    def standing_inertia(self, qpos: Rows) -> Float64:
         """Return the inertia (dof,) that each joint moves at one pose (dof,) if the base floats and its feet stand."""
 
-    def in_contact(self, qpos: NDArray[Any], clearance: float = 0.0) -> Bool:
+    def in_contact(self, qpos: Rows, clearance: float = 0.0) -> Bool:
         """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,)."""
 
-    def near(self, qpos: NDArray[Any], within: float) -> list[Near]:
+    def near(self, qpos: Rows, within: float) -> list[Near]:
         """Return the pairs of shapes closer than ``within`` [m] to each other or to the ground, at one pose (dof,)."""
 
 
@@ -227,7 +227,7 @@ class RobotDescription(Urdf):
         InvalidArgumentError
             The robot has no gains and ``options`` has no ``kp``.
         """
-        known: dict[str, Any] = {"joint_names": self.joint_names, "anti_windup": "conditional"}
+        known: Document = {"joint_names": self.joint_names, "anti_windup": "conditional"}
         if self.continuous.any():
             known["continuous"] = self.continuous
         if not {"effort_min", "effort_max"} & set(options):
@@ -306,7 +306,7 @@ class RobotDescription(Urdf):
         """True if scenes have a ground by default; False if a fixed base is so low that links start in it."""
         return not self.self_contact.reaches_ground
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Document:
         """Return a description of the simulated robot as plain values, equal for robots of equal content.
 
         The repaired URDF with its collision meshes, the .srdf, and the settings of a bundled robot are given by their

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Rows
 from batchpid.checks.warn import warn
 from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 
@@ -33,7 +34,7 @@ class SetpointCheck:
         self._low, self._high = robot.lower - LIMIT_TOLERANCE, robot.upper + LIMIT_TOLERANCE
         self._warned: set[tuple[str, int]] = set()
 
-    def check(self, argument: str, positions: NDArray[Any], envs: NDArray[np.bool_] | None = None) -> None:
+    def check(self, argument: str, positions: Rows, envs: NDArray[np.bool_] | None = None) -> None:
         """Warn of finite ``positions`` (..., envs, dof) [rad or m] outside the limits.
 
         One warning names all joints, each with its worst position and its envs; ``envs`` (envs,) masks those to check.
@@ -58,7 +59,7 @@ class SetpointCheck:
             SetpointWarning,
         )
 
-    def _describe(self, index: int, positions: NDArray[Any], outside: NDArray[np.bool_]) -> str:
+    def _describe(self, index: int, positions: Rows, outside: NDArray[np.bool_]) -> str:
         """Return joint, limits, worst position and envs of ``positions`` (..., envs), of which some are outside."""
         joint = self._robot.joints[index]
         beyond = np.where(outside, np.maximum(joint.lower - positions, positions - joint.upper), 0.0)

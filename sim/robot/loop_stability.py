@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.arrays.choices import PerInertia, PerMassMatrix
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
@@ -101,7 +101,7 @@ def gains_at(
     """
     params, motors, independent = as_explicit(params, timestep), actuators or bp.Actuators(), robot.coupling.independent
 
-    def column(leaf: Any, neutral: float = 0.0) -> Float64:
+    def column(leaf: Array, neutral: float = 0.0) -> Float64:
         rows = np.full((1, robot.dof), neutral) if leaf is None else np.asarray(leaf, np.float64)
         return np.broadcast_to(rows, (len(rows), robot.dof))
 
@@ -258,7 +258,7 @@ class StabilityCheck:
         return stability_report(self._robot, params, self._robot.start, self._timestep, actuators=actuators)
 
 
-def _extreme(record: Any, ends: dict[str, Any]) -> Any:
+def _extreme(record: Any, ends: Document) -> Any:
     """Return params or actuators of one env with the end of the range of all envs that is the least stable."""
     leaves = {name: getattr(record, name) for name in ends}
     found = {name: ends[name](leaf, 0, keepdims=True) for name, leaf in leaves.items() if leaf is not None}

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 import batchpid as bp
 from batchpid import assets
+from batchpid.arrays.array_types import Document
 from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.read_only import read_only
 from batchpid.checks.keywords import check_keywords
@@ -212,7 +213,7 @@ class Robot(RobotDescription):
         """
         chosen = ("mass_matrix" if self.fixed_base else "effort") if gain_units is None else gain_units
         gain_units = choice("gain_units", chosen, CHOICES["gain_units"])
-        options: dict[str, Any] = {"gain_units": gain_units, "measurement_rate": "measured"}
+        options: Document = {"gain_units": gain_units, "measurement_rate": "measured"}
         if gain_units == "effort" and not self.fixed_base:
             return bp.design_gains(self, STANDING_HZ, load=self.dynamics().standing_inertia(self.start), **options)
         if gain_units != "mass_matrix":
@@ -283,7 +284,7 @@ class Robot(RobotDescription):
                 f"{self.name!r} has no servos of an MJCF file (<position>, <pid>, or <general> with an affine bias)"
             )
             raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
-        options: dict[str, Any] = {"ki": 0.0}
+        options: Document = {"ki": 0.0}
         if defaults.ki is not None and defaults.imax is not None and defaults.ki.any():
             limit = np.where(defaults.ki > 0, defaults.ki, 1.0) * defaults.imax
             options = {"ki": defaults.ki, "anti_windup": "none", "integral_limit": limit}
@@ -318,10 +319,10 @@ def _file_defaults(mjcf: Mjcf, joints: tuple[Joint, ...]) -> FileDefaults:
 def _file_actuators(mjcf: Mjcf, joints: tuple[Joint, ...]) -> bp.Actuators | None:
     """Return the motors of an MJCF file; None if they are ideal."""
     effects = {"armature": 0.0, "saturation_effort": np.inf, "no_load_speed": np.inf, "lag": 0.0}
-    columns: dict[str, Any] = {
+    columns: Document = {
         name: [getattr(mjcf.motors, name).get(joint.name, off) for joint in joints] for name, off in effects.items()
     }
-    found: dict[str, Any] = {
+    found: Document = {
         name: column for name, column in columns.items() if any(each != effects[name] for each in column)
     }
     return bp.make_actuators(len(joints), **found) if found else None

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Bool, Float64
+from batchpid.arrays.array_types import Array, Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 from batchpid.gains.stability import Oscillation
@@ -676,7 +676,7 @@ class _Run:
         return float(self.rollout.time[min(first, len(moving) - 1)])
 
 
-def _row(leaf: Any, env: int) -> Float64:
+def _row(leaf: Array, env: int) -> Float64:
     """Return one env's row of a leaf of params (1 or envs, 1 or dof)."""
     rows = np.atleast_2d(np.asarray(leaf, np.float64))
     return rows[env if len(rows) > 1 else 0]

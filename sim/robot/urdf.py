@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from lxml import etree
 
+from batchpid.arrays.array_types import Document
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding, refuse
 from batchpid.sim.robot.inertia import from_entries, triangle_excess
@@ -115,7 +115,7 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
     if not parent or not child:
         raise RobotError(f"{where}: needs <parent link=...> and <child link=...>; add them")
     axis, limit, dynamics, mimic = map(element.find, ("axis", "limit", "dynamics", "mimic"))
-    fields: dict[str, Any] = _origin(element, where)
+    fields: Document = _origin(element, where)
     if axis is not None:
         fields["axis"] = numbers(axis, "xyz", "1 0 0", where)
     if limit is not None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Array, Float64
 from batchpid.task_space import native_law
 from batchpid.task_space.osc_coefficients import OSCCoefficients
 
@@ -31,7 +31,7 @@ class BoundOSC:
     def __init__(
         self,
         k: OSCCoefficients,
-        tool: tuple[Any, ...],
+        tool: tuple[Array, ...],
         parts: Mapping[str, slice],
         columns: NDArray[np.intp],
         damping: Float64 | None,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid.task_space as ts
+from batchpid.arrays.array_types import Array
 from batchpid.arrays.display import summary
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.leaves import frozen
@@ -39,8 +40,8 @@ OPTIONAL = {
 class Friction(NamedTuple):
     """Known Coulomb friction of the joints, and the band of small errors in which it is reduced (1, dof)."""
 
-    coulomb: Any
-    band: Any
+    coulomb: Array
+    band: Array
 
 
 class OperationalSpace:
@@ -184,7 +185,9 @@ class OperationalSpace:
             raise InvalidArgumentError("control", problem, remedy="make it for the robot of the runner")
         return ts.init(self._params, np.repeat(self._posture, num_envs, axis=0))
 
-    def __call__(self, state: ts.OSCState, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> tuple[Any, Any]:
+    def __call__(
+        self, state: ts.OSCState, setpoint: Array, qpos: Array, qvel: Array, passive: Array
+    ) -> tuple[Array, Array]:
         """Return the state and the efforts (envs, dof) [N m or N]."""
         return self._advance(state, setpoint, qpos, qvel, passive)[:2]
 
@@ -196,7 +199,9 @@ class OperationalSpace:
         """
         return self._advance if type(self).__call__ is OperationalSpace.__call__ else None
 
-    def _advance(self, state: ts.OSCState, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> tuple[Any, Any, Any]:
+    def _advance(
+        self, state: ts.OSCState, setpoint: Array, qpos: Array, qvel: Array, passive: Array
+    ) -> tuple[Array, Array, Array]:
         xp = namespace(setpoint, qpos)
         aimed = state
         if self._columns.any():
@@ -219,7 +224,7 @@ class OperationalSpace:
         """Whether native code has this law; a subclass may change it."""
         return type(self) is OperationalSpace
 
-    def bound(self, qpos: Any, qvel: Any, passive: Any) -> BoundOSC | None:
+    def bound(self, qpos: Array, qvel: Array, passive: Array) -> BoundOSC | None:
         """Return this controller as a native call on these arrays (envs, dof); None where it must run in Python."""
         if not self.is_native or native_rows.in_use() is None:
             return None
@@ -227,11 +232,13 @@ class OperationalSpace:
         given = self._parts, self._columns, self._damping, self._friction, self._timestep
         return BoundOSC(self._k, tool, *given, (qpos, qvel, passive))
 
-    def _coefficients(self, setpoint: Any) -> ts.OSCCoefficients:
+    def _coefficients(self, setpoint: Array) -> ts.OSCCoefficients:
         """Return the coefficients of the law for setpoints (envs, size)."""
         return self._k
 
-    def _friction_to(self, setpoint: Any, twist: Any, posture: Any, qpos: Any, dynamics: ts.TaskDynamics) -> Any:
+    def _friction_to(
+        self, setpoint: Array, twist: Array, posture: Array, qpos: Array, dynamics: ts.TaskDynamics
+    ) -> Array:
         """Return the friction (envs, dof) on the way to the setpoint; joints outside the chain go to ``posture``."""
         assert self._friction is not None
         arrays = {"pose": dynamics.pose, "jacobian": dynamics.jacobian, "chain": dynamics.chain}
@@ -271,7 +278,7 @@ class OperationalSpace:
                     StabilityWarning,
                 )
 
-    def tool_pose(self, qpos: Any) -> NDArray[np.float32]:
+    def tool_pose(self, qpos: Array) -> NDArray[np.float32]:
         """Return the poses of the tool (..., 7) at ``qpos`` (..., dof)."""
         return tool_pose(self.tree, self.link, self.point, qpos)
 
@@ -281,7 +288,7 @@ def default_tool(robot: Robot) -> str:
     return robot.rigid_tree.tool
 
 
-def tool_pose(tree: ts.RigidTree, link: str, point: Any, qpos: Any) -> NDArray[np.float32]:
+def tool_pose(tree: ts.RigidTree, link: str, point: Array, qpos: Array) -> NDArray[np.float32]:
     """Return the poses of a tool (..., 7) at ``qpos`` (..., dof), as they are observed."""
     return ts.link_poses(tree, qpos, [link], point=point)[..., 0, :].astype(np.float32)
 

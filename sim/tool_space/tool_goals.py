@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Array, Float64
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
@@ -42,7 +40,7 @@ def reaches(robot: Robot, control: OperationalSpace, start: Float64, goal: Float
         qvel = qvel + TIMESTEP * ts.forward_dynamics(tree, qpos, qvel, terms.effort)
         qpos = qpos + TIMESTEP * qvel
         inside &= ((qpos >= robot.lower - SLACK) & (qpos <= robot.upper + SLACK)).all(1)
-    left: Any = np.abs(pose_error(goal, ts.link_poses(tree, qpos, [tool.link], point=tool.point)[:, 0])).max(1)
+    left: Array = np.abs(pose_error(goal, ts.link_poses(tree, qpos, [tool.link], point=tool.point)[:, 0])).max(1)
     reached: NDArray[np.bool_] = inside & (left <= ARRIVED)
     return reached
 

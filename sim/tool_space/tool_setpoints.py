@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Array, Float64
 from batchpid.arrays.read_only import read_only
 from batchpid.checks.validate import array, entries, read_array
 from batchpid.checks.warn import warn
@@ -61,11 +59,11 @@ class ToolSetpoints:
                 remedy = "use control 'osc', or setpoint_space 'joints'"
                 raise InvalidArgumentError("setpoint_space", problem, joint=joint.name, remedy=remedy)
 
-    def tool_pose(self, qpos: Any) -> NDArray[np.float32]:
+    def tool_pose(self, qpos: Array) -> NDArray[np.float32]:
         """Return the poses of the link (..., 7) at ``qpos`` (..., dof)."""
         return tool_pose(self._tree, self.link, None, qpos)
 
-    def joints(self, name: str, setpoint: Any, last: Float64, finite: bool, ticks: int | None) -> Float64:
+    def joints(self, name: str, setpoint: Array, last: Float64, finite: bool, ticks: int | None) -> Float64:
         """Return joint setpoints (envs, dof), or (ticks, envs, dof), for poses after ``last`` (envs, dof).
 
         Setpoints have 7 entries, or all entries of :attr:`command`; with 7 the other joints keep their setpoint. A
@@ -103,7 +101,7 @@ class ToolSetpoints:
             last = np.where(good[:, None], found[tick], last)
         return read_only(found.reshape(*lead, -1))
 
-    def rates(self, name: str, twist: Any, qpos: Float64, finite: bool) -> Float64:
+    def rates(self, name: str, twist: Array, qpos: Float64, finite: bool) -> Float64:
         """Return the joint rates (..., envs, dof) at setpoints ``qpos`` (..., envs, dof) for twists of the tool.
 
         A twist has 6 entries, in the world [m/s, rad/s], and may go on with the rates of the joints outside the chain.
@@ -125,7 +123,7 @@ class ToolSetpoints:
         found[..., self._others[: len(names) - 6]] = rows[..., 6:]
         return read_only(found)
 
-    def _warn(self, name: str, failed: Any, found: ts.IKResult) -> None:
+    def _warn(self, name: str, failed: Array, found: ts.IKResult) -> None:
         """Warn of the first env whose pose was not reached, once."""
         if not len(failed) or self._has_warned:
             return

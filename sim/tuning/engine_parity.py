@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -155,7 +154,7 @@ def _dynamics(robot: Robot, seed: int) -> float:
     forces = []
     for name in ENGINES:
         engine = load_engine(name)
-        options: dict[str, Any] = {"ground": False, "merge_fixed": robot.merge_fixed, "engine": name}
+        options: Document = {"ground": False, "merge_fixed": robot.merge_fixed, "engine": name}
         spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, engine.physics["fast"], **options)
         pack = engine.make_pack(spec, 1)
         found = []
@@ -167,7 +166,7 @@ def _dynamics(robot: Robot, seed: int) -> float:
     return _relative(*forces)
 
 
-def _relative(reference: NDArray[Any], other: NDArray[Any]) -> float:
+def _relative(reference: Rows, other: Rows) -> float:
     return float(np.abs(reference - other).max() / max(np.abs(reference).max(), 1e-300))
 
 
@@ -186,7 +185,7 @@ def _open_loop(
     efforts = (robot.dynamics().mass_matrix(start) @ wave[..., None])[..., 0]
     runs = []
     for engine, qpos in ((ENGINES[0], start), (ENGINES[1], start), (ENGINES[0], _next_float32(start))):
-        options: dict[str, Any] = {"engine": engine, "control": "effort", "substeps": SUBSTEPS, "compensate": "gravity"}
+        options: Document = {"engine": engine, "control": "effort", "substeps": SUBSTEPS, "compensate": "gravity"}
         options["workers"] = workers
         options |= {"collisions": False} if robot.fixed_base else {"ground": False}
         with Runner(robot, len(start), **options) as runner, warnings.catch_warnings():
@@ -218,7 +217,7 @@ def _push(robot: Robot, params: bp.PIDParams | None, seed: int, workers: int | N
         return None
     ends = []
     for engine in ENGINES:
-        options: dict[str, Any] = {"engine": engine, "ground": True, "workers": workers}
+        options: Document = {"engine": engine, "ground": True, "workers": workers}
         with Runner(robot, len(low), params=_params(robot, params), **options) as runner:
             runner.reset()
             ticks = round(PUSH_SECONDS / (runner.timestep * runner.substeps))

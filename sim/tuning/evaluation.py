@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
@@ -107,9 +107,7 @@ class Evaluation(NamedTuple):
         return int(late.sum()), int((excess > 1).sum()), max(1.0, float(excess.max(initial=0.0)))
 
 
-def step_response_metrics(
-    robot: Robot, rollout: Rollout, start: NDArray[Any], *, with_effort: bool = True
-) -> StepMetrics:
+def step_response_metrics(robot: Robot, rollout: Rollout, start: Rows, *, with_effort: bool = True) -> StepMetrics:
     """Return the metrics of a rollout from rest at ``start`` (envs, dof); inf for envs that diverged.
 
     Followers have the metrics of their leaders. Without ``with_effort`` the metrics of efforts are undefined (NaN), as

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Document
 from batchpid.arrays.digest import digest
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
@@ -71,7 +72,7 @@ def other_inputs(kind: str, theirs: Mapping[str, Any], ours: Mapping[str, Any]) 
     return f"is of another {kind} ({', '.join(sorted(different))} differ)" if different else None
 
 
-def plain_options(options: Mapping[str, Any], resumes: bool) -> dict[str, Any]:
+def plain_options(options: Mapping[str, Any], resumes: bool) -> Document:
     """Return options of the runner as plain values, and the versions of the packages that they use.
 
     Raises InvalidArgumentError for a function if the search ``resumes`` from a history.

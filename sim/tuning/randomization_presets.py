@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 import batchpid as bp
 import batchpid.task_space as ts
+from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import file_path, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
@@ -27,7 +27,7 @@ PAYLOAD_SHARE = 0.5
 """Share that a payload may take of the effort that the robot's own weight leaves."""
 PAYLOAD = 0.5
 """Largest payload of the presets [kg]; less where the robot cannot carry it."""
-PRESETS: dict[str, dict[str, Any]] = {
+PRESETS: dict[str, Document] = {
     "payload": {},
     "model": {
         "link_mass": Uniform(0.9, 1.1, operation="scale"),

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from lxml import etree
 
+from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import integer, number
 from batchpid.errors import BatchPIDError, InvalidArgumentError, RobotError
 from batchpid.sim.processes.fork_server import ONE_THREAD
@@ -77,7 +78,7 @@ class RobotReport:
     seconds: float = 0.0
     error: str | None = None
 
-    def asdict(self) -> dict[str, Any]:
+    def asdict(self) -> Document:
         """Return the fields as JSON takes them."""
         return asdict(self) | {"findings": list(self.findings)}
 
@@ -196,7 +197,7 @@ def survey(
 
 def _in_a_process(
     urdf: Path,
-    options: dict[str, Any],
+    options: Document,
     time_limit: float,
     running: set[subprocess.Popen[str]],
     stop: threading.Event,
@@ -271,8 +272,8 @@ def _stages(
     bandwidth_hz: float,
     engine: str,
     physics: str,
-    loading: dict[str, Any],
-) -> Iterator[tuple[str, dict[str, Any]]]:
+    loading: Document,
+) -> Iterator[tuple[str, Document]]:
     """Yield each stage of the survey as it begins, with the fields of the report that the one before found."""
     import batchpid as bp
     from batchpid.sim.robot.robot import Robot
@@ -289,7 +290,7 @@ def _stages(
     drawn = random_moves(robot, moves, seed)
     yield STAGES[4], {"moves": len(drawn.start)}
     params = bp.design_gains(robot, bandwidth_hz, gain_units="mass_matrix")
-    options: dict[str, Any] = {"engine": engine, "physics": physics, "workers": 0}
+    options: Document = {"engine": engine, "physics": physics, "workers": 0}
     metrics = evaluate_gains(robot, params, drawn, seconds=seconds, **options).metrics
     error = np.nan_to_num(metrics.steady_state_error, nan=0.0, posinf=np.inf)
     done = ((error <= MAX_ERROR) & ~np.isinf(metrics.settling_time)).all(1)

@@ -30,7 +30,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64
 from batchpid.arrays.digest import digest
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
@@ -72,7 +72,7 @@ class Tuning(NamedTuple):
     start_cost: float
     history: tuple[tuple[float, ...], ...]
     """Costs of every candidate of every generation."""
-    settings: dict[str, Any]
+    settings: Document
     """Seed, moves, options and versions, for the record."""
     rejected: str | None = None
     """Criterion by which the designed gains beat all candidates, with both figures; None if a candidate was best."""
@@ -156,7 +156,7 @@ def tune(
     own = final is not None and robot.fixed_base and runner_options.get("build") is None
     # Physics "free", with one iteration, is enough if the loop computes friction, and not the solver.
     is_free = own and DISSIPATION[robot.dissipation].modelled and runner_options.get("control", "pid") != "drive"
-    settings: dict[str, Any] = {
+    settings: Document = {
         **robot.describe(),
         "seed": seed,
         "population": population,
@@ -185,7 +185,7 @@ def tune(
         delay = loop_delay(robot, randomization, dt + float(np.max(start.derivative_filter_time)), motors)
         firsts += [*search.points(first_gains(delay))][: population - 1]
     where = {"workers": workers, "cluster": cluster, "randomization": reseeded(randomization, seed)}
-    options: dict[str, Any] = {"params": start, "substeps": SUBSTEPS, **where} | runner_options
+    options: Document = {"params": start, "substeps": SUBSTEPS, **where} | runner_options
     search_options = options | {"ground": None, **SEARCH_PHYSICS} if is_free else options
     with Runner(robot, population * search.envs, **search_options | search.drawn(motors, population)) as runner:
         points, costs = evolve(

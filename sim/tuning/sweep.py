@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.digest import digest
 from batchpid.checks.validate import array, file_path, integer, read_array
 from batchpid.checks.warn import warn
@@ -95,7 +96,7 @@ def sweep(
     num_envs = integer("num_envs", num_envs, 1, 1_000_000)
     first = integer("first_env", options.get("first_env", 0), 0, 10**9)
     numbers = first + np.arange(num_envs)
-    given: dict[str, Any] = {"params": params, "qpos": qpos, "qvel": qvel, "seed": seed, **options}
+    given: Document = {"params": params, "qpos": qpos, "qvel": qvel, "seed": seed, **options}
     given |= {name: given[name](numbers) for name in PER_ENV if callable(given.get(name))}
     gains, *start, streams = (given.pop(name) for name in PER_ENV[:4])
     checked = RunnerOptions(robot, num_envs, **given)
@@ -161,7 +162,7 @@ def _warn(kind: type[Warning], events: Sequence[Any], envs: slice) -> None:
         warn(text, kind)
 
 
-def _ticks(name: str, value: ArrayLike | None, num_envs: int) -> NDArray[Any] | None:
+def _ticks(name: str, value: ArrayLike | None, num_envs: int) -> Rows | None:
     """Return a command (ticks, envs, size), or (ticks, 1, size) for all envs."""
     if value is None:
         return None
@@ -211,7 +212,7 @@ def _joined(parts: Sequence[Rollout], params: bp.PIDParams, actuators: bp.Actuat
         every = [each._replace(env=offset + each.env) for offset, info in pairs for each in getattr(info, name)]
         return tuple(sorted(every, key=lambda each: (each.time, each.env)))
 
-    whole: dict[str, Any] = {"params": params, "actuators": actuators}
+    whole: Document = {"params": params, "actuators": actuators}
     whole |= {name: events(name) for name in ("faults", "redraws")}
     whole["start"] = np.concatenate([info.start for info in infos if info.start is not None])
     if infos[0].draws is not None:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.arrays.elementwise import namespace
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
@@ -52,7 +52,7 @@ SIZE = 0.5
 _ROUNDS = 4
 
 
-def osc_options(gains: Float64) -> dict[str, Any]:
+def osc_options(gains: Float64) -> Document:
     """Return the options of :func:`batchpid.task_space.make_osc_params` for GAINS (5,)."""
     position, rotation, posture, *ratios = gains.tolist()
     return {
@@ -73,7 +73,7 @@ class SearchedSpace(OperationalSpace):
         neutral = (*np.array(self.command.neutral).tolist(), *values)
         self.command = CommandSpec(names, (*self.command.units, *units), neutral=neutral)
 
-    def _coefficients(self, setpoint: Any) -> ts.OSCCoefficients:
+    def _coefficients(self, setpoint: Array) -> ts.OSCCoefficients:
         """Return the coefficients of each env (envs, 6 | dof)."""
         xp = namespace(setpoint)
         position, rotation, posture, *ratios = (setpoint[:, 7 + k : 8 + k] for k in range(len(GAINS)))

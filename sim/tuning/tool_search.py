@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from batchpid.arrays.array_types import Document
 from batchpid.arrays.digest import digest
 from batchpid.metrics import StepMetrics
 from batchpid.sim.robot.findings import Findings
@@ -38,13 +39,13 @@ _FINAL_SEED = 1_000_003
 class ToolTuning(NamedTuple):
     """Result of a search."""
 
-    options: dict[str, Any]
+    options: Document
     """Options of :func:`batchpid.task_space.make_osc_params`; the defaults if they were better."""
     costs: tuple[float, float]
     """Costs in the final round: of the default gains, and of the result."""
     metrics: tuple[StepMetrics, StepMetrics]
     """Metrics of the six axes on the moves of the final round (moves, 6): of the default gains, and of the result."""
-    settings: dict[str, Any]
+    settings: Document
     """Seed, moves, options and versions, for the record."""
     findings: Findings
     """Causes for which moves of the final round do not settle under the result."""
@@ -91,7 +92,7 @@ def tune_tool(
     moves, unseen = (tool_moves(robot, full, *each) for each in ((MOVES, seed), (FINAL_MOVES, seed + _FINAL_SEED)))
     search = ToolCandidates(robot, limited, moves, seconds, weights)
     judge = ToolCandidates(robot, full, unseen, seconds, weights)
-    settings: dict[str, Any] = {
+    settings: Document = {
         **robot.describe(),
         "robot_actuators": None if robot.actuators is None else digest(robot.actuators),
         "tool": tool,
@@ -103,7 +104,7 @@ def tune_tool(
         "headroom": HEADROOM,
         **plain_options(runner_options, history is not None),
     }
-    options: dict[str, Any] = {"substeps": SUBSTEPS, "workers": workers, **runner_options}
+    options: Document = {"substeps": SUBSTEPS, "workers": workers, **runner_options}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StabilityWarning)
         warnings.simplefilter("ignore", MissedContactWarning)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64
 from batchpid.sim.robot.loop_stability import StabilityReport, stability_report
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
@@ -57,7 +57,7 @@ def within(
     """
     draws, count = motors.num_envs, len(moves.start)
     every = moves.take(np.tile(np.arange(count), draws))
-    known: dict[str, Any] = {
+    known: Document = {
         "substeps": SUBSTEPS,
         "params": params,
         "actuators": motors.for_envs(np.repeat(np.arange(draws), count)),

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Document
 from batchpid.sim.view.data import ViewData
 from batchpid.sim.view.playback import HISTORY_SECONDS
 
@@ -28,7 +29,7 @@ class Charts:
         self._data = data
         names = data.groups if len(data.groups) > 1 else ("",)
 
-        def chart(title: str, *series: dict[str, Any]) -> Any:
+        def chart(title: str, *series: Document) -> Any:
             return gui.add_uplot(
                 (np.array([-HISTORY_SECONDS, 0.0]), *[np.zeros(2)] * len(series)),  # flat until the first update
                 ({"label": "s"}, *series),
@@ -40,7 +41,7 @@ class Charts:
                 padding=(4, 14, 0, 0),
             )
 
-        def curves(quantity: str) -> list[dict[str, Any]]:
+        def curves(quantity: str) -> list[Document]:
             return [
                 {"label": f"{quantity} {name}".strip(), "stroke": colour, "width": 2}
                 for name, colour in zip(names, _COLOURS, strict=False)

@@ -25,6 +25,7 @@ import websockets.asyncio.server as websocket_server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from batchpid.arrays.array_types import Document
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 from batchpid.sim.view.address import listen
 from batchpid.sim.view.messages import MAX_BYTES, check_message
@@ -157,7 +158,7 @@ class Gate:
             response.headers["Referrer-Policy"] = "no-referrer"  # the address holds the token
         return response
 
-    def _report(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    def _report(self, loop: asyncio.AbstractEventLoop, context: Document) -> None:
         """Report a value that viser cannot convert; viser raises in a task that nobody awaits."""
         error = context.get("exception")
         _LOG.error(context["message"], exc_info=error)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.shapes import surfaces
 from batchpid.sim.view.layout import FIELD_OF_VIEW, TILE, arrange_robots
@@ -38,7 +38,7 @@ class Triangles:
         self.colours: Float64 = np.repeat([surface.rgba[:3] for surface in self._surfaces], counts, axis=0)
         """Colours of the triangles of one robot (triangles, 3)."""
 
-    def corners(self, qpos: NDArray[Any], positions: Float64, base_pose: NDArray[Any] | None = None) -> Float64:
+    def corners(self, qpos: Rows, positions: Float64, base_pose: Rows | None = None) -> Float64:
         """Return the corners (envs, triangles, 3, 3) [m] of robots at ``qpos`` (envs, dof), moved by ``positions``
         (envs, 3), with the poses (envs, 7) of floating bases.
         """
@@ -97,9 +97,9 @@ class PaintedScene:
         corners = [np.stack([x + a, y + b, 0 * x + layout.floor], -1) for a, b in TILE * np.array(_SQUARE)]
         self._tiles: Float64 = np.stack(corners, axis=2).reshape(-1, 4, 3)
         self._qpos = np.tile(robot.start, (count, 1))
-        self._base_pose: NDArray[Any] | None = None
+        self._base_pose: Rows | None = None
 
-    def place(self, qpos: NDArray[Any], base_pose: NDArray[Any] | None = None) -> None:
+    def place(self, qpos: Rows, base_pose: Rows | None = None) -> None:
         """Set the joint positions (envs, dof) [rad or m], and poses of floating bases (envs, 7).
 
         A robot with a number that is not finite keeps its pose.

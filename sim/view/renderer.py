@@ -15,6 +15,7 @@ import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Rows, SapienScene
 from batchpid.errors import BatchPIDError
 from batchpid.sim.engine.native.library import import_sapien
 from batchpid.sim.robot.robot import Robot
@@ -70,7 +71,7 @@ def check_renderer() -> None:
         raise RenderError(f"SAPIEN cannot render on this machine ({problem}); {REMEDY}")
 
 
-def add_floor(scene: Any, layout: RobotLayout, ground: bool, material: Any) -> None:
+def add_floor(scene: SapienScene, layout: RobotLayout, ground: bool, material: Any) -> None:
     """Add a floor to a SAPIEN scene: a plane if physics has a ``ground``, otherwise a grid of lines."""
     if ground:
         scene.add_ground(layout.floor, render_material=material, render_half_size=[20, 20])
@@ -138,13 +139,13 @@ class RenderScene:
         several = isinstance(returned, Iterable) and not isinstance(returned, str)
         self._content = [] if returned is None else list(returned) if several else [returned]
 
-    def place_content(self, poses: NDArray[Any]) -> None:
+    def place_content(self, poses: Rows) -> None:
         """Set the poses (entities, 7) of what ``build`` returned: position [m], w, x, y, z. Links are the robot's."""
         for entity, pose in zip(self._content, poses, strict=True):
             if not isinstance(entity, str) and np.isfinite(pose).all():
                 entity.set_pose(sapien.Pose(pose[:3], pose[3:]))
 
-    def place(self, qpos: NDArray[Any], base_pose: NDArray[Any] | None = None) -> None:
+    def place(self, qpos: Rows, base_pose: Rows | None = None) -> None:
         """Set the joint positions (envs, dof) [rad or m], and poses of floating bases (envs, 7).
 
         A robot with a number that is not finite keeps its pose.

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
+from batchpid.arrays.array_types import Document, Rows
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.robot import Robot
@@ -103,7 +104,7 @@ class RobotScene:
             **options,
         )
 
-    def _place(self, nodes: list[Any], qpos: NDArray[Any], positions: Float64, base: NDArray[Any] | None) -> None:
+    def _place(self, nodes: list[Any], qpos: Rows, positions: Float64, base: Rows | None) -> None:
         poses = ts.link_poses(self._tree, qpos)
         if base is not None:
             poses = placed(base.astype(np.float64)[:, None], poses)
@@ -123,7 +124,7 @@ class RobotScene:
         scene.configure_default_lights(enabled=True, cast_shadow=False)
         scene.add_light_ambient("/lights/ambient", color=(235, 240, 255), intensity=1.3)
         low, high = layout.corners
-        place: dict[str, Any] = {"position": (*(low + high) / 2, layout.floor)}
+        place: Document = {"position": (*(low + high) / 2, layout.floor)}
         if ground:  # an image is not lit and costs a third of tiles made of triangles
             scene.add_image("/floor", _tiles(layout), *(high - low), format="png", **place, **_NO_SHADOW)
         else:

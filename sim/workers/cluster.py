@@ -14,6 +14,7 @@ from collections import Counter
 from typing import Any, NamedTuple
 
 import batchpid as bp
+from batchpid.arrays.array_types import Document
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, WorkerError
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.processes.background import BACKGROUND
@@ -168,7 +169,7 @@ def _connect(options: Ray) -> Any:
     if ray.is_initialized():
         return ray
     logging.getLogger("ray").setLevel(logging.ERROR)
-    quiet: dict[str, Any] = {"log_to_driver": False, "configure_logging": False}
+    quiet: Document = {"log_to_driver": False, "configure_logging": False}
     address = options.address or os.environ.get("RAY_ADDRESS") or "auto"
     host, _, port = address.rpartition(":")
     if host and not (port.isdecimal() and _answers(host, int(port))):

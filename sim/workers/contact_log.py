@@ -5,11 +5,11 @@ from __future__ import annotations
 import copy
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Rows
 from batchpid.sim.loop.arrays import Arrays
 
 LISTED = 5
@@ -40,7 +40,7 @@ class MissedContactLog:
     ``links`` returns the names of the links that overlap most at a pose (dof,).
     """
 
-    def __init__(self, num_envs: int, timestep: float, links: Callable[[NDArray[Any]], tuple[str, ...]]) -> None:
+    def __init__(self, num_envs: int, timestep: float, links: Callable[[Rows], tuple[str, ...]]) -> None:
         self.contacts: deque[MissedContact] = deque(maxlen=10_000)
         """Latest last."""
         self._timestep, self._links = timestep, links

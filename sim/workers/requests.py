@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
+from batchpid.arrays.array_types import Rows
 from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot
@@ -226,10 +227,10 @@ class ReadPoses(Request):
     def for_envs(self, envs: slice) -> Self:
         return self
 
-    def apply(self, loop: Loop) -> list[NDArray[Any]]:
+    def apply(self, loop: Loop) -> list[Rows]:
         return loop.poses(self.names)
 
-    def join(self, results: list[list[NDArray[Any]]]) -> list[NDArray[Any]]:
+    def join(self, results: list[list[Rows]]) -> list[Rows]:
         return [rows for poses in results for rows in poses]
 
 

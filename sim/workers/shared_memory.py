@@ -9,11 +9,10 @@ from __future__ import annotations
 import io
 import mmap
 import os
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import WorkerError
 from batchpid.sim.loop.arrays import Layout
@@ -46,7 +45,7 @@ class SharedArrays(SingleOwner):
         self.fd = fd
         with standard_streams_occupied():
             memory = mmap.mmap(fd, max(size, 1))  # it holds a copy of the descriptor
-        self.arrays: dict[str, NDArray[Any]] = {
+        self.arrays: dict[str, Rows] = {
             name: np.ndarray(shape, dtype, buffer=memory, offset=offsets[name])
             for name, (shape, dtype) in layout.items()
         }

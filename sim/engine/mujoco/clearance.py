@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import MjModel
 from batchpid.sim.engine.link_reach import LinkExtent, closing_arms, link_reach
 from batchpid.sim.engine.mujoco.model_builder import FLOATING, RobotMj
 from batchpid.sim.engine.native.interface import Clearance
@@ -76,7 +77,7 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
     }
 
 
-def touching_pairs(model: Any) -> NDArray[np.int32]:
+def touching_pairs(model: MjModel) -> NDArray[np.int32]:
     """Return the pairs of shapes (pairs, 2), by number, that MuJoCo checks for contact; a plane comes first.
 
     MuJoCo ignores two planes, bodies that are welded together, a body and its parent unless the parent is the world,

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.merging import place_links
@@ -46,7 +46,7 @@ class FileScene(NamedTuple):
     have their followers'.
     """
 
-    scene: Any
+    scene: MjSpec
     names: dict[str, str]
     frames: dict[str, BodyFrame]
     root: str
@@ -92,7 +92,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
     return FileScene(scene, bodies, frames, root, own)
 
 
-def set_ground(scene: Any, ground: bool) -> None:
+def set_ground(scene: MjSpec, ground: bool) -> None:
     """Let the planes of the world collide or not; a scene without one gets one at height 0."""
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     planes = [each for each in scene.worldbody.geoms if each.type == plane and (each.contype or each.conaffinity)]
@@ -102,14 +102,14 @@ def set_ground(scene: Any, ground: bool) -> None:
         each.contype, each.conaffinity = 0, 0
 
 
-def _start(model: Any) -> dict[str, Any]:
+def _start(model: MjModel) -> Document:
     """Return the keyframe of the start: the file's "home", else its reference pose."""
     if (key := home(model)) is None:
         return {"qpos": model.qpos0, "qvel": np.zeros(model.nv)}
     return {name: getattr(model, f"key_{name}")[key].ravel() for name in ("qpos", "qvel", "mpos", "mquat")}
 
 
-def _set_pairs(scene: Any, ignored: Iterable[tuple[str, str]], robot: set[str]) -> None:
+def _set_pairs(scene: MjSpec, ignored: Iterable[tuple[str, str]], robot: set[str]) -> None:
     """Exclude the pairs of the robot's bodies that do not collide, and no others."""
     for each in list(scene.excludes):
         if {each.bodyname1, each.bodyname2} <= robot:
@@ -119,7 +119,7 @@ def _set_pairs(scene: Any, ignored: Iterable[tuple[str, str]], robot: set[str]) 
             scene.add_exclude(bodyname1=first, bodyname2=second)
 
 
-def _frames(model: Any, robot: dict[int, str], spec: SceneSpec) -> tuple[dict[str, str], dict[str, BodyFrame]]:
+def _frames(model: MjModel, robot: dict[int, str], spec: SceneSpec) -> tuple[dict[str, str], dict[str, BodyFrame]]:
     """Return the body of each simulated link, the first of the bodies that are merged into it, and its frame there.
 
     A body's link has the body's axes, and its origin at the anchor of the body's last hinge.

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import MjModel, MjSpec
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.merging import place_links
 
@@ -25,7 +26,7 @@ def contact_bodies(spec: SceneSpec) -> list[str]:
     return [bodies[link].link for link in spec.contacts or ()]
 
 
-def add_link_sensors(scene: Any, spec: SceneSpec, names: dict[str, str], frames: Mapping[str, Any]) -> None:
+def add_link_sensors(scene: MjSpec, spec: SceneSpec, names: dict[str, str], frames: Mapping[str, Any]) -> None:
     """Add sensors for the links of ``spec.contacts`` and ``spec.wrenches``.
 
     ``names`` are the bodies of the links, ``frames`` frames of links in their bodies, where these differ.
@@ -54,7 +55,7 @@ def _parts(body: Any, others: set[str]) -> Iterator[Any]:
 class LinkSensors:
     """Places of the sensors of ``spec`` in the ``size`` values of ``model``; ``bodies`` are the bodies of its links."""
 
-    def __init__(self, spec: SceneSpec, model: Any, bodies: dict[str, int]) -> None:
+    def __init__(self, spec: SceneSpec, model: MjModel, bodies: dict[str, int]) -> None:
         ids = model.sensor_objid[model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT]
         owners = ids.copy()
         while (lower := ~np.isin(owners, [*bodies.values()])).any():

@@ -14,6 +14,7 @@ import numpy as np
 from lxml import etree
 from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Document, MjModel, MjSpec
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError, RobotError
 from batchpid.export.exported import Exported
@@ -131,7 +132,7 @@ def _set_inertia(body: Any, inertia: Any, link: str) -> Iterable[str]:
         yield f"inertia: link {link!r}: MuJoCo needs moments of a body: {figures[1]} instead of {figures[0]} kg m^2"
 
 
-def _set_joints(scene: Any, robot: RobotDescription, found: Drive, friction: Any) -> None:
+def _set_joints(scene: MjSpec, robot: RobotDescription, found: Drive, friction: Any) -> None:
     """Set damping, friction and armature of the joints, and tie the followers."""
     rows = {"damping": friction.viscous, "frictionloss": friction.coulomb}
     for at, name in enumerate(robot.joint_names):
@@ -157,7 +158,7 @@ def _add_actuators(root: Any, motors: MjcfActuators) -> None:
         etree.SubElement(section, tag, attributes)
 
 
-def _add_keyframe(root: Any, model: Any, robot: RobotDescription, motors: MjcfActuators) -> None:
+def _add_keyframe(root: Any, model: MjModel, robot: RobotDescription, motors: MjcfActuators) -> None:
     """Add the keyframe "home": the start pose as positions and setpoints, and lags at the holding efforts."""
     data = mujoco.MjData(model)
     for at, name in enumerate(robot.joint_names):
@@ -191,7 +192,7 @@ def _compare(found: Drive, robot: RobotDescription, friction: Any) -> None:
         found.append(f"followers: soft constraints in MuJoCo: {', '.join(names)}")
 
 
-def _exact(scene: Any) -> Any:
+def _exact(scene: MjSpec) -> Any:
     """Return the XML of a compiled scene with all digits, of which MuJoCo writes six."""
     root = etree.fromstring(scene.to_xml().encode())
     _write(root.find("option"), {"timestep": scene.option.timestep, "gravity": scene.option.gravity})
@@ -213,7 +214,7 @@ def _exact(scene: Any) -> Any:
     return root
 
 
-def _write(element: Any, figures: dict[str, Any]) -> None:
+def _write(element: Any, figures: Document) -> None:
     """Replace the numbers of the attributes that an element has."""
     for key, values in figures.items():
         if element is not None and key in element.attrib:

@@ -24,6 +24,7 @@ import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Document, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.mujoco.file_scene import BodyFrame, file_scene, set_ground
 from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
@@ -55,7 +56,7 @@ _FARTHEST = 1e10
 class RobotMj:
     """Compiled model of a robot, and the indices of its joints in MuJoCo's arrays."""
 
-    model: Any
+    model: MjModel
     """``mujoco.MjModel``; it is shared, so copy it before a change."""
     qpos: NDArray[np.intp]
     """Index of each joint in MuJoCo's qpos (dof,)."""
@@ -99,7 +100,7 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     return RobotMj(model, *_places(model, spec), bodies, base=None if spec.fixed_base else (0, 0))
 
 
-def _places(model: Any, spec: SceneSpec) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _places(model: MjModel, spec: SceneSpec) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the indices of the joints in MuJoCo's qpos and qvel."""
     joints = [model.joint(joint.name) for joint in spec.joints]
     qpos, qvel = (np.array([getattr(joint, name)[0] for joint in joints]) for name in ("qposadr", "dofadr"))
@@ -178,7 +179,7 @@ def principal_inertia(inertia: SpatialInertia) -> tuple[NDArray[np.float64], NDA
     return moments, wxyz
 
 
-def _set_options(scene: Any, spec: SceneSpec) -> None:
+def _set_options(scene: MjSpec, spec: SceneSpec) -> None:
     solver: MujocoSolver = spec.physics
     option, off = scene.option, mujoco.mjtDisableBit
     option.timestep, option.gravity = spec.timestep, spec.gravity
@@ -189,7 +190,7 @@ def _set_options(scene: Any, spec: SceneSpec) -> None:
     option.disableflags |= off.mjDSBL_AUTORESET | off.mjDSBL_ACTUATION
 
 
-def _add_links(scene: Any, spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> dict[str, str]:
+def _add_links(scene: MjSpec, spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> dict[str, str]:
     """Add the simulated links of ``spec`` as bodies; return the name of the body of each."""
     root = etree.fromstring(simulated(spec.urdf, spec.merge_fixed).urdf.encode())
     above = {joint.find("child").get("link"): joint for joint in root.findall("joint")}
@@ -197,7 +198,7 @@ def _add_links(scene: Any, spec: SceneSpec, inertias: dict[str, SpatialInertia])
     limits = {joint.name: (joint.lower, joint.upper) for joint in spec.joints}
     damping = {joint.name: joint.damping for joint in spec.joints}
     continuous = {joint.name for joint in spec.joints if joint.continuous}
-    added: dict[str, Any] = {}
+    added: Document = {}
 
     def add(link: str) -> Any:
         if link in added:
@@ -242,7 +243,7 @@ def _add_links(scene: Any, spec: SceneSpec, inertias: dict[str, SpatialInertia])
     return names
 
 
-def _add_shapes(scene: Any, spec: SceneSpec, names: dict[str, str]) -> None:
+def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
     """Add the collision shapes, the pairs of bodies that do not collide, and the ground."""
     shapes = link_shapes(spec.urdf, spec.merge_fixed)
     owners = {link: list(dict.fromkeys(shape.owner for shape in of_link)) for link, of_link in shapes.items()}
@@ -269,7 +270,7 @@ def _add_shapes(scene: Any, spec: SceneSpec, names: dict[str, str]) -> None:
         scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **_contact(spec))
 
 
-def _add_drives(scene: Any, spec: SceneSpec) -> None:
+def _add_drives(scene: MjSpec, spec: SceneSpec) -> None:
     """Add an actuator for each joint, in their order: effort = ctrl + bias (1, q, q'), between its limits."""
     scene.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     scene.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -279,11 +280,11 @@ def _add_drives(scene: Any, spec: SceneSpec) -> None:
         actuator.forcelimited, actuator.forcerange = True, [-LARGEST_FORCE, LARGEST_FORCE]
 
 
-def _contact(spec: SceneSpec) -> dict[str, Any]:
+def _contact(spec: SceneSpec) -> Document:
     return {"friction": [CONTACT_FRICTION, 0.005, 0.0001], "solref": [spec.physics.contact_time, 1.0]}
 
 
-def set_inertia(model: Any, robot: RobotMj, link: str, inertia: SpatialInertia) -> None:
+def set_inertia(model: MjModel, robot: RobotMj, link: str, inertia: SpatialInertia) -> None:
     """Give a simulated link in a ``mujoco.MjModel`` this inertia, in the link's frame; ``mj_setConst`` comes next."""
     body, welded = robot.bodies[link], tuple[int, ...]()
     if link in robot.frames:

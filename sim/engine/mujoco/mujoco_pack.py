@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
+from batchpid.arrays.array_types import DType, Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
@@ -134,15 +135,15 @@ class MujocoPack(SingleOwner):
 
     # -- reading -----------------------------------------------------------------------------------------------
 
-    def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
+    def read_qpos(self, dtype: DType = np.float64) -> Rows:
         """Return the joint positions [rad or m], a new array."""
         return np.array([data.qpos[self._at] for data in self._data], dtype)
 
-    def read_qvel(self, dtype: Any = np.float64) -> NDArray[Any]:
+    def read_qvel(self, dtype: DType = np.float64) -> Rows:
         """Return the joint velocities [rad/s or m/s], a new array."""
         return np.array([data.qvel[self._moves] for data in self._data], dtype)
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
+    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N], by the model."""
         if self.steps_read_force(gravity, coriolis):
             return np.array([data.qfrc_bias[self._moves] for data in self._data], dtype)
@@ -181,7 +182,7 @@ class MujocoPack(SingleOwner):
             model.vary(range(self.size), self.size, self._added)
         return model
 
-    def joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
+    def joint_mass_matrix(self, qpos: Rows) -> Float64:
         """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
         if self.steps_natively:
             return self._joint_model.mass_matrix(qpos)
@@ -189,7 +190,7 @@ class MujocoPack(SingleOwner):
 
     # -- stepping ----------------------------------------------------------------------------------------------
 
-    def write_qf(self, effort: NDArray[Any]) -> None:
+    def write_qf(self, effort: Rows) -> None:
         """Apply joint efforts [N m or N]. They persist until written again."""
         self.qf[...] = effort
 
@@ -300,9 +301,7 @@ class MujocoPack(SingleOwner):
             data[row].qvel[at + 3 : at + FLOATING] += turn.T @ twist[3:]
         self._evaluate(rows)
 
-    def write_state(
-        self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], base: Float64 | None = None
-    ) -> None:
+    def write_state(self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None) -> None:
         """Place robots ``rows``: positions and velocities (len(rows), dof), zero efforts, the root at ``base``."""
         everyone, floats = self._data, self._robot.base is not None
         bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else base.copy()
@@ -404,7 +403,7 @@ class MujocoPack(SingleOwner):
         if "_joint_model" in self.__dict__:
             self._joint_model.vary(list(rows), self.size, self._added)
 
-    def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
+    def write_drive(self, stiffness: Rows, damping: Rows, force_limit: Rows) -> None:
         """Set the drive of every joint; each argument broadcasts to (M, dof).
 
         They are MuJoCo's actuators, implicit in the time step dt as PhysX's are: with the velocity v+ after it, the
@@ -432,7 +431,7 @@ class MujocoPack(SingleOwner):
                 model.actuator_forcerange[:] = np.stack([-limit[row], limit[row]], axis=1)
         self._update(range(self.size))
 
-    def write_drive_target(self, position: NDArray[Any], velocity: NDArray[Any] | None = None) -> None:
+    def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
         if velocity is not None:
             self._target_rate = velocity
@@ -461,7 +460,7 @@ class MujocoPack(SingleOwner):
                 begin += len(field)
         self._update(range(self.size))
 
-    def read_poses(self, names: Sequence[str] | None = None) -> list[NDArray[Any]]:
+    def read_poses(self, names: Sequence[str] | None = None) -> list[Rows]:
         """Return the poses of bodies of the file, by name, in each env (names, 7)."""
         numbers = [self._robot.model.body(name).id for name in names or ()]
         return [np.hstack([data.xpos[numbers], data.xquat[numbers]]) for data in self._data]

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
@@ -98,7 +99,7 @@ class MujocoStep:
         reads_force: bool,
         speed_limit: NDArray[np.float64] | None,
         constraint: int | None = None,
-        drives: tuple[NDArray[Any], ...] | None = None,
+        drives: tuple[Rows, ...] | None = None,
         *,
         sensed: NDArray[np.float64],
     ) -> None:
@@ -113,7 +114,7 @@ class MujocoStep:
             "data": [each._address for each in data],
             **{field: [getattr(each, name).ctypes.data for each in data] for field, name in FIELDS.items()},
         }
-        arrays: dict[str, NDArray[Any]] = {name: np.array(rows, np.uint64) for name, rows in tables.items()}
+        arrays: dict[str, Rows] = {name: np.array(rows, np.uint64) for name, rows in tables.items()}
         arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64), "qf": qf}
         arrays |= {"turn": np.ascontiguousarray(rotation_matrix(robot.turn)), "sensed": sensed}
         if drives is not None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.array_types import Array
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine import native
 
@@ -36,7 +37,7 @@ def _registered() -> str:
     return ""
 
 
-def sim_step(address: Any, step: Any, effort: Any) -> tuple[Any, Any, Any, Any]:
+def sim_step(address: Any, step: Any, effort: Array) -> tuple[Any, Any, Any, Any]:
     """Do a sim step of a :class:`batchpid.sim.engine.sapien.sim_step.NativeStep` in a program of JAX.
 
     Order is kept by the data and by the number of the step, which is another in each call.
@@ -63,7 +64,7 @@ def sim_step(address: Any, step: Any, effort: Any) -> tuple[Any, Any, Any, Any]:
     return qpos, qvel, passive, status
 
 
-def mass_matrix(tree: Any, bodies: Any, qpos: Any) -> Any:
+def mass_matrix(tree: Any, bodies: Any, qpos: Array) -> Array:
     """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof) in a program of JAX.
 
     ``tree`` (dof, 2) and ``bodies`` (dof, 25) are arrays of :attr:`batchpid.task_space.RigidTree.tables`.

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.sim.engine.sapien.building import build_scene, new_system
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.task_space.frames import matrix_of
@@ -22,7 +22,7 @@ def scene_tree(spec: SceneSpec) -> RigidTree:
     Before each link but the base comes a link without mass, "LINK (joint)", in the frame of the joint above.
     """
     _scene, robot = build_scene(spec, new_system(spec))
-    rows: list[dict[str, Any]] = []
+    rows: list[Document] = []
     at: dict[Any, int] = {}
     for link in robot.links:
         kind, turn = "fixed", np.diag([float(str(one)) for one in link.inertia])
@@ -35,7 +35,7 @@ def scene_tree(spec: SceneSpec) -> RigidTree:
             rows.append(_row(f"{link.name} (joint)", at[link.parent], kind, link.joint.pose_in_parent))
             rows.append(_row(link.name, len(rows) - 1, "fixed", link.joint.pose_in_child.inv()) | inertia)
         at[link] = len(rows) - 1
-    columns: dict[str, Any] = {
+    columns: Document = {
         name: np.array([row[name] for row in rows]) for name in rows[0] if name not in ("links", "joint_types")
     }
     names = tuple(joint.name for joint in spec.joints)
@@ -45,7 +45,7 @@ def scene_tree(spec: SceneSpec) -> RigidTree:
     )
 
 
-def _row(name: str, parent: int, kind: str, pose: Any) -> dict[str, Any]:
+def _row(name: str, parent: int, kind: str, pose: Array) -> Document:
     """Return a link without mass at one of SAPIEN's poses in its parent."""
     position, wxyz = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])) if pose is None else (pose.p, _wxyz(pose))
     empty = {"mass": 0.0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}
@@ -53,11 +53,11 @@ def _row(name: str, parent: int, kind: str, pose: Any) -> dict[str, Any]:
     return {"links": name, "parent": parent, "joint_types": kind, **place, **empty}
 
 
-def _place(pose: Any) -> tuple[Float64, Float64]:
+def _place(pose: Array) -> tuple[Float64, Float64]:
     """Return axes (3, 3) and position (3,) of one of SAPIEN's poses."""
     return matrix_of(_wxyz(pose)), np.asarray(pose.p, float)
 
 
-def _wxyz(pose: Any) -> Float64:
+def _wxyz(pose: Array) -> Float64:
     """Return the rotation of one of SAPIEN's poses, by roll, pitch and yaw, as SAPIEN's own dynamics take it."""
     return from_rpy(np.asarray(pose.rpy, float))

@@ -8,17 +8,19 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import DType, Rows
+
 
 class EngineCalls(Protocol):
     """Reads and writes of M robots, as arrays (M, dof) in SAPIEN's order, SI units."""
 
-    def qpos(self, dtype: Any) -> NDArray[Any]:
+    def qpos(self, dtype: DType) -> Rows:
         """Return the joint positions, a new array."""
 
-    def qvel(self, dtype: Any) -> NDArray[Any]:
+    def qvel(self, dtype: DType) -> Rows:
         """Return the joint velocities, a new array."""
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: Any) -> NDArray[Any]:
+    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType) -> Rows:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new array."""
 
     def write_qf(self) -> None:
@@ -49,15 +51,15 @@ class PythonCalls:
         self._set_qf = [(robot.set_qf, row) for robot, row, skipped in rows if not skipped]
         self._steps = [system.step for system in systems]
 
-    def qpos(self, dtype: Any) -> NDArray[Any]:
+    def qpos(self, dtype: DType) -> Rows:
         """Return the joint positions, a new array."""
         return np.concatenate([get() for get in self._get_qpos], dtype=dtype).reshape(self._shape)
 
-    def qvel(self, dtype: Any) -> NDArray[Any]:
+    def qvel(self, dtype: DType) -> Rows:
         """Return the joint velocities, a new array."""
         return np.concatenate([get() for get in self._get_qvel], dtype=dtype).reshape(self._shape)
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: Any) -> NDArray[Any]:
+    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType) -> Rows:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new array."""
         forces = [compute(gravity, coriolis) for compute in self._passive_force]
         return np.concatenate(forces, dtype=dtype).reshape(self._shape)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import DType, Rows
 from batchpid.sim.engine.native import SWITCH, extension
 from batchpid.sim.engine.native.library import functions
 from batchpid.sim.engine.sapien.calls import EngineCalls, PythonCalls
@@ -45,19 +46,19 @@ class NativeCalls:
         self.gateway = self._native.gateway(functions(), *pointers, qf.shape[1])
         self.qf, self.skip = qf, skip
 
-    def qpos(self, dtype: Any) -> NDArray[Any]:
+    def qpos(self, dtype: DType) -> Rows:
         """Return the joint positions, a new array."""
         rows = np.empty(self.qf.shape, dtype)
         self._native.read_qpos(self.gateway, rows)
         return rows
 
-    def qvel(self, dtype: Any) -> NDArray[Any]:
+    def qvel(self, dtype: DType) -> Rows:
         """Return the joint velocities, a new array."""
         rows = np.empty(self.qf.shape, dtype)
         self._native.read_qvel(self.gateway, rows)
         return rows
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: Any) -> NDArray[Any]:
+    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType) -> Rows:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new array."""
         rows = np.empty(self.qf.shape, dtype)
         self._native.passive_force(self.gateway, rows, gravity, coriolis)

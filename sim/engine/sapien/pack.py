@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float32, Float64
+from batchpid.arrays.array_types import DType, Float32, Float64, Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
@@ -197,19 +197,19 @@ class Pack(SingleOwner):
         self._stepped[used] = False
         self._bind()
 
-    def read_qpos(self, dtype: Any = np.float64) -> NDArray[Any]:
+    def read_qpos(self, dtype: DType = np.float64) -> Rows:
         return self._calls.qpos(dtype)
 
-    def read_qvel(self, dtype: Any = np.float64) -> NDArray[Any]:
+    def read_qvel(self, dtype: DType = np.float64) -> Rows:
         return self._calls.qvel(dtype)
 
-    def joint_mass_matrix(self, qpos: NDArray[Any]) -> NDArray[np.float64]:
+    def joint_mass_matrix(self, qpos: Rows) -> NDArray[np.float64]:
         return self._joint_model.mass_matrix(qpos) if self.steps_natively else self._joint_mass_matrix(qpos)
 
-    def _joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
+    def _joint_mass_matrix(self, qpos: Rows) -> Float64:
         return ts.mass_matrix(scene_tree(self.spec), qpos)
 
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: Any = np.float64) -> NDArray[Any]:
+    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
         if self.steps_read_force(gravity, coriolis):
             return self._calls.passive_force(gravity, coriolis, dtype)
         state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
@@ -219,7 +219,7 @@ class Pack(SingleOwner):
     def _passive_force(self) -> Callable[..., Float64]:
         return passive_force_of(self.spec, self.steps_natively)
 
-    def write_qf(self, effort: NDArray[Any]) -> None:
+    def write_qf(self, effort: Rows) -> None:
         self.qf[...] = effort
         if self._constraint is None:
             self._calls.write_qf()
@@ -265,9 +265,7 @@ class Pack(SingleOwner):
     def take_sensed(self) -> dict[str, Float64]:
         return {} if self._sensors is None else self._sensors.take()
 
-    def write_state(
-        self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], base: Float64 | None = None
-    ) -> None:
+    def write_state(self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None) -> None:
         """Place robots ``rows``: positions and velocities (len(rows), dof), the root at ``base``; their efforts become
         zero, and the content of their scenes is reset.
         """
@@ -275,7 +273,7 @@ class Pack(SingleOwner):
         self._place(rows, qpos, qvel, bases.astype(np.float32))
         self.update_constraint(list(rows))  # within a tick, the robots may have failed
 
-    def _place(self, rows: Sequence[int], qpos: NDArray[Any], qvel: NDArray[Any], roots: Float32) -> None:
+    def _place(self, rows: Sequence[int], qpos: Rows, qvel: Rows, roots: Float32) -> None:
         """Do :meth:`write_state` with these states of the root (len(rows), 13).
 
         They are always set, since a robot whose state is NaN has lost its root, too.
@@ -350,7 +348,7 @@ class Pack(SingleOwner):
             for joint, value in zip(self.robots[row].active_joints, values[row, :, None], strict=True):
                 joint.set_armature(value)
 
-    def write_drive(self, stiffness: NDArray[Any], damping: NDArray[Any], force_limit: NDArray[Any]) -> None:
+    def write_drive(self, stiffness: Rows, damping: Rows, force_limit: Rows) -> None:
         """Set PhysX's internal PD drive of every joint; each argument broadcasts to (M, dof).
 
         Where the engine simulates the URDF's joint damping, which is drive damping too, it is added to ``damping``.
@@ -360,7 +358,7 @@ class Pack(SingleOwner):
         for joint, *values in zip(self._joints, *tables, strict=True):
             joint.set_drive_properties(*map(float, values), "force")
 
-    def write_drive_target(self, position: NDArray[Any], velocity: NDArray[Any] | None = None) -> None:
+    def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
         for joint, target in zip(self._joints, position.ravel().tolist(), strict=True):
             joint.set_drive_target(target)
         if velocity is not None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Rows
 from batchpid.sim.engine.native.interface import Group
 from batchpid.sim.engine.sapien.calls import EngineCalls
 from batchpid.sim.engine.sapien.native_calls import NativeCalls, gateway_address, gateway_sim_step, pointer
@@ -53,7 +54,7 @@ class NativeStep:
     ) -> None:
         assert isinstance(calls, NativeCalls)
         count, dof = calls.qf.shape
-        arrays: dict[str, NDArray[Any]] = {"qf": calls.qf, "skip": calls.skip}
+        arrays: dict[str, Rows] = {"qf": calls.qf, "skip": calls.skip}
         if speed_limit is not None:
             arrays["speed_limit"] = np.broadcast_to(speed_limit, dof).astype(np.float64)
         if joints is not None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sapien.physx import PhysxArticulationLinkComponent, PhysxCpuSystem, PhysxRigidDynamicComponent
 from sapien.wrapper.actor_builder import ActorBuilder
 
+from batchpid.arrays.array_types import Array, SapienScene
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.sapien.mirrored_meshes import MirroringBuilder
 from batchpid.sim.engine.scene_spec import Build
@@ -58,7 +59,7 @@ class SceneContent:
     number of values in the state. ``links`` are the links of the scene's robot.
     """
 
-    def __init__(self, build: Build, scene: Any, env: int, links: Frames) -> None:
+    def __init__(self, build: Build, scene: SapienScene, env: int, links: Frames) -> None:
         before = {entity.per_scene_id for entity in scene.entities}  # the robot and the ground
         self.watched = _call(build, scene, env, links)
         self._bodies, self._articulations = [], []
@@ -80,7 +81,7 @@ class SceneContent:
     def read(self, at_rest: bool = False) -> NDArray[np.float32]:
         """Return the state of everything that moves (size,), with zero velocities if ``at_rest``."""
 
-        def velocity(values: Any) -> Any:
+        def velocity(values: Array) -> Array:
             return np.zeros_like(values) if at_rest else values
 
         parts: list[Any] = [np.zeros(0, np.float32)]
@@ -119,7 +120,7 @@ class SceneContent:
         return np.array(rows, np.float32).reshape(len(rows), 7)
 
 
-def refuse_shapes(scene: Any, env: int) -> None:
+def refuse_shapes(scene: SapienScene, env: int) -> None:
     """Raise InvalidArgumentError if an entity of ``scene``, which belongs to env ``env``, has a collision shape."""
     for entity in scene.entities:
         for component in entity.components:
@@ -132,7 +133,7 @@ def refuse_shapes(scene: Any, env: int) -> None:
                 )
 
 
-def _call(build: Build, scene: Any, env: int, links: Frames) -> list[tuple[sapien.Entity, sapien.Pose | None]]:
+def _call(build: Build, scene: SapienScene, env: int, links: Frames) -> list[tuple[sapien.Entity, sapien.Pose | None]]:
     """Return the entities and frames that ``build`` returns; its errors become an InvalidArgumentError."""
     try:
         returned = build(scene, env)

@@ -13,11 +13,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sapien import Pose, physx
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.joint_friction import own_friction
 from batchpid.sim.engine.native_model import NativeModel
@@ -120,7 +119,7 @@ class VariedPack(Pack):
         """Return the friction and damping of the joints."""
         return own_friction(self.spec, self._variation)
 
-    def _joint_mass_matrix(self, qpos: NDArray[Any]) -> Float64:
+    def _joint_mass_matrix(self, qpos: Rows) -> Float64:
         tree = scene_tree(self.spec)
         return ts.mass_matrix(tree, qpos, tree.varied(self._added) if self._added else None)
 

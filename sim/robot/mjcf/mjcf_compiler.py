@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import mujoco
 
+from batchpid.arrays.array_types import MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.meshes import LFS_PROBLEM, mesh_problem
@@ -33,8 +34,8 @@ class Attempt(NamedTuple):
     are the bodies whose mass depends on a geom that is left out, each with the mesh.
     """
 
-    scene: Any
-    model: Any
+    scene: MjSpec
+    model: MjModel
     reading: str
     missing: tuple[str, ...] = ()
     weighing: tuple[tuple[str, str], ...] = ()

@@ -18,6 +18,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from batchpid.arrays.array_types import MjModel
+
 _POSITION, _VOLTAGE, _NO_INPUT = 1, 8, 16
 """Inputs of an actuator: bits of ``mjtCtrlInput`` (3.12 and later)."""
 _GAIN, _BIAS, _DYN = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn
@@ -47,7 +49,7 @@ class Line(NamedTuple):
     damping: float
 
 
-def servo_of(model: Any, actuator: int) -> Servo | None:
+def servo_of(model: MjModel, actuator: int) -> Servo | None:
     """Return the gains of a servo, of <pid>, its plugin or the controller of <dcmotor>; None for other actuators."""
     gain, dynamics = model.actuator_gainprm[actuator], model.actuator_dynprm[actuator]
     if (plugin := plugin_name(model, model.actuator_plugin[actuator])) is not None:
@@ -64,7 +66,7 @@ def servo_of(model: Any, actuator: int) -> Servo | None:
     return Servo(kp, kv, rate=math.inf if scale is None else scale * _most(model, actuator, "ctrl"))
 
 
-def plugin_name(model: Any, instance: int) -> str | None:
+def plugin_name(model: MjModel, instance: int) -> str | None:
     """Return the name of the plugin of an instance, None for -1."""
     if instance < 0:
         return None
@@ -72,7 +74,7 @@ def plugin_name(model: Any, instance: int) -> str | None:
     return (name[0] or b"").decode()  # the first field of mjpPlugin
 
 
-def _plugin_servo(model: Any, actuator: int) -> Servo:
+def _plugin_servo(model: MjModel, actuator: int) -> Servo:
     """Return the gains of the plugin "mujoco.pid"."""
     given = {key: value for key, (_, value) in _plugin_config(model, actuator).items()}
     ki = given.get("ki", 0.0)
@@ -80,7 +82,7 @@ def _plugin_servo(model: Any, actuator: int) -> Servo:
     return Servo(given.get("kp", 0.0), given.get("kd", 0.0), ki, imax, given.get("slewmax", math.inf))
 
 
-def _plugin_config(model: Any, actuator: int) -> dict[str, tuple[str, float]]:
+def _plugin_config(model: MjModel, actuator: int) -> dict[str, tuple[str, float]]:
     """Return the texts that the plugin "mujoco.pid" is given, with the number that it reads from each by strtod."""
     config = {}
     for key in ("kp", "ki", "kd", "imax", "slewmax"):
@@ -108,7 +110,7 @@ def _library() -> Any:
     return library
 
 
-def _velocity_scale(model: Any, actuator: int, kp: float, kv: float) -> float | None:
+def _velocity_scale(model: MjModel, actuator: int, kp: float, kv: float) -> float | None:
     """Return the target velocity of a servo per unit of its input; None if its target is not a velocity."""
     gain = abs(float(model.actuator_gainprm[actuator, 0]))
     if kp > 0:
@@ -116,13 +118,13 @@ def _velocity_scale(model: Any, actuator: int, kp: float, kv: float) -> float | 
     return gain / kv if gain and kp == 0 and kv > 0 and not _is_pid(model, actuator) else None
 
 
-def _most(model: Any, actuator: int, field: str) -> float:
+def _most(model: MjModel, actuator: int, field: str) -> float:
     """Return the largest magnitude in an actuator's range "ctrl" or "act"; infinite without a range."""
     ends = _range(model, actuator, field)
     return math.inf if ends is None else float(np.abs(ends).max())
 
 
-def _range(model: Any, actuator: int, field: str) -> Any | None:
+def _range(model: MjModel, actuator: int, field: str) -> Any | None:
     """Return the range of an actuator's (first) input, "ctrl", or of its state, "act"; None without one."""
     first = actuator
     if field == "ctrl" and hasattr(model, "actuator_ctrladr"):  # older versions have one input for each actuator
@@ -132,13 +134,13 @@ def _range(model: Any, actuator: int, field: str) -> Any | None:
     )
 
 
-def input_range(model: Any, actuator: int) -> Any | None:
+def input_range(model: MjModel, actuator: int) -> Any | None:
     """Return the range of the input of an actuator's gain: of its control, or of its state; None without a range."""
     filters = map(int, (_DYN.mjDYN_NONE, _DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT))
     return _range(model, actuator, "ctrl" if int(model.actuator_dyntype[actuator]) in filters else "act")
 
 
-def is_motor(model: Any, actuator: int) -> bool:
+def is_motor(model: MjModel, actuator: int) -> bool:
     """Return whether the force of an actuator is proportional to its input."""
     bias = model.actuator_biastype[actuator]
     unbiased = bias == _BIAS.mjBIAS_NONE or (
@@ -148,12 +150,12 @@ def is_motor(model: Any, actuator: int) -> bool:
     return bool(fixed and unbiased and model.actuator_plugin[actuator] < 0)
 
 
-def line_of(model: Any, actuator: int) -> Line | None:
+def line_of(model: MjModel, actuator: int) -> Line | None:
     """Return the torque-speed line of a DC motor at its supply voltage; None for other actuators."""
     return _line(model, actuator) if _is_dcmotor(model, actuator) else None
 
 
-def _line(model: Any, actuator: int) -> Line:
+def _line(model: MjModel, actuator: int) -> Line:
     resistance, constant = (float(each) for each in model.actuator_gainprm[actuator, :2])
     if min(resistance, constant) <= 0:
         return Line(math.inf, math.inf, 0.0, 0.0)
@@ -168,7 +170,7 @@ def _line(model: Any, actuator: int) -> Line:
     return Line(constant * voltage / resistance, voltage / constant, lag, 0.0)
 
 
-def unread(model: Any, actuator: int, servo: Servo | None) -> Iterator[tuple[str, str, str]]:
+def unread(model: MjModel, actuator: int, servo: Servo | None) -> Iterator[tuple[str, str, str]]:
     """Yield the effects of an actuator that are not simulated, each as problem, remedy and figures."""
     bias, dynamics = model.actuator_biasprm[actuator], model.actuator_dynprm[actuator]
     kinds = [int(getattr(model, f"actuator_{each}type")[actuator]) for each in ("gain", "bias", "dyn")]
@@ -224,7 +226,7 @@ def unread(model: Any, actuator: int, servo: Servo | None) -> Iterator[tuple[str
         yield "is disabled in the file (actuatorgroupdisable): here it acts", "remove it from the file", ""
 
 
-def setpoint_range(model: Any, actuator: int, servo: Servo) -> tuple[float, float]:
+def setpoint_range(model: MjModel, actuator: int, servo: Servo) -> tuple[float, float]:
     """Return the range to which a servo limits its setpoint, in its own units; infinite without a limit."""
     chosen = _is_pid(model, actuator) or _is_dcmotor(model, actuator)
     if servo.kp <= 0 or not _has_position(model, actuator):
@@ -238,24 +240,24 @@ def setpoint_range(model: Any, actuator: int, servo: Servo) -> tuple[float, floa
     return low, high
 
 
-def _has_position(model: Any, actuator: int) -> bool:
+def _has_position(model: MjModel, actuator: int) -> bool:
     """Return whether an input of a servo is its setpoint."""
     if _is_pid(model, actuator) or _is_dcmotor(model, actuator):
         return bool(_inputs(model, actuator) & _POSITION)
     return bool(model.actuator_plugin[actuator] >= 0 or model.actuator_gainprm[actuator, 0])
 
 
-def _is_pid(model: Any, actuator: int) -> bool:
+def _is_pid(model: MjModel, actuator: int) -> bool:
     """Return whether an actuator is MuJoCo's <pid> (3.12 and later)."""
     return bool(model.actuator_gaintype[actuator] == getattr(mujoco.mjtGain, "mjGAIN_PID", None))
 
 
-def _is_dcmotor(model: Any, actuator: int) -> bool:
+def _is_dcmotor(model: MjModel, actuator: int) -> bool:
     """Return whether an actuator is MuJoCo's <dcmotor> whose gains give efforts (3.12 and later)."""
     kind = getattr(mujoco.mjtGain, "mjGAIN_DCMOTOR", None)
     return bool(hasattr(model, "actuator_ctrlspec") and model.actuator_gaintype[actuator] == kind)
 
 
-def _inputs(model: Any, actuator: int) -> int:
+def _inputs(model: MjModel, actuator: int) -> int:
     """Return the inputs of an actuator as bits of ``mjtCtrlInput``; 0 for actuators without a choice."""
     return int(model.actuator_ctrlspec[actuator]) if hasattr(model, "actuator_ctrlspec") else 0

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from batchpid.arrays.array_types import MjModel
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.mjcf.mjcf_laws import Line, input_range, is_motor, line_of, servo_of, setpoint_range, unread
 from batchpid.sim.robot.mjcf.mjcf_names import ALONE, Names, label
@@ -47,7 +48,7 @@ class Motors(NamedTuple):
     """Torque-speed lines and time constants [s] of DC motors; joints without one are left out."""
 
 
-def read_couplings(model: Any, names: Names, findings: list[Finding]) -> Couplings:
+def read_couplings(model: MjModel, names: Names, findings: list[Finding]) -> Couplings:
     """Return the joints that linear equalities couple: y - y0 = c0 + c1 (x - x0), with y0, x0 the reference pose."""
     couplings: Couplings = {}
     others: list[str] = []
@@ -83,7 +84,7 @@ def read_couplings(model: Any, names: Names, findings: list[Finding]) -> Couplin
     return couplings
 
 
-def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[Finding]) -> Motors:
+def read_motors(model: MjModel, names: Names, couplings: Couplings, findings: list[Finding]) -> Motors:
     """Return the effects of the model's actuators on its joints, with findings for effects that are not simulated."""
     armature = {name: float(model.dof_armature[model.jnt_dofadr[joint]]) for joint, name in names.joints.items()}
     damping = dict.fromkeys(armature, 0.0)
@@ -172,7 +173,7 @@ def read_motors(model: Any, names: Names, couplings: Couplings, findings: list[F
     return Motors(dict(limits), armature, damping, dict(kp), dict(kv), dict(ki), imax, rate, stall, speed, lag)
 
 
-def _narrower(model: Any, names: Names, name: str, ends: tuple[float, float], arm: float) -> list[Finding]:
+def _narrower(model: MjModel, names: Names, name: str, ends: tuple[float, float], arm: float) -> list[Finding]:
     """Return a finding if a servo limits the setpoint of a joint to less than the joint's range."""
     joint = next(joint for joint, each in names.joints.items() if each == name)
     low, high = sorted(end / arm for end in ends)
@@ -187,12 +188,12 @@ def _narrower(model: Any, names: Names, name: str, ends: tuple[float, float], ar
     return [Finding("note", "actuator", text, remedy, name, detail=f"{low:g} to {high:g}")]
 
 
-def _field(model: Any, name: str, index: int) -> float:
+def _field(model: MjModel, name: str, index: int) -> float:
     values = getattr(model, name, None)  # older versions have neither armature nor damping of actuators
     return 0.0 if values is None else float(values[index])
 
 
-def roots_of_actuators(model: Any) -> set[int]:
+def roots_of_actuators(model: MjModel) -> set[int]:
     """Return the bodies in the world that actuators move, or bodies below them."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -200,7 +201,7 @@ def roots_of_actuators(model: Any) -> set[int]:
     return {int(body) for body in model.body_rootid[model.dof_bodyid[dofs]]}
 
 
-def _arms(model: Any, actuator: int, names: Names) -> dict[str, float] | None:
+def _arms(model: MjModel, actuator: int, names: Names) -> dict[str, float] | None:
     """Return the moment arms of an actuator on the joints that it acts on by a constant arm, by name; else None."""
     kind, target = int(model.actuator_trntype[actuator]), int(model.actuator_trnid[actuator, 0])
     outputs = getattr(model, "actuator_outadr", None)  # an orientation servo has three, each with a gear
@@ -231,7 +232,7 @@ def _leading(arms: dict[str, float], couplings: Couplings) -> dict[str, float]:
     return {name: arm for name, arm in leading.items() if arm}
 
 
-def _force_limit(model: Any, actuator: int, name: str, findings: list[Finding]) -> float:
+def _force_limit(model: MjModel, actuator: int, name: str, findings: list[Finding]) -> float:
     """Return the largest magnitude of an actuator's force that both its signs reach."""
     low, high = -math.inf, math.inf
     if model.actuator_forcelimited[actuator]:
@@ -253,7 +254,7 @@ def _magnitude(ends: Any, name: str, findings: list[Finding]) -> float:
     return magnitudes[0] or magnitudes[1]
 
 
-def _tendons(model: Any) -> list[Finding]:
+def _tendons(model: MjModel) -> list[Finding]:
     """Return findings of tendons that act on the joints by themselves, and of tendons that do not act."""
     effects = ("stiffness", "stiffnesspoly", "damping", "dampingpoly", "frictionloss", "armature", "limited")
     passive = [getattr(model, f"tendon_{name}", np.zeros(model.ntendon)) for name in effects]  # by version

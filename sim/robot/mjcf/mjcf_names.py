@@ -6,6 +6,8 @@ from typing import Any
 
 import mujoco
 
+from batchpid.arrays.array_types import MjModel
+
 ALONE = "engine 'mujoco' alone simulates"
 """Beginning of what findings say of elements that have no equivalent in a URDF."""
 MOVING = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -23,7 +25,7 @@ class Names:
     A body or joint without a name gets one of its number. :meth:`leave_out` removes the joints of other objects.
     """
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: MjModel) -> None:
         self._types, self._bodies, self._roots = model.jnt_type, model.jnt_bodyid, model.body_rootid
         self._left_out: set[int] = set()
         given = [model.body(body).name for body in range(1, model.nbody)]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from lxml import etree
 
+from batchpid.arrays.array_types import MjModel, MjSpec
 from batchpid.arrays.digest import digest
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.mjcf.mjcf_compiler import Attempt, compile_file
@@ -69,7 +70,7 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> M
     return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, missing, tuple(findings), file)
 
 
-def home(model: Any) -> int | None:
+def home(model: MjModel) -> int | None:
     """Return the number of the keyframe with the start pose, None without one."""
     return next((key for key in range(model.nkey) if model.key(key).name == _KEYFRAME), None)
 
@@ -100,12 +101,12 @@ def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> Mjcf
     )
 
 
-def content_of(scene: Any) -> str:
+def content_of(scene: MjSpec) -> str:
     """Return the digest of a compiled ``mujoco.MjSpec``, the same on every machine."""
     return digest(scene.to_xml())
 
 
-def _in_radians(model: Any, names: Names) -> list[Finding]:
+def _in_radians(model: MjModel, names: Names) -> list[Finding]:
     """Return a finding if all limited hinges have ranges within 3.2 degrees, as if radians were read as degrees."""
     hinges = [joint for joint in names.joints if model.jnt_limited[joint] and not names.is_slide(joint)]
     if not hinges or np.abs(model.jnt_range[hinges]).max() > np.deg2rad(3.2):
@@ -114,7 +115,7 @@ def _in_radians(model: Any, names: Names) -> list[Finding]:
     return [Finding("warning", "limits", text, 'add <compiler angle="radian"/> if the file is in radians')]
 
 
-def _unused(model: Any, names: Names, key: int | None) -> list[Finding]:
+def _unused(model: MjModel, names: Names, key: int | None) -> list[Finding]:
     """Return findings for content that is not simulated, apart from motors, couplings, shapes and keyframe ``key``."""
     found = []
     counts = {"site": model.nsite, "sensor": model.nsensor, "camera": model.ncam, "skin": model.nskin}

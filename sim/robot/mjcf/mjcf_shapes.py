@@ -10,13 +10,13 @@ import os
 from collections import defaultdict
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 from lxml import etree
 from numpy.typing import ArrayLike, NDArray
 
+from batchpid.arrays.array_types import MjModel
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
 from batchpid.io.files import write_atomically
@@ -31,16 +31,16 @@ _PARALLELS, _MERIDIANS = 12, 16
 """Rings, poles included, and vertices of a ring, of an ellipsoid's hull."""
 
 
-def can_collide(model: Any, geom: int) -> bool:
+def can_collide(model: MjModel, geom: int) -> bool:
     """Return whether a geom collides with anything, by its masks or in a ``<pair>``."""
     return bool(model.geom_contype[geom] | model.geom_conaffinity[geom]) or geom in _paired(model)
 
 
-def _paired(model: Any) -> set[int]:
+def _paired(model: MjModel) -> set[int]:
     return {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
 
 
-def excluded_pairs(model: Any, solid: dict[int, str]) -> tuple[DisabledPair, ...]:
+def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair, ...]:
     """Return the pairs of links with shapes that never collide: excluded, or by the masks of all their geoms.
 
     ``solid`` maps bodies with shapes to their links. Bodies that are welded together do not count.
@@ -74,7 +74,7 @@ def excluded_pairs(model: Any, solid: dict[int, str]) -> tuple[DisabledPair, ...
 class ShapeWriter:
     """Writer of a body's geoms as the ``<collision>`` elements of its link."""
 
-    def __init__(self, model: Any, names: Names, findings: list[Finding]) -> None:
+    def __init__(self, model: MjModel, names: Names, findings: list[Finding]) -> None:
         self._model, self._names, self._findings = model, names, findings
         self._files: dict[int, Path] = {}  # by number of the mesh
 
@@ -161,7 +161,7 @@ def text_of(values: ArrayLike) -> str:
     return " ".join(map(repr, np.asarray(values, float).tolist()))
 
 
-def _hull(model: Any, mesh: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+def _hull(model: MjModel, mesh: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Return vertices (n, 3) [m] and triangles (m, 3) of the convex hull of a mesh, or of the mesh if it has none.
 
     The hull's graph has the layout of ``mesh_graph`` in MuJoCo's mjmodel.h.

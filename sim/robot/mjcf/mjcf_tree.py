@@ -13,13 +13,13 @@ Several joints of one body become a chain of links, of which the last has the ma
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import MjModel
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.link_repair import MOMENTS
@@ -41,7 +41,7 @@ class Tree:
     ``names``. Raises RobotError if there is a ball joint, or more than one robot.
     """
 
-    def __init__(self, model: Any, names: Names, path: Path, fixed_base: bool, findings: list[Finding]) -> None:
+    def __init__(self, model: MjModel, names: Names, path: Path, fixed_base: bool, findings: list[Finding]) -> None:
         self._model, self._names, self._path, self._findings = model, names, path, findings
         self._shapes = ShapeWriter(model, names, findings)
         self._anchors = {0: np.zeros(3)}  # origin of each body's link, in the frame of the body
