@@ -1,5 +1,7 @@
 """Runner: N robots in N headless scenes, stepped by worker processes under one batch controller.
 
+Each method makes a command of its arguments (:mod:`batchpid.sim.commands`), which :meth:`Runner._execute` carries out.
+
 Longer than 300 lines because the public signatures and their documentation are spelled out for editors and readers.
 """
 
@@ -136,10 +138,13 @@ class Runner(SingleOwner):
             self._call.waits = True
             self._pool = WorkerPool(options, state.params)
             self._pool.open()
-            self._state = start.committed(state, self._pool.run(start.request(state)))
+            outcome = self._pool.run(start.request(state))
+            if outcome.failure is not None:
+                raise outcome.failure.error
+            self._state = state = start.committed(state, outcome)
         finally:
             self._call.end()
-        state = self._state
+        self._warnings.issue(state.faults, state.contacts, self._pool.messages)
         self._warnings.check_stability(state.params, state.actuators)
         self._warnings.set_gains(state.params, state.actuators)
         self._warnings.check_controller()

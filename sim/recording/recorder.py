@@ -6,8 +6,9 @@ most a second's ticks, however slow the disk. The file grows as ``NAME.partial``
 an existing file of that name is not touched before. See :mod:`batchpid.sim.recording.recording_files` for its
 content.
 
-A signal handler (Ctrl-C) can interrupt the calls at any moment, but not the thread. So the calls take no lock that the
-thread needs: they put items into queues that are written in C, and wait in ways that can be repeated.
+The runner gives a completed tick to :meth:`Recorder.append`, which only queues it, and calls :meth:`Recorder.wait`
+before the next: Ctrl-C interrupts the wait, in which nothing has begun, and loses no tick. It can interrupt the other
+calls at any moment, but not the thread. So they take no lock that the thread needs, and can be repeated.
 """
 
 from __future__ import annotations

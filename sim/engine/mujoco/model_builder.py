@@ -111,7 +111,7 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     found = file_scene(spec, file)
     scene, off = found.scene, mujoco.mjtDisableBit
     option = scene.option
-    option.disableflags &= ~(off.mjDSBL_GRAVITY | off.mjDSBL_ACTUATION | off.mjDSBL_CLAMPCTRL)
+    option.disableflags &= ~(off.mjDSBL_GRAVITY | off.mjDSBL_ACTUATION | off.mjDSBL_CLAMPCTRL | off.mjDSBL_SENSOR)
     option.enableflags &= ~(_NOT_KEPT)
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     _set_options(scene, spec)
