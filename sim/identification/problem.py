@@ -4,12 +4,11 @@ The residuals of joint j are its measured positions y less the simulated ones, r
 stretches b; in each the residuals of a joint are white noise of unknown size, so that the negative logarithm of the
 likelihood is, over the number of rows and joints::
 
-    mean over rows and joints of log(sigma_bj),     sigma_bj^2 = f_j^2 + mean over the rows of b of r_j^2
+    mean over rows and joints of log(sigma_bj),     sigma_bj^2 = f_j^2 + (1 - w) s_bj^2 + w (mean over b of s_bj)^2
 
-f^2 is the sum of the squares of twice the noise of the sensor, and of twice the root mean square of r_j in a stretch,
-on average over all: no model is exact, and a stretch in which the robot hardly moves would have all the weight. Where
-the model fails, for example where a joint slips a little sooner or later in the simulation, the size is large and the
-stretch has less weight.
+s_bj is the root mean square of r_j in b, and f twice the noise of the sensor. The mean is there because no model is
+exact, and a stretch in which the robot hardly moves would have all the weight. Where the model fails, for example where
+a joint slips a little sooner or later in the simulation, the size is large and the stretch has less weight.
 
 Motion by unknown disturbances, such as sensor noise between the rows, is removed from residuals and Jacobian
 (:mod:`batchpid.sim.identification.wander`); the simulated motion is the mean over several draws of them.
@@ -47,8 +46,8 @@ STRETCH = 0.5
 """Length of the stretches of a log [s], about."""
 NOISES = 2
 """Least size of residuals, over the noise of the sensor."""
-MODEL_ERROR = 2
-"""Least size of residuals, over their root mean square in a stretch, on average over the stretches."""
+SHARED = 0.8
+"""w: share of the mean of all stretches in the size of the residuals of each."""
 LEAST_NOISE = 1e-6
 """Least noise of a sensor, over the range of the motion."""
 WORST = 1e6
@@ -157,7 +156,7 @@ class Problem:
             ]
             stretches = np.stack(squares, axis=-2)
             mean = np.average(np.sqrt(stretches), axis=-2, weights=self._rows)[..., None, :]
-            return np.sqrt(stretches + self.noise**2 + (MODEL_ERROR * mean) ** 2)
+            return np.sqrt(self.noise**2 + (1 - SHARED) * stretches + SHARED * mean**2)
 
     def costs(self, sizes: Float64, determinants: Float64 | float = 0.0) -> Float64:
         """Return the negative logarithms of the likelihood (..., joints) for ``sizes`` (..., stretches, joints).

@@ -40,11 +40,14 @@ def test_calls_are_counted():
 
 @pytest.mark.parametrize(("shape", "more"), [((64, PANDA.dof), 0), ((PANDA.dof,), 1)])
 def test_python_calls_of_a_tick(shape, more):
-    """The least of some ticks: 0.1 s of waiting adds two or three, which look whether the worker is alive."""
+    """A tick that did not wait: 0.1 s of it adds two or three, which look whether the worker is alive."""
     setpoint = np.broadcast_to(PANDA.settings.target, shape).copy()
     with Runner(PANDA, 64, workers=1, substeps=2) as runner:
         for _ in range(2):
             runner.step(setpoint)
-        count, levels = min(python_calls(lambda: runner.step(setpoint)) for _ in range(20))
+        for _ in range(100):  # on a busy machine many
+            count, levels = python_calls(lambda: runner.step(setpoint))
+            if count <= CALLS + more:
+                break
     assert 10 < count <= CALLS + more
     assert 3 < levels <= LEVELS
