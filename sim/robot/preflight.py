@@ -108,7 +108,7 @@ def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Find
     if left_over := robot.self_contact.left_over:
         text = f"{len(left_over)} pairs that should not collide do, since PhysX's filter cannot hold them all"
         yield Finding("note", "pairs-left-over", text, "disable fewer pairs in the .srdf")
-    if robot.dynamics().in_contact(start[None])[0]:
+    if robot.dynamics(ground=robot.fixed_base and robot.has_ground).in_contact(start[None])[0]:
         text = "links overlap each other or the ground at the start pose: SAPIEN pushes them apart"
         remedy = "use another start pose, correct the collision shapes, or load with self_collision='auto'"
         yield Finding("warning", "touching", text, remedy)
