@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from batchpid.arrays.array_types import Document
 
 
-class Choice(NamedTuple):
+class NamedChoice(NamedTuple):
     """Base of choices. Equality depends on the type: as keys of a cache, plain empty tuples would all be equal."""
 
     def __eq__(self, other: object) -> bool:
@@ -23,43 +23,43 @@ class Choice(NamedTuple):
         return hash(type(self))
 
 
-class Everywhere(Choice):
+class Everywhere(NamedChoice):
     """An option that may be chosen per joint and env is on for all of them, so no mask is needed."""
 
 
-class IntegrateFirst(Choice):
+class IntegrateFirst(NamedChoice):
     """The present error enters the integral before the effort is computed."""
 
 
-class DerivativeKick(Choice):
+class DerivativeKick(NamedChoice):
     """The error before the first sample counts as 0, so that the first derivative is a kick."""
 
 
-class WeightFromStart(Choice):
+class WeightFromStart(NamedChoice):
     """Setpoint weighting measures positions from the first measurement instead of from 0."""
 
 
-class ZeroEffort(Choice):
+class ZeroEffort(NamedChoice):
     """A joint with a non-finite input gets effort 0."""
 
 
-class HoldEffort(Choice):
+class HoldEffort(NamedChoice):
     """A joint with a non-finite input gets its last effort again."""
 
 
-class MeasuredRate(Choice):
+class MeasuredRate(NamedChoice):
     """The derivative takes the measured velocity instead of the difference quotient of positions."""
 
 
-class PerInertia(Choice):
+class PerInertia(NamedChoice):
     """Gains are per unit of the joint's inertia, the diagonal of the mass matrix."""
 
 
-class PerMassMatrix(Choice):
+class PerMassMatrix(NamedChoice):
     """Gains are of an acceleration, which the whole mass matrix turns into an effort."""
 
 
-class ImplicitLaw(Choice):
+class ImplicitLaw(NamedChoice):
     """P, I and D act on position and velocity at the end of the step, which the law predicts."""
 
 

@@ -14,7 +14,7 @@ from batchpid.arrays.elementwise import replace_envs as reset
 from batchpid.motors import actuator_presets as presets
 from batchpid.motors.actuator_dynamics import (
     STAGES,
-    Coefficients,
+    MotorCoefficients,
     Stages,
     advance_effort,
     advance_measurement,
@@ -36,7 +36,7 @@ __all__ = [
     "STAGES",
     "ActuatorState",
     "Actuators",
-    "Coefficients",
+    "MotorCoefficients",
     "Stages",
     "advance_effort",
     "advance_measurement",

@@ -40,7 +40,7 @@ from batchpid.motors.envelope import Envelope, command_envelope, envelope, limit
 _ONE = np.uint32(1)
 
 
-class Coefficients(NamedTuple):
+class MotorCoefficients(NamedTuple):
     """:class:`Actuators` at one time step, in the symbols of :mod:`batchpid.motors.actuator_dynamics`; None is off."""
 
     command: delay.Delay | None = None
@@ -125,7 +125,7 @@ def init(
     return state._replace(effort=clip(_motor(k, asked), *limits(k.envelope, position, velocity), xp) + zeros)
 
 
-def discretise(actuators: Actuators, state: ActuatorState, dt: Array, num_envs: int | None = None) -> Coefficients:
+def discretise(actuators: Actuators, state: ActuatorState, dt: Array, num_envs: int | None = None) -> MotorCoefficients:
     """Return the coefficients at ``dt`` [s], for :func:`advance_effort` and :func:`advance_measurement`.
 
     With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches faster. Raises
@@ -137,7 +137,7 @@ def discretise(actuators: Actuators, state: ActuatorState, dt: Array, num_envs: 
     if a.sensor_delay is not None:
         begins = 0, a.sensor_delay.shape[1]
         position, velocity = (delay.discretise(a.sensor_delay, dt, state.sensor, begin) for begin in begins)
-    k = Coefficients(
+    k = MotorCoefficients(
         command=None if a.command_delay is None else delay.discretise(a.command_delay, dt, state.command),
         position_delay=position,
         velocity_delay=velocity,
@@ -201,13 +201,13 @@ class Stages(NamedTuple):
     """Position, velocity and the noise of each -> both as measured."""
 
 
-def _motor(k: Coefficients, effort: Array) -> Array:
+def _motor(k: MotorCoefficients, effort: Array) -> Array:
     """Return s u + b."""
     effort = effort if k.strength is None else k.strength * effort
     return effort if k.bias is None else effort + k.bias
 
 
-def _delivered(k: Coefficients, behind: Any, effort: Array, qpos: Array, qvel: Array) -> tuple[Array]:
+def _delivered(k: MotorCoefficients, behind: Any, effort: Array, qpos: Array, qvel: Array) -> tuple[Array]:
     """Return s u + b within the envelope, after the lag; ``behind`` is the effort of the step before, None without."""
     xp = namespace(effort, qpos, qvel)
     low, high = limits(k.envelope, qpos, qvel)
@@ -217,7 +217,7 @@ def _delivered(k: Coefficients, behind: Any, effort: Array, qpos: Array, qvel: A
     return (motor,)
 
 
-def command_limits(k: Coefficients, qpos: Array, qvel: Array) -> tuple[Array, Array]:
+def command_limits(k: MotorCoefficients, qpos: Array, qvel: Array) -> tuple[Array, Array]:
     """Return the least and the largest effort to ask for that the motor does not clip at ``qpos`` and ``qvel``.
 
     They are those for the saturation and anti-windup of a law. Delay and lag do not enter: they are dynamics, and as a
@@ -226,7 +226,7 @@ def command_limits(k: Coefficients, qpos: Array, qvel: Array) -> tuple[Array, Ar
     return limits(k.commands, qpos, qvel)
 
 
-def _play(k: Coefficients, encoder: Array, qpos: Array, qvel: Array) -> tuple[Array, Array]:
+def _play(k: MotorCoefficients, encoder: Array, qpos: Array, qvel: Array) -> tuple[Array, Array]:
     """Return position and velocity behind the backlash; ``encoder`` is the position of the step before."""
     xp = namespace(qpos, qvel)
     behind = wrap(encoder - qpos, k.turns, xp)
@@ -234,7 +234,7 @@ def _play(k: Coefficients, encoder: Array, qpos: Array, qvel: Array) -> tuple[Ar
     return qpos + offset, qvel * (offset != behind).astype(qvel.dtype)
 
 
-def _encode(k: Coefficients, qpos: Array, qvel: Array, position: Array, velocity: Array) -> tuple[Array, Array]:
+def _encode(k: MotorCoefficients, qpos: Array, qvel: Array, position: Array, velocity: Array) -> tuple[Array, Array]:
     """Return position and velocity as encoded: with offset and noise, in steps of the resolution.
 
     ``position`` and ``velocity`` are the noise, or None.
@@ -255,7 +255,7 @@ STAGES = Stages(_delivered, command_limits, _play, _encode)
 
 
 def advance_effort(
-    k: Coefficients, state: ActuatorState, effort: Array, qpos: Array, qvel: Array, stages: Stages = STAGES
+    k: MotorCoefficients, state: ActuatorState, effort: Array, qpos: Array, qvel: Array, stages: Stages = STAGES
 ) -> tuple[ActuatorState, Any]:
     """Advance the motors with given coefficients, for loops with constant actuators; otherwise as :func:`deliver`."""
     xp = namespace(effort, qpos, qvel)
@@ -268,7 +268,7 @@ def advance_effort(
 
 
 def advance_measurement(
-    k: Coefficients,
+    k: MotorCoefficients,
     state: ActuatorState,
     qpos: Array,
     qvel: Array,
@@ -294,7 +294,7 @@ def advance_measurement(
     return ActuatorState(command, effort, sensor, encoder, key, step), qpos, qvel
 
 
-def measurement_noise(k: Coefficients, key: Any, step: Any, like: Any, xp: ArrayModule) -> tuple[Array, Array]:
+def measurement_noise(k: MotorCoefficients, key: Any, step: Any, like: Any, xp: ArrayModule) -> tuple[Array, Array]:
     """Return the noise of positions and of velocities (..., envs, joints) at ``step`` (..., envs); None for none.
 
     ``key`` is the key of the state, and ``like`` an array (envs, joints) of the same dtype.

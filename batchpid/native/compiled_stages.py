@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.motors import STAGES, Coefficients, Stages
+from batchpid.motors import STAGES, MotorCoefficients, Stages
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
 from batchpid.native.operations import OPERATION
@@ -22,7 +22,7 @@ LEAST_OPERATIONS = 3
 """Least number of operations for which a call of the extension is faster than NumPy."""
 
 
-def compiled_stages(k: Coefficients, shape: tuple[int, int]) -> Stages:
+def compiled_stages(k: MotorCoefficients, shape: tuple[int, int]) -> Stages:
     """Return the stages of actuators with coefficients ``k``, as programs where programs are faster.
 
     ``shape`` is (envs, joints).
@@ -32,11 +32,11 @@ def compiled_stages(k: Coefficients, shape: tuple[int, int]) -> Stages:
     return Stages(*(_compiled(stage, k, shape) for stage in STAGES))
 
 
-def _compiled(stage: Callable[..., Any], k: Coefficients, shape: tuple[int, int]) -> Callable[..., Any]:
+def _compiled(stage: Callable[..., Any], k: MotorCoefficients, shape: tuple[int, int]) -> Callable[..., Any]:
     """Return ``stage``, run by programs where possible: one program for each set of inputs that are None."""
     programs: dict[tuple[bool, ...], Any] = {}
 
-    def run(given: Coefficients, *inputs: Any) -> Any:
+    def run(given: MotorCoefficients, *inputs: Any) -> Any:
         none = tuple([each is None for each in inputs])
         if none not in programs:
             programs[none] = _program(stage, k, shape, none)
@@ -48,7 +48,7 @@ def _compiled(stage: Callable[..., Any], k: Coefficients, shape: tuple[int, int]
 
 
 def _program(
-    stage: Callable[..., Any], k: Coefficients, shape: tuple[int, int], none: tuple[bool, ...]
+    stage: Callable[..., Any], k: MotorCoefficients, shape: tuple[int, int], none: tuple[bool, ...]
 ) -> ArrayProgram | None:
     """Return the program of ``stage``; None if it cannot be traced, or is faster in NumPy."""
     k = mapped(lambda leaf: tuple(leaf) if leaf.ndim == 3 else leaf, k)

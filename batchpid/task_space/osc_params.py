@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Array, Document
-from batchpid.arrays.choices import CHOICES, Choice
+from batchpid.arrays.choices import CHOICES, NamedChoice
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field
@@ -44,15 +44,15 @@ FIELDS = {
 """Options that are numbers; units are those with full decoupling."""
 
 
-class PartialDecoupling(Choice):
+class PartialDecoupling(NamedChoice):
     """The inertias of positions and of rotations, without the coupling between the two."""
 
 
-class NoDecoupling(Choice):
+class NoDecoupling(NamedChoice):
     """Gains are forces and moments: stiffness in N/m and N m/rad."""
 
 
-class ToolFrame(Choice):
+class ToolFrame(NamedChoice):
     """Gains, selected axes and wrenches are in the axes of the tool."""
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs, write_figures
+from batchpid.sim.cli.outputs import OutputFiles, write_figures
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import gain_set
 
@@ -50,7 +50,7 @@ class CompareCommand:
         from batchpid.sim.cli.report import draw_first_move, evaluation_table
         from batchpid.sim.cli.run import evaluate_sets, read_variation
 
-        outputs = Outputs(force=self.force)
+        outputs = OutputFiles(force=self.force)
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))

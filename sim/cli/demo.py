@@ -10,7 +10,7 @@ from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs, beside, write_figures
+from batchpid.sim.cli.outputs import OutputFiles, beside, write_figures
 from batchpid.sim.cli.progress import waiting
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import gain_set
@@ -63,7 +63,7 @@ class DemoCommand:
                 "robot", "has no tutorial setpoint", value=self.robot, remedy=f"run: batchpid rollout {self.robot}"
             )
         picture = self.picture or beside(Path("out") / robot.path.name, "demo")
-        outputs = Outputs(force=self.force)
+        outputs = OutputFiles(force=self.force)
         picture = outputs.path("picture", picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
         seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")

@@ -11,7 +11,7 @@ import numpy as np
 from batchpid.arrays.array_types import Document
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs
+from batchpid.sim.cli.outputs import OutputFiles
 
 if TYPE_CHECKING:
     import batchpid as bp
@@ -99,7 +99,7 @@ class ExportCommand:
                 raise InvalidArgumentError(option.name, problem, value=value, remedy="leave it out")
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
-        outputs = Outputs(force=self.force)
+        outputs = OutputFiles(force=self.force)
         out = outputs.path("out", out, (Path(FILES[self.to]).suffix,))
         others = {name: outputs.path("out", out.with_name(name), ()) for name in PROJECT if self.project}
         if self.to == "urdf":

@@ -11,7 +11,7 @@ import tyro
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs, beside, write_figures
+from batchpid.sim.cli.outputs import OutputFiles, beside, write_figures
 from batchpid.sim.cli.progress import AT_MOST, bar
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ class IdentifyCommand:
         if self.actuators is not None:
             return self._judge(robot, self.actuators)
         out = self.out or Path(f"out/{robot.path.stem}.actuators.yaml")
-        outputs = Outputs(force=self.force, inputs=(None if self.gains is None else Path(self.gains), *self.logs))
+        outputs = OutputFiles(force=self.force, inputs=(None if self.gains is None else Path(self.gains), *self.logs))
         out = outputs.path("out", out, (".yaml", ".yml", ".json"))
         details = outputs.path("json", self.json, (".json",))
         corrected = outputs.path("corrected_urdf", self.corrected_urdf, (".urdf",))

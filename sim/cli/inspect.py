@@ -13,7 +13,7 @@ import tyro
 from batchpid.io.versions import package_versions
 from batchpid.sim import Finding, Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs, write_figures
+from batchpid.sim.cli.outputs import OutputFiles, write_figures
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.joint_rows import HEADERS, joint_rows
@@ -51,7 +51,7 @@ class InspectCommand:
 
     def run(self) -> int:
         """Run the command and return its exit status."""
-        json = Outputs(force=self.force).path("json", self.json, (".json",))
+        json = OutputFiles(force=self.force).path("json", self.json, (".json",))
         robot = Robot.load(self.robot, **vars(self.meshes))
         mass = sum(link.mass for link in robot.link_masses.values())
         size = f"{robot.dof} degrees of freedom, {len(robot.links)} links, {mass:.4g} kg"

@@ -22,7 +22,7 @@ FOLDER = Path("out")
 P = TypeVar("P", bound=Path | None)
 
 
-class Outputs:
+class OutputFiles:
     """Output files of one run of a command.
 
     Parameters

@@ -8,7 +8,7 @@ import numpy as np
 
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs, write_figures
+from batchpid.sim.cli.outputs import OutputFiles, write_figures
 from batchpid.sim.tuning.gain_sets import gain_set
 
 
@@ -40,7 +40,7 @@ class ParityCommand:
         from batchpid.sim.plots.figures import engine_differences
         from batchpid.sim.tuning.engine_parity import compare_engines
 
-        outputs = Outputs(force=self.force)
+        outputs = OutputFiles(force=self.force)
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         json_path = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))

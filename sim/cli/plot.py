@@ -12,7 +12,7 @@ from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Rollout, read_recording
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs, beside, stem
+from batchpid.sim.cli.outputs import OutputFiles, beside, stem
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class PlotCommand:
         if not self.recording.is_file():  # before a picture is named after it
             read_recording(self.recording)
         shown = self.kind if self.versus is None else f"versus-{stem(self.versus)}"
-        outputs = Outputs(force=self.force, inputs=(self.recording, self.versus))
+        outputs = OutputFiles(force=self.force, inputs=(self.recording, self.versus))
         picture = outputs.path("picture", self.picture or beside(self.recording, shown), plots.FORMATS)
         rollout = _read(self.recording, every)
         if self.versus is not None:

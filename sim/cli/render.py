@@ -10,7 +10,7 @@ import tyro
 
 from batchpid.checks.validate import integer
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs, beside
+from batchpid.sim.cli.outputs import OutputFiles, beside
 from batchpid.sim.cli.progress import bar
 
 
@@ -46,7 +46,7 @@ class RenderCommand:
         from batchpid.sim.view.layout import MAX_ROBOTS
         from batchpid.sim.view.renderer import REMEDY, render_problem
 
-        outputs = Outputs(force=self.force, inputs=(self.recording,))
+        outputs = OutputFiles(force=self.force, inputs=(self.recording,))
         out = outputs.path("out", self.out or beside(self.recording, "film", ".mp4"), FORMATS)
         usage = f"batchpid render {shlex.quote(str(self.recording))} PATH/TO/ROBOT.urdf"
         rollout, robot = read_run(self.recording, self.robot, self.meshes, usage)

@@ -15,7 +15,7 @@ from batchpid.checks.validate import array, file_path, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Recorder, Robot, write_recording
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs, write_figures
+from batchpid.sim.cli.outputs import OutputFiles, write_figures
 from batchpid.sim.cli.progress import waiting
 from batchpid.sim.recording.recording_files import HDF5
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
@@ -102,7 +102,7 @@ class RolloutCommand:
             start_poses,
         )
 
-        outputs = Outputs(force=self.force)
+        outputs = OutputFiles(force=self.force)
         if self.resume and self.out is None:
             raise InvalidArgumentError("resume", "has no file to continue", remedy="add --out NAME.h5")
         if self.resume and self.out is not None:

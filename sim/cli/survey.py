@@ -12,7 +12,7 @@ import tyro
 
 from batchpid.io.files import write_atomically
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs, write_figures
+from batchpid.sim.cli.outputs import OutputFiles, write_figures
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class SurveyCommand:
         from batchpid.sim.cli.progress import bar
         from batchpid.sim.tuning.robot_survey import find_robots, survey
 
-        outputs = Outputs(force=self.force)
+        outputs = OutputFiles(force=self.force)
         json_path = outputs.path("json", self.json, (".json",))
         out = outputs.path("out", self.out, (".md",))
         urdfs = find_robots(self.paths)

@@ -14,7 +14,7 @@ from batchpid.arrays.array_types import Document
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import Outputs, beside
+from batchpid.sim.cli.outputs import OutputFiles, beside
 from batchpid.sim.cli.progress import bar
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import GainSet
@@ -93,7 +93,7 @@ class TuneCommand:
 
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         read = [Path(path) for path in (self.actuators, self.randomize) if path is not None]
-        outputs = Outputs(force=self.force, inputs=read)
+        outputs = OutputFiles(force=self.force, inputs=read)
         named = self.out or Path("out") / robot.path.name
         if self.control == "osc":
             return self._tune_tool(robot, named, outputs)
@@ -191,7 +191,7 @@ class TuneCommand:
         print("\n".join(f"  {line}" for line in within_report(robot, found, drawn)))
         return rejected, found
 
-    def _tune_tool(self, robot: Robot, named: Path, outputs: Outputs) -> None:
+    def _tune_tool(self, robot: Robot, named: Path, outputs: OutputFiles) -> None:
         """Tune operational-space control: print a table and write the options."""
         from batchpid.sim.cli.report import cause_lines, gains_table
         from batchpid.sim.tuning.tool_search import tune_tool

@@ -17,7 +17,7 @@ from batchpid.arrays.array_types import Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import BASES, Model, Refresh
+from batchpid.sim.engine.native.interface import BASES, ModelStruct, Refresh
 from batchpid.sim.engine.protocol import CompiledModel
 from batchpid.sim.engine.robot_model import passive_force, scene_tree
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -36,13 +36,13 @@ class NativeModel:
         return scene_tree(self._spec)
 
     @cached_property
-    def _structure(self) -> tuple[Model, Any]:
+    def _structure(self) -> tuple[ModelStruct, Any]:
         tree, rows = self._tree.tables
         inertias = self._tree.inertias()[None] if self._inertias is None else self._inertias
         arrays: dict[str, Rows] = {"tree": tree, "rows": rows, "inertias": inertias}
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
         numbers = {"dof": len(tree), "varies": self._inertias is not None, "base": BASES.index(self._base)}
-        return Model(gravity=self._spec.gravity, **numbers, **addresses), arrays
+        return ModelStruct(gravity=self._spec.gravity, **numbers, **addresses), arrays
 
     @property
     def address(self) -> int:

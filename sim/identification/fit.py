@@ -23,7 +23,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.identification.problem import Evaluation, Problem
+from batchpid.sim.identification.problem import FitEvaluation, Problem
 
 GAIN, LEAST_GAIN, STEP = 5e-3, 2e-4, 0.1
 """The fit ends with a step that decreases the cost by less than LEAST_GAIN, or by less than GAIN if it is shorter than
@@ -36,7 +36,7 @@ _INSIDE = 1e-9
 """Least distance of points from the bounds, over typical sizes."""
 
 
-class Step(NamedTuple):
+class FitStep(NamedTuple):
     """State of a fit before a step: all that the rest of the fit depends on."""
 
     theta: Float64
@@ -49,7 +49,7 @@ class Step(NamedTuple):
     """Cost there; inf at the start."""
 
     @classmethod
-    def first(cls, theta: Float64, evaluations: int) -> Step:
+    def first(cls, theta: Float64, evaluations: int) -> FitStep:
         """Return the state at the start of a fit."""
         return cls(theta, evaluations, theta, np.inf)
 
@@ -62,13 +62,13 @@ class Solution(NamedTuple):
     """Negative logarithm of the likelihood, over rows and joints."""
     sizes: Float64
     """Sizes of the residuals (stretches, joints) [rad or m]."""
-    windows: list[Evaluation]
+    windows: list[FitEvaluation]
     promised: float
     """Further decrease of the cost that linear residuals would allow; not small if the fit stopped before an
     optimum."""
 
 
-def fit(problem: Problem, begin: Step, report: Callable[[Step, float], None] = lambda *_: None) -> Solution:
+def fit(problem: Problem, begin: FitStep, report: Callable[[FitStep, float], None] = lambda *_: None) -> Solution:
     """Return the best point from ``begin`` on.
 
     ``report`` is called before each step with the state and the cost.
@@ -89,7 +89,7 @@ def fit(problem: Problem, begin: Step, report: Callable[[Step, float], None] = l
         sizes = factors.sizes(x * scale)
         determinants = np.concatenate([window.determinant for window in factors.windows(x * scale)])
         before, cost = cost, float(problem.costs(sizes, determinants).mean())
-        report(Step(x * scale, factors.left, last * scale, before), cost)
+        report(FitStep(x * scale, factors.left, last * scale, before), cost)
         gain = before - cost
         weighed = factors.at(x * scale) / sizes[..., None, None]
         moved = np.max(np.abs(x - last) / _deviations(weighed, scale / spread))
@@ -146,7 +146,7 @@ class _Factors:
     def __init__(self, problem: Problem, left: int) -> None:
         self.left = left
         self._problem = problem
-        self._known: dict[bytes, tuple[Float64, Float64, list[Evaluation]]] = {}
+        self._known: dict[bytes, tuple[Float64, Float64, list[FitEvaluation]]] = {}
 
     def at(self, theta: Float64) -> Float64:
         """Return the factors (stretches, joints, rows, unknowns + 1); inf if the simulation diverges."""
@@ -160,11 +160,11 @@ class _Factors:
         """Discard all points except ``theta``."""
         self._known = {theta.tobytes(): self._all(theta)}
 
-    def windows(self, theta: Float64) -> list[Evaluation]:
+    def windows(self, theta: Float64) -> list[FitEvaluation]:
         """Return residuals and Jacobian of all windows."""
         return self._all(theta)[2]
 
-    def _all(self, theta: Float64) -> tuple[Float64, Float64, list[Evaluation]]:
+    def _all(self, theta: Float64) -> tuple[Float64, Float64, list[FitEvaluation]]:
         key = theta.tobytes()
         if key not in self._known:
             # The one at the start does not count, so that a fit may resume there. A point that is moved off a bound
@@ -173,7 +173,7 @@ class _Factors:
             self._known[key] = self._evaluate(theta)
         return self._known[key]
 
-    def _evaluate(self, theta: Float64) -> tuple[Float64, Float64, list[Evaluation]]:
+    def _evaluate(self, theta: Float64) -> tuple[Float64, Float64, list[FitEvaluation]]:
         problem, scale = self._problem, self._problem.unknowns.scale
         with np.errstate(invalid="ignore", over="ignore"):  # simulations that diverge end at inf
             windows = problem.evaluate(theta)

@@ -8,14 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.sim.identification.fit import Step
+from batchpid.sim.identification.fit import FitStep
 from batchpid.sim.tuning.history import HistoryFile
 
 
 class State(NamedTuple):
     """State of a search: all that the rest of it depends on."""
 
-    step: Step
+    step: FitStep
     """State of the fit that is being done."""
     done: tuple[tuple[int, list[float]], ...] = ()
     """Fits that were done: number of the problem, and solution."""
@@ -41,7 +41,7 @@ class History:
         try:
             theta, last = (np.array(found[name], float) for name in ("theta", "last"))
             done = tuple((int(number), [float(value) for value in point]) for number, point in found["done"])
-            state = State(Step(theta, int(found["left"]), last, float(found["cost"])), done)
+            state = State(FitStep(theta, int(found["left"]), last, float(found["cost"])), done)
         except (ValueError, LookupError, TypeError, OverflowError) as error:
             raise self._file.damaged(str(error)) from None
         points = [theta, last, *(np.array(point) for _, point in done)]

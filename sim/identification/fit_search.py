@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.identification.fit import LEAST_GAIN, Solution, Step, fit
+from batchpid.sim.identification.fit import LEAST_GAIN, FitStep, Solution, fit
 from batchpid.sim.identification.fit_history import History, State
 from batchpid.sim.identification.plant import plants_of
-from batchpid.sim.identification.problem import Evaluation, Problem
+from batchpid.sim.identification.problem import FitEvaluation, Problem
 from batchpid.sim.identification.regression import Regression
 from batchpid.sim.identification.unknowns import LAW
 
@@ -55,13 +55,13 @@ def search(
 
     Each is begun with the solution of the one before, with ``evaluations`` at most.
     """
-    done = [(number, fit(problems[number], Step.first(np.array(theta), 0))) for number, theta in state.done]
-    begin: Step | None = state.step
+    done = [(number, fit(problems[number], FitStep.first(np.array(theta), 0))) for number, theta in state.done]
+    begin: FitStep | None = state.step
     while (stage := _stage(problems, done, evaluations)) is not None:
         number, start = stage
         before = tuple((number, solution.theta.tolist()) for number, solution in done)
 
-        def report(step: Step, cost: float, before: Any = before) -> None:
+        def report(step: FitStep, cost: float, before: Any = before) -> None:
             record.write(State(step, before))
             progress(len(before), step.left, cost)
 
@@ -81,7 +81,7 @@ def extended(problem: Problem, best: Solution, kinds: tuple[str, ...]) -> tuple[
         if not set(LAW).isdisjoint(kinds):  # with another law other motors explain the motion
             tried = np.concatenate([tried, [_regressed(wider, point) for point in tried]])
         costs = wider.costs(wider.sizes(wider.residuals(tried))).mean(1)
-        found = fit(wider, Step.first(tried[int(costs.argmin())], EXTRA_EVALUATIONS))
+        found = fit(wider, FitStep.first(tried[int(costs.argmin())], EXTRA_EVALUATIONS))
         before, after = (errors_of(wider, each.windows) for each in (best, found))
         if np.linalg.norm(after) < ACCEPTED * np.linalg.norm(before):
             return wider, found
@@ -112,18 +112,18 @@ def _typical(problem: Problem, best: Solution) -> dict[str, Float64]:
     return {name: np.maximum(size, 1e-3) for name, size in sizes.items()}
 
 
-def errors_of(problem: Problem, windows: list[Evaluation]) -> Float64:
+def errors_of(problem: Problem, windows: list[FitEvaluation]) -> Float64:
     """Return the root mean square of the residuals of each joint on the held-out rows (joints,) [rad or m]."""
     kept = [each.residual[~window.fitted] for each, window in zip(windows, problem.windows, strict=True)]
     with np.errstate(invalid="ignore", over="ignore"):
         return np.nan_to_num(np.sqrt((np.concatenate(kept) ** 2).mean(0)), nan=np.inf)
 
 
-def _stage(problems: list[Problem], done: list[tuple[int, Solution]], evaluations: int) -> tuple[int, Step] | None:
+def _stage(problems: list[Problem], done: list[tuple[int, Solution]], evaluations: int) -> tuple[int, FitStep] | None:
     """Return the number of the next problem and where its fit begins, None at the end."""
     if len(done) < len(problems):
         start = done[-1][1].theta if done else np.zeros(0)  # the first begins where the state says
-        return len(done), Step.first(start, evaluations)
+        return len(done), FitStep.first(start, evaluations)
     variants, neighbours = done[: len(problems)], iter(done[len(problems) :])
     number, best = min(variants, key=lambda each: each[1].cost)
     jumps = problems[number].drive.noisy or problems[number].shoots
@@ -134,7 +134,7 @@ def _stage(problems: list[Problem], done: list[tuple[int, Solution]], evaluation
         while (theta := _delayed(problems[number], at.theta, direction)) is not None:
             found = next(neighbours, None)
             if found is None:
-                return number, Step.first(theta, NEIGHBOUR_EVALUATIONS)
+                return number, FitStep.first(theta, NEIGHBOUR_EVALUATIONS)
             if found[1].cost > at.cost - LEAST_GAIN:
                 break
             at = found[1]

@@ -23,12 +23,12 @@ from batchpid.motors.actuator_files import dumps_actuators, loads_actuators
 from batchpid.native.availability import obstacle
 from batchpid.sim.identification.diagnosis import diagnose
 from batchpid.sim.identification.effort_ratios import EffortRatios, effort_ratios
-from batchpid.sim.identification.fit import Solution, Step
+from batchpid.sim.identification.fit import FitStep, Solution
 from batchpid.sim.identification.fit_history import History, State
 from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, extended, search
 from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_of, residuals_of_ideal
 from batchpid.sim.identification.inputs import read_inputs
-from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.plant import Plant, plants_of
 from batchpid.sim.identification.problem import Problem
@@ -161,13 +161,13 @@ def identify(
         pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
     with pool as executor:
 
-        def fit_under(drive: Drive, regression: Regression, record: History) -> tuple[Problem, Solution]:
+        def fit_under(drive: LoggedDrive, regression: Regression, record: History) -> tuple[Problem, Solution]:
             """Return the likeliest fit under ``drive``."""
             problems = [
                 Problem(resting, joints, each, found, motions, unknowns, executor) for each in variants(drive, motions)
             ]
             known = record.state(len(unknowns.names), max(evaluations, NEIGHBOUR_EVALUATIONS), len(problems))
-            state = known or State(Step.first(begin(problems[0], regression, ideal, seed), evaluations))
+            state = known or State(FitStep.first(begin(problems[0], regression, ideal, seed), evaluations))
             return search(problems, state, evaluations, record, Progress(len(problems), evaluations, progress))
 
         fits_of_ways = [fit_under(drive, regression, record)]
@@ -235,7 +235,7 @@ def _known(log: Log, payload: bool, ratios: EffortRatios | None) -> Motors:
 
 
 def _unknowns(
-    robot: Robot, joints: tuple[int, ...], drive: Drive, start: Regression, motions: list[Motion], payload: bool
+    robot: Robot, joints: tuple[int, ...], drive: LoggedDrive, start: Regression, motions: list[Motion], payload: bool
 ) -> Unknowns:
     """Return the unknowns with typical sizes from the motion."""
     plant, motors = Plant(robot, joints, drive), start.best.motors

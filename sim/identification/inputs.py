@@ -14,7 +14,7 @@ import batchpid as bp
 from batchpid.checks.validate import choice, flag, instance, integer, number
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.logs import Log, LogWarning, at_limits, checked, read_logs
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
@@ -33,7 +33,7 @@ class Inputs(NamedTuple):
     robot: Robot
     """The robot, which rests where the joints that did not move are."""
     logs: list[Log]
-    drive: Drive
+    drive: LoggedDrive
     """Control, with the compensation outside of the motors."""
     still: list[str]
     """Names of the joints that did not move."""
@@ -77,7 +77,7 @@ def read_inputs(
     params = found[0].settings.params if params is None else params
     measured = params is not None and params.measurement_rate is not None
     forces = _forces(compensate)
-    drive = Drive(control / sim_steps, params, forces, substeps=sim_steps, measured_rate=measured)
+    drive = LoggedDrive(control / sim_steps, params, forces, substeps=sim_steps, measured_rate=measured)
     return Inputs(resting, found, drive, still)
 
 

@@ -30,7 +30,7 @@ from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, St
 
 
 @dataclass(frozen=True)
-class Drive:
+class LoggedDrive:
     """Control of the robot in a log."""
 
     timestep: float
@@ -57,7 +57,7 @@ class Drive:
         """Hypothesis about the compensation."""
         return self.compensate, self.through, self.knows_payload
 
-    def of(self, motors: Motors) -> Drive:
+    def of(self, motors: Motors) -> LoggedDrive:
         """Return the drive with gains, saturation and limit of the setpoints' rate of n candidates (n, joints)."""
         params = self.params
         if params is None or motors.keys().isdisjoint(LAW):
@@ -88,7 +88,7 @@ class Drive:
         }
 
 
-class Control:
+class LoggedControl:
     """Control and motors of n robots: :func:`batchpid.sim.loop.control_step.control_step` at every sim step.
 
     It is a native program where programs are used, with the same bits as NumPy.
@@ -96,7 +96,7 @@ class Control:
 
     def __init__(
         self,
-        drive: Drive,
+        drive: LoggedDrive,
         actuators: Actuators,
         qpos: Float64,
         qvel: Float64,

@@ -37,7 +37,7 @@ from batchpid.motors.friction import Friction, bound_of
 from batchpid.sim.engine.joint_friction import added_friction
 from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.identification.log import Log
-from batchpid.sim.identification.logged_control import Control, Drive
+from batchpid.sim.identification.logged_control import LoggedControl, LoggedDrive
 from batchpid.sim.identification.unknowns import Motors, actuators_of
 from batchpid.sim.robot.robot import Robot
 from batchpid.task_space import native_rows
@@ -84,7 +84,7 @@ class Passive(NamedTuple):
 class Plant:
     """Logged ``joints`` of ``robot`` under ``drive``."""
 
-    def __init__(self, robot: Robot, joints: tuple[int, ...], drive: Drive) -> None:
+    def __init__(self, robot: Robot, joints: tuple[int, ...], drive: LoggedDrive) -> None:
         self.drive, own, coupling = drive, list(joints), robot.coupling
         tree, whole = robot_model(robot, False).tree.held, robot.rigid_tree
         moves = np.isin(coupling.leader, joints)
@@ -179,15 +179,15 @@ class Plant:
         qpos: Float64,
         qvel: Float64,
         asked: Float64 | None = None,
-        drive: Drive | None = None,
-    ) -> Control:
+        drive: LoggedDrive | None = None,
+    ) -> LoggedControl:
         """Return the control of robots at ``qpos`` and ``qvel`` (n, joints), with their motors; default: its drive."""
         unloaded = np.zeros((len(qpos), 1))
 
         def model(qpos: Float64) -> Float64:
             return self.mass_matrix(qpos, unloaded)
 
-        return Control(drive or self.drive, actuators, qpos, qvel, asked, self._damping, model)
+        return LoggedControl(drive or self.drive, actuators, qpos, qvel, asked, self._damping, model)
 
     def simulate(self, motors: Motors, segments: list[Segment], past: int) -> Float64:
         """Return the positions (n, steps + 1, joints) of candidate i in segment i, the start included.
@@ -237,7 +237,7 @@ class Plant:
         return out if offset is None else out + offset[:, None]
 
 
-def plants_of(robot: Robot, joints: tuple[int, ...], drive: Drive, logs: list[Log]) -> list[Plant]:
+def plants_of(robot: Robot, joints: tuple[int, ...], drive: LoggedDrive, logs: list[Log]) -> list[Plant]:
     """Return the plant of each log under ``drive``, with the robot and the params of its settings."""
     known: dict[tuple[int, int], Plant] = {}
     found = []

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.regression import Motion
 from batchpid.sim.identification.unknowns import Unknowns, take
@@ -56,7 +56,7 @@ STATE_STEP = 1e-4
 """Change of an initial position [rad or m], and of a velocity per second, for the projection."""
 
 
-class Evaluation(NamedTuple):
+class FitEvaluation(NamedTuple):
     """Residuals of a point, and their Jacobian, of one window."""
 
     residual: Float64
@@ -77,7 +77,7 @@ class Problem:
 
     robot: Robot
     joints: tuple[int, ...]
-    drive: Drive
+    drive: LoggedDrive
     logs: list[Log]
     motions: list[Motion]
     unknowns: Unknowns
@@ -165,7 +165,7 @@ class Problem:
         """
         return np.average(np.log(np.fmin(sizes, WORST)) + determinants, axis=-2, weights=self._rows)
 
-    def evaluate(self, theta: Float64) -> list[Evaluation]:
+    def evaluate(self, theta: Float64) -> list[FitEvaluation]:
         """Return residuals and Jacobian of each window at one point (unknowns,)."""
         changes, joints = self.unknowns.changes(theta), len(self.joints)
         inverse, count = np.linalg.inv(changes).T, len(changes) + 1
@@ -187,7 +187,7 @@ class Problem:
             noise = self.noise / NOISES
             wander /= noise[:, None]
             expected = noise * np.sqrt(1 + (wander**2).sum(2))
-            found.append(Evaluation(residual, *whiten(wander, stretches, residual, jacobian), expected))
+            found.append(FitEvaluation(residual, *whiten(wander, stretches, residual, jacobian), expected))
         return found
 
     def lags(self, seconds: float) -> list[int]:

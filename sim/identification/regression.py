@@ -22,7 +22,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.sim.identification.log_noise import Noise, split
-from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.plant import Plant, plants_of
 from batchpid.sim.identification.unknowns import Motors
@@ -71,7 +71,7 @@ class Motion(NamedTuple):
     """Efforts that are added to the efforts of the law."""
 
 
-class Start(NamedTuple):
+class FirstGuess(NamedTuple):
     """Result of the regression."""
 
     motors: Motors
@@ -153,7 +153,7 @@ class Regression:
             self.ratios_only = links < LEAST_SHARE**2 * efforts
             self._bounds = [TAKEN if each else STRENGTHS for each in self.ratios_only]
 
-    def at(self, delay: float, kg: float = 0.0, strength_prior: float | Float64 = WEAK) -> Start:
+    def at(self, delay: float, kg: float = 0.0, strength_prior: float | Float64 = WEAK) -> FirstGuess:
         """Return the motors that explain the efforts best at a ``delay`` [s], with a payload.
 
         ``strength_prior`` is the weight of the prior at strength 1, of all joints or of each (joints,).
@@ -168,7 +168,7 @@ class Regression:
             both.append(_solve_joint(required, columns, NO_PRIOR if bounds == GAINS else prior, bounds))
         cost = float(sum(np.log(mean + 1e-30) for mean, _ in both))
         values = [*np.array([found for _, found in both]).T[:, None], *np.array([delay, kg])[:, None, None]]
-        return Start(dict(zip(FOUND, values, strict=True)), cost)
+        return FirstGuess(dict(zip(FOUND, values, strict=True)), cost)
 
     def tables(self, delay: float, kg: float) -> tuple[Float64, ...]:
         """Return required efforts, acceleration, velocity, its sign, and the efforts so far, all (rows, joints)."""
@@ -179,7 +179,7 @@ class Regression:
         return empty + kg * per_kg, a, v, sign, effort
 
     @cached_property
-    def best(self) -> Start:
+    def best(self) -> FirstGuess:
         """Motors at the delay, and with the payload if one is asked for, that explain the efforts best."""
         empty = self._at_best_delay(0.0)
         if not self._payload:
@@ -190,11 +190,11 @@ class Regression:
             loaded = self._at_best_delay(PAYLOADS[int(np.argmin(costs))])
         return loaded if explains_better(loaded, empty) else empty
 
-    def _at_best_delay(self, kg: float) -> Start:
+    def _at_best_delay(self, kg: float) -> FirstGuess:
         return min((self.at(delay, kg, NO_PRIOR) for delay in DELAYS), key=lambda start: start.cost)
 
 
-def explains_better(special: Start, plain: Start) -> bool:
+def explains_better(special: FirstGuess, plain: FirstGuess) -> bool:
     """Return whether ``special`` explains the efforts significantly better than ``plain``."""
     return plain.cost - special.cost > EVIDENCE * plain.motors["armature"].shape[1]
 
@@ -240,7 +240,7 @@ def _solve_joint(
     return float(((matrix @ found + required) ** 2).mean()), found / size
 
 
-def hypotheses(drive: Drive, payload: bool) -> list[Drive]:
+def hypotheses(drive: LoggedDrive, payload: bool) -> list[LoggedDrive]:
     """Return the possible compensations: outside the motors, with the payload or without, or through the motors.
 
     The logged efforts may also include the compensation.
@@ -253,7 +253,7 @@ def hypotheses(drive: Drive, payload: bool) -> list[Drive]:
     return ways if drive.params is not None else [*ways, replace(drive, compensate="none")]
 
 
-def variants(drive: Drive, motions: list[Motion]) -> list[Drive]:
+def variants(drive: LoggedDrive, motions: list[Motion]) -> list[LoggedDrive]:
     """Return the possible measurements of the law: with or without sensor noise, rates or differences of positions.
 
     Without noise, the law gets the simulated positions and rates.
@@ -268,12 +268,12 @@ def variants(drive: Drive, motions: list[Motion]) -> list[Drive]:
 def best_drive(
     robot: Any,
     joints: tuple[int, ...],
-    drive: Drive,
+    drive: LoggedDrive,
     logs: list[Log],
     motions: list[Motion],
     payload: bool,
     gains_known: bool = True,
-) -> tuple[Drive, Regression]:
+) -> tuple[LoggedDrive, Regression]:
     """Return the drive that explains the logs best, with its regression."""
     ways = hypotheses(drive, payload)
     found = [

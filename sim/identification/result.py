@@ -15,7 +15,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.confidence_region import KEY, Region
 from batchpid.sim.identification.diagnosis import Diagnosis
 from batchpid.sim.identification.held_out import ASSUMED
-from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.statistics import INTERVAL, Uncertainty
 from batchpid.sim.identification.unknowns import ADDED, DESCRIBED, KINDS, Unknowns, kind_of
 from batchpid.sim.robot.robot import Robot
@@ -57,7 +57,7 @@ class Identification(NamedTuple):
     """Held-out residuals over the noise of the sensors (joints,): about 1 if the model explains the motion."""
     noise: Float64
     """Root mean square of the residuals (joints,) [rad or m]."""
-    drive: Drive
+    drive: LoggedDrive
     """Control of the robot, as assumed or found."""
     settings: Document
     """Logs, options and versions, for the record."""

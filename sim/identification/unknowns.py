@@ -23,7 +23,7 @@ class Kind(NamedTuple):
 
     field: str | None
     """Field of :class:`batchpid.Actuators`; None: of the plant, :mod:`batchpid.sim.identification.plant`, or of the
-    law, :meth:`batchpid.sim.identification.logged_control.Drive.of`."""
+    law, :meth:`batchpid.sim.identification.logged_control.LoggedDrive.of`."""
     per_joint: bool
     low: float
     high: float

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
-from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.plant import Plant, Segment
 from batchpid.sim.identification.regression import Motion
@@ -64,12 +64,12 @@ class Subject(NamedTuple):
 
     robot: Robot
     joints: tuple[int, ...]
-    drive: Drive
+    drive: LoggedDrive
     key: str
     """Digest of these."""
 
     @classmethod
-    def of(cls, robot: Robot, joints: tuple[int, ...], drive: Drive) -> Subject:
+    def of(cls, robot: Robot, joints: tuple[int, ...], drive: LoggedDrive) -> Subject:
         """Return the subject with its digest."""
         return cls(robot, joints, drive, digest(robot.describe(), joints, drive))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.law.coefficients import spread
-from batchpid.motors import ActuatorState, Coefficients, measurement_noise
+from batchpid.motors import ActuatorState, MotorCoefficients, measurement_noise
 from batchpid.native.compiled_stages import compiled_stages
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
@@ -181,12 +181,12 @@ class NoiseBlocks:
         self._first = 0
         self._block: tuple[Array, Array] = (None, None)
 
-    def __call__(self, k: Coefficients, state: ActuatorState, like: Float64) -> tuple[Array, Array] | None:
+    def __call__(self, k: MotorCoefficients, state: ActuatorState, like: Float64) -> tuple[Array, Array] | None:
         """Return the noise of positions and velocities; None for sensors without noise."""
         blocks = self.from_step(k, state, like)
         return None if blocks is None else (_first(blocks[0]), _first(blocks[1]))
 
-    def from_step(self, k: Coefficients, state: ActuatorState, like: Float64) -> tuple[Array, Array] | None:
+    def from_step(self, k: MotorCoefficients, state: ActuatorState, like: Float64) -> tuple[Array, Array] | None:
         """Return the noise of the step of a state and the next ones (steps, M, dof), as far as it has been drawn.
 
         A reset replaces the key. While the key is the same, all envs advance by the same number of steps.

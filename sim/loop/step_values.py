@@ -46,7 +46,7 @@ class Measured(NamedTuple):
 class Step(NamedTuple):
     """Place of a sim step in its tick."""
 
-    index: Any
+    index: Array
     """Sim steps of the tick before this one."""
     end: Array
     """Sim steps of the tick."""
@@ -121,7 +121,7 @@ class Constants(NamedTuple):
     guard: Any = None
     """:class:`batchpid.Guard`"""
     motors: Any = None
-    """:class:`batchpid.motors.Coefficients` of motors and sensors."""
+    """:class:`batchpid.motors.MotorCoefficients` of motors and sensors."""
     driven: bp.PIDParams | None = None
     """Params of the integral that moves the targets of drives."""
     turns: Array = None

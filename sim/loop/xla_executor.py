@@ -29,7 +29,7 @@ from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Ou
 from batchpid.sim.options import RunnerOptions
 
 
-class Bodies(NamedTuple):
+class TracedBodies(NamedTuple):
     """Arguments of :func:`batchpid.sim.engine.native.xla.mass_matrix`; None where nothing needs them."""
 
     tree: Any = None
@@ -83,7 +83,7 @@ class XLAExecutor:
         rows = (pack.size, pack.dof)
         with own_settings(options.dtype):
             self._constants = put(arrays)
-            self._bodies = put(Bodies() if tables is None else Bodies(*tables))
+            self._bodies = put(TracedBodies() if tables is None else TracedBodies(*tables))
             self._zero = put(padded(np.zeros(rows)))
 
     def measure(self) -> Measured:
@@ -159,7 +159,7 @@ def tick(
     gravity: bool,
     span: Any,
     constants: Constants,
-    bodies: Bodies,
+    bodies: TracedBodies,
     state: StepState,
     measured: Measured,
     command: Command,

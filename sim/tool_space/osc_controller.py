@@ -37,7 +37,7 @@ OPTIONAL = {
 """Names of further entries of a setpoint, and units of the linear and angular ones."""
 
 
-class Friction(NamedTuple):
+class TaskFriction(NamedTuple):
     """Known Coulomb friction of the joints, and the band of small errors in which it is reduced (1, dof)."""
 
     coulomb: Array
@@ -130,14 +130,14 @@ class OperationalSpace:
             raise InvalidArgumentError("params", problem, remedy="make them with robot.kinematic_tree()")
         self._params = params
         self._k, self._timestep = ts.discretise(params, 1 / 2000), 1 / 2000
-        self._friction: Friction | None = None
+        self._friction: TaskFriction | None = None
         # Damping and friction that the robot is known to have: the law acts against them.
         modelled, known = DISSIPATION[robot.dissipation].modelled, known_joints(robot)
         damping = known.viscous + np.array([joint.damping * modelled for joint in robot.joints])
         self._damping = damping[None] if damping.any() else None
         coulomb = known.coulomb + robot.friction * modelled
         band = np.array([BAND[unit] for unit in robot.units])
-        self._known_friction = Friction(coulomb[None], band[None]) if coulomb.any() else None
+        self._known_friction = TaskFriction(coulomb[None], band[None]) if coulomb.any() else None
         chain = tree.chain(link)
         # A setpoint has the pose (7), then the optional twist, acceleration and wrench (6 each), then single joints.
         self._columns = np.zeros(tree.dof, np.intp)  # of the setpoint, for each joint; 0 for none

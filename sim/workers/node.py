@@ -32,7 +32,7 @@ class NodeInfo(NamedTuple):
     """Digest of the canonical episode (:mod:`batchpid.sim.workers.canonical`)."""
 
 
-class Share(NamedTuple):
+class NodeShare(NamedTuple):
     """Part of a runner's envs that the pool of a node has."""
 
     first_env: int
@@ -71,7 +71,7 @@ class Node:
         # The caller replaces a node that has lost a worker: it keeps the requests to replay.
         options = start.options.with_values(workers=workers, cluster=None, recover=False)
         envs = start.envs
-        self._pool = pool_type(options, start.params, Share(envs.start, envs.stop - envs.start, ticks))
+        self._pool = pool_type(options, start.params, NodeShare(envs.start, envs.stop - envs.start, ticks))
         self._pool.open()
         digest = self._run(ReadDigest(canonical)).result
         pids = tuple(worker.pid for worker in self._pool.workers)

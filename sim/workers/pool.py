@@ -27,7 +27,7 @@ from batchpid.sim.loop.failure import Failure, order
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.workers.cluster import NODE_STEPS, Cluster
 from batchpid.sim.workers.memory import check_memory
-from batchpid.sim.workers.node import NodeInfo, Share
+from batchpid.sim.workers.node import NodeInfo, NodeShare
 from batchpid.sim.workers.node_worker import NodeWorker
 from batchpid.sim.workers.placement import pinned_cores, split_envs
 from batchpid.sim.workers.requests import Request, Start
@@ -99,7 +99,7 @@ class WorkerPool(SingleOwner):
     Each node has its own pool, for a ``share`` of the envs.
     """
 
-    def __init__(self, options: RunnerOptions, params: bp.PIDParams, share: Share | None = None) -> None:
+    def __init__(self, options: RunnerOptions, params: bp.PIDParams, share: NodeShare | None = None) -> None:
         self._options, self._params = options, params
         self.messages: dict[type[Warning], str] = {}
         """Latest message of each category, for warnings."""

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any
 
-from batchpid.law.params import PIDParams
+from batchpid import PIDParams
 
 
 @dataclass

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
+from batchpid import spectral_radius, stability_bound
 from batchpid.errors import InvalidArgumentError
 from batchpid.gains.design import FILTER_SHARE, FILTER_STEPS, pid_from_inertia
-from batchpid.gains.stability import spectral_radius, stability_bound
 from batchpid.metrics import step_metrics
 
 DT = 1 / 2000

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from batchpid.arrays.elementwise import replace_envs
 from batchpid.motors import friction
-from batchpid.motors.friction import Friction
+from batchpid.sim.engine.protocol import Friction
 
 DT = 1 / 2000
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
+from batchpid import spectral_radius
 from batchpid.errors import InvalidArgumentError
 from batchpid.export import to_isaac_lab, to_maniskill, to_ros2_control
-from batchpid.gains.stability import spectral_radius
 from batchpid.law.computed_torque import advance_with_mass_matrix
 from batchpid.law.implicit import as_explicit
 

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
+from batchpid import spectral_radius, stability_bound
 from batchpid.errors import InvalidArgumentError
-from batchpid.gains.stability import oscillation, spectral_radius, stability_bound
+from batchpid.gains.stability import oscillation
 
 DT = 1 / 2000
 

@@ -15,8 +15,7 @@ from identical import assert_identical
 from robots import load_bundled
 
 import batchpid as bp
-from batchpid.sim import Randomization, Runner, Uniform
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim import Randomization, Runner, RunnerOptions, Uniform
 
 ROBOT = load_bundled("panda")
 N, DOF = 4, ROBOT.dof

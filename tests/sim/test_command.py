@@ -489,7 +489,7 @@ def test_a_recording_plays_back_with_numbers_by_name(arm, rollout):
 
 def test_identification_and_metrics_refuse_such_runs(arm, rollout):
     from batchpid.sim.identification.logs import logs_of_rollout
-    from batchpid.sim.tuning.evaluation import step_response_metrics
+    from batchpid.sim.tuning import step_response_metrics
 
     with pytest.raises(InvalidArgumentError, match=r"setpoints of x, z, gain <b>, not of joints"):
         step_response_metrics(arm, rollout, np.zeros((N, 2)))

@@ -16,12 +16,11 @@ import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.errors import BatchPIDError
 from batchpid.export import to_c
-from batchpid.sim import OperationalSpace, Robot, Runner
+from batchpid.sim import OperationalSpace, Robot, Runner, write_recording
 from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
 from batchpid.sim.identification import identify
-from batchpid.sim.recording.recording_files import write_recording
 from batchpid.sim.robot.urdf_export import to_urdf
-from batchpid.sim.tuning.search import tune
+from batchpid.sim.tuning import tune
 from batchpid.task_space.frames import pose_error
 from batchpid.trajectories import minimum_jerk
 from tests.c_programs import COMPILERS, TABLE, compiled

@@ -15,7 +15,7 @@ from robots import load_bundled
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim import RunInfo, Runner, RunnerKeywords, RunnerOptions
-from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.engine.protocol import SceneSpec
 
 PANDA = load_bundled("panda")
 OWN = bp.make_actuators(PANDA.dof, coulomb=0.3, armature=0.05, command_delay=0.002)

@@ -120,7 +120,7 @@ def test_bundled_gains_do_not_warn(panda, jaco2):
 def test_candidates_of_a_search_do_not_warn(arm, monkeypatch):
     monkeypatch.setattr(Candidates, "params", lambda self, points: arm.params(**BAD, derivative_filter_time=1e-6))
     import batchpid.sim.tuning.moves as moves
-    from batchpid.sim.tuning.weights import Weights
+    from batchpid.sim.tuning import Weights
 
     some = moves.random_moves(arm, 2, 0)
     search = Candidates(arm, "effort", False, some, 0.02, Weights(), headroom=1.0, varied=False)

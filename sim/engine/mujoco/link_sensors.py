@@ -52,7 +52,7 @@ def _parts(body: Any, others: set[str]) -> Iterator[Any]:
             yield from _parts(child, others)
 
 
-class LinkSensors:
+class MujocoLinkSensors:
     """Places of the sensors of ``spec`` in the ``size`` values of ``model``; ``bodies`` are the bodies of its links."""
 
     def __init__(self, spec: SceneSpec, model: MjModel, bodies: dict[str, int]) -> None:

@@ -21,7 +21,7 @@ from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.data_pool import DataPool
-from batchpid.sim.engine.mujoco.link_sensors import LinkSensors
+from batchpid.sim.engine.mujoco.link_sensors import MujocoLinkSensors
 from batchpid.sim.engine.mujoco.model_builder import FLOATING, LARGEST_FORCE, RobotMj, robot_model, set_inertia
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
@@ -101,7 +101,7 @@ class MujocoPack(SingleOwner):
         if robot not in self._workspace:
             self._workspace[robot] = DataPool(robot)
         self._robot, self._pool = robot, self._workspace[robot]
-        self._sensors = LinkSensors(self.spec, robot.model, robot.bodies)
+        self._sensors = MujocoLinkSensors(self.spec, robot.model, robot.bodies)
         self._sensed = np.zeros((self.size, self._sensors.size))
         self.models, self.rows = [self._pool.model] * self.size, self._pool.initial(self.size)
         self._at, self._moves = _columns(robot.qpos), _columns(robot.qvel)

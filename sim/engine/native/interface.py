@@ -25,7 +25,7 @@ SYMBOLS = (
 )
 """Functions of SAPIEN, in the order of Functions in gateway.h."""
 BASES = ("fixed", "free", "held")
-"""Kinds of the base of a :class:`Model`, as Base in model.h."""
+"""Kinds of the base of a :class:`ModelStruct`, as Base in model.h."""
 STATUS = ("not_finite", "too_fast", "failed", "no_noise")
 """Bits of the status of a sim step: reasons to stop a loop over sim steps, as Status in sim_step.h."""
 STAGES = ("program", "force", "inertia", "mass_matrix", "controller", "targets", "constraint", "engine")
@@ -97,7 +97,7 @@ class Constraint(ctypes.Structure):
     ]
 
 
-class Model(ctypes.Structure):
+class ModelStruct(ctypes.Structure):
     """Rigid-body model of robots, as Model in model.h."""
 
     _fields_ = [

@@ -18,9 +18,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.export import to_isaac_lab, to_maniskill, to_newton
 from batchpid.export.pd_drive import EFFECTS
 from batchpid.law.computed_torque import advance_with_mass_matrix
-from batchpid.motors import envelope
-from batchpid.motors.actuator_fields import JOINT_SIDE
-from batchpid.motors.actuators import make_actuators
+from batchpid.motors import JOINT_SIDE, envelope, make_actuators
 
 PD = {"measurement_rate": "measured"}
 

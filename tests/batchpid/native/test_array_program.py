@@ -13,7 +13,7 @@ from test_compiled_law import bits, numbers
 import batchpid as bp
 from batchpid.arrays.elementwise import matrix_vector, push_history, read_history, row_minimum, take_columns
 from batchpid.motors import STAGES, delay, friction, guard
-from batchpid.motors import Coefficients as ActuatorCoefficients
+from batchpid.motors import MotorCoefficients as ActuatorCoefficients
 from batchpid.motors.envelope import Envelope
 from batchpid.native import array_program
 from batchpid.native.array_program import ArrayProgram

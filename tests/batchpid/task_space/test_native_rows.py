@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from trees import planar, states, tool_of, tree_of
 
 import batchpid.task_space as ts
-from batchpid.native.availability import SWITCH
 from batchpid.task_space import native_rows
 
 pytestmark = pytest.mark.skipif(native_rows.in_use() is None, reason="there is no extension")
@@ -24,7 +23,7 @@ MASKS = st.lists(st.booleans(), min_size=6, max_size=6)
 def both(function):
     """Return the results of native code and of NumPy."""
     found = function()
-    with mock.patch.dict("os.environ", {SWITCH: "0"}):
+    with mock.patch.dict("os.environ", {"BATCHPID_NATIVE": "0"}):
         return found, function()
 
 

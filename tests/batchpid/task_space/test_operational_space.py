@@ -10,7 +10,6 @@ from trees import planar, states, tree_of
 
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
-from batchpid.native.availability import SWITCH
 from batchpid.task_space import frames
 
 DT = 1 / 2000
@@ -198,7 +197,7 @@ def test_inputs_of_a_step_are_checked(monkeypatch):
         inputs = ts.OSCInputs(**({"setpoint": goal, "qpos": qpos, "qvel": qpos} | change))
         for dynamics in (ts.task_dynamics(tree, qpos, qpos, "tip"), ts.Tool(tree, "tip")):
             for switch in "01":
-                monkeypatch.setenv(SWITCH, switch)
+                monkeypatch.setenv("BATCHPID_NATIVE", switch)
                 with pytest.raises(InvalidArgumentError, match=message):
                     ts.osc(k, state, dynamics, inputs)
     inputs = ts.OSCInputs(goal, qpos, qpos)

@@ -13,7 +13,6 @@ from trees import TOOLS, planar, states, tree_of
 import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
-from batchpid.native.availability import SWITCH
 from batchpid.task_space import frames
 
 START = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8, 0.02, 0.02])
@@ -193,7 +192,7 @@ def test_native_numpy_and_jax_compute_the_same(x64):
 
         inputs = params, state, goal, qpos, qvel
         native = step(*inputs)
-        with mock.patch.dict("os.environ", {SWITCH: "0"}):
+        with mock.patch.dict("os.environ", {"BATCHPID_NATIVE": "0"}):
             plain = step(*inputs)
         traced = None
         if how == "implicit":

@@ -9,7 +9,7 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
 import batchpid as bp
 from batchpid.export import to_c, to_c_project
 from batchpid.sim import Robot
-from batchpid.sim.tuning.gain_sets import gain_set
+from batchpid.sim.tuning import gain_set
 
 MIMIC = joint("b", "y", "z", "revolute", LIMIT + '<mimic joint="a" multiplier="0.5"/>')
 

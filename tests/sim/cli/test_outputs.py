@@ -13,7 +13,7 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner, write_recording
 from batchpid.sim.cli import COMMANDS, parse
-from batchpid.sim.cli.outputs import Outputs, beside
+from batchpid.sim.cli.outputs import OutputFiles, beside
 
 SHORT = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02)
 WORDS = {
@@ -119,7 +119,7 @@ def test_a_recording_that_is_not_complete_names_its_picture_as_the_complete_one(
 def test_inputs_are_never_replaced_and_no_two_outputs_are_one_file(tmp_path):
     (path := tmp_path / "motors.yaml").write_text("kept")
     (link := tmp_path / "link.yaml").symlink_to(path)
-    outputs = Outputs(force=True, inputs=(None, path))
+    outputs = OutputFiles(force=True, inputs=(None, path))
     for each in (path, link, tmp_path / "." / "motors.yaml"):
         with pytest.raises(InvalidArgumentError, match="is a file to read"):
             outputs.path("out", each, (".yaml",))
@@ -130,14 +130,14 @@ def test_inputs_are_never_replaced_and_no_two_outputs_are_one_file(tmp_path):
 
 def test_a_stopped_search_is_neither_lost_nor_continued_unasked(tmp_path):
     path = tmp_path / "a.search.json"
-    assert Outputs(force=False).history(path, resume=True) == path  # nothing to continue yet
+    assert OutputFiles(force=False).history(path, resume=True) == path  # nothing to continue yet
     path.write_text("costs")
     with pytest.raises(InvalidArgumentError, match=r"exists already.*--resume to continue.*--force to begin anew"):
-        Outputs(force=False).history(path, resume=False)
-    assert Outputs(force=False).history(path, resume=True).read_text() == "costs"
-    Outputs(force=True).history(path, resume=True)
+        OutputFiles(force=False).history(path, resume=False)
+    assert OutputFiles(force=False).history(path, resume=True).read_text() == "costs"
+    OutputFiles(force=True).history(path, resume=True)
     assert path.read_text() == "costs"
-    Outputs(force=True).history(path, resume=False)
+    OutputFiles(force=True).history(path, resume=False)
     assert not path.exists()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from batchpid.sim import Observation, Rollout
 from batchpid.sim.cli import report
-from batchpid.sim.tuning.evaluation import step_response_metrics
+from batchpid.sim.tuning import step_response_metrics
 
 TICKS, ENVS = 200, 5
 

@@ -14,9 +14,7 @@ import batchpid as bp
 from batchpid.sim import Robot
 from batchpid.sim.cli import parse
 from batchpid.sim.identification.confidence_region import KEY, Region
-from batchpid.sim.tuning.moves import random_moves
-from batchpid.sim.tuning.search import tune
-from batchpid.sim.tuning.weights import Weights
+from batchpid.sim.tuning import Weights, random_moves, tune
 
 pytest.importorskip("cmaes")
 

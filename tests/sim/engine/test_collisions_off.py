@@ -15,11 +15,11 @@ import batchpid
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import MissedContactWarning, Randomization, Robot, Runner, Uniform
 from batchpid.sim.engine.missed_contact import DEPTH
+from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.robot_model import scene_model
 from batchpid.sim.engine.sapien.physics import PHYSICS
-from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.options import default_params
-from batchpid.sim.tuning.moves import random_moves
+from batchpid.sim.tuning import random_moves
 
 BOX = '<collision><geometry><box size="0.1 0.1 0.4"/></geometry></collision>'
 TICKS = 15

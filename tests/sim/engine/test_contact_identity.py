@@ -14,7 +14,7 @@ from identical import assert_identical
 from robots import load_bundled
 
 from batchpid.sim import Randomization, RecoveryWarning, Robot, Runner, Uniform
-from batchpid.sim.tuning.randomization_presets import usual_variation
+from batchpid.sim.tuning import usual_variation
 
 # In MuJoCo, which does not limit the speed of joints, light fingers fail under these efforts.
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")

@@ -16,9 +16,9 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors import actuator_dynamics as motor_model
 from batchpid.motors import guard as guard_model
 from batchpid.sim import Robot, Runner
+from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.robot_model import scene_model
-from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.tuning.moves import random_moves
+from batchpid.sim.tuning import random_moves
 
 mujoco = pytest.importorskip("mujoco", "3.17")
 from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf  # noqa: E402

@@ -31,11 +31,10 @@ from batchpid.sim.engine.engines import load_engine  # noqa: E402
 from batchpid.sim.engine.mujoco import model_builder  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import _set_options, robot_model  # noqa: E402
 from batchpid.sim.engine.mujoco.mujoco_step import CLOCK, mujoco_library  # noqa: E402
+from batchpid.sim.engine.protocol import SceneSpec  # noqa: E402
 from batchpid.sim.engine.robot_model import scene_model  # noqa: E402
-from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 from batchpid.sim.observation import OBSERVED  # noqa: E402
-from batchpid.sim.tuning.evaluation import arm_joints, run_moves  # noqa: E402
-from batchpid.sim.tuning.moves import random_moves, tutorial_move  # noqa: E402
+from batchpid.sim.tuning import arm_joints, random_moves, run_moves, tutorial_move  # noqa: E402
 
 SCALE = Uniform(0.8, 1.2, operation="scale")
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")

@@ -12,7 +12,6 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.motors.friction import Friction
 from batchpid.sim import Runner, RunnerOptions
 from batchpid.sim.engine import engines
 from batchpid.sim.engine.protocol import (
@@ -21,13 +20,14 @@ from batchpid.sim.engine.protocol import (
     DrivenPack,
     Engine,
     EnginePack,
+    Friction,
+    RigidTree,
 )
 from batchpid.sim.engine.sapien.pack import Pack
 from batchpid.sim.engine.sapien.sapien_engine import SapienEngine
 from batchpid.sim.engine.sapien.sim_step import NativeStep
 from batchpid.sim.engine.sapien.variation import VariedPack
 from batchpid.sim.loop.backend import describe
-from batchpid.task_space.rigid_tree import RigidTree
 
 PANDA = load_bundled("panda")
 PANDA.has_ground  # noqa: B018 - by SAPIEN, before a test replaces it

@@ -11,11 +11,11 @@ import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.sim import OperationalSpace, Robot, Runner
 from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.robot_model import passive_force, scene_tree
 from batchpid.sim.engine.sapien.building import build_scene, new_system
 from batchpid.sim.engine.sapien.physics import PHYSICS
-from batchpid.sim.engine.scene_spec import SceneSpec
-from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.plant import Plant
 from batchpid.task_space import osc_state, tree_dynamics
 
@@ -148,7 +148,7 @@ def uses(engine, panda):
             control = options.get("control")
             runner.step(panda.start if control is None else control.command.neutral)
 
-    drive = Drive(1e-3, None, "none")
+    drive = LoggedDrive(1e-3, None, "none")
     yield "law", lambda: run(compensate="gravity+coriolis")
     yield "friction", lambda: run(params=panda.params(), actuators=bp.make_actuators(panda.dof, coulomb=0.5))
     yield "task space", lambda: run(control=OperationalSpace(panda, "panda_hand", posture=panda.settings.target))

@@ -11,9 +11,7 @@ import pytest
 from identical import assert_identical
 
 import batchpid as bp
-from batchpid.sim import Runner
-from batchpid.sim.loop.faults import FaultWarning
-from batchpid.sim.workers.pool import RecoveryWarning
+from batchpid.sim import FaultWarning, RecoveryWarning, Runner
 
 ENVS = 10
 SCALES = {

@@ -12,9 +12,9 @@ import batchpid as bp
 from batchpid.motors import discretise
 from batchpid.motors import guard as guard_model
 from batchpid.motors.coupling import Coupling, Follower
-from batchpid.motors.friction import Friction
 from batchpid.motors.friction import init as init_friction
 from batchpid.sim import Runner
+from batchpid.sim.engine.protocol import Friction
 from batchpid.sim.loop import control_step as module
 from batchpid.sim.loop import xla_executor
 from batchpid.sim.loop.arrays import Command

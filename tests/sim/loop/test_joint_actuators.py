@@ -13,8 +13,7 @@ from identical import assert_identical
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Robot, Runner, Snapshot, read_recording, write_recording
-from batchpid.sim.workers.pool import RecoveryWarning
+from batchpid.sim import RecoveryWarning, Robot, Runner, Snapshot, read_recording, write_recording
 
 N = 5
 

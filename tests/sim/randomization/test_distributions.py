@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform, read_distribution
+from batchpid.sim import Choice, LogUniform, Normal, Uniform
+from batchpid.sim.randomization.distributions import read_distribution
 
 COUNT = 20_000
 numbers = st.floats(-1e3, 1e3, allow_nan=False)

@@ -16,8 +16,7 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.sim import Robot
-from batchpid.sim.tuning.evaluation import evaluate_gains
-from batchpid.sim.tuning.moves import random_moves
+from batchpid.sim.tuning import evaluate_gains, random_moves
 
 FOLDER = Path(sysconfig.get_path("purelib")) / "cmeel.prefix/share/example-robot-data/robots"
 ROBOTS = {

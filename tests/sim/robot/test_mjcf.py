@@ -18,11 +18,11 @@ from batchpid.errors import InvalidArgumentError, MissingDependencyError, RobotE
 from batchpid.sim import Robot, Runner  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.mujoco.solver import SOLVERS  # noqa: E402
+from batchpid.sim.engine.protocol import SceneSpec  # noqa: E402
 from batchpid.sim.engine.robot_model import scene_model  # noqa: E402
-from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 from batchpid.sim.robot.shapes import surfaces  # noqa: E402
 from batchpid.sim.robot.xml import numbers  # noqa: E402
-from batchpid.sim.tuning.gain_sets import gain_set  # noqa: E402
+from batchpid.sim.tuning import gain_set  # noqa: E402
 from batchpid.task_space.rotations import from_rpy, rotate  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")

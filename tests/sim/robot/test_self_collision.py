@@ -15,8 +15,8 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
+from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.robot_model import contacts_of
-from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.self_collision import disabled_pairs, read_srdf
 
 BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'

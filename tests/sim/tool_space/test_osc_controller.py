@@ -12,9 +12,7 @@ from tiny_urdf import joint, link, robot, write
 import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError, RobotError
-from batchpid.native.availability import SWITCH
-from batchpid.sim import OperationalSpace, Robot, Runner
-from batchpid.sim.robot.loop_stability import StabilityWarning
+from batchpid.sim import OperationalSpace, Robot, Runner, StabilityWarning
 from tests.sim.engine.test_coupled_joints import arm as coupled_arm
 
 HAND = "panda_hand"
@@ -385,7 +383,7 @@ def test_native_friction_is_that_of_numpy(with_friction, twist, monkeypatch):
     setpoint = np.tile(control.command.neutral, (rows, 1)) + 0.1 * rng.normal(size=(rows, control.command.size))
     state, efforts = control.init(with_friction, rows), []
     for switch in ("1", "0"):
-        monkeypatch.setenv(SWITCH, switch)
+        monkeypatch.setenv("BATCHPID_NATIVE", switch)
         efforts.append(control(state, setpoint, qpos, qvel, passive)[1])
     np.testing.assert_allclose(*efforts, rtol=1e-9, atol=1e-9)
     idle = OperationalSpace(with_friction, "l6", twist=twist).in_runner(1 / 2000, "none")

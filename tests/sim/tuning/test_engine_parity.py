@@ -10,7 +10,7 @@ from tiny_urdf import joint, link, robot, write
 
 from batchpid.sim import Robot
 from batchpid.sim.engine.mujoco import model_builder
-from batchpid.sim.tuning.engine_parity import compare_engines
+from batchpid.sim.tuning import compare_engines
 
 
 def forget():

@@ -8,15 +8,20 @@ import pytest
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import LogUniform, Randomization, Runner, Uniform
-from batchpid.sim.tuning.evaluation import (
+from batchpid.sim.tuning import (
+    Moves,
     arm_joints,
     evaluate_gains,
     following_error,
+    load_randomization,
+    payload_capacity,
+    random_moves,
     run_moves,
     step_response_metrics,
+    tutorial_move,
+    usual_variation,
 )
-from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
-from batchpid.sim.tuning.randomization_presets import PRESETS, load_randomization, payload_capacity, usual_variation
+from batchpid.sim.tuning.randomization_presets import PRESETS
 
 
 def hold(pose, name="hold"):

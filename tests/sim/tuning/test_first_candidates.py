@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from batchpid import make_actuators
 from batchpid.sim import Randomization, Uniform
+from batchpid.sim.tuning import Weights, random_moves
 from batchpid.sim.tuning.candidates import Candidates
 from batchpid.sim.tuning.first_candidates import (
     FASTEST,
@@ -20,8 +21,6 @@ from batchpid.sim.tuning.first_candidates import (
     loop_delay,
     phase_margin,
 )
-from batchpid.sim.tuning.moves import random_moves
-from batchpid.sim.tuning.weights import Weights
 
 SPEED = st.floats(0.5, 50.0)
 DELAY = st.floats(0.0, 0.2)

@@ -11,7 +11,7 @@ import pytest
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
-from batchpid.sim.tuning.gain_sets import gain_set
+from batchpid.sim.tuning import gain_set
 
 
 def same(one, other):

@@ -18,17 +18,13 @@ from option_values import ARM, MOTORS, is_slow, option_values
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import RunnerKeywords
-from batchpid.sim.identification.fit import Step
+from batchpid.sim.identification.fit import FitStep
 from batchpid.sim.identification.fit_history import History, State
-from batchpid.sim.tuning import tool_candidates
+from batchpid.sim.tuning import Weights, random_moves, tool_candidates, tune, tune_tool
 from batchpid.sim.tuning.history import HistoryFile
-from batchpid.sim.tuning.moves import random_moves
-from batchpid.sim.tuning.search import tune
-from batchpid.sim.tuning.tool_search import tune_tool
-from batchpid.sim.tuning.weights import Weights
 
 SETTINGS = {"robot": "arm", "seed": 3, "weights": {"itae": 1.0}}
-STATE = State(Step(np.array([0.1, 0.2]), 5, np.array([0.0, 0.2]), np.inf), ((0, [0.1, 0.3]),))
+STATE = State(FitStep(np.array([0.1, 0.2]), 5, np.array([0.0, 0.2]), np.inf), ((0, [0.1, 0.3]),))
 
 
 @pytest.fixture

@@ -5,16 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from batchpid.sim.tuning.moves import (
-    Moves,
-    random_moves,
-    search_moves,
-    shortest_durations,
-    smooth_durations,
-    smooth_effort,
-    smooth_variation,
-    tutorial_move,
-)
+from batchpid.sim.tuning import Moves, random_moves, search_moves, tutorial_move
+from batchpid.sim.tuning.moves import shortest_durations, smooth_durations, smooth_effort, smooth_variation
 from batchpid.trajectories import minimum_jerk
 
 

@@ -14,14 +14,9 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Physics, Randomization, Robot, Runner, Uniform
 from batchpid.sim.cli.run import evaluate_sets
 from batchpid.sim.robot.self_collision import Srdf
-from batchpid.sim.tuning.evaluation import arm_joints
+from batchpid.sim.tuning import GainSet, Weights, arm_joints, load_randomization, random_moves, tune, tune_tool
 from batchpid.sim.tuning.first_candidates import first_gains
-from batchpid.sim.tuning.gain_sets import GainSet
-from batchpid.sim.tuning.moves import random_moves
-from batchpid.sim.tuning.randomization_presets import ENCODER, load_randomization
-from batchpid.sim.tuning.search import tune
-from batchpid.sim.tuning.tool_search import tune_tool
-from batchpid.sim.tuning.weights import Weights
+from batchpid.sim.tuning.randomization_presets import ENCODER
 
 pytest.importorskip("cmaes")
 

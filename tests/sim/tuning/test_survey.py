@@ -10,7 +10,7 @@ import pytest
 from tiny_urdf import one_joint
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.tuning.robot_survey import find_robots, survey
+from batchpid.sim.tuning import find_robots, survey
 
 
 @pytest.fixture(scope="module")

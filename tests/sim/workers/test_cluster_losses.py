@@ -15,8 +15,7 @@ from identical import assert_identical
 from processes import have_ended
 
 from batchpid.sim import RecoveryWarning
-from batchpid.sim.tuning.moves import Moves
-from batchpid.sim.tuning.search import tune
+from batchpid.sim.tuning import Moves, tune
 
 ray = pytest.importorskip("ray")
 pytestmark = [*FILTERS, pytest.mark.slow]

@@ -14,8 +14,7 @@ from processes import children
 from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Runner
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim import Runner, RunnerOptions
 from batchpid.sim.workers.memory import estimate_memory
 
 ROBOT = load_bundled("panda")

@@ -10,7 +10,7 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.identification.confidence_region import KEY, Region, draw_motors, read_region
-from batchpid.sim.tuning.moves import random_moves
+from batchpid.sim.tuning import random_moves
 from batchpid.sim.tuning.within import within
 from tests.sim.tuning.identification.test_identify import ARM
 

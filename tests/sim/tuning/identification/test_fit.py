@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from batchpid.sim.identification.fit import Step, fit
-from batchpid.sim.identification.problem import Evaluation
+from batchpid.sim.identification.fit import FitStep, fit
+from batchpid.sim.identification.problem import FitEvaluation
 
 TIME = np.linspace(0, 1, 8)
 JACOBIAN = np.stack([np.ones(8), TIME], axis=-1)[:, None]
@@ -20,7 +20,7 @@ class Line:
 
     def evaluate(self, theta):
         rows = (5 + TIME - JACOBIAN[:, 0] @ theta)[:, None]
-        return [Evaluation(rows, rows, JACOBIAN, np.zeros((1, 1)), np.ones_like(rows))]
+        return [FitEvaluation(rows, rows, JACOBIAN, np.zeros((1, 1)), np.ones_like(rows))]
 
     def sizes(self, white):
         return np.sqrt(np.mean(np.square(white), axis=1))
@@ -32,7 +32,7 @@ class Line:
 @pytest.mark.parametrize("evaluations", range(1, 6))
 def test_a_fit_at_a_bound_leaves_no_less_than_no_evaluation(evaluations):
     steps = []
-    found = fit(Line(), Step.first(np.array([1.0, 0.0]), evaluations), lambda step, _: steps.append(step))
+    found = fit(Line(), FitStep.first(np.array([1.0, 0.0]), evaluations), lambda step, _: steps.append(step))
     assert len(steps) > 1
     assert min(step.left for step in steps) >= 0
     again = fit(Line(), steps[-1])  # as from a history
@@ -42,8 +42,8 @@ def test_a_fit_at_a_bound_leaves_no_less_than_no_evaluation(evaluations):
 
 def test_what_a_bound_closes_promises_nothing():
     """A fit whose best point is at a bound has arrived: its unknowns count as found."""
-    begun = fit(Line(), Step.first(np.zeros(2), 0))
+    begun = fit(Line(), FitStep.first(np.zeros(2), 0))
     assert begun.promised > 0.03
-    arrived = fit(Line(), Step.first(np.zeros(2), 40))
+    arrived = fit(Line(), FitStep.first(np.zeros(2), 40))
     assert arrived.theta == pytest.approx([1.0, 1.0], abs=1e-3)
     assert arrived.promised < 0.003

@@ -16,11 +16,11 @@ import batchpid as bp
 from batchpid.sim import Robot, Runner
 from batchpid.sim.identification import identify
 from batchpid.sim.identification.excitation import excite
-from batchpid.sim.identification.fit import Step, fit
+from batchpid.sim.identification.fit import FitStep, fit
 from batchpid.sim.identification.fit_history import History, State
 from batchpid.sim.identification.fit_search import Progress, search
 from batchpid.sim.identification.log_noise import split
-from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.logs import Log, LogWarning, read_logs
 from batchpid.sim.identification.plant import Plant, Segment
 from batchpid.sim.identification.problem import Problem
@@ -143,7 +143,7 @@ def test_the_plant_moves_as_mujoco(arm, mujoco_log):
     per_joint = [getattr(truth, kind) for kind in PER_JOINT]
     motors = motors_of(*per_joint, truth.delay, 0.0095, 0.0)
     for kind in ("setpoint", "effort"):
-        plant = Plant(arm, (0, 1), Drive(1 / 2000, params if kind == "setpoint" else None, "gravity+coriolis"))
+        plant = Plant(arm, (0, 1), LoggedDrive(1 / 2000, params if kind == "setpoint" else None, "gravity+coriolis"))
         segment = Segment(table["qpos"][0], np.zeros(2), table[kind], np.zeros((len(table[kind]), 2)))
         moved = plant.simulate(motors, [segment], 0)[0, :-1]
         np.testing.assert_allclose(moved, table["qpos"], atol=2e-5 if kind == "setpoint" else 2e-4)
@@ -152,7 +152,7 @@ def test_the_plant_moves_as_mujoco(arm, mujoco_log):
 @pytest.mark.slow
 def test_a_stronger_motor_with_more_inertia_moves_one_joint_alike(arm):
     """The change of a strength for finite differences moves a joint only by its coupling to others."""
-    inertia = Plant(arm, (1,), Drive(1 / 2000, None, "gravity+coriolis")).mass_matrix(
+    inertia = Plant(arm, (1,), LoggedDrive(1 / 2000, None, "gravity+coriolis")).mass_matrix(
         np.zeros((1, 1)), np.zeros((1, 1))
     )
     unknowns = Unknowns.of(inertia[0, 0], np.array([0.02]), np.ones(1), np.ones(1), payload=False)
@@ -160,7 +160,7 @@ def test_a_stronger_motor_with_more_inertia_moves_one_joint_alike(arm):
     changes = unknowns.changes(theta)
     assert np.linalg.matrix_rank(changes / unknowns.scale) == len(theta)
     params = bp.make_params(1, kp=40.0, ki=10.0, kd=2.0)
-    plant = Plant(arm, (1,), Drive(1 / 2000, params, "gravity+coriolis"))
+    plant = Plant(arm, (1,), LoggedDrive(1 / 2000, params, "gravity+coriolis"))
     command = 0.3 * np.sin(9.0 * np.arange(2000) / 2000)[:, None]
     segment = Segment(np.zeros(1), np.zeros(1), command, np.zeros_like(command))
     moved = [
@@ -173,12 +173,12 @@ def test_a_stronger_motor_with_more_inertia_moves_one_joint_alike(arm):
 @pytest.mark.slow
 def test_a_search_leaves_a_delay_that_is_best_nearby_only(arm, runs):
     truth, _, efforts = runs
-    joints, drive = (0, 1), Drive(DT, None, "gravity+coriolis")
+    joints, drive = (0, 1), LoggedDrive(DT, None, "gravity+coriolis")
     unknowns = Unknowns.of(*(np.ones(2) for _ in range(4)), payload=False)
     problem = Problem(arm, joints, drive, [efforts], [smooth(efforts, DT)], unknowns)
     per_joint = [getattr(truth, kind) for kind in PER_JOINT]
     theta = unknowns.point(motors_of(*per_joint, truth.delay + 7e-4, 0.0095, 0.0))
-    begin, delay = State(Step.first(theta, 20)), unknowns.names.index(("delay", None))
+    begin, delay = State(FitStep.first(theta, 20)), unknowns.names.index(("delay", None))
     same, found = search([problem], begin, 20, History(None, {}), Progress(1, 20, None))
     assert same is problem
     assert found.theta[delay] == pytest.approx(truth.delay, abs=1e-4)
@@ -190,7 +190,7 @@ def test_a_slow_control_is_simulated_in_smaller_steps(arm, mujoco_log):
     motion = excite(arm, 1.0, rate=2000.0, lowest=1.0).position
     per_joint = [getattr(truth, kind) for kind in PER_JOINT]
     motors = motors_of(*per_joint, truth.delay, 0.005, 0.0)
-    drive = Drive(1 / 2000, params, "gravity+coriolis", substeps=4)
+    drive = LoggedDrive(1 / 2000, params, "gravity+coriolis", substeps=4)
     segment = Segment(motion[0], np.zeros(2), motion, np.zeros_like(motion))
     qpos = Plant(arm, (0, 1), drive).simulate(motors, [segment], 0)[0, :-1:4]
     time = np.arange(len(qpos)) / 500
@@ -203,7 +203,7 @@ def test_a_slow_control_is_simulated_in_smaller_steps(arm, mujoco_log):
 
 
 def test_rows_of_a_simulation_do_not_depend_on_their_company(arm):
-    plant = Plant(arm, (0, 1), Drive(1 / 2000, arm.designed("effort"), "gravity"))
+    plant = Plant(arm, (0, 1), LoggedDrive(1 / 2000, arm.designed("effort"), "gravity"))
     rng = np.random.default_rng(0)
     leaves = [rng.uniform(0.1, 1.0, (3, 2)) for _ in PER_JOINT]
     leaves += [*rng.uniform(0.002, 0.01, (2, 3, 1)), np.array([[0.0], [0.3], [0.3]])]
@@ -380,11 +380,11 @@ def test_the_way_of_the_compensation_is_judged_by_the_motion(arm, mujoco_log):
 def test_joints_that_noise_alone_shakes_tell_nothing(arm, runs):
     truth, _, efforts = runs
     unknowns = Unknowns.of(*(np.ones(2) for _ in range(4)), payload=False)
-    drive, motion = Drive(DT, None, "gravity+coriolis"), smooth(efforts, DT)
+    drive, motion = LoggedDrive(DT, None, "gravity+coriolis"), smooth(efforts, DT)
     problem = Problem(arm, (0, 1), drive, [efforts], [motion], unknowns)
     per_joint = [getattr(truth, kind) for kind in PER_JOINT]
     theta = unknowns.point(motors_of(*per_joint, truth.delay, 0.0095, 0.0))
-    found = fit(problem, Step.first(theta, 10))
+    found = fit(problem, FitStep.first(theta, 10))
     of_elbow = np.array([joint == 1 for _, joint in unknowns.names])
     known = uncertainty(problem, found).identified
     assert known[of_elbow].sum() >= 4

@@ -10,15 +10,14 @@ from robots import load_bundled
 from tiny_urdf import LIMIT, joint, link, random_tree, robot, write
 
 import batchpid as bp
-from batchpid.native.availability import SWITCH
 from batchpid.sim import Robot
-from batchpid.sim.identification.logged_control import Control, Drive
+from batchpid.sim.identification.logged_control import LoggedControl, LoggedDrive
 from batchpid.sim.identification.plant import Plant, Segment
 from batchpid.sim.identification.unknowns import ADDED, KINDS, Motors
 from batchpid.task_space import native_rows
 
 DT, ROWS = 5e-4, 5
-EFFORTS = Drive(DT, None, "none")
+EFFORTS = LoggedDrive(DT, None, "none")
 needs_extension = pytest.mark.skipif(native_rows.in_use() is None, reason="the extensions were not built")
 
 
@@ -55,7 +54,7 @@ def segments_of(arm: Robot, joints: tuple[int, ...], past: int, rows: int = ROWS
 def both(monkeypatch) -> Iterator[str]:
     """Yield with native code, and without."""
     for value in ("1", "0"):
-        monkeypatch.setenv(SWITCH, value)
+        monkeypatch.setenv("BATCHPID_NATIVE", value)
         yield value
 
 
@@ -69,7 +68,7 @@ def test_native_code_gives_what_numpy_gives(name, joints, kind, tmp_path, monkey
     arm = load(name, tmp_path)
     joints = tuple(np.flatnonzero(arm.independent)) if joints is None else tuple(joints)
     params = bp.make_params(len(joints), kp=40.0, ki=5.0, kd=3.0) if kind == "setpoint" else None
-    plant = Plant(arm, joints, Drive(DT, params, "gravity+coriolis", noisy=params is not None, substeps=2))
+    plant = Plant(arm, joints, LoggedDrive(DT, params, "gravity+coriolis", noisy=params is not None, substeps=2))
     past = 0 if params else 30
     fast, slow = (
         plant.simulate(motors_of(len(joints)), segments_of(arm, joints, past), past) for _ in both(monkeypatch)
@@ -82,7 +81,7 @@ def test_native_code_gives_what_numpy_gives(name, joints, kind, tmp_path, monkey
 @pytest.mark.parametrize("names", [(name,) for name in ADDED if name != "stribeck"] + [tuple(ADDED)], ids="+".join)
 def test_effects_that_are_added_change_the_motion_alike_natively(names, panda, monkeypatch):
     params = bp.make_params(2, kp=40.0, ki=5.0, kd=3.0)
-    plant = Plant(panda, (1, 3), Drive(DT, params, "none"))
+    plant = Plant(panda, (1, 3), LoggedDrive(DT, params, "none"))
     motors, segments = motors_of(2), segments_of(panda, (1, 3), 0)
     values = {"static": 9.0, "stribeck": 0.01, "saturation": 1e-3, "slew": 0.1}
     added = {name: np.full((ROWS, 2), values.get(name, 0.5)) for name in names}
@@ -102,14 +101,14 @@ EFFECTS = {"lag": 0.002, "sensor_delay": 0.0013, "backlash": 0.01, "effort_limit
 def test_a_control_gives_the_same_bits_natively(effect, units, substeps, monkeypatch):
     """With each effect of the motors, and laws in every unit of gains or without law."""
     params = None if units is None else bp.make_params(2, kp=30.0, ki=5.0, kd=1.0, gain_units=units)
-    drive, rng = Drive(DT, params, "none", substeps=substeps, measured_rate=True), np.random.default_rng(0)
+    drive, rng = LoggedDrive(DT, params, "none", substeps=substeps, measured_rate=True), np.random.default_rng(0)
     given = {} if effect is None else {effect: EFFECTS[effect]}
     options = bp.make_actuators(2, viscous=0.3, **given)
     full = [leaf if leaf is None or leaf.shape == (1, 1) else np.repeat(leaf, ROWS, 0) for leaf in options]
     rows = rng.normal(size=(40, 4, ROWS, 2))
     found = []
     for _ in both(monkeypatch):
-        control = Control(drive, bp.Actuators(*full), *rows[0, :2], damping=np.array([0.1, 0.2]), model=matrices)
+        control = LoggedControl(drive, bp.Actuators(*full), *rows[0, :2], damping=np.array([0.1, 0.2]), model=matrices)
         found.append(
             [control.advance(rows[k, 2], *rows[k, :2], rows[k, 3], 1e-3 * rows[k, 3]).copy() for k in range(40)]
         )
@@ -180,7 +179,7 @@ def test_a_tool_that_is_part_of_the_base_weighs_nothing(tmp_path):
 def test_strong_friction_stops_and_limits_hold(panda):
     ideal = {"damping": 0.0, "strength": 1.0, "bias": 0.0, "delay": 0.0, "payload": 0.0, "armature": 0.0}
     motors = motors_of(2, 2, **ideal, stopping=0.0) | {"friction": np.array([[1e4, 1e4], [0.0, 0.0]])}
-    plant = Plant(panda, (0, 1), Drive(DT, None, "gravity+coriolis"))
+    plant = Plant(panda, (0, 1), LoggedDrive(DT, None, "gravity+coriolis"))
     still = np.zeros((20, 2))
     begins = (
         (np.array([0.1, 0.2]), np.array([0.5, -0.3])),

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.plant import Plant, Segment
 from batchpid.sim.identification.regression import STRONG, Regression, smooth
@@ -24,7 +24,7 @@ def motors_of(**values: list[float]) -> Motors:
 def test_joints_that_stick_half_of_the_time_are_found(panda):
     joints, params = (5,), panda.designed("effort")
     params = type(params)(*(leaf[:, list(joints)] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
-    plant = Plant(panda, joints, Drive(DT, params, "gravity+coriolis"))
+    plant = Plant(panda, joints, LoggedDrive(DT, params, "gravity+coriolis"))
     sticky = motors_of(
         armature=[0.05], damping=[0.2], friction=[1.0], strength=[1.0], bias=[0.1],
         delay=0.002, stopping=0.002, payload=0.0,

@@ -13,7 +13,7 @@ from tiny_urdf import joint, link, robot, write
 
 import batchpid as bp
 from batchpid.sim import Robot
-from batchpid.sim.identification.logged_control import Drive
+from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.plant import Segment
 from batchpid.sim.identification.regression import smooth
@@ -39,9 +39,9 @@ def arm(tmp_path_factory) -> Robot:
     return Robot.load(write(tmp_path_factory.mktemp("arm"), ARM))
 
 
-def drive_of(options: dict) -> Drive:
+def drive_of(options: dict) -> LoggedDrive:
     params = options["params"]
-    return Drive(**{**options, "params": None if params is None else bp.make_params(2, **params)})
+    return LoggedDrive(**{**options, "params": None if params is None else bp.make_params(2, **params)})
 
 
 @settings(max_examples=30, deadline=None)
@@ -55,7 +55,7 @@ def test_drives_share_a_plant_only_if_they_are_the_same(arm, one, two):
 @given(GAINS)
 def test_permuted_gains_do_not_share_a_plant(arm, gains):
     assume(gains[0] != gains[1])
-    one, two = (Drive(1 / 2000, bp.make_params(2, kp=kp, kd=1.0), "none") for kp in (gains, gains[::-1]))
+    one, two = (LoggedDrive(1 / 2000, bp.make_params(2, kp=kp, kd=1.0), "none") for kp in (gains, gains[::-1]))
     assert repr(one) == repr(two)
     moved = [positions(plant_of(Subject.of(arm, (0, 1), each))) for each in (one, two)]
     assert not np.array_equal(*moved)
@@ -69,7 +69,7 @@ def positions(plant) -> np.ndarray:
 
 
 def test_robots_that_differ_do_not_share_a_plant(arm, tmp_path):
-    drive = Drive(1 / 2000, None, "none")
+    drive = LoggedDrive(1 / 2000, None, "none")
     heavier = Robot.load(write(tmp_path, ARM.replace('mass value="1"', 'mass value="2"', 1)))
     limited = replace(arm, joints=tuple(replace(each, upper=0.5) for each in arm.joints))
     subjects = [Subject.of(each, (0, 1), drive) for each in (arm, heavier, limited)] + [Subject.of(arm, (0,), drive)]
@@ -78,7 +78,7 @@ def test_robots_that_differ_do_not_share_a_plant(arm, tmp_path):
 
 
 def test_threads_do_not_share_plants(arm):
-    subject, found = Subject.of(arm, (0, 1), Drive(1 / 2000, None, "none")), [None]
+    subject, found = Subject.of(arm, (0, 1), LoggedDrive(1 / 2000, None, "none")), [None]
     thread = threading.Thread(target=lambda: found.append(plant_of(subject)))
     thread.start()
     thread.join()
