@@ -1,6 +1,10 @@
 """Options of a runner, checked: one definition for :class:`batchpid.sim.Runner`, its loops, snapshots and recordings.
 
 Longer than 300 lines because the checks of all options are here; :mod:`batchpid.sim.runner_keywords` documents them.
+
+A new option is a keyword with its type and documentation there, and, in the same order, a field with its places and its
+check here. One that is kept in recordings is a field of :class:`batchpid.sim.RunInfo`, too; one that changes scenes, of
+:class:`batchpid.sim.engine.scene_spec.SceneSpec`.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ class TickRecorder(Protocol):
 
 
 class Runner(SingleOwner):
-    """N robots in N headless SAPIEN scenes under explicit PID, drive or effort control.
+    """N robots in N headless scenes of a physics engine, under explicit PID, drive or effort control.
 
     Parameters
     ----------

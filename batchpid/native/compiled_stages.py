@@ -55,7 +55,7 @@ def _program(
     inputs = tuple([None if each else ... for each in none])
     try:
         found = trace_trees(lambda k, given: stage(k, *given), structure(k), inputs)
-    except (TypeError, AttributeError):  # it has no limits
+    except (TypeError, AttributeError):  # without limits, or with operations that programs lack: NumPy runs it
         return None
     if len(found.operations) < LEAST_OPERATIONS * len(OPERATION) * np.int32().itemsize:
         return None

@@ -20,7 +20,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.sim.identification.unknowns import DESCRIBED, KINDS
+from batchpid.sim.identification.unknowns import ADDED, DESCRIBED, KINDS, kind_of
 from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.robot import Robot
 
@@ -61,7 +61,7 @@ class Region(NamedTuple):
         while len(z) < count:
             tried = rng.normal(size=(count, size))
             z = np.concatenate([z, tried[(tried**2).sum(1) <= largest]])
-        low, high = (np.array([getattr(KINDS[kind], end) for kind, _ in self.names]) for end in ("low", "high"))
+        low, high = (np.array([getattr(kind_of(kind), end) for kind, _ in self.names]) for end in ("low", "high"))
         points = np.clip(self.estimate + self.deviation * (z[:count] @ root.T), low, high)
         return points, (points - self.estimate) / np.maximum(self.deviation, 1e-300)
 
@@ -79,7 +79,7 @@ class DrawnMotors(NamedTuple):
 
     def describe(self, draw: int, joint: str) -> str:
         """Return the unknowns of ``joint``, and those of all joints, that are farthest off in a draw."""
-        own = [n for n, (kind, of) in enumerate(self.region.names) if of in (None, joint) and KINDS[kind].field]
+        own = [n for n, (kind, of) in enumerate(self.region.names) if of in (None, joint) and kind_of(kind).field]
         farthest = sorted(own, key=lambda n: -abs(self.distance[draw, n]))[:3]
         return ", ".join(
             f"{self.region.names[n][0]} {self.points[draw, n]:.3g} ({self.distance[draw, n]:+.1f} sd)" for n in farthest
@@ -105,7 +105,7 @@ def read_region(path: str | os.PathLike[str], robot: Robot) -> Region:
         raise InvalidArgumentError(source, f"cannot be read ({error})", remedy=remedy) from None
     right = estimate.shape == deviation.shape == (len(names),) and bool(np.isfinite([*estimate, *deviation]).all())
     right = right and bool((deviation >= 0).all() and (np.abs(correlation) <= 1).all()) and len(names) > 0
-    if not right or any(kind not in KINDS for kind, _ in names):
+    if not right or any(kind not in KINDS | ADDED for kind, _ in names):
         raise InvalidArgumentError(source, "has wrong shapes, numbers or unknowns", remedy=remedy)
     if strangers := sorted({joint for _, joint in names if joint} - set(robot.joint_names)):
         raise InvalidArgumentError(source, f"is of other joints: {', '.join(strangers)}", remedy="name their robot")
@@ -122,12 +122,14 @@ def draw_motors(path: str | os.PathLike[str], robot: Robot, count: int, seed: in
     points, distance = region.draw(count, seed)
     columns: dict[str, Float64] = {}
     for n, (kind, joint) in enumerate(region.names):
-        field = KINDS[kind].field
+        field = kind_of(kind).field
         if field is None:
             continue
         if field not in columns:
             leaf = getattr(nominal, field)
-            columns[field] = np.full((count, robot.dof), KINDS[kind].neutral if leaf is None else np.array(leaf, float))
+            columns[field] = np.full(
+                (count, robot.dof), kind_of(kind).neutral if leaf is None else np.array(leaf, float)
+            )
         if joint is None:
             columns[field][:] = points[:, n, None]
             continue

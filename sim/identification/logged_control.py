@@ -182,7 +182,11 @@ class LoggedControl:
         constants = mapped(lambda array: tuple(array) if array.ndim == 3 else array, self._constants)
         try:
             traced = _trace(self._layout, *map(structure, (constants, self._state, inputs)))
-        except (TypeError, AttributeError, AssertionError):  # it has tables
+        except (
+            TypeError,
+            AttributeError,
+            AssertionError,
+        ):  # with tables, or with operations that programs lack: NumPy runs it
             return None
         effort, state = np.zeros_like(inputs[1]), leaves(self._state)
         program = ArrayProgram(traced, leaves(constants), len(state) + len(leaves(inputs)), effort.shape)

@@ -54,7 +54,8 @@ KINDS = {
     "stopping": Kind(None, False, 5e-4, 0.1, 5e-3, 4.0, 5e-3),
     "payload": Kind(None, False, 0.0, np.inf, 0.2, 50.0),
 }
-"""Kinds of unknowns. A line here is all that an effect of :mod:`batchpid.motors` needs to be identified."""
+"""Kinds of unknowns that every fit has. An effect of the motor or the sensor needs one line, here, or in :data:`ADDED`
+and :data:`EXTRAS`; one that acts on the joint is a term of :mod:`batchpid.sim.identification.plant` as well."""
 ADDED = {
     "lag": Kind("lag", True, 0.0, 0.1, 5e-3, 20.0),
     "load_friction": Kind("load_friction", True, 0.0, 0.9, 0.1, 5.0, tries=(0.5, 2.0)),

@@ -84,6 +84,8 @@ class EnvGroup:
         layout = make_layout(options, self._acting_params, self._actuators)
         layout = with_model(options, pack, layout, constants, self._controller)
         self._layout, self._constants = layout, constants
+        # Native wherever the engine has native steps, under backend "numpy" too: the bits are the same. XLA for "jax",
+        # if nothing stands in its way; else the calls of NumPy, which also serve controllers in Python.
         self._executor: NumPyExecutor | XLAExecutor
         if not isinstance(pack, CompiledPack) or not pack.steps_natively:
             self._executor = NumPyExecutor(options, pack, layout, constants)
@@ -190,6 +192,8 @@ class EnvGroup:
                 fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
                 self._table = Table(ticks.arrays, self._motor, self._saturated, self._guarded, fault)
             table = self._table
+        # With a table native code reads the commands and writes the observations of many ticks by itself. It stops
+        # within a tick where Python has to look: then ``done`` steps of it are made, and the rest follows here.
         tick, done = self._execute(command, Span(first, 0, until, substeps), table)
         if not done:
             return tick

@@ -59,7 +59,7 @@ inline void constrain_row(Group const &group, std::size_t row, float *qf) {
 // Apply efforts (rows, dof), do one sim step, read (rows, dof) each; rows beyond the robots repeat the first one.
 // Robot by robot, each while it is in the cache.
 template <class T>
-std::int32_t sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
+std::int32_t sim_step_in_sapien(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
   Gateway const &gateway = *group.gateway;
   Functions const &call = gateway.functions;
   std::ptrdiff_t const dof = gateway.dof;
@@ -112,7 +112,7 @@ inline void apply_efforts(Group const &group, std::int64_t row) {
 
 // The same in MuJoCo; the arrays are those of the robots and of the rows beyond them.
 template <class T>
-std::int32_t mujoco_step(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
+std::int32_t sim_step_in_mujoco(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
   Mujoco const &mujoco = *group.mujoco;
   std::int64_t const dof = group.dof;
   std::int32_t status = 0;
@@ -145,11 +145,11 @@ std::int32_t mujoco_step(Group &group, std::int64_t rows, T const *effort, T *qp
 // The same for callers that take no exceptions, in the engine of the group.
 template <class T>
 std::int32_t try_sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
-  if (group.mujoco != nullptr) return mujoco_step(group, rows, effort, qpos, qvel, passive);
+  if (group.mujoco != nullptr) return sim_step_in_mujoco(group, rows, effort, qpos, qvel, passive);
   char const *message = "SAPIEN raised an exception";
   std::size_t const last = sizeof(group.message) - 1;
   try {
-    return sim_step(group, rows, effort, qpos, qvel, passive);
+    return sim_step_in_sapien(group, rows, effort, qpos, qvel, passive);
   } catch (std::exception const &error) {
     std::strncpy(group.message, error.what()[0] ? error.what() : message, last);
   } catch (...) {
