@@ -188,7 +188,9 @@ class IdentifyCommand:
         from batchpid.sim.identification.logs import read_logs
 
         names = "time_unit degrees measured topic command_topic prefix"
-        kind: Literal["setpoint", "effort"] = "effort" if self.gains is None else "setpoint"
+        kind: Literal["setpoint", "effort"] | None = "effort" if self.gains is None else "setpoint"
+        if self.evaluations == 0 and self.actuators is None:
+            kind = None  # what the logs hold is seen in _compare_efforts
         return read_logs(robot, self.logs, kind, hold=self.hold, reading=Reading(**flags.chosen(self, names)))
 
     def _compare_efforts(self, robot: Robot, logs: list[Log], out: Path, details: Path | None) -> None:
@@ -275,12 +277,18 @@ def _not_identified(found: Identification) -> list[str]:
         return []
     lines = ["NOT WELL DETERMINED by these logs (marked ?), but part of the optimum, and in the actuators file:"]
     before, after = found.held_out_error
-    if not found.uncertainty.identified.any() and after < before and ("payload", None) in found.unknowns.names:
-        remedy = "pass --no-payload if the tool carries none, or record a longer motion without compensation"
-        return [*lines, f"  everything: no value is certain beside a payload; {remedy}"]
     if not found.uncertainty.identified.any():
-        remedy = "check --gains, --timestep and --compensate, or give more --evaluations"
-        return [*lines, f"  everything: the fit does not explain the motion; {remedy}"]
+        text = (
+            "the fit does not explain the motion; check --gains, --timestep, --compensate, or give more --evaluations"
+        )
+        if after < before and ("payload", None) in found.unknowns.names:
+            text = (
+                "no value is certain beside a payload; "
+                "pass --no-payload if the tool carries none, or record a longer motion without compensation"
+            )
+        elif after < before:
+            text = "no value is certain, though together they lower the error; record a longer and more varied motion"
+        return [*lines, f"  everything: {text}"]
     names = [found.robot.joint_names[number] for number in found.joints]
     moves = dict(zip(names, found.uncertainty.moves, strict=True))
     for joint, kinds in of_joints.items():
