@@ -13,9 +13,9 @@ IMPORTED = """
     dataclasses datetime decimal enum errno fcntl fractions functools glob gymnasium gzip h5py hashlib hmac http
     imageio_ffmpeg importlib inspect io ipaddress itertools jax json logging lxml math matplotlib mimetypes mmap
     msgspec mujoco multiprocessing numbers numpy operator os pathlib pickle PIL platform queue random ray re reprlib
-    resource ruckig sapien scipy secrets select shutil signal socket ssl stable_baselines3 stat statistics string struct
-    subprocess tabulate tempfile textwrap threading token tokenize tqdm traceback trimesh types typing tyro urllib uuid
-    viser warnings weakref websockets xarray yaml zipfile zlib
+    resource rosbags ruckig sapien scipy secrets select shutil signal socket ssl stable_baselines3 stat statistics
+    string struct subprocess tabulate tempfile textwrap threading token tokenize tqdm traceback trimesh types typing
+    tyro urllib uuid viser warnings weakref websockets xarray yaml zipfile zlib
 """.split()  # noqa: SIM905
 """Modules that this project imports, and some that these import."""
 

@@ -1,7 +1,7 @@
 """Commands of a Runner: each makes one request to the workers, and the state of the runner after it.
 
-A command is made of arguments that were checked, and changes nothing itself: the runner executes its request, and then
-replaces the state by the one that :meth:`RunnerCommand.committed` returns.
+A command holds checked arguments and changes nothing by itself. The runner executes its request, and then replaces its
+state by the result of :meth:`RunnerCommand.committed`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class RunnerState(NamedTuple):
     targets: Float64 | None
     """Last joint setpoints (envs, dof), where searches for poses of the tool start; None without such poses."""
     motion: Motion | None
-    """Setpoint of the last tick and its rate; after a reset positions and velocities. None for setpoints of others."""
+    """Setpoint of the last tick and its rate, or position and velocity after a reset. None for other setpoints."""
     steps: int = 0
     steps_since_checkpoint: int = 0
     work: tuple[tuple[float, ...], int] = ((), 1)
@@ -83,13 +83,13 @@ class RunnerCommand(ABC):
         """Return the request to the workers for this command after ``state``."""
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        """Return the state after the command, from the state before and from what the workers did."""
+        """Return the state after the command, from the state before it and the outcome in the workers."""
         return state
 
 
 @dataclass(frozen=True)
 class Read(RunnerCommand):
-    """Read something from the loops that changes nothing."""
+    """Read from the loops, without a change of state."""
 
     what: Request
     changes_loops = False
@@ -182,7 +182,7 @@ class RunTicks(RunnerCommand):
         if motion is not None and count:
             motion = setpoint[count - 1], None if rate is None else rate[count - 1]
         steps = count * self.substeps
-        return RunnerState(  # not _replace(), which takes a second call of Python
+        return RunnerState(  # not _replace(): it is one more Python call per tick
             state.params,
             state.actuators,
             state.draws,
@@ -198,7 +198,7 @@ class RunTicks(RunnerCommand):
 
 @dataclass(frozen=True)
 class ChangeParams(RunnerCommand):
-    """Change gains, limits and times in flight."""
+    """Change the params between ticks."""
 
     params: bp.PIDParams
 
@@ -211,7 +211,7 @@ class ChangeParams(RunnerCommand):
 
 @dataclass(frozen=True)
 class ChangeActuators(RunnerCommand):
-    """Change the actuators in flight."""
+    """Change the actuators between ticks."""
 
     actuators: bp.Actuators | None
 
@@ -224,7 +224,7 @@ class ChangeActuators(RunnerCommand):
 
 @dataclass(frozen=True)
 class MakeSnapshot(RunnerCommand):
-    """Read the state of all envs, from which they go on."""
+    """Read the state of all envs; they continue from this state."""
 
     def request(self, state: RunnerState) -> TakeSnapshot:
         return TakeSnapshot()
@@ -306,8 +306,8 @@ def read_command(
 ) -> Command:
     """Return the command (ticks, envs, ...) of one tick, or of ``ticks``, as a copy.
 
-    ``given`` are its arrays by the names of their arguments, in the order of :class:`Command`. Positions of followers
-    become those that their leaders mean for them; efforts act on leaders in the loop. ``limits`` warns of setpoints.
+    ``given`` has its arrays by the names of their arguments, in the order of :class:`Command`. Positions of followers
+    are computed from their leaders; the loop passes efforts on to the leaders. ``limits`` warns of setpoints.
     """
     if options.tool_setpoints is not None:
         given = _joint_setpoints(options, state, given, ticks)
@@ -377,7 +377,7 @@ def _check_acceleration(params: bp.PIDParams, given: Mapping[str, ArrayLike | No
         remedy = "give M(q) times it as feedforward, or use gains in accelerations, such as robot.designed()"
         raise InvalidArgumentError(name, "is for gains in accelerations, and these are efforts", remedy=remedy)
     if given_rate is None:
-        raise InvalidArgumentError(name, f"has no {rate} beside it", remedy=f"give {rate}, too")
+        raise InvalidArgumentError(name, f"is given without {rate}", remedy=f"give {rate}, too")
 
 
 def _joint_setpoints(

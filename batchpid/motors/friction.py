@@ -23,10 +23,10 @@ models", IROS 2005)::
   2002). The yield by clipping is the return mapping of J. C. Simo and T. J. R. Hughes, Computational Inelasticity
   (1998), section 1.4.
 
-With a static friction F_s > F the bound is F_s until the joint yields. While it slides the bound falls with the speed
-from F_s to F, half way at the Stribeck velocity v_s, and at once if that is 0 (D. P. Hess and A. Soom, "Friction at a
-lubricated line contact operating at oscillating sliding velocities", Journal of Tribology 112, 1990). In gears friction
-grows with the effort that they transmit; here that is the motor's::
+With a static friction F_s > F the bound is F_s until the joint yields. While it slides, the bound falls with the speed
+from F_s to F. It is half way at the Stribeck velocity v_s; if v_s is 0, it is F at once (D. P. Hess and A. Soom,
+"Friction at a lubricated line contact operating at oscillating sliding velocities", Journal of Tribology 112, 1990). In
+gears friction grows with the transmitted effort, here the effort of the motor::
 
     bound = F + (F_s - F) / (1 + (v / v_s)^2) + mu |tau|
 
@@ -58,7 +58,7 @@ class Friction(NamedTuple):
     viscous: Array = None
     """B >= 0 [N m s/rad or N s/m]."""
     static: Array = None
-    """F_s >= F, which holds the joint at rest; 0: F [N m or N]."""
+    """F_s >= F, friction of a joint at rest; 0: F [N m or N]."""
     stribeck: Array = None
     """v_s >= 0 [rad/s or m/s]."""
     load: Array = None
@@ -66,7 +66,7 @@ class Friction(NamedTuple):
 
     @property
     def most(self) -> Array:
-        """Array that is positive where a joint has friction other than viscous; None without such joints."""
+        """Array that is positive for joints with friction other than viscous; None without such joints."""
         parts = [leaf for leaf in (self.coulomb, self.static, self.load) if leaf is not None]
         return sum(parts[1:], parts[0]) if parts else None
 
@@ -83,7 +83,7 @@ class FrictionState(NamedTuple):
     memory: Array = None
     """K w: the factor of v' [N m s/rad or N s/m]."""
     sliding: Array = None
-    """1.0 where the friction had yielded in the last step, else 0.0."""
+    """1.0 if the joint was sliding in the last step, else 0.0."""
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")
@@ -172,7 +172,7 @@ def advance(friction: Friction, state: FrictionState, effort: Array, velocity: A
 def bound_of(friction: Friction, sliding: Array, effort: Array, velocity: Array) -> Array:
     """Return the largest friction other than viscous (envs, joints) [N m or N] under the motors' ``effort``.
 
-    ``sliding`` is positive where the friction had yielded before.
+    ``sliding`` is positive for joints that were sliding in the last step.
     """
     bound = friction.coulomb
     if friction.static is not None:

@@ -30,12 +30,13 @@ TROT = [
 class WalkVectorEnv(RobotVectorEnv):
     """N quadrupeds, each with a velocity to follow: forward, to the left, and about the vertical axis.
 
-    The setpoint of the joints is the posture, plus a gait that a clock moves, plus :attr:`scale` times the action, in
+    The joint setpoint is the sum of the posture, a gait that depends on a clock, and :attr:`scale` times the action, in
     [-1, 1] (A. Iscen et al., "Policies modulating trajectory generators", CoRL 2018). The gait is a trot that lifts two
-    legs at a time, and swings all hips in proportion to the command. An episode begins at a random time of it.
+    legs at a time, and swings all hips in proportion to the command. An episode begins at a random phase.
 
-    - *Observation*: of the trunk, in its own axes, velocity [m/s], angular velocity [rad/s] and the upright axis, (3)
-      each; command (3); of the joints, position from the posture, velocity, last action; sine and cosine of the clock.
+    - *Observation*: velocity [m/s] and angular velocity [rad/s] of the trunk and the vertical, (3) each, in the axes of
+      the trunk; command (3); joint positions relative to the posture, joint velocities and last action, (dof) each;
+      sine and cosine of the clock.
     - *Reward*: exp(-error^2 / 0.1) for the horizontal velocity and 0.5 exp(-error^2 / 0.25) for the turn, minus v_z^2,
       0.02 (roll rate^2 + pitch rate^2), 2 sin^2 of the tilt, 1e-4 effort^2, and 0.01 (change of the action)^2.
     - *Terminated*: the robot fell: its trunk is lower than :attr:`lowest`, or tilted by 60 degrees; or it diverged.
@@ -46,14 +47,15 @@ class WalkVectorEnv(RobotVectorEnv):
     num_envs, robot
         As for :class:`RobotVectorEnv`, with ``fixed_base=False``.
     commands
-        Least and greatest command (2, 3): forward, left [m/s], turn [rad/s]. Every episode draws one.
+        Smallest and largest command (2, 3): forward, left [m/s], turn [rad/s]. Each episode draws one.
     posture
         Joint positions (dof,) of the standing robot [rad]; default ``robot.start``.
     gait
-        Offsets (3, dof) [rad]: in the middle of the swing of the first and of the second pair of legs, and at the start
-        of a period at 1 m/s. Default: the trot of the bundled quadruped; none for other robots.
+        Offsets (3, dof) [rad]: lift of the first and of the second pair of legs in the middle of their swing, and the
+        stride at 1 m/s at the start of a period. Default: a trot for the bundled quadruped, 0 for other robots.
     options
-        Of :class:`RobotVectorEnv` and the Runner. ``params`` are a bundled robot's settings, ``compensate`` is "none".
+        Options of :class:`RobotVectorEnv` and the Runner. Defaults here: ``params`` of a bundled robot's settings, and
+        ``compensate="none"``.
 
     Raises
     ------
@@ -92,7 +94,7 @@ class WalkVectorEnv(RobotVectorEnv):
         self._clock, self._command = np.zeros(self.num_envs), np.zeros((self.num_envs, 3))
 
     def runner_options(self) -> Mapping[str, Any]:
-        """Return the law of joint setpoints, and the ground."""
+        """Return the control mode and the ground."""
         return {"control": "pid", "ground": True}
 
     def spaces(self) -> tuple[spaces.Box, spaces.Box]:
@@ -102,7 +104,7 @@ class WalkVectorEnv(RobotVectorEnv):
         return spaces.Box(-high, high), spaces.Box(-1.0, 1.0, (dof,), np.float32)
 
     def draw(self, env: int, random: np.random.Generator) -> Float64:
-        """Draw a command, a time of the clock, and a start within 0.1 rad of the posture."""
+        """Draw a command, a phase of the clock, and a start within 0.1 rad of the posture."""
         self._command[env] = random.uniform(*self.commands)
         self._clock[env] = random.uniform()
         self.action[env] = 0.0

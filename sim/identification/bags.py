@@ -1,7 +1,7 @@
 """Logs in ROS bags: ``sensor_msgs/JointState`` in bags of ROS 1, in bags of ROS 2, and in MCAP files.
 
-Messages have the positions, velocities and efforts of joints by name, in any order. The efforts of the topic of the
-measurements count as measured; the positions of the topic of the commands are setpoints, its efforts commands.
+Messages hold positions, velocities and efforts of joints by name, in any order. In the topic of measurements, efforts
+are measured efforts. Positions in the topic of commands are setpoints, and its efforts are commanded efforts.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ def is_bag(path: Path) -> bool:
 
 
 def read_bag(path: Path, reading: Reading) -> list[dict[str, Float64]]:
-    """Return the columns of a bag by name, and those of its topic of commands if ``reading`` names one.
+    """Return the columns of a bag by name: of its measurements, and of its commands if ``reading`` names their topic.
 
-    Times are in seconds from the first message of the measurements on, by the stamps of the headers, or where these are
-    0 by the bag's. Of messages with different joints, the joints with most messages are taken.
+    Times are in seconds since the first measurement. They come from the stamps of the headers, or from the bag if a
+    stamp is 0. If messages have different joints, the most frequent set of joints is used.
 
     Raises
     ------
@@ -76,10 +76,10 @@ def _columns(source: str, messages: list[Any], names: dict[str, str], begin: int
     if not groups:
         raise error(source, "has no messages", "choose another topic")
     joints, rows = max(groups.items(), key=lambda group: len(group[1]))
-    rows.sort(key=itemgetter(0))  # a bag has them as they arrived
+    rows.sort(key=itemgetter(0))  # a bag has them in the order of arrival
     columns = {"time": np.array([stamp - begin for stamp, _ in rows]) / 1e9}
     for field, quantity in names.items():
         values = [getattr(message, field) for _, message in rows]
-        if all(len(value) == len(joints) for value in values):  # an empty list where a driver has no such value
+        if all(len(value) == len(joints) for value in values):  # a driver without such a value leaves the list empty
             columns |= {f"{quantity}:{joint}": column for joint, column in zip(joints, np.array(values).T, strict=True)}
     return columns

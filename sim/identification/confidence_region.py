@@ -1,12 +1,12 @@
-r"""Joint confidence region of identified motors: kept in the actuators file, and drawn from.
+r"""Joint confidence region of identified motors: its place in an actuators file, and draws from it.
 
-The estimates of a fit are correlated: where the strength is higher, so are armature and friction. With the estimate m,
+The estimates of a fit are correlated: a higher strength comes with more armature and friction. With the estimate m,
 the standard deviations d and the correlations R, the region is the ellipsoid with 95 % of the normal distribution::
 
     theta = m + d * (R^1/2 z),     |z|^2 <= chi^2_0.95(n)
 
-Draws are normal, within the ellipsoid and the bounds of the unknowns. The quantile of chi^2 is E. B. Wilson's and M. M.
-Hilferty's ("The distribution of chi-square", PNAS 17, 1931).
+Draws are normal, within the ellipsoid and the bounds of the unknowns. The quantile of chi^2 is approximated as in
+E. B. Wilson and M. M. Hilferty, "The distribution of chi-square", PNAS 17, 1931.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Region(NamedTuple):
     """Joint confidence region of n unknowns."""
 
     names: tuple[tuple[str, str | None], ...]
-    """Kind of each unknown, and its joint; None where all joints share it."""
+    """Kind and joint of each unknown; the joint is None if all joints share it."""
     estimate: Float64
     deviation: Float64
     """Standard deviations (n,)."""
@@ -42,7 +42,7 @@ class Region(NamedTuple):
     """(n, n)."""
 
     def to_dict(self) -> Document:
-        """Return plain values, for :func:`read_region`; of the correlations the rows up to the diagonal."""
+        """Return plain values for :func:`read_region`, with the lower triangle of the correlations."""
         rows = [[float(f"{each:.5f}") for each in row[: k + 1]] for k, row in enumerate(self.correlation)]
         return {
             "unknowns": [[kind] if joint is None else [kind, joint] for kind, joint in self.names],
@@ -52,7 +52,7 @@ class Region(NamedTuple):
         }
 
     def draw(self, count: int, seed: int) -> tuple[Float64, Float64]:
-        """Return ``count`` points (count, n) of the region, and their distance from the estimate in deviations."""
+        """Return ``count`` points (count, n) of the region, and their distances from the estimate in deviations."""
         size, rng = len(self.names), np.random.default_rng(seed)
         values, vectors = np.linalg.eigh(self.correlation)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -73,12 +73,12 @@ class DrawnMotors(NamedTuple):
     points: Float64
     """(draws, unknowns)."""
     distance: Float64
-    """Their distance from the estimate, in standard deviations."""
+    """Distances of the points from the estimate (draws, unknowns), in standard deviations."""
     actuators: bp.Actuators
     """One row for each draw."""
 
     def describe(self, draw: int, joint: str) -> str:
-        """Return the unknowns of ``joint``, and those of all joints, that are farthest off in a draw."""
+        """Return the values of a draw for ``joint`` that deviate most from the estimate, three of them."""
         own = [n for n, (kind, of) in enumerate(self.region.names) if of in (None, joint) and kind_of(kind).field]
         farthest = sorted(own, key=lambda n: -abs(self.distance[draw, n]))[:3]
         return ", ".join(
@@ -89,7 +89,7 @@ class DrawnMotors(NamedTuple):
 def read_region(path: str | os.PathLike[str], robot: Robot) -> Region:
     """Return the region in an actuators file of ``robot``.
 
-    Raises InvalidArgumentError if the file holds none, or one that does not fit, and FileNotFoundError without a file.
+    Raises InvalidArgumentError if the file has no region or an invalid one, and FileNotFoundError without a file.
     """
     known = documents.read(path).get("about", {}).get(KEY)
     source, remedy = f"{path}: {KEY}", "write the file with `batchpid identify` of this version"
@@ -113,10 +113,10 @@ def read_region(path: str | os.PathLike[str], robot: Robot) -> Region:
 
 
 def draw_motors(path: str | os.PathLike[str], robot: Robot, count: int, seed: int = 0) -> DrawnMotors:
-    """Return ``count`` motors of ``robot`` from the region in an actuators file, whose other effects are kept.
+    """Return ``count`` sets of motors of ``robot``, drawn from the region in an actuators file.
 
-    Friction and damping are the excess over the robot's description, at least 0. A payload at the tool is no motor, and
-    is left out. Raises as :func:`read_region`.
+    Effects outside the region keep their values in the file. Friction and damping are in addition to the robot's
+    description, at least 0. A payload at the tool is left out. Raises as :func:`read_region`.
     """
     region, nominal = read_region(path, robot), load_robot_actuators(str(path), robot)
     points, distance = region.draw(count, seed)

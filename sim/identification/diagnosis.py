@@ -1,4 +1,4 @@
-r"""Diagnosis of the model beside a fit: links whose masses are off, and the stretch of the logs that disagrees most.
+r"""Diagnosis of the robot's model in a fit: links with wrong masses, and the part of the logs that disagrees most.
 
 Required efforts are linear in the mass m and the first moment m c of every link, and in its inertia tensor (C. G.
 Atkeson, C. H. An and J. M. Hollerbach, "Estimation of inertial parameters of manipulator loads and links", Int. J.
@@ -7,10 +7,10 @@ Robotics Research 5(3), 1986). With the tables of :mod:`batchpid.sim.identificat
 
     u - b - (M q'' + h) = A q'' + B q' + F sgn(q') + sum over links of columns x
 
-in two ways: x are changes of each link's mass and first moment, or the one link is heavier by the factor x, with the
-same shape. The first says how much free masses would explain, the second gives a link its name. A heavier link and a
-weaker motor may look alike: then both are said. Every fourth half second is left out and decides, and single rows that
-disagree much have little weight (P. J. Huber, "Robust estimation of a location parameter", Annals of Mathematical
+There are two regressions: x are changes of the mass and first moment of every link, or x scales the mass of one link,
+with its shape unchanged. The first shows how much free masses would explain, the second which link is wrong. A heavier
+link and a weaker motor may explain a log equally well; both are then reported. Every fourth half second is held out and
+decides. Outliers have little weight (P. J. Huber, "Robust estimation of a location parameter", Annals of Mathematical
 Statistics 35, 1964).
 """
 
@@ -29,40 +29,39 @@ from batchpid.sim.identification.regression import Regression
 from batchpid.task_space.rigid_tree import RigidTree
 
 SPREAD, MOMENT_SPREAD = 0.5, 0.05
-"""Standard deviations of the priors: of the change of a link's mass, over the mass, where only some links change, and
-of its center of mass [m] where all masses are free."""
+"""Standard deviations of the priors: of the relative change of a link's mass if some links change, and of the center
+of mass [m] if all masses are free."""
 DECREASE, EXPLAINED = 0.03, 0.5
-"""Least decrease of the residual, over it, for which a link is named, and least share of the efforts that is explained
-then."""
+"""Smallest relative decrease of the residual, and smallest explained share of the efforts, for a report of a link."""
 ALIKE = 1.1
-"""Ratio of residuals up to which two explanations are alike."""
+"""Largest ratio of the residuals of two explanations that count as equally good."""
 LEAST_CHANGE = 0.05
-"""Least change of a link's mass, over the mass, that is named."""
+"""Smallest relative change of a link's mass that is reported."""
 MOST_LINKS = 3
 SLOW = 0.02
-"""Speed, over its root mean square, below which a joint may stick."""
+"""Speed below which a joint may stick, over the root mean square speed."""
 STRETCH, STANDS_OUT, SHARE = 0.25, 5.0, 0.3
-"""Length of a stretch [s]; its residual over the median stretch's, and over the joint's efforts, from which it is a
-disturbance."""
+"""Length of a part of a log [s]. It is a disturbance if the ratios of its residual to the median of all parts and
+to the joint's efforts are at least as large."""
 _HUBER, _ROUNDS = 2.0, 6
 
 
 class Disturbance(NamedTuple):
-    """Stretch of a log in which the efforts disagree most with the model."""
+    """Part of a log in which the efforts disagree most with the model."""
 
     log: str
     """Source of the log."""
     time: float
-    """Middle of the stretch [s], as in the log."""
+    """Middle of the part [s], as in the log."""
     joint: str
     effort: float
     """Root mean square of the effort that the model does not explain there [N m or N]."""
     ratio: float
-    """The same over that of the joint's median stretch."""
+    """Ratio of ``effort`` to the median of all parts, for this joint."""
 
 
 class Diagnosis(NamedTuple):
-    """How well the model explains the efforts, and what would explain them better."""
+    """Share of the efforts that the model explains, and changes of the model that would explain more."""
 
     explained: tuple[float, float]
     """Share of the efforts on the held-out part that is explained, 1 - |residual| / |effort|, with the masses of the
@@ -70,7 +69,7 @@ class Diagnosis(NamedTuple):
     links: dict[str, float]
     """Factors of the mass of links that seem lighter or heavier than described."""
     strengths: Float64 | None
-    """Strengths (joints,) that explain the efforts as well as ``links``; None where they do not, or there are none."""
+    """Strengths (joints,) that explain the efforts as well as ``links`` do; None if there are none."""
     disturbance: Disturbance | None
 
     def to_dict(self) -> Document:
@@ -83,7 +82,7 @@ class Diagnosis(NamedTuple):
         }
 
     def sentences(self) -> list[str]:
-        """Return what is found, in sentences."""
+        """Return the diagnosis as sentences."""
         described, free = (100 * max(each, 0.0) for each in self.explained)
         found = [f"the efforts of the motion are explained to {described:.3g} %"]
         if self.links:
@@ -107,7 +106,7 @@ class Diagnosis(NamedTuple):
 
 
 def diagnose(regression: Regression, logs: list[Log], joints: list[str]) -> Diagnosis:
-    """Return the diagnosis of the model of ``regression`` of ``logs``, at its best delay and payload.
+    """Return the diagnosis of the model in a ``regression`` of ``logs``, at its best delay and payload.
 
     ``joints`` are the names of the logged joints.
     """
@@ -122,7 +121,7 @@ def diagnose(regression: Regression, logs: list[Log], joints: list[str]) -> Diag
     links, best = _heavier(system, scaled, described)
     strong, strengths = system.with_strengths()
     if links and (strong.held_out * ALIKE < best.held_out or best.explained < EXPLAINED):
-        links, best = {}, described  # the motors explain it better, or nothing does
+        links, best = {}, described  # the motors explain the efforts better, or neither does
     alike = bool(links) and strong.held_out <= ALIKE * best.held_out
     least = min((described, best, strong), key=lambda each: each.held_out)
     explained = described.explained, max(masses.explained, best.explained)
@@ -133,7 +132,7 @@ class _Solved(NamedTuple):
     """Solution of a regression."""
 
     values: Float64
-    """Of the further columns."""
+    """Values of the further columns."""
     residual: Float64
     """(rows, joints)."""
     held_out: float
@@ -160,10 +159,9 @@ class _System:
         return list(zip(self.regression.rows, self.regression.motions, self.regression.plants, strict=True))
 
     def columns(self, link: str, more: float = 0.0, further: Float64 | float = 0.0) -> Float64:
-        """Return the change of the required efforts (rows, joints, 1) with a link that is heavier, or has its center
-        of mass elsewhere.
+        """Return the change of the required efforts (rows, joints, 1) due to a change of a link.
 
-        It is heavier by the share ``more``, of the same shape; its center is ``further`` on (3,) [m].
+        Its mass and inertia grow by the share ``more``, and its center of mass moves by ``further`` (3,) [m].
         """
         found = []
         for rows, motion, plant in self._of_logs():
@@ -210,7 +208,7 @@ class _System:
         return self._solved(np.zeros(0), residual), motors["strength"][0]
 
     def _spread_of(self, residual: Float64) -> Float64:
-        """Return the size of the fitted residuals (joints,), of which half are less than 2 / 3."""
+        """Return a robust standard deviation of the fitted residuals (joints,), from their median."""
         each = np.where(self._moves & ~self._held_out[:, None], np.abs(residual), np.nan)
         size: Float64 = 1.4826 * np.nanmedian(each, axis=0) + 1e-6 * self._size
         return size
@@ -222,7 +220,7 @@ class _System:
         return _Solved(values, residual, float(np.linalg.norm(weighed)), float(1 - left / max(whole, 1e-12)))
 
     def disturbance(self, solved: _Solved, logs: list[Log], joints: list[str]) -> Disturbance | None:
-        """Return the stretch with the largest residual, over that of the joint's median stretch; None without one."""
+        """Return the part with the largest residual over the median of all parts; None if none is large enough."""
         dt, begin = self.regression.plants[0].drive.timestep, 0
         stretches: list[tuple[int, float, Float64]] = []
         for log, (rows, *_) in enumerate(self._of_logs()):
@@ -244,7 +242,7 @@ class _System:
 
 
 def _heavier(system: _System, scaled: dict[str, Float64], described: _Solved) -> tuple[dict[str, float], _Solved]:
-    """Return the factors of the links that explain the efforts better, one after another, and the solution."""
+    """Return mass factors of links, added one by one while the residual falls enough, and the solution."""
     chosen, best = list[str](), described
     while len(chosen) < MOST_LINKS:
         tried = {

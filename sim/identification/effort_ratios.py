@@ -1,12 +1,13 @@
-r"""Motors from efforts that are both commanded, u, and measured, m: without a rigid-body model, also in contact.
+r"""Motors from commanded efforts u and measured efforts m, without a rigid-body model; robots may be in contact.
 
-Behind the motor m is what the motor delivers; behind the gear it lacks what the motor itself takes::
+The effort e is the command after delay and lag. A sensor at the motor measures the effort of the motor. A sensor behind
+the gear measures it minus the effort for inertia, damping and friction of the motor::
 
     m = s e + b,     m = s e + b - A q'' - B q' - F sgn(q')     (sensor at the link)
     e_k = e_{k-1} + (1 - exp(-dt / T)) (u(t_k - d) - e_{k-1})
 
-The delay d, common to all joints, and the lags T are found on a grid, where the others are linear; then all are refined
-by least squares. Lags are accepted if they lower the error on the held-out rows.
+The delay d of all joints and the lags T are searched on a grid; the other unknowns are then linear. Least squares
+refine all of them. Lags are accepted if they lower the error on the held-out rows.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ from batchpid.sim.identification.windows import share_fitted
 from batchpid.sim.robot.robot import Robot
 
 LAGS = np.r_[0.0, np.geomspace(5e-4, 0.1, 12)]
-"""Lags that are tried [s]."""
+"""Lags of the grid [s]."""
 GAIN = 0.99
-"""Largest error with lags that are accepted, over the error without."""
+"""Largest ratio of the errors with and without lags for which lags are accepted."""
 OF_MOTOR, OF_LINK = ("strength", "bias"), ("strength", "bias", "armature", "damping", "friction")
 
 
 class EffortRatios(NamedTuple):
-    """Motors that measured efforts show."""
+    """Motors identified from commanded and measured efforts."""
 
     joints: tuple[int, ...]
     names: tuple[tuple[str, int | None], ...]
@@ -45,17 +46,17 @@ class EffortRatios(NamedTuple):
     estimate: Float64
     """Values (values,)."""
     deviation: Float64
-    """Standard deviations (values,): the scatter of estimates from parts of the logs."""
+    """Standard deviations (values,), from the scatter between parts of the logs."""
     error: Float64
-    """Root mean squares of the error on the held-out rows, over those of the efforts (joints,)."""
+    """Relative error (joints,): root mean square error on the held-out rows, over the root mean square effort."""
 
     def values(self, kinds: Iterable[str]) -> Motors:
-        """Return the values of ``kinds``, (1, joints) or (1, 1), of those that were found."""
+        """Return the identified values among ``kinds``, (1, joints) or (1, 1)."""
         own = {kind: [at for at, name in enumerate(self.names) if name[0] == kind] for kind in kinds}
         return {kind: self.estimate[None, places] for kind, places in own.items() if places}
 
     def document(self, robot: Robot) -> dict[str, dict[str, list[float]]]:
-        """Return estimate, lower and upper end of the 95 % interval by joint and kind; the delay is of "all joints"."""
+        """Return estimate, lower and upper end of the 95 % interval by joint and kind, the delay as "all joints"."""
         found: dict[str, dict[str, list[float]]] = {}
         for (kind, joint), value, half in zip(self.names, self.estimate, INTERVAL * self.deviation, strict=True):
             place = found.setdefault("all joints" if joint is None else robot.joint_names[self.joints[joint]], {})
@@ -63,7 +64,7 @@ class EffortRatios(NamedTuple):
         return found
 
     def save(self, path: str | os.PathLike[str], robot: Robot) -> None:
-        """Write the actuators of ``robot``, with their intervals, to a .yaml or .json file; the others are ideal."""
+        """Write the actuators of ``robot``, with intervals, to a .yaml or .json file; other joints are ideal."""
         nothing = np.zeros(len(self.names))
         motors = actuators_at(
             robot, self.joints, Unknowns(len(self.joints), self.names, nothing, nothing), self.estimate
@@ -75,16 +76,16 @@ class EffortRatios(NamedTuple):
 def measured_motors(
     robot: Robot, logs: Iterable[str | os.PathLike[str] | Log], *, timestep: float | None = None, hold: bool = False
 ) -> EffortRatios:
-    """Return the motors that efforts show which are both commanded and measured; the robot may be in contact.
+    """Identify motors from commanded and measured efforts; the robot may be in contact.
 
-    The arguments are those of :func:`batchpid.sim.identification.identify`. Raises InvalidArgumentError if the logs
+    The arguments are as in :func:`batchpid.sim.identification.identify`. Raises InvalidArgumentError if the logs
     lack efforts of both kinds, and the errors of :func:`batchpid.sim.identification.identify`.
     """
     return effort_ratios(read_inputs(robot, logs, None, "none", timestep, 1, hold))
 
 
 def effort_ratios(inputs: Inputs) -> EffortRatios:
-    """Return the motors that the efforts of logs show, which are commanded and measured."""
+    """Return the motors identified from the commanded and measured efforts of logs."""
     if any(log.measured is None for log in inputs.logs):
         remedy = "add columns effort:JOINT and measured_effort:JOINT"
         raise InvalidArgumentError("logs", "lack efforts that are both commanded and measured", remedy=remedy)
@@ -117,7 +118,7 @@ class _Tables:
         self._fitted, self._measured, *self._motion = (np.concatenate(each) for each in zip(*rows, strict=True))
 
     def _filtered(self, table: Float64) -> Float64:
-        """Return ``table`` with the filter of the motion, which only a sensor at the link needs."""
+        """Return ``table`` filtered as the motion is, if the sensor is at the link; otherwise unchanged."""
         from scipy.signal import butter, sosfiltfilt
 
         return sosfiltfilt(butter(4, CUTOFF, fs=1 / self._dt, output="sos"), table, axis=0) if self._links else table
@@ -144,7 +145,7 @@ class _Tables:
         return float(np.log(((wanted - columns @ found) ** 2).mean() + 1e-30)), found
 
     def solve(self, lags: Float64) -> EffortRatios:
-        """Return the solution with ``lags`` to try."""
+        """Return the solution for a grid with ``lags``."""
         from scipy.optimize import least_squares
 
         joints, kinds = range(len(self._joints)), (*(OF_LINK if self._links else OF_MOTOR), "lag")

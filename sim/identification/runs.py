@@ -1,8 +1,8 @@
-"""Lists of logs with settings of their own: a YAML file that takes the place of logs.
+"""Lists of logs, each with its settings: a YAML file given in place of a log.
 
-``logs`` is a list; what stands beside it applies to every log that does not say otherwise::
+``logs`` is the list. Other keys at the top are defaults for all logs::
 
-    gains: soft.yaml            # gains of the PID law, as of --gains; without gains the efforts are used
+    gains: soft.yaml            # gains of the PID law, as for --gains; without gains the efforts are used
     logs:
     - log: monday.csv
       held_out: true            # tests the result; then the other logs are fitted as a whole
@@ -53,12 +53,12 @@ def read_runs(
 ) -> list[Log]:
     """Return the logs of a list, with their settings; ``read`` is :func:`batchpid.sim.identification.logs.read_logs`.
 
-    ``kind``, ``hold`` and ``reading`` apply where the list does not say otherwise. Raises InvalidArgumentError for a
-    key or value that is not understood, and the errors of :func:`batchpid.sim.identification.logs.read_logs`.
+    ``kind``, ``hold`` and ``reading`` are defaults, which keys of the list replace. Raises InvalidArgumentError for an
+    unknown key or an invalid value, and the errors of :func:`batchpid.sim.identification.logs.read_logs`.
     """
     document = documents.read(path)
     if not isinstance(document, dict) or not isinstance(document.get("logs"), list) or not document["logs"]:
-        raise error(str(path), "is no list of logs", "write 'logs:' and a list of mappings, each with the key 'log'")
+        raise error(str(path), "is not a list of logs", "write 'logs:' and a list of mappings, each with the key 'log'")
     common = {"hold": hold, **reading._asdict(), **{key: each for key, each in document.items() if key != "logs"}}
     found: list[Log] = []
     for number_, entry in enumerate(document["logs"]):
@@ -99,7 +99,7 @@ def _read(
     kind: CommandKind | None,
     entry: Document,
 ) -> list[Log]:
-    """Return the stretches of one log of a list, with its settings."""
+    """Return the parts of one log of a list, divided where its times jump, with its settings."""
     own, params = robot, None
     if (urdf := entry.get("urdf")) is not None:
         own = Robot.load(folder / urdf)

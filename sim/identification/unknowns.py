@@ -15,7 +15,7 @@ from batchpid.motors.actuator_fields import FIELDS
 from batchpid.motors.actuators import Actuators
 
 Motors = dict[str, Float64]
-"""Values of n candidates by kind of unknown: (n, joints), or (n, 1) where all joints share it."""
+"""Values of n candidates by kind of unknown: (n, joints), or (n, 1) for a value that all joints share."""
 
 
 class Kind(NamedTuple):
@@ -28,15 +28,15 @@ class Kind(NamedTuple):
     low: float
     high: float
     size: str | float
-    """Typical size: a number, or the name of a typical value of each joint, as of :meth:`Unknowns.of`."""
+    """Typical size: a number, or the name of a typical value of each joint, see :meth:`Unknowns.of`."""
     spread: float
     """Standard deviation of the prior, over the typical size."""
     start: float = 0.0
     """Mean of the prior, and value at the start of a fit where the regression does not give it."""
     off: float = 0.0
-    """Value without effect, of kinds without field."""
+    """Value without effect, for kinds without field."""
     tries: tuple[float, ...] = ()
-    """Values that are tried first, over the typical size, of kinds that are added to a fit."""
+    """Values to try first, over the typical size, for kinds that are added to a fit."""
 
     @property
     def neutral(self) -> float:
@@ -69,9 +69,9 @@ ADDED = {
     ),
     "slew": Kind(None, True, 1e-3, np.inf, "speed", 10.0, off=np.inf, tries=(0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2)),
 }
-"""Kinds that a fit has only where it is asked for them; they stay out of simulations otherwise.
+"""Kinds that a fit has on request only. Otherwise simulations leave them out.
 
-"gain" is a factor of all gains of the law, and "kd" of that gain alone; "saturation" is the law's effort limit over its
+"gain" is a factor of all gains of the law, "kd" of kd alone; "saturation" is the law's effort limit over its
 kp [rad or m], and "slew" the limit of its setpoints' rate [rad/s or m/s].
 """
 LAW = ("gain", "kd", "saturation", "slew")
@@ -84,15 +84,15 @@ EXTRAS = {
     "saturation": ("saturation",),
     "slew": ("slew",),
 }
-"""Kinds that are added to a fit together, and kept where the error on the held-out part falls."""
+"""Kinds that are added to a fit together, and kept at joints where they lower the error on the held-out part."""
 DESCRIBED = {"damping": "damping", "friction": "friction", "static": "friction"}
-"""Kinds of which the robot's description states a share, and its name there; here they are the whole."""
+"""Kinds to which the robot's description contributes, and the name there. Values of a fit include that part."""
 SCALES, SCALED = ("strength", "gain"), ("armature", "damping", "friction", "static", "bias")
-"""Kinds that scale a joint's efforts, and kinds that, if they grow with these, leave its motion as it is."""
+"""Kinds that scale a joint's efforts, and kinds that must be scaled with them to keep its motion unchanged."""
 _STEP = 2e-3
 """Change of an unknown for a finite difference, in units of its scale."""
 _STRENGTH_STEP = 1e-2
-"""Change of a strength, over it."""
+"""Relative change of a strength for a finite difference."""
 
 
 def kind_of(name: str) -> Kind:
@@ -123,7 +123,7 @@ class Unknowns:
 
     joints: int
     names: tuple[tuple[str, int | None], ...]
-    """Kind and joint of each, None where all joints share it."""
+    """Kind and joint of each; the joint is None if all joints share it."""
     scale: Float64
     """Typical sizes, powers of 2: points over them are exact, so that a fit resumes bit-identically."""
     inertia: Float64
@@ -164,7 +164,7 @@ class Unknowns:
         return replace(self, names=(*self.names, *names), scale=np.append(self.scale, _rounded(scale)))
 
     def tries(self, theta: Float64, kinds: Sequence[str], sizes: Mapping[str, Float64]) -> Float64:
-        """Return the points (n, unknowns) that are tried first for ``kinds`` beside the others' ``theta``."""
+        """Return the points (n, unknowns) to try first: values of ``kinds`` appended to ``theta``."""
         rows = []
         for factors in product(*(ADDED[name].tries for name in kinds)):
             values = [
@@ -179,12 +179,12 @@ class Unknowns:
         return np.broadcast_to(sizes[size] if isinstance(size, str) else size, self.joints)
 
     def without(self, known: Motors) -> Unknowns:
-        """Return the unknowns without the kinds in ``known``, whose values (1, joints or 1) are taken as they are."""
+        """Return the unknowns without the kinds in ``known``, which keep these values (1, joints or 1)."""
         kept = [index for index, (name, _) in enumerate(self.names) if name not in known]
         return replace(self, names=tuple(self.names[index] for index in kept), scale=self.scale[kept], known=known)
 
     def plus_known(self, names: tuple[tuple[str, int | None], ...]) -> Unknowns:
-        """Return the unknowns with ``names`` among them, whose kinds are known no longer."""
+        """Return the unknowns with ``names`` added. Their kinds are no longer known."""
         known = {kind: values for kind, values in self.known.items() if kind not in dict(names)}
         scale = np.append(self.scale, np.ones(len(names)))
         return replace(self, names=(*self.names, *names), scale=scale, known=known)
@@ -222,7 +222,7 @@ class Unknowns:
         return np.flatnonzero([kind == name for kind, _ in self.names])
 
     def joints_of(self, name: str) -> list[int]:
-        """Return the joints that have an unknown of a kind; 0 for a kind that all share."""
+        """Return the joints that have an unknown of a kind; [0] if all joints share it."""
         return [joint or 0 for kind, joint in self.names if kind == name]
 
     def changes(self, theta: Float64) -> Float64:
@@ -247,7 +247,7 @@ class Unknowns:
         return np.clip(theta, self.low, self.high)
 
     def point(self, motors: Motors) -> Float64:
-        """Return the point of one candidate; unknowns that it lacks are those at the start of a fit."""
+        """Return the point of one candidate; missing unknowns have their values at the start of a fit."""
         point = self.prior
         if "gain" not in motors and "strength" in motors:  # a regression calls it so
             motors = motors | {"gain": motors["strength"]}
@@ -257,7 +257,7 @@ class Unknowns:
         return point
 
     def motors(self, points: Float64) -> Motors:
-        """Return the candidates at ``points`` (n, unknowns), ideal in what is not an unknown."""
+        """Return the candidates at ``points`` (n, unknowns). Kinds that are not unknowns have ideal or known values."""
         named = {*dict(self.names), *self.known}
         kinds = KINDS | {name: kind for name, kind in ADDED.items() if name in named}
         found = {}

@@ -1,4 +1,4 @@
-"""Gains on many drawn motors: stability at their delay, settling, and the motors that bind."""
+"""Evaluation of gains on many drawn sets of motors: stability at their delay, settling, and the worst draw."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from batchpid.sim.tuning.evaluation import SUBSTEPS, arm_joints, run_moves, sett
 from batchpid.sim.tuning.moves import Moves
 
 POSES = 3
-"""Poses at which the stability bound of each draw is taken: starts and targets of the moves."""
+"""Number of poses, starts and targets of moves, at which the stability of each draw is evaluated."""
 
 
 class Within(NamedTuple):
-    """Gains on drawn motors."""
+    """Stability and settling of gains on drawn sets of motors."""
 
     stability: StabilityReport
-    """Of the least stable draw and pose; ``env`` is the number of the draw."""
+    """Report for the least stable draw and pose; ``env`` is the number of the draw."""
     settling: Float64
     """Settling time of the slowest joint of the arm in the slowest move of each draw (draws,) [s]; inf: never."""
     excess: Float64
-    """The largest settling time over the time asked for, of each draw (draws,)."""
+    """Largest settling time over the requested time, in each draw (draws,)."""
     joints: tuple[str, ...]
-    """The joint that settles last in that move, by draw."""
+    """Joint that settles last in the move with the largest excess, by draw."""
     moves: tuple[str, ...]
-    """That move."""
+    """Move with the largest excess, by draw."""
 
     @property
     def binding(self) -> int:
@@ -44,14 +44,14 @@ class Within(NamedTuple):
 
     @property
     def rank(self) -> tuple[bool, float, float]:
-        """Figure that is less for the better gains: the settling of the worst draw, if they hold for all."""
+        """Key for sorting, smallest for the best gains: not :attr:`holds`, largest excess, mean excess."""
         return not self.holds, float(self.excess.max()), float(np.mean(np.minimum(self.excess, 1e6)))
 
 
 def within(
     robot: Robot, params: bp.PIDParams, motors: bp.Actuators, moves: Moves, seconds: float = 3.0, **options: Any
 ) -> Within:
-    """Run every one of ``moves`` with every row of ``motors``, as steps from rest, and return what holds for all.
+    """Run all ``moves`` as setpoint steps from rest with each row of ``motors``, and evaluate them.
 
     ``params`` have one row. ``options`` go to :class:`batchpid.sim.Runner`.
     """

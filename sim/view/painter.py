@@ -29,7 +29,7 @@ _NEAREST = 0.05
 
 
 class Triangles:
-    """Triangles of a robot's surfaces, placed at any pose; ``deviation`` [m] as in :func:`surfaces`."""
+    """Triangles of a robot's surfaces, placed at any pose; ``deviation`` [m] is as in :func:`surfaces`."""
 
     def __init__(self, robot: Robot, deviation: float = 8e-3) -> None:
         self._surfaces, self._tree = surfaces(robot, deviation), robot.rigid_tree
@@ -56,8 +56,8 @@ class Triangles:
 def paint(axes: Any, corners: Float64, colours: Float64, places: Float64, distance: Float64) -> None:
     """Draw triangles at ``places`` (triangles, 3, 2) of ``axes``, shaded, in the order of their ``distance``.
 
-    ``corners`` (triangles, 3, 3) [m] and ``colours`` (triangles, 3) are of the same triangles, and ``distance``
-    (triangles,) is that of their centers from the camera.
+    ``corners`` (triangles, 3, 3) [m] give the shading, ``colours`` (triangles, 3) the colours in RGB, and ``distance``
+    (triangles,) [m] the distance of the centers from the camera.
     """
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -82,7 +82,7 @@ class _Camera(NamedTuple):
 
 
 class PaintedScene:
-    """``count`` robots, which are placed and not simulated, on a floor: the same picture as of RenderScene, plainer."""
+    """Picture of ``count`` robots on a floor in given poses, as RenderScene has it without shadows and textures."""
 
     def __init__(self, robot: Robot, count: int, ground: bool) -> None:
         layout = arrange_robots(robot, 1, count, ground)

@@ -1,4 +1,4 @@
-"""Call of a runner that is in progress: one at a time, and Ctrl-C waits until its request has ended."""
+"""Exclusive use of a runner by one call at a time; Ctrl-C waits until the request of the call is done."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from batchpid.errors import InUseError
 class OneCall:
     """Use of a runner by one call at a time, from :meth:`begin` to :meth:`end`.
 
-    In the main thread SIGINT is held back meanwhile: its handler, which may raise KeyboardInterrupt, is called in
-    :meth:`end`. So a request to the workers is done completely, with the change of the runner's state that belongs to
-    it. A second SIGINT is not held back while :attr:`waits` is set; if its handler raises, the request is not
-    completed, and the runner must be closed.
+    In the main thread SIGINT is held back during the call: its handler, which may raise KeyboardInterrupt, is called in
+    :meth:`end`. So a request to the workers is completed, and so is the change of the runner's state. A second SIGINT
+    is not held back while :attr:`waits` is set; if its handler raises, the request is not completed, and the runner
+    must be closed.
     """
 
     def __init__(self) -> None:
         self.waits = False
         """True while the call waits for workers, or runs the loop in this process."""
         self._owner, self._main = os.getpid(), threading.main_thread().ident
-        self._user = 0  # the thread in a call
+        self._user = 0  # identifier of the thread in a call
         self._handler: Any = None  # of SIGINT, while it is replaced
         self._is_held = False
 
@@ -44,7 +44,7 @@ class OneCall:
         me, process = threading.get_ident(), os.getpid()
         if self._user or process != self._owner:
             raise self._refusal(me, process)
-        # Nothing is called between the check and here, so that neither a thread nor a signal can come in between.
+        # No function is called since the check, so no other thread and no signal handler can run in between.
         self._user, self._handler, self._is_held = me, None, False
         if me == self._main and _signal.getsignal(SIGINT) is not None:  # None: it is not one of Python
             try:

@@ -173,7 +173,6 @@ def test_the_advantages_of_the_training_are_those_of_the_definition():
 
 @needs_training
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
 def test_the_trained_quadruped_walks(run):
     share = re.search(r"exploration ([\d.]+)% of 32 robots walk for 10 s", run("train_walk.py"))
     assert share is not None

@@ -179,7 +179,7 @@ def test_an_acceleration_that_nothing_takes_is_an_error():
             with pytest.raises(InvalidArgumentError, match=message.replace("acceleration:", "accelerations:")):
                 runner.rollout(row[None], setpoint_rates=row[None], setpoint_accelerations=row[None])
     with Runner(panda, 1, workers=0) as runner:
-        with pytest.raises(InvalidArgumentError, match="setpoint_acceleration: has no setpoint_rate beside it"):
+        with pytest.raises(InvalidArgumentError, match="setpoint_acceleration: is given without setpoint_rate"):
             runner.step(row, setpoint_acceleration=row)
         with pytest.raises(InvalidArgumentError, match=r"setpoint_acceleration: has shape \(3,\)"):
             runner.step(row, setpoint_rate=row, setpoint_acceleration=np.zeros(3))

@@ -1,8 +1,8 @@
-"""MJCF file as MuJoCo simulates it here: with all that it holds, in place of a robot that is rebuilt from a URDF.
+"""Scene of an MJCF file for MuJoCo: the file itself, in place of a robot built from a URDF.
 
 Actuators, sensors, keyframes, and the gravity compensation of the robot's bodies are removed. Friction, damping and
-armature of the robot's joints are set later. Other elements are the file's, also friction and impedance of contacts
-and limits. Time step, integrator, solver and gravity are those of the run.
+armature of the robot's joints are set later. The runner sets time step, integrator, solver and gravity. All other
+elements are unchanged, friction and impedance of contacts and limits included.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 class BodyFrame(NamedTuple):
-    """Frame of a simulated link in the frame of its body, and the numbers of the bodies that are welded to that one."""
+    """Frame of a simulated link in the frame of its body, and the numbers of the bodies welded to this body."""
 
     position: Float64
     wxyz: Float64
@@ -41,9 +41,9 @@ class BodyFrame(NamedTuple):
 class FileScene(NamedTuple):
     """``mujoco.MjSpec`` of a file.
 
-    ``names``: body of each simulated link, and ``frames``: its frame there; ``root``: the body of a floating base, else
-    ""; ``own`` (2, dof): armature and damping of the joints besides those of the robot's description, where leaders
-    have their followers'.
+    ``names`` has the body of each simulated link, ``frames`` the frame of the link in this body, ``root`` the body of a
+    floating base, or "". ``own`` (2, dof) is armature and damping that the file's joints have in addition to the
+    robot's description, in which leaders include their followers.
     """
 
     scene: MjSpec
@@ -64,7 +64,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
         problem = compiled.problem or "it has another content"
         raise RobotError(f"{file.path}: has changed since the robot was loaded: {problem}; load the robot again")
     names = Names(model)
-    Tree(model, names, Path(file.path), spec.fixed_base, [])  # leaves out what is apart from the robot
+    Tree(model, names, Path(file.path), spec.fixed_base, [])  # removes bodies that are not of the robot
     robot = {body: name for body, name in names.bodies.items() if names.is_of_robot(body)}
     for joint in scene.joints:
         joint.name = names.joints.get(joint.id, joint.name)
@@ -93,7 +93,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
 
 
 def set_ground(scene: MjSpec, ground: bool) -> None:
-    """Let the planes of the world collide or not; a scene without one gets one at height 0."""
+    """Switch collisions with the planes of the world on or off. A scene without planes gets one at height 0 for on."""
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     planes = [each for each in scene.worldbody.geoms if each.type == plane and (each.contype or each.conaffinity)]
     if ground and not planes:
@@ -103,14 +103,14 @@ def set_ground(scene: MjSpec, ground: bool) -> None:
 
 
 def _start(model: MjModel) -> Document:
-    """Return the keyframe of the start: the file's "home", else its reference pose."""
+    """Return the keyframe of the start: "home" in the file, or its reference pose."""
     if (key := home(model)) is None:
         return {"qpos": model.qpos0, "qvel": np.zeros(model.nv)}
     return {name: getattr(model, f"key_{name}")[key].ravel() for name in ("qpos", "qvel", "mpos", "mquat")}
 
 
 def _set_pairs(scene: MjSpec, ignored: Iterable[tuple[str, str]], robot: set[str]) -> None:
-    """Exclude the pairs of the robot's bodies that do not collide, and no others."""
+    """Exclude exactly those pairs of the robot's bodies that do not collide."""
     for each in list(scene.excludes):
         if {each.bodyname1, each.bodyname2} <= robot:
             scene.delete(each)
@@ -120,14 +120,14 @@ def _set_pairs(scene: MjSpec, ignored: Iterable[tuple[str, str]], robot: set[str
 
 
 def _frames(model: MjModel, robot: dict[int, str], spec: SceneSpec) -> tuple[dict[str, str], dict[str, BodyFrame]]:
-    """Return the body of each simulated link, the first of the bodies that are merged into it, and its frame there.
+    """Return the body of each simulated link and the frame of the link in it; of merged bodies the first counts.
 
     A body's link has the body's axes, and its origin at the anchor of the body's last hinge.
     """
     placements, names = place_links(spec.urdf, spec.merge_fixed), dict[str, str]()
     frames: dict[str, BodyFrame] = {}
     for body, name in robot.items():
-        if name not in placements:  # the world, beside a robot that is a body in it
+        if name not in placements:  # the world, if the robot does not include it
             continue
         link, position, wxyz = placements[name]
         if link in frames:

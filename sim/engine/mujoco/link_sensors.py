@@ -15,9 +15,9 @@ from batchpid.sim.robot.merging import place_links
 
 _FOUND_AND_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND) | 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
 _NET_FORCE = 3
-"""Reduction of all contacts to their net force along the axes of the world."""
+"""Reduction mode of MuJoCo's contact sensor: net force of all contacts, along the axes of the world."""
 _CONTACT, _WRENCH = 4, 6
-"""Values of a sensor: number of contacts and force on the other body; force and torque."""
+"""Numbers of values: contacts and force on the other body of a contact sensor; force and torque of a wrench."""
 
 
 def contact_bodies(spec: SceneSpec) -> list[str]:
@@ -29,7 +29,7 @@ def contact_bodies(spec: SceneSpec) -> list[str]:
 def add_link_sensors(scene: MjSpec, spec: SceneSpec, names: dict[str, str], frames: Mapping[str, Any]) -> None:
     """Add sensors for the links of ``spec.contacts`` and ``spec.wrenches``.
 
-    ``names`` are the bodies of the links, ``frames`` frames of links in their bodies, where these differ.
+    ``names`` are the bodies of the links, ``frames`` the frames of links that differ from the frames of their bodies.
     """
     kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
     for link in dict.fromkeys(contact_bodies(spec)):
@@ -45,7 +45,7 @@ def add_link_sensors(scene: MjSpec, spec: SceneSpec, names: dict[str, str], fram
 
 
 def _parts(body: Any, others: set[str]) -> Iterator[Any]:
-    """Yield the body of a link, and those below it that belong to it: they are not among the ``others``."""
+    """Yield the body of a link, and its descendants that belong to the same link, since ``others`` lacks them."""
     yield body
     for child in body.bodies:
         if child.name not in others:
@@ -53,7 +53,7 @@ def _parts(body: Any, others: set[str]) -> Iterator[Any]:
 
 
 class MujocoLinkSensors:
-    """Places of the sensors of ``spec`` in the ``size`` values of ``model``; ``bodies`` are the bodies of its links."""
+    """Indices of the sensors of ``spec`` in the ``size`` sensor values of ``model``; ``bodies`` by link."""
 
     def __init__(self, spec: SceneSpec, model: MjModel, bodies: dict[str, int]) -> None:
         ids = model.sensor_objid[model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT]
@@ -64,7 +64,7 @@ class MujocoLinkSensors:
         self._contacts, self._wrenches, self.size = len(owners), len(spec.wrenches or ()), int(model.nsensordata)
 
     def quantities(self, values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """Return the quantities of :meth:`batchpid.sim.engine.protocol.EnginePack.take_sensed` in (M, size)."""
+        """Return the quantities of :meth:`batchpid.sim.engine.protocol.EnginePack.take_sensed` for values (M, size)."""
         of_contacts, of_wrenches = np.split(values, [_CONTACT * self._contacts], axis=1)
         found = {}
         if self._rows:

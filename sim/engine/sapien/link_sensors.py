@@ -1,8 +1,9 @@
 """Sensors of links in SAPIEN: contact forces, and wrenches between a link and its parent.
 
-PhysX reports the normal forces of contacts, but not their friction. The net contact force F on a body of mass m follows
-from the change of its velocity v (of the center of mass), gravity g, and the forces of its joints, which PhysX reports:
-F = m (dv/dt - g) - (force of the parent on it) + (its forces on its children).
+PhysX reports the normal forces of contacts, but not their friction. So the net contact force F on a body of mass m is
+computed from the velocity v of its center of mass, gravity g, and the forces in its joints, which PhysX reports::
+
+    F = m (dv/dt - g) - (force of the parent on it) + (its forces on its children)
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from batchpid.sim.robot.merging import place_links
 
 
 class LinkSensors:
-    """Sums of the sensors of ``spec`` over sim steps. ``robots`` and ``systems`` are a pack's lists, with changes."""
+    """Sums of the sensors of ``spec`` over sim steps. ``robots`` and ``systems`` are a pack's own lists."""
 
     def __init__(self, spec: SceneSpec, robots: list[Any], systems: list[Any]) -> None:
         self._robots, self._systems, self._spec = robots, systems, spec
@@ -35,14 +36,14 @@ class LinkSensors:
         self.place(range(len(robots)))
 
     def take(self) -> dict[str, Float64]:
-        """Return the sums since the last call, and begin again."""
+        """Return the sums since the last call, and set them to 0."""
         before, (size, contacts, _) = self._sums, self._velocities.shape
         shapes = {"contact_force": (contacts, 3), "touching": (contacts,), "wrench": (len(self._wrenches), 6)}
         self._sums = {name: np.zeros((size, *shape)) for name, shape in shapes.items() if shape[0]}
         return before
 
     def place(self, rows: Sequence[int]) -> None:
-        """Begin again for robots ``rows``, which were placed."""
+        """Set the sums of robots ``rows`` to 0, after they were placed."""
         for row in rows:
             robot = self._robots[row]
             numbers = {link.entity: at for at, link in enumerate(robot.links)}
@@ -78,7 +79,7 @@ class LinkSensors:
         self._velocities[row] = velocities
 
     def _touched(self, row: int) -> set[int]:
-        """Return the links with a contact that pushes."""
+        """Return the links with a contact of nonzero impulse."""
         _, _, numbers, _ = self._parts[row]
         return {
             numbers[body.entity]
@@ -90,7 +91,7 @@ class LinkSensors:
 
 
 def _in_link(joint: Any, force: Float32) -> Float64:
-    """Return a force and torque (6,) in the frame of a joint in the frame of its link, about the link's origin."""
+    """Transform a force and torque (6,) from the frame of a joint to the frame of its link, about the link's origin."""
     placed = joint.pose_in_child.to_transformation_matrix().astype(np.float64)
     axes, linear = placed[:3, :3], placed[:3, :3] @ force[:3]
     return np.concatenate([linear, axes @ force[3:] + np.cross(placed[:3, 3], linear)])
