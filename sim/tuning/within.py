@@ -49,7 +49,7 @@ class Within(NamedTuple):
 
 
 def within(
-    robot: Robot, params: bp.PIDParams, motors: bp.Actuators, moves: Moves, seconds: float = 3.0, **options: Any
+    robot: Robot, params: bp.PIDParams, motors: bp.Actuators, moves: Moves, seconds: float = 2.0, **options: Any
 ) -> Within:
     """Run every one of ``moves`` with every row of ``motors``, as steps from rest, and return what holds for all.
 

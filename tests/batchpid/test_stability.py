@@ -128,7 +128,7 @@ def test_a_time_step_that_no_loop_has_is_an_error(dt):
 
 
 def test_the_joint_whose_motor_is_late_is_in_the_mode_that_becomes_unstable():
-    """The law multiplies by the mass matrix, so that the joints move as one each, and only the late one can oscillate."""
+    """The law multiplies by the mass matrix, so that only the joint that is late can oscillate."""
     mass = np.array([[2.0, 0.8, 0.2], [0.8, 0.7, 0.2], [0.2, 0.2, 0.1]])
     for late in range(3):
         delay = np.where(np.arange(3) == late, 0.03, 0.0)
