@@ -252,7 +252,10 @@ class MujocoPack(SingleOwner):
     def update_constraint(self, rows: Any = slice(None)) -> None:
         """Give the constraint efforts of robots ``rows`` the present mass matrix and passive force."""
         if self._constraint is not None:
-            bias = self._model_force(self._bias_model, self._tree, True, True)
+            if self.spec.fixed_base:  # the bias is the passive force, with the bits that native steps read
+                bias = self.passive_force(True, True)
+            else:
+                bias = self._model_force(self._bias_model, self._tree, True, True)
             self._constraint.update(self.joint_mass_matrix, self.read_qpos(), bias, rows)
 
     # -- changes -----------------------------------------------------------------------------------------------

@@ -132,14 +132,18 @@ def clearances(monkeypatch):
     return made
 
 
+def step_of(built, data, dof):
+    """Return the compiled sim step of one robot."""
+    still, nothing = (np.zeros((1, dof)), np.zeros(1, bool)), np.zeros((1, 0))
+    return mujoco_step.MujocoStep(built, [built.model], lambda: [data], *still, False, None, sensed=nothing)
+
+
 @needs_extension
 def test_bounds_are_below_the_distances_and_near_them(arm, clearances):
     built = model_of(arm)
     for qpos in poses(arm, 12):
         data = at(built, qpos)
-        step = mujoco_step.MujocoStep(
-            built, [built.model], lambda data=data: [data], np.zeros((1, arm.dof)), np.zeros(1, bool), False, None
-        )
+        step = step_of(built, data, arm.dof)
         step(*np.zeros((4, 1, arm.dof)))
         proof = clearances[-1].arrays
         if proof["wait"][0]:
@@ -206,8 +210,7 @@ def test_a_falling_robot_moves_the_same_without_proofs(arm, clearances, monkeypa
     for tables in (shape_tables, lambda robot: None):
         monkeypatch.setattr(mujoco_step, "shape_tables", tables)
         data = at(built, arm.start, [0, 0, 1.5, 1, 0, 0, 0])
-        still = np.zeros((1, arm.dof)), np.zeros(1, bool)
-        step = mujoco_step.MujocoStep(built, [built.model], lambda data=data: [data], *still, False, None)
+        step = step_of(built, data, arm.dof)
         for _ in range(1500):
             step(np.ones((1, arm.dof)), *np.zeros((3, 1, arm.dof)))
             open_bodies.append(int(clearances[0].arrays["open"].sum()))
