@@ -91,8 +91,8 @@ class TuneCommand:
         """Run the command."""
         generations = GENERATIONS_WITHIN if self.within else GENERATIONS
         engine = "mujoco" if self.within and find_spec("mujoco") else DEFAULT_ENGINE
-        given = {name: value for name, value in vars(self).items() if value is not None}
-        replace(self, **{"generations": generations, "engine": engine} | given)._run()
+        known: Document = {"generations": generations, "engine": engine}
+        replace(self, **{name: value for name, value in known.items() if getattr(self, name) is None})._run()
 
     def _run(self) -> None:
         """Run the command with all options known."""
@@ -134,7 +134,7 @@ class TuneCommand:
         sets = GainSet("designed", found.start_params), GainSet("tuned", found.params)
         options = flags.chosen(self, "seed workers cluster physics collisions ground")
         evaluations = evaluate_sets(
-            robot, sets, moves=20, randomization=randomization, engines=(self.engine,), **options
+            robot, sets, moves=20, randomization=randomization, engines=(self.engine or DEFAULT_ENGINE,), **options
         )
         print(evaluation_table(robot, evaluations))
         arm = arm_joints(robot)
