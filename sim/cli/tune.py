@@ -247,7 +247,7 @@ class TuneCommand:
         words = ["batchpid", "rollout", self.robot, "--gains", str(params)]
         if self.control == "osc":
             words += ["--control", "osc", *([] if self.tool is None else ["--tool", self.tool])]
-        defaults = {each.name: each.default for each in fields(self)}
+        defaults = {each.name: each.default for each in fields(self)} | {"engine": DEFAULT_ENGINE}
         for name in ("randomize", "engine", "physics", "collisions", "ground", "cluster", "actuators"):
             if (value := getattr(self, name)) != defaults[name]:
                 words += [f"--no-{name}"] if value is False else [f"--{name}", str(value)]
