@@ -128,12 +128,23 @@ def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) ->
         z = np.exp(1j * np.append(slow, np.linspace(np.pi / 4, np.pi, _FREQUENCIES)[1:]))
         loop = _loop(z, m[at], unit[at], own, dt)
         ratio[at], where = _crossing(z, np.linalg.eigvals(loop))
-        values, vectors = np.linalg.eig(loop[where])
-        # The mode that crosses there; kinetic energy, apart from the coupling of joints.
-        mode = vectors[:, np.argmax(np.where(values.real < 0, np.abs(values), 0.0))]
-        energy = np.abs(mode) ** 2 * np.diagonal(m[at])
-        participation[at] = energy / energy.sum()
+        inertia = m[at] + dt * z[where] / (z[where] - 1) * np.diag(own[3])
+        participation[at] = _participation(loop[where], inertia, min(float(ratio[at]), 1e300))
     return StabilityBound(ratio, participation)
+
+
+def _participation(loop: Rows, inertia: Rows, ratio: float) -> Float64:
+    """Return the share of each joint's motor (joints,) in the mode of ``loop`` that passes -180 degrees at ``ratio``.
+
+    It is the sensitivity of the mode's eigenvalue to a factor of the motor's effort: with right and left eigenvectors
+    x and y, and the effort ``inertia`` x of the motion, |y^H inertia^-1| |inertia x|. All arrays are (joints, joints).
+    """
+    values, right = np.linalg.eig(loop)
+    mode = int(np.argmin(np.abs(values + ratio)))
+    left = np.linalg.pinv(right)[mode]
+    share = np.abs(np.linalg.solve(inertia.T, left) * (inertia @ right[:, mode]))
+    normed: Float64 = share / share.sum()
+    return normed
 
 
 def _loop(z: Rows, m: Float64, unit: Float64, columns: list[Float64], dt: float) -> Rows:

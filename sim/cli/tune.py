@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -25,8 +26,10 @@ if TYPE_CHECKING:
     from batchpid.sim.identification.confidence_region import DrawnMotors
     from batchpid.sim.tuning.within import Within
 
-DRAWS, MOVES_WITHIN = 100, 4
-"""Motors that ``--within`` draws, and random moves that are made with each."""
+DRAWS, MOVES_WITHIN = 100, 1
+"""Motors that ``--within`` draws, and random moves that are made with each, besides the tutorial's."""
+GENERATIONS, GENERATIONS_WITHIN = 10, 4
+"""Generations of a search, and of one among drawn motors: the first one has gains for their delay."""
 SUFFIXES = ".yaml", ".yml", ".json"
 """Formats of a params file."""
 
@@ -43,8 +46,8 @@ class TuneCommand:
     """Gains of the joints, or of operational-space control of a tool: bandwidths and damping ratios."""
     tool: Annotated[str | None, tyro.conf.arg(metavar="LINK", help_behavior_hint="")] = None
     """With --control osc: link to move. Default: the last one of the longest chain."""
-    generations: int = 10
-    """Number of populations that the search evaluates."""
+    generations: int | None = None
+    """Number of populations that the search evaluates. Default: 10; 4 with --within."""
     population: int = 8
     """Candidates of a population, evaluated at once."""
     seed: int = 0
@@ -61,7 +64,8 @@ class TuneCommand:
     variation: flags.Variation = False
     payload: flags.Payload = 2.0
     friction: flags.Friction = 0.1
-    engine: flags.Engine = DEFAULT_ENGINE
+    engine: flags.Engine | None = None
+    """Default: sapien; mujoco with --within, where it is installed."""
     physics: flags.Physics = "accurate"
     collisions: flags.Collisions = True
     ground: flags.Ground = None
@@ -85,6 +89,13 @@ class TuneCommand:
 
     def run(self) -> None:
         """Run the command."""
+        generations = GENERATIONS_WITHIN if self.within else GENERATIONS
+        engine = "mujoco" if self.within and find_spec("mujoco") else DEFAULT_ENGINE
+        known: Document = {"generations": generations, "engine": engine}
+        replace(self, **{name: value for name, value in known.items() if getattr(self, name) is None})._run()
+
+    def _run(self) -> None:
+        """Run the command with all options known."""
         from batchpid.sim import plots
         from batchpid.sim.cli.report import draw_first_move, evaluation_table
         from batchpid.sim.cli.run import evaluate_sets, read_variation
@@ -123,13 +134,13 @@ class TuneCommand:
         sets = GainSet("designed", found.start_params), GainSet("tuned", found.params)
         options = flags.chosen(self, "seed workers cluster physics collisions ground")
         evaluations = evaluate_sets(
-            robot, sets, moves=20, randomization=randomization, engines=(self.engine,), **options
+            robot, sets, moves=20, randomization=randomization, engines=(self.engine or DEFAULT_ENGINE,), **options
         )
         print(evaluation_table(robot, evaluations))
         arm = arm_joints(robot)
         rejected, of_all = found.rejected or evaluations[1].drawback(evaluations[0], arm), None
         if drawn is not None:
-            rejected, of_all = self._judge_within(robot, sets, drawn)
+            rejected, of_all = self._judge_within(robot, sets, drawn, rejected)
         chosen = 0 if rejected else 1
         judged = evaluations[chosen]
         worst, followed = judged.metrics.worst(), judged.following_error
@@ -171,23 +182,29 @@ class TuneCommand:
         return draw_motors(self.actuators, robot, DRAWS, self.seed)
 
     def _judge_within(
-        self, robot: Robot, sets: tuple[GainSet, GainSet], drawn: DrawnMotors
+        self, robot: Robot, sets: tuple[GainSet, GainSet], drawn: DrawnMotors, rejected: str | None
     ) -> tuple[str | None, Within]:
-        """Print what holds for all drawn motors; return why the designed gains are better, if so, and the figures."""
+        """Print what holds for all drawn motors; return why the designed gains are better, if so, and the figures.
+
+        The designed gains are tried too where the search ``rejected`` the tuned ones, or these do not hold for all.
+        """
         from batchpid.sim.tuning.moves import random_moves, tutorial_move
         from batchpid.sim.tuning.within import within
 
         moves = tutorial_move(robot) + random_moves(robot, MOVES_WITHIN, self.seed + 1)
         options = flags.chosen(self, "workers cluster engine physics collisions ground")
-        designed, tuned = (within(robot, each.params, drawn.actuators, moves, **options) for each in sets)
+        found = within(robot, sets[1].params, drawn.actuators, moves, **options)
+        designed = None
+        if rejected or not found.holds:
+            designed = within(robot, sets[0].params, drawn.actuators, moves, **options)
         rejected = None
-        if tuned.rank > designed.rank:
+        if designed is not None and designed.rank < found.rank:
             worst = [
-                f"{each.name} {found.settling.max():.3g} s" for each, found in zip(sets, (designed, tuned), strict=True)
+                f"{each.name} {of_all.settling.max():.3g} s"
+                for each, of_all in zip(sets, (designed, found), strict=True)
             ]
-            rejected = f"settling with the worst of the drawn motors: {', '.join(worst)}"
-        found = designed if rejected else tuned
-        print(f"\nwithin the confidence region of {self.actuators}, {DRAWS} draws of motors:")
+            rejected, found = f"settling with the worst of the drawn motors: {', '.join(worst)}", designed
+        print(f"\nwithin the confidence region of {self.actuators}, {DRAWS} draws of motors, in {self.engine}:")
         print("\n".join(f"  {line}" for line in within_report(robot, found, drawn)))
         return rejected, found
 
@@ -230,7 +247,7 @@ class TuneCommand:
         words = ["batchpid", "rollout", self.robot, "--gains", str(params)]
         if self.control == "osc":
             words += ["--control", "osc", *([] if self.tool is None else ["--tool", self.tool])]
-        defaults = {each.name: each.default for each in fields(self)}
+        defaults = {each.name: each.default for each in fields(self)} | {"engine": DEFAULT_ENGINE}
         for name in ("randomize", "engine", "physics", "collisions", "ground", "cluster", "actuators"):
             if (value := getattr(self, name)) != defaults[name]:
                 words += [f"--no-{name}"] if value is False else [f"--{name}", str(value)]

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Array, Bool, Float64
+from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 from batchpid.gains.stability import Oscillation
@@ -388,9 +388,7 @@ class _Run:
                 yield _Cause("setpoint-not-finite", time, joint, detail=fault.cause)
                 return
         finite = np.isfinite(rollout.qpos[:tick, env]).all(1)
-        poses = [self.start[env], *rollout.qpos[:tick, env][finite][-1:].astype(np.float64)]
-        reports = [report for pose in poses if (report := self._stability(env, pose)) is not None]
-        worst = max(reports, key=lambda report: report.robot_ratio, default=None)
+        worst = self._stability(env, self.start[env], *rollout.qpos[:tick, env][finite][-1:])
         if worst is not None and worst.robot_ratio >= 1:
             yield _Cause("unstable", time, int(np.argmax(worst.participation)), detail=_times(worst))
             return
@@ -517,26 +515,34 @@ class _Run:
             earliest -= 1
         return float(time[earliest])
 
-    def _stability(self, env: int, qpos: Float64) -> StabilityReport | None:
-        """Return the share of the stability range that an env's gains use at a pose (dof,); None if unknown."""
+    def _stability(self, env: int, *poses: Rows) -> StabilityReport | None:
+        """Return the largest share of the stability range that an env's gains use at ``poses``; None if unknown."""
         info = self.rollout.info
         if info.control != "pid" or info.params is None or info.timestep is None:
             return None
         motors = None if info.actuators is None else info.actuators.for_envs(slice(env, env + 1))
+        params, dt = _env(info.params, env), info.timestep
         try:
-            return stability_report(self.robot, _env(info.params, env), qpos, info.timestep, actuators=motors)
+            reports = [
+                stability_report(self.robot, params, pose.astype(np.float64), dt, actuators=motors) for pose in poses
+            ]
         except BatchPIDError:  # a mass matrix that is not positive definite
             return None
+        return max(reports, key=lambda report: report.robot_ratio)
 
     def _unstable(self, env: int, joints: list[int]) -> _Cause | None:
         """Return the cause of an env whose gains are beyond the bound, and whose efforts or speeds show it."""
         rollout, tail = self.rollout, self.tail
-        report = self._stability(env, rollout.qpos[-1, env].astype(np.float64))
+        report = self._stability(env, rollout.qpos[-1, env])
+        if report is not None and report.late:  # it swings far, and ends in any pose
+            report = self._stability(env, self.start[env], rollout.qpos[-1, env])
         if report is None or report.robot_ratio < 1:
             return None
         speed = np.abs(rollout.qvel[tail, env]).mean(0)
         moved = np.abs(np.diff(rollout.qpos[tail, env].astype(np.float64), axis=0)).mean(0) / rollout.tick
         shaking = (speed > 3 * moved + 1e-2) | (rollout.saturated[tail, env].mean(0) > 0.5)
+        if report.late:  # it oscillates slowly
+            shaking |= [self._oscillation(env, joint) is not None for joint in range(len(shaking))]
         if not shaking[joints].any():
             return None
         saturated = rollout.saturated[:, env].any(1)

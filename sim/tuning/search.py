@@ -51,7 +51,7 @@ from batchpid.sim.workers.contact_log import MissedContactWarning
 
 INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
-VARIED_MOVES = 20
+VARIED_MOVES, DRAWN_MOVES = 20, 8
 """Number of random moves in the search for robots that differ from the model."""
 FINALISTS, FINAL_MOVES = 3, 24
 """Number of candidates in the final round, besides the designed gains, and of its moves."""
@@ -117,7 +117,8 @@ def tune(
         following error.
     moves
         Default: :func:`batchpid.sim.tuning.moves.search_moves`, and FINAL_MOVES random ones in the final round. For
-        robots with actuators or a randomization, the search uses the tutorial's move and VARIED_MOVES random ones,
+        robots with actuators or a randomization, the search uses the tutorial's move and VARIED_MOVES random ones
+        (with drawn ``motors`` DRAWN_MOVES),
         because the hardest moves within the effort limits of the model are too hard for such robots. Given moves
         replace them, with collisions, since they may touch something. There is then no final round.
     randomization
@@ -151,7 +152,7 @@ def tune(
     is_varied = randomization is not None or robot.actuators is not None or motors is not None
     of_mean = is_varied and motors is None
     if moves is None and is_varied:
-        moves = tutorial_move(robot) + random_moves(robot, VARIED_MOVES, seed)
+        moves = tutorial_move(robot) + random_moves(robot, VARIED_MOVES if motors is None else DRAWN_MOVES, seed)
     moves = search_moves(robot, seed) if moves is None else moves
     own = final is not None and robot.fixed_base and runner_options.get("build") is None
     # Physics "free", with one iteration, is enough if the loop computes friction, and not the solver.

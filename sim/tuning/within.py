@@ -49,7 +49,7 @@ class Within(NamedTuple):
 
 
 def within(
-    robot: Robot, params: bp.PIDParams, motors: bp.Actuators, moves: Moves, seconds: float = 3.0, **options: Any
+    robot: Robot, params: bp.PIDParams, motors: bp.Actuators, moves: Moves, seconds: float = 2.0, **options: Any
 ) -> Within:
     """Run all ``moves`` as setpoint steps from rest with each row of ``motors``, and evaluate them.
 

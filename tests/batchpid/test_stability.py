@@ -125,3 +125,13 @@ def test_an_integral_that_is_too_fast_rings_and_grows():
 def test_a_time_step_that_no_loop_has_is_an_error(dt):
     with pytest.raises(InvalidArgumentError, match="dt"):
         stability_bound(np.eye(2), 1.0, 0.1, dt)
+
+
+def test_the_joint_whose_motor_is_late_is_in_the_mode_that_becomes_unstable():
+    """The law multiplies by the mass matrix, so that only the joint that is late can oscillate."""
+    mass = np.array([[2.0, 0.8, 0.2], [0.8, 0.7, 0.2], [0.2, 0.2, 0.1]])
+    for late in range(3):
+        delay = np.where(np.arange(3) == late, 0.03, 0.0)
+        bound = bp.stability_bound(mass, 400.0, 40.0, 5e-4, delay=delay, model=mass)
+        assert bound.ratio > 0.2
+        np.testing.assert_allclose(bound.participation, np.arange(3) == late, atol=0.01)

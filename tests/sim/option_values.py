@@ -75,6 +75,8 @@ VALUES = {
     "actuators": [bp.Actuators(), MOTORS, bp.make_actuators(2, command_delay=2e-3)],
     "randomization": [Randomization(payload=Uniform(0, 1)), Randomization(payload=Uniform(0, 2))],
     "guard": [bp.make_guard(2, rate=0.5), bp.make_guard(2, rate=0.2)],
+    "contacts": [["hand"], ["arm", "hand"]],
+    "wrenches": [["hand"], ["arm"]],
     "checkpoint_steps": [100],
     "timeout": [60.0, 30.0],
 }  # fmt: skip

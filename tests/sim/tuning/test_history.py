@@ -114,6 +114,7 @@ INPUTS = {
     "time_limit": [None, 1e9],
     "progress": [None, list],
     "actuators": [None, *MOTOR_VALUES],
+    "motors": [None, *MOTOR_VALUES],
 }
 """Values of the inputs of searches, besides those of option_values."""
 START = {"robot": ARM, "generations": 1, "population": 4, "seconds": 0.05, "workers": 0}
