@@ -25,7 +25,7 @@ from batchpid.sim.identification.inputs import Inputs, read_inputs
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.regression import CUTOFF, DELAYS, EDGE, smooth
 from batchpid.sim.identification.result import actuators_at
-from batchpid.sim.identification.statistics import INTERVAL, LEAST_DEVIATION, PARTS, variance_between
+from batchpid.sim.identification.statistics import INTERVAL, LEAST_DEVIATION, PARTS, jackknife_variance
 from batchpid.sim.identification.unknowns import KINDS, Motors, Unknowns
 from batchpid.sim.identification.windows import share_fitted
 from batchpid.sim.robot.robot import Robot
@@ -183,7 +183,7 @@ class _Tables:
         for rows in np.array_split(np.arange(len(found.fun)), PARTS):
             slopes = found.jac[rows]
             parts.append((slopes.T @ slopes, -slopes.T @ found.fun[rows]))
-        deviation = np.sqrt(variance_between(parts, np.full(free.sum(), 1e-9)))
+        deviation = np.sqrt(jackknife_variance(parts, np.full(free.sum(), 1e-9)))
         share = np.sqrt((error[~self._fitted] ** 2).mean(0) / (self._measured[~self._fitted] ** 2).mean(0)) * sizes
         chosen = tuple(name for name, own in zip(names, free, strict=True) if own)
         deviation = np.hypot(deviation, LEAST_DEVIATION * np.abs(found.x))

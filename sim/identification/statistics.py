@@ -9,8 +9,8 @@ c is the autocovariance of the joint's residuals, tapered (E. A. Morelli and V. 
 parameters estimated from flight test data", Journal of Guidance, Control, and Dynamics 20(1), 1997). For white
 residuals it is H^-1. What the residuals of a log cannot show, such as friction that depends on load or temperature,
 shows in the scatter of the parts of the logs. The estimate without part p is theta - (H - H_p)^-1 (J^T r - J_p^T r_p),
-and P times the variance of these by the jackknife (B. Efron, The Jackknife, the Bootstrap and Other Resampling Plans,
-SIAM, 1982) is the variance between P parts; where it exceeds P cov, the excess is added.
+and the jackknife makes of these a variance of the estimate (B. Efron, The Jackknife, the Bootstrap and Other Resampling
+Plans, SIAM, 1982); where it exceeds cov, the excess is added.
 
 Small singular values of J, in units of typical sizes, mark combinations of unknowns that a log does not show.
 """
@@ -100,7 +100,7 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     covariance = inverse @ (spread + np.diag(prior)) @ inverse
     variance = np.maximum(np.diagonal(covariance), np.diagonal(inverse))
     parts = _parts(problem, point)
-    excess = np.maximum(variance_between(parts, prior) - len(parts) * variance, 0.0)
+    excess = np.maximum(jackknife_variance(parts, prior) - variance, 0.0)
     own = unknowns.scale * np.sqrt(MODEL_ERROR**2 * variance + excess)
     deviation = np.hypot(own, LEAST_DEVIATION * np.abs(point.theta))
     values = np.sqrt(np.maximum(np.linalg.eigvalsh(normal)[::-1], 0.0))
@@ -132,8 +132,8 @@ def _parts(problem: Problem, point: Solution) -> list[tuple[Float64, Float64]]:
     return [(part[:-1, :-1], part[:-1, -1]) for part in parts]
 
 
-def variance_between(parts: list[tuple[Float64, Float64]], prior: Float64) -> Float64:
-    """Return the variances (unknowns,) of estimates from one part, by leaving out each in turn.
+def jackknife_variance(parts: list[tuple[Float64, Float64]], prior: Float64) -> Float64:
+    """Return the variances (unknowns,) of the estimates, from those without each of the parts in turn.
 
     ``parts`` are J^T J and J^T r; ``prior`` is the information of the prior (unknowns,). It is 0 for too few parts.
     """
@@ -142,7 +142,7 @@ def variance_between(parts: list[tuple[Float64, Float64]], prior: Float64) -> Fl
         return np.zeros(len(prior))
     whole, gradient = sum(part[0] for part in parts) + np.diag(prior), sum(part[1] for part in parts)
     estimates = np.array([np.linalg.solve(whole - own, gradient - pull) for own, pull in parts])
-    return (count - 1) * ((estimates - estimates.mean(0)) ** 2).sum(0)
+    return (count - 1) / count * ((estimates - estimates.mean(0)) ** 2).sum(0)
 
 
 def misfits(problem: Problem, point: Solution) -> Float64:

@@ -14,7 +14,7 @@ from batchpid.sim import Robot
 from batchpid.sim.identification import identify
 from batchpid.sim.identification.effort_ratios import measured_motors
 from batchpid.sim.identification.logs import Log
-from batchpid.sim.identification.statistics import variance_between
+from batchpid.sim.identification.statistics import jackknife_variance
 
 pytest.importorskip("scipy")
 EXAMPLE = runpy.run_path(str(Path(__file__).parents[4] / "examples/real_logs.py"))
@@ -122,10 +122,10 @@ def test_measured_efforts_alone_show_a_load_and_no_delay(tmp_path):
     assert {*dict(behind.unknowns.names)} == {"bias", "stopping", "payload"}
 
 
-def test_parts_that_differ_scatter_as_their_own_estimates():
+def test_the_variance_is_that_of_the_mean_of_parts_that_differ():
     rng = np.random.default_rng(0)
     slopes = 2.0 + 0.3 * rng.standard_normal(8)
     tables = [np.linspace(-1, 1, 50)[:, None] for _ in slopes]
     parts = [(table.T @ table, table.T @ (slope * table[:, 0])) for table, slope in zip(tables, slopes, strict=True)]
-    np.testing.assert_allclose(variance_between(parts, np.zeros(1)), slopes.var(ddof=1))
-    assert not variance_between(parts[:3], np.zeros(1)).any()
+    np.testing.assert_allclose(jackknife_variance(parts, np.zeros(1)), slopes.var(ddof=1) / len(slopes))
+    assert not jackknife_variance(parts[:3], np.zeros(1)).any()
