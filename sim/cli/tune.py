@@ -64,7 +64,7 @@ class TuneCommand:
     variation: flags.Variation = False
     payload: flags.Payload = 2.0
     friction: flags.Friction = 0.1
-    engine: flags.Engine | None = None
+    engine: Annotated[Literal["sapien", "mujoco"] | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """Default: sapien; mujoco with --within, where it is installed."""
     physics: flags.Physics = "accurate"
     collisions: flags.Collisions = True
