@@ -174,18 +174,21 @@ class Pack(SingleOwner):
         Robots without shapes have no contacts. Scenes with user content stay, because ``build`` is called only once.
         """
         used = [row for row in rows if self._stepped[row]]
-        if not used or not self.spec.collisions or self._contents:
-            return
-        drives = [[_read_drive(joint) for joint in self.robots[row].active_joints] for row in used]
+        if used and self.spec.collisions and not self._contents:
+            self._rebuild(used)
+
+    def _rebuild(self, rows: Sequence[int]) -> None:
+        """Build the robots ``rows`` again, in new systems, with the drives that they have."""
+        drives = [[_read_drive(joint) for joint in self.robots[row].active_joints] for row in rows]
         # First the old robots are freed: new ones in other memory make every later sim step a tenth slower.
         self._calls.close()
         self._joints = []
-        for row in used:
+        for row in rows:
             self._scenes[row].clear()
             self._scenes[row] = self.robots[row] = self.systems[row] = None
-        for row in used:
+        for row in rows:
             self.systems[row] = self._system(row)
-        for row, settings in zip(used, drives, strict=True):
+        for row, settings in zip(rows, drives, strict=True):
             self._scenes[row], robot = self._build(row, self.systems[row])
             for joint, (drive, target, rate, armature) in zip(robot.active_joints, settings, strict=True):
                 joint.set_drive_properties(*drive)
@@ -194,7 +197,7 @@ class Pack(SingleOwner):
                 joint.set_armature(armature)
             _disable_gravity(robot, bool(self._suspended[row]))
             self.robots[row] = robot
-        self._stepped[used] = False
+        self._stepped[rows] = False
         self._bind()
 
     def read_qpos(self, dtype: DType = np.float64) -> Rows:

@@ -63,8 +63,7 @@ class VariedPack(Pack):
             if mine is not None:
                 mine[rows] = new
         if self._variation.gravity is not None:  # a system keeps its gravity
-            self._stepped[rows] = True
-            self._renew(rows)
+            self._rebuild(rows)
         for row in rows:
             self._change_masses(self.robots[row], row)
             self._change_friction(row)

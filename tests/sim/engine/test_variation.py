@@ -58,11 +58,12 @@ def swing(pack, robot, steps=STEPS, seed=0):
     return np.array(seen)
 
 
-@pytest.mark.parametrize("name", ["panda", "jaco2"])
-def test_a_live_robot_that_changes_moves_as_a_fresh_one(name):
+@pytest.mark.parametrize(("name", "collisions"), [("panda", True), ("jaco2", True), ("panda", False)])
+def test_a_live_robot_that_changes_moves_as_a_fresh_one(name, collisions):
     robot = load_bundled(name)
-    fresh = swing(make(robot, random_variation(robot, 1)), robot)
-    changed = make(robot, random_variation(robot, 2))
+    spec = dataclasses.replace(spec_of(robot), collisions=collisions)
+    fresh = swing(make(robot, random_variation(robot, 1), spec=spec), robot)
+    changed = make(robot, random_variation(robot, 2), spec=spec)
     assert np.abs(swing(changed, robot) - fresh).max() > 1e-3
     for seed in (3, 1):
         changed.vary([0], random_variation(robot, seed))
