@@ -24,6 +24,11 @@ def rotate(q: Rows, v: Rows) -> Rows:
     return v + w * t + np.cross(u, t)
 
 
+def inverse(q: Rows) -> Rows:
+    """Return the inverse of unit quaternions (..., 4): the conjugate."""
+    return np.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
+
+
 def placed(base: Rows, poses: Rows) -> Rows:
     """Return poses (..., 7) that are given in the frame of ``base`` (..., 7), in the frame of that one."""
     position = base[..., :3] + rotate(base[..., 3:], poses[..., :3])

@@ -21,7 +21,7 @@ from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.robot_tree import rigid_tree
 from batchpid.sim.robot.simulated_links import body_inertias, simulated
-from batchpid.task_space.frames import matrix_of, rotate
+from batchpid.task_space.frames import matrix_of, unrotate
 from batchpid.task_space.rigid_tree import RigidTree
 
 
@@ -145,8 +145,11 @@ def passive_force(
 
 
 def turned_back(wxyz: Float64, vectors: Any) -> Float64:
-    """Return vectors of the world (..., 3) in the axes of bases with these quaternions (n, 4), as native code does."""
-    return np.asarray(rotate(np.swapaxes(matrix_of(wxyz), 1, 2), np.broadcast_to(vectors, (len(wxyz), 3))))
+    """Return vectors of the world, (3,) or (n, 3), in the axes of bases with these quaternions (n, 4).
+
+    Rounded as by ``turn_back`` in ``sim_step.h``.
+    """
+    return np.asarray(unrotate(matrix_of(wxyz), vectors))
 
 
 @lru_cache(maxsize=16)

@@ -17,7 +17,7 @@ from batchpid.sim.gym.robot_env import RobotEnv
 from batchpid.sim.gym.robot_vector_env import Bool, Float32, Float64, RobotVectorEnv
 from batchpid.sim.observation import Observation
 from batchpid.sim.robot.robot import Robot
-from batchpid.task_space.rotations import rotate
+from batchpid.task_space.rotations import inverse, rotate
 
 TROT = [
     [0, 0, 0, 0, 0.2, 0, 0, 0.2, -0.4, 0, 0, -0.4],
@@ -123,7 +123,7 @@ class WalkVectorEnv(RobotVectorEnv):
     def observe(self, observed: Observation) -> Float64:
         """Return the motion of the trunk, the command, the joints and the clock."""
         pose, twist = (np.asarray(each, np.float64) for each in (observed.base_pose, observed.base_twist))
-        turn = pose[:, 3:] * (1.0, -1.0, -1.0, -1.0)  # from the world's axes to the trunk's
+        turn = inverse(pose[:, 3:])  # from the world's axes to the trunk's
         trunk = [rotate(turn, each) for each in (twist[:, :3], twist[:, 3:], np.array([0.0, 0.0, 1.0]))]
         angle = 2 * np.pi * self._clock[:, None]
         joints = [observed.qpos - self.posture, observed.qvel, self.action]

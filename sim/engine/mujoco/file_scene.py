@@ -24,10 +24,9 @@ from batchpid.sim.robot.mjcf.mjcf_names import Names
 from batchpid.sim.robot.mjcf.mjcf_reader import content_of, home
 from batchpid.sim.robot.mjcf.mjcf_tree import Tree
 from batchpid.sim.robot.parts import MjcfFile
-from batchpid.task_space.rotations import rotate
+from batchpid.task_space.rotations import inverse, rotate
 
 _REMOVED = ("tuples", "sensors", "actuators", "keys", "cameras", "lights")
-_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 class BodyFrame(NamedTuple):
@@ -136,7 +135,7 @@ def _frames(model: MjModel, robot: dict[int, str], spec: SceneSpec) -> tuple[dic
         joints = np.flatnonzero(model.jnt_bodyid == body)
         hinges = joints[-1:][model.jnt_type[joints[-1:]] == mujoco.mjtJoint.mjJNT_HINGE]
         anchor = model.jnt_pos[hinges[0]].copy() if len(hinges) else np.zeros(3)
-        back = wxyz * _CONJUGATE
+        back = inverse(wxyz)
         names[link], frames[link] = name, BodyFrame(anchor - rotate(back, position), back, ())
     return names, frames
 

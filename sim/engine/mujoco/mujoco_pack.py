@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import DType, Rows
+from batchpid.arrays.array_types import DType, Float64, Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
@@ -31,12 +31,11 @@ from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_ba
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation, varied_inertia
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.simulated_links import varied_bodies
+from batchpid.task_space import frames
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.rotations import multiply, rotate
-from batchpid.task_space.spatial_inertia import spatial_matrix, total
-
-Float64 = NDArray[np.float64]
+from batchpid.task_space.rotations import inverse, multiply
+from batchpid.task_space.spatial_inertia import rotation_matrix, spatial_matrix, total
 
 _STATE = ("qpos", "qvel", "qacc_warmstart")
 """Fields of ``mujoco.MjData`` that a robot's later motion depends on, besides its efforts."""
@@ -263,10 +262,9 @@ class MujocoPack(SingleOwner):
     def read_base(self) -> Float64:
         """Return pose and twist of floating bases (M, 13), as :class:`batchpid.sim.engine.protocol.EnginePack` says."""
         rows, turn = self._bases(), self._robot.turn
-        inverse = rows[:, 3:7] * _CONJUGATE
-        rows[:, 10:] = turned_back(inverse, rows[:, 10:])  # MuJoCo's are in the body's axes
+        rows[:, 10:] = turned_back(inverse(rows[:, 3:7]), rows[:, 10:])  # MuJoCo's are in the body's axes
         if turn[0] != 1.0:
-            rows[:, 3:7] = multiply(rows[:, 3:7], turn * _CONJUGATE)
+            rows[:, 3:7] = multiply(rows[:, 3:7], inverse(turn))
         return rows
 
     def _bases(self) -> Float64:
@@ -276,7 +274,7 @@ class MujocoPack(SingleOwner):
         return np.array([np.concatenate([data.qpos[parts[0]], data.qvel[parts[1]]]) for data in self._data])
 
     def strays(self) -> NDArray[np.bool_]:
-        """Return the robots (M,) whose base, or an object beside it, is beyond :data:`FARTHEST` or not finite."""
+        """Return the robots (M,) whose base, or an object of the file, is beyond FARTHEST or not finite."""
         if self._robot.model.nq == self.dof:
             return np.zeros(self.size, bool)
         return ~np.array([np.abs(data.qpos).max() <= FARTHEST for data in self._data])
@@ -291,9 +289,9 @@ class MujocoPack(SingleOwner):
         """Return gravity and the rate at which floating bases turn, in their own axes (M, 6); None for fixed ones."""
         if self.spec.fixed_base:
             return None
-        rows, turn = self._bases(), self._robot.turn
+        rows, turn = self._bases(), rotation_matrix(self._robot.turn)  # a matrix: it rounds as native code does
         parts = turned_back(rows[:, 3:7], np.array(self.spec.gravity)), rows[:, 10:]
-        return np.concatenate([rotate(turn, part) for part in parts], axis=1)
+        return np.concatenate([frames.rotate(turn, part) for part in parts], axis=1)
 
     def push(self, rows: Sequence[int], twists: Float64) -> None:
         """Add ``twists`` (len(rows), 6) to the twists of floating bases, as :meth:`read_base` has them."""
@@ -315,9 +313,10 @@ class MujocoPack(SingleOwner):
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
             data = everyone[row]
             ctrl = data.ctrl.copy()
-            mujoco.mj_resetData(self.models[row], data)
             if self.models[row].nkey:
                 mujoco.mj_resetDataKeyframe(self.models[row], data, 0)
+            else:
+                mujoco.mj_resetData(self.models[row], data)
             if floats:
                 data.qpos[at : at + FLOATING + 1], data.qvel[moves : moves + FLOATING] = np.split(root, [FLOATING + 1])
             data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = position, velocity
@@ -482,7 +481,6 @@ class MujocoPack(SingleOwner):
 
 
 _ORIGIN = np.array([0.0, 0.0, 0.0, 1.0, *9 * [0.0]])
-_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def _columns(indices: NDArray[np.intp]) -> Any:
