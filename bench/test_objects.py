@@ -1,6 +1,6 @@
-"""A panda beside a cube, in an MJCF scene: closed loop over ``mujoco.batch`` without control, in the same motion.
+"""A panda with a cube in an MJCF scene: closed loop over ``mujoco.batch`` without control, in the same motion.
 
-``mujoco.batch`` is given the efforts of our loop at every sim step. Both have the file's model, in one process in turn.
+``mujoco.batch`` gets the efforts of our loop at every sim step. Both step the file's model, in turn in one process.
 Processor time: another program disturbs it less.
 """
 
@@ -29,7 +29,7 @@ CUBE = '<body name="cube" pos=".5 0 .03"><freejoint/><geom type="box" size=".03 
 
 
 def panda_with_a_cube(folder: Path) -> Robot:
-    """Return a panda on a floor, beside a cube that lies on it."""
+    """Return a panda and a cube on a floor."""
     root = etree.fromstring(to_mjcf(Robot.load("panda"), None, 1 / 2000).text.encode())
     root.find("worldbody").append(etree.fromstring(CUBE))
     for keyframe in root.findall("keyframe"):

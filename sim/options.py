@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Array, Document, Rows
+from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.choices import PerMassMatrix
 from batchpid.arrays.digest import digest, object_digest
 from batchpid.arrays.jax_settings import require_jax
@@ -442,7 +442,7 @@ class RunnerOptions:
             fitted = prepared_actuators(self.randomization, fitted, self.robot, self.control)
         return None if fitted is None else frozen(fitted)
 
-    def with_values(self, **values: Array) -> RunnerOptions:
+    def with_values(self, **values: Any) -> RunnerOptions:
         """Return a copy with other ``values``, as the attributes hold them: they are not checked."""
         changed = copy.copy(self)
         vars(changed).update(values)

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import TURN, wrap
 from batchpid.sim.observation import Observation
 from batchpid.sim.robot.robot import Robot
-
-Float64 = NDArray[np.float64]
 
 MAX_SPEED = 100.0
 """Joint speed that PhysX allows, and bound of the observed one [rad/s or m/s]."""
 
 FARTHEST = 1000.0
-"""Bound of the observed position of a base that floats [m]."""
+"""Bound of the observed position of a floating base [m]."""
 
 
 class JointSpace:
@@ -50,7 +48,7 @@ class JointSpace:
         return np.concatenate(low), np.concatenate(high)
 
     def observe(self, observed: Observation) -> Float64:
-        """Return positions and velocities (envs, 2 joints), then pose and twist (envs, 13) of a base that floats.
+        """Return positions and velocities (envs, 2 joints), then pose and twist (envs, 13) of a floating base.
 
         Positions of continuous joints are in [-pi, pi].
         """

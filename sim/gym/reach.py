@@ -144,7 +144,7 @@ class ReachVectorEnv(RobotVectorEnv):
         return rate
 
     def observe(self, observed: Observation) -> Float32:
-        """Return qpos, qvel, pose and twist of a base that floats, and goal."""
+        """Return qpos, qvel, pose and twist of a floating base, and goal."""
         return np.concatenate([self._joints.observe(observed), self._goal], axis=1).astype(np.float32)
 
     def success(self, observation: Float32) -> Bool:

@@ -106,7 +106,7 @@ class Ticks:
     def __init__(self, arrays: Arrays) -> None:
         self.arrays = arrays
         self.made = list[Arrays]()
-        """The views that there are."""
+        """Views that were made, of the first ticks."""
 
     def __len__(self) -> int:
         return len(self.arrays.observation.ok)

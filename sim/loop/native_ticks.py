@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Array, Rows
+from batchpid.arrays.array_types import Array, Pytree, Rows
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.symbols import Symbol
 from batchpid.native.tracing import Trace, trace
@@ -181,7 +181,7 @@ class NativeTicks:
             self._tick.noise[place] = block.ctypes.data
         return min(map(len, noise))
 
-    def _draw(self) -> Array:
+    def _draw(self) -> Any:
         """Return the noise of positions and velocities in the next steps (steps, M, dof) each, or None."""
         if self.state.motors is None or not self._layout.measures:
             return None
@@ -379,7 +379,7 @@ class _Traced(NamedTuple):
     """Program of some stages."""
 
     program: Trace
-    values: Array
+    values: Pytree
     """Structure of the values after it."""
     places: tuple[_Place, ...]
     """Places of the arrays in these."""

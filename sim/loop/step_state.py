@@ -26,7 +26,7 @@ def reset_friction(layout: Layout, constants: Constants, state: StepState, pack:
     model = constants.friction
     if model.coulomb is None:
         return state._replace(friction=FrictionState(), age=None)
-    falls = not pack.spec.fixed_base  # its joints do not carry the weight of a robot on a fixed base
+    falls = not pack.spec.fixed_base  # then gravity does not load the joints
     velocity, load = pack.read_qvel(), constants.coupling.efforts(pack.passive_force(not falls, True))
     fresh = refreshed(layout, constants, friction_model.started(velocity, load), pack.read_qpos())
     age = np.zeros(pack.size, np.int64)

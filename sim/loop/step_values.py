@@ -136,9 +136,9 @@ def when(due: Any, function: Callable[[], Any], otherwise: Array) -> Any:
 class Model(NamedTuple):
     """Functions that an executor passes to the control step. Their results do not depend on the executor."""
 
-    mass_matrix: Array = None
+    mass_matrix: Any = None
     """qpos (M, dof) -> mass matrix of the description (M, dof, dof), as the law knows it."""
-    joint_mass_matrix: Array = None
+    joint_mass_matrix: Any = None
     """qpos -> effective mass matrix of the joints, armature of the motors included."""
     refresh: Any = None
     """state of the friction model, qpos -> the state with its inertia there; None: by :attr:`joint_mass_matrix`."""

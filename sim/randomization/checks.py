@@ -37,7 +37,7 @@ def check_robot(randomization: Randomization, robot: Robot) -> None:
 
 
 def _check_pushes(randomization: Randomization, robot: Robot) -> None:
-    """Check that pushes have intervals, longer than 0, and a base that floats."""
+    """Check that pushes have intervals, longer than 0, and that the base floats."""
     events = randomization.events
     if not events:
         return

@@ -46,7 +46,7 @@ NOTHING = Draws(np.zeros((0, 2), np.int64), {})
 def generators(
     seed: int, name: str, episodes: Episodes, constant: bool, number: Any = 0
 ) -> Iterator[np.random.Generator]:
-    """Yield a generator for each env, of the draws of one field, with this ``number`` among those of an episode."""
+    """Yield a generator for each env, of draw ``number`` (an int, or one for each env) of one field in its episode."""
     digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
     bits = np.random.Philox(key=np.array([seed, int.from_bytes(digest, "little")], np.uint64))
     state: Any = bits.state

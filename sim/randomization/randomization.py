@@ -156,15 +156,13 @@ class Randomization:
     def next_push(
         self, robot: Robot, episodes: NDArray[np.int64], number: NDArray[np.int64]
     ) -> tuple[Float64, Float64]:
-        """Return the time (n,) [s] from push ``number`` (n,) of these episodes (n, 2) to the next, and that one (n, 6).
-
-        Number 0 is the reset.
+        """Return the time (n,) [s] from push ``number`` (n,) of these episodes (n, 2) to the next, and the twist (n, 6)
+        that the next one adds. Number 0 is the reset.
         """
         assert self.push is not None
         assert self.push_interval is not None
-        drawn = [self._draw(name, each, robot, episodes, number) for name, each in self.events.items()]
-        twists, intervals = drawn
-        return intervals[:, 0], np.nan_to_num(twists)
+        drawn = {name: self._draw(name, each, robot, episodes, number) for name, each in self.events.items()}
+        return drawn["push_interval"][:, 0], np.nan_to_num(drawn["push"])
 
     def first(self, robot: Robot, num_envs: int, first_env: int = 0) -> Draws:
         """Return the draws for the first episode of each env, of the stream of its number, from ``first_env`` on."""

@@ -147,10 +147,10 @@ class MjcfFile:
     """MJCF file that MuJoCo simulates itself, with all that it holds besides the robot.
 
     ``reading`` is the way in which it was read (:func:`batchpid.sim.robot.mjcf.mjcf_compiler.attempt`), ``content`` the
-    digest of what was read. ``bodies`` are the names of all bodies, ``falling`` those of bodies on free joints beside
-    the robot. ``loops`` are the equality constraints that close loops of the robot's links. ``is_alone`` is False if
-    more than the robot moves. ``has_floor`` is True if planes of the world can collide, unless the root is fixed to the
-    origin in place of its free joint.
+    digest of what was read. ``bodies`` are the names of all bodies, ``falling`` those of bodies on free joints that are
+    not the robot's. ``loops`` are the equality constraints that close loops of the robot's links. ``is_alone`` is False
+    if more than the robot moves. ``has_floor`` is True if planes of the world can collide, unless the root is fixed to
+    the origin in place of its free joint.
     """
 
     path: str

@@ -43,8 +43,8 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
     """Return the tables of shapes and pairs for ``Clearance`` in ``clearance.h``, the same for every robot.
 
     None if collision detection is never skipped: the model has no pair of shapes that may touch, or a kind of shape
-    that is not supported, or the fields to change are not found in this version of MuJoCo. The same for a file with
-    bodies that move beside the robot, pairs or margins of its own, or flexible bodies.
+    that is not supported, or the fields to change are not found in this version of MuJoCo. None also for a file with
+    moving bodies apart from the robot, with ``<pair>`` elements or margins of shapes, or with flexible bodies.
     """
     model = robot.model
     moves = len(robot.qvel) + (0 if robot.base is None else FLOATING)

@@ -113,7 +113,7 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     scene, off = found.scene, mujoco.mjtDisableBit
     option = scene.option
     option.disableflags &= ~(off.mjDSBL_GRAVITY | off.mjDSBL_ACTUATION | off.mjDSBL_CLAMPCTRL | off.mjDSBL_SENSOR)
-    option.enableflags &= ~(_NOT_KEPT)
+    option.enableflags &= ~_NOT_KEPT
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     _set_options(scene, spec)
     if not spec.collisions:

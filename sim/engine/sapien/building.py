@@ -27,7 +27,7 @@ from batchpid.sim.robot.simulated_links import simulated
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
 RESTITUTION = 0.1
-"""Of SAPIEN's default material."""
+"""Coefficient of restitution of SAPIEN's default material."""
 _building = RLock()
 """Lock of the thread that builds a robot: SAPIEN's settings are process-wide, and builders are shared."""
 

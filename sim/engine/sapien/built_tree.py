@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Document, Float64
+from batchpid.arrays.array_types import Document, Float64
 from batchpid.sim.engine.sapien.building import build_scene, new_system
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.task_space.frames import matrix_of
@@ -45,7 +45,7 @@ def scene_tree(spec: SceneSpec) -> RigidTree:
     )
 
 
-def _row(name: str, parent: int, kind: str, pose: Array) -> Document:
+def _row(name: str, parent: int, kind: str, pose: Any) -> Document:
     """Return a link without mass at one of SAPIEN's poses in its parent."""
     position, wxyz = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])) if pose is None else (pose.p, _wxyz(pose))
     empty = {"mass": 0.0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}
@@ -53,11 +53,11 @@ def _row(name: str, parent: int, kind: str, pose: Array) -> Document:
     return {"links": name, "parent": parent, "joint_types": kind, **place, **empty}
 
 
-def _place(pose: Array) -> tuple[Float64, Float64]:
+def _place(pose: Any) -> tuple[Float64, Float64]:
     """Return axes (3, 3) and position (3,) of one of SAPIEN's poses."""
     return matrix_of(_wxyz(pose)), np.asarray(pose.p, float)
 
 
-def _wxyz(pose: Array) -> Float64:
+def _wxyz(pose: Any) -> Float64:
     """Return the rotation of one of SAPIEN's poses, by roll, pitch and yaw, as SAPIEN's own dynamics take it."""
     return from_rpy(np.asarray(pose.rpy, float))

@@ -86,7 +86,8 @@ def _attempts(path: Path, fixed_base: bool, first: Attempt, problem: str) -> Ite
 def attempt(path: Path, fixed_base: bool, reading: str) -> Attempt:
     """Return a compilation of the "whole" file, or without the geoms of meshes that are "unreadable" or "damaged".
 
-    The latter is also without the geoms that are only drawn, unless ``reading`` ends with "drawn".
+    Unless it is of the whole file, geoms that are only drawn are left out, too; "unreadable, drawn" and "damaged,
+    drawn" keep them.
     """
     left_out: tuple[Any, Any] = (), ()
     problem_of, scene = {"unreadable": _unreadable, "damaged": _damaged}.get(reading.split(",")[0]), None

@@ -194,7 +194,7 @@ def _field(model: MjModel, name: str, index: int) -> float:
 
 
 def roots_of_actuators(model: MjModel) -> set[int]:
-    """Return the bodies in the world that actuators move, or bodies below them."""
+    """Return the children of the world that actuators move, either themselves or bodies below them."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     dofs = data.moment_colind[: data.moment_rownnz.sum()]
