@@ -316,26 +316,6 @@ def test_a_floating_base_behind_an_object(load):
     assert np.abs(seen[0] - seen[2]).max() > 0.01
 
 
-def test_a_restored_floating_base_moves_on_alike(load):
-    """Gravity along the axes of a base that is turned in its link has the same bits before and after a restore."""
-    robot, random, ends = load(WALKER.replace("1 1 0 0", "1 .2 -.3 .5"), fixed_base=False), np.random.default_rng(0), []
-    poses = random.uniform(0.2, 1.0, (8, 7))
-    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    options = {"control": "effort", "compensate": "gravity", "ground": False}
-    with Runner(robot, 8, workers=0, engine="mujoco", **options) as runner:
-        runner.reset(base_pose=poses, base_twist=random.uniform(-1.0, 1.0, (8, 6)))
-        runner.step([0.02])
-        kept = runner.snapshot()
-        for restores in (False, True):
-            if restores:
-                runner.restore(kept)
-            for _ in range(5):
-                runner.step([0.02])
-            ends.append(runner.snapshot().states.engine)
-    np.testing.assert_array_equal(*ends)
-    assert not np.array_equal(ends[0], kept.states.engine)
-
-
 def test_gains_of_the_law_are_those_of_the_user(load):
     """The file's own servos do nothing."""
     servo = ARM.replace('<motor joint="turn"/>', '<position joint="turn" kp="1000"/>')
