@@ -113,7 +113,7 @@ def identify(
     Warns
     -----
     LogWarning
-        A joint is at a limit.
+        A joint is at a limit, or did not move.
     """
     evaluations, seed = integer("evaluations", evaluations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
     if workers is not None:
@@ -195,7 +195,8 @@ def identify(
     errors_of_fit = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
     noise = np.sqrt((errors_of_fit**2).mean(0))
     if problem.drive.compensation != drive.compensation:
-        regression = Regression(plants_of(resting, joints, problem.drive, fitted), fitted, fitted_motions, payload)
+        plants = plants_of(resting, joints, problem.drive, fitted)
+        regression = Regression(plants, fitted, fitted_motions, payload, gains_known)
     diagnosis = diagnose(regression, fitted, [robot.joint_names[joint] for joint in joints])
     estimate = best.theta
     if ratios is not None:
