@@ -211,7 +211,8 @@ def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float6
     """Return the efforts that a motion requires, less the compensation that does not pass through the motors."""
     q, v, a = (table[rows] for table in motion[:3])
     kg = np.full((len(q), 1), payload)
-    effort = (plant.mass_matrix(q, kg) @ a[..., None])[..., 0] + plant.passive(q, v, kg)
+    passive = plant.at(q, v, kg)
+    effort = (passive.matrix @ a[..., None])[..., 0] + (passive.force + passive.payload_force)
     held = None if plant.drive.through else plant.compensation(q, v, kg)
     return effort if held is None else effort - held
 
