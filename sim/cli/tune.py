@@ -172,10 +172,10 @@ class TuneCommand:
 
     def _draw(self, robot: Robot) -> DrawnMotors | None:
         """Return the motors that ``--within`` draws; None without it."""
-        from batchpid.sim.identification.confidence_region import draw_motors
-
         if not self.within:
             return None
+        from batchpid.sim.identification.confidence_region import draw_motors
+
         if self.actuators is None:
             remedy = "name the file of `batchpid identify` as --actuators"
             raise InvalidArgumentError("within", "needs a confidence region", remedy=remedy)
