@@ -28,8 +28,8 @@ from batchpid.sim.identification.fit_history import History, State
 from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, extended, search
 from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_of, residuals_of_ideal
 from batchpid.sim.identification.inputs import read_inputs
+from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.logged_control import LoggedDrive
-from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.plant import Plant, plants_of
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import Motion, Regression, best_drive, hypotheses, smooth, variants

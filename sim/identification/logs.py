@@ -37,12 +37,12 @@ from batchpid.sim.identification import bags, runs
 from batchpid.sim.identification.columns import QUANTITIES, Reading, error, read_csv, read_hdf5_columns, time_column
 from batchpid.sim.identification.gaps import commands_of
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning, Sensor
-from batchpid.sim.identification.log_checks import SPEEDING, at_limits, checked, too_fast
+from batchpid.sim.identification.log_checks import SPEEDING, checked, too_fast
 from batchpid.sim.observation import Rollout
 from batchpid.sim.recording.recording_files import HDF5, read_recording
 from batchpid.sim.robot.robot import Robot
 
-__all__ = ["CommandKind", "Log", "LogWarning", "at_limits", "checked", "logs_of_rollout", "read_logs"]
+__all__ = ["CommandKind", "Log", "LogWarning", "logs_of_rollout", "read_logs"]
 
 SUFFIXES = (".csv", ".txt", ".npz", *HDF5, *bags.SUFFIXES)
 

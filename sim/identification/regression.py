@@ -21,9 +21,9 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.actuators import Actuators
+from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.log_noise import Noise, split
 from batchpid.sim.identification.logged_control import LoggedDrive
-from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.plant import Plant, plants_of
 from batchpid.sim.identification.unknowns import Motors
 
