@@ -106,7 +106,7 @@ class IdentifyCommand:
         from batchpid.io.files import write_atomically
         from batchpid.sim import plots
         from batchpid.sim.identification.identification import identify
-        from batchpid.sim.identification.runs import gains_of
+        from batchpid.sim.identification.log_lists import gains_of
 
         robot = Robot.load(self.robot, **vars(self.meshes))
         if not self.logs:
@@ -164,7 +164,7 @@ class IdentifyCommand:
     def _judge(self, robot: Robot, actuators: Path) -> None:
         """Print the error of an actuators file."""
         from batchpid.sim.identification.held_out import held_out_error
-        from batchpid.sim.identification.runs import gains_of
+        from batchpid.sim.identification.log_lists import gains_of
 
         if self.evaluations:
             remedy = "add --evaluations 0 to print the error of the file, or leave it out to fit"

@@ -65,7 +65,7 @@ def identify(
     ----------
     logs
         Files (:mod:`batchpid.sim.identification.logs`), lists of logs with settings of their own
-        (:mod:`batchpid.sim.identification.runs`), or logs that were read.
+        (:mod:`batchpid.sim.identification.log_lists`), or logs that were read.
     params
         Params of the PID law that drove the robot, of all its joints or of those in the logs: the setpoints of the logs
         are used. None: the efforts.
