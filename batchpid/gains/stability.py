@@ -110,8 +110,8 @@ def stability_bound(
         mass_matrix, dt, kp=kp, kd=kd, filter_time=filter_time, damping=damping, delay=delay, lag=lag
     )
     if model is not None or late.any() or slow.any():
-        unit = np.eye(m.shape[-1]) if model is None else model
-        unit = broadcast("model", unit, m.shape, "give it the shape of mass_matrix")
+        one = np.eye(m.shape[-1])
+        unit = broadcast("model", one if model is None else model, m.shape, "give it the shape of mass_matrix")
         return _late_bound(m, unit, [p, c, tau, b, late, slow], dt)
     passed = dt / (dt + 2 * tau)
     weight = np.sqrt(passed * dt * c + 0.5 * dt**2 * p)
