@@ -1,6 +1,6 @@
 """Runner: N robots in N headless scenes, stepped by worker processes under one batch controller.
 
-Each method makes a command of its arguments (:mod:`batchpid.sim.commands`), which :meth:`Runner._execute` carries out.
+Each method makes a command of its arguments (:mod:`batchpid.sim.runner_commands`), and :meth:`Runner._execute` runs it.
 
 Longer than 300 lines because the public signatures and their documentation are spelled out for editors and readers.
 """
@@ -28,21 +28,6 @@ from batchpid.checks.warn import warn
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.sim.command import CommandSpec
-from batchpid.sim.commands import (
-    ChangeActuators,
-    ChangeParams,
-    GoBack,
-    MakeSnapshot,
-    Read,
-    ResetEnvs,
-    RunnerCommand,
-    RunnerState,
-    RunTicks,
-    count_ticks,
-    read_command,
-    restored,
-    snapshot_of,
-)
 from batchpid.sim.loop.backend import describe
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
@@ -50,7 +35,21 @@ from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observ
 from batchpid.sim.options import RunnerOptions, default_params, keyword_parameters
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.run_warnings import RunWarnings
+from batchpid.sim.runner_arguments import count_ticks, read_command
+from batchpid.sim.runner_commands import (
+    ChangeActuators,
+    ChangeParams,
+    GoBack,
+    MakeSnapshot,
+    Read,
+    ResetEnvs,
+    RunnerCommand,
+    RunTicks,
+    restored,
+    snapshot_of,
+)
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE, RunnerKeywords
+from batchpid.sim.runner_state import RunnerState
 from batchpid.sim.workers.contact_log import MissedContact
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall

@@ -1,0 +1,163 @@
+"""Arguments of a runner's methods, checked and copied: commands of ticks, and states to reset to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import batchpid as bp
+from batchpid.arrays.array_types import Bool, Float64
+from batchpid.checks.validate import array, read_array, within
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim.command import POSE_UNITS, TWIST_UNITS
+from batchpid.sim.engine.robot_model import robot_model
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.faults import FARTHEST, ORIGIN
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.robot.limits import SetpointCheck
+from batchpid.sim.runner_state import Motion, RunnerState
+
+
+def read_command(
+    options: RunnerOptions,
+    state: RunnerState,
+    limits: SetpointCheck | None,
+    given: Mapping[str, ArrayLike | None],
+    ticks: int | None = None,
+) -> Command:
+    """Return the command (ticks, envs, ...) of one tick, or of ``ticks``, as a copy.
+
+    ``given`` has its arrays by the names of their arguments, in the order of :class:`Command`. Positions of followers
+    are computed from their leaders; the loop passes efforts on to the leaders. ``limits`` warns of setpoints.
+    """
+    if options.tool_setpoints is not None:
+        given = _joint_setpoints(options, state, given, ticks)
+    _, _, acceleration, _ = given.values()
+    if acceleration is not None:
+        _check_acceleration(state.params, given)
+    table = (options.num_envs,) if ticks is None else (ticks, options.num_envs)
+    finite, rows = options.on_invalid_input == "raise", list[Any]()
+    for (name, value), (kind, names) in zip(given.items(), options.command_columns, strict=True):
+        if value is None and rows:  # the setpoint, which is first, must be given
+            rows.append(None)
+            continue
+        each: Any = value
+        if ticks is not None:
+            each = read_array(name, each)
+            each = each[:, None] if each.ndim == 2 else each
+        own = array(name, each, (*table, len(names)), names, finite=finite, kind=kind).copy()
+        rows.append(own[None] if ticks is None else own)
+    coupling = options.command_coupling
+    if coupling is not None:
+        rows[0] = coupling.positions(rows[0])
+        rows[1:3] = [None if each is None else coupling.rates(each) for each in rows[1:3]]
+    if limits is not None:
+        limits.check("setpoint", rows[0])
+    return Command(*rows)
+
+
+def accelerated(command: Command, motion: Motion, seconds: float) -> Command:
+    """Return ``command`` (ticks, envs, ...) with the mean accelerations in ticks of ``seconds`` with rates.
+
+    The mean is the change of the rate over the tick, from ``motion`` before the first. It is taken where the setpoints
+    confirm that rates (and given accelerations) are those at the tick's end, since they change by the mean of the old
+    and the new rate rather than by the new one, as increments do. Elsewhere the given acceleration is kept, or 0.
+    """
+    setpoint, rate, given, _ = command
+    before = [0.0 * rate[0] if rows is None else rows for rows in motion]
+    with np.errstate(invalid="ignore"):  # non-finite rates become faults
+        moved, change = (
+            np.diff(rows, axis=0, prepend=first[None]) for rows, first in zip((setpoint, rate), before, strict=True)
+        )
+        ahead = moved - seconds * rate  # of increments 0, else minus half the change
+        fits = np.abs(ahead + 0.5 * seconds * change) < 4 * np.abs(ahead)
+        if given is not None:  # with the jerk (given - mean) / (seconds / 2), where the rate is at its largest, too
+            end = seconds**2 * given
+            fits |= np.abs(ahead + end / 6 + seconds * change / 3) < np.abs(end) / 24
+    return command._replace(setpoint_acceleration=np.where(fits, change / seconds, 0.0 if given is None else given))
+
+
+def count_ticks(options: RunnerOptions, setpoints: ArrayLike) -> int:
+    """Return the number of ticks of a rollout, from the shape of its setpoints."""
+    rows, num_envs = read_array("setpoints", setpoints), options.num_envs
+    size = len(options.command_columns[0][1])
+    if options.tool_setpoints is None and (rows.ndim not in (2, 3) or len(rows) == 0):
+        raise InvalidArgumentError(
+            "setpoints",
+            f"must have shape (ticks, {num_envs}, {size}) or (ticks, {size})",
+            value=rows.shape,
+            remedy=f"repeat a constant setpoint with np.broadcast_to(setpoint, (ticks, {size}))",
+        )
+    return len(np.atleast_1d(rows))
+
+
+def _check_acceleration(params: bp.PIDParams, given: Mapping[str, ArrayLike | None]) -> None:
+    """Raise InvalidArgumentError for an acceleration that the law does not take."""
+    _, (rate, given_rate), (name, _), _ = given.items()
+    if params.gain_units is None:
+        remedy = "give M(q) times it as feedforward, or use gains in accelerations, such as robot.designed()"
+        raise InvalidArgumentError(name, "is for gains in accelerations, and these are efforts", remedy=remedy)
+    if given_rate is None:
+        raise InvalidArgumentError(name, f"is given without {rate}", remedy=f"give {rate}, too")
+
+
+def _joint_setpoints(
+    options: RunnerOptions, state: RunnerState, given: Mapping[str, ArrayLike | None], ticks: int | None
+) -> dict[str, ArrayLike | None]:
+    """Return ``given`` with joint setpoints and their rates for poses of the tool and its twists."""
+    (name, poses), (rate_name, twists), (acceleration_name, acceleration), _ = given.items()
+    if acceleration is not None:
+        problem = "is for joint setpoints, and setpoints are poses"
+        raise InvalidArgumentError(acceleration_name, problem, remedy="leave it out")
+    tool, finite = options.tool_setpoints, options.on_invalid_input == "raise"
+    assert tool is not None
+    assert state.targets is not None
+    qpos = tool.joints(name, poses, state.targets, finite, ticks)
+    rates = None if twists is None else tool.rates(rate_name, twists, qpos, finite)
+    return dict(given) | {name: qpos, rate_name: rates}
+
+
+def joint_rows(options: RunnerOptions, name: str, value: ArrayLike) -> Float64:
+    """Return positions or velocities (envs, dof) to reset to."""
+    robot, is_finite = options.robot, options.on_invalid_input == "raise"
+    rows = array(name, value, (options.num_envs, robot.dof), robot.joint_names, finite=is_finite).copy()
+    if is_finite:
+        return within(name, rows, FARTHEST, robot.joint_names)
+    return np.where(np.abs(rows) > FARTHEST, np.nan, rows)
+
+
+def base_rows(
+    options: RunnerOptions, pose: ArrayLike | None, twist: ArrayLike | None, qpos: NDArray[np.float64], mask: Bool
+) -> Float64 | None:
+    """Return poses and twists (envs, 13) of floating bases to reset to, at joint positions ``qpos``.
+
+    By default a base is at rest, upright, and so high that the robot's lowest point is on the ground.
+    """
+    robot, num_envs = options.robot, options.num_envs
+    if robot.fixed_base:
+        for name, value in (("base_pose", pose), ("base_twist", twist)):
+            if value is not None:
+                remedy = "leave it out, or load the robot with fixed_base=False"
+                raise InvalidArgumentError(name, "is for a floating base, and this one is fixed", remedy=remedy)
+        return None
+    rows = np.tile(ORIGIN, (num_envs, 1))
+    if twist is not None:
+        rows[:, 7:] = array("base_twist", twist, (num_envs, 6), tuple(TWIST_UNITS), kind="entry")
+    if pose is not None:
+        rows[:, :7] = array("base_pose", pose, (num_envs, 7), tuple(POSE_UNITS), kind="entry")
+        length = np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
+        if not length.all():
+            problem = f"env {int(np.flatnonzero(length == 0)[0])} has a quaternion of length 0"
+            raise InvalidArgumentError("base_pose", problem, remedy="give (w, x, y, z), (1, 0, 0, 0) upright")
+        rows[:, 3:7] /= length
+    elif options.ground:
+        heights: dict[bytes, float] = {}
+        for env in np.flatnonzero(mask).tolist():
+            key = qpos[env].tobytes()
+            if key not in heights:
+                heights[key] = robot_model(robot).height(np.nan_to_num(qpos[env]), base_too=True)
+            rows[env, 2] = -heights[key] if np.isfinite(heights[key]) else 0.0
+    return rows

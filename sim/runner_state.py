@@ -1,0 +1,54 @@
+"""State of a runner that its commands change."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+import batchpid as bp
+from batchpid.arrays.array_types import Float64
+from batchpid.sim.engine.robot_model import robot_model
+from batchpid.sim.loop.faults import FaultLog
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.randomization.draws import NOTHING, Draws
+from batchpid.sim.workers.contact_log import MissedContactLog
+
+Motion = tuple[Float64, Float64 | None]
+"""Setpoints of joints and their rates (envs, dof); None for 0."""
+
+
+class RunnerState(NamedTuple):
+    """Everything about a runner that its commands change, apart from the workers. Replaced once by each command."""
+
+    params: bp.PIDParams
+    actuators: bp.Actuators | None
+    draws: Draws
+    faults: FaultLog
+    contacts: MissedContactLog | None
+    """None with collisions."""
+    targets: Float64 | None
+    """Last joint setpoints (envs, dof), where searches for poses of the tool start; None without such poses."""
+    motion: Motion | None
+    """Setpoint of the last tick and its rate, or position and velocity after a reset. None for other setpoints."""
+    steps: int = 0
+    steps_since_checkpoint: int = 0
+    work: tuple[tuple[float, ...], int] = ((), 1)
+    """Seconds of each worker in the last run, and the ticks of that run."""
+
+    @classmethod
+    def first(cls, options: RunnerOptions, params: bp.PIDParams) -> RunnerState:
+        """Return the state before the first reset, which places all envs."""
+        robot, own, count = options.robot, options.own_command, options.num_envs
+        draws = NOTHING
+        if options.randomization is not None:
+            draws = options.randomization.first(robot, count, options.first_env)
+        names = None if own is None else own.names
+        faults, contacts = FaultLog(count, robot.joint_names, options.timestep, options.on_fault, names), None
+        if not options.collisions:
+            nearest = lambda qpos: robot_model(robot).nearest_links(qpos)  # noqa: E731
+            contacts = MissedContactLog(count, options.timestep, nearest)
+        start = np.tile(robot.start, (count, 1))
+        targets = None if options.tool_setpoints is None else start
+        motion = (start, None) if options.sets_positions else None
+        return cls(params, options.actuators, draws, faults, contacts, targets, motion)
