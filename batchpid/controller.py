@@ -14,7 +14,7 @@ from batchpid.backends import JAXBackend, NumPyBackend, declined
 from batchpid.checks.validate import choice, env_mask, instance, integer, names, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.law import bumpless, pid
-from batchpid.law.inputs import check_alone
+from batchpid.law.input_checks import check_alone
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
 

@@ -31,7 +31,7 @@ from batchpid.checks.keywords import check_keywords
 from batchpid.checks.validate import AxisKind, choice, flag, instance, integer, joint_speeds, names, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
-from batchpid.law.inputs import check_drive
+from batchpid.law.input_checks import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.command import CommandSpec, joint_command, own_command

@@ -25,7 +25,8 @@ from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.choices import CHOICES
-from batchpid.checks.validate import choice, number, positive, time_step
+from batchpid.checks.validate import at_least, broadcast, choice, number, positive, time_step
+from batchpid.errors import InvalidArgumentError
 from batchpid.gains.stability import stability_bound
 from batchpid.law.params import PIDParams
 from batchpid.motors.coupling import Coupling
@@ -146,8 +147,8 @@ def design_gains(
     Raises
     ------
     InvalidArgumentError
-        A number out of range, an unknown unit, an implicit law with gains not per "mass_matrix", or a robot whose mass
-        matrix is not positive definite.
+        A number out of range, an unknown unit, a load for gains not as "effort", an implicit law with gains not per
+        "mass_matrix", or a robot whose mass matrix is not positive definite.
     """
     bandwidth = positive("bandwidth_hz", bandwidth_hz, "Hz")
     positive("damping_ratio", damping_ratio, "zeta")
@@ -158,11 +159,15 @@ def design_gains(
         positive("integral_time", integral_time, "s")
     choice("gain_units", gain_units, CHOICES["gain_units"])
     is_explicit = choice("discretization", discretization, CHOICES["discretization"]) == "explicit"
+    least = at_least("load", broadcast("load", load, robot.damping.shape), 0.0)
+    if gain_units != "effort" and least.any():
+        remedy = "leave it out: these gains are per inertia"
+        raise InvalidArgumentError("load", f"has no effect with gain_units {gain_units!r}", remedy=remedy)
     mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
     coupling = getattr(robot, "coupling", Coupling.of(mass.shape[-1]))
     mass, viscous = coupling.reduced(mass), coupling.reduced_damping(robot.damping)
     own = np.diagonal(mass, axis1=1, axis2=2)
-    carried = np.maximum(own.max(0), coupling.reduced_damping(np.broadcast_to(load, robot.damping.shape)))
+    carried = np.maximum(own.max(0), coupling.reduced_damping(least))
     inertia = {"effort": carried, "inertia": np.ones(own.shape[1]), "mass_matrix": np.ones(own.shape[1])}[gain_units]
     # The loop with the whole mass matrix compensates the joints' damping.
     damping = {"effort": viscous, "inertia": viscous / own.max(0), "mass_matrix": 0.0}[gain_units]

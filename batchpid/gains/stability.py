@@ -106,11 +106,13 @@ def stability_bound(
     InvalidArgumentError
         A shape that does not fit, a mass matrix that is not positive definite, or a dt above 1 s.
     """
-    m, p, c, tau, b = _columns(mass_matrix, dt, kp=kp, kd=kd, filter_time=filter_time, damping=damping)
-    late, slow = _columns(mass_matrix, dt, delay=delay, lag=lag)[1:]
+    m, p, c, tau, b, late, slow = _columns(
+        mass_matrix, dt, kp=kp, kd=kd, filter_time=filter_time, damping=damping, delay=delay, lag=lag
+    )
     if model is not None or late.any() or slow.any():
-        unit = np.eye(m.shape[-1]) if model is None else read_array("model", model).astype(np.float64)
-        return _late_bound(m, np.broadcast_to(unit, m.shape), [p, c, tau, b, late, slow], dt)
+        one = np.eye(m.shape[-1])
+        unit = broadcast("model", one if model is None else model, m.shape, "give it the shape of mass_matrix")
+        return _late_bound(m, unit, [p, c, tau, b, late, slow], dt)
     passed = dt / (dt + 2 * tau)
     weight = np.sqrt(passed * dt * c + 0.5 * dt**2 * p)
     inverse = np.linalg.inv(m + 0.5 * dt * b[..., None] * np.eye(m.shape[-1]))

@@ -8,7 +8,7 @@ from batchpid.arrays.array_types import Array
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, namespace, tiny_of
 from batchpid.law.implicit import as_explicit, implicit_gains
-from batchpid.law.inputs import checked_dt
+from batchpid.law.input_checks import checked_dt
 from batchpid.law.params import PIDParams
 
 

@@ -33,7 +33,7 @@ from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.choices import Everywhere, HoldEffort
 from batchpid.arrays.elementwise import clip, flush, namespace, nearest_turn, replace_envs, wrap
 from batchpid.law.coefficients import Coefficients, discretise
-from batchpid.law.inputs import check_alone, check_drive, checked_inputs, checked_mask, checked_state, needs
+from batchpid.law.input_checks import check_alone, check_drive, checked_inputs, checked_mask, checked_state, needs
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
 

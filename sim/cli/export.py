@@ -92,11 +92,9 @@ class ExportCommand:
         from batchpid.sim.robot.urdf_export import to_urdf
         from batchpid.sim.tuning.gain_sets import gain_set
 
-        for option in fields(self):
-            unused = any(option.name in names for names in USED.values()) and option.name not in USED[self.to]
-            if unused and (value := getattr(self, option.name)) != option.default:
-                problem = f"has no effect with --to {self.to}"
-                raise InvalidArgumentError(option.name, problem, value=value, remedy="leave it out")
+        known = {name for names in USED.values() for name in names}
+        unused = [each.name for each in fields(self) if each.name in known.difference(USED[self.to])]
+        flags.refuse(self, unused, f"has no effect with --to {self.to}")
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
         outputs = OutputFiles(force=self.force)

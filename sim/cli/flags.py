@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
 from batchpid.arrays.array_types import Document
+from batchpid.errors import InvalidArgumentError
 
 
 def _flag(help: str | None = None, **options: Any) -> Any:
@@ -26,6 +28,14 @@ def chosen(command: Any, names: str) -> Document:
     if "ground" in values and (ground := values.pop("ground")) is not None:
         values["ground"] = ground == "on"
     return values
+
+
+def refuse(command: Any, names: Iterable[str], problem: str) -> None:
+    """Raise InvalidArgumentError for the first flag among ``names`` that is not at its default."""
+    defaults = {each.name: each.default for each in fields(command)}
+    for name in names:
+        if (value := getattr(command, name)) != defaults[name]:
+            raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
 
 
 OptionalPath = Annotated[Path | None, _flag()]

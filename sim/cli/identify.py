@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from batchpid.sim.identification.log import Log
     from batchpid.sim.identification.result import Identification
 
+OF_FIT = ("no_payload", "extras", "seed", "workers", "resume", "corrected_urdf", "picture")
+"""Options that a fit alone has, besides its files."""
 Logs = Annotated[
     tuple[Path, ...],
     tyro.conf.Positional,
@@ -106,7 +108,7 @@ class IdentifyCommand:
         from batchpid.io.files import write_atomically
         from batchpid.sim import plots
         from batchpid.sim.identification.identification import identify
-        from batchpid.sim.identification.runs import gains_of
+        from batchpid.sim.identification.log_lists import gains_of
 
         robot = Robot.load(self.robot, **vars(self.meshes))
         if not self.logs:
@@ -164,16 +166,12 @@ class IdentifyCommand:
     def _judge(self, robot: Robot, actuators: Path) -> None:
         """Print the error of an actuators file."""
         from batchpid.sim.identification.held_out import held_out_error
-        from batchpid.sim.identification.runs import gains_of
+        from batchpid.sim.identification.log_lists import gains_of
 
         if self.evaluations:
             remedy = "add --evaluations 0 to print the error of the file, or leave it out to fit"
             raise InvalidArgumentError("actuators", "are not the start of a fit", value=actuators, remedy=remedy)
-        defaults = {each.name: each.default for each in fields(self)}
-        for name in ("no_payload", "seed", "workers", "resume", "out", "json", "corrected_urdf", "picture"):
-            if (value := getattr(self, name)) != defaults[name]:
-                problem = "is for a fit, and --evaluations 0 fits nothing"
-                raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
+        flags.refuse(self, (*OF_FIT, "out", "json"), "is for a fit, and --evaluations 0 fits nothing")
         errors = held_out_error(
             robot,
             self._logs(robot),
@@ -201,6 +199,8 @@ class IdentifyCommand:
         if logs[0].measured is None:
             remedy = "give 1 or more, name an actuators file as --actuators, or a log with measured efforts too"
             raise InvalidArgumentError("evaluations", "is 0, and there is no file", value=0, remedy=remedy)
+        unused = (*OF_FIT, "gains", "compensate", "sim_steps")
+        flags.refuse(self, unused, "is not used where commanded and measured efforts are compared")
         found = measured_motors(robot, logs, timestep=self.timestep, hold=self.hold)
         document = found.document(robot)
         rows = [

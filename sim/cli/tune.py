@@ -172,10 +172,10 @@ class TuneCommand:
 
     def _draw(self, robot: Robot) -> DrawnMotors | None:
         """Return the motors that ``--within`` draws; None without it."""
-        from batchpid.sim.identification.confidence_region import draw_motors
-
         if not self.within:
             return None
+        from batchpid.sim.identification.confidence_region import draw_motors
+
         if self.actuators is None:
             remedy = "name the file of `batchpid identify` as --actuators"
             raise InvalidArgumentError("within", "needs a confidence region", remedy=remedy)
@@ -213,11 +213,8 @@ class TuneCommand:
         from batchpid.sim.cli.report import cause_lines, gains_table
         from batchpid.sim.tuning.tool_search import tune_tool
 
-        defaults = {each.name: each.default for each in fields(self)}
-        for name in ("gain_units", "per_joint", "randomize", "variation", "cluster", "actuators", "within", "picture"):
-            if (value := getattr(self, name)) != defaults[name]:
-                problem = "is not available with --control osc"
-                raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
+        others = ("gain_units", "per_joint", "randomize", "variation", "cluster", "actuators", "within", "picture")
+        flags.refuse(self, others, "is not available with --control osc")
         out = outputs.path("out", self.out or named.with_suffix(".osc.yaml"), SUFFIXES)
         history = outputs.history(out.with_suffix(".search.json"), resume=self.resume)
         out.parent.mkdir(parents=True, exist_ok=True)

@@ -91,7 +91,9 @@ def read_region(path: str | os.PathLike[str], robot: Robot) -> Region:
 
     Raises InvalidArgumentError if the file has no region or an invalid one, and FileNotFoundError without a file.
     """
-    known = documents.read(path).get("about", {}).get(KEY)
+    document = documents.read(path)
+    about = document.get("about") if isinstance(document, dict) else None
+    known = about.get(KEY) if isinstance(about, dict) else None
     source, remedy = f"{path}: {KEY}", "write the file with `batchpid identify` of this version"
     if not isinstance(known, dict):
         raise InvalidArgumentError(source, "is missing", remedy=remedy)
@@ -105,6 +107,7 @@ def read_region(path: str | os.PathLike[str], robot: Robot) -> Region:
         raise InvalidArgumentError(source, f"cannot be read ({error})", remedy=remedy) from None
     right = estimate.shape == deviation.shape == (len(names),) and bool(np.isfinite([*estimate, *deviation]).all())
     right = right and bool((deviation >= 0).all() and (np.abs(correlation) <= 1).all()) and len(names) > 0
+    right = right and np.allclose(np.diagonal(correlation), 1.0)
     if not right or any(kind not in KINDS | ADDED for kind, _ in names):
         raise InvalidArgumentError(source, "has wrong shapes, numbers or unknowns", remedy=remedy)
     if strangers := sorted({joint for _, joint in names if joint} - set(robot.joint_names)):

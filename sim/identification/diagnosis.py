@@ -17,6 +17,7 @@ Statistics 35, 1964).
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.plant import Plant
-from batchpid.sim.identification.regression import Regression
+from batchpid.sim.identification.regression import Motion, Regression
 from batchpid.task_space.rigid_tree import RigidTree
 
 SPREAD, MOMENT_SPREAD = 0.5, 0.05
@@ -155,7 +156,7 @@ class _System:
         self._held_out = np.concatenate([(rows // stretch) % 4 == 3 for rows, *_ in self._of_logs()])
         self._size = np.sqrt((self._effort**2).mean(0)) + 1e-9
 
-    def _of_logs(self) -> list[tuple[NDArray[np.intp], Any, Plant]]:
+    def _of_logs(self) -> list[tuple[NDArray[np.intp], Motion, Plant]]:
         return list(zip(self.regression.rows, self.regression.motions, self.regression.plants, strict=True))
 
     def columns(self, link: str, more: float = 0.0, further: Float64 | float = 0.0) -> Float64:
@@ -164,24 +165,25 @@ class _System:
         Its mass and inertia grow by the share ``more``, and its center of mass moves by ``further`` (3,) [m].
         """
         found = []
-        for rows, motion, plant in self._of_logs():
-            q, v, a = (table[rows] for table in motion[:3])
-            both, none = [], np.zeros((len(q), 1))
-            for each in (plant.with_tree(_changed(plant.tree, link, more, further)), plant):
-                passive = each.at(q, v, none)
-                both.append((passive.matrix @ a[..., None])[..., 0] + passive.force)
-            found.append(both[0] - both[1])
+        for (rows, motion, plant), described in zip(self._of_logs(), self._described, strict=True):
+            changed = plant.with_tree(_changed(plant.tree, link, more, further))
+            found.append(_required(changed, motion, rows) - described)
         return np.concatenate(found)[..., None]
+
+    @cached_property
+    def _described(self) -> list[Float64]:
+        """Required efforts (rows, joints) of each log with the links as described."""
+        return [_required(plant, motion, rows) for rows, motion, plant in self._of_logs()]
 
     def solve(self, further: Float64, spread: Float64 | float = SPREAD) -> _Solved:
         """Return the solution with ``further`` columns (rows, joints, n), which all joints share."""
         count, shared = 4 * self.joints, further.shape[2]
-        target, weight = self._effort - self._required, np.where(self._moves, 1.0, 0.0)
+        target = self._effort - self._required
         residual = target
         for _ in range(_ROUNDS):
             size = self._spread_of(residual)
             small = np.minimum(1.0, _HUBER * size / (np.abs(residual) + 1e-12))
-            root = np.sqrt(weight * small) / size
+            root = np.sqrt(small) / size
             factors = [np.diag(np.r_[np.full(count, 1e-6), 1 / np.broadcast_to(spread, shared)])]
             rhs = [np.zeros(count + shared)]
             for joint in range(self.joints):
@@ -258,6 +260,13 @@ def _heavier(system: _System, scaled: dict[str, Float64], described: _Solved) ->
         chosen, best = [*chosen, name], tried[name]
     factors = {name: float(1 + value) for name, value in zip(chosen, best.values, strict=True)}
     return {name: each for name, each in factors.items() if abs(each - 1) > LEAST_CHANGE and each > 0}, best
+
+
+def _required(plant: Plant, motion: Motion, rows: NDArray[np.intp]) -> Float64:
+    """Return the efforts (rows, joints) that a motion requires, without payload and compensation."""
+    q, v, a = (table[rows] for table in (motion.qpos, motion.qvel, motion.qacc))
+    passive = plant.at(q, v, np.zeros((len(q), 1)))
+    return (passive.matrix @ a[..., None])[..., 0] + passive.force
 
 
 def _changed(tree: RigidTree, link: str, more: float, further: Float64 | float) -> RigidTree:

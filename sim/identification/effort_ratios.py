@@ -46,7 +46,7 @@ class EffortRatios(NamedTuple):
     estimate: Float64
     """Values (values,)."""
     deviation: Float64
-    """Standard deviations (values,), from the scatter between parts of the logs."""
+    """Standard deviations (values,), by the jackknife over parts of the logs."""
     error: Float64
     """Relative error (joints,): root mean square error on the held-out rows, over the root mean square effort."""
 

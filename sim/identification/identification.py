@@ -28,8 +28,8 @@ from batchpid.sim.identification.fit_history import History, State
 from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, extended, search
 from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_of, residuals_of_ideal
 from batchpid.sim.identification.inputs import read_inputs
+from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.logged_control import LoggedDrive
-from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.plant import Plant, plants_of
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import Motion, Regression, best_drive, hypotheses, smooth, variants
@@ -65,7 +65,7 @@ def identify(
     ----------
     logs
         Files (:mod:`batchpid.sim.identification.logs`), lists of logs with settings of their own
-        (:mod:`batchpid.sim.identification.runs`), or logs that were read.
+        (:mod:`batchpid.sim.identification.log_lists`), or logs that were read.
     params
         Params of the PID law that drove the robot, of all its joints or of those in the logs: the setpoints of the logs
         are used. None: the efforts.
@@ -113,7 +113,7 @@ def identify(
     Warns
     -----
     LogWarning
-        A joint is at a limit.
+        A joint is at a limit, or did not move.
     """
     evaluations, seed = integer("evaluations", evaluations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
     if workers is not None:
@@ -195,7 +195,8 @@ def identify(
     errors_of_fit = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
     noise = np.sqrt((errors_of_fit**2).mean(0))
     if problem.drive.compensation != drive.compensation:
-        regression = Regression(plants_of(resting, joints, problem.drive, fitted), fitted, fitted_motions, payload)
+        plants = plants_of(resting, joints, problem.drive, fitted)
+        regression = Regression(plants, fitted, fitted_motions, payload, gains_known)
     diagnosis = diagnose(regression, fitted, [robot.joint_names[joint] for joint in joints])
     estimate = best.theta
     if ratios is not None:

@@ -14,8 +14,10 @@ import batchpid as bp
 from batchpid.checks.validate import choice, flag, instance, integer, number
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.sim.identification.log import Log, LogWarning
+from batchpid.sim.identification.log_checks import at_limits, checked
 from batchpid.sim.identification.logged_control import LoggedDrive
-from batchpid.sim.identification.logs import Log, LogWarning, at_limits, checked, read_logs
+from batchpid.sim.identification.logs import read_logs
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
 

@@ -120,11 +120,6 @@ class Plant:
         other._tree = tree
         return other
 
-    def passive(self, qpos: Float64, qvel: Float64, payload: Float64) -> Float64:
-        """Return gravity and Coriolis forces (n, joints) [N m or N]."""
-        found = self.at(qpos, qvel, payload)
-        return found.force + found.payload_force
-
     def compensation(self, qpos: Float64, qvel: Float64, payload: Float64) -> Float64 | None:
         """Return the robot's compensation (n, joints), None for none; ``payload`` is included if the robot knows it."""
         return self._compensation(self.at(qpos, qvel, payload), self._at_rest(qpos, payload))

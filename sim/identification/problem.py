@@ -32,8 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
+from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.logged_control import LoggedDrive
-from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.regression import Motion
 from batchpid.sim.identification.unknowns import Unknowns, take
 from batchpid.sim.identification.wander import spread, whiten

@@ -21,9 +21,9 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.actuators import Actuators
+from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.log_noise import Noise, split
 from batchpid.sim.identification.logged_control import LoggedDrive
-from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.plant import Plant, plants_of
 from batchpid.sim.identification.unknowns import Motors
 
@@ -126,7 +126,8 @@ class Regression:
             self.rows.append(rows)
             v, a = motion.qvel[rows], motion.qacc[rows]
             known = log.settings.payload
-            empty, loaded = (_required(plant, motion, rows, known + kg) for kg in (0.0, 1.0 if payload else 0.0))
+            empty = _required(plant, motion, rows, known)
+            per_kg = _required(plant, motion, rows, known + 1.0) - empty if payload else np.zeros_like(empty)
             effort = motion.command if drive.params is None else _law_efforts(plant, motion, law or {})
             unloaded = np.full((len(motion.qpos), 1), known)
             if drive.through and (held := plant.compensation(motion.qpos, motion.qvel, unloaded)) is not None:
@@ -139,7 +140,7 @@ class Regression:
             )
             still = 0.01 * np.abs(v).max(0) + 1e-9
             sign = sosfiltfilt(sections, np.clip(motion.qvel / still, -1, 1), axis=0)[rows]
-            blocks.append((empty, loaded - empty, a, v, sign))
+            blocks.append((empty, per_kg, a, v, sign))
         self._efforts = np.concatenate(late, axis=1)
         self._columns = [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
         fast = np.abs(speeds := self._columns[3]) > MOVES * np.sqrt((speeds**2).mean(0))
@@ -211,7 +212,8 @@ def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float6
     """Return the efforts that a motion requires, less the compensation that does not pass through the motors."""
     q, v, a = (table[rows] for table in motion[:3])
     kg = np.full((len(q), 1), payload)
-    effort = (plant.mass_matrix(q, kg) @ a[..., None])[..., 0] + plant.passive(q, v, kg)
+    passive = plant.at(q, v, kg)
+    effort = (passive.matrix @ a[..., None])[..., 0] + (passive.force + passive.payload_force)
     held = None if plant.drive.through else plant.compensation(q, v, kg)
     return effort if held is None else effort - held
 

@@ -71,7 +71,8 @@ class Identification(NamedTuple):
 
         ``kind`` is a name of :data:`batchpid.sim.identification.unknowns.KINDS`: "armature", "damping", "friction",
         "strength" or "bias" of a ``joint``, by its number among :attr:`joints`; or "delay", "stopping" or "payload",
-        without joint.
+        without joint. Fits with further effects also have kinds of
+        :data:`batchpid.sim.identification.unknowns.ADDED`, each of a joint.
 
         Raises
         ------

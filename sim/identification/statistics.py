@@ -34,7 +34,7 @@ sees noise. Without it 30 % of the intervals missed the truth on logs of a two-j
 LEAST_DEVIATION, LEAST_OF_BIAS = 5e-3, 2e-2
 """Least standard deviation of an unknown, over its estimate, and of a bias: no model is more exact."""
 PARTS, LEAST_PARTS = 10, 4
-"""Most parts of the logs, each a stretch or more, whose estimates are compared, and least number of them."""
+"""Most parts of the logs, each a stretch or more, that the jackknife leaves out in turn, and least number of them."""
 INTERVAL = 1.96
 """Half width of a 95 % interval, in standard deviations."""
 RESOLVED, DELAY_RESOLVED = 0.05, 0.1
@@ -75,9 +75,8 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     """Return the uncertainty of the fitted ``point``."""
     unknowns = problem.unknowns
     count = len(unknowns.scale)
-    size = np.array(problem.lags(MEMORY))
     normal, spread = np.zeros((count, count)), np.zeros((count, count))
-    covariances = _autocovariances(problem, point, int(size.max()))
+    covariances = _autocovariances(problem, point, max(problem.lags(MEMORY)))
     weights = _sizes_of_rows(problem, point)
     for evaluation, window, sigma in zip(point.windows, problem.windows, weights, strict=True):
         jacobian = evaluation.jacobian

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.digest import digest
+from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.logged_control import LoggedDrive
-from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.plant import Plant, Segment
 from batchpid.sim.identification.regression import Motion
 from batchpid.sim.identification.unknowns import Motors, take

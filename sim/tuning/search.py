@@ -52,7 +52,7 @@ from batchpid.sim.workers.contact_log import MissedContactWarning
 INITIAL_SPREAD = 0.12
 """First standard deviation of the search, in log space."""
 VARIED_MOVES, DRAWN_MOVES = 20, 8
-"""Number of random moves in the search for robots that differ from the model."""
+"""Number of random moves in the search for robots that differ from the model, and with drawn motors."""
 FINALISTS, FINAL_MOVES = 3, 24
 """Number of candidates in the final round, besides the designed gains, and of its moves."""
 SEARCH_PHYSICS = {"collisions": False, "physics": "free"}

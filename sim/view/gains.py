@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.checks.validate import at_least, broadcast, choice, integer
 from batchpid.errors import InvalidArgumentError
-from batchpid.law.inputs import DRIVE_LACKS
+from batchpid.law.input_checks import DRIVE_LACKS
 from batchpid.sim.options import RunnerOptions, default_params
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import ControlMode

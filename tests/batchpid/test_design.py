@@ -108,6 +108,8 @@ def test_a_step_settles_within_two_periods_without_overshoot():
         ("margin", {"margin": 1.5}),
         ("dt", {"dt": 0.0}),
         ("gain_units", {"gain_units": "torque"}),
+        ("load", {"load": -1.0}),
+        ("load", {"load": 1.0, "gain_units": "inertia"}),
         ("discretization", {"discretization": "tustin"}),
         ("discretization", {"discretization": "implicit"}),
         ("mass_matrix", {}),

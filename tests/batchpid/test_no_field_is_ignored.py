@@ -16,7 +16,7 @@ from batchpid.arrays.choices import CHOICES
 from batchpid.errors import InvalidArgumentError
 from batchpid.export import to_c, to_isaac_lab, to_maniskill, to_newton, to_ros2_control
 from batchpid.law.computed_torque import advance_with_mass_matrix, per_inertia
-from batchpid.law.inputs import DRIVE_LACKS
+from batchpid.law.input_checks import DRIVE_LACKS
 from batchpid.motors import guard as guards
 from batchpid.motors.actuator_fields import FIELDS
 from batchpid.sim import Robot

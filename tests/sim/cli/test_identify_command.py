@@ -162,6 +162,10 @@ def test_what_is_missing_is_named(batchpid, log, tmp_path):
         (("identify", robot, recording, "--evaluations", 0), "evaluations: is 0"),
         (("identify", robot, recording, "--actuators", "motors.yaml"), "actuators: are not the start of a fit"),
         (("identify", robot, recording, "--evaluations", 0, "--actuators", "a.yaml"), "out: is for a fit"),
+        (
+            ("identify", robot, recording, "--evaluations", 0, "--actuators", "a.yaml", "--extras", "slew"),
+            "extras: is for",
+        ),
         (("identify", robot, recording, "--gains", "nothing.yaml"), "gains: is neither a name nor a file of gains"),
     ):
         status, _, error = batchpid(*words, "--out", tmp_path / "motors.yaml")

@@ -63,6 +63,7 @@ def test_all_draws_are_within_the_ellipsoid():
     [
         (lambda known: None, "is missing"),
         (lambda known: known | {"correlation": [[1], [2, 1]]}, "wrong shapes, numbers"),
+        (lambda known: known | {"correlation": known["correlation"][:-1]}, "wrong shapes, numbers"),
         (lambda known: known | {"estimate": [1.0]}, "wrong shapes, numbers"),
         (lambda known: known | {"unknowns": [["strength", "knee"], *known["unknowns"][1:]]}, "of other joints: knee"),
         (lambda known: known | {"unknowns": [["colour"], *known["unknowns"][1:]]}, "wrong shapes, numbers or unknowns"),

@@ -7,7 +7,8 @@ import batchpid as bp
 from batchpid.sim import Robot, Rollout, Runner, read_recording, write_recording
 from batchpid.sim.identification import identify
 from batchpid.sim.identification.gaps import divided
-from batchpid.sim.identification.logs import Log, LogWarning, at_limits, logs_of_rollout, read_logs
+from batchpid.sim.identification.log_checks import at_limits
+from batchpid.sim.identification.logs import Log, LogWarning, logs_of_rollout, read_logs
 
 ROWS = 60
 

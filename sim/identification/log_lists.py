@@ -43,7 +43,7 @@ OWN = ("log", "gains", "payload", "urdf", "held_out", "hold")
 MOST_PAYLOAD = 1000.0
 
 
-def read_runs(
+def read_log_list(
     path: Path,
     robot: Robot,
     read: Callable[..., list[Log]],
