@@ -26,8 +26,8 @@ from batchpid.sim.robot.robot import Robot
 
 KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
-QUANTILE = 1.645
-"""95 % quantile of the standard normal distribution."""
+OUTSIDE = 0.05
+"""Probability of the points outside a region."""
 
 
 class Region(NamedTuple):
@@ -53,10 +53,12 @@ class Region(NamedTuple):
 
     def draw(self, count: int, seed: int) -> tuple[Float64, Float64]:
         """Return ``count`` points (count, n) of the region, and their distances from the estimate in deviations."""
+        from scipy.special import chdtri
+
         size, rng = len(self.names), np.random.default_rng(seed)
         values, vectors = np.linalg.eigh(self.correlation)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        largest = size * (1 - 2 / (9 * size) + QUANTILE * np.sqrt(2 / (9 * size))) ** 3
+        largest = chdtri(size, OUTSIDE)
         z = np.zeros((0, size))
         while len(z) < count:
             tried = rng.normal(size=(count, size))
