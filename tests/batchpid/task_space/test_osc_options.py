@@ -12,7 +12,6 @@ from trees import TOOLS, planar, states, tree_of
 
 import batchpid as bp
 import batchpid.task_space as ts
-from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import frames
 
 START = np.array([0.0, -0.5, 0.0, -2.2, 0.0, 1.8, 0.8, 0.02, 0.02])
@@ -226,27 +225,3 @@ def test_presets_are_params():
     wrench = 100 * frames.pose_error(goal, d.pose) - 20 * (d.jacobian * qvel[:, None]).sum(-1)
     chain = tree.chain(HAND)
     np.testing.assert_allclose(terms.effort[:, chain], (d.jacobian * wrench[..., None]).sum(1)[:, chain], atol=1e-9)
-
-
-def test_options_are_checked():
-    tree = planar()
-    for options, message in (
-        ({"integral_gain": -1.0}, "integral_gain, .* 'x'"),
-        ({"integral_gain": 1.0, "integral_limit": np.nan}, "integral_limit"),
-        ({"limit_margin": -0.1}, "limit_margin"),
-        ({"discretization": "tustin"}, "discretization: unknown option"),
-        ({"damping": 9.0, "damping_ratio": 0.7}, "damping_ratio: has no effect: damping is given"),
-        ({"integral_limit": 1.0}, "integral_limit: has no effect: integral_gain is not given"),
-        ({"limit_stiffness": [10.0, 20.0]}, "limit_stiffness: has no effect: limit_margin is not given"),
-        ({"discretization": "implicit", "decoupling": "none", "damping": 1.0}, "discretization: 'implicit' needs"),
-    ):
-        with pytest.raises(InvalidArgumentError, match=message):
-            ts.make_osc_params(tree, **options)
-    params, q = ts.make_osc_params(tree), np.ones((1, 2))
-    with pytest.raises(InvalidArgumentError, match="dt"):
-        ts.discretise(params, 0.0)
-    d = ts.task_dynamics(tree, q, q, "tip")
-    for changed, message in ((params, "integral_gain: is off"), (None, "partial")):
-        changed = changed or ts.make_osc_params(tree, decoupling="partial", integral_gain=1.0)
-        with pytest.raises(InvalidArgumentError, match=message):
-            ts.track(changed, ts.init(changed, q), d.pose, q, q, q, 0.01, d)
