@@ -182,7 +182,7 @@ def test_a_change_of_ki_is_bumpless(run, ki):
     assert before.tobytes() == after.tobytes()
 
 
-@pytest.mark.parametrize("turns", [-2, -1, 0, 1, 3])
+@pytest.mark.parametrize("turns", [-2, 1])
 @pytest.mark.parametrize(
     "options",
     [{"kd": 0.5}, {"kd": 0.5, "setpoint_weight": 0.3, "setpoint_weight_derivative": 0.8}, {"setpoint_weight": 0.3}],

@@ -124,7 +124,7 @@ def test_gradients_survive_non_finite_inputs(inputs, x64):
 @pytest.mark.parametrize("build", ["make_params", "replace"])
 def test_gains_may_be_traced_through_make_params_and_replace(build, inputs, x64):
     """The gradient through both is that through the leaves, compiled and vectorised."""
-    options = {"ki": 5.0, "kd": [0.0, 2.0, 1.0], "effort_limit": 9.0, "anti_windup": "conditional"}
+    options = {"ki": 5.0, "kd": [0.0, 2.0, 1.0], "effort_limit": 90.0, "anti_windup": "conditional"}
     r, y = jnp.asarray(inputs.setpoint), jnp.asarray(inputs.measurement)
     base = bp.make_params(JOINTS, 40.0, **options)
 
