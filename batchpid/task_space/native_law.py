@@ -1,4 +1,7 @@
-"""Operational-space control in native code, for any number of rows: task_space.cpp."""
+"""Operational-space control in native code, for any number of rows, or within the sim steps of a tick.
+
+The code is in task_space.cpp.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Array
+from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.native.task_space_extension import DECOUPLING, FRICTION, LAW
 from batchpid.task_space import native_rows
 from batchpid.task_space.osc_coefficients import OSCCoefficients
@@ -16,8 +19,6 @@ from batchpid.task_space.osc_params import NoDecoupling, PartialDecoupling
 from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDynamics, Tool
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_kinematics import prepared, read_point
-
-Float64 = NDArray[np.float64]
 
 _RESULTS = {
     **{"effort": 0, "integral": 6, "limited": 0, "error": 6, "wrench": 6, "task": 0, "posture": 0, "unsaturated": 0},
@@ -69,25 +70,6 @@ def friction(arrays: Mapping[str, Any]) -> Float64 | None:
     return found
 
 
-def bind(
-    tree: RigidTree, link: str, point: Array, k: OSCCoefficients, arrays: Mapping[str, Any]
-) -> tuple[Any, int] | None:
-    """Return an object that keeps ``arrays``, and the address of a Call (call.h) that runs :func:`law` on them.
-
-    ``arrays`` are contiguous float64 arrays by their names in LAW; without ``bias`` it is the tree's. The tool is at a
-    ``point`` (3,) of ``link``, by default at its origin. With ``coulomb`` and ``band`` (dof,) the feedforward is
-    friction. The result is None where native code is not used.
-    """
-    if (native := native_rows.in_use()) is None:
-        return None
-    fixed, chain = _of_tree(native, tree, link, point, len(arrays["qpos"]), k)
-    known = {**dict(zip(k._fields[:-2], k[:-2], strict=True)), **arrays, "chain": chain}
-    rubbing = [None, None, None]
-    if "coulomb" in arrays:  # damping is part of this friction, and not an input of the law
-        rubbing = [known.pop(name, None) for name in ("damping", "coulomb", "band")]
-    return native.bind(*fixed, *map(known.get, LAW), *rubbing)
-
-
 def _of_tree(
     native: Any, tree: RigidTree, link: str, point: Array, rows: int, k: OSCCoefficients
 ) -> tuple[tuple[Any, ...], Float64]:
@@ -102,3 +84,63 @@ def _kind(k: OSCCoefficients) -> tuple[int, bool]:
     """Return the index in DECOUPLING, and whether the coefficients are in the axes of the tool."""
     kind = {NoDecoupling: "none", PartialDecoupling: "partial"}.get(type(k.decoupling), "full")
     return DECOUPLING.index(kind), k.frame is not None
+
+
+class BoundOSC:
+    """The law of :class:`batchpid.sim.OperationalSpace` as a native call on fixed arrays.
+
+    Attributes
+    ----------
+    state
+        Arrays of the state by name; a call updates the integral in place.
+    effort
+        Efforts of the last call (envs, dof).
+    limited
+        1 for joints whose effort the limits have changed in the last call, else 0 (envs, dof).
+    address
+        Address of the call: ``control`` of :class:`batchpid.sim.engine.native.interface.Tick`.
+    """
+
+    def __init__(
+        self,
+        k: OSCCoefficients,
+        tool: Tool,
+        parts: Mapping[str, slice],
+        columns: NDArray[np.intp],
+        damping: Float64 | None,
+        friction: tuple[Float64, Float64] | None,
+        timestep: float,
+        reading: tuple[Float64, Float64, Float64],
+    ) -> None:
+        qpos, qvel, bias = reading
+        rows, native = len(qpos), native_rows.in_use()
+        assert native is not None
+        self._parts, self._columns = {"setpoint": slice(0, 7), **parts}, columns
+        self._given = {name: np.zeros((rows, part.stop - part.start)) for name, part in self._parts.items()}
+        self._posture = np.zeros_like(qpos)
+        self.state = {"posture": np.zeros_like(qpos)}
+        if k.ki_dt is not None:
+            self.state["integral"] = np.zeros((rows, 6))
+        self.effort, self.limited = np.zeros((2, *qpos.shape))
+        fixed, chain = _of_tree(native, tool.tree, tool.link, tool.point, rows, k)
+        integral = self.state.get("integral")
+        known: Document = dict(zip(k._fields[:-2], k[:-2], strict=True)) | self._given
+        known |= {"qpos": qpos, "qvel": qvel, "bias": bias, "chain": chain, "posture": self._posture}
+        known |= {"integral": integral, "next_integral": integral, "effort": self.effort, "limited": self.limited}
+        if damping is not None:
+            known |= {"damping": damping, "added_inertia": timestep * damping}
+        rubbing = [None, None, None]
+        if friction is not None:  # damping is part of this friction, and not an input of the law
+            rubbing = [known.pop("damping", None), *friction]
+        self._kept, self.address = native.bind(*fixed, *map(known.get, LAW), *rubbing)
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Copy a state."""
+        for name, array in self.state.items():
+            array[...] = state[name]
+
+    def load(self, setpoint: Float64) -> None:
+        """Copy the setpoints of a tick (envs, size); joints without a column in them keep the state's posture."""
+        for name, part in self._parts.items():
+            self._given[name][...] = setpoint[:, part]
+        self._posture[...] = np.where(self._columns > 0, setpoint[:, self._columns], self.state["posture"])

@@ -20,12 +20,12 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.command import POSE_UNITS, CommandSpec
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
-from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.loop_stability import StabilityWarning
+from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.tool_space.bound_osc import BoundOSC
 from batchpid.task_space import native_law, native_rows
 from batchpid.task_space.frames import pose_error
+from batchpid.task_space.native_law import BoundOSC
 from batchpid.task_space.osc_params import AXES, NoDecoupling
 from batchpid.task_space.symmetric import gram, solve
 
@@ -228,9 +228,8 @@ class OperationalSpace:
         """Return this controller as a native call on these arrays (envs, dof); None where it must run in Python."""
         if not self.is_native or native_rows.in_use() is None:
             return None
-        tool = self.tree, self.link, self.point
         given = self._parts, self._columns, self._damping, self._friction, self._timestep
-        return BoundOSC(self._k, tool, *given, (qpos, qvel, passive))
+        return BoundOSC(self._k, ts.Tool(self.tree, self.link, self.point), *given, (qpos, qvel, passive))
 
     def _coefficients(self, setpoint: Array) -> ts.OSCCoefficients:
         """Return the coefficients of the law for setpoints (envs, size)."""

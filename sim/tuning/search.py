@@ -37,7 +37,7 @@ from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
-from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
 from batchpid.sim.tuning.candidates import HEADROOM, Candidates

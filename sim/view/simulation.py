@@ -11,10 +11,11 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import batchpid as bp
 import batchpid.task_space as ts
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import array, choice, integer, number
 from batchpid.errors import InvalidArgumentError
@@ -27,8 +28,6 @@ from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.view.gains import GroupGains, offered_gains
 from batchpid.sim.view.layout import MAX_ROBOTS
 from batchpid.sim.view.playback import HISTORY_SECONDS
-
-Float64 = NDArray[np.float64]
 
 CONTROLS = ("pid", "drive", "osc")
 MAX_DISTANCE = 10.0

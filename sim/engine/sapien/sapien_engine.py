@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 from batchpid.sim.engine.native.library import obstacle
+from batchpid.sim.engine.physics import PHYSICS, Physics
 from batchpid.sim.engine.protocol import Capability, Engine
-from batchpid.sim.engine.sapien.built_tree import scene_tree
+from batchpid.sim.engine.sapien.building import scene_tree
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.sapien.physics import PHYSICS, Physics
 from batchpid.sim.engine.sapien.variation import VariedPack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 

@@ -12,20 +12,15 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 from sapien import Pose, physx
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.motors.friction import Friction
-from batchpid.sim.engine.joint_friction import own_friction
 from batchpid.sim.engine.native_model import NativeModel
-from batchpid.sim.engine.sapien.building import RESTITUTION, new_system, set_inertia
-from batchpid.sim.engine.sapien.built_tree import scene_tree
+from batchpid.sim.engine.sapien.building import RESTITUTION, new_system, scene_tree, set_inertia
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation, varied_inertia
-from batchpid.sim.robot.simulated_links import varied_bodies
-from batchpid.task_space.spatial_inertia import spatial_matrix, total
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation, VariedMasses, own_friction
 
 
 class VariedPack(Pack):
@@ -44,13 +39,7 @@ class VariedPack(Pack):
         links: Sequence[str],
     ) -> None:
         self._variation = variation
-        varies_links = variation.link_mass is not None or variation.center_of_mass is not None
-        varies_mass = varies_links or variation.payload is not None
-        self._bodies = (
-            varied_bodies(spec.urdf, spec.merge_fixed, carrier, links if varies_links else []) if varies_mass else {}
-        )
-        self._models = {name: total([part.inertia for part in body.parts]) for name, body in self._bodies.items()}
-        self._added = {name: np.zeros((size, 6, 6)) for name in self._bodies}  # spatial inertias, to the models'
+        self._masses = VariedMasses(spec, size, variation, carrier, links)
         self._shapes: dict[int, list[Any]] = {}
         self._frames: list[tuple[Pose, Pose] | None] = []
         super().__init__(spec, size, first_env)
@@ -64,17 +53,18 @@ class VariedPack(Pack):
                 mine[rows] = new
         if self._variation.gravity is not None:  # a system keeps its gravity
             self._rebuild(rows)
-        for row in rows:
-            self._change_masses(self.robots[row], row)
-            self._change_friction(row)
-        if self._bodies and "_joint_model" in self.__dict__:
-            self._joint_model.vary(rows, self.size, self._added)
+        else:
+            for row in rows:
+                self._change_masses(self.robots[row], row)
+                self._change_friction(row)
+        if self._masses.added and "_joint_model" in self.__dict__:
+            self._joint_model.vary(rows, self.size, self._masses.added)
 
     @cached_property
     def _joint_model(self) -> NativeModel:
         model = super()._joint_model
-        if self._bodies:
-            model.vary(range(len(self.qf)), len(self.qf), self._added)
+        if self._masses.added:
+            model.vary(range(len(self.qf)), len(self.qf), self._masses.added)
         return model
 
     def _system(self, row: int) -> Any:
@@ -102,13 +92,12 @@ class VariedPack(Pack):
                 shape.set_physical_material(material)
 
     def _change_masses(self, robot: Any, row: int) -> None:
-        if not self._bodies:
+        if not self._masses.added:
             return
+        inertias = self._masses.of_robot(row)
         for link in robot.links:
-            if (body := self._bodies.get(name := link.name)) is not None:
-                inertia = varied_inertia(body, self._variation, row)
-                set_inertia(link, inertia)
-                self._added[name][row] = spatial_matrix(inertia) - spatial_matrix(self._models[name])
+            if link.name in inertias:
+                set_inertia(link, inertias[link.name])
         for joint, frames in zip(robot.joints, self._frames, strict=True):
             if frames is not None:
                 joint.set_pose_in_parent(frames[0])
@@ -119,10 +108,10 @@ class VariedPack(Pack):
         return own_friction(self.spec, self._variation)
 
     def _joint_mass_matrix(self, qpos: Rows) -> Float64:
-        tree = scene_tree(self.spec)
-        return ts.mass_matrix(tree, qpos, tree.varied(self._added) if self._added else None)
+        tree, added = scene_tree(self.spec), self._masses.added
+        return ts.mass_matrix(tree, qpos, tree.varied(added) if added else None)
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether compiled steps read the force of the model: not where a mass differs from it."""
-        own = not self._bodies and self._variation.gravity is None
+        own = not self._masses.added and self._variation.gravity is None
         return own and super().steps_read_force(gravity, coriolis)

@@ -7,10 +7,10 @@ from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
+from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec, Variation
 from batchpid.sim.engine.sapien.building import parse
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.engine.sapien.variation import VariedPack
 
 BOX = '<collision><origin xyz="0.1 0 0" rpy="0.3 0 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
