@@ -13,7 +13,6 @@
 #include "batchpid/native/mobility.h"
 #include "batchpid/native/tables.h"
 #include "batchpid/native/tool.h"
-#include "batchpid/native/tool_dynamics.h"
 
 namespace batchpid {
 

@@ -136,10 +136,9 @@ class PoseSearch {
 
   // Add half the acceleration along the step to the moves of free joints.
   void accelerate(Vector<Lanes> const &place) {
-    double const still[3] = {0.0, 0.0, 0.0};
     Lanes rate[AXES], moved{}, changed{};
     for (std::size_t j = 0; j < joints_.size(); ++j) angle_[j] = multiplier_[j] * move_[of_[j]];
-    move_bodies(static_cast<std::int64_t>(joints_.size()), chain_.data(), bodies_.data(), angle_.data(), still,
+    move_bodies(static_cast<std::int64_t>(joints_.size()), chain_.data(), bodies_.data(), angle_.data(), {},
                 motions_.data());
     write_rate(motions_.back(), place, rate);
     solve(rate);

@@ -39,19 +39,12 @@ MOVE = (
 DECOUPLING = ("full", "partial", "none")
 """Kinds of decoupling, as Decoupling in task_space.cpp."""
 
-BUFFER, CALL, COUPLING, LANES, RIGID_BODY = (
-    f"batchpid/native/{name}.h" for name in ("buffer", "call", "coupling", "lanes", "rigid_body")
-)
-TABLES = "batchpid/native/task_space_extension.py"
-_HEADERS = tuple(
-    f"batchpid/native/{name}.h"
-    for name in ("extension", "mobility", "osc_friction", "osc_law", "pose_search", "tables", "tool", "tool_dynamics")
-)
-
+RIGID_BODIES = ("batchpid/native/lanes.h", "batchpid/native/rigid_body.h", "batchpid/native/task_space_extension.py")
+_NAMES = ("task_space.cpp", "extension.h", "mobility.h", "osc_law.h", "pose_search.h", "tables.h", "tool.h")
 
 TASK_SPACE = Extension(
     "batchpid.native._task_space",
-    ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, CALL, COUPLING, LANES, RIGID_BODY, TABLES),
+    (*(f"batchpid/native/{name}" for name in _NAMES), *RIGID_BODIES),
     (*ROUNDED, *LANES_ONLY),
 )
 EXTENSIONS = {"_task_space": TASK_SPACE}

@@ -46,11 +46,11 @@ def law(
     rows, dof = inputs.qpos.shape
     wanted = wanted if state.integral is None else (*wanted, "integral")
     results = [np.empty((rows, size or dof)) if name in wanted else None for name, size in _RESULTS.items()]
-    if tool is None:
-        native_rows.call(native.law, rows, dof, *_kind(k), *given, *arrays, *results)
-    else:
-        fixed, chain = _of_tree(native, tool.tree, tool.link, given[0], rows, k)
-        native_rows.call(native.step, *fixed, *[None] * 5, chain, *arrays, *results)
+    fixed: tuple[Any, ...] = (*_kind(k), None, -1, None)
+    if tool is not None:
+        fixed, chain = _of_tree(native, tool.tree, tool.link, given[0], k)
+        given = (*[None] * 5, chain)
+    native_rows.call(native.law, rows, dof, *fixed, *given, *arrays, *results)
     effort, integral, _, *parts, s1, s2, near = results
     shares = [None if each is None else each[:, 0] for each in (s1, s2)]
     terms = OSCTerms._make((*parts, effort, *shares, None if near is None else near[:, 0] > 0))
@@ -71,12 +71,12 @@ def friction(arrays: Mapping[str, Any]) -> Float64 | None:
 
 
 def _of_tree(
-    native: Any, tree: RigidTree, link: str, point: Array, rows: int, k: OSCCoefficients
+    native: Any, tree: RigidTree, link: str, point: Array, k: OSCCoefficients
 ) -> tuple[tuple[Any, ...], Float64]:
-    """Return the arguments of ``step`` and ``bind`` before the arrays of the law, and the chain to the tool (dof,)."""
+    """Return the arguments of ``law`` and ``bind`` between sizes and arrays, and the chain to the tool (dof,)."""
     own, index = native_rows.native_tree(native, tree), tree.index(link)
     body = tree.link_bodies[index]
-    fixed = own.tree, body, rows, native_rows.tool(own, index, point), *_kind(k)
+    fixed = *_kind(k), own.tree, body, native_rows.tool(own, index, point)
     return fixed, np.array(tree.chains[body], np.float64)
 
 
@@ -113,7 +113,7 @@ class BoundOSC:
         reading: tuple[Float64, Float64, Float64],
     ) -> None:
         qpos, qvel, bias = reading
-        rows, native = len(qpos), native_rows.in_use()
+        (rows, dof), native = qpos.shape, native_rows.in_use()
         assert native is not None
         self._parts, self._columns = {"setpoint": slice(0, 7), **parts}, columns
         self._given = {name: np.zeros((rows, part.stop - part.start)) for name, part in self._parts.items()}
@@ -122,17 +122,17 @@ class BoundOSC:
         if k.ki_dt is not None:
             self.state["integral"] = np.zeros((rows, 6))
         self.effort, self.limited = np.zeros((2, *qpos.shape))
-        fixed, chain = _of_tree(native, tool.tree, tool.link, tool.point, rows, k)
+        fixed, chain = _of_tree(native, tool.tree, tool.link, tool.point, k)
         integral = self.state.get("integral")
         known: Document = dict(zip(k._fields[:-2], k[:-2], strict=True)) | self._given
         known |= {"qpos": qpos, "qvel": qvel, "bias": bias, "chain": chain, "posture": self._posture}
         known |= {"integral": integral, "next_integral": integral, "effort": self.effort, "limited": self.limited}
         if damping is not None:
             known |= {"damping": damping, "added_inertia": timestep * damping}
-        rubbing = [None, None, None]
+        rubbing: list[Float64 | None] = [None, None, None]
         if friction is not None:  # damping is part of this friction, and not an input of the law
             rubbing = [known.pop("damping", None), *friction]
-        self._kept, self.address = native.bind(*fixed, *map(known.get, LAW), *rubbing)
+        self._kept, self.address = native.bind(rows, dof, *fixed, *map(known.get, LAW), *rubbing)
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Copy a state."""
