@@ -159,7 +159,7 @@ class Coupling(NamedTuple):
     def mass_matrix(self, matrix: Array) -> Array:
         """Return G^T M G for M (..., joints, joints) in the rows and columns of the independent joints.
 
-        Rows and columns of followers are rows and columns of the identity. ``fold`` in rigid_body.h is the same function.
+        Rows and columns of followers are rows and columns of the identity. ``fold`` in rigid_body.h is the same.
         """
         xp = namespace(matrix)
         rows = xp.swapaxes(self.efforts(xp.swapaxes(matrix, -1, -2)), -1, -2)

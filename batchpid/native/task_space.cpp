@@ -94,34 +94,26 @@ std::int64_t law_columns(int array, std::int64_t dof) {
   return std::count(std::begin(SIX), std::end(SIX), array) ? AXES : dof;
 }
 
-// Arrays of `friction` that are constants of the robot, and then in `bind`.
-constexpr int JOINTS[] = {VISCOUS, COULOMB, BAND};
-
-// Friction of some robots from its arrays; the others of Friction are those of a law.
+// Friction of some robots, from damping, Coulomb friction and band of their joints; the damping may be left out.
 class JointFriction {
  public:
-  JointFriction(Tables const &table, std::int64_t dof) : out(static_cast<std::size_t>(dof)) {
-    for (int i = 0; i < 3; ++i) {
-      if (!table[i]) continue;
-      columns_[i].resize(static_cast<std::size_t>(dof));
-      table[i].load(0, columns_[i].data());
-      of[JOINTS[i]] = columns_[i].data();
-    }
+  JointFriction(Tables const &table, std::int64_t dof) : out(static_cast<std::size_t>(dof)), table_(table), dof_(dof) {
+    for (auto &each : columns_) each.resize(out.size());
   }
-  // Write the friction at the state of a law with this dynamics.
-  void write(OSCLaw const &law, std::int64_t dof) {
-    constexpr std::pair<Friction, Law> SAME[] = {{AT_POSE, TASK_POSE},   {AT_JACOBIAN, TASK_JACOBIAN},
-                                                 {ON_CHAIN, CHAIN},      {GOAL_POSE, SETPOINT},
-                                                 {GOAL_TWIST, TWIST},    {OTHERS_GOAL, POSTURE},
-                                                 {AT_QPOS, LAW_QPOS},    {AT_QVEL, LAW_QVEL}};
-    for (auto const &[mine, its] : SAME) of[mine] = law.given()[its];
-    write_friction(dof, of, out.data());
+  // Write the friction of the rows from `first` on, which a law has loaded.
+  void write(std::int64_t first, Given const &at) {
+    auto &[viscous, coulomb, band] = columns_;
+    for (int i = 0; i < 3; ++i) {
+      if (table_[i]) table_[i].load(first, columns_[i].data());
+    }
+    write_friction(dof_, at, table_[0] ? viscous.data() : nullptr, coulomb.data(), band.data(), out.data());
   }
 
   std::vector<Lanes> out;
 
  private:
-  Lanes const *of[FRICTION] = {};
+  Tables const &table_;
+  std::int64_t dof_;
   std::vector<Lanes> columns_[3];
 };
 
@@ -149,9 +141,9 @@ struct Step : Call {
     }
     return true;
   }
-  // Arguments: those of `open`, and damping, Coulomb friction and band of the joints, one row each.
+  // Arguments: those of `open`, and damping, Coulomb friction and band of the joints.
   bool open_with_friction(PyObject *const *arguments) {
-    return open(arguments) && friction.open_all(arguments + 7 + LAW, {dof, dof, dof}, 1, 3);
+    return open(arguments) && friction.open_all(arguments + 7 + LAW, {dof, dof, dof}, rows, 3);
   }
 };
 
@@ -181,14 +173,9 @@ FOR_EACH_PROCESSOR void write_step(Step const &step, StepRoom &room) {
       if (!step.law[TASK_BIAS]) dynamics.set_bias();
       dynamics.set_mass();
     }
-    if (step.friction[1]) friction.write(law, step.dof);
+    if (step.friction[1]) friction.write(first, law.given());
     law.advance(first);
   }
-}
-
-void write_step(Step const &step) {
-  StepRoom room(step);
-  write_step(step, room);
 }
 
 // Step on arrays that stay, with its room.
@@ -206,29 +193,20 @@ void write_bound_step(Call const &call) {
 PyObject *law(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Step once;
   if (!once.open(arguments)) return nullptr;
-  write_step(once);
+  StepRoom room(once);
+  write_step(once, room);
   Py_RETURN_NONE;
 }
 
-// friction(rows, dof, *arrays of Friction)
+// friction(*arguments of Step::open_with_friction): write the friction, instead of the effort.
 PyObject *friction(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  std::int64_t const rows = PyLong_AsLong(arguments[0]), dof = PyLong_AsLong(arguments[1]);
-  if (PyErr_Occurred()) return nullptr;
-  Tables table;
-  std::int64_t const sizes[FRICTION] = {POSE, AXES * dof, dof, POSE, AXES, dof, dof, dof, dof, dof, dof, dof};
-  if (!table.open_all(arguments + 2, sizes, rows, RUBBING)) return nullptr;
-  std::vector<Lanes> columns[FRICTION];
-  Lanes const *of[FRICTION] = {};
-  for (int i = 0; i < FRICTION; ++i) {
-    columns[i].resize(static_cast<std::size_t>(sizes[i]));
-    if (table[i]) of[i] = columns[i].data();
-  }
-  for (std::int64_t first = 0; first < rows; first += WIDTH) {
-    for (int i = 0; i < RUBBING; ++i) {
-      if (table[i]) table[i].load(first, columns[i].data());
-    }
-    write_friction(dof, of, columns[RUBBING].data());
-    table[RUBBING].store(first, columns[RUBBING].data());
+  Step once;
+  if (!once.open_with_friction(arguments)) return nullptr;
+  StepRoom room(once);
+  for (std::int64_t first = 0; first < once.rows; first += WIDTH) {
+    room.law.load(first);
+    room.friction.write(first, room.law.given());
+    once.law[EFFORT].store(first, room.friction.out.data());
   }
   Py_RETURN_NONE;
 }
@@ -266,10 +244,8 @@ FOR_EACH_PROCESSOR void write_move(std::int64_t rows, std::int64_t joints, doubl
   std::vector<Lanes> columns[MOVE], room(n * n), free(n), weight(n), next(n);
   for (int i = 0; i < MOVE; ++i) columns[i].resize(i == INERTIA ? n * n : n);
   std::vector<Lanes> &inverse = columns[INERTIA];
-  auto const along = [&](std::int64_t j, std::vector<Lanes> const &effort) {
-    Lanes sum{};
-    for (std::int64_t k = 0; k < joints; ++k) sum += inverse[j * joints + k] * effort[k];
-    return dt * sum;
+  auto const moved = [&](std::int64_t j, std::vector<Lanes> const &effort) {
+    return dt * along(&inverse[j * joints], effort.data(), joints);
   };
   auto &[q, v, f, matrix, push, added, limit, keep, creep, low, high] = columns;
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
@@ -277,18 +253,18 @@ FOR_EACH_PROCESSOR void write_move(std::int64_t rows, std::int64_t joints, doubl
     for (std::int64_t j = 0; j < joints; ++j) matrix[j * joints + j] += added[j];
     invert(joints, inverse.data(), room.data());
     for (std::int64_t j = 0; j < joints; ++j) {
-      free[j] = v[j] + along(j, push);
+      free[j] = v[j] + moved(j, push);
       weight[j] = 1.0 / (dt * inverse[j * joints + j] + creep[j]);
     }
     for (long sweep = 0; sweep < sweeps; ++sweep) {
       for (std::int64_t j = 0; j < joints; ++j) {
-        next[j] = f[j] + weight[j] * (free[j] - along(j, f) - keep[0] * v[j] - creep[j] * f[j]);
+        next[j] = f[j] + weight[j] * (free[j] - moved(j, f) - keep[0] * v[j] - creep[j] * f[j]);
         next[j] = at_most(at_least(next[j], -limit[j]), limit[j]);
       }
       std::swap(f, next);
     }
     for (std::int64_t j = 0; j < joints; ++j) {
-      v[j] = free[j] - along(j, f);
+      v[j] = free[j] - moved(j, f);
       Lanes const end = q[j] + dt * v[j];
       v[j] = zero_outside(v[j], low[j], end, high[j]);
       q[j] = at_most(at_least(end, low[j]), high[j]);

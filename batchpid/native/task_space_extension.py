@@ -24,11 +24,6 @@ LAW = (
     *("task_share", "posture_share", "near_singular"),
 )
 """Arrays of ``law``: dynamics, inputs and state, coefficients, and results from the effort on."""
-FRICTION = (
-    *("pose", "jacobian", "chain", "setpoint", "twist", "posture", "qpos", "qvel"),
-    *("damping", "coulomb", "band", "feedforward"),
-)
-"""Arrays of ``friction``; the last is the result."""
 SEARCH = ("goal", "tool", "lower", "upper", "tolerances", "qpos", "errors", "steps")
 """Arrays of ``search`` in pose_search.h; those after the tolerances are results. ``qpos`` holds the starts first."""
 MOVE = (

@@ -1,5 +1,5 @@
-// A kinematic tree with a tool, a frame on one of its bodies: its pose, the dynamics at it, and the friction on its way.
-// The equations stand in batchpid/task_space: tree_kinematics.py, tree_dynamics.py and frames.py.
+// A kinematic tree with a tool, a frame on one of its bodies: its pose, and the dynamics at it. The equations stand in
+// batchpid/task_space: tree_kinematics.py, tree_dynamics.py and frames.py.
 
 #pragma once
 
@@ -196,40 +196,5 @@ class ToolDynamics {
   std::vector<BodyState<Lanes>> bodies_;
   std::vector<BodyMotion<Lanes>> motions_;
 };
-
-// Arrays of `friction`: FRICTION in task_space_extension.py.
-enum Friction {
-  AT_POSE, AT_JACOBIAN, ON_CHAIN, GOAL_POSE, GOAL_TWIST, OTHERS_GOAL, AT_QPOS, AT_QVEL,
-  VISCOUS, COULOMB, BAND, RUBBING,
-  FRICTION
-};
-
-// Write the efforts of damping and Coulomb friction (dof,) on the way of a tool to its setpoint, from columns by their
-// names in Friction: sim/tool_space/osc_controller.py. Without a twist the setpoint rests; without a viscous damping that
-// part is left out.
-inline void write_friction(std::int64_t dof, Lanes const *const (&of)[FRICTION], Lanes *out) {
-  constexpr double LOOKAHEAD = 0.1;  // of batchpid/motors/friction.py
-  Lanes const *jacobian = of[AT_JACOBIAN], *chain = of[ON_CHAIN];
-  Lanes ahead[AXES], mobility[AXES * AXES];
-  write_error(of[GOAL_POSE], of[AT_POSE], ahead);
-  for (int a = 0; a < AXES; ++a) {
-    if (of[GOAL_TWIST] != nullptr) ahead[a] += LOOKAHEAD * of[GOAL_TWIST][a];
-    for (int b = 0; b <= a; ++b) {
-      Lanes sum{};
-      for (std::int64_t j = 0; j < dof; ++j) sum += jacobian[a * dof + j] * jacobian[b * dof + j];
-      mobility[a * AXES + b] = mobility[b * AXES + a] = sum;
-    }
-    mobility[a * AXES + a] += 1e-4;
-  }
-  factorize(AXES, mobility);
-  solve_both<1>(AXES, mobility, ahead);
-  for (std::int64_t j = 0; j < dof; ++j) {
-    Lanes moved{};
-    for (int axis = 0; axis < AXES; ++axis) moved += jacobian[axis * dof + j] * ahead[axis];
-    Lanes const way = chain[j] * moved + (1.0 - chain[j]) * (of[OTHERS_GOAL][j] - of[AT_QPOS][j]);
-    out[j] = at_most(at_least(way * (of[COULOMB][j] / of[BAND][j]), -of[COULOMB][j]), of[COULOMB][j]);
-    if (of[VISCOUS] != nullptr) out[j] = of[VISCOUS][j] * of[AT_QVEL][j] + out[j];
-  }
-}
 
 }  // namespace batchpid

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Document, Float64
-from batchpid.native.task_space_extension import DECOUPLING, FRICTION, LAW
+from batchpid.native.task_space_extension import DECOUPLING, LAW
 from batchpid.task_space import native_rows
 from batchpid.task_space.osc_coefficients import OSCCoefficients
 from batchpid.task_space.osc_params import NoDecoupling, PartialDecoupling
@@ -25,6 +25,8 @@ _RESULTS = {
     **{"task_share": 1, "posture_share": 1, "near_singular": 1},
 }
 """Terms and state in the order of the results in LAW, and their columns; 0 for one per joint."""
+_WITHOUT_TREE = None, -1, None
+"""Tree, body and tool of a law whose dynamics are among its arrays."""
 
 
 def law(
@@ -46,7 +48,7 @@ def law(
     rows, dof = inputs.qpos.shape
     wanted = wanted if state.integral is None else (*wanted, "integral")
     results = [np.empty((rows, size or dof)) if name in wanted else None for name, size in _RESULTS.items()]
-    fixed: tuple[Any, ...] = (*_kind(k), None, -1, None)
+    fixed: tuple[Any, ...] = (*_kind(k), *_WITHOUT_TREE)
     if tool is not None:
         fixed, chain = _of_tree(native, tool.tree, tool.link, given[0], k)
         given = (*[None] * 5, chain)
@@ -57,16 +59,17 @@ def law(
     return (state if integral is None else state._replace(integral=integral)), terms
 
 
-def friction(arrays: Mapping[str, Any]) -> Float64 | None:
-    """Return the friction (envs, dof) on the way to a setpoint, from arrays by their names in FRICTION.
+def friction(arrays: Mapping[str, Any], coulomb: Array, band: Array) -> Float64 | None:
+    """Return the friction (envs, dof) on the way to a setpoint, from arrays by their names in LAW.
 
-    The result is None where native code is not used. With ``damping`` the efforts of damping are included.
+    The result is None where native code is not used.
     """
     qpos = arrays["qpos"]
-    if (native := native_rows.for_rows(qpos, *arrays.values())) is None:
+    if (native := native_rows.for_rows(qpos, *arrays.values(), coulomb, band)) is None:
         return None
     found = np.empty(qpos.shape)
-    native_rows.call(native.friction, *qpos.shape, *({**arrays, "feedforward": found}.get(name) for name in FRICTION))
+    given = map({**arrays, "effort": found}.get, LAW)
+    native_rows.call(native.friction, *qpos.shape, 0, False, *_WITHOUT_TREE, *given, None, coulomb, band)
     return found
 
 

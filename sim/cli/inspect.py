@@ -15,7 +15,7 @@ from batchpid.sim import Finding, Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, write_figures
 from batchpid.sim.robot.findings import summary
-from batchpid.sim.robot.inertia import DENSITY
+from batchpid.sim.robot.link_repair import DENSITY
 from batchpid.sim.robot.parts import HEADERS, joint_rows
 from batchpid.sim.tuning.gain_sets import gain_set
 

@@ -76,7 +76,7 @@ class Link:
     """Link of a URDF: its mass [kg] (None without ``<inertial>``) and number of collision shapes.
 
     ``inertial`` is True if SAPIEN takes mass and inertia from the URDF. ``triangle_excess`` is positive if no body has
-    that inertia tensor: see :func:`batchpid.sim.robot.inertia.triangle_excess`.
+    that inertia tensor: see :func:`batchpid.sim.robot.link_repair.triangle_excess`.
     """
 
     name: str

@@ -15,7 +15,7 @@ the error is at most (d w - L) / kp. (This is also so for MuJoCo's own servos wi
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,16 +164,6 @@ _PROGRESS = 0.1
 """Largest share of the distance at these velocities that a chattering joint moves."""
 
 
-class _Window(NamedTuple):
-    """State of every joint since it began to look like chatter, (envs, dof)."""
-
-    start: Float64
-    """Position at the beginning [rad or m]."""
-    distance: Float64
-    """Distance that the joint would have moved at the magnitudes of its velocities [rad or m]."""
-    ticks: NDArray[np.int64]
-
-
 class DriveChatterCheck:
     """Check of the ticks under control "drive" for joints that chatter. It warns once.
 
@@ -186,14 +176,16 @@ class DriveChatterCheck:
     def __init__(self, robot: RobotDescription, timestep: float) -> None:
         self._robot, self._timestep = robot, timestep
         self._speed: Float64 | None = None
-        self._window: _Window | None = None
+        self._seen: tuple[Float64, Float64, NDArray[np.int64]] | None = None
+        """Of every joint since it began to look like chatter (envs, dof): its position at the beginning [rad or m], the
+        distance that it would have moved at the magnitudes of its velocities, and ticks."""
         self.found: tuple[int, int] | None = None
         """Env and joint that chatters."""
         self._has_warned = False
 
     def set_gains(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
         """Find the joints that can chatter with these gains, effort limits and armature."""
-        self._speed = self._window = None
+        self._speed = self._seen = None
         kp, kd = (np.zeros((1, self._robot.dof)) if leaf is None else leaf for leaf in (params.kp, params.kd))
         armature = None if actuators is None else actuators.armature
         least = 0.0 if armature is None else armature.min(0)
@@ -222,18 +214,14 @@ class DriveChatterCheck:
             self._advance(qpos, speed * seconds, alike & observation.ok[tick][:, None], seconds)
 
     def _advance(self, qpos: Float64, distance: Float64, alike: Bool, seconds: float) -> None:
-        window = self._window
-        if window is None:
-            window = _Window(qpos, np.zeros_like(qpos), np.zeros(qpos.shape, int))
-        moved, covered, ticks = np.abs(qpos - window.start), window.distance + distance, window.ticks + 1
-        chatters = alike & ((moved < _PROGRESS * covered) | (ticks < TICKS))
+        start, covered, ticks = self._seen or (qpos, np.zeros_like(qpos), np.zeros(qpos.shape, int))
+        covered, ticks = covered + distance, ticks + 1
+        chatters = alike & ((np.abs(qpos - start) < _PROGRESS * covered) | (ticks < TICKS))
         long = chatters & (ticks >= TICKS) & (ticks * seconds >= DURATION)
         if self.found is None and long.any():
             env, joint = np.argwhere(long)[0]
             self.found = int(env), int(joint)
-        self._window = _Window(
-            np.where(chatters, window.start, qpos), np.where(chatters, covered, 0.0), np.where(chatters, ticks, 0)
-        )
+        self._seen = np.where(chatters, start, qpos), np.where(chatters, covered, 0.0), np.where(chatters, ticks, 0)
 
     def warn(self) -> None:
         """Warn, once, if a joint was found to chatter."""

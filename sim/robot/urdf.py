@@ -27,9 +27,8 @@ from functools import cache
 from batchpid.arrays.array_types import Document
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import refuse
-from batchpid.sim.robot.inertia import from_entries, triangle_excess
 from batchpid.sim.robot.joint_repair import ends_of
-from batchpid.sim.robot.link_repair import MOMENTS
+from batchpid.sim.robot.link_repair import MOMENTS, from_entries, triangle_excess
 from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
 from batchpid.sim.robot.parts import Joint, Link, Mimic, Urdf
 from batchpid.sim.robot.repair import repair

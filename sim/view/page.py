@@ -97,7 +97,7 @@ class View(SingleOwner, AbstractContextManager["View"]):
         count = 0
         with ThreadPoolExecutor(1) as executor:
             while not self._stopped and (seconds is None or time.monotonic() - began < seconds):
-                panel.run_requests()
+                panel.requests.run()
                 frame = data.frame()
                 # The workers compute the next frame while this one is sent.
                 job = executor.submit(data.advance) if panel.frames_left > 0 else None

@@ -293,7 +293,7 @@ class Pack(SingleOwner):
             self._sensors.place(rows)
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
-        """Raise TypeError: the robots of this pack equal the model; see :mod:`batchpid.sim.engine.sapien.variation`."""
+        """Raise TypeError: the robots of this pack equal the model; see :class:`.sapien_engine.VariedPack`."""
         raise TypeError("the robots of this pack do not vary; make it with a variation")
 
     def state_sizes(self) -> list[int]:

@@ -25,8 +25,7 @@ from batchpid.sim.engine.protocol import (
 )
 from batchpid.sim.engine.sapien.calls import SapienStep
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.sapien.sapien_engine import SapienEngine
-from batchpid.sim.engine.sapien.variation import VariedPack
+from batchpid.sim.engine.sapien.sapien_engine import SapienEngine, VariedPack
 from batchpid.sim.loop.backend import describe
 
 PANDA = load_bundled("panda")
