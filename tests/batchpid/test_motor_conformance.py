@@ -17,7 +17,7 @@ from batchpid import motors
 from batchpid.motors import friction, guard
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
-from batchpid.native.compiled_stages import compiled_stages
+from batchpid.native.compiled import compiled_stages
 from batchpid.native.tracing import trace
 
 DT, STEPS, ENVS, JOINTS = 1 / 500, 40, 5, 3
