@@ -8,11 +8,9 @@ import pytest
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Observation, Rollout, Runner
 from batchpid.sim.view import LiveSimulation, Playback
-from batchpid.sim.view.charts import Charts
-from batchpid.sim.view.controls import MAX_REQUESTS, Requests
-from batchpid.sim.view.data import cause
 from batchpid.sim.view.gains import GroupGains, offered_gains
-from batchpid.sim.view.panel import short_names
+from batchpid.sim.view.page import Charts
+from batchpid.sim.view.panel import MAX_REQUESTS, Requests, cause, short_names
 
 BELOW = np.array([0, 1.7, 0, -1.2, 0, 1.5, 0, 0.02, 0.02])
 
