@@ -11,9 +11,9 @@ from identical import assert_identical
 from robots import load_bundled
 
 import batchpid as bp
+import batchpid.sim.engine.protocol as engines
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Runner, RunnerOptions
-from batchpid.sim.engine import engines
 from batchpid.sim.engine.protocol import (
     CompiledPack,
     CompiledStep,
