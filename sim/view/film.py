@@ -24,7 +24,7 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.view import renderer
 from batchpid.sim.view.layout import FIELD_OF_VIEW, MAX_ROBOTS
 from batchpid.sim.view.painter import PaintedScene
-from batchpid.sim.view.playback import had_ground, rows_at
+from batchpid.sim.view.playback import Playback, rows_at
 from batchpid.sim.view.renderer import RenderError, RenderScene, check_renderer
 
 FORMATS = (".mp4", ".gif")
@@ -64,7 +64,7 @@ def write_film(
     Raises
     ------
     InvalidArgumentError, RobotNotFoundError
-        An argument is out of range, or the robot of the run is not bundled.
+        An argument is out of range, the run has another number of joints, or its robot is not bundled.
     MissingDependencyError
         The package imageio-ffmpeg is missing.
     RenderError
@@ -75,8 +75,8 @@ def write_film(
     size = integer("width", width, 16, 8192), integer("height", height, 16, 8192)
     integer("num_envs", rollout.num_envs, 1, MAX_ROBOTS)
     ffmpeg = _ffmpeg()
-    robot, kind = _robot_of(rollout, robot), PaintedScene if renderer.render_problem() else RenderScene
-    scene = kind(robot, rollout.num_envs, had_ground(rollout, robot))
+    recorded, kind = Playback(rollout, robot), PaintedScene if renderer.render_problem() else RenderScene
+    scene = kind(recorded.robot, rollout.num_envs, recorded.ground)
     picture = scene.add_camera(*size)
     rows = film_rows(rollout, rate).tolist()
 
@@ -159,8 +159,8 @@ def show_window(rollout: Rollout, *, robot: Robot | None = None, seconds: float 
     check_renderer()
     from sapien.utils import Viewer
 
-    robot = _robot_of(rollout, robot)
-    scene = RenderScene(robot, rollout.num_envs, had_ground(rollout, robot))
+    recorded = Playback(rollout, robot)
+    scene = RenderScene(recorded.robot, rollout.num_envs, recorded.ground)
     try:
         viewer = Viewer()
     except RuntimeError as error:
@@ -175,7 +175,3 @@ def show_window(rollout: Rollout, *, robot: Robot | None = None, seconds: float 
         scene.place(rollout.qpos[row], None if rollout.base_pose is None else rollout.base_pose[row])
         viewer.render()
     viewer.close()
-
-
-def _robot_of(rollout: Rollout, robot: Robot | None) -> Robot:
-    return Robot.load(rollout.info.robot) if robot is None else robot
