@@ -559,10 +559,15 @@ def _code_digest(value: object) -> str | None:
     return None if value is None or isinstance(value, str) else object_digest(value)
 
 
+def worker_count(workers: Any) -> int:
+    """Return ``workers`` if it is a number of processes; None: one per available core."""
+    return len(os.sched_getaffinity(0)) if workers is None else integer("workers", workers, 0, 1024)
+
+
 def _places(workers: Any, cluster: Any) -> tuple[int | None, Ray | None]:
     """Return the options ``workers`` and ``cluster``, of which a runner has one."""
     if cluster is None:
-        return len(os.sched_getaffinity(0)) if workers is None else integer("workers", workers, 0, 1024), None
+        return worker_count(workers), None
     cluster = instance("cluster", Ray() if cluster == "ray" else cluster, Ray, "pass 'ray' or Ray(...)")
     if workers is not None:
         remedy = "pass cluster=Ray(cpus_per_node=...)"

@@ -146,6 +146,9 @@ def tune(
         The package ``cmaes`` is missing.
     """
     refuse_searched(runner_options, ("params", "discretization"), "leave it out; bp.design_gains makes implicit gains")
+    if motors is not None and runner_options.get("actuators") is not None:
+        remedy = "leave it out; the control knows the actuators of the robot: Robot.load(..., actuators=...)"
+        raise InvalidArgumentError("actuators", "is given with motors", remedy=remedy)
     seed, generations, population, seconds = checked_effort(seed, generations, population, seconds)
     weights = Weights() if weights is None else weights
     final = random_moves(robot, FINAL_MOVES, seed + _FINAL_SEED) if moves is None else None
