@@ -3,7 +3,10 @@
 A pack is M scenes, each with one robot and a PhysX system. PhysX solves the contacts of a system in an order that
 depends on everything in the system, so robots that share one would not move bit-identically to a robot alone.
 
-The loop uses only the members of :class:`batchpid.sim.engine.protocol.EnginePack` and its capabilities.
+The engine takes changed payloads, masses, centers of mass and friction while a robot exists, and then moves
+bit-identically to a robot that was built with them. The loop uses only the members of
+:class:`batchpid.sim.engine.protocol.EnginePack` and its capabilities. Longer than 350 lines because that is the whole
+interface between loop and engine.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sapien import Pose, physx
 
 from batchpid.arrays.array_types import DType, Float32, Float64, Rows
 from batchpid.motors import Actuators
@@ -22,7 +26,15 @@ from batchpid.sim.engine.model_pack import ModelPack
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native.library import obstacle
 from batchpid.sim.engine.robot_model import turned_back
-from batchpid.sim.engine.sapien.building import build_scene, engine_settings, link_frames, new_system, scene_tree
+from batchpid.sim.engine.sapien.building import (
+    RESTITUTION,
+    build_scene,
+    engine_settings,
+    link_frames,
+    new_system,
+    scene_tree,
+    set_inertia,
+)
 from batchpid.sim.engine.sapien.calls import EngineCalls, SapienStep, engine_calls
 from batchpid.sim.engine.sapien.link_sensors import LinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, refuse_shapes, write_root
@@ -61,6 +73,8 @@ class Pack(ModelPack):
         links: Sequence[str] = (),
     ) -> None:
         super().__init__(spec, size, first_env, variation, carrier, links, not obstacle())
+        self._shapes: dict[int, list[Any]] = {}
+        self._frames: list[tuple[Pose, Pose] | None] = []
         self.systems = [self._system(row) for row in range(size)]
         built = [self._build(row, system) for row, system in enumerate(self.systems)]
         # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.
@@ -89,14 +103,23 @@ class Pack(ModelPack):
                 self._constraint.use(self._joint_model, None)
         self._sensors = LinkSensors(spec, self.robots, self.systems) if spec.contacts or spec.wrenches else None
         self._bind()
+        if variation is not None:
+            self.write_joints(None)
 
     def _system(self, row: int) -> Any:
         """Return a new system for ``row``."""
-        return new_system(self.spec)
+        gravity = self._variation.gravity
+        return new_system(self.spec, None if gravity is None else gravity[row])
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
-        """Return a new scene in ``system`` and the robot in it, for ``row``."""
-        return build_scene(self.spec, system)
+        """Return a new scene in ``system`` and the robot in it, for ``row``, with its masses and friction."""
+        scene, robot = build_scene(self.spec, system)
+        self._change_masses(robot, row)
+        if self._variation.ground_friction is not None:
+            owners = *robot.links, *system.rigid_static_components
+            self._shapes[row] = [shape for owner in owners for shape in owner.collision_shapes]
+            self._change_friction(row)
+        return scene, robot
 
     def _bind(self) -> None:
         """Prepare the calls of every sim step, for the present robots and systems."""
@@ -266,8 +289,38 @@ class Pack(ModelPack):
             self._sensors.place(rows)
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
-        """Raise TypeError: the robots of this pack equal the model; see :class:`.sapien_engine.VariedPack`."""
-        raise TypeError("the robots of this pack do not vary; make it with a variation")
+        self._change(rows, variation)
+        if self._variation.gravity is not None:  # a system keeps its gravity
+            self._rebuild(rows)
+        else:
+            for row in rows:
+                self._change_masses(self.robots[row], row)
+                self._change_friction(row)
+        self._change_model(rows)
+
+    def _change_friction(self, row: int) -> None:
+        """Set the friction of the robot's shapes and of the ground."""
+        if (friction := self._variation.ground_friction) is not None:
+            material = physx.PhysxMaterial(friction[row], friction[row], RESTITUTION)
+            for shape in self._shapes[row]:
+                shape.set_physical_material(material)
+
+    def _change_masses(self, robot: Any, row: int) -> None:
+        """Set the masses of a robot. They move the frames of its joints by rounding, so that these are set again."""
+        if not self._masses.added:
+            return
+        if not self._frames:  # of a robot as it is built
+            moves = [joint.parent_link is not None for joint in robot.joints]
+            pairs = zip(robot.joints, moves, strict=True)
+            self._frames = [(joint.pose_in_parent, joint.pose_in_child) if move else None for joint, move in pairs]
+        inertias = self._masses.of_robot(row)
+        for link in robot.links:
+            if link.name in inertias:
+                set_inertia(link, inertias[link.name])
+        for joint, frames in zip(robot.joints, self._frames, strict=True):
+            if frames is not None:
+                joint.set_pose_in_parent(frames[0])
+                joint.set_pose_in_child(frames[1])
 
     def state_sizes(self) -> list[int]:
         """Return the number of values in the state of each scene: of the robot, and of its content."""
