@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.trees import leaves, mapped, structure
 from batchpid.motors import STAGES, MotorCoefficients, Stages
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
 from batchpid.native.operations import OPERATION
 from batchpid.native.tracing import trace_trees
-from batchpid.native.trees import leaves, mapped, structure
 
 LEAST_OPERATIONS = 3
 """Least number of operations for which a call of the extension is faster than NumPy."""

@@ -18,8 +18,8 @@ from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, beside
 from batchpid.sim.cli.progress import bar
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
+from batchpid.sim.tuning.cost import Weights
 from batchpid.sim.tuning.gain_sets import GainSet
-from batchpid.sim.tuning.weights import Weights
 from batchpid.task_space import save_osc_options
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, Rows
 from batchpid.arrays.jax_settings import own_settings
-from batchpid.native.trees import mapped
+from batchpid.arrays.trees import mapped
 from batchpid.sim.engine.native import xla
 from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep
 from batchpid.sim.engine.robot_model import scene_tree

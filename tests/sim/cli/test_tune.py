@@ -15,6 +15,7 @@ from batchpid.sim import Robot
 from batchpid.sim.cli import parse
 from batchpid.sim.identification.confidence_region import KEY, Region
 from batchpid.sim.tuning import Weights, random_moves, tune
+from batchpid.sim.tuning.cost import Trial
 
 pytest.importorskip("cmaes")
 
@@ -129,16 +130,17 @@ def test_the_last_line_is_a_command_that_works(batchpid, tmp_path, monkeypatch):
 def test_the_search_says_by_which_figures_it_rejected_its_candidates(monkeypatch):
     robot = load_bundled("panda")
     monkeypatch.setattr(
-        "batchpid.sim.tuning.candidates.Candidates.costs", lambda self, runner, points: (*points[:, 0] ** 2,)
+        "batchpid.sim.tuning.candidates.Candidates.trial",
+        lambda self, runner, points: Trial((*points[:, 0] ** 2,), None, None),
     )
     found = tune(robot, generations=1, population=4, seconds=0.05, workers=0)  # the designed gains are at 0
     assert found.rejected.startswith("cost in the search: best candidate 0.")
     assert found.rejected.endswith(", designed 0.0000")
 
     def worse_in_the_final(self, runner, points):
-        return (*points[:, 0] ** 2 * (-1 if len(points) == 5 else 1),)
+        return Trial((*points[:, 0] ** 2 * (-1 if len(points) == 5 else 1),), None, None)
 
-    monkeypatch.setattr("batchpid.sim.tuning.candidates.Candidates.costs", worse_in_the_final)
+    monkeypatch.setattr("batchpid.sim.tuning.candidates.Candidates.trial", worse_in_the_final)
     found = tune(robot, generations=1, population=5, seconds=0.05, workers=0, timestep=0.0005)
     assert found.rejected.startswith("cost in the final: best candidate 0.")
     assert found.rejected.endswith(", designed 0.0000")

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from batchpid import make_actuators
 from batchpid.sim import Randomization, Uniform
 from batchpid.sim.tuning import Weights, random_moves
-from batchpid.sim.tuning.candidates import Candidates
-from batchpid.sim.tuning.first_candidates import (
+from batchpid.sim.tuning.candidates import (
     FASTEST,
     PHASE_MARGIN,
+    Candidates,
     first_gains,
     gains_of_poles,
     loop_delay,

@@ -19,7 +19,7 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import RunnerKeywords
 from batchpid.sim.identification.fit import FitStep
-from batchpid.sim.identification.fit_history import History, State
+from batchpid.sim.identification.fit_search import State
 from batchpid.sim.tuning import Weights, random_moves, tool_candidates, tune, tune_tool
 from batchpid.sim.tuning.history import HistoryFile
 
@@ -30,33 +30,38 @@ STATE = State(FitStep(np.array([0.1, 0.2]), 5, np.array([0.0, 0.2]), np.inf), ((
 @pytest.fixture
 def path(tmp_path):
     path = tmp_path / "fit.json"
-    History(path, SETTINGS).write(STATE)
+    HistoryFile(path, "fit", SETTINGS).write(STATE.plain())
     return path
 
 
+def read(path, settings=SETTINGS, unknowns=2, evaluations=25, problems=2):
+    """Return the state of a fit in a file."""
+    history = HistoryFile(path, "fit", settings)
+    return history.state(lambda found: State.of_plain(found, unknowns, evaluations, problems))
+
+
 def test_a_state_is_read_as_it_was_written(path, tmp_path):
-    found = History(path, SETTINGS).state(2, 25, 2)
-    assert repr(found) == repr(STATE)
-    assert History(tmp_path / "other.json", SETTINGS).state(2, 25, 2) is None
-    assert History(None, SETTINGS).state(2, 25, 2) is None
+    assert repr(read(path)) == repr(STATE)
+    assert read(tmp_path / "other.json") is None
+    assert read(None) is None
 
 
 def test_inputs_that_differ_are_named(path):
     other = {**SETTINGS, "seed": 4, "weights": {"itae": 2.0}, "added": None}
     with pytest.raises(InvalidArgumentError, match=r"another fit \(seed, weights differ\)"):
-        History(path, {**SETTINGS, "seed": 4, "weights": {"itae": 2.0}}).state(2, 25, 2)
+        read(path, {**SETTINGS, "seed": 4, "weights": {"itae": 2.0}})
     with pytest.raises(InvalidArgumentError, match=r"added, seed, weights differ"):
-        History(path, other).state(2, 25, 2)
+        read(path, other)
 
 
 def test_a_state_that_fits_no_fit_is_refused(path):
     for unknowns, evaluations, problems in ((3, 25, 2), (2, 4, 2), (2, 25, 0)):
         with pytest.raises(InvalidArgumentError, match="not a history of a fit"):
-            History(path, SETTINGS).state(unknowns, evaluations, problems)
+            read(path, SETTINGS, unknowns, evaluations, problems)
     for state in (7, {}, {"theta": 1}, [], {"theta": [1], "left": 1e999, "last": [1], "cost": 0, "done": 4}):
         HistoryFile(path, "fit", SETTINGS).write(state)
         with pytest.raises(InvalidArgumentError, match="not a history of a fit"):
-            History(path, SETTINGS).state(2, 25, 2)
+            read(path)
 
 
 def test_an_edited_state_is_refused(path):
@@ -64,7 +69,7 @@ def test_an_edited_state_is_refused(path):
     document["state"]["theta"][0] = 0.7
     path.write_text(json.dumps(document))
     with pytest.raises(InvalidArgumentError, match="was damaged or edited"):
-        History(path, SETTINGS).state(2, 25, 2)
+        read(path)
 
 
 HOSTILE = st.one_of(
@@ -88,12 +93,12 @@ HOSTILE = st.one_of(
 def test_hostile_content_ends_in_one_error(path, content):
     path.write_bytes(content)
     with pytest.raises(InvalidArgumentError, match="not a history of a fit"):
-        History(path, SETTINGS).state(2, 25, 2)
+        read(path)
 
 
 def test_a_folder_is_no_history(tmp_path):
     with pytest.raises(InvalidArgumentError, match="not a history of a search"):
-        HistoryFile(tmp_path, "search", SETTINGS).read()
+        HistoryFile(tmp_path, "search", SETTINGS)
 
 
 MOTOR_VALUES = [MOTORS, MOTORS._replace(coulomb=2 * MOTORS.coulomb), bp.make_actuators(2, command_delay=2e-3)]

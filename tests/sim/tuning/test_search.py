@@ -15,7 +15,7 @@ from batchpid.sim import Physics, Randomization, Robot, Runner, Uniform
 from batchpid.sim.cli.run import evaluate_sets
 from batchpid.sim.robot.self_collision import Srdf
 from batchpid.sim.tuning import GainSet, Weights, arm_joints, load_randomization, random_moves, tune, tune_tool
-from batchpid.sim.tuning.first_candidates import first_gains
+from batchpid.sim.tuning.candidates import first_gains
 from batchpid.sim.tuning.randomization_presets import ENCODER
 
 pytest.importorskip("cmaes")
@@ -80,7 +80,7 @@ def test_robots_touch_things_in_the_final_and_where_the_moves_are_given(panda, f
         options.append((kwargs.get("collisions", True), kwargs.get("physics")))
         return Runner(*args, **kwargs)
 
-    monkeypatch.setattr("batchpid.sim.tuning.search.Runner", runner)
+    monkeypatch.setattr("batchpid.sim.tuning.evolution.Runner", runner)
     tune(panda, workers=0, physics="fast", **SMALL)
     assert options == [(False, "free"), (True, "fast")]
     options.clear()

@@ -17,8 +17,7 @@ from batchpid.sim import Robot, Runner
 from batchpid.sim.identification import identify
 from batchpid.sim.identification.excitation import excite
 from batchpid.sim.identification.fit import FitStep, fit
-from batchpid.sim.identification.fit_history import History, State
-from batchpid.sim.identification.fit_search import Progress, search
+from batchpid.sim.identification.fit_search import Progress, State, search
 from batchpid.sim.identification.log_noise import split
 from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.logs import Log, LogWarning, read_logs
@@ -27,6 +26,7 @@ from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import smooth
 from batchpid.sim.identification.statistics import EXPLAINED, uncertainty
 from batchpid.sim.identification.unknowns import KINDS, Kind, Motors, Unknowns, take
+from batchpid.sim.tuning.history import HistoryFile
 
 pytest.importorskip("scipy")
 EXAMPLE = Path(__file__).parents[4] / "examples/mujoco_log.py"
@@ -179,7 +179,7 @@ def test_a_search_leaves_a_delay_that_is_best_nearby_only(arm, runs):
     per_joint = [getattr(truth, kind) for kind in PER_JOINT]
     theta = unknowns.point(motors_of(*per_joint, truth.delay + 7e-4, 0.0095, 0.0))
     begin, delay = State(FitStep.first(theta, 20)), unknowns.names.index(("delay", None))
-    same, found = search([problem], begin, 20, History(None, {}), Progress(1, 20, None))
+    same, found = search([problem], begin, 20, HistoryFile(None, "fit", {}), Progress(1, 20, None))
     assert same is problem
     assert found.theta[delay] == pytest.approx(truth.delay, abs=1e-4)
 
