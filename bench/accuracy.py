@@ -37,8 +37,7 @@ from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import STAGES, control_step
 from batchpid.sim.loop.pid_law import PIDLaw
-from batchpid.sim.loop.step_constants import acting_gains
-from batchpid.sim.loop.step_state import reset_friction
+from batchpid.sim.loop.step_setup import acting_gains, reset_friction
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
 from batchpid.sim.robot.description import Dynamics
 from batchpid.sim.robot.robot import Robot

@@ -24,7 +24,7 @@ from batchpid.task_space import save_osc_options
 
 if TYPE_CHECKING:
     from batchpid.sim.identification.confidence_region import DrawnMotors
-    from batchpid.sim.tuning.within import Within
+    from batchpid.sim.tuning.evaluation import Within
 
 DRAWS, MOVES_WITHIN = 100, 1
 """Motors that ``--within`` draws, and random moves that are made with each, besides the tutorial's."""
@@ -188,8 +188,8 @@ class TuneCommand:
 
         The designed gains are tried too where the search ``rejected`` the tuned ones, or these do not hold for all.
         """
+        from batchpid.sim.tuning.evaluation import within
         from batchpid.sim.tuning.moves import random_moves, tutorial_move
-        from batchpid.sim.tuning.within import within
 
         moves = tutorial_move(robot) + random_moves(robot, MOVES_WITHIN, self.seed + 1)
         options = flags.chosen(self, "workers cluster engine physics collisions ground")

@@ -24,7 +24,7 @@ from batchpid.sim.loop.control_step import sim_step
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.jitted import padded, put
 from batchpid.sim.loop.numpy_executor import Ran, Span, passive_forces
-from batchpid.sim.loop.step_constants import needs_qvel
+from batchpid.sim.loop.step_setup import needs_qvel
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
 from batchpid.sim.options import RunnerOptions
 
