@@ -19,10 +19,11 @@ import numpy as np
 import batchpid as bp
 from batchpid.arrays.array_types import Document
 from batchpid.arrays.digest import digest
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
-from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.candidates import Candidates, first_gains, loop_delay
 from batchpid.sim.tuning.cost import HEADROOM, Weights
@@ -121,6 +122,9 @@ def tune(
     MissingDependencyError
         The package ``cmaes`` is missing.
     """
+    if motors is not None and runner_options.get("actuators") is not None:
+        remedy = "leave it out; the control knows the actuators of the robot: Robot.load(..., actuators=...)"
+        raise InvalidArgumentError("actuators", "is given with motors", remedy=remedy)
     weights = Weights() if weights is None else weights
     search = Search(
         robot, runner_options, seed, generations, population, seconds, weights, time_limit, history, progress

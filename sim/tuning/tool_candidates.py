@@ -25,7 +25,7 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.unsettled import PRISMATIC_BAND, REVOLUTE_BAND
 from batchpid.sim.runner import Runner
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
-from batchpid.sim.tool_space.tool_goals import reaches
+from batchpid.sim.tool_space.tool_setpoints import reaches
 from batchpid.sim.tuning.cost import (
     PENALTY_RATIO,
     Trial,

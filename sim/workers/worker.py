@@ -27,7 +27,7 @@ from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import InvalidArgumentError, WorkerError
 from batchpid.io.files import read_bytes
 from batchpid.sim.engine import native
-from batchpid.sim.engine.engines import MODULES
+from batchpid.sim.engine.protocol import MODULES
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.failure import Failure, failure_of
 from batchpid.sim.loop.loop import Loop
