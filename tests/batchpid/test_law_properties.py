@@ -202,6 +202,7 @@ def test_whole_turns_of_a_continuous_joint_change_no_term(turns, options):
             np.testing.assert_allclose(x, z, atol=1e-9)
 
 
+@settings(max_examples=25)
 @given(st.floats(-50, 50), st.lists(st.floats(-50, 50), min_size=2, max_size=20))
 def test_a_constant_error_has_no_derivative_under_wrap(error, path):
     y = np.array(path)[:, None, None]
