@@ -15,8 +15,7 @@ from batchpid.arrays.array_types import Document
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, beside
-from batchpid.sim.cli.progress import bar
+from batchpid.sim.cli.outputs import OutputFiles, bar, beside
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.cost import Weights
 from batchpid.sim.tuning.gain_sets import GainSet
