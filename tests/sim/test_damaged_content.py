@@ -118,6 +118,8 @@ def plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         parts = {each.name: plain(getattr(value, each.name)) for each in dataclasses.fields(value)}
         return {"type": type(value).__name__, **parts}
+    if isinstance(value, int) and abs(value) < 2**53 and not isinstance(value, bool):
+        return repr(float(value))
     if isinstance(value, dict):
         return {key: plain(each) for key, each in value.items()}
     return [plain(each) for each in value] if isinstance(value, tuple | list) else repr(value)

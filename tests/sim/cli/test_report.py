@@ -91,14 +91,6 @@ def test_envs_held_at_a_finite_pose_after_diverging_count_as_diverged(panda):
     assert "DIVERGED: 5 of 5" in next(report.outcome_lines(panda, rollout, metrics, rollout.findings()))
 
 
-def test_setpoints_out_of_limits_say_the_worst_once(panda):
-    setpoint = np.tile(panda.settings.target, (ENVS, 1))
-    setpoint[:, 3] = [1.0, 0.0, -1.0, 0.5, -3.5]
-    assert list(report.limit_lines(panda, setpoint)) == [
-        "OUT OF LIMITS: setpoint 1 rad of panda_joint4, whose limits are [-3.0718, -0.0698]: that error remains."
-    ]
-
-
 def test_the_speed_is_env_steps_and_real_time_factors():
     assert report.speed_line(64, 2.0, 1 / 2000, 4.0) == (
         "64,000 env-steps/s: 2 s of 64 robots in 4.00 s; real-time factor 0.5 per robot, 32 in total"

@@ -14,7 +14,7 @@ from batchpid.sim.identification.diagnosis import diagnose
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.regression import best_drive, smooth
 from batchpid.sim.robot.urdf_export import to_urdf
-from tests.sim.tuning.identification.test_identify import ARM, six_joints
+from tests.sim.tuning.identification.test_identify import ARM, several_joints
 
 pytest.importorskip("scipy")
 pytest.importorskip("mujoco.batch")
@@ -65,7 +65,7 @@ def test_a_heavier_link_is_named(arms, tmp_path):
 
 
 def test_a_joint_that_sticks_does_not_hide_a_heavier_link(tmp_path):
-    (tmp_path / "six.urdf").write_text(six_joints())
+    (tmp_path / "six.urdf").write_text(several_joints(6))
     robot = Robot.load(tmp_path / "six.urdf")
     (tmp_path / "heavy.urdf").write_text(to_urdf(robot, mass_factors={"l3": 1.3}).text)
     arms = {"described": robot, "heavy": Robot.load(tmp_path / "heavy.urdf")}

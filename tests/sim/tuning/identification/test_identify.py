@@ -39,11 +39,12 @@ PENDULUM = """<robot name="pendulum"><link name="base"/>
 <axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="40" velocity="6"/></joint></robot>"""
 
 
-def three_joints(fixed: int | None = None) -> str:
-    """Return the URDF of an arm of three joints, j0 to j2, one of which may be fixed at 0."""
-    parts, above = ['<robot name="arm3"><link name="l0"/>'], 0.1
-    for number, (mass, length, effort) in enumerate([(4, 0.2, 150), (5, 0.4, 150), (3, 0.35, 100)]):
-        axis, kind = "0 1 0" if number else "0 0 1", "fixed" if number == fixed else "revolute"
+def several_joints(count: int, fixed: int | None = None) -> str:
+    """Return the URDF of an arm of up to six joints, j0 and so on, one of which may be fixed at 0."""
+    parts, above = ['<robot name="arm"><link name="l0"/>'], 0.1
+    sizes = [(4, 0.2, 150), (5, 0.4, 150), (3, 0.35, 100), (1.5, 0.1, 30), (1.2, 0.1, 30), (0.5, 0.08, 15)]
+    for number, (mass, length, effort) in enumerate(sizes[:count]):
+        axis, kind = "0 0 1" if number in (0, 4) else "0 1 0", "fixed" if number == fixed else "revolute"
         across = mass * (length**2 / 12 + 0.002)
         tensor = f'ixx="{across}" iyy="{across}" izz="{0.003 * mass}" ixy="0" ixz="0" iyz="0"'
         inertial = f'<origin xyz="0.01 0 {length / 2}"/><mass value="{mass}"/><inertia {tensor}/>'
@@ -207,7 +208,7 @@ def test_a_joint_of_three_that_stuck_does_not_spoil_the_others(mujoco_log, tmp_p
     """
     stuck, rest = 1, [0, 2]
     for name, fixed in (("three", None), ("two", stuck)):
-        (tmp_path / f"{name}.urdf").write_text(three_joints(fixed))
+        (tmp_path / f"{name}.urdf").write_text(several_joints(3, fixed))
     three, two = (Robot.load(tmp_path / f"{name}.urdf") for name in ("three", "two"))
     truth, params = mujoco_log["plausible"](three, 0), three.designed("effort")
     motion = excite(three, 1.0, lowest=1.0)
