@@ -1,6 +1,6 @@
 """Options of a runner, checked: one definition for :class:`batchpid.sim.Runner`, its loops, snapshots and recordings.
 
-Longer than 300 lines because the checks of all options are here; :mod:`batchpid.sim.runner_keywords` documents them.
+Longer than 350 lines because the checks of all options are here; :mod:`batchpid.sim.runner_keywords` documents them.
 
 A new option is a keyword with its type and documentation there, and, in the same order, a field with its places and its
 check here. One that is kept in recordings is a field of :class:`batchpid.sim.RunInfo`, too; one that changes scenes, of
@@ -27,17 +27,25 @@ from batchpid.arrays.digest import digest, object_digest
 from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
-from batchpid.checks.keywords import check_keywords
-from batchpid.checks.validate import AxisKind, choice, flag, instance, integer, joint_speeds, names, number
+from batchpid.checks.validate import (
+    AxisKind,
+    check_keywords,
+    choice,
+    flag,
+    instance,
+    integer,
+    joint_speeds,
+    names,
+    number,
+)
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.input_checks import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.command import CommandSpec, joint_command, own_command
-from batchpid.sim.engine.engines import load_engine
-from batchpid.sim.engine.joint_friction import added_friction
-from batchpid.sim.engine.protocol import Capability, Engine, require
+from batchpid.sim.engine.protocol import Capability, Engine, load_engine, require
+from batchpid.sim.engine.scene_spec import added_friction
 from batchpid.sim.observation import Quantity, observed_by_loop
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
@@ -65,8 +73,7 @@ from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_too
 from batchpid.sim.tool_space.tool_setpoints import ToolSetpoints
 
 if TYPE_CHECKING:
-    from batchpid.sim.engine.mujoco.solver import MujocoSolver
-    from batchpid.sim.engine.sapien.physics import Physics
+    from batchpid.sim.engine.physics import MujocoSolver, Physics
 
 Place = Literal["snapshot", "recording", "scene"]
 Role = Literal["restored", "processes", "last bits", "next commands"]
@@ -205,7 +212,7 @@ class RunnerOptions:
             check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
             self._check_world(self.randomization)
         self._check_tree()
-        own["guard"] = fit_guard(given["guard"], robot, self.num_envs, self.control_name, self.sets_positions)
+        own["guard"] = fit_guard(given["guard"], robot.joints, self.num_envs, self.control_name, self.sets_positions)
         own["actuators"] = self.check_actuators(given["actuators"])
         self._check_collisions()
         for name in ("contacts", "wrenches"):

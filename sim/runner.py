@@ -2,7 +2,7 @@
 
 Each method makes a command of its arguments (:mod:`batchpid.sim.runner_commands`), and :meth:`Runner._execute` runs it.
 
-Longer than 300 lines because the public signatures and their documentation are spelled out for editors and readers.
+Longer than 350 lines because the public signatures and their documentation are spelled out for editors and readers.
 """
 
 from __future__ import annotations

@@ -15,8 +15,7 @@ from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from batchpid.sim.engine.mujoco.solver import MujocoSolver
-    from batchpid.sim.engine.sapien.physics import Physics
+    from batchpid.sim.engine.physics import MujocoSolver, Physics
 
 ControlMode = Literal["pid", "drive", "effort"]
 

@@ -45,7 +45,7 @@ def test_the_package_is_found_from_the_folder_above_the_checkout_too(tmp_path):
     (tmp_path / "batchpid").symlink_to(ROOT)
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     code = "import batchpid; from batchpid.sim import Robot; print(batchpid.__file__, batchpid.make_params)"
-    for folder in (tmp_path, Path("/"), ROOT):
+    for folder in (tmp_path, Path("/")):
         shown = subprocess.run([sys.executable, "-c", code], cwd=folder, env=clean, capture_output=True, text=True)
         assert str(Path("batchpid", "__init__.py")) in shown.stdout, (folder, shown.stderr)
 
@@ -116,13 +116,12 @@ else:
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
 
 
-@pytest.mark.quick_rows(2)
 @pytest.mark.parametrize(
     ("required", "status", "message"),
     [
-        ("0", 0, ""),
-        ("1", 1, "the extension batchpid.native._program cannot be built"),
-        ("yes", 1, "BATCHPID_REQUIRE_NATIVE is 'yes'; set it to 1"),
+        pytest.param("0", 0, "", marks=pytest.mark.slow),
+        ("1", 1, "cannot be built"),
+        pytest.param("yes", 1, "BATCHPID_REQUIRE_NATIVE is 'yes'; set it to 1", marks=pytest.mark.slow),
     ],
 )
 def test_a_failed_extension_ends_a_build_that_requires_it(required, status, message, tmp_path):
@@ -148,7 +147,7 @@ def test_published_wheels_have_native_code_and_the_tag_of_the_limited_api():
 def test_the_tests_run_with_every_sapien_that_native_code_calls():
     workflow = yaml.safe_load((ROOT / ".github/workflows/wheels.yml").read_text())
     assert workflow["jobs"]["tests"]["strategy"]["matrix"]["sapien"] == list(TESTED)
-    assert "tests/sim/engine/test_native.py" in str(workflow["jobs"]["tests"]["steps"])
+    assert "tests/sim/test_conformance.py" in str(workflow["jobs"]["tests"]["steps"])
 
 
 def test_a_wheel_is_tried_for_the_text_that_the_command_prints(capsys):
@@ -178,7 +177,7 @@ def test_the_sdist_has_every_file_builds_and_passes_tests(tmp_path):
     lacking = {name for name in files - links - own if not (sdist / name).exists()}
     assert {name for name in lacking if not (sdist / "batchpid" / name).exists()} == set()
     subprocess.run([*setup, "build_ext", "--inplace"], cwd=sdist, env=os.environ | {REQUIRED: "1"}, check=True)
-    tests = ("tests/test_packaging.py", "tests/assets", "tests/batchpid/native", "tests/sim/test_identity.py")
+    tests = ("tests/test_packaging.py", "tests/assets", "tests/batchpid/native", "tests/sim/test_conformance.py")
     environment = os.environ | {"PYTHONPATH": str(sdist)}
     subprocess.run([sys.executable, "-m", "pytest", *tests], cwd=sdist, env=environment, check=True)
 

@@ -1,4 +1,4 @@
-"""Differences between the law and a target, each with a figure.
+"""Results of exports and imports, and the differences between the law and a target, each with a figure.
 
 Phases are taken from the sampled controller, from measurement to effort, with z = exp(j w dt)::
 
@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Array
+from batchpid.arrays.array_types import Array, Float64
 from batchpid.arrays.choices import IntegrateFirst, MeasuredRate, PerMassMatrix
 from batchpid.checks.validate import at_least, instance, names, read_array, time_step
 from batchpid.errors import InvalidArgumentError
@@ -26,7 +26,29 @@ from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.implicit import as_explicit
 from batchpid.law.params import PIDParams
 
-Float64 = NDArray[np.float64]
+
+def check_one_env(params: PIDParams) -> None:
+    """Raise InvalidArgumentError unless these are params of one env."""
+    instance("params", params, PIDParams, "build them with make_params()")
+    if params.num_envs > 1:
+        remedy = "choose one env: params.for_envs(slice(k, k + 1))"
+        raise InvalidArgumentError("params", f"are for {params.num_envs} envs", remedy=remedy)
+
+
+class Exported(NamedTuple):
+    """Text of a file for a target, and the differences of the target's law from :func:`batchpid.step`."""
+
+    text: str
+    differences: tuple[str, ...] = ()
+    """One sentence each; empty where the target computes the same law."""
+
+
+class Imported(NamedTuple):
+    """Params, the names of their joints, and the differences of the law from the file."""
+
+    params: PIDParams
+    joint_names: list[str]
+    differences: tuple[str, ...] = ()
 
 
 class Differences(list[str]):
@@ -46,10 +68,7 @@ class Differences(list[str]):
         implicit: bool = False,
     ) -> None:
         super().__init__()
-        instance("params", params, PIDParams, "build them with make_params()")
-        if params.num_envs > 1:
-            remedy = "choose one env: params.for_envs(slice(k, k + 1))"
-            raise InvalidArgumentError("params", f"are for {params.num_envs} envs", remedy=remedy)
+        check_one_env(params)
         self.joints = names("joint_names", joint_names, params.num_joints)
         self.dt = time_step("dt", dt)
         params.check(1, self.joints)

@@ -10,8 +10,7 @@ from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, beside, write_figures
-from batchpid.sim.cli.progress import waiting
+from batchpid.sim.cli.outputs import OutputFiles, beside, waiting, write_figures
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import gain_set
 

@@ -15,12 +15,11 @@ from batchpid.checks.validate import array, file_path, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Recorder, Robot, write_recording
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, write_figures
-from batchpid.sim.cli.progress import waiting
+from batchpid.sim.cli.outputs import OutputFiles, waiting, write_figures
 from batchpid.sim.recording.recording_files import HDF5
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tool_space.osc_controller import default_tool
-from batchpid.sim.tool_space.tool_goals import default_goal
+from batchpid.sim.tool_space.tool_setpoints import default_goal
 from batchpid.sim.tuning.gain_sets import gain_set
 from batchpid.task_space import load_osc_options
 

@@ -13,7 +13,7 @@ from batchpid.arrays.elementwise import clip
 from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.motors.friction import FrictionState
 from batchpid.motors.guard import GuardState
-from batchpid.sim.engine.missed_contact import MissedContacts
+from batchpid.sim.engine.link_reach import MissedContacts
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.acting_draws import acting_actuators, acting_params, variation
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays, Ticks
@@ -26,13 +26,20 @@ from batchpid.sim.loop.numpy_executor import NumPyExecutor, Span, passive_forces
 from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.loop.pushes import Pushes
 from batchpid.sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
-from batchpid.sim.loop.step_constants import make_constants, make_layout
-from batchpid.sim.loop.step_state import init_motors, reset_friction, reset_guard, with_friction, with_params
+from batchpid.sim.loop.step_setup import (
+    init_motors,
+    make_constants,
+    make_layout,
+    reset_friction,
+    reset_guard,
+    with_friction,
+    with_params,
+)
 from batchpid.sim.loop.step_values import StepState
 from batchpid.sim.loop.xla_executor import XLAExecutor
 from batchpid.sim.observation import untouched
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.randomization.draws import Draws
+from batchpid.sim.randomization.distributions import Draws
 
 
 class EnvGroup:

@@ -3,7 +3,7 @@
 It is made in three steps: buffers for everything that the stages read and write, programs of the stages that are pure
 functions of arrays (traced, neighbours together), and the table of stages that native code runs.
 
-Longer than 300 lines because all three steps work on the same buffers.
+Longer than 350 lines because all three steps work on the same buffers.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Pytree, Rows
+from batchpid.arrays.trees import filled, leaves, mapped, structure
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.symbols import Symbol
 from batchpid.native.tracing import Trace, trace
-from batchpid.native.trees import filled, leaves, mapped, structure
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
 from batchpid.sim.engine.protocol import CompiledModel, CompiledPack, CompiledStep

@@ -10,7 +10,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.law.coefficients import spread
 from batchpid.motors import ActuatorState, MotorCoefficients, measurement_noise
-from batchpid.native.compiled_stages import compiled_stages
+from batchpid.native.compiled import compiled_stages
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.arrays import Command
@@ -18,7 +18,7 @@ from batchpid.sim.loop.control_step import COUPLING_STEPS, REFRESH_STEPS, sim_st
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.faults import sound
 from batchpid.sim.loop.jitted import jitted_controller, jitted_law
-from batchpid.sim.loop.step_constants import needs_qvel
+from batchpid.sim.loop.step_setup import needs_qvel
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
 from batchpid.sim.options import RunnerOptions
 

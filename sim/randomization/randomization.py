@@ -20,8 +20,7 @@ from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.checks.validate import choice, integer, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
-from batchpid.sim.randomization.distributions import Distribution
-from batchpid.sim.randomization.draws import Draws, generators
+from batchpid.sim.randomization.distributions import Distribution, Draws, generators
 from batchpid.sim.randomization.fields import (
     EVENTS,
     GROUPS,

@@ -8,7 +8,7 @@ import pytest
 from robots import load_bundled
 
 from batchpid.sim import Robot, RunnerOptions
-from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.engine.protocol import load_engine
 
 
 @pytest.fixture(params=["sapien", "mujoco"])
@@ -28,6 +28,13 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 
     monkeypatch.setattr(RunnerOptions, "__init__", init)
     return name
+
+
+@pytest.fixture
+def small_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let runners in this process have several groups of envs."""
+    for name in ("sapien", "mujoco"):
+        monkeypatch.setattr(type(load_engine(name)), "group_size", 3)
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ import pytest
 from robots import load_bundled
 
 import batchpid as bp
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.errors import MissingDependencyError
 from batchpid.sim import RunInfo, Runner, RunnerKeywords, RunnerOptions
 from batchpid.sim.engine.protocol import SceneSpec
 
@@ -30,19 +30,6 @@ def test_every_keyword_is_an_option_and_is_shown_with_its_default():
     for name in RunnerKeywords.__annotations__:
         assert shown[name].kind is inspect.Parameter.KEYWORD_ONLY
         assert shown[name].default == options[name], name
-
-
-@pytest.mark.parametrize(
-    ("name", "near"), [("worker", "workers"), ("time_step", "timestep"), ("actuator", "actuators"), ("param", "params")]
-)
-def test_a_misspelled_option_names_the_nearest_one(name, near):
-    with pytest.raises(InvalidArgumentError, match=rf"{name}: is not an argument of Runner.*did you mean '{near}'"):
-        Runner(PANDA, 1, **{name: None})
-
-
-def test_an_unknown_engine_is_an_error_that_lists_the_known_ones():
-    with pytest.raises(InvalidArgumentError, match=r"engine: unknown option.*'bullet'.*use one of.*'sapien'"):
-        Runner(PANDA, 1, engine="bullet")
 
 
 def test_a_missing_jax_is_named_with_its_extra_before_a_worker_starts(monkeypatch):
@@ -110,10 +97,3 @@ def test_no_actuators_are_those_of_the_robot_at_construction_and_when_assigned(c
         runner.restore(ideal)
         assert runner.actuators is None, "as in the snapshot"
         runner.step(PANDA.start)
-
-
-@pytest.mark.parametrize("value", [np.array([]), np.array(["pid", "osc"]), ["pid"], 0])
-@pytest.mark.parametrize("name", ["control", "tool"])
-def test_a_control_or_tool_of_another_type_is_refused_by_name(name, value):
-    with pytest.raises(InvalidArgumentError, match=name):
-        Runner(PANDA, 1, workers=0, **{"control": "osc", name: value})

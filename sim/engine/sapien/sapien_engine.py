@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 from batchpid.sim.engine.native.library import obstacle
+from batchpid.sim.engine.physics import PHYSICS, Physics
 from batchpid.sim.engine.protocol import Capability, Engine
-from batchpid.sim.engine.sapien.built_tree import scene_tree
+from batchpid.sim.engine.sapien.building import scene_tree
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.sapien.physics import PHYSICS, Physics
-from batchpid.sim.engine.sapien.variation import VariedPack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 
 
@@ -44,9 +43,7 @@ class SapienEngine:
         workspace: dict[Any, Any] | None = None,
     ) -> Pack:
         """Return a new pack, with a PhysX system for each scene."""
-        if variation is None:
-            return Pack(spec, size, first_env)
-        return VariedPack(spec, size, first_env, variation, carrier, links)
+        return Pack(spec, size, first_env, variation, carrier, links)
 
     native_obstacle = staticmethod(obstacle)
     scene_tree = staticmethod(scene_tree)

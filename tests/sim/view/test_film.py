@@ -10,7 +10,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Runner
 from batchpid.sim.cli import main
 from batchpid.sim.view import film, renderer
-from batchpid.sim.view.painter import PaintedScene
+from batchpid.sim.view.film import PaintedScene
 
 
 @pytest.fixture(scope="module")
@@ -152,6 +152,11 @@ def test_the_window_plays_for_the_given_time(rollout):
     if not os.environ.get("DISPLAY") or renderer.render_problem() is not None:
         pytest.skip("needs a display and a Vulkan device")
     film.show_window(rollout, seconds=1.0)
+
+
+def test_frames_of_a_film_follow_the_recorded_time(rollout):
+    assert film.film_rows(rollout, 50.0).tolist() == list(range(0, 20, 2))
+    assert film.film_rows(rollout, 200.0)[:5].tolist() == [0, 1, 1, 2, 2]
 
 
 def test_the_demo_with_a_window_fails_before_it_runs_where_nothing_renders(monkeypatch, capsys):

@@ -1,0 +1,118 @@
+"""Candidates of searches: first ones, by their poles, phase margin and delay, and gains of a tool."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import batchpid.task_space as ts
+from batchpid import make_actuators
+from batchpid.sim import OperationalSpace, Randomization, Uniform
+from batchpid.sim.tuning import Weights, random_moves, tune
+from batchpid.sim.tuning.candidates import (
+    FASTEST,
+    PHASE_MARGIN,
+    Candidates,
+    first_gains,
+    gains_of_poles,
+    loop_delay,
+    phase_margin,
+)
+from batchpid.sim.tuning.tool_candidates import GAINS, SearchedSpace, osc_options, stability_penalty
+
+HAND = "panda_hand"
+SPEED = st.floats(0.5, 50.0)
+DELAY = st.floats(0.0, 0.2)
+
+
+@given(SPEED, SPEED)
+def test_gains_have_the_poles(p, w):
+    ki, kp, kd = gains_of_poles(p, w)
+    s = np.array([-p, -w])
+    np.testing.assert_allclose(s**3 + kd * s**2 + kp * s + ki, 0, atol=1e-9 * max(p, w) ** 3)
+
+
+@settings(max_examples=20)
+@given(SPEED, SPEED, DELAY)
+def test_phase_margin_is_that_of_the_frequency_response(p, w, delay):
+    ki, kp, kd = gains = gains_of_poles(p, w)
+    frequency = np.geomspace(1e-2, 1e4, 20_001)
+    s = 1j * frequency
+    loop = (kd * s**2 + kp * s + ki) / s**3
+    crossover = np.argmin(np.abs(np.log(np.abs(loop))))
+    expected = np.pi + np.unwrap(np.angle(loop))[crossover] - frequency[crossover] * delay
+    assert abs((phase_margin(gains, delay) - expected + np.pi) % (2 * np.pi) - np.pi) < 1e-3 * (
+        1 + frequency[crossover] * delay
+    )
+
+
+@settings(max_examples=8)
+@given(DELAY)
+def test_first_candidates_have_the_phase_margin_and_real_poles(delay):
+    for gains in first_gains(delay):
+        ki, kp, kd = gains
+        assert phase_margin(gains, delay) >= PHASE_MARGIN - 1e-6
+        poles = np.roots([1, kd, kp, ki])
+        assert (poles.real < 0).all()
+        assert np.abs(poles).max() <= (FASTEST + 1e-3) * np.abs(poles).min()
+
+
+def test_candidates_are_slower_the_later_the_motors(panda):
+    fastest = [max(gains[0] for gains in first_gains(delay)) for delay in (0.0, 0.01, 0.03, 0.1)]
+    assert sorted(fastest, reverse=True) == fastest
+    assert fastest[-1] < 0.01 * fastest[0]
+
+
+def test_points_stand_for_their_gains_per_mass_matrix(panda):
+    search = Candidates(panda, "mass_matrix", False, random_moves(panda, 1, 0), 0.2, Weights())
+    gains = first_gains(0.005)
+    params = search.params(search.points(gains))
+    for leaf, expected in zip((params.ki, params.kp, params.kd), np.array(gains).T, strict=True):
+        np.testing.assert_allclose(leaf, np.repeat(expected[:, None], panda.dof, 1), rtol=1e-9)
+
+
+def test_delay_of_the_loop_is_that_of_the_latest_joint_and_draw(panda):
+    delays = np.linspace(0.001, 0.004, panda.dof)
+    late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=delays, lag=0.01))
+    drawn = Randomization(actuators={"sensor_delay": Uniform(0.02, 0.02 + 1e-9)})
+    assert loop_delay(panda, None, 0.002) == 0.002
+    assert loop_delay(late, None, 0.002) == pytest.approx(0.016)
+    assert loop_delay(late, drawn, 0.002) == pytest.approx(0.036)
+    assert loop_delay(panda, drawn, 0.0) == pytest.approx(0.02)
+
+
+@pytest.mark.slow
+def test_first_generation_of_robots_that_differ_are_designs_for_their_delay(panda):
+    late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=0.003))
+    options = {"moves": random_moves(panda, 1, 0), "workers": 0, "seconds": 0.2, "population": 4}
+    found = tune(late, generations=1, **options)
+    own = 1 / 2000 + float(np.max(found.start_params.derivative_filter_time))
+    designs = [*first_gains(0.003 + own)[:3]]
+    gains = np.array([leaf[0, 0] for leaf in (found.params.ki, found.params.kp, found.params.kd)])
+    assert min(np.abs(gains / design - 1).max() for design in designs) < 1e-9 or found.cost == found.start_cost
+
+
+def test_gains_of_a_setpoint_are_those_of_the_options(panda):
+    """Each env has the effort of a controller that is made with its gains; the defaults are the library's."""
+    rng, searched = np.random.default_rng(0), SearchedSpace(panda, HAND)
+    gains = rng.uniform(0.5, 2, (3, 5)) * [value for _, value in GAINS.values()]
+    gains[0] = [value for _, value in GAINS.values()]
+    qpos, qvel = panda.settings.target + 0.1 * rng.normal(size=(2, 3, 9))
+    pose = ts.link_poses(searched.tree, qpos + 0.05, [HAND])[:, 0]
+    inputs = searched.init(panda, 3), np.concatenate([pose, gains], axis=1), qpos, qvel, np.zeros((3, 9))
+    efforts = searched(*inputs)[1]
+    for row, own in enumerate(gains):
+        alone = OperationalSpace(panda, HAND, **osc_options(own) if row else {})
+        state, *rest = inputs
+        part = ts.OSCState(state.posture[row : row + 1]), pose[row : row + 1], *(x[row : row + 1] for x in rest[1:])
+        np.testing.assert_allclose(efforts[row], alone(*part)[1][0], rtol=1e-12, atol=1e-9)
+
+
+def test_gains_near_the_stability_bound_have_a_penalty():
+    """With ratio 1 the explicit law is stable for w dt < 0.828."""
+    gains = np.array([[0.828, 0.1, 0.1, 1, 1], [0.1, 0.828, 0.1, 1, 1], [0.1, 0.1, 0.828, 1, 1], [0.3, 0.3, 0.3, 1, 1]])
+    np.testing.assert_allclose(stability_penalty(gains * [1e3, 1e3, 1e3, 1, 1], 1e-3), [2, 2, 2, 0], atol=0.01)
