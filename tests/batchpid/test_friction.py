@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from batchpid import motors
+from batchpid.errors import InvalidArgumentError
 from batchpid.motors import friction
 
 Friction = friction.Friction
@@ -174,6 +175,8 @@ def test_nothing_is_done_without_friction():
     effort = np.ones((2, 3))
     state = friction.init(Friction(), effort, effort, np.eye(3)[None], DT)
     assert friction.advance(Friction(), state, effort, effort) == (friction.FrictionState(), effort)
+    with pytest.raises(InvalidArgumentError, match="dt"):
+        friction.init(Friction(), effort, effort, np.eye(3)[None], 2000.0)
 
 
 @given(seed=st.integers(0, 2**32 - 1))

@@ -127,3 +127,26 @@ def test_about_survives_and_does_not_affect_the_params(tmp_path, suffix):
     loaded = [bp.load_params(path)[0] for path in (with_about, without)]
     assert loaded[0].gain_units == loaded[1].gain_units == params.gain_units
     assert (loaded[0].kp == params.kp).all()
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *('!!int ""', "!!int _", "!!float _", "!!bool x", "!!timestamp x", "!!binary '=='", "!!omap [a]", "!!merge x"),
+        *("2001-13-45", "1e999", "1" + "0" * 5000, ".nan", "{<<: 1}", "!!python/object/apply:os.abort []"),
+        pytest.param("[" * 2_000, marks=pytest.mark.slow),
+        *("{a: " * 2_000, "- " * 2_000, "? " * 2_000, "'" + "a\n" * 2_000, "!" * 2_000, "\x00"),
+    ],
+)
+def test_values_that_the_parser_trips_over_are_refused(value):
+    with pytest.raises(bp.InvalidArgumentError):
+        bp.loads_params(f"format: batchpid-params-1\njoints:\n  a:\n    kp: {value}\n")
+
+
+def test_files_that_cannot_be_opened_are_named(tmp_path):
+    (tmp_path / "folder.yaml").mkdir()
+    for name in ("folder.yaml", "x" * 5000 + ".yaml"):
+        with pytest.raises(bp.InvalidArgumentError, match="cannot be read"):
+            bp.load_params(tmp_path / name)
+    with pytest.raises(FileNotFoundError):
+        bp.load_params(tmp_path / "nothing.yaml")

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.native import array_program
-from batchpid.native.availability import SWITCH, obstacle
 
-needs_extension = pytest.mark.skipif(bool(obstacle()), reason="there are no native programs")
+NATIVE = bp.BatchPID(bp.make_params(1, 1.0), 1, 0.01).native
+needs_extension = pytest.mark.skipif(not NATIVE, reason="there are no native programs")
 DT = 1 / 2000
 CHOICES = {
     "ki": st.sampled_from([0.0, 50.0, [[5.0]]]),
@@ -57,7 +56,7 @@ def params_of(joints, options, dtype):
 
 def in_numpy(*arguments, **options):
     """Return a controller that NumPy computes."""
-    with mock.patch.dict("os.environ", {SWITCH: "0"}):
+    with mock.patch.dict("os.environ", {"BATCHPID_NATIVE": "0"}):
         return bp.BatchPID(*arguments, **options)
 
 
@@ -81,33 +80,42 @@ def numbers(rng, shape, odd, dtype):
     st.sampled_from([np.float64, np.float32]),
     st.sampled_from([0.0, 0.1]),
     st.booleans(),
-    st.integers(1, 4),
     st.integers(0, 2**32),
     st.data(),
 )
-def test_a_native_controller_is_bit_identical_to_numpy(options, joints, envs, dtype, odd, terms, threads, seed, data):
+def test_a_native_controller_is_bit_identical_to_numpy(options, joints, envs, dtype, odd, terms, seed, data):
     rng, shape = np.random.default_rng(seed), (envs, joints)
     if data.draw(st.booleans(), "gains of each env"):
         options = {**options, "kp": rng.uniform(1, 50, shape)}
     params = params_of(joints, options, dtype)
     setpoint_shape = data.draw(st.sampled_from([shape, (1, joints), (joints,), (envs, 1), ()]), "setpoint")
     present = data.draw(st.tuples(*[st.booleans()] * 3), "optional inputs")
-    with mock.patch.object(array_program, "NUMBERS_PER_THREAD", 64):
-        ours = bp.BatchPID(params, envs, DT, terms=terms, threads=threads)
-        theirs = in_numpy(params, envs, DT, terms=terms)
-        for step in range(4):
-            r, y = numbers(rng, setpoint_shape, odd, dtype), numbers(rng, shape, odd, dtype)
-            rest = [numbers(rng, shape, odd, dtype) if one else None for one in present]
-            with np.errstate(all="ignore"):
-                expected = theirs(r, y, *rest)
-            out = data.draw(st.sampled_from([None, np.empty(shape, dtype), y]), "out")
-            found = ours(r, y, *rest, out=out)
-            assert out is None or found is out
-            assert bits(found) == bits(expected)
-            if terms:
-                assert [*map(bits, ours.terms)] == [*map(bits, theirs.terms)]
-            if step % 2:
-                assert [*map(bits, ours.state)] == [*map(bits, theirs.state)]
+    ours = bp.BatchPID(params, envs, DT, terms=terms)
+    theirs = in_numpy(params, envs, DT, terms=terms)
+    for step in range(4):
+        r, y = numbers(rng, setpoint_shape, odd, dtype), numbers(rng, shape, odd, dtype)
+        rest = [numbers(rng, shape, odd, dtype) if one else None for one in present]
+        with np.errstate(all="ignore"):
+            expected = theirs(r, y, *rest)
+        out = data.draw(st.sampled_from([None, np.empty(shape, dtype), y]), "out")
+        found = ours(r, y, *rest, out=out)
+        assert out is None or found is out
+        assert bits(found) == bits(expected)
+        if terms:
+            assert [*map(bits, ours.terms)] == [*map(bits, theirs.terms)]
+        if step % 2:
+            assert [*map(bits, ours.state)] == [*map(bits, theirs.state)]
+
+
+@needs_extension
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_threads_of_a_large_batch_give_the_bytes_of_numpy(threads):
+    params, rng = bp.make_params(9, **EVERYTHING), np.random.default_rng(0)
+    shape = 60_001, 9  # numbers of four threads
+    ours, theirs = bp.BatchPID(params, shape[0], DT, threads=threads), in_numpy(params, shape[0], DT)
+    for _ in range(2):
+        y = rng.normal(size=shape)
+        np.testing.assert_array_equal(ours(1.0, y), theirs(1.0, y))
 
 
 def both(options=EVERYTHING, envs=5, joints=3):

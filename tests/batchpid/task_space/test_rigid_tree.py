@@ -27,7 +27,10 @@ def relative(found, wanted):
     return np.abs(found - wanted).max() / max(np.abs(wanted).max(), 1e-9)
 
 
-def test_mujoco_computes_the_same(case):
+@pytest.mark.parametrize("native", ["0", "1"])
+def test_mujoco_computes_the_same(case, native, monkeypatch):
+    """NumPy and native code; JAX against these below."""
+    monkeypatch.setenv("BATCHPID_NATIVE", native)
     mujoco = pytest.importorskip("mujoco")
     tree, tool, robot = case
     spec = mujoco.MjSpec.from_string(robot.urdf)
@@ -35,7 +38,7 @@ def test_mujoco_computes_the_same(case):
     model = spec.compile()
     data, columns = mujoco.MjData(model), [model.joint(name).qposadr[0] for name in tree.joint_names]
     body, dof = model.body(tool).id, tree.dof
-    qpos, qvel = states(tree, 100)
+    qpos, qvel = states(tree, 40)
     found = (
         ts.jacobian(tree, qpos, tool, point=POINT),
         ts.jacobian_rate(tree, qpos, qvel, tool, point=POINT),

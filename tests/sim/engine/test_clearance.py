@@ -38,7 +38,7 @@ def shaped_tree(seed, folder, **options):
 
 
 def motion(of, monkeypatch, proofs, ticks=30, **options):
-    """Return a rollout of 4 robots from random poses under random efforts, and whether a link has touched another."""
+    """Return rollouts of 4 robots from random poses under random efforts, with a reset of two between them."""
     rng, envs = np.random.default_rng(1), 4
     monkeypatch.setenv("BATCHPID_NATIVE", str(int(proofs)))
     starts = rng.uniform(np.maximum(of.lower, -3.0), np.minimum(of.upper, 3.0), (envs, of.dof))
@@ -69,5 +69,5 @@ def test_a_motion_is_the_same_without_proofs(name, fixed_base, ground, tmp_path,
     for one, other in zip(ours, theirs, strict=True):
         assert_identical(one, other)
     if fixed_base and not ground:
-        free = motion(of, monkeypatch, proofs=True, ground=False, collisions=False)
-        assert not np.array_equal(free[0].qpos, ours[0].qpos), "nothing has touched"
+        poses = np.concatenate([each.qpos.reshape(-1, of.dof) for each in theirs])
+        assert of.dynamics(ground=False).in_contact(poses, 0.02).any(), "no links come near each other"

@@ -83,7 +83,7 @@ def test_exactly_the_pairs_that_an_srdf_disables_do_not_touch(left_out, engine, 
     box = INERTIAL + '<collision><geometry><box size="0.4 0.4 0.4"/></geometry></collision>'
     weld = '<joint name="weld" type="fixed"><parent link="arm"/><child link="tip"/><origin xyz="0 0 0.1"/></joint>'
     parts = [link("base", INERTIAL), link("arm", box), link("tip", box), weld, link("side", box), link("back", box)]
-    places = {"arm": "0 0 1", "side": "0 0.05 1", "back": "0.05 0 1.05"}
+    places = {"arm": "0 0 1", "side": "0 0 1", "back": "0.1 0 1.1"}
     parts += [joint(child, "base", child, origin=origin) for child, origin in places.items()]
     pairs = [pair for pair in PAIRS if pair != PAIRS[left_out]]
     text = "".join(f'<disable_collisions link1="{one}" link2="{two}" reason="Default"/>' for one, two in pairs)

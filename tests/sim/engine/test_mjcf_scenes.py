@@ -348,7 +348,8 @@ def test_the_planes_of_the_file_are_the_ground(load):
 
 
 def test_an_error_of_mujoco_closes_the_runner(load):
-    robot = load(ARM.replace("<worldbody>", '<size memory="16K"/><worldbody>', 1))
+    # Enough to load the robot, and not for its contacts.
+    robot = load(ARM.replace("<worldbody>", '<size memory="20K"/><worldbody>', 1))
     with Runner(robot, 2, workers=0, engine="mujoco", control="effort") as runner:
         with pytest.raises(Exception, match="memory"):
             runner.rollout(np.full((100, 2, robot.dof), 3.0))

@@ -64,7 +64,7 @@ def test_joints_stop_at_their_limits(panda):
     """Within the travel of one sim step, and within 1e-4 rad where they rest under load."""
     with Runner(panda, 1, engine="mujoco", workers=0, substeps=1, compensate="none") as runner:
         runner.reset()
-        for _ in range(1000):
+        for _ in range(1500):
             speed = 0.0 if runner.time == 0 else np.abs(obs.qvel).max()  # noqa: F821
             obs = runner.step(panda.upper + 0.5)
             beyond = np.maximum(panda.lower - obs.qpos, obs.qpos - panda.upper).max()
@@ -99,7 +99,7 @@ def test_drives_of_each_env_keep_their_gains_beside_motors(panda):
 
     both = run_drives(50.0, 200.0)
     for env, stiffness in enumerate((50.0, 200.0)):
-        assert_identical(run_drives(stiffness), both, slice(env, env + 1))
+        assert_identical(run_drives(stiffness), both.for_envs(slice(env, env + 1)))
 
 
 def test_a_state_that_is_not_finite_is_contained(panda, tmp_path, monkeypatch):

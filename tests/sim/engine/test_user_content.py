@@ -4,13 +4,20 @@ import threading
 
 import numpy as np
 import pytest
-import sapien
 from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Runner
 
 ROBOT = load_bundled("panda")
+
+
+def pose(*place):
+    import sapien  # which the runner has imported
+
+    return sapien.Pose(*place)
+
+
 DROP = 0.5 * 9.81 * 0.2**2
 
 
@@ -20,7 +27,7 @@ def box_beside_the_robot(scene, env):
     builder.add_box_collision(half_size=[0.5, 0.5, 0.5])
     builder.add_box_visual(half_size=[0.5, 0.5, 0.5], material=[1.0, 0.0, 0.0])
     box = builder.build(name="box")
-    box.set_pose(sapien.Pose(p=[2, 0, 1.0 + 0.1 * env]))
+    box.set_pose(pose([2, 0, 1.0 + 0.1 * env]))
     scene.set_ambient_light([0.5, 0.5, 0.5])
     scene.add_directional_light([0, 1, -1], [0.5, 0.5, 0.5])
     return box
@@ -32,7 +39,7 @@ def balls_on_the_arm(scene, env):
     for k in range(3):
         builder = scene.create_actor_builder()
         builder.add_sphere_collision(radius=0.05 + 0.01 * (env % 3))
-        builder.set_initial_pose(sapien.Pose([0.02 if k == 0 else 0.4, 0.0, 1.25 if k == 0 else 0.1 + 0.12 * k]))
+        builder.set_initial_pose(pose([0.02 if k == 0 else 0.4, 0.0, 1.25 if k == 0 else 0.1 + 0.12 * k]))
         balls.append(builder.build())
     return balls
 
@@ -73,9 +80,10 @@ def test_content_touches_the_robot_and_no_other_env():
 
 
 def test_a_function_that_no_worker_can_import_is_sent_to_the_workers():
-    scope = {"sapien": sapien}
+    scope = {}
     exec(  # as in a script's __main__ or a notebook: no worker can import it
         "def build(scene, env):\n"
+        "    import sapien\n"
         "    builder = scene.create_actor_builder()\n"
         "    builder.add_sphere_collision(radius=size)\n"
         "    builder.set_initial_pose(sapien.Pose([1, env, 2]))\n"

@@ -23,6 +23,7 @@ from identical import assert_identical
 from option_values import ARM
 from robots import load_bundled
 
+import batchpid as bp
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 from batchpid.sim import Randomization, Robot, Runner, Snapshot, Uniform
 
@@ -39,7 +40,7 @@ def make(**options: Any) -> Runner:
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("snapshot") / "good.npz"
     with make() as runner:
-        runner.step(GOAL)
+        runner.step(GOAL, setpoint_rate=0.1 * GOAL)
         runner.snapshot().save(path)
     return path
 
@@ -186,6 +187,8 @@ DAMAGES = {
     "negative gains": array("params.kp", lambda rows: -rows),
     "whole gains": array("params.kp", lambda rows: rows.astype(int)),
     "gains as text": array("params.kp", lambda rows: np.array("x")),
+    "a motion of one row": array("motion", lambda rows: rows[:1]),
+    "a motion of another precision": array("motion", np.float32),
     "numbers in place of a choice": array("params.integration", lambda rows: np.zeros((1, ARM.dof))),
 }
 
@@ -208,6 +211,41 @@ def test_a_damaged_snapshot_is_refused_before_anything_changes(
     assert caught.value.argument in ("path", "snapshot")
     assert_identical(before, runner.observe())
     assert runner.step(GOAL).ok.all()
+
+
+class Counts:
+    """Controller with a state: the number of its sim steps."""
+
+    def init(self, robot: Any, num_envs: int) -> Any:
+        return {"steps": np.zeros(num_envs)}
+
+    def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:
+        return {"steps": state["steps"] + 1}, passive + 0.1 * state["steps"][:, None]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"control": Counts()},
+        {"actuators": bp.make_actuators(ARM.dof, command_delay=2e-3)},
+        {"actuators": bp.make_actuators(ARM.dof, sensor_delay=np.full((3, ARM.dof), 2e-3))},
+        {"contacts": ["hand"], "guard": True},
+    ],
+    ids=str,
+)
+def test_a_file_holds_the_state_of_every_part(options: Any, tmp_path: Path) -> None:
+    setpoint = np.outer([1, 2, 3], np.full(ARM.dof, 0.1))
+    with Runner(ARM, 3, workers=0, **options) as runner:
+        runner.step(setpoint)
+        runner.snapshot().save(tmp_path / "s.npz")
+        expected = runner.step(setpoint)
+        runner.restore(Snapshot.load(tmp_path / "s.npz"))
+        assert_identical(runner.step(setpoint), expected)
+    head, tables = read(tmp_path / "s.npz")
+    for name in (each for each in tables if each.partition(".")[0] in ("controller", "actuators", "guard", "sensors")):
+        if tables[name].shape[:1] == (3,):
+            with pytest.raises(InvalidArgumentError):
+                Snapshot.load(write(tmp_path / "bad.npz", head, tables | {name: tables[name][:2]}))
 
 
 @pytest.fixture(scope="module")

@@ -158,7 +158,7 @@ def test_a_worker_that_dies_is_noticed_while_another_works():
         later(0.5, lambda: send(runner.pids[0], signal.SIGKILL)),
     ):
         with pytest.raises(WorkerError, match=r"envs 0 to 3\) died \(SIGKILL\).*recover=True"):
-            runner.step(marked(4))
+            runner.step(marked(4), substeps=1_000_000)
         assert runner.closed
         with pytest.raises(ClosedError):
             runner.observe()
