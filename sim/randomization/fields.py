@@ -54,7 +54,7 @@ def elements(name: str, robot: Robot) -> Sequence[str]:
     if name == "center_of_mass":
         return [f"{link}.{axis}" for link in elements("link_mass", robot) for axis in "xyz"]
     if name == "link_mass":
-        return [link.name for link in robot.links if link.mass or (link.mass is None and link.collisions)]
+        return [link.name for link in robot.links if link.mass or (link.mass is None and link.num_shapes)]
     return robot.joint_names
 
 

@@ -11,7 +11,7 @@ For such robots the first generation consists of the designs of :mod:`batchpid.s
 starts from the best of them.
 
 Gains that are best on the few moves of the search need not be best on others. So the best candidates and the designed
-gains run a final round on more moves, with collisions, with the caller's solver, at the full effort limits. The gains
+gains run a final round on more moves, with contacts, with the caller's solver, at the full effort limits. The gains
 with the lowest cost there are the result.
 
 The result of a search depends on its seed and not on the number of workers. To resume, a new search with the same seed
@@ -120,7 +120,7 @@ def tune(
         robots with actuators or a randomization, the search uses the tutorial's move and VARIED_MOVES random ones
         (with drawn ``motors`` DRAWN_MOVES),
         because the hardest moves within the effort limits of the model are too hard for such robots. Given moves
-        replace them, with collisions, since they may touch something. There is then no final round.
+        replace them, with contacts, since they may touch something. There is then no final round.
     randomization
         The robot of each move is drawn from it, the same for all candidates. None: the robot as described.
     motors

@@ -1,7 +1,7 @@
 """Search for gains of operational-space control on simulated moves of a tool, by CMA-ES from the default gains.
 
 The robots have no collision shapes in the search, and candidates may use only a share of the effort limits. The best
-candidates and the default gains then run a final round on other moves, with collisions, at the full limits. The gains
+candidates and the default gains then run a final round on other moves, with contacts, at the full limits. The gains
 with the lowest cost there are the result.
 """
 

@@ -15,7 +15,7 @@ from sapien.wrapper.actor_builder import ActorBuilder
 from batchpid.arrays.array_types import Array, SapienScene
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.sapien.mirrored_meshes import MirroringBuilder
-from batchpid.sim.engine.scene_spec import Build
+from batchpid.sim.engine.scene_spec import Build, SceneSpec
 
 Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
 """Links of a robot by name: the entity that each is part of, and its pose in that, None for the same."""
@@ -59,9 +59,11 @@ class SceneContent:
     number of values in the state. ``links`` are the links of the scene's robot.
     """
 
-    def __init__(self, build: Build, scene: SapienScene, env: int, links: Frames) -> None:
+    def __init__(self, spec: SceneSpec, build: Build, scene: SapienScene, env: int, links: Frames) -> None:
         before = {entity.per_scene_id for entity in scene.entities}  # the robot and the ground
         self.watched = _call(build, scene, env, links)
+        if not spec.collisions:
+            _refuse_shapes(scene, env)
         self._bodies, self._articulations = [], []
         for entity in scene.entities:
             if entity.per_scene_id in before:
@@ -120,7 +122,7 @@ class SceneContent:
         return np.array(rows, np.float32).reshape(len(rows), 7)
 
 
-def refuse_shapes(scene: SapienScene, env: int) -> None:
+def _refuse_shapes(scene: SapienScene, env: int) -> None:
     """Raise InvalidArgumentError if an entity of ``scene``, which belongs to env ``env``, has a collision shape."""
     for entity in scene.entities:
         for component in entity.components:
