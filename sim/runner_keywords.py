@@ -1,15 +1,25 @@
-"""Options of a Runner, as they are passed: types and documentation. :mod:`batchpid.sim.options` checks them."""
+"""Arguments of a Runner: the record in which each is declared once.
+
+An option has its type, default, bounds and documentation here, the places that keep it, and the help of its flag. From
+this record come the signature of :class:`batchpid.sim.Runner`, the checks of plain numbers, bools and choices, the
+values that snapshots, recordings and scenes keep, and the flags of the command line. Checks of options that depend on
+the robot or on each other are in :mod:`batchpid.sim.options`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cache
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_type_hints
 
 from numpy.typing import ArrayLike
 
 import batchpid as bp
 from batchpid.arrays.array_types import Rows
+from batchpid.arrays.field_tables import Field, plain
+from batchpid.checks.keywords import checks_keywords
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.robot import Robot
@@ -66,97 +76,223 @@ FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]
 
 
-class RunnerKeywords(TypedDict, total=False):
-    """Options of a :class:`batchpid.sim.Runner`, as they are passed by keyword; all may be left out."""
+Place = Literal["snapshot", "recording", "scene"]
+Role = Literal["restored", "processes", "last bits", "next commands"]
+"""Reason for which a snapshot may be restored in a runner with another value of an option.
 
-    first_env: int
+- "restored": the snapshot holds the value, and the runner takes it over;
+- "processes": the value says where and how fast the envs run, and results are bit-identical for any;
+- "last bits": so, but the last bits of results differ;
+- "next commands": the value is a default of the commands to come (``substeps``), or says which of them are refused.
+"""
+
+
+def option(
+    *kept: Place, apart: Role | None = None, bounds: Field | None = None, flag: str = "", **kept_as: str
+) -> dict[str, Any]:
+    """Return the metadata of an option.
+
+    Parameters
+    ----------
+    kept
+        Places that keep the option: see :meth:`batchpid.sim.RunnerOptions.values_for`.
+    apart
+        Role of an option that a snapshot does not hold against the runner that restores it.
+    bounds
+        Range and unit of a number.
+    flag
+        Help of the flag of this name, which `batchpid rollout` has; "" for none.
+    kept_as
+        The same as ``kept``, where a place keeps another value than the option itself: the attribute that holds it.
+    """
+    return dict.fromkeys(kept) | {**kept_as, "role": apart, "bounds": bounds, "flag": flag}
+
+
+@checks_keywords("Runner")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunnerKeywords:
+    """Arguments of a :class:`batchpid.sim.Runner`, as they are passed; all but the first two may be left out.
+
+    A snapshot and the runner that restores it must agree in the options that snapshots keep.
+    """
+
+    robot: Robot = field(kw_only=False, metadata=option(snapshot="robot_name"))
+    """From :meth:`batchpid.sim.Robot.load`."""
+    num_envs: int = field(kw_only=False, metadata=option("snapshot", bounds=Field(low=1, high=1_000_000)))
+    """Number of robots, one in each scene."""
+    params: bp.PIDParams | None = field(default=None, metadata=option(apart="restored"))
+    """PID parameters of one row, or one row per env. Default: see :func:`batchpid.sim.options.default_params`."""
+
+    first_env: int = field(default=0, metadata=option("snapshot", bounds=Field(high=1e9)))
     """Number of the first env; default 0. A runner with 100 for it is bit-identical to the envs from 100 on of a larger
     one: the noise of sensors, the streams of a randomization and ``build`` go by the numbers of envs."""
-    workers: int | None
+    workers: int | None = field(
+        default=None,
+        metadata=option(
+            apart="processes",
+            bounds=Field(high=1024),
+            flag="Processes that step the scenes; 0: this one. Default: one per available core.",
+        ),
+    )
     """Processes that step the scenes; 0 runs the same code in this process. Default: one per available core, each
     pinned to its core. Results are bit-identical for any number of workers."""
-    timestep: float
+    timestep: float = field(
+        default=1 / 2000,
+        metadata=option(
+            "snapshot", "recording", "scene", bounds=Field("seconds, not a rate: 1/2000", low=1e-6, high=0.1)
+        ),
+    )
     """Time step of simulation and control [s]; default 1/2000."""
-    substeps: int
+    substeps: int = field(
+        default=20, metadata=option("recording", apart="next commands", bounds=Field(low=1, high=1_000_000))
+    )
     """Sim steps of one tick, all under the same setpoint; the control runs at every one of them. Default 20."""
-    control: ControlMode | Literal["osc"] | Controller
+    control: ControlMode | Literal["osc"] | Controller = field(
+        default="pid", metadata=option(snapshot="control_name", recording="control_name")
+    )
     """``"pid"``, the default; ``"drive"``: the engine's internal PD drive, with the params' kp and kd as stiffness and
     damping; ``"effort"``: the setpoint is the joint effort; ``"osc"``: operational-space control of the link ``tool``,
     whose setpoints are poses (7,), a :class:`batchpid.sim.OperationalSpace` with its defaults; or a
     :class:`Controller`."""
-    tool: str | None
+    tool: str | None = field(default=None, metadata=option("snapshot", "recording"))
     """Link that control "osc" and ``setpoint_space`` "tool" move; default the last link of the robot's longest
     chain."""
-    setpoint_space: SetpointSpace
+    setpoint_space: SetpointSpace = field(default="joints", metadata=option("snapshot"))
     """``"joints"``, the default, or ``"tool"``: under control "pid" or "drive" setpoints are poses (7,) of the link
     ``tool``, position and quaternion (w, x, y, z), or poses and the positions of the joints outside the chain to it.
     Inverse kinematics (:class:`batchpid.sim.tool_space.tool_setpoints.ToolSetpoints`) makes joint setpoints of them,
     which rollouts and recordings hold."""
-    backend: Backend
+    backend: Backend = field(
+        default="numpy",
+        metadata=option("snapshot", flag="Library of the law: NumPy, or JAX, as one program with the steps."),
+    )
     """Library of the law: ``"numpy"``, the default, or ``"jax"``, which runs law and sim steps of a tick as one program
     of XLA on the CPU, and a :class:`Controller` in it (docs/performance.md). Between the two, and between processors,
     the last bits of results differ."""
-    dtype: Precision
+    dtype: Precision = field(default="float64", metadata=option("snapshot"))
     """Floating-point type of the law under backend ``"jax"``: ``"float64"``, the default, or ``"float32"``."""
-    compensate: Compensation
+    compensate: Compensation = field(
+        default="gravity+coriolis+friction",
+        metadata=option(
+            "snapshot",
+            "recording",
+            flag="Passive force and known friction, added at every sim step.",
+        ),
+    )
     """Passive force, and the known Coulomb friction on the way to the setpoint, added at every sim step.
     ``"gravity+coriolis+friction"``, the default, or a part of it; under control "effort" friction is not
     compensated. On a floating base the passive force is the joints' own share, as if the base were held where it is:
     what the legs carry of the base depends on their contacts, and is left to the law."""
-    engine: EngineName
+    engine: EngineName = field(
+        default=DEFAULT_ENGINE,
+        metadata=option(
+            "scene",
+            snapshot="engine_name",
+            recording="engine_name",
+            flag="Physics engine; mujoco is several times as fast, and its contacts differ.",
+        ),
+    )
     """Physics engine: ``"sapien"``, the reference and the default where it is installed, or ``"mujoco"``, several times
     as fast (docs/two-engines.md)."""
-    physics: PhysicsPreset | Physics | MujocoSolver
+    physics: PhysicsPreset | Physics | MujocoSolver = field(
+        default="accurate",
+        metadata=option(
+            snapshot="solver_settings",
+            recording="physics_name",
+            scene="solver",
+            flag="Solver settings: SAPIEN's, fewer iterations, or one, for motion without contact.",
+        ),
+    )
     """``"accurate"`` (the default: SAPIEN's solver settings), ``"fast"``, ``"free"`` (for motion without contact), or a
     :class:`batchpid.sim.Physics`, with the engine MuJoCo a :class:`batchpid.sim.MujocoSolver`."""
-    collisions: bool
+    collisions: bool = field(
+        default=True,
+        metadata=option(
+            "snapshot",
+            "recording",
+            "scene",
+            flag="Robots have no collision shapes: faster, for free motion only.",
+        ),
+    )
     """Default True. With False robots have no collision shapes, and there is no ground: for free motion only. Masses,
     inertias and joint limits stay. A :class:`batchpid.sim.MissedContactWarning` says which robots would have touched
     something."""
-    ground: bool | None
+    ground: bool | None = field(
+        default=None,
+        metadata=option(
+            "snapshot",
+            "recording",
+            "scene",
+            flag="Ground at height 0. Default: on, unless links of a fixed robot reach it at the start pose.",
+        ),
+    )
     """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
     so low that other links reach the ground at its start pose. With engine "mujoco" the planes in the world of an MJCF
     file take its place, by default as in the file."""
-    contacts: Sequence[str] | None
+    contacts: Sequence[str] | None = field(default=None, metadata=option("scene", "recording", snapshot="contact_list"))
     """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``. Links that fixed joints join
     are one body, and count as one. Default none. The links must move; with SAPIEN the robot has
     ``dissipation="urdf"``."""
-    wrenches: Sequence[str] | None
+    wrenches: Sequence[str] | None = field(default=None, metadata=option("scene", "recording", snapshot="wrench_list"))
     """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``. Default none. A
     link that a fixed joint holds needs a robot with ``merge_fixed=False``."""
-    build: Callable[[Any, int], Any] | None
+    build: Callable[[Any, int], Any] | None = field(default=None, metadata=option("scene", snapshot="build_digest"))
     """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
     that code written for a screen runs unchanged. It may return the entities that :meth:`batchpid.sim.Runner.poses`
     reports. A reset puts the content back to where ``build`` left it."""
-    on_fault: FaultAction
+    on_fault: FaultAction = field(default="hold", metadata=option("snapshot"))
     """``"hold"`` (the default) an env that fails at rest in its last valid state, with ``ok`` False until it is reset;
     or ``"reset"`` it to its last start, with ``ok`` False for that tick. An env fails when its state is not finite,
     when a position is beyond 1e6 rad or m, or by ``speed_limit``. The other envs are not affected."""
-    speed_limit: ArrayLike | None
+    speed_limit: ArrayLike | None = field(default=None, metadata=option(snapshot="speed_limits"))
     """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
-    actuators: bp.Actuators | None
+    actuators: bp.Actuators | None = field(default=None, metadata=option(apart="restored"))
     """Delays, limits, friction and errors of motors and sensors: :func:`batchpid.make_actuators`, of one row, or one
     row per env. None, the default, selects the robot's actuators: under control "drive" their friction and
     armature. ``bp.Actuators()`` is ideal. The control sees measured positions and velocities; observations hold the
     true ones, and the effort that was delivered."""
-    randomization: Randomization | None
+    randomization: Randomization | None = field(
+        default=None, metadata=option(snapshot="distributions", recording="distributions")
+    )
     """Distributions from which payload, masses, friction, gains and more are drawn for each env and episode
     (docs/randomization.md); default none."""
-    guard: bool | bp.Guard | None
+    guard: bool | bp.Guard | None = field(default=None, metadata=option(snapshot="guard_digest"))
     """Limits of setpoints, applied at every sim step: True for :meth:`batchpid.sim.Robot.guard`, or
     :func:`batchpid.make_guard`; default none. ``obs.guarded`` tells which setpoints were changed."""
-    on_invalid_input: InvalidInputAction
+    on_invalid_input: InvalidInputAction = field(default="raise", metadata=option(apart="next commands"))
     """``"raise"`` (the default) an error for NaN or infinity in a command or in a pose to reset to, or ``"contain"``
     it: only the env concerned fails."""
-    recover: bool
+    recover: bool = field(default=True, metadata=option(apart="processes"))
     """Default True: replace a worker process that dies or gets stuck, and replay its envs: results are bit-identical to
     an undisturbed run. With False :class:`batchpid.errors.WorkerError` is raised."""
-    checkpoint_steps: int | None
+    checkpoint_steps: int | None = field(
+        default=8000, metadata=option(apart="last bits", bounds=Field(low=1, high=1e9))
+    )
     """Sim steps between checkpoints, from which a replay starts, by default 8000; None: one replay from the start, for
     which all commands are kept. After contacts the last bits of the results depend on it."""
-    timeout: float
+    timeout: float = field(
+        default=60.0, metadata=option(apart="processes", bounds=Field("seconds", low=1e-3, high=1e9))
+    )
     """Seconds, by default 60, beyond an upper bound of the time that its work takes, before a worker counts as stuck. A
     worker that is stopped or asleep within a tick counts as stuck within a second."""
-    cluster: Literal["ray"] | Ray | None
+    cluster: Literal["ray"] | Ray | None = field(
+        default=None,
+        metadata=option(
+            apart="processes",
+            flag="Run on a Ray cluster: that of RAY_ADDRESS, else of this machine (extra `ray`; docs/cluster.md).",
+        ),
+    )
     """``"ray"`` or :class:`batchpid.sim.Ray`: the workers run on the machines of a Ray cluster, with bit-identical
     results (docs/cluster.md)."""
+
+    def __post_init__(self) -> None:
+        """Bring plain options to their declared type, within their bounds."""
+        for each in fields(self):
+            value = plain(each.name, kinds()[each.name], getattr(self, each.name), each.metadata["bounds"])
+            object.__setattr__(self, each.name, value)
+
+
+@cache
+def kinds() -> dict[str, Any]:
+    """Return the declared type of each argument, with any object for an engine's solver, which is not imported."""
+    return get_type_hints(RunnerKeywords, localns={"Physics": object, "MujocoSolver": object})

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from types import NoneType
+from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array
-from batchpid.checks.validate import at_least, entries, is_traced
+from batchpid.checks.validate import at_least, choice, entries, flag, integer, is_traced, number
 from batchpid.errors import InvalidArgumentError
 
 
@@ -50,6 +51,27 @@ WHOLE = ("max_delay", "seed")
 """Leaves for all joints together."""
 TABLES = ("limit_positions", "limit_efforts")
 """Leaves with a table for each joint (1 | envs, joints, points)."""
+
+
+def plain(name: str, kind: Any, value: Any, bounds: Field | None) -> Any:
+    """Return ``value`` in the canonical form of its declared type: a bool, a number, a choice, or one of these or None.
+
+    A value of another declared type is returned as it is.
+
+    Raises InvalidArgumentError if a number is out of ``bounds``, or the value is of another type.
+    """
+    kinds = [each for each in get_args(kind) if each is not NoneType]
+    if get_origin(kind) is Literal:
+        return choice(name, value, get_args(kind))
+    if len(kinds) == 1 and NoneType in get_args(kind):
+        return None if value is None else plain(name, kinds[0], value, bounds)
+    if kind is bool:
+        return flag(name, value)
+    if kind is int and bounds is not None:
+        return integer(name, value, int(bounds.low), int(bounds.high))
+    if kind is float and bounds is not None:
+        return number(name, value, bounds.low, bounds.high, bounds.unit)
+    return value
 
 
 def check_leaves(

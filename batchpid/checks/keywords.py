@@ -6,12 +6,13 @@ import difflib
 import functools
 import inspect
 from collections.abc import Callable, Collection
-from typing import ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from batchpid.errors import InvalidArgumentError
 
 P = ParamSpec("P")
 R = TypeVar("R")
+T = TypeVar("T")
 
 
 def check_keywords(owner: str, given: Collection[str], known: Collection[str]) -> None:
@@ -33,3 +34,26 @@ def known_keywords(function: Callable[P, R]) -> Callable[P, R]:
         return function(*args, **options)
 
     return checked
+
+
+def checks_keywords(owner: str) -> Callable[[type[T]], type[T]]:
+    """Decorate a class to check the names of its keywords; errors say that they are not arguments of ``owner``."""
+
+    def decorate(record: type[T]) -> type[T]:
+        init: Any = record.__init__
+        known = tuple(inspect.signature(record).parameters)
+
+        @functools.wraps(init)
+        def checked(self: T, *args: Any, **options: Any) -> None:
+            check_keywords(owner, options, known)
+            init(self, *args, **options)
+
+        record.__init__ = checked  # type: ignore[method-assign, assignment]
+        return record
+
+    return decorate
+
+
+def arguments_of(record: Callable[P, object]) -> Callable[[Callable[..., None]], Callable[Concatenate[Any, P], None]]:
+    """Decorate an ``__init__`` that passes its arguments on to ``record``, for editors to show those of ``record``."""
+    return lambda init: init

@@ -18,7 +18,6 @@ from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, write_figures
 from batchpid.sim.cli.progress import waiting
 from batchpid.sim.recording.recording_files import HDF5
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tool_space.tool_goals import default_goal
 from batchpid.sim.tuning.gain_sets import gain_set
@@ -26,6 +25,8 @@ from batchpid.task_space import load_osc_options
 
 if TYPE_CHECKING:
     from batchpid.sim.identification.setpoint_files import Setpoints
+
+RUNNER = flags.runner_flags()
 
 
 @dataclass(frozen=True)
@@ -63,17 +64,10 @@ class RolloutCommand:
     spread: float = 0.3
     """Largest distance of a start pose from the robot's own, with --control osc from the bundled robot's target, with
     --trajectory from its first row at time 0 [rad or m]; env 0 starts at that itself."""
-    compensate: flags.Compensate = "gravity+coriolis+friction"
-    engine: flags.Engine = DEFAULT_ENGINE
-    physics: flags.Physics = "accurate"
-    backend: flags.Backend = "numpy"
-    collisions: flags.Collisions = True
-    ground: flags.Ground = None
+    runner: Annotated[flags.RunnerFlags, flags.group(RUNNER)] = field(default_factory=RUNNER)
     dissipation: Literal["urdf", "sapien"] = "urdf"
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""
     randomize: flags.Randomize = None
-    workers: flags.Workers = None
-    cluster: flags.Cluster = None
     actuators: flags.Actuators = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
@@ -143,8 +137,9 @@ class RolloutCommand:
                 self.num_envs,
                 params=params,
                 control=control,
-                **flags.chosen(self, "tool workers cluster timestep compensate engine physics backend"),
-                **flags.chosen(self, "collisions ground"),
+                tool=self.tool,
+                timestep=self.timestep,
+                **self.runner.options(),
                 substeps=self.substeps if setpoints is None else setpoints.substeps,
                 randomization=randomization,
             )

@@ -33,7 +33,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-RUNNER_OPTIONS = tuple({"params", *RunnerKeywords.__annotations__} - {"substeps"})
+RUNNER_OPTIONS = tuple(RunnerKeywords.__annotations__.keys() - {"robot", "num_envs", "substeps"})
 """Options of the runner, without ``substeps``, which follow from ``rate_hz``."""
 
 

@@ -28,7 +28,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.sim.loop.faults import FaultWarning
 from batchpid.sim.observation import Observation, Rollout
-from batchpid.sim.options import RunnerOptions, default_params
+from batchpid.sim.options import RunnerOptions
 from batchpid.sim.recording.recording_files import HDF5, load_h5py, read_recording, write_recording
 from batchpid.sim.robot.limits import SetpointCheck, SetpointWarning
 from batchpid.sim.robot.robot import Robot
@@ -98,9 +98,8 @@ def sweep(
     numbers = first + np.arange(num_envs)
     given: Document = {"params": params, "qpos": qpos, "qvel": qvel, "seed": seed, **options}
     given |= {name: given[name](numbers) for name in PER_ENV if callable(given.get(name))}
-    gains, *start, streams = (given.pop(name) for name in PER_ENV[:4])
+    start, streams = [given.pop(name) for name in ("qpos", "qvel")], given.pop("seed")
     checked = RunnerOptions(robot, num_envs, **given)
-    gains = checked.check_params(default_params(robot, checked.control, checked.loops) if gains is None else gains)
     is_finite, shape = checked.on_invalid_input == "raise", (num_envs, robot.dof)
     if start[0] is None:
         start[0] = robot.start
@@ -118,7 +117,8 @@ def sweep(
         **{name: getattr(checked, name) for name in ("substeps", "checkpoint_steps", "on_invalid_input")},
         **{name: digest(rows) for name, rows in command.items()},
         **{
-            name: digest(rows) for name, rows in zip(PER_ENV, (gains, *start, streams, checked.actuators), strict=False)
+            name: digest(rows)
+            for name, rows in zip(PER_ENV, (checked.params, *start, streams, checked.actuators), strict=False)
         },
         "versions": package_versions(("batchpid", checked.engine, "numpy", *jax)),
     }
@@ -138,7 +138,7 @@ def sweep(
     for envs in (progress or iter)(spans := _spans(num_envs, part, done)):
         if envs.start not in done:
             own = {name: _rows(given[name], envs) for name in PER_ENV[4:] if name in given}
-            known = given | own | {"params": _rows(gains, envs), "first_env": first + envs.start}
+            known = given | own | {"params": _rows(checked.params, envs), "first_env": first + envs.start}
             with warnings.catch_warnings(), Runner(robot, envs.stop - envs.start, **known) as runner:
                 for kind in (FaultWarning, MissedContactWarning, SetpointWarning):  # they count from the part's first
                     warnings.simplefilter("ignore", kind)
@@ -148,7 +148,7 @@ def sweep(
             _warn(MissedContactWarning, runner.missed_contacts, envs)
             done[envs.start] = replace(rollout, info=replace(rollout.info, sweep=inputs))
             write_recording(done[envs.start], folder / f"{envs.start}.h5", overwrite=True)
-    whole = _joined([done[envs.start] for envs in spans], gains, checked.actuators)
+    whole = _joined([done[envs.start] for envs in spans], checked.params, checked.actuators)
     write_recording(whole, path)
     shutil.rmtree(folder, ignore_errors=True)
     return whole

@@ -23,13 +23,12 @@ GEARED = dataclasses.replace(PANDA, actuators=OWN)
 
 
 def test_every_keyword_is_an_option_and_is_shown_with_its_default():
-    options = {each.name: each.default for each in fields(RunnerOptions)}
+    robot, num_envs, *options = fields(RunnerKeywords)
     shown = inspect.signature(Runner).parameters
-    assert list(options) == ["robot", "num_envs", *RunnerKeywords.__annotations__]
-    assert list(shown) == ["robot", "num_envs", "params", *RunnerKeywords.__annotations__]
-    for name in RunnerKeywords.__annotations__:
-        assert shown[name].kind is inspect.Parameter.KEYWORD_ONLY
-        assert shown[name].default == options[name], name
+    assert list(shown) == [robot.name, num_envs.name, *(each.name for each in options)]
+    for each in options:
+        assert shown[each.name].kind is inspect.Parameter.KEYWORD_ONLY
+        assert shown[each.name].default == each.default, each.name
 
 
 @pytest.mark.parametrize(

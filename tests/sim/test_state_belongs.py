@@ -15,7 +15,7 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Randomization, Robot, Runner, RunnerOptions, Uniform
 from batchpid.sim.gym import ReachVectorEnv, ToolReachVectorEnv
-from batchpid.sim.options import Role
+from batchpid.sim.runner_keywords import Role
 
 pytest.importorskip("mujoco")
 POSTURE = np.array([0, -0.5, 0, -2.2, 0, 1.8, 0.8, 0.02, 0.02])
@@ -47,7 +47,7 @@ CONTEXTS = [
     {"workers": None, "build": None, "ground": None},
 ]
 """Further options that a value may need."""
-NAMES = [each.name for each in fields(RunnerOptions)] + ["params"]
+NAMES = [each.name for each in fields(RunnerOptions)]
 
 
 def quick(name):
@@ -103,7 +103,7 @@ def changed(ours, theirs):
 def check(ours, theirs, before=None):
     """Check that a snapshot made under ``ours`` is refused, or gives the same, under ``theirs``."""
     snapshot, (expected, ends) = before or went_on(ours)
-    roles = {each.name: each.metadata.get("role") for each in fields(RunnerOptions)} | {"params": "restored"}
+    roles = {each.name: each.metadata["role"] for each in fields(RunnerOptions)}
     with made(theirs) as other:
         try:
             other.restore(snapshot)
@@ -140,7 +140,7 @@ def panda():
 
 def test_every_option_is_kept_or_has_a_role_apart():
     for each in fields(RunnerOptions):
-        assert ("snapshot" in each.metadata) != (each.metadata.get("role") in get_args(Role)), each.name
+        assert ("snapshot" in each.metadata) != (each.metadata["role"] in get_args(Role)), each.name
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -164,7 +164,7 @@ def test_a_snapshot_is_refused_or_goes_on_as_before_under_each_value_of_each_opt
 
 def test_each_option_has_a_value_to_try_besides_its_default():
     """A new option needs a line in VALUES, unless its type lists its values."""
-    default = {each.name: each.default for each in fields(RunnerOptions)} | {"params": None}
+    default = {each.name: each.default for each in fields(RunnerOptions)}
     assert not [name for name in NAMES if {repr(each) for each in option_values(name)} <= {repr(default[name])}]
 
 
