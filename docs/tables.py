@@ -18,9 +18,8 @@ import batchpid as bp
 from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.field_tables import Field
 from batchpid.law.params import FIELDS as PARAMS
-from batchpid.motors.actuator_fields import FIELDS as ACTUATORS
-from batchpid.sim.randomization.fields import EVENTS, PHYSICAL, START
-from batchpid.sim.randomization.randomization import Randomization
+from batchpid.motors.actuators import FIELDS as ACTUATORS
+from batchpid.sim.randomization.randomization import EVENTS, PHYSICAL, START, Randomization
 
 DOCS = Path(__file__).parent
 

@@ -373,8 +373,9 @@ class RunnerOptions(RunnerKeywords):
         """
         marked = [each for each in fields(self) if place in each.metadata]
         values = {each.name: getattr(self, each.metadata[place] or each.name) for each in marked}
-        further = values.keys() - RunInfo.__annotations__ if place == "recording" else ()
-        return {**values, "options": {name: values.pop(name) for name in sorted(further)}} if further else values
+        if place == "recording" and (further := sorted(values.keys() - RunInfo.__annotations__)):
+            values["options"] = {name: values.pop(name) for name in further}
+        return values
 
     def describe(self) -> Document:
         """Return robot and options that two runners must share to restore each other's snapshots, as plain values."""

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Literal, Protocol, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, get_type_hints
 
 from numpy.typing import ArrayLike
 
@@ -87,9 +87,7 @@ Role = Literal["restored", "processes", "last bits", "next commands"]
 """
 
 
-def option(
-    *kept: Place, apart: Role | None = None, bounds: Field | None = None, flag: str = "", **kept_as: str
-) -> dict[str, Any]:
+def option(*kept: Place, apart: Role | None = None, flag: str = "", **kept_as: str) -> dict[str, Any]:
     """Return the metadata of an option.
 
     Parameters
@@ -98,14 +96,12 @@ def option(
         Places that keep the option: see :meth:`batchpid.sim.RunnerOptions.values_for`.
     apart
         Role of an option that a snapshot does not hold against the runner that restores it.
-    bounds
-        Range and unit of a number.
     flag
         Help of the flag of this name, which `batchpid rollout` has; "" for none.
     kept_as
         The same as ``kept``, where a place keeps another value than the option itself: the attribute that holds it.
     """
-    return dict.fromkeys(kept) | {**kept_as, "role": apart, "bounds": bounds, "flag": flag}
+    return dict.fromkeys(kept) | {**kept_as, "role": apart, "flag": flag}
 
 
 @checks_keywords("Runner")
@@ -118,33 +114,29 @@ class RunnerKeywords:
 
     robot: Robot = field(kw_only=False, metadata=option(snapshot="robot_name"))
     """From :meth:`batchpid.sim.Robot.load`."""
-    num_envs: int = field(kw_only=False, metadata=option("snapshot", bounds=Field(low=1, high=1_000_000)))
+    num_envs: Annotated[int, Field(low=1, high=1_000_000)] = field(kw_only=False, metadata=option("snapshot"))
     """Number of robots, one in each scene."""
     params: bp.PIDParams | None = field(default=None, metadata=option(apart="restored"))
     """PID parameters of one row, or one row per env. Default: see :func:`batchpid.sim.options.default_params`."""
 
-    first_env: int = field(default=0, metadata=option("snapshot", bounds=Field(high=1e9)))
+    first_env: Annotated[int, Field(high=1e9)] = field(default=0, metadata=option("snapshot"))
     """Number of the first env; default 0. A runner with 100 for it is bit-identical to the envs from 100 on of a larger
     one: the noise of sensors, the streams of a randomization and ``build`` go by the numbers of envs."""
-    workers: int | None = field(
+    workers: Annotated[int | None, Field(high=1024)] = field(
         default=None,
         metadata=option(
             apart="processes",
-            bounds=Field(high=1024),
             flag="Processes that step the scenes; 0: this one. Default: one per available core.",
         ),
     )
     """Processes that step the scenes; 0 runs the same code in this process. Default: one per available core, each
     pinned to its core. Results are bit-identical for any number of workers."""
-    timestep: float = field(
-        default=1 / 2000,
-        metadata=option(
-            "snapshot", "recording", "scene", bounds=Field("seconds, not a rate: 1/2000", low=1e-6, high=0.1)
-        ),
+    timestep: Annotated[float, Field("seconds, not a rate: 1/2000", low=1e-6, high=0.1)] = field(
+        default=1 / 2000, metadata=option("snapshot", "recording", "scene")
     )
     """Time step of simulation and control [s]; default 1/2000."""
-    substeps: int = field(
-        default=20, metadata=option("recording", apart="next commands", bounds=Field(low=1, high=1_000_000))
+    substeps: Annotated[int, Field(low=1, high=1_000_000)] = field(
+        default=20, metadata=option("recording", apart="next commands")
     )
     """Sim steps of one tick, all under the same setpoint; the control runs at every one of them. Default 20."""
     control: ControlMode | Literal["osc"] | Controller = field(
@@ -173,11 +165,7 @@ class RunnerKeywords:
     """Floating-point type of the law under backend ``"jax"``: ``"float64"``, the default, or ``"float32"``."""
     compensate: Compensation = field(
         default="gravity+coriolis+friction",
-        metadata=option(
-            "snapshot",
-            "recording",
-            flag="Passive force and known friction, added at every sim step.",
-        ),
+        metadata=option("snapshot", "recording", flag="Passive force and known friction, added at every sim step."),
     )
     """Passive force, and the known Coulomb friction on the way to the setpoint, added at every sim step.
     ``"gravity+coriolis+friction"``, the default, or a part of it; under control "effort" friction is not
@@ -265,13 +253,13 @@ class RunnerKeywords:
     recover: bool = field(default=True, metadata=option(apart="processes"))
     """Default True: replace a worker process that dies or gets stuck, and replay its envs: results are bit-identical to
     an undisturbed run. With False :class:`batchpid.errors.WorkerError` is raised."""
-    checkpoint_steps: int | None = field(
-        default=8000, metadata=option(apart="last bits", bounds=Field(low=1, high=1e9))
+    checkpoint_steps: Annotated[int | None, Field(low=1, high=1e9)] = field(
+        default=8000, metadata=option(apart="last bits")
     )
     """Sim steps between checkpoints, from which a replay starts, by default 8000; None: one replay from the start, for
     which all commands are kept. After contacts the last bits of the results depend on it."""
-    timeout: float = field(
-        default=60.0, metadata=option(apart="processes", bounds=Field("seconds", low=1e-3, high=1e9))
+    timeout: Annotated[float, Field("seconds", low=1e-3, high=1e9)] = field(
+        default=60.0, metadata=option(apart="processes")
     )
     """Seconds, by default 60, beyond an upper bound of the time that its work takes, before a worker counts as stuck. A
     worker that is stopped or asleep within a tick counts as stuck within a second."""
@@ -288,11 +276,11 @@ class RunnerKeywords:
     def __post_init__(self) -> None:
         """Bring plain options to their declared type, within their bounds."""
         for each in fields(self):
-            value = plain(each.name, kinds()[each.name], getattr(self, each.name), each.metadata["bounds"])
+            value = plain(each.name, kinds()[each.name], getattr(self, each.name))
             object.__setattr__(self, each.name, value)
 
 
 @cache
 def kinds() -> dict[str, Any]:
     """Return the declared type of each argument, with any object for an engine's solver, which is not imported."""
-    return get_type_hints(RunnerKeywords, localns={"Physics": object, "MujocoSolver": object})
+    return get_type_hints(RunnerKeywords, localns={"Physics": object, "MujocoSolver": object}, include_extras=True)

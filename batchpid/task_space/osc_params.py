@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +12,7 @@ from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.choices import CHOICES, NamedChoice
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
-from batchpid.arrays.field_tables import Field
+from batchpid.arrays.field_tables import Field, declared
 from batchpid.checks.keywords import known_keywords
 from batchpid.checks.validate import array, choice, entries, instance, read_array
 from batchpid.errors import InvalidArgumentError
@@ -21,27 +21,6 @@ from batchpid.task_space.tree_dynamics import check_masses
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Names of the axes of a task."""
-
-FIELDS = {
-    "stiffness": Field("1/s^2"),
-    "damping_ratio": Field("1", 1.0),
-    "damping": Field("1/s"),
-    "integral_gain": Field("1/s^3"),
-    "integral_limit": Field("m/s^2 or rad/s^2", math.inf),
-    "axes": Field(neutral=1.0),
-    "force_axes": Field(),
-    "posture_stiffness": Field("1/s^2"),
-    "posture_damping_ratio": Field("1", 1.0),
-    "limit_margin": Field("rad or m"),
-    "limit_stiffness": Field("1/s^2"),
-    "position_error_limit": Field("m", math.inf, above=True),
-    "rotation_error_limit": Field("rad", math.inf, above=True),
-    "smallest_eigenvalue": Field("1/kg or 1/(kg m^2)", above=True),
-    "effort_limit": Field("N m or N", math.inf),
-    "effort_min": Field("N m or N", -math.inf, low=-math.inf),
-    "effort_max": Field("N m or N", math.inf, low=-math.inf),
-}
-"""Options that are numbers; units are those with full decoupling."""
 
 
 class PartialDecoupling(NamedChoice):
@@ -121,23 +100,23 @@ class OSCParams(NamedTuple):
 def make_osc_params(
     tree: RigidTree,
     *,
-    stiffness: ArrayLike = 150.0,
-    damping_ratio: ArrayLike = 1.0,
-    damping: ArrayLike | None = None,
-    integral_gain: ArrayLike | None = None,
-    integral_limit: ArrayLike = math.inf,
-    axes: ArrayLike | None = None,
-    force_axes: ArrayLike | None = None,
-    posture_stiffness: ArrayLike = 10.0,
-    posture_damping_ratio: ArrayLike = 1.0,
-    limit_margin: ArrayLike | None = None,
-    limit_stiffness: ArrayLike = 400.0,
-    position_error_limit: ArrayLike = 0.1,
-    rotation_error_limit: ArrayLike = 0.5,
-    smallest_eigenvalue: ArrayLike = 0.02,
-    effort_limit: ArrayLike | None = None,
-    effort_min: ArrayLike | None = None,
-    effort_max: ArrayLike | None = None,
+    stiffness: Annotated[ArrayLike, Field("1/s^2")] = 150.0,
+    damping_ratio: Annotated[ArrayLike, Field("1", 1.0)] = 1.0,
+    damping: Annotated[ArrayLike | None, Field("1/s")] = None,
+    integral_gain: Annotated[ArrayLike | None, Field("1/s^3")] = None,
+    integral_limit: Annotated[ArrayLike, Field("m/s^2 or rad/s^2", math.inf)] = math.inf,
+    axes: Annotated[ArrayLike | None, Field(neutral=1.0)] = None,
+    force_axes: Annotated[ArrayLike | None, Field()] = None,
+    posture_stiffness: Annotated[ArrayLike, Field("1/s^2")] = 10.0,
+    posture_damping_ratio: Annotated[ArrayLike, Field("1", 1.0)] = 1.0,
+    limit_margin: Annotated[ArrayLike | None, Field("rad or m")] = None,
+    limit_stiffness: Annotated[ArrayLike, Field("1/s^2")] = 400.0,
+    position_error_limit: Annotated[ArrayLike, Field("m", math.inf, above=True)] = 0.1,
+    rotation_error_limit: Annotated[ArrayLike, Field("rad", math.inf, above=True)] = 0.5,
+    smallest_eigenvalue: Annotated[ArrayLike, Field("1/kg or 1/(kg m^2)", above=True)] = 0.02,
+    effort_limit: Annotated[ArrayLike | None, Field("N m or N", math.inf)] = None,
+    effort_min: Annotated[ArrayLike | None, Field("N m or N", -math.inf, low=-math.inf)] = None,
+    effort_max: Annotated[ArrayLike | None, Field("N m or N", math.inf, low=-math.inf)] = None,
     decoupling: str = "full",
     frame: str = "world",
     discretization: str = "explicit",
@@ -248,6 +227,10 @@ def make_osc_params(
     )
     _check_rows(params)
     return params
+
+
+FIELDS = declared(make_osc_params)
+"""Options that are numbers; units are those with full decoupling."""
 
 
 def _rows(name: str, value: ArrayLike, columns: tuple[str, ...]) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from batchpid.export import to_c, to_isaac_lab, to_maniskill, to_newton, to_ros2
 from batchpid.law.computed_torque import advance_with_mass_matrix, per_inertia
 from batchpid.law.input_checks import DRIVE_LACKS
 from batchpid.motors import guard as guards
-from batchpid.motors.actuator_fields import FIELDS
+from batchpid.motors.actuators import FIELDS
 from batchpid.sim import Robot
 
 DT, JOINTS = 0.01, ["a", "b", "c"]

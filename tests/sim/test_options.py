@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import inspect
 import pickle
 import sys
 from dataclasses import fields
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,7 +16,8 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
-from batchpid.sim import RunInfo, Runner, RunnerKeywords, RunnerOptions
+from batchpid.sim import RunInfo, Runner, RunnerKeywords, RunnerOptions, read_recording, write_recording
+from batchpid.sim.cli import parse
 from batchpid.sim.engine.protocol import SceneSpec
 
 PANDA = load_bundled("panda")
@@ -48,6 +51,36 @@ def test_a_missing_jax_is_named_with_its_extra_before_a_worker_starts(monkeypatc
     monkeypatch.setitem(sys.modules, "jax", None)
     with pytest.raises(MissingDependencyError, match=r"backend='jax' needs the package 'jax'.*batchpid\[jax\]"):
         Runner(PANDA, 1, backend="jax")
+
+
+def test_a_flag_of_an_option_has_its_default_and_reaches_the_runner():
+    given = parse(["rollout"]).runner.options()
+    flags = {each.name: each.default for each in fields(RunnerKeywords) if each.metadata["flag"]}
+    assert given == {name: value for name, value in flags.items() if name != "ground"}, "on or off, or neither"
+    words = ["--no-collisions", "--ground", "off", "--workers", "2", "--backend", "jax"]
+    given = parse(["rollout", *words]).runner.options()
+    assert (given["collisions"], given["ground"], given["workers"], given["backend"]) == (False, False, 2, "jax")
+
+
+def test_every_option_is_documented_where_it_is_declared():
+    body = ast.parse(inspect.getsource(RunnerKeywords)).body[0].body
+    pairs = {one.target.id: next_one for one, next_one in pairwise(body) if isinstance(one, ast.AnnAssign)}
+    assert pairs.keys() == {each.name for each in fields(RunnerKeywords)}
+    assert not [name for name, text in pairs.items() if not isinstance(text, ast.Expr)]
+
+
+def test_an_option_without_a_field_in_recordings_is_kept_among_their_options(tmp_path, monkeypatch):
+    annotations = {name: kind for name, kind in RunInfo.__annotations__.items() if name not in ("ground", "tool")}
+    monkeypatch.setattr(RunInfo, "__annotations__", annotations)
+    kept = RunnerOptions(PANDA, 2).values_for("recording")
+    assert kept["options"] == {"ground": PANDA.has_ground, "tool": None}
+    assert "ground" not in kept
+    monkeypatch.undo()
+    with Runner(PANDA, 1, workers=0) as runner:
+        run = runner.rollout(np.tile(PANDA.start, (2, 1)))
+    run = dataclasses.replace(run, info=dataclasses.replace(run.info, options=kept["options"]))
+    for name in ("run.npz", "run.h5"):
+        assert read_recording(write_recording(run, tmp_path / name)).info.options == kept["options"]
 
 
 def test_options_are_plain_values_of_their_documented_type():

@@ -92,7 +92,6 @@ def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
 @pytest.mark.parametrize(
     "name",
     [
-        "collisions",
         "meshes",
         "seed",
         "variation",
