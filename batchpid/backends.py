@@ -14,7 +14,7 @@ from batchpid.law.coefficients import discretise
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
 from batchpid.native.availability import obstacle
-from batchpid.native.compiled_law import CompiledLaw
+from batchpid.native.compiled import CompiledLaw
 
 LARGE = 2**18
 """Number of envs from which JAX's CPU backend steps block by block: it maps larger buffers again at every call."""

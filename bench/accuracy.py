@@ -31,8 +31,8 @@ from batchpid.checks.validate import choice, integer, number
 from batchpid.io.files import write_atomically
 from batchpid.motors.friction import Friction
 from batchpid.sim.cli.report import table
+from batchpid.sim.engine.physics import PHYSICS, Physics
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.sapien.physics import PHYSICS, Physics
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import STAGES, control_step

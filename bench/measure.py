@@ -34,8 +34,7 @@ from batchpid.io.versions import package_versions
 from batchpid.sim import Robot
 from batchpid.sim.cli.report import table
 from batchpid.sim.engine import native
-from batchpid.sim.engine.engines import load_engine
-from batchpid.sim.engine.protocol import EnginePack
+from batchpid.sim.engine.protocol import EnginePack, load_engine
 from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options import RunnerOptions

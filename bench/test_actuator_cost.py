@@ -12,7 +12,7 @@ from workload import Workload
 
 import batchpid as bp
 from batchpid.motors import advance_effort, advance_measurement, discretise
-from batchpid.native.compiled_stages import compiled_stages
+from batchpid.native.compiled import compiled_stages
 from batchpid.sim import Robot
 from batchpid.sim.loop.numpy_executor import NoiseBlocks
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.sim import Robot, Runner
-from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.scene_spec import SceneSpec
 
 TIMESTEP = 1 / 2000

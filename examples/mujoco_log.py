@@ -18,7 +18,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.sim import Robot
-from batchpid.sim.identification.excitation import excite
+from batchpid.sim.identification import excite
 
 
 class Truth(NamedTuple):

@@ -38,16 +38,15 @@ from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
 from batchpid.sim.robot.description import Dynamics, RobotDescription, register_dynamics
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.limits import MovingSetpointWarning, SetpointWarning
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.run_checks import MovingSetpointWarning, SetpointWarning
 from batchpid.sim.runner_keywords import Controller, RunnerKeywords
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContact, MissedContactWarning
 
 if TYPE_CHECKING:
-    from batchpid.sim.engine.mujoco.solver import MujocoSolver
-    from batchpid.sim.engine.sapien.physics import Physics
+    from batchpid.sim.engine.physics import MujocoSolver, Physics
     from batchpid.sim.runner import Runner
     from batchpid.sim.tuning.sweep import sweep
     from batchpid.sim.workers.pool import RecoveryWarning
@@ -90,8 +89,8 @@ __all__ = [
 ]
 
 _LOADED_LATE = {
-    "MujocoSolver": "batchpid.sim.engine.mujoco.solver",
-    "Physics": "batchpid.sim.engine.sapien.physics",
+    "MujocoSolver": "batchpid.sim.engine.physics",
+    "Physics": "batchpid.sim.engine.physics",
     "Runner": "batchpid.sim.runner",
     "RecoveryWarning": "batchpid.sim.workers.pool",
     "sweep": "batchpid.sim.tuning.sweep",

@@ -1,6 +1,6 @@
 """Options of a runner, checked: one definition for :class:`batchpid.sim.Runner`, its loops, snapshots and recordings.
 
-Longer than 300 lines because the checks of options that depend on the robot or on each other are here. A new option is
+Longer than 350 lines because the checks of options that depend on the robot or on each other are here. A new option is
 a field of :class:`batchpid.sim.RunnerKeywords`; one that changes scenes is a field of
 :class:`batchpid.sim.engine.scene_spec.SceneSpec`, too.
 """
@@ -21,6 +21,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.choices import PerMassMatrix
 from batchpid.arrays.digest import digest, object_digest
+from batchpid.arrays.field_tables import plain
 from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
@@ -31,9 +32,8 @@ from batchpid.law.input_checks import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.command import CommandSpec, joint_command, own_command
-from batchpid.sim.engine.engines import load_engine
-from batchpid.sim.engine.joint_friction import added_friction
-from batchpid.sim.engine.protocol import Capability, Engine, require
+from batchpid.sim.engine.protocol import Capability, Engine, load_engine, require
+from batchpid.sim.engine.scene_spec import added_friction
 from batchpid.sim.observation import Quantity, RunInfo, observed_by_loop
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
@@ -43,7 +43,7 @@ from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
-from batchpid.sim.runner_keywords import Controller, ControlMode, Place, RunnerKeywords
+from batchpid.sim.runner_keywords import Controller, ControlMode, Place, RunnerKeywords, kinds
 from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
 from batchpid.sim.tool_space.tool_setpoints import ToolSetpoints
 
@@ -108,7 +108,7 @@ class RunnerOptions(RunnerKeywords):
             check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
             self._check_world(self.randomization)
         self._check_tree()
-        own["guard"] = fit_guard(given["guard"], robot, self.num_envs, self.control_name, self.sets_positions)
+        own["guard"] = fit_guard(given["guard"], robot.joints, self.num_envs, self.control_name, self.sets_positions)
         own["actuators"] = self.check_actuators(given["actuators"])
         self._check_collisions()
         params = default_params(robot, self.control, self.loops) if given["params"] is None else given["params"]
@@ -465,10 +465,15 @@ def _code_digest(value: object) -> str | None:
     return None if value is None or isinstance(value, str) else object_digest(value)
 
 
+def worker_count(workers: Any) -> int:
+    """Return ``workers`` if it is a number of processes; None: one per available core."""
+    return len(os.sched_getaffinity(0)) if workers is None else plain("workers", kinds()["workers"], workers)
+
+
 def _places(workers: Any, cluster: Any) -> tuple[int | None, Ray | None]:
     """Return the options ``workers`` and ``cluster``, of which a runner has one."""
     if cluster is None:
-        return len(os.sched_getaffinity(0)) if workers is None else workers, None
+        return worker_count(workers), None
     cluster = instance("cluster", Ray() if cluster == "ray" else cluster, Ray, "pass 'ray' or Ray(...)")
     if workers is not None:
         remedy = "pass cluster=Ray(cpus_per_node=...)"

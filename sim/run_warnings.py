@@ -10,9 +10,8 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.observation import Observation
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.robot.drive_chatter import DriveChatterCheck
-from batchpid.sim.robot.limits import MovingSetpointCheck, SetpointCheck
 from batchpid.sim.robot.loop_stability import StabilityCheck
+from batchpid.sim.robot.run_checks import DriveChatterCheck, MovingSetpointCheck, SetpointCheck
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContactLog, MissedContactWarning
 

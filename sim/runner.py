@@ -2,7 +2,7 @@
 
 Each method makes a command of its arguments (:mod:`batchpid.sim.runner_commands`), and :meth:`Runner._execute` runs it.
 
-Longer than 300 lines because the public signatures and their documentation are spelled out for editors and readers.
+Longer than 350 lines because the public signatures and their documentation are spelled out for editors and readers.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Rows
-from batchpid.checks.keywords import arguments_of
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import choice, instance, integer
 from batchpid.checks.warn import warn
@@ -48,7 +47,7 @@ from batchpid.sim.runner_commands import (
     restored,
     snapshot_of,
 )
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE, arguments_of
 from batchpid.sim.runner_state import RunnerState
 from batchpid.sim.workers.contact_log import MissedContact
 from batchpid.sim.workers.node import NodeInfo

@@ -17,7 +17,7 @@ from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FARTHEST, ORIGIN
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.robot.limits import SetpointCheck
+from batchpid.sim.robot.run_checks import SetpointCheck
 from batchpid.sim.runner_state import Motion, RunnerState
 
 

@@ -10,24 +10,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cache
+from functools import cache, wraps
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, get_type_hints
+from inspect import signature
+from typing import Annotated, Any, Concatenate, Literal, ParamSpec, Protocol, TypeVar, get_type_hints
 
 from numpy.typing import ArrayLike
 
 import batchpid as bp
 from batchpid.arrays.array_types import Rows
 from batchpid.arrays.field_tables import Field, plain
-from batchpid.checks.keywords import checks_keywords
+from batchpid.checks.validate import check_keywords
+from batchpid.sim.engine.physics import MujocoSolver, Physics
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.robot import Robot
 
-if TYPE_CHECKING:
-    from batchpid.sim.engine.mujoco.solver import MujocoSolver
-    from batchpid.sim.engine.sapien.physics import Physics
-
+P = ParamSpec("P")
+T = TypeVar("T")
 ControlMode = Literal["pid", "drive", "effort"]
 
 
@@ -104,7 +104,21 @@ def option(*kept: Place, apart: Role | None = None, flag: str = "", **kept_as: s
     return dict.fromkeys(kept) | {**kept_as, "role": apart, "flag": flag}
 
 
-@checks_keywords("Runner")
+def _checks_names(record: type[T]) -> type[T]:
+    """Decorate a class to check the names of its keywords."""
+    init: Any = record.__init__
+    known = tuple(signature(record).parameters)
+
+    @wraps(init)
+    def checked(self: T, *args: Any, **options: Any) -> None:
+        check_keywords("Runner", options, known)
+        init(self, *args, **options)
+
+    record.__init__ = checked  # type: ignore[method-assign, assignment]
+    return record
+
+
+@_checks_names
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunnerKeywords:
     """Arguments of a :class:`batchpid.sim.Runner`, as they are passed; all but the first two may be left out.
@@ -282,5 +296,10 @@ class RunnerKeywords:
 
 @cache
 def kinds() -> dict[str, Any]:
-    """Return the declared type of each argument, with any object for an engine's solver, which is not imported."""
-    return get_type_hints(RunnerKeywords, localns={"Physics": object, "MujocoSolver": object}, include_extras=True)
+    """Return the declared type of each argument, with its bounds."""
+    return get_type_hints(RunnerKeywords, include_extras=True)
+
+
+def arguments_of(record: Callable[P, object]) -> Callable[[Callable[..., None]], Callable[Concatenate[Any, P], None]]:
+    """Decorate an ``__init__`` that passes its arguments on to ``record``, for editors to show those of ``record``."""
+    return lambda init: init

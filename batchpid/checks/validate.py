@@ -6,12 +6,15 @@ Every function takes the argument's name and its value, returns the value in its
 
 from __future__ import annotations
 
+import difflib
+import functools
+import inspect
 import math
 import os
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -278,6 +281,31 @@ def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_
             argument, f"has shape {mask.shape}, needs ({num_envs},)", remedy="use e.g. mask = ~obs.ok"
         )
     return mask
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def check_keywords(owner: str, given: Collection[str], known: Collection[str]) -> None:
+    """Raise InvalidArgumentError for the first name in ``given`` that is not among the ``known`` ones of ``owner``."""
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            remedy = f"did you mean {near[0]!r}?" if near else f"use one of {', '.join(known)}"
+            raise InvalidArgumentError(name, f"is not an argument of {owner}", remedy=remedy)
+
+
+def known_keywords(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate ``function``, which is called with the ``**options`` of others, to check the names of its keywords."""
+    known = tuple(inspect.signature(function).parameters)
+
+    @functools.wraps(function)
+    def checked(*args: P.args, **options: P.kwargs) -> R:
+        check_keywords(function.__name__, options, known)
+        return function(*args, **options)
+
+    return checked
 
 
 def _scalar(argument: str, value: Any, unit: str) -> float:

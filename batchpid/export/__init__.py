@@ -2,12 +2,10 @@
 
 from batchpid.export.c_header import to_c
 from batchpid.export.c_project import to_c_project
-from batchpid.export.exported import Exported, Imported
-from batchpid.export.isaac_lab import to_isaac_lab
-from batchpid.export.maniskill import to_maniskill
-from batchpid.export.newton import to_newton
+from batchpid.export.differences import Exported, Imported
 from batchpid.export.ros2_control import to_ros2_control
 from batchpid.export.ros2_control_reader import from_ros2_control
+from batchpid.export.simulators import to_isaac_lab, to_maniskill, to_newton
 
 __all__ = [
     "Exported",

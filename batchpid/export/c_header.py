@@ -21,7 +21,7 @@ from batchpid.checks.validate import choice, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.c_rigid_body import rigid_body
 from batchpid.export.c_step import Dialect, Value, helpers, statements
-from batchpid.export.exported import Exported
+from batchpid.export.differences import Exported
 from batchpid.law import pid
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.computed_torque import advance_with_mass_matrix, check_gain_units, per_inertia

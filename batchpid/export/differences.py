@@ -1,4 +1,4 @@
-"""Differences between the law and a target, each with a figure.
+"""Results of exports and imports, and the differences between the law and a target, each with a figure.
 
 Phases are taken from the sampled controller, from measurement to effort, with z = exp(j w dt)::
 
@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Array
+from batchpid.arrays.array_types import Array, Float64
 from batchpid.arrays.choices import IntegrateFirst, MeasuredRate, PerMassMatrix
 from batchpid.checks.validate import at_least, instance, names, read_array, time_step
 from batchpid.errors import InvalidArgumentError
@@ -26,7 +26,21 @@ from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.implicit import as_explicit
 from batchpid.law.params import PIDParams
 
-Float64 = NDArray[np.float64]
+
+class Exported(NamedTuple):
+    """Text of a file for a target, and the differences of the target's law from :func:`batchpid.step`."""
+
+    text: str
+    differences: tuple[str, ...] = ()
+    """One sentence each; empty where the target computes the same law."""
+
+
+class Imported(NamedTuple):
+    """Params, the names of their joints, and the differences of the law from the file."""
+
+    params: PIDParams
+    joint_names: list[str]
+    differences: tuple[str, ...] = ()
 
 
 class Differences(list[str]):

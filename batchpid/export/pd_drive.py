@@ -6,8 +6,9 @@ import math
 from collections.abc import Collection, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from batchpid.arrays.array_types import Float64
 from batchpid.arrays.choices import IntegrateFirst, MeasuredRate
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
@@ -15,7 +16,6 @@ from batchpid.export.differences import Differences, strategies
 from batchpid.law.params import PIDParams
 from batchpid.motors.actuators import FIELDS, Actuators
 
-Float64 = NDArray[np.float64]
 EFFECTS = {name: field for name, field in FIELDS.items() if name not in ("no_load_speed", "effort_limit")}
 """Effects of actuators that a target may lack."""
 _PROBLEMS = {

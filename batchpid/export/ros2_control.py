@@ -28,8 +28,7 @@ from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.choices import MeasuredRate
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
-from batchpid.export.differences import Differences, plain, strategies
-from batchpid.export.exported import Exported
+from batchpid.export.differences import Differences, Exported, plain, strategies
 from batchpid.io import documents
 from batchpid.law.params import PIDParams
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import choice, names
 from batchpid.errors import InvalidArgumentError
-from batchpid.export.exported import Imported
+from batchpid.export.differences import Imported
 from batchpid.export.ros2_control import LEAVES, NEUTRAL, STRATEGIES
 from batchpid.io import documents
 from batchpid.law.params import PIDParams, make_params

@@ -19,8 +19,7 @@ from batchpid.arrays.choices import CHOICES, Everywhere, PerMassMatrix
 from batchpid.arrays.display import params_summary
 from batchpid.arrays.field_tables import Field, check_leaves, declared
 from batchpid.arrays.leaves import LeafBuilder
-from batchpid.checks.keywords import known_keywords
-from batchpid.checks.validate import is_traced
+from batchpid.checks.validate import is_traced, known_keywords
 from batchpid.errors import InvalidArgumentError
 
 PLAIN = "effort_rate_limit", "derivative_filter_time", "setpoint_weight", "setpoint_weight_derivative", "deadband"

@@ -18,8 +18,7 @@ from batchpid.arrays.array_types import Array, Document, DType
 from batchpid.arrays.display import span, summary
 from batchpid.arrays.field_tables import WHOLE, Field, check_leaves, declared, in_group
 from batchpid.arrays.leaves import LeafBuilder
-from batchpid.checks.keywords import known_keywords
-from batchpid.checks.validate import entries, integer, is_traced, number, read_array
+from batchpid.checks.validate import entries, integer, is_traced, known_keywords, number, read_array
 from batchpid.errors import InvalidArgumentError
 
 MAX_DELAY = 1.0

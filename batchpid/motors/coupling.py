@@ -159,7 +159,7 @@ class Coupling(NamedTuple):
     def mass_matrix(self, matrix: Array) -> Array:
         """Return G^T M G for M (..., joints, joints) in the rows and columns of the independent joints.
 
-        Rows and columns of followers are rows and columns of the identity. ``fold`` in coupling.h is the same function.
+        Rows and columns of followers are rows and columns of the identity. ``fold`` in rigid_body.h is the same.
         """
         xp = namespace(matrix)
         rows = xp.swapaxes(self.efforts(xp.swapaxes(matrix, -1, -2)), -1, -2)
@@ -176,7 +176,7 @@ class Coupling(NamedTuple):
         return self.matrix.T**2 @ damping
 
     def native(self) -> dict[str, Rows]:
-        """Return the arrays for coupling.h; none for the identity."""
+        """Return the arrays for Coupling in rigid_body.h; none for the identity."""
         if self.is_identity:
             return {}
         return {"leader": self.leader.astype(np.int32), "multiplier": np.array(self.multiplier)}

@@ -111,17 +111,22 @@ inline Lanes angle_of(Lanes y, Lanes x) {
 
 // Copy a column of each of WIDTH rows, from row `first` on; the last row stands for those that there are not.
 template <class T>
-Lanes gather(T const *table, std::int64_t columns, std::int64_t column, std::int64_t first,
-                    std::int64_t rows) {
+Lanes gather(T const *table, std::int64_t columns, std::int64_t column, std::int64_t first, std::int64_t rows) {
   Lanes out;
   for (int k = 0; k < WIDTH; ++k) out.of[k] = table[std::min(first + k, rows - 1) * columns + column];
   return out;
 }
 
 template <class T>
-void scatter(Lanes value, T *table, std::int64_t columns, std::int64_t column, std::int64_t first,
-                    std::int64_t rows) {
+void scatter(Lanes value, T *table, std::int64_t columns, std::int64_t column, std::int64_t first, std::int64_t rows) {
   for (int k = 0; k < WIDTH && first + k < rows; ++k) table[(first + k) * columns + column] = static_cast<T>(value.of[k]);
+}
+
+// Return the product of a row, or of a column whose entries are `stride` apart, and a vector.
+inline Lanes along(Lanes const *row, Lanes const *vector, std::int64_t size, std::int64_t stride = 1) {
+  Lanes sum{};
+  for (std::int64_t k = 0; k < size; ++k) sum += row[k * stride] * vector[k];
+  return sum;
 }
 
 // Overwrite the lower triangle of symmetric matrices (n, n) by the factor L of L D L^T, without its diagonal of ones, and

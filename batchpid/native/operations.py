@@ -23,7 +23,7 @@ MOST_SUMMED = 128
 """Largest number of terms for which a sum has NumPy's order."""
 
 
-_FILES = ("make_program.h", "extension.h", "buffer.h", "program.h", "operations.py")
+_FILES = ("make_program.h", "extension.h", "program.h", "operations.py")
 PROGRAMS = tuple(f"batchpid/native/{name}" for name in _FILES)
 """Headers and tables of programs, for extensions that include them."""
 PROGRAM = Extension("batchpid.native._program", ("batchpid/native/program.cpp", *PROGRAMS), (*ROUNDED, "-pthread"))

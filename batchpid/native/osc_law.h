@@ -1,5 +1,5 @@
-// Law of operational-space control for WIDTH robots. The equations stand in batchpid/task_space: operational_space.py and
-// projections.py.
+// Law of operational-space control for WIDTH robots, and its compensation of friction. The equations stand in
+// batchpid/task_space: operational_space.py and projections.py; and in sim/tool_space/osc_controller.py.
 
 #pragma once
 
@@ -13,7 +13,6 @@
 #include "batchpid/native/mobility.h"
 #include "batchpid/native/tables.h"
 #include "batchpid/native/tool.h"
-#include "batchpid/native/tool_dynamics.h"
 
 namespace batchpid {
 
@@ -32,12 +31,6 @@ enum Law {
   TASK_SHARE, POSTURE_SHARE, NEAR_SINGULAR,
   LAW
 };
-
-inline Lanes along(Lanes const *row, Lanes const *vector, std::int64_t size) {
-  Lanes sum{};
-  for (std::int64_t k = 0; k < size; ++k) sum += row[k] * vector[k];
-  return sum;
-}
 
 // Inputs of a law for WIDTH rows. Coefficients in one row are loaded once.
 class Given {
@@ -71,6 +64,31 @@ class Given {
   std::vector<int> each_;
   std::vector<Lanes> of_;
 };
+
+// Write the efforts of damping and Coulomb friction (dof,) on the way of a tool to its setpoint. Without a twist the
+// setpoint rests; without a viscous damping that part is left out.
+inline void write_friction(std::int64_t dof, Given const &at, Lanes const *viscous, Lanes const *coulomb,
+                           Lanes const *band, Lanes *out) {
+  constexpr double LOOKAHEAD = 0.1;  // of batchpid/motors/friction.py
+  Lanes const *jacobian = at[TASK_JACOBIAN], *chain = at[CHAIN];
+  Lanes ahead[AXES], mobility[AXES * AXES];
+  write_error(at[SETPOINT], at[TASK_POSE], ahead);
+  for (int a = 0; a < AXES; ++a) {
+    if (at[TWIST] != nullptr) ahead[a] += LOOKAHEAD * at[TWIST][a];
+    for (int b = 0; b <= a; ++b) {
+      mobility[a * AXES + b] = mobility[b * AXES + a] = along(jacobian + a * dof, jacobian + b * dof, dof);
+    }
+    mobility[a * AXES + a] += 1e-4;
+  }
+  factorize(AXES, mobility);
+  solve_both<1>(AXES, mobility, ahead);
+  for (std::int64_t j = 0; j < dof; ++j) {
+    Lanes const moved = along(jacobian + j, ahead, AXES, dof);
+    Lanes const way = chain[j] * moved + (1.0 - chain[j]) * (at[POSTURE][j] - at[LAW_QPOS][j]);
+    out[j] = at_most(at_least(way * (coulomb[j] / band[j]), -coulomb[j]), coulomb[j]);
+    if (viscous != nullptr) out[j] = viscous[j] * at[LAW_QVEL][j] + out[j];
+  }
+}
 
 // Return the share of an effort, added to efforts `at`, with which the joints within their limits stay there.
 inline Lanes share_within(std::int64_t dof, Lanes const *effort, Lanes const *at, Lanes const *base, Lanes const *low,
@@ -134,6 +152,13 @@ class OSCLaw {
 
   std::int64_t links() const { return static_cast<std::int64_t>(chain_.size()); }
 
+  // Add J v of the chain.
+  void add_moved(Lanes const *v, Lanes *out) const {
+    for (std::int64_t const j : chain_) {
+      for (int axis = 0; axis < AXES; ++axis) out[axis] += given_[TASK_JACOBIAN][axis * dof_ + j] * v[j];
+    }
+  }
+
   // Set error, a, a_n and a_s.
   void set_accelerations() {
     Lanes *jacobian = given_[TASK_JACOBIAN], *rate = given_[TASK_RATE];
@@ -147,10 +172,7 @@ class OSCLaw {
       Lanes const scale = where_positive(length - limit, limit / length, 1.0);
       for (int k = 0; k < 3; ++k) near_error_[half + k] = scale * e[k];
     }
-    std::fill(twist, twist + AXES, Lanes{});
-    for (std::int64_t const j : chain_) {  // J q'
-      for (int axis = 0; axis < AXES; ++axis) twist[axis] += jacobian[axis * dof_ + j] * qvel[j];
-    }
+    add_moved(qvel, twist);
     if (in_tool_axes_) {
       Turn const turn(given_[TASK_POSE] + 3);
       if (target != nullptr) target = std::copy(target, target + AXES, turned_[0]) - AXES;
@@ -231,9 +253,7 @@ class OSCLaw {
     for (int axis = 0; axis < AXES; ++axis) {
       moved[axis] = decoupling_ == NONE ? a_[axis] : a_[axis] - given_[TASK_RATE][axis];
     }
-    for (std::int64_t const i : chain_) {  // J a_n of the chain
-      for (int axis = 0; axis < AXES; ++axis) pulled[axis] += jacobian[axis * dof_ + i] * a_n_[i];
-    }
+    add_moved(a_n_.data(), pulled);
     Lanes drop[AXES];
     for (int axis = 0; axis < AXES; ++axis) {
       force_[axis] = decoupling_ != NONE ? along(inertia_ + axis * AXES, moved, AXES)
@@ -244,9 +264,7 @@ class OSCLaw {
     }
     if (any_positive(null_near_)) {  // (L_s - L_n) J a_s
       Lanes sprung[AXES], held[AXES];
-      for (std::int64_t const i : chain_) {
-        for (int axis = 0; axis < AXES; ++axis) sprung[axis] += jacobian[axis * dof_ + i] * a_s_[i];
-      }
+      add_moved(a_s_.data(), sprung);
       more_of_springs_.add(sprung, held);
       for (int axis = 0; axis < AXES; ++axis) {
         drop[axis] = where_positive(null_near_, drop[axis] + held[axis], drop[axis]);
@@ -254,11 +272,8 @@ class OSCLaw {
     }
     for (std::size_t c = 0; c < chain_.size(); ++c) {
       std::int64_t const i = chain_[c];
-      Lanes x{}, y{};
-      for (int axis = 0; axis < AXES; ++axis) {
-        x += jacobian[axis * dof_ + i] * force_[axis];
-        y -= jacobian[axis * dof_ + i] * drop[axis];
-      }
+      Lanes const x = along(jacobian + i, force_, AXES, dof_);
+      Lanes y = -along(jacobian + i, drop, AXES, dof_);
       for (std::int64_t const j : chain_) y += mass[i * dof_ + j] * a_n_[j];
       task_[i] = both_[2 * c] = x;
       posture_[i] = both_[2 * c + 1] = y;

@@ -73,9 +73,7 @@ class PoseSearch {
   void step(Lanes const *error, Vector<Lanes> const &place) {
     std::int64_t const size = count();
     if (size == 0) return;
-    Lanes square{};
-    for (int axis = 0; axis < AXES; ++axis) square += error[axis] * error[axis];
-    Lanes const damping = DAMPING + DAMPING_PER_ERROR * (square / 2.0);
+    Lanes const damping = DAMPING + DAMPING_PER_ERROR * (along(error, error, AXES) / 2.0);
     std::fill(free_.begin(), free_.end(), Lanes(1.0));
     std::fill(move_.begin(), move_.end(), Lanes{});
     for (int pass = 0; pass < PASSES; ++pass) {
@@ -127,27 +125,19 @@ class PoseSearch {
   // Set the changes J^T (J J^T + damping 1)^-1 v of the free joints; v is overwritten.
   void solve(Lanes *v) {
     solve_both<1>(AXES, factor_, v);
-    for (std::int64_t j = 0; j < count(); ++j) {
-      Lanes sum{};
-      for (int axis = 0; axis < AXES; ++axis) sum += part_[j * AXES + axis] * v[axis];
-      change_[j] = sum;
-    }
+    for (std::int64_t j = 0; j < count(); ++j) change_[j] = along(&part_[j * AXES], v, AXES);
   }
 
   // Add half the acceleration along the step to the moves of free joints.
   void accelerate(Vector<Lanes> const &place) {
-    double const still[3] = {0.0, 0.0, 0.0};
-    Lanes rate[AXES], moved{}, changed{};
+    Lanes rate[AXES];
     for (std::size_t j = 0; j < joints_.size(); ++j) angle_[j] = multiplier_[j] * move_[of_[j]];
-    move_bodies(static_cast<std::int64_t>(joints_.size()), chain_.data(), bodies_.data(), angle_.data(), still,
+    move_bodies(static_cast<std::int64_t>(joints_.size()), chain_.data(), bodies_.data(), angle_.data(), {},
                 motions_.data());
     write_rate(motions_.back(), place, rate);
     solve(rate);
-    for (std::int64_t j = 0; j < count(); ++j) {
-      moved += move_[j] * move_[j];
-      changed += change_[j] * change_[j];
-    }
-    Lanes const velocity = root(moved), acceleration = root(changed);
+    Lanes const velocity = root(along(move_.data(), move_.data(), count()));
+    Lanes const acceleration = root(along(change_.data(), change_.data(), count()));
     Lanes const most = LARGEST_ACCELERATION * velocity;
     Lanes const share = 0.5 * where_positive(acceleration - most, most / acceleration, 1.0);
     for (std::int64_t j = 0; j < count(); ++j) {

@@ -6,6 +6,7 @@
 #pragma once
 
 #include <cmath>
+#include <cstddef>
 #include <cstdint>
 
 namespace batchpid {
@@ -205,13 +206,41 @@ void move_bodies(std::int64_t dof, std::int32_t const *tree, BodyState<N> const 
   }
 }
 
-// The same on a base at rest; gravity (3,) is an acceleration of the base.
-template <class N>
-void move_bodies(std::int64_t dof, std::int32_t const *tree, BodyState<N> const *body, N const *qvel,
-                 double const *gravity, BodyMotion<N> *motion) {
-  BodyMotion<N> base{};
-  base.moving_change = {N(-gravity[0]), N(-gravity[1]), N(-gravity[2])};
-  move_bodies(dof, tree, body, qvel, base, motion);
-}
+// Leaders and multipliers of the joints, null for none: batchpid/motors/coupling.py.
+struct Coupling {
+  std::int32_t const *leader;  // (dof,)
+  double const *multiplier;    // (dof,)
+
+  // Write G^T M G of coupled joints in place of M (n, n): Coupling.mass_matrix.
+  template <class N>
+  void fold(std::size_t n, N *matrix) const {
+    auto const above = [&](std::size_t i) { return static_cast<std::size_t>(leader[i]); };
+    if (leader == nullptr) return;
+    for (std::size_t i = 0; i < n; ++i) {
+      if (above(i) == i) continue;
+      for (std::size_t j = 0; j < n; ++j) matrix[above(i) * n + j] += multiplier[i] * matrix[i * n + j];
+    }
+    for (std::size_t i = 0; i < n; ++i) {
+      if (above(i) == i) continue;
+      for (std::size_t j = 0; j < n; ++j) matrix[j * n + above(i)] += multiplier[i] * matrix[j * n + i];
+    }
+    for (std::size_t i = 0; i < n; ++i) {
+      if (above(i) == i) continue;
+      for (std::size_t j = 0; j < n; ++j) matrix[i * n + j] = matrix[j * n + i] = 0.0;
+      matrix[i * n + i] = 1.0;
+    }
+  }
+
+  // Write G^T u in place of u, whose entry for a joint is at u[i]: Coupling.efforts.
+  template <class N>
+  void fold_vector(std::size_t n, N *u) const {
+    for (std::size_t i = 0; i < n && leader != nullptr; ++i) {
+      auto const above = static_cast<std::size_t>(leader[i]);
+      if (above == i) continue;
+      u[above] += multiplier[i] * u[i];
+      u[i] = 0.0;
+    }
+  }
+};
 
 }  // namespace batchpid

@@ -6,7 +6,7 @@
 #include <cstdint>
 #include <utility>
 
-#include "batchpid/native/buffer.h"
+#include "batchpid/native/extension.h"
 #include "batchpid/native/lanes.h"
 
 namespace batchpid {
@@ -89,6 +89,14 @@ class Tables {
       return false;
     }
     table = Table{buffer.as<double>(), columns, own};
+    return true;
+  }
+  // Open arrays with these columns, of which those from `results` on are outputs.
+  template <std::size_t N>
+  bool open_all(PyObject *const *arrays, std::int64_t const (&columns)[N], std::int64_t rows, std::size_t results) {
+    for (std::size_t i = 0; i < N; ++i) {
+      if (!open(arrays[i], columns[i], rows, i >= results)) return false;
+    }
     return true;
   }
   Table const &operator[](int at) const { return tables_[at]; }

@@ -6,17 +6,13 @@
 #include <utility>
 #include <vector>
 
-#include "batchpid/native/buffer.h"
-#include "batchpid/native/call.h"
 #include "batchpid/native/extension.h"
 #include "batchpid/native/lanes.h"
-#include "batchpid/native/osc_friction.h"
+#include "batchpid/native/tool.h"
 #include "batchpid/native/osc_law.h"
 #include "batchpid/native/pose_search.h"
 #include "batchpid/native/rigid_body.h"
 #include "batchpid/native/tables.h"
-#include "batchpid/native/tool.h"
-#include "batchpid/native/tool_dynamics.h"
 
 using namespace batchpid;
 
@@ -74,21 +70,14 @@ FOR_EACH_PROCESSOR void write_kinematics(Tree const &tree, std::int64_t body, st
   }
 }
 
-bool open_kinematics(Tables &table, PyObject *const *arrays, std::int64_t rows, std::int64_t dof) {
-  std::int64_t const sizes[KINEMATICS] = {dof, dof, FRAME, POSE, AXES * dof, AXES, dof * dof, dof};
-  for (int i = 0; i < KINEMATICS; ++i) {
-    if (!table.open(arrays[i], sizes[i], rows, i > TOOL)) return false;
-  }
-  return true;
-}
-
 // kinematics(tree, body, rows, *arrays)
 PyObject *kinematics(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Tree const *tree = held<Tree>(arguments[0]);
   if (tree == nullptr) return nullptr;
-  std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]);
+  std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]), dof = tree->dof;
   Tables table;
-  if (!open_kinematics(table, arguments + 3, rows, tree->dof)) return nullptr;
+  std::int64_t const columns[KINEMATICS] = {dof, dof, FRAME, POSE, AXES * dof, AXES, dof * dof, dof};
+  if (!table.open_all(arguments + 3, columns, rows, TOOL_POSE)) return nullptr;
   write_kinematics(*tree, body, rows, table);
   Py_RETURN_NONE;
 }
@@ -105,75 +94,56 @@ std::int64_t law_columns(int array, std::int64_t dof) {
   return std::count(std::begin(SIX), std::end(SIX), array) ? AXES : dof;
 }
 
-bool open_law(Tables &table, PyObject *const *arrays, std::int64_t rows, std::int64_t dof) {
-  for (int i = 0; i < LAW; ++i) {
-    if (!table.open(arrays[i], law_columns(i, dof), i == CHAIN ? 1 : rows, i >= EFFORT)) return false;
-  }
-  return true;
-}
-
-// Arrays of `friction` that are constants of the robot, and then in `bind`.
-constexpr int JOINTS[] = {VISCOUS, COULOMB, BAND};
-
-// Friction of some robots from its arrays; the others of Friction are those of a law.
+// Friction of some robots, from damping, Coulomb friction and band of their joints; the damping may be left out.
 class JointFriction {
  public:
-  JointFriction(Tables const &table, std::int64_t dof) : out(static_cast<std::size_t>(dof)) {
-    for (int i = 0; i < 3; ++i) {
-      if (!table[i]) continue;
-      columns_[i].resize(static_cast<std::size_t>(dof));
-      table[i].load(0, columns_[i].data());
-      of[JOINTS[i]] = columns_[i].data();
-    }
+  JointFriction(Tables const &table, std::int64_t dof) : out(static_cast<std::size_t>(dof)), table_(table), dof_(dof) {
+    for (auto &each : columns_) each.resize(out.size());
   }
-  // Write the friction at the state of a law with this dynamics.
-  void write(OSCLaw const &law, std::int64_t dof) {
-    constexpr std::pair<Friction, Law> SAME[] = {{AT_POSE, TASK_POSE},   {AT_JACOBIAN, TASK_JACOBIAN},
-                                                 {ON_CHAIN, CHAIN},      {GOAL_POSE, SETPOINT},
-                                                 {GOAL_TWIST, TWIST},    {OTHERS_GOAL, POSTURE},
-                                                 {AT_QPOS, LAW_QPOS},    {AT_QVEL, LAW_QVEL}};
-    for (auto const &[mine, its] : SAME) of[mine] = law.given()[its];
-    write_friction(dof, of, out.data());
+  // Write the friction of the rows from `first` on, which a law has loaded.
+  void write(std::int64_t first, Given const &at) {
+    auto &[viscous, coulomb, band] = columns_;
+    for (int i = 0; i < 3; ++i) {
+      if (table_[i]) table_[i].load(first, columns_[i].data());
+    }
+    write_friction(dof_, at, table_[0] ? viscous.data() : nullptr, coulomb.data(), band.data(), out.data());
   }
 
   std::vector<Lanes> out;
 
  private:
-  Lanes const *of[FRICTION] = {};
+  Tables const &table_;
+  std::int64_t dof_;
   std::vector<Lanes> columns_[3];
 };
 
 // Law of some robots on given arrays, with dynamics of a tree where it has a tool.
 struct Step : Call {
   Tree tree{};
-  std::int64_t body = -1, rows, dof;
+  std::int64_t body, rows, dof;
   Decoupling decoupling;
   bool in_tool_axes;
   Tables law, tool, friction;
 
-  // Arguments: decoupling, in_tool_axes, *arrays of law.
+  // Arguments: rows, dof, decoupling, in_tool_axes, tree, body and tool (None, any and None without them), *arrays of Law.
   bool open(PyObject *const *arguments) {
-    decoupling = static_cast<Decoupling>(PyLong_AsLong(arguments[0]));
-    in_tool_axes = PyLong_AsLong(arguments[1]) != 0;
-    return !PyErr_Occurred() && open_law(law, arguments + 2, rows, dof);
-  }
-  // Arguments: tree, body, rows, tool, and those of `open`.
-  bool open_with_tree(PyObject *const *arguments) {
-    Tree const *given = held<Tree>(arguments[0]);
-    if (given == nullptr) return false;
-    tree = *given;
-    dof = tree.dof;
-    body = PyLong_AsLong(arguments[1]);
-    rows = PyLong_AsLong(arguments[2]);
-    return !PyErr_Occurred() && tool.open(arguments[3], FRAME, rows, false) && open(arguments + 4);
-  }
-  // Arguments: those of `open_with_tree`, and damping, Coulomb friction and band of the joints, one row each.
-  bool open_with_friction(PyObject *const *arguments) {
-    if (!open_with_tree(arguments)) return false;
-    for (int i = 0; i < 3; ++i) {
-      if (!friction.open(arguments[6 + LAW + i], dof, 1, false)) return false;
+    rows = PyLong_AsLong(arguments[0]);
+    dof = PyLong_AsLong(arguments[1]);
+    decoupling = static_cast<Decoupling>(PyLong_AsLong(arguments[2]));
+    in_tool_axes = PyLong_AsLong(arguments[3]) != 0;
+    body = PyLong_AsLong(arguments[5]);
+    if (!PyErr_Occurred() && arguments[4] != Py_None) {
+      if (Tree const *given = held<Tree>(arguments[4])) tree = *given;
+    }
+    if (PyErr_Occurred() || !tool.open(arguments[6], FRAME, rows, false)) return false;
+    for (int i = 0; i < LAW; ++i) {
+      if (!law.open(arguments[7 + i], law_columns(i, dof), i == CHAIN ? 1 : rows, i >= EFFORT)) return false;
     }
     return true;
+  }
+  // Arguments: those of `open`, and damping, Coulomb friction and band of the joints.
+  bool open_with_friction(PyObject *const *arguments) {
+    return open(arguments) && friction.open_all(arguments + 7 + LAW, {dof, dof, dof}, rows, 3);
   }
 };
 
@@ -203,14 +173,9 @@ FOR_EACH_PROCESSOR void write_step(Step const &step, StepRoom &room) {
       if (!step.law[TASK_BIAS]) dynamics.set_bias();
       dynamics.set_mass();
     }
-    if (step.friction[1]) friction.write(law, step.dof);
+    if (step.friction[1]) friction.write(first, law.given());
     law.advance(first);
   }
-}
-
-void write_step(Step const &step) {
-  StepRoom room(step);
-  write_step(step, room);
 }
 
 // Step on arrays that stay, with its room.
@@ -224,46 +189,24 @@ void write_bound_step(Call const &call) {
   write_step(step, *step.room);
 }
 
-// law(rows, dof, *arguments of Step::open)
+// law(*arguments of Step::open)
 PyObject *law(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Step once;
-  once.rows = PyLong_AsLong(arguments[0]);
-  once.dof = PyLong_AsLong(arguments[1]);
-  if (PyErr_Occurred() || !once.open(arguments + 2)) return nullptr;
-  write_step(once);
+  if (!once.open(arguments)) return nullptr;
+  StepRoom room(once);
+  write_step(once, room);
   Py_RETURN_NONE;
 }
 
-// step(*arguments of Step::open_with_tree)
-PyObject *step(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  Step once;
-  if (!once.open_with_tree(arguments)) return nullptr;
-  write_step(once);
-  Py_RETURN_NONE;
-}
-
-// friction(rows, dof, *arrays of Friction)
+// friction(*arguments of Step::open_with_friction): write the friction, instead of the effort.
 PyObject *friction(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  std::int64_t const rows = PyLong_AsLong(arguments[0]), dof = PyLong_AsLong(arguments[1]);
-  if (PyErr_Occurred()) return nullptr;
-  Tables table;
-  std::vector<Lanes> columns[FRICTION];
-  Lanes const *of[FRICTION] = {};
-  for (int i = 0; i < FRICTION; ++i) {
-    std::int64_t size = dof;
-    if (i == AT_POSE || i == GOAL_POSE) size = POSE;
-    if (i == AT_JACOBIAN) size = AXES * dof;
-    if (i == GOAL_TWIST) size = AXES;
-    if (!table.open(arguments[2 + i], size, i == ON_CHAIN ? 1 : rows, i == RUBBING)) return nullptr;
-    columns[i].resize(static_cast<std::size_t>(size));
-    if (table[i]) of[i] = columns[i].data();
-  }
-  for (std::int64_t first = 0; first < rows; first += WIDTH) {
-    for (int i = 0; i < RUBBING; ++i) {
-      if (table[i]) table[i].load(first, columns[i].data());
-    }
-    write_friction(dof, of, columns[RUBBING].data());
-    table[RUBBING].store(first, columns[RUBBING].data());
+  Step once;
+  if (!once.open_with_friction(arguments)) return nullptr;
+  StepRoom room(once);
+  for (std::int64_t first = 0; first < once.rows; first += WIDTH) {
+    room.law.load(first);
+    room.friction.write(first, room.law.given());
+    once.law[EFFORT].store(first, room.friction.out.data());
   }
   Py_RETURN_NONE;
 }
@@ -285,11 +228,9 @@ PyObject *search(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   std::int64_t const body = PyLong_AsLong(arguments[1]), rows = PyLong_AsLong(arguments[2]);
   std::int64_t const iterations = PyLong_AsLong(arguments[3]), dof = tree->dof;
   if (PyErr_Occurred()) return nullptr;
-  std::int64_t const sizes[SEARCH] = {POSE, FRAME, dof, dof, 2, dof, 2, 1};
   Tables table;
-  for (int i = 0; i < SEARCH; ++i) {
-    if (!table.open(arguments[4 + i], sizes[i], rows, i > LARGEST)) return nullptr;
-  }
+  std::int64_t const columns[SEARCH] = {POSE, FRAME, dof, dof, 2, dof, 2, 1};
+  if (!table.open_all(arguments + 4, columns, rows, FOUND)) return nullptr;
   search_poses(*tree, body, rows, iterations, table);
   Py_RETURN_NONE;
 }
@@ -303,10 +244,8 @@ FOR_EACH_PROCESSOR void write_move(std::int64_t rows, std::int64_t joints, doubl
   std::vector<Lanes> columns[MOVE], room(n * n), free(n), weight(n), next(n);
   for (int i = 0; i < MOVE; ++i) columns[i].resize(i == INERTIA ? n * n : n);
   std::vector<Lanes> &inverse = columns[INERTIA];
-  auto const along = [&](std::int64_t j, std::vector<Lanes> const &effort) {
-    Lanes sum{};
-    for (std::int64_t k = 0; k < joints; ++k) sum += inverse[j * joints + k] * effort[k];
-    return dt * sum;
+  auto const moved = [&](std::int64_t j, std::vector<Lanes> const &effort) {
+    return dt * along(&inverse[j * joints], effort.data(), joints);
   };
   auto &[q, v, f, matrix, push, added, limit, keep, creep, low, high] = columns;
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
@@ -314,18 +253,18 @@ FOR_EACH_PROCESSOR void write_move(std::int64_t rows, std::int64_t joints, doubl
     for (std::int64_t j = 0; j < joints; ++j) matrix[j * joints + j] += added[j];
     invert(joints, inverse.data(), room.data());
     for (std::int64_t j = 0; j < joints; ++j) {
-      free[j] = v[j] + along(j, push);
+      free[j] = v[j] + moved(j, push);
       weight[j] = 1.0 / (dt * inverse[j * joints + j] + creep[j]);
     }
     for (long sweep = 0; sweep < sweeps; ++sweep) {
       for (std::int64_t j = 0; j < joints; ++j) {
-        next[j] = f[j] + weight[j] * (free[j] - along(j, f) - keep[0] * v[j] - creep[j] * f[j]);
+        next[j] = f[j] + weight[j] * (free[j] - moved(j, f) - keep[0] * v[j] - creep[j] * f[j]);
         next[j] = at_most(at_least(next[j], -limit[j]), limit[j]);
       }
       std::swap(f, next);
     }
     for (std::int64_t j = 0; j < joints; ++j) {
-      v[j] = free[j] - along(j, f);
+      v[j] = free[j] - moved(j, f);
       Lanes const end = q[j] + dt * v[j];
       v[j] = zero_outside(v[j], low[j], end, high[j]);
       q[j] = at_most(at_least(end, low[j]), high[j]);
@@ -341,10 +280,9 @@ PyObject *move(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   long const sweeps = PyLong_AsLong(arguments[3]);
   if (PyErr_Occurred()) return nullptr;
   Tables table;
-  for (int i = 0; i < MOVE; ++i) {
-    std::int64_t const columns = i == INERTIA ? joints * joints : i == KEEP ? 1 : joints;
-    if (!table.open(arguments[4 + i], columns, rows, i <= RUB)) return nullptr;
-  }
+  std::int64_t const all = joints * joints, others[] = {all, joints, joints, joints, 1, joints, joints, joints};
+  if (!table.open_all(arguments + 4, {joints, joints, joints}, rows, 0)) return nullptr;
+  if (!table.open_all(arguments + 4 + INERTIA, others, rows, MOVE)) return nullptr;
   write_move(rows, joints, dt, sweeps, table);
   Py_RETURN_NONE;
 }
@@ -353,7 +291,6 @@ PyMethodDef METHODS[] = {
     {"tree", make_tree, METH_VARARGS, nullptr},
     {"kinematics", method(kinematics), METH_FASTCALL, nullptr},
     {"law", method(law), METH_FASTCALL, nullptr},
-    {"step", method(step), METH_FASTCALL, nullptr},
     {"friction", method(friction), METH_FASTCALL, nullptr},
     {"bind", method(bind), METH_FASTCALL, nullptr},
     {"search", method(search), METH_FASTCALL, nullptr},

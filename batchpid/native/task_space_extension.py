@@ -24,11 +24,6 @@ LAW = (
     *("task_share", "posture_share", "near_singular"),
 )
 """Arrays of ``law``: dynamics, inputs and state, coefficients, and results from the effort on."""
-FRICTION = (
-    *("pose", "jacobian", "chain", "setpoint", "twist", "posture", "qpos", "qvel"),
-    *("damping", "coulomb", "band", "feedforward"),
-)
-"""Arrays of ``friction``; the last is the result."""
 SEARCH = ("goal", "tool", "lower", "upper", "tolerances", "qpos", "errors", "steps")
 """Arrays of ``search`` in pose_search.h; those after the tolerances are results. ``qpos`` holds the starts first."""
 MOVE = (
@@ -39,19 +34,12 @@ MOVE = (
 DECOUPLING = ("full", "partial", "none")
 """Kinds of decoupling, as Decoupling in task_space.cpp."""
 
-BUFFER, CALL, COUPLING, LANES, RIGID_BODY = (
-    f"batchpid/native/{name}.h" for name in ("buffer", "call", "coupling", "lanes", "rigid_body")
-)
-TABLES = "batchpid/native/task_space_extension.py"
-_HEADERS = tuple(
-    f"batchpid/native/{name}.h"
-    for name in ("extension", "mobility", "osc_friction", "osc_law", "pose_search", "tables", "tool", "tool_dynamics")
-)
-
+RIGID_BODIES = ("batchpid/native/lanes.h", "batchpid/native/rigid_body.h", "batchpid/native/task_space_extension.py")
+_NAMES = ("task_space.cpp", "extension.h", "mobility.h", "osc_law.h", "pose_search.h", "tables.h", "tool.h")
 
 TASK_SPACE = Extension(
     "batchpid.native._task_space",
-    ("batchpid/native/task_space.cpp", *_HEADERS, BUFFER, CALL, COUPLING, LANES, RIGID_BODY, TABLES),
+    (*(f"batchpid/native/{name}" for name in _NAMES), *RIGID_BODIES),
     (*ROUNDED, *LANES_ONLY),
 )
 EXTENSIONS = {"_task_space": TASK_SPACE}

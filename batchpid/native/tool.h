@@ -1,5 +1,5 @@
-// A kinematic tree, and the pose of a tool: a frame on one of its bodies. The equations stand in
-// batchpid/task_space: tree_kinematics.py and frames.py.
+// A kinematic tree with a tool, a frame on one of its bodies: its pose, and the dynamics at it. The equations stand in
+// batchpid/task_space: tree_kinematics.py, tree_dynamics.py and frames.py.
 
 #pragma once
 
@@ -8,7 +8,6 @@
 #include <cstdint>
 #include <vector>
 
-#include "batchpid/native/coupling.h"
 #include "batchpid/native/lanes.h"
 #include "batchpid/native/rigid_body.h"
 
@@ -37,6 +36,31 @@ inline void write_cosines(std::int64_t count, Lanes const *angle, Lanes *cosine,
   for (std::int64_t i = 0; i < count; ++i) sine_and_cosine(angle[i], sine[i], cosine[i]);
 }
 
+inline void put(Vector<Lanes> const &v, Lanes *out, std::int64_t stride = 1) {
+  out[0] = v.x;
+  out[stride] = v.y;
+  out[2 * stride] = v.z;
+}
+
+// Write the unit quaternion (w, x, y, z), w >= 0, of the rotation with columns x, y, z: wxyz_of in frames.py.
+inline void write_quaternion(Vector<Lanes> const &x, Vector<Lanes> const &y, Vector<Lanes> const &z, Lanes *out) {
+  Lanes const same = 1.0 + x.x, other = 1.0 - x.x, sum = y.y + z.z, difference = y.y - z.z;
+  Lanes const squares[4] = {same + sum, same - sum, other + difference, other - difference};
+  Lanes const wx = y.z - z.y, wy = z.x - x.z, wz = x.y - y.x, xy = x.y + y.x, xz = x.z + z.x, yz = y.z + z.y;
+  Lanes const rows[4][4] = {
+      {squares[0], wx, wy, wz}, {wx, squares[1], xy, xz}, {wy, xy, squares[2], yz}, {wz, xz, yz, squares[3]}};
+  Lanes q[4], most = squares[0];
+  std::copy(rows[0], rows[0] + 4, q);
+  for (int row = 1; row < 4; ++row) {
+    Lanes const larger = squares[row] - most;
+    most = where_positive(larger, squares[row], most);
+    for (int k = 0; k < 4; ++k) q[k] = where_positive(larger, rows[row][k], q[k]);
+  }
+  Lanes const length = root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+  Lanes const scale = where_positive(-q[0], -1.0, 1.0) / length;
+  for (int k = 0; k < 4; ++k) out[k] = scale * q[k];
+}
+
 // Axes and origin of a tool in the world: columns of its frame.
 struct Tool {
   Vector<Lanes> columns[4];
@@ -52,14 +76,11 @@ struct Tool {
   }
   Vector<Lanes> const &place() const { return columns[3]; }
   // Write the pose (7,): position and quaternion.
-  void write_pose(Lanes *pose) const;
+  void write_pose(Lanes *pose) const {
+    put(columns[3], pose);
+    write_quaternion(columns[0], columns[1], columns[2], pose + 3);
+  }
 };
-
-inline void put(Vector<Lanes> const &v, Lanes *out, std::int64_t stride = 1) {
-  out[0] = v.x;
-  out[stride] = v.y;
-  out[2 * stride] = v.z;
-}
 
 // Write the column (6,) of the Jacobian of a place that belongs to the joint of a body.
 inline void write_column(BodyState<Lanes> const &body, bool slides, Vector<Lanes> const &place, Lanes *out,
@@ -97,30 +118,6 @@ struct Turn {
   }
 };
 
-// Write the unit quaternion (w, x, y, z), w >= 0, of the rotation with columns x, y, z: wxyz_of in frames.py.
-inline void write_quaternion(Vector<Lanes> const &x, Vector<Lanes> const &y, Vector<Lanes> const &z, Lanes *out) {
-  Lanes const same = 1.0 + x.x, other = 1.0 - x.x, sum = y.y + z.z, difference = y.y - z.z;
-  Lanes const squares[4] = {same + sum, same - sum, other + difference, other - difference};
-  Lanes const wx = y.z - z.y, wy = z.x - x.z, wz = x.y - y.x, xy = x.y + y.x, xz = x.z + z.x, yz = y.z + z.y;
-  Lanes const rows[4][4] = {
-      {squares[0], wx, wy, wz}, {wx, squares[1], xy, xz}, {wy, xy, squares[2], yz}, {wz, xz, yz, squares[3]}};
-  Lanes q[4], most = squares[0];
-  std::copy(rows[0], rows[0] + 4, q);
-  for (int row = 1; row < 4; ++row) {
-    Lanes const larger = squares[row] - most;
-    most = where_positive(larger, squares[row], most);
-    for (int k = 0; k < 4; ++k) q[k] = where_positive(larger, rows[row][k], q[k]);
-  }
-  Lanes const length = root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-  Lanes const scale = where_positive(-q[0], -1.0, 1.0) / length;
-  for (int k = 0; k < 4; ++k) out[k] = scale * q[k];
-}
-
-inline void Tool::write_pose(Lanes *pose) const {
-  put(columns[3], pose);
-  write_quaternion(columns[0], columns[1], columns[2], pose + 3);
-}
-
 inline Lanes length_of(Lanes const *v) { return root(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
 
 // Write the error (6,) from a pose to a goal: pose_error in frames.py.
@@ -138,5 +135,66 @@ inline void write_error(Lanes const *goal, Lanes const *pose, Lanes *out) {
   Lanes const scale = where_positive(large, angle_of(length, size), 1.0) / over;
   for (int k = 0; k < 3; ++k) out[3 + k] = 2.0 * scale * v[k];
 }
+
+// Kinematics and dynamics of WIDTH robots with a tool, reduced to the leaders of coupled joints.
+class ToolDynamics {
+ public:
+  // `body` is the body of the tool, or -1 for the base.
+  ToolDynamics(Tree const &tree, std::int64_t body) : tree_(tree), body_(body) {
+    auto const size = static_cast<std::size_t>(tree.dof);
+    for (auto *leaf : {&bias, &cosine_, &sine_}) leaf->resize(size);
+    jacobian.resize(AXES * size);
+    mass.resize(size * size);
+    bodies_.resize(size);
+    motions_.resize(size);
+  }
+
+  // Set the bodies at positions and velocities (dof,); without velocities, their frames alone.
+  void place(Lanes const *qpos, Lanes const *qvel) {
+    write_cosines(tree_.dof, qpos, cosine_.data(), sine_.data());
+    place_bodies(tree_.dof, above(), tree_.bodies(), cosine_.data(), sine_.data(), qpos, bodies_.data());
+    if (qvel != nullptr) move_bodies(tree_.dof, above(), bodies_.data(), qvel, {}, motions_.data());
+  }
+  // Set the pose of a tool, its Jacobian, and J' q' where the bodies have velocities.
+  void set_tool(Lanes const *frame, bool poses, bool columns, bool moves) {
+    Tool const tool(frame, body_ < 0 ? nullptr : &bodies_[body_]);
+    if (poses) tool.write_pose(pose);
+    if (columns && tree_.coupled) std::fill(jacobian.begin(), jacobian.end(), Lanes{});  // leaders are added to
+    for (std::int64_t j = columns ? body_ : -1; j >= 0; j = above()[2 * j]) {
+      write_column(bodies_[j], above()[2 * j + 1], tool.place(), &jacobian[j], tree_.dof);
+    }
+    for (int axis = 0; axis < AXES && columns && tree_.coupled; ++axis) {
+      Lanes *row = &jacobian[axis * tree_.dof];
+      tree_.coupling().fold_vector(size(), row);
+    }
+    if (moves) write_rate(body_ < 0 ? BodyMotion<Lanes>{} : motions_[body_], tool.place(), rate);
+  }
+  // Set the inertias of the bodies; each of the following needs them, and the first must come first.
+  void weigh() { weigh_bodies(tree_.dof, tree_.bodies(), bodies_.data()); }
+  void set_bias() {
+    for (std::int64_t i = 0; i < tree_.dof; ++i) motions_[i].accelerate(bodies_[i].inertia, tree_.gravity);
+    efforts_of_wrenches(tree_.dof, above(), bodies_.data(), motions_.data(), bias.data());
+    tree_.coupling().fold_vector(size(), bias.data());
+  }
+  void set_mass() {
+    composite_mass_matrix(tree_.dof, above(), bodies_.data(), mass.data());
+    for (std::int64_t i = 0; i < tree_.dof; ++i) mass[i * tree_.dof + i] += tree_.armature[i];
+    tree_.coupling().fold(size(), mass.data());
+  }
+
+  Lanes pose[POSE], rate[AXES];
+  std::vector<Lanes> jacobian;  // J G: 0 for joints that do not move the tool, and for followers
+  std::vector<Lanes> mass, bias;
+
+ private:
+  std::int32_t const *above() const { return tree_.tree.data(); }
+  std::size_t size() const { return static_cast<std::size_t>(tree_.dof); }
+
+  Tree const &tree_;
+  std::int64_t body_;
+  std::vector<Lanes> cosine_, sine_;
+  std::vector<BodyState<Lanes>> bodies_;
+  std::vector<BodyMotion<Lanes>> motions_;
+};
 
 }  // namespace batchpid

@@ -6,12 +6,11 @@ twists, wrenches and Jacobians have linear parts first. NumPy computes in float6
 
 from batchpid.task_space import osc_presets as presets
 from batchpid.task_space.inverse_kinematics import IKResult, InverseKinematicsWarning, inverse_kinematics
-from batchpid.task_space.operational_space import init, osc, reset
+from batchpid.task_space.operational_space import init, osc, reset, track
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
 from batchpid.task_space.osc_files import load_osc_options, save_osc_options
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
 from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDynamics, Tool, task_dynamics
-from batchpid.task_space.osc_transfer import track
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_dynamics import bias, forward_dynamics, gravity, inverse_dynamics, mass_matrix
 from batchpid.task_space.tree_kinematics import jacobian, jacobian_rate, link_poses

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Array
+from batchpid.arrays.array_types import Array, Float64
 from batchpid.arrays.display import array_summary
 from batchpid.checks.validate import array, broadcast, choice, entries, integer, positive
 from batchpid.checks.warn import warn
@@ -33,8 +33,6 @@ from batchpid.task_space.frames import pose_error, pose_of
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.symmetric import gram, product, quiet, whitened
 from batchpid.task_space.tree_kinematics import jacobian_at, motions_of, rate_at, tool_frame, velocities_of
-
-Float64 = NDArray[np.float64]
 
 ON_FAILURE = ("warn", "raise", "return")
 _DAMPING, _DAMPING_PER_ERROR = 1e-8, 0.1

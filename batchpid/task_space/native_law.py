@@ -1,4 +1,7 @@
-"""Operational-space control in native code, for any number of rows: task_space.cpp."""
+"""Operational-space control in native code, for any number of rows, or within the sim steps of a tick.
+
+The code is in task_space.cpp.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Array
-from batchpid.native.task_space_extension import DECOUPLING, FRICTION, LAW
+from batchpid.arrays.array_types import Array, Document, Float64
+from batchpid.native.task_space_extension import DECOUPLING, LAW
 from batchpid.task_space import native_rows
 from batchpid.task_space.osc_coefficients import OSCCoefficients
 from batchpid.task_space.osc_params import NoDecoupling, PartialDecoupling
@@ -17,13 +20,13 @@ from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDyn
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_kinematics import prepared, read_point
 
-Float64 = NDArray[np.float64]
-
 _RESULTS = {
     **{"effort": 0, "integral": 6, "limited": 0, "error": 6, "wrench": 6, "task": 0, "posture": 0, "unsaturated": 0},
     **{"task_share": 1, "posture_share": 1, "near_singular": 1},
 }
 """Terms and state in the order of the results in LAW, and their columns; 0 for one per joint."""
+_WITHOUT_TREE = None, -1, None
+"""Tree, body and tool of a law whose dynamics are among its arrays."""
 
 
 def law(
@@ -45,56 +48,38 @@ def law(
     rows, dof = inputs.qpos.shape
     wanted = wanted if state.integral is None else (*wanted, "integral")
     results = [np.empty((rows, size or dof)) if name in wanted else None for name, size in _RESULTS.items()]
-    if tool is None:
-        native_rows.call(native.law, rows, dof, *_kind(k), *given, *arrays, *results)
-    else:
-        fixed, chain = _of_tree(native, tool.tree, tool.link, given[0], rows, k)
-        native_rows.call(native.step, *fixed, *[None] * 5, chain, *arrays, *results)
+    fixed: tuple[Any, ...] = (*_kind(k), *_WITHOUT_TREE)
+    if tool is not None:
+        fixed, chain = _of_tree(native, tool.tree, tool.link, given[0], k)
+        given = (*[None] * 5, chain)
+    native_rows.call(native.law, rows, dof, *fixed, *given, *arrays, *results)
     effort, integral, _, *parts, s1, s2, near = results
     shares = [None if each is None else each[:, 0] for each in (s1, s2)]
     terms = OSCTerms._make((*parts, effort, *shares, None if near is None else near[:, 0] > 0))
     return (state if integral is None else state._replace(integral=integral)), terms
 
 
-def friction(arrays: Mapping[str, Any]) -> Float64 | None:
-    """Return the friction (envs, dof) on the way to a setpoint, from arrays by their names in FRICTION.
+def friction(arrays: Mapping[str, Any], coulomb: Array, band: Array) -> Float64 | None:
+    """Return the friction (envs, dof) on the way to a setpoint, from arrays by their names in LAW.
 
-    The result is None where native code is not used. With ``damping`` the efforts of damping are included.
+    The result is None where native code is not used.
     """
     qpos = arrays["qpos"]
-    if (native := native_rows.for_rows(qpos, *arrays.values())) is None:
+    if (native := native_rows.for_rows(qpos, *arrays.values(), coulomb, band)) is None:
         return None
     found = np.empty(qpos.shape)
-    native_rows.call(native.friction, *qpos.shape, *({**arrays, "feedforward": found}.get(name) for name in FRICTION))
+    given = map({**arrays, "effort": found}.get, LAW)
+    native_rows.call(native.friction, *qpos.shape, 0, False, *_WITHOUT_TREE, *given, None, coulomb, band)
     return found
 
 
-def bind(
-    tree: RigidTree, link: str, point: Array, k: OSCCoefficients, arrays: Mapping[str, Any]
-) -> tuple[Any, int] | None:
-    """Return an object that keeps ``arrays``, and the address of a Call (call.h) that runs :func:`law` on them.
-
-    ``arrays`` are contiguous float64 arrays by their names in LAW; without ``bias`` it is the tree's. The tool is at a
-    ``point`` (3,) of ``link``, by default at its origin. With ``coulomb`` and ``band`` (dof,) the feedforward is
-    friction. The result is None where native code is not used.
-    """
-    if (native := native_rows.in_use()) is None:
-        return None
-    fixed, chain = _of_tree(native, tree, link, point, len(arrays["qpos"]), k)
-    known = {**dict(zip(k._fields[:-2], k[:-2], strict=True)), **arrays, "chain": chain}
-    rubbing = [None, None, None]
-    if "coulomb" in arrays:  # damping is part of this friction, and not an input of the law
-        rubbing = [known.pop(name, None) for name in ("damping", "coulomb", "band")]
-    return native.bind(*fixed, *map(known.get, LAW), *rubbing)
-
-
 def _of_tree(
-    native: Any, tree: RigidTree, link: str, point: Array, rows: int, k: OSCCoefficients
+    native: Any, tree: RigidTree, link: str, point: Array, k: OSCCoefficients
 ) -> tuple[tuple[Any, ...], Float64]:
-    """Return the arguments of ``step`` and ``bind`` before the arrays of the law, and the chain to the tool (dof,)."""
+    """Return the arguments of ``law`` and ``bind`` between sizes and arrays, and the chain to the tool (dof,)."""
     own, index = native_rows.native_tree(native, tree), tree.index(link)
     body = tree.link_bodies[index]
-    fixed = own.tree, body, rows, native_rows.tool(own, index, point), *_kind(k)
+    fixed = *_kind(k), own.tree, body, native_rows.tool(own, index, point)
     return fixed, np.array(tree.chains[body], np.float64)
 
 
@@ -102,3 +87,63 @@ def _kind(k: OSCCoefficients) -> tuple[int, bool]:
     """Return the index in DECOUPLING, and whether the coefficients are in the axes of the tool."""
     kind = {NoDecoupling: "none", PartialDecoupling: "partial"}.get(type(k.decoupling), "full")
     return DECOUPLING.index(kind), k.frame is not None
+
+
+class BoundOSC:
+    """The law of :class:`batchpid.sim.OperationalSpace` as a native call on fixed arrays.
+
+    Attributes
+    ----------
+    state
+        Arrays of the state by name; a call updates the integral in place.
+    effort
+        Efforts of the last call (envs, dof).
+    limited
+        1 for joints whose effort the limits have changed in the last call, else 0 (envs, dof).
+    address
+        Address of the call: ``control`` of :class:`batchpid.sim.engine.native.interface.Tick`.
+    """
+
+    def __init__(
+        self,
+        k: OSCCoefficients,
+        tool: Tool,
+        parts: Mapping[str, slice],
+        columns: NDArray[np.intp],
+        damping: Float64 | None,
+        friction: tuple[Float64, Float64] | None,
+        timestep: float,
+        reading: tuple[Float64, Float64, Float64],
+    ) -> None:
+        qpos, qvel, bias = reading
+        (rows, dof), native = qpos.shape, native_rows.in_use()
+        assert native is not None
+        self._parts, self._columns = {"setpoint": slice(0, 7), **parts}, columns
+        self._given = {name: np.zeros((rows, part.stop - part.start)) for name, part in self._parts.items()}
+        self._posture = np.zeros_like(qpos)
+        self.state = {"posture": np.zeros_like(qpos)}
+        if k.ki_dt is not None:
+            self.state["integral"] = np.zeros((rows, 6))
+        self.effort, self.limited = np.zeros((2, *qpos.shape))
+        fixed, chain = _of_tree(native, tool.tree, tool.link, tool.point, k)
+        integral = self.state.get("integral")
+        known: Document = dict(zip(k._fields[:-2], k[:-2], strict=True)) | self._given
+        known |= {"qpos": qpos, "qvel": qvel, "bias": bias, "chain": chain, "posture": self._posture}
+        known |= {"integral": integral, "next_integral": integral, "effort": self.effort, "limited": self.limited}
+        if damping is not None:
+            known |= {"damping": damping, "added_inertia": timestep * damping}
+        rubbing: list[Float64 | None] = [None, None, None]
+        if friction is not None:  # damping is part of this friction, and not an input of the law
+            rubbing = [known.pop("damping", None), *friction]
+        self._kept, self.address = native.bind(rows, dof, *fixed, *map(known.get, LAW), *rubbing)
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Copy a state."""
+        for name, array in self.state.items():
+            array[...] = state[name]
+
+    def load(self, setpoint: Float64) -> None:
+        """Copy the setpoints of a tick (envs, size); joints without a column in them keep the state's posture."""
+        for name, part in self._parts.items():
+            self._given[name][...] = setpoint[:, part]
+        self._posture[...] = np.where(self._columns > 0, setpoint[:, self._columns], self.state["posture"])

@@ -15,15 +15,12 @@ from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Array
+from batchpid.arrays.array_types import Array, Float64
 from batchpid.native.availability import SWITCH, obstacle
 from batchpid.native.extensions import load
 from batchpid.native.task_space_extension import KINEMATICS, TASK_SPACE
 from batchpid.task_space.rigid_tree import RigidTree
-
-Float64 = NDArray[np.float64]
 
 _SIZES = {"pose": (7,), "jacobian": (6, -1), "jacobian_rate": (6,), "mass_matrix": (-1, -1), "bias": (-1,)}
 """Shapes of the results of :func:`kinematics`; -1 stands for the degrees of freedom."""

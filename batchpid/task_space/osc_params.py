@@ -13,8 +13,7 @@ from batchpid.arrays.choices import CHOICES, NamedChoice
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field, declared
-from batchpid.checks.keywords import known_keywords
-from batchpid.checks.validate import array, choice, entries, instance, read_array
+from batchpid.checks.validate import array, choice, entries, instance, known_keywords, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_dynamics import check_masses

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Array, Document, Rows
+from batchpid.arrays.array_types import Array, Document, Float64, Rows
 from batchpid.arrays.display import summary
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.read_only import read_only
@@ -27,8 +27,6 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.task_space.frames import matrix_of, turned, wxyz_of
 from batchpid.task_space.spatial_inertia import SpatialInertia, inertia_rows, moved_matrix, spatial_matrix
-
-Float64 = NDArray[np.float64]
 
 JOINT_TYPES = ("fixed", "revolute", "prismatic")
 

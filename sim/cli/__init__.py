@@ -22,16 +22,14 @@ import tyro
 
 import batchpid
 from batchpid.errors import BatchPIDError
-from batchpid.sim.cli.compare import CompareCommand
+from batchpid.sim.cli.compare import CompareCommand, ParityCommand
 from batchpid.sim.cli.demo import DemoCommand
 from batchpid.sim.cli.excite import ExciteCommand
 from batchpid.sim.cli.export import ExportCommand
 from batchpid.sim.cli.identify import IdentifyCommand
 from batchpid.sim.cli.inspect import InspectCommand
-from batchpid.sim.cli.parity import ParityCommand
-from batchpid.sim.cli.plot import PlotCommand
+from batchpid.sim.cli.plot import PlotCommand, RenderCommand
 from batchpid.sim.cli.progress import close_bars
-from batchpid.sim.cli.render import RenderCommand
 from batchpid.sim.cli.rollout import RolloutCommand
 from batchpid.sim.cli.survey import SurveyCommand
 from batchpid.sim.cli.tune import TuneCommand

@@ -173,7 +173,7 @@ def _with_differences(exported: Exported, comment: str) -> str:
 
 def _mjcf(robot: Robot, params: bp.PIDParams | None, dt: float, limits: bool) -> Exported:
     """Return the MJCF of the robot with its motors."""
-    from batchpid.sim.engine.engines import load_engine
+    from batchpid.sim.engine.protocol import load_engine
 
     load_engine("mujoco")  # raises without MuJoCo
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf

@@ -226,7 +226,7 @@ def _errors(before: float, after: float) -> str:
 def report(found: Identification) -> str:
     """Return a table of the joints, and the delay, the payload and the errors in lines."""
     from batchpid.sim.cli.report import table
-    from batchpid.sim.identification.statistics import EXPLAINED
+    from batchpid.sim.identification.statistics import LARGEST_MISFIT
 
     def cell(kind: str, joint: int | None = None, factor: float = 1.0) -> str:
         row = document[kind] if joint is None else document["joints"][names[joint]][kind]
@@ -260,7 +260,7 @@ def report(found: Identification) -> str:
         text.append(f"the robot compensates {found.drive.compensate} {way}")
     text.append(_errors(*found.held_out_error))
     text += found.diagnosis.sentences()
-    if found.misfit > EXPLAINED:
+    if found.misfit > LARGEST_MISFIT:
         text.append(
             f"the error there is up to {found.misfit:.2g} times the noise of the sensors, at {found.worst_joint!r}: "
             "the model does not explain all of the motion, and the intervals hold for this motion only"

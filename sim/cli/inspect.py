@@ -15,8 +15,8 @@ from batchpid.sim import Finding, Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, write_figures
 from batchpid.sim.robot.findings import summary
-from batchpid.sim.robot.inertia import DENSITY
-from batchpid.sim.robot.joint_rows import HEADERS, joint_rows
+from batchpid.sim.robot.link_repair import DENSITY
+from batchpid.sim.robot.parts import HEADERS, joint_rows
 from batchpid.sim.tuning.gain_sets import gain_set
 
 SOURCES = {
@@ -70,8 +70,8 @@ class InspectCommand:
         print("\n" + mass_table(robot, light_too=self.all))
         print("\n" + contact_lines(robot, pairs_too=self.all))
         if self.engine:
-            from batchpid.sim.engine.engines import load_engine
             from batchpid.sim.engine.native import describe_calls
+            from batchpid.sim.engine.protocol import load_engine
 
             engine, version = load_engine(self.engine), package_versions([self.engine])[self.engine]
             print(f"\nEngine: {describe_calls(f'{engine.title} {version}', engine.native_obstacle())}.")

@@ -19,7 +19,7 @@ from batchpid.sim.cli.outputs import OutputFiles, write_figures
 from batchpid.sim.cli.progress import waiting
 from batchpid.sim.recording.recording_files import HDF5
 from batchpid.sim.tool_space.osc_controller import default_tool
-from batchpid.sim.tool_space.tool_goals import default_goal
+from batchpid.sim.tool_space.tool_setpoints import default_goal
 from batchpid.sim.tuning.gain_sets import gain_set
 from batchpid.task_space import load_osc_options
 

@@ -58,17 +58,17 @@ class SurveyCommand:
     def run(self) -> int:
         """Run the command; the exit status is 1 if a robot crashed its process."""
         from batchpid.sim.cli.progress import bar
+        from batchpid.sim.options import worker_count
         from batchpid.sim.tuning.robot_survey import find_robots, survey
 
         outputs = OutputFiles(force=self.force)
         json_path = outputs.path("json", self.json, (".json",))
         out = outputs.path("out", self.out, (".md",))
         urdfs = find_robots(self.paths)
-        cores = len(os.sched_getaffinity(0))
         reports = survey(
             urdfs,
             bandwidth_hz=self.bandwidth,
-            processes=max(1, cores if self.workers is None else self.workers),
+            processes=max(1, worker_count(self.workers)),
             **flags.chosen(self, "moves seed seconds engine physics time_limit"),
             **vars(self.meshes),
         )

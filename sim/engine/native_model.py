@@ -1,4 +1,4 @@
-r"""Rigid-body model of robots in native code: mass matrices and passive forces, also within the sim steps of a tick.
+r"""Robots in native code: mass matrices and passive forces, also within the sim steps of a tick, and the step itself.
 
 The equations are those of :mod:`batchpid.task_space.tree_dynamics`, on a base that is held or floats.
 """
@@ -17,7 +17,7 @@ from batchpid.arrays.array_types import Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import BASES, ModelStruct, Refresh
+from batchpid.sim.engine.native.interface import BASES, Group, ModelStruct, Refresh
 from batchpid.sim.engine.protocol import CompiledModel
 from batchpid.sim.engine.robot_model import passive_force, scene_tree
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -135,6 +135,38 @@ class NativeRefresh:
         factors = np.empty(qpos.shape), np.empty(qpos.shape)
         self._native.refresh(self.address, np.ascontiguousarray(qpos, np.float64), *factors, len(qpos))
         return state._replace(gain=factors[0], memory=factors[1])
+
+
+class NativeStep:
+    """Sim step of ``robots`` with ``dof`` joints as one native call, which a program of XLA can make as well.
+
+    ``arrays`` and ``fields`` are those of :class:`.interface.Group`; ``speed_limit`` (dof,) is the joint speed beyond
+    which the status says so. Implements :class:`batchpid.sim.engine.protocol.CompiledStep`.
+    """
+
+    def __init__(
+        self, robots: int, dof: int, arrays: Mapping[str, Rows], speed_limit: Float64 | None, **fields: Any
+    ) -> None:
+        self._arrays = dict(arrays)
+        if speed_limit is not None:
+            self._arrays["speed_limit"] = np.broadcast_to(speed_limit, dof).astype(np.float64)
+        addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
+        self._native = native.extension("_gateway")
+        self._group = Group(robots=robots, dof=dof, **addresses, **fields)
+
+    def prepare(self) -> int:
+        """Return the address of the group, for a call of the extension or of XLA that does a sim step."""
+        return ctypes.addressof(self._group)
+
+    def __call__(self, *arrays: Float64) -> int:
+        """Do one sim step: (effort, qpos, qvel, passive force), each (robots, dof); return the status."""
+        status: int = self._native.sim_step(self.prepare(), *arrays)
+        return status
+
+    @property
+    def message(self) -> str:
+        """Message of the engine's exception, after the status FAILED."""
+        return self._group.message.decode(errors="replace")
 
 
 def mass_matrix_of(spec: SceneSpec, natively: bool) -> Callable[[Float64], Float64]:

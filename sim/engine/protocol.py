@@ -1,8 +1,8 @@
 """Interface of the physics engines to the loop, the robots and the tuning.
 
 The loop holds the M envs of a group as one :class:`EnginePack`. Robots, controls and tuning use a
-:class:`batchpid.sim.engine.robot_model.RobotModel`. :func:`batchpid.sim.engine.engines.load_engine` returns an
-:class:`Engine`, which makes packs.
+:class:`batchpid.sim.engine.robot_model.RobotModel`. :func:`load_engine` returns an :class:`Engine` by its name, which
+makes packs; the engine's packages are imported at its first use.
 
 A feature of only some engines is a capability. :func:`require` raises an error if the engine lacks it.
 """
@@ -10,12 +10,16 @@ A feature of only some engines is a capability. :func:`require` raises an error 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from sys import modules
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from batchpid.arrays.array_types import Bool, DType, Float64, Rows
-from batchpid.errors import InvalidArgumentError
+from batchpid.checks.validate import choice
+from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.native.interface import STATUS
@@ -304,3 +308,37 @@ def require(engine: Engine, capability: Capability, argument: str) -> None:
     if capability not in engine.capabilities:
         problem = f"needs an engine with the capability {capability!r}, which {engine.name!r} does not have"
         raise InvalidArgumentError(argument, problem, remedy="omit it, or use the engine 'sapien', which has all")
+
+
+MODULES = {
+    "sapien": "batchpid.sim.engine.sapien.sapien_engine",
+    "mujoco": "batchpid.sim.engine.mujoco.mujoco_engine",
+}
+"""Module of each engine; its constant ENGINE is the engine."""
+
+
+def load_engine(name: str = "sapien") -> Engine:
+    """Return an engine.
+
+    Raises
+    ------
+    InvalidArgumentError
+        No engine has this name, or SAPIEN is not installed.
+    MissingDependencyError
+        MuJoCo is too old.
+    """
+    module = MODULES[choice("engine", name, MODULES)]
+    if name == "mujoco" and module not in modules:
+        _require_mujoco()
+    if name == "sapien" and module not in modules and find_spec("sapien") is None:
+        problem = "is not installed: SAPIEN is for Linux on x86-64"
+        raise InvalidArgumentError("engine", problem, value=name, remedy="use 'mujoco'")
+    engine: Engine = import_module(module).ENGINE
+    return engine
+
+
+def _require_mujoco() -> None:
+    try:
+        import_module("mujoco.batch")
+    except ImportError as error:
+        raise MissingDependencyError("mujoco>=3.17", "the engine 'mujoco'") from error

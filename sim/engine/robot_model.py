@@ -13,14 +13,13 @@ import numpy as np
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array, Bool, Document, Float64, Rows
-from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import link_shapes
 from batchpid.sim.robot.contacts import Contacts, Near
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.robot_tree import rigid_tree
-from batchpid.sim.robot.simulated_links import body_inertias, simulated
+from batchpid.sim.robot.simulated_links import body_inertias, rigid_tree, simulated
 from batchpid.task_space.frames import matrix_of, unrotate
 from batchpid.task_space.rigid_tree import RigidTree
 

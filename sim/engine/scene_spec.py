@@ -1,17 +1,23 @@
-"""Description of the envs of a pack: the robot and its scene, and how each robot differs from the model."""
+"""Description of the envs of a pack: the robot and its scene, and how each robot differs from the model.
+
+A variation changes a robot's inertias, and the friction and damping of its joints.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.robot.parts import Joint, MjcfFile
-from batchpid.sim.robot.simulated_links import Body
-from batchpid.task_space.spatial_inertia import SpatialInertia, total
+from batchpid.motors import Actuators
+from batchpid.motors.friction import Friction
+from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
+from batchpid.sim.robot.simulated_links import Body, varied_bodies
+from batchpid.task_space.spatial_inertia import SpatialInertia, spatial_matrix, total
 
 Build = Callable[[Any, int], Any]
 """``build(scene, env)`` adds content to the engine's scene of env ``env``; returns objects whose poses are read.
@@ -77,17 +83,70 @@ class Variation(NamedTuple):
     """(envs, 3) [m/s^2]"""
 
 
-def varied_inertia(body: Body, variation: Variation, row: int) -> SpatialInertia:
-    """Return the inertia of a body with its links as in ``row`` of ``variation``, and with the payload."""
-    parts = []
-    for part in body.parts:
-        (mass, center, tensor), column, share = part.inertia, part.column, 1.0
-        if variation.link_mass is not None and column is not None:
-            share = float(np.nan_to_num(variation.link_mass[row, column], nan=1.0))
-        if variation.center_of_mass is not None and column is not None:
-            displacement = variation.center_of_mass[row, 3 * column : 3 * column + 3]
-            center = center + part.axes @ np.nan_to_num(displacement)
-        parts.append(SpatialInertia(share * mass, center, share * tensor))
-    if body.payload is not None and variation.payload is not None:
-        parts.append(SpatialInertia(float(variation.payload[row]), body.payload, np.zeros((3, 3))))
-    return total(parts)
+class VariedMasses:
+    """Inertias of the simulated links of ``size`` robots that differ by ``variation``, one row for each.
+
+    ``carrier`` is the link of the URDF that carries the payload; ``links`` are those whose mass or center varies.
+
+    Attributes
+    ----------
+    added
+        Spatial inertias (size, 6, 6) of the links that vary, by name, less those of the model; none if no mass varies.
+    """
+
+    def __init__(self, spec: SceneSpec, size: int, variation: Variation, carrier: str, links: Sequence[str]) -> None:
+        self._variation, self._bodies = variation, dict[str, Body]()
+        varies_links = variation.link_mass is not None or variation.center_of_mass is not None
+        if varies_links or variation.payload is not None:
+            self._bodies = varied_bodies(spec.urdf, spec.merge_fixed, carrier, links if varies_links else [])
+        self._nominal = {name: total([part.inertia for part in body.parts]) for name, body in self._bodies.items()}
+        self.added = {name: np.zeros((size, 6, 6)) for name in self._bodies}
+
+    def of_robot(self, row: int) -> dict[str, SpatialInertia]:
+        """Return the present inertias of robot ``row`` by link, in the frames of the links; :attr:`added` gets them."""
+        inertias = {name: self._inertia(body, row) for name, body in self._bodies.items()}
+        for name, inertia in inertias.items():
+            self.added[name][row] = spatial_matrix(inertia) - spatial_matrix(self._nominal[name])
+        return inertias
+
+    def _inertia(self, body: Body, row: int) -> SpatialInertia:
+        """Return the inertia of a body with its links as in ``row``, and with the payload."""
+        parts, variation = [], self._variation
+        for part in body.parts:
+            (mass, center, tensor), column, share = part.inertia, part.column, 1.0
+            if variation.link_mass is not None and column is not None:
+                share = float(np.nan_to_num(variation.link_mass[row, column], nan=1.0))
+            if variation.center_of_mass is not None and column is not None:
+                displacement = variation.center_of_mass[row, 3 * column : 3 * column + 3]
+                center = center + part.axes @ np.nan_to_num(displacement)
+            parts.append(SpatialInertia(share * mass, center, share * tensor))
+        if body.payload is not None and variation.payload is not None:
+            parts.append(SpatialInertia(float(variation.payload[row]), body.payload, np.zeros((3, 3))))
+        return total(parts)
+
+
+def own_friction(spec: SceneSpec, variation: Variation | None = None) -> Friction:
+    """Return the friction and damping that the loop applies to robots of ``spec``, with ``variation``."""
+    model = Friction()
+    if DISSIPATION[spec.dissipation].modelled:
+        rows = (np.array([[getattr(joint, name) for joint in spec.joints]]) for name in ("friction", "damping"))
+        model = Friction(*(row if row.any() else None for row in rows))
+    if variation is not None and variation.friction is not None:
+        # The coupling moves the others.
+        model = model._replace(coulomb=coupling_of(spec.joints).of_independent(variation.friction))
+    if variation is not None and variation.damping is not None:
+        model = model._replace(viscous=variation.damping.copy())
+    return model if spec.mjcf is None else model._replace(viscous=None)  # there MuJoCo computes the damping
+
+
+def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
+    """Return ``own`` friction and damping plus the actuators' friction and damping."""
+    added = Actuators() if actuators is None else actuators
+    static, load = added.static, added.load_friction
+    both = zip(own[:2], (added.coulomb, added.viscous), strict=True)
+    coulomb, viscous = (one if more is None else more if one is None else one + more for one, more in both)
+    if static is not None:
+        static = static if own.coulomb is None else static + own.coulomb
+    if coulomb is None and (rubs := Friction(None, None, static, load=load).most) is not None:
+        coulomb = np.zeros_like(rubs)
+    return Friction(coulomb, viscous, static, added.stribeck, load)

@@ -17,7 +17,7 @@ from batchpid.sim.gym.push import PushEnv, PushVectorEnv
 from batchpid.sim.gym.reach import ReachEnv, ReachVectorEnv
 from batchpid.sim.gym.robot_env import RobotEnv
 from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
-from batchpid.sim.gym.tool_reach import ToolReachEnv, ToolReachVectorEnv
+from batchpid.sim.gym.tool_vector_env import ToolReachEnv, ToolReachVectorEnv
 from batchpid.sim.gym.walk import WalkEnv, WalkVectorEnv
 
 __all__ = [

@@ -8,10 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Rows, SapienScene
+from batchpid.arrays.array_types import Bool, Float32, Float64, Rows, SapienScene
 from batchpid.checks.validate import number
 from batchpid.sim.gym.robot_env import RobotEnv
-from batchpid.sim.gym.robot_vector_env import Bool, Float32, Float64
 from batchpid.sim.gym.tool_vector_env import FAR, ToolVectorEnv
 from batchpid.sim.observation import Observation
 from batchpid.sim.robot.robot import Robot

@@ -9,11 +9,11 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Document
-from batchpid.checks.keywords import check_keywords
+from batchpid.arrays.array_types import Document, Float32
 from batchpid.checks.single_owner import SingleOwner
+from batchpid.checks.validate import check_keywords
 from batchpid.sim.gym.pictures import RENDER_MODES
-from batchpid.sim.gym.robot_vector_env import Float32, RobotVectorEnv, arguments_of
+from batchpid.sim.gym.robot_vector_env import RobotVectorEnv, arguments_of
 from batchpid.sim.robot.robot import Robot
 
 _FIXED = ("num_envs", "max_episode_steps", "autoreset_mode")

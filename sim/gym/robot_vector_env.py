@@ -1,6 +1,6 @@
 """Base class of tasks: N robots under a Runner as a vector environment of Gymnasium, with hooks for the task.
 
-Longer than 300 lines because one class is the whole environment, and documents every hook of a task.
+Longer than 350 lines because one class is the whole environment, and documents every hook of a task.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from batchpid.arrays.array_types import Document, DType, Rows
-from batchpid.checks.keywords import check_keywords
+from batchpid.arrays.array_types import Bool, Document, DType, Float32, Float64, Rows
 from batchpid.checks.single_owner import SingleOwner
-from batchpid.checks.validate import array, choice, env_mask, flag, integer, number
+from batchpid.checks.validate import array, check_keywords, choice, env_mask, flag, integer, number
 from batchpid.errors import CallOrderError, InvalidArgumentError
 from batchpid.sim.gym.pictures import RENDER_MODES, EnvMetadata, EnvPictures, check_render_mode
 from batchpid.sim.observation import Observation
@@ -28,10 +27,6 @@ from batchpid.sim.randomization.randomization import LARGEST
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
 from batchpid.sim.runner_keywords import RunnerKeywords
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 RUNNER_OPTIONS = tuple(RunnerKeywords.__annotations__.keys() - {"robot", "num_envs", "substeps"})
 """Options of the runner, without ``substeps``, which follow from ``rate_hz``."""

@@ -9,12 +9,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Rows
+from batchpid.arrays.array_types import Bool, Float32, Float64, Rows
 from batchpid.checks.validate import array, entries
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.gym.joint_space import MAX_SPEED
 from batchpid.sim.gym.robot_env import RobotEnv
-from batchpid.sim.gym.robot_vector_env import Bool, Float32, Float64, RobotVectorEnv
+from batchpid.sim.gym.robot_vector_env import RobotVectorEnv
 from batchpid.sim.observation import Observation
 from batchpid.sim.robot.robot import Robot
 from batchpid.task_space.rotations import inverse, rotate

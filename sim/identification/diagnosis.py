@@ -32,7 +32,7 @@ from batchpid.task_space.rigid_tree import RigidTree
 SPREAD, MOMENT_SPREAD = 0.5, 0.05
 """Standard deviations of the priors: of the relative change of a link's mass if some links change, and of the center
 of mass [m] if all masses are free."""
-DECREASE, EXPLAINED = 0.03, 0.5
+DECREASE, LEAST_EXPLAINED = 0.03, 0.5
 """Smallest relative decrease of the residual, and smallest explained share of the efforts, for a report of a link."""
 ALIKE = 1.1
 """Largest ratio of the residuals of two explanations that count as equally good."""
@@ -121,7 +121,7 @@ def diagnose(regression: Regression, logs: list[Log], joints: list[str]) -> Diag
     masses = system.solve(np.concatenate([*scaled.values(), *moments], axis=2), 1.0)
     links, best = _heavier(system, scaled, described)
     strong, strengths = system.with_strengths()
-    if links and (strong.held_out * ALIKE < best.held_out or best.explained < EXPLAINED):
+    if links and (strong.held_out * ALIKE < best.held_out or best.explained < LEAST_EXPLAINED):
         links, best = {}, described  # the motors explain the efforts better, or neither does
     alike = bool(links) and strong.held_out <= ALIKE * best.held_out
     least = min((described, best, strong), key=lambda each: each.held_out)

@@ -20,7 +20,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.sim.identification.fit import LEAST_GAIN, FitStep, Solution, fit
 from batchpid.sim.identification.fit_history import History, State
 from batchpid.sim.identification.plant import plants_of
-from batchpid.sim.identification.problem import FitEvaluation, Problem
+from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import Regression
 from batchpid.sim.identification.unknowns import LAW
 
@@ -82,7 +82,7 @@ def extended(problem: Problem, best: Solution, kinds: tuple[str, ...]) -> tuple[
             tried = np.concatenate([tried, [_regressed(wider, point) for point in tried]])
         costs = wider.costs(wider.sizes(wider.residuals(tried))).mean(1)
         found = fit(wider, FitStep.first(tried[int(costs.argmin())], EXTRA_EVALUATIONS))
-        before, after = (errors_of(wider, each.windows) for each in (best, found))
+        before, after = (wider.held_out_errors([window.residual for window in each.windows]) for each in (best, found))
         if np.linalg.norm(after) < ACCEPTED * np.linalg.norm(before):
             return wider, found
         fewer = [joint for joint in joints if after[joint] < ACCEPTED * before[joint]]
@@ -110,13 +110,6 @@ def _typical(problem: Problem, best: Solution) -> dict[str, Float64]:
         "friction": problem.unknowns.motors(best.theta[None])["friction"][0],
     }
     return {name: np.maximum(size, 1e-3) for name, size in sizes.items()}
-
-
-def errors_of(problem: Problem, windows: list[FitEvaluation]) -> Float64:
-    """Return the root mean square of the residuals of each joint on the held-out rows (joints,) [rad or m]."""
-    kept = [each.residual[~window.fitted] for each, window in zip(windows, problem.windows, strict=True)]
-    with np.errstate(invalid="ignore", over="ignore"):
-        return np.nan_to_num(np.sqrt((np.concatenate(kept) ** 2).mean(0)), nan=np.inf)
 
 
 def _stage(problems: list[Problem], done: list[tuple[int, Solution]], evaluations: int) -> tuple[int, FitStep] | None:

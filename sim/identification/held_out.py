@@ -88,10 +88,7 @@ def held_out_error(
 
 def error_of(problem: Problem, residuals: list[Float64]) -> float:
     """Return the root mean square of the residuals (1, rows, joints) of each window on the held-out rows."""
-    kept = [r[0][~w.fitted] for r, w in zip(residuals, problem.windows, strict=True)]
-    with np.errstate(invalid="ignore", over="ignore"):
-        error = float(np.sqrt((np.concatenate(kept) ** 2).mean()))
-    return error if np.isfinite(error) else float("inf")
+    return float(np.sqrt((problem.held_out_errors([each[0] for each in residuals]) ** 2).mean()))
 
 
 def residuals_of_ideal(problem: Problem, robot: Robot) -> list[Float64]:

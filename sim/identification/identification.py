@@ -35,9 +35,10 @@ from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import Motion, Regression, best_drive, hypotheses, smooth, variants
 from batchpid.sim.identification.result import Fit, Identification, actuators_at
 from batchpid.sim.identification.start import begin
-from batchpid.sim.identification.statistics import EXPLAINED, misfits, uncertainty
+from batchpid.sim.identification.statistics import LARGEST_MISFIT, misfits, uncertainty
 from batchpid.sim.identification.unknowns import EXTRAS, KINDS, LAW, Motors, Unknowns
 from batchpid.sim.identification.windows import rows_of
+from batchpid.sim.options import worker_count
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Compensation
 
@@ -116,8 +117,7 @@ def identify(
         A joint is at a limit, or did not move.
     """
     evaluations, seed = integer("evaluations", evaluations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
-    if workers is not None:
-        integer("workers", workers, 0, 1024)
+    processes = worker_count(workers)
     payload, gains_known = flag("payload", payload), "gain" not in extras
     for name in extras:
         choice("extras", name, [*EXTRAS, "gain"])
@@ -155,7 +155,6 @@ def identify(
     ratios = None if found[0].measured is None else effort_ratios(inputs)
     unknowns = unknowns.without(_known(found[0], payload, ratios))
     ideal = ideal_motors(robot, joints)
-    processes = len(os.sched_getaffinity(0)) if workers is None else workers
     pool: Any = nullcontext()
     if processes > 1:
         pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
@@ -170,13 +169,14 @@ def identify(
             state = known or State(FitStep.first(begin(problems[0], regression, ideal, seed), evaluations))
             return search(problems, state, evaluations, record, Progress(len(problems), evaluations, progress))
 
-        fits_of_ways = [fit_under(drive, regression, record)]
-        if misfits(*fits_of_ways[0]).max() > EXPLAINED:  # then the regression may have chosen the wrong compensation
+        fits_of_ways, regressions = [fit_under(drive, regression, record)], {drive.compensation: regression}
+        if misfits(*fits_of_ways[0]).max() > LARGEST_MISFIT:  # the compensation may be wrong
             for way in hypotheses(assumed, payload):
                 if way.compensation != drive.compensation:
                     plants = plants_of(resting, joints, way, fitted)
-                    other = Regression(plants, fitted, fitted_motions, payload, gains_known)
-                    fits_of_ways.append(fit_under(way, other, History(None, settings)))
+                    regression = Regression(plants, fitted, fitted_motions, payload, gains_known)
+                    regressions[way.compensation] = regression
+                    fits_of_ways.append(fit_under(way, regression, History(None, settings)))
         problem, best = min(fits_of_ways, key=lambda each: each[1].cost)
         for name in extras:
             if name in EXTRAS:
@@ -194,10 +194,8 @@ def identify(
     )
     errors_of_fit = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
     noise = np.sqrt((errors_of_fit**2).mean(0))
-    if problem.drive.compensation != drive.compensation:
-        plants = plants_of(resting, joints, problem.drive, fitted)
-        regression = Regression(plants, fitted, fitted_motions, payload, gains_known)
-    diagnosis = diagnose(regression, fitted, [robot.joint_names[joint] for joint in joints])
+    names = [robot.joint_names[joint] for joint in joints]
+    diagnosis = diagnose(regressions[problem.drive.compensation], fitted, names)
     estimate = best.theta
     if ratios is not None:
         own = [at for at, (kind, _) in enumerate(ratios.names) if kind in unknowns.known]

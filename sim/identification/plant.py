@@ -34,8 +34,8 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.coupling import Coupling, Follower
 from batchpid.motors.friction import Friction, bound_of
-from batchpid.sim.engine.joint_friction import added_friction
 from batchpid.sim.engine.robot_model import robot_model
+from batchpid.sim.engine.scene_spec import added_friction
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.logged_control import LoggedControl, LoggedDrive
 from batchpid.sim.identification.unknowns import Motors, actuators_of

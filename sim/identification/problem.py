@@ -165,6 +165,16 @@ class Problem:
         """
         return np.average(np.log(np.fmin(sizes, WORST)) + determinants, axis=-2, weights=self._rows)
 
+    def held_out_errors(self, residuals: list[Float64]) -> Float64:
+        """Return the root mean squares (joints,) of the residuals (rows, joints) of all windows on the held-out rows.
+
+        They are inf if a simulation diverges.
+        """
+        kept = [each[~window.fitted] for each, window in zip(residuals, self.windows, strict=True)]
+        with np.errstate(invalid="ignore", over="ignore"):
+            errors = np.sqrt((np.concatenate(kept) ** 2).mean(0))
+        return np.where(np.isfinite(errors), errors, np.inf)
+
     def evaluate(self, theta: Float64) -> list[FitEvaluation]:
         """Return residuals and Jacobian of each window at one point (unknowns,)."""
         changes, joints = self.unknowns.changes(theta), len(self.joints)

@@ -3,7 +3,7 @@
 It is made in three steps: buffers for everything that the stages read and write, programs of the stages that are pure
 functions of arrays (traced, neighbours together), and the table of stages that native code runs.
 
-Longer than 300 lines because all three steps work on the same buffers.
+Longer than 350 lines because all three steps work on the same buffers.
 """
 
 from __future__ import annotations

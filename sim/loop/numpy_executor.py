@@ -10,7 +10,7 @@ import numpy as np
 from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.law.coefficients import spread
 from batchpid.motors import ActuatorState, MotorCoefficients, measurement_noise
-from batchpid.native.compiled_stages import compiled_stages
+from batchpid.native.compiled import compiled_stages
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.arrays import Command

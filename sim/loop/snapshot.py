@@ -23,8 +23,7 @@ from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.choices import CHOICES, Everywhere
 from batchpid.checks.validate import file_path, integer, names
 from batchpid.errors import InvalidArgumentError
-from batchpid.io.files import write_atomically
-from batchpid.io.npz import read_npz
+from batchpid.io.files import read_npz, write_atomically
 from batchpid.motors.friction import FrictionState
 from batchpid.motors.guard import GuardState
 from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, ORIGIN, FaultContainment

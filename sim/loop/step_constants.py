@@ -15,8 +15,8 @@ from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.loop.step_values import Constants, KnownFriction, Layout
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
-from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.parts import DISSIPATION
 
 
 def make_layout(options: RunnerOptions, params: bp.PIDParams, actuators: bp.Actuators | None) -> Layout:

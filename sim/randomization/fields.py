@@ -12,7 +12,7 @@ from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.command import TWIST_UNITS
 from batchpid.sim.randomization.distributions import Distribution, read_distribution
-from batchpid.sim.robot.dissipation import CONTACT_FRICTION
+from batchpid.sim.robot.parts import CONTACT_FRICTION
 from batchpid.sim.robot.robot import Robot
 
 Field = Distribution | Mapping[str, Distribution]

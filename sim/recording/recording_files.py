@@ -27,8 +27,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.checks.validate import file_path, instance, integer
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
-from batchpid.io.files import write_atomically
-from batchpid.io.npz import read_npz
+from batchpid.io.files import read_npz, write_atomically
 from batchpid.sim.command import CommandSpec
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.observation import RECORDED, Observation, Redraw, Rollout, RunInfo

@@ -16,7 +16,7 @@ from batchpid.arrays.array_types import Float64, MjModel
 from batchpid.arrays.digest import digest
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import RobotError
-from batchpid.sim.robot.inertia import DENSITY
+from batchpid.sim.robot.link_repair import DENSITY
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.meshes import note_meshes
 from batchpid.sim.robot.xml import number, numbers

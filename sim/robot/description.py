@@ -20,22 +20,44 @@ from batchpid.arrays.read_only import read_only
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.observation import RunInfo
-from batchpid.sim.robot.dissipation import DISSIPATION
-from batchpid.sim.robot.effort import POSES, suggested_effort_limit
-from batchpid.sim.robot.joint_rows import HEADERS, joint_rows
-from batchpid.sim.robot.link_masses import link_masses
 from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.parts import FileDefaults, Joint, LinkMass, MjcfFile, Placement, Settings, Urdf
-from batchpid.sim.robot.robot_tree import rigid_tree
-from batchpid.sim.robot.self_collision import SelfContact, Srdf
-from batchpid.sim.robot.self_contact import self_contact
+from batchpid.sim.robot.parts import (
+    DISSIPATION,
+    HEADERS,
+    FileDefaults,
+    Joint,
+    LinkMass,
+    MjcfFile,
+    Placement,
+    Settings,
+    Urdf,
+    joint_rows,
+)
+from batchpid.sim.robot.self_collision import SelfContact, Srdf, self_contact
 from batchpid.sim.robot.setpoint_limits import setpoint_guard
-from batchpid.sim.robot.simulated_links import body_inertias, simulated
+from batchpid.sim.robot.simulated_links import body_inertias, link_masses, rigid_tree, simulated
 from batchpid.task_space.rigid_tree import RigidTree
 
 if TYPE_CHECKING:
     from batchpid.sim.robot.contacts import Near
+
+GRAVITY_MARGIN = 2.0  # of the effort that holds the joint still
+SPEED = 3.0  # [rad/s or m/s], at which the joint's damping is overcome
+ACCELERATION = 30.0  # [rad/s^2 or m/s^2] of all joints at once
+POSES = 50
+
+
+def suggested_effort_limit(gravity: Float64, mass_matrix: Float64, friction: ArrayLike, damping: ArrayLike) -> Float64:
+    """Return an effort limit for each joint (dof,) [N m or N], from gravity (n, dof) and M (n, dof, dof) at n poses.
+
+    It is 2 (max |g_j| + friction) + damping * 3 rad/s + max sum_k |M_jk| * 30 rad/s^2: twice the effort that holds the
+    joint still, plus the effort that accelerates all joints at once, in the worst directions.
+    """
+    still = np.abs(gravity).max(0) + np.asarray(friction)
+    inertia = np.abs(mass_matrix).sum(2).max(0)
+    return GRAVITY_MARGIN * still + SPEED * np.asarray(damping) + ACCELERATION * inertia
+
 
 LIMIT_TOLERANCE = 1e-6  # rad or m
 
@@ -146,7 +168,7 @@ class RobotDescription(Urdf):
     def design_effort_limit(self) -> Float64:
         """Effort limits (dof,) [N m or N] of designed and tuned gains.
 
-        They are the URDF's, or :func:`batchpid.sim.robot.effort.suggested_effort_limit` where it gives none.
+        They are the URDF's, or :func:`batchpid.sim.robot.description.suggested_effort_limit` where it gives none.
         """
         given = self.effort_limit
         if np.isfinite(given).all():
@@ -193,7 +215,7 @@ class RobotDescription(Urdf):
         InvalidArgumentError
             A limit is not positive.
         """
-        return setpoint_guard(self, rate, acceleration)
+        return setpoint_guard(self.joints, rate, acceleration)
 
     @cached_property
     def coupling(self) -> Coupling:

@@ -28,7 +28,7 @@ from batchpid.gains.stability import Oscillation, oscillation
 from batchpid.law.implicit import as_explicit
 from batchpid.sim.robot.actuator_checks import known_joints
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.parts import DISSIPATION
 
 
 class StabilityReport(NamedTuple):
@@ -193,7 +193,7 @@ class StabilityWarning(UserWarning):
     The bound holds at the start pose, and counts delays, lag, strength, armature and viscous friction of the actuators.
     Noise and limits of efforts are not in it: beyond it, a joint with limits oscillates instead of diverging. With
     ``dissipation="sapien"``, which adds friction that is not in the formula, there is no warning. Under control "drive"
-    in MuJoCo the warning names the first joint that sticks, see :mod:`batchpid.sim.robot.drive_chatter`.
+    in MuJoCo the warning names the first joint that sticks, see :mod:`batchpid.sim.robot.run_checks`.
     """
 
 

@@ -1,8 +1,9 @@
-"""Parts of a robot's description: joints, links, the text for the simulator, and the settings of bundled robots."""
+"""Parts of a robot's description: joints, links, dissipation, the text for the simulator, bundled settings."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -75,7 +76,7 @@ class Link:
     """Link of a URDF: its mass [kg] (None without ``<inertial>``) and ``num_shapes`` that collide.
 
     ``inertial`` is True if SAPIEN takes mass and inertia from the URDF. ``triangle_excess`` is positive if no body has
-    that inertia tensor: see :func:`batchpid.sim.robot.inertia.triangle_excess`.
+    that inertia tensor: see :func:`batchpid.sim.robot.link_repair.triangle_excess`.
     """
 
     name: str
@@ -179,3 +180,61 @@ class Urdf:
     links: tuple[Link, ...]
     missing_meshes: tuple[str, ...]
     repairs: tuple[Finding, ...]
+
+
+HEADERS = ("", "joint", "type", "limits", "effort", "velocity", "damping", "friction", "parent > child link")
+
+
+def joint_rows(joints: Iterable[Joint]) -> Iterator[list[str]]:
+    """Yield the cells of each joint under :data:`HEADERS`. Moving joints are numbered as in qpos."""
+    index = 0
+    for joint in joints:
+        links = f"{joint.parent_link} > {joint.child_link}"
+        if not joint.moves:
+            yield ["-", joint.name, joint.type, *"-----", links]
+            continue
+        yield [
+            str(index),
+            joint.name,
+            joint.type,
+            _range(joint),
+            _bound(joint.effort_limit, f" {joint.effort_unit}"),
+            _bound(joint.velocity_limit, f" {joint.unit}/s"),
+            f"{joint.damping:g}",
+            f"{joint.friction:g}",
+            links,
+        ]
+        index += 1
+
+
+def _range(joint: Joint) -> str:
+    limits = joint.lower, joint.upper
+    return f"{_bound(limits[0])} to {_bound(limits[1])} {joint.unit}" if any(map(math.isfinite, limits)) else "none"
+
+
+def _bound(value: float, unit: str = "") -> str:
+    return f"{value:.5g}{unit}" if math.isfinite(value) else "none"
+
+
+CONTACT_FRICTION = 0.3
+"""Coefficient of sliding friction of every shape and of the ground: SAPIEN's default material."""
+
+
+class Dissipation(NamedTuple):
+    """Friction and damping in the engine.
+
+    ``joint_friction``: PhysX's dimensionless coefficient of every joint; ``link_damping``: damping of every link [1/s];
+    ``modelled``: whether :mod:`batchpid.motors.friction` computes the joints' friction and damping, in the URDF's
+    units, instead of the engine.
+    """
+
+    joint_friction: float
+    link_damping: float
+    modelled: bool
+
+
+DISSIPATION = {
+    "urdf": Dissipation(joint_friction=0.0, link_damping=0.0, modelled=True),
+    "sapien": Dissipation(joint_friction=0.05, link_damping=0.05, modelled=False),  # SAPIEN 3's defaults
+}
+"""Values of the option ``dissipation`` of :meth:`batchpid.sim.Robot.load`."""

@@ -26,8 +26,7 @@ from collections.abc import Iterator
 import numpy as np
 from lxml import etree
 
-from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.effort import POSES
+from batchpid.sim.robot.description import POSES, RobotDescription
 from batchpid.sim.robot.findings import Finding, finding_of
 from batchpid.sim.robot.parts import Joint
 from batchpid.sim.robot.xml import numbers

@@ -15,14 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.dissipation import DISSIPATION
-from batchpid.sim.robot.effort import POSES
+from batchpid.sim.robot.description import POSES, RobotDescription
 from batchpid.sim.robot.findings import SEVERITIES, Finding, Findings
-from batchpid.sim.robot.inertia import DENSITY
 from batchpid.sim.robot.joint_repair import GIVE_RANGE
+from batchpid.sim.robot.link_repair import DENSITY
 from batchpid.sim.robot.loop_stability import implicit_remedy, slow_oscillation, stability_report
-from batchpid.sim.robot.parts import Joint
+from batchpid.sim.robot.parts import DISSIPATION, Joint
 from batchpid.sim.robot.plausibility import implausible_figures
 
 EXCESS = 0.01  # of the triangle inequality of principal moments, above which it is reported; less is rounding

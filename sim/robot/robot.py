@@ -16,21 +16,18 @@ from batchpid import assets
 from batchpid.arrays.array_types import Document
 from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.read_only import read_only
-from batchpid.checks.keywords import check_keywords
-from batchpid.checks.validate import choice, file_path, flag
+from batchpid.checks.validate import check_keywords, choice, file_path, flag
 from batchpid.errors import InvalidArgumentError, RobotError, RobotNotFoundError
 from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.findings import Findings
 from batchpid.sim.robot.joint_repair import free_base, free_joint_of
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.mimics import couple
-from batchpid.sim.robot.parts import FileDefaults, Joint, Settings
+from batchpid.sim.robot.parts import DISSIPATION, FileDefaults, Joint, Settings
 from batchpid.sim.robot.preflight import check
 from batchpid.sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
-from batchpid.sim.robot.source import read_source
-from batchpid.sim.robot.urdf import read_urdf
+from batchpid.sim.robot.urdf import read_source, read_urdf
 from batchpid.task_space.rigid_tree import RigidTree
 
 if TYPE_CHECKING:

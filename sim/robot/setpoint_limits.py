@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,39 +11,18 @@ import batchpid as bp
 from batchpid.arrays.leaves import frozen
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
-from batchpid.motors.coupling import Coupling
 from batchpid.motors.guard import check_guard
+from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import Joint
 
 
-class GuardedRobot(Protocol):
-    """Part of a robot that the guard needs; arrays are (dof,)."""
-
-    @property
-    def joints(self) -> tuple[Joint, ...]:
-        """Degrees of freedom."""
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Names of the degrees of freedom."""
-
-    @property
-    def continuous(self) -> NDArray[np.bool_]:
-        """Joints whose positions wrap."""
-
-    @property
-    def coupling(self) -> Coupling:
-        """Coupling of the joints."""
-
-
-def setpoint_guard(robot: GuardedRobot, rate: ArrayLike | None, acceleration: ArrayLike | None) -> bp.Guard:
-    """Return the limits of setpoints, of the URDF where they are not given.
+def setpoint_guard(joints: Sequence[Joint], rate: ArrayLike | None, acceleration: ArrayLike | None) -> bp.Guard:
+    """Return the limits of setpoints of the degrees of freedom ``joints``, of the URDF where they are not given.
 
     Followers have none: their limits narrow the limits of their leaders.
 
     Raises InvalidArgumentError if a follower of a continuous joint has position limits.
     """
-    joints = robot.joints
     fastest = [joint.velocity_limit if joint.velocity_limit > 0 else np.inf for joint in joints]
     limits = bp.make_guard(
         len(joints),
@@ -51,21 +30,21 @@ def setpoint_guard(robot: GuardedRobot, rate: ArrayLike | None, acceleration: Ar
         upper=[min(joint.upper, joint.soft_upper) for joint in joints],
         rate=fastest if rate is None else rate,
         acceleration=acceleration,
-        continuous=robot.continuous,
-        joint_names=robot.joint_names,
+        continuous=[joint.continuous for joint in joints],
+        joint_names=[joint.name for joint in joints],
     )
-    return _of_leaders(limits, robot)
+    return _of_leaders(limits, joints)
 
 
-def _of_leaders(guard: bp.Guard, robot: GuardedRobot) -> bp.Guard:
+def _of_leaders(guard: bp.Guard, joints: Sequence[Joint]) -> bp.Guard:
     """Return ``guard`` with limits of the leaders that hold for their followers, too, and none of the followers.
 
     Position limits of a follower that leave its leader no range are left out, as in a robot's own limits.
     """
-    coupling = robot.coupling
+    coupling = coupling_of(tuple(joints))
     if coupling.is_identity:  # its limits keep their shapes
         return guard
-    shape = max((np.shape(leaf) for leaf in guard if leaf is not None), default=(1, len(robot.joints)))
+    shape = max((np.shape(leaf) for leaf in guard if leaf is not None), default=(1, len(joints)))
     free = guard._replace(lower=-np.inf, upper=np.inf, rate=np.inf, acceleration=np.inf)
     low, high, rate, acceleration = (
         np.broadcast_to(none if leaf is None else leaf, shape).astype(np.float64)
@@ -78,8 +57,8 @@ def _of_leaders(guard: bp.Guard, robot: GuardedRobot) -> bp.Guard:
         for fastest in (rate, acceleration):
             fastest[:, leader] = np.minimum(fastest[:, leader], fastest[:, index] / abs(multiplier))
         ends = np.sort([(end[:, index] - coupling.offset[index]) / multiplier for end in (low, high)], axis=0)
-        if robot.continuous[leader]:
-            _check_turning(robot, index, leader, ends)
+        if joints[leader].continuous:
+            _check_turning(joints[index].name, joints[leader].name, ends)
             continue
         ends = np.stack([np.maximum(low[:, leader], ends[0]), np.minimum(high[:, leader], ends[1])])
         narrower = ends[0] < ends[1]
@@ -90,16 +69,17 @@ def _of_leaders(guard: bp.Guard, robot: GuardedRobot) -> bp.Guard:
     return guard._replace(**{name: None if np.isinf(limits).all() else limits for name, limits in found.items()})
 
 
-def _check_turning(robot: GuardedRobot, index: int, leader: int, ends: NDArray[np.float64]) -> None:
+def _check_turning(follower: str, leader: str, ends: NDArray[np.float64]) -> None:
     """Raise InvalidArgumentError for position limits ``ends`` of a follower of a continuous joint."""
     if np.isfinite(ends).any():
-        names = robot.joint_names
-        problem = f"cannot hold the position limits of {names[index]!r}, which follows the continuous joint"
+        problem = f"cannot hold the position limits of {follower!r}, which follows the continuous joint"
         remedy = "make the leader revolute with limits, or pass batchpid.make_guard(...) without lower and upper"
-        raise InvalidArgumentError("guard", problem, joint=names[leader], remedy=remedy)
+        raise InvalidArgumentError("guard", problem, joint=leader, remedy=remedy)
 
 
-def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, sets_positions: bool) -> bp.Guard | None:
+def fit_guard(
+    guard: object, joints: Sequence[Joint], num_envs: int, control: str, sets_positions: bool
+) -> bp.Guard | None:
     """Return the guard for a runner's option ``guard``; None means no guard.
 
     Raises InvalidArgumentError if it does not fit the robot or the control, or limits the positions of a follower of a
@@ -110,7 +90,7 @@ def fit_guard(guard: object, robot: GuardedRobot, num_envs: int, control: str, s
     if not sets_positions:
         problem, remedy = "limits positions of joints, which this control does not take", "use control 'pid' or 'drive'"
         raise InvalidArgumentError("guard", problem, value=control, remedy=remedy)
-    limits = setpoint_guard(robot, None, None) if guard is True else guard
+    limits = setpoint_guard(joints, None, None) if guard is True else guard
     limits = instance("guard", limits, bp.Guard, "pass True, or robot.guard(...)")
-    check_guard(limits, num_envs, robot.joint_names)
-    return frozen(_of_leaders(limits, robot))
+    check_guard(limits, num_envs, [joint.name for joint in joints])
+    return frozen(_of_leaders(limits, joints))

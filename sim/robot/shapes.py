@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.meshes import find_mesh, mesh_problem
-from batchpid.sim.robot.source import is_mjcf
+from batchpid.sim.robot.urdf import is_mjcf
 from batchpid.sim.robot.xml import numbers, parse_xml
 from batchpid.task_space.rotations import from_rpy, rotate
 

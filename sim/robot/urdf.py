@@ -1,5 +1,7 @@
 """URDF reader for headless simulation: parses safely, drops visuals, resolves meshes, lists the joints.
 
+An MJCF file is read as the URDF that is equivalent to it (:mod:`batchpid.sim.robot.mjcf`).
+
 SAPIEN's own loader builds render components for every ``<visual>``, which fails on a machine without a render device,
 and silently skips a collision mesh that it cannot read. The text made here has no visuals, absolute mesh paths, and no
 mimic joint: the coupling is not SAPIEN's (:mod:`batchpid.sim.engine.coupled_joints`).
@@ -7,24 +9,63 @@ mimic joint: the coupling is not SAPIEN's (:mod:`batchpid.sim.engine.coupled_joi
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lxml import etree
 
+from batchpid.errors import MissingDependencyError
+from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.xml import parse_xml
+
+if TYPE_CHECKING:
+    from batchpid.sim.robot.mjcf.mjcf_reader import Mjcf
+
+from collections import Counter, defaultdict
+from functools import cache
+
 from batchpid.arrays.array_types import Document
 from batchpid.errors import RobotError
-from batchpid.sim.robot.findings import Finding, refuse
-from batchpid.sim.robot.inertia import from_entries, triangle_excess
+from batchpid.sim.robot.findings import refuse
 from batchpid.sim.robot.joint_repair import ends_of
-from batchpid.sim.robot.link_repair import MOMENTS
+from batchpid.sim.robot.link_repair import MOMENTS, from_entries, triangle_excess
 from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
 from batchpid.sim.robot.parts import Joint, Link, Mimic, Urdf
 from batchpid.sim.robot.repair import repair
 from batchpid.sim.robot.xml import number, numbers
 
 MOST_READ = 4096  # links and joints of a file
+
+
+def is_mjcf(root: etree._Element) -> bool:
+    """Return whether a root element is an MJCF file's; MuJoCo ignores a default namespace."""
+    return root.prefix is None and etree.QName(root).localname == "mujoco"
+
+
+def read_source(path: Path, fixed_base: bool, missing_meshes: str) -> tuple[etree._Element, list[Finding], Mjcf | None]:
+    """Return the root of the URDF at ``path``, or of one that is equivalent to the MJCF there, and the findings.
+
+    The last value is the rest of an MJCF file, None for a URDF.
+
+    Raises
+    ------
+    RobotError
+        The file cannot be read, or MuJoCo does not compile it.
+    MissingDependencyError
+        The file is MJCF, and the package ``mujoco`` is missing.
+    """
+    findings: list[Finding] = []
+    root = parse_xml(path, findings)
+    if not is_mjcf(root):
+        return root, findings, None
+    try:
+        import mujoco  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError("mujoco>=3.17", "reading an MJCF file") from error
+    from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
+
+    mjcf = read_mjcf(path, root.get("model") or path.stem, fixed_base, missing_meshes)
+    return mjcf.root, [*findings, *mjcf.findings], mjcf
 
 
 def read_urdf(

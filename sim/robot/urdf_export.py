@@ -11,13 +11,12 @@ from pathlib import Path
 from lxml import etree
 
 from batchpid.errors import RobotError
-from batchpid.export.exported import Exported
+from batchpid.export.differences import Exported
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.meshes import find_mesh
 from batchpid.sim.robot.repair import UNUSED
-from batchpid.sim.robot.source import read_source
-from batchpid.sim.robot.urdf import read_urdf, repair_urdf
+from batchpid.sim.robot.urdf import read_source, read_urdf, repair_urdf
 
 
 def to_urdf(

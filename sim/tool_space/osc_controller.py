@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,12 +20,12 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors.friction import LOOKAHEAD, compensation
 from batchpid.sim.command import POSE_UNITS, CommandSpec
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
-from batchpid.sim.robot.dissipation import DISSIPATION
 from batchpid.sim.robot.loop_stability import StabilityWarning
+from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.tool_space.bound_osc import BoundOSC
 from batchpid.task_space import native_law, native_rows
 from batchpid.task_space.frames import pose_error
+from batchpid.task_space.native_law import BoundOSC
 from batchpid.task_space.osc_params import AXES, NoDecoupling
 from batchpid.task_space.symmetric import gram, solve
 
@@ -35,13 +35,6 @@ OPTIONAL = {
     "wrench": ("fx fy fz mx my mz", "N", "N m"),
 }
 """Names of further entries of a setpoint, and units of the linear and angular ones."""
-
-
-class TaskFriction(NamedTuple):
-    """Known Coulomb friction of the joints, and the band of small errors in which it is reduced (1, dof)."""
-
-    coulomb: Array
-    band: Array
 
 
 class OperationalSpace:
@@ -130,14 +123,14 @@ class OperationalSpace:
             raise InvalidArgumentError("params", problem, remedy="make them with robot.kinematic_tree()")
         self._params = params
         self._k, self._timestep = ts.discretise(params, 1 / 2000), 1 / 2000
-        self._friction: TaskFriction | None = None
+        self._friction: tuple[Array, Array] | None = None  # Coulomb's, and the band of errors in which it is reduced
         # Damping and friction that the robot is known to have: the law acts against them.
         modelled, known = DISSIPATION[robot.dissipation].modelled, known_joints(robot)
         damping = known.viscous + np.array([joint.damping * modelled for joint in robot.joints])
         self._damping = damping[None] if damping.any() else None
         coulomb = known.coulomb + robot.friction * modelled
         band = np.array([BAND[unit] for unit in robot.units])
-        self._known_friction = TaskFriction(coulomb[None], band[None]) if coulomb.any() else None
+        self._known_friction = (coulomb[None], band[None]) if coulomb.any() else None
         chain = tree.chain(link)
         # A setpoint has the pose (7), then the optional twist, acceleration and wrench (6 each), then single joints.
         self._columns = np.zeros(tree.dof, np.intp)  # of the setpoint, for each joint; 0 for none
@@ -228,9 +221,8 @@ class OperationalSpace:
         """Return this controller as a native call on these arrays (envs, dof); None where it must run in Python."""
         if not self.is_native or native_rows.in_use() is None:
             return None
-        tool = self.tree, self.link, self.point
         given = self._parts, self._columns, self._damping, self._friction, self._timestep
-        return BoundOSC(self._k, tool, *given, (qpos, qvel, passive))
+        return BoundOSC(self._k, ts.Tool(self.tree, self.link, self.point), *given, (qpos, qvel, passive))
 
     def _coefficients(self, setpoint: Array) -> ts.OSCCoefficients:
         """Return the coefficients of the law for setpoints (envs, size)."""
@@ -243,7 +235,8 @@ class OperationalSpace:
         assert self._friction is not None
         arrays = {"pose": dynamics.pose, "jacobian": dynamics.jacobian, "chain": dynamics.chain}
         arrays |= {"setpoint": setpoint[:, :7], "twist": twist, "posture": posture, "qpos": qpos}
-        found = native_law.friction({**arrays, **self._friction._asdict()})
+        coulomb, band = self._friction
+        found = native_law.friction(arrays, coulomb, band)
         if found is not None:
             return found
         error, j, others = pose_error(setpoint[:, :7], dynamics.pose), dynamics.jacobian, posture - qpos
@@ -251,7 +244,7 @@ class OperationalSpace:
         rows, eye = namespace(j).swapaxes(j, -1, -2), 1e-4 * namespace(j).eye(6)
         moved = gram(j, solve(gram(rows, rows) + eye.astype(j.dtype), ahead[..., None]))[..., 0]
         chain = dynamics.chain
-        return compensation(self._friction.coulomb, chain * moved + (1 - chain) * others, None, self._friction.band)
+        return compensation(coulomb, chain * moved + (1 - chain) * others, None, band)
 
     def in_runner(self, timestep: float, compensate: str) -> OperationalSpace:
         """Return this controller for the time step [s] and the option ``compensate`` of a runner."""

@@ -1,4 +1,4 @@
-"""Poses of a tool as the setpoints of joint control, by inverse kinematics."""
+"""Poses of a tool: as setpoints of joint control, by inverse kinematics; and those that operational space reaches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.command import POSE_UNITS, CommandSpec
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.tool_space.osc_controller import OPTIONAL, tool_pose
+from batchpid.sim.tool_space.osc_controller import OPTIONAL, OperationalSpace, tool_pose
+from batchpid.task_space.frames import pose_error
+from batchpid.task_space.osc_params import TASK_CHOICES, NoDecoupling
 
 DAMPING = 1e-4
 """Damping of the inverse Jacobian of a tool's twist."""
@@ -134,3 +136,56 @@ class ToolSetpoints:
         )
         error = InvalidArgumentError(name, problem, env=int(failed[0]), remedy="keep setpoints within reach")
         warn(str(error), ts.InverseKinematicsWarning)
+
+
+SECONDS, TIMESTEP = 3.0, 1 / 250
+"""Time that a tool has, and time step of the model [s]."""
+ARRIVED = 2e-3
+"""Largest error of a pose that was reached [m, rad]."""
+SLACK = 1e-3
+"""Distance by which a joint may pass a limit [rad or m]."""
+
+
+def reaches(robot: Robot, control: OperationalSpace, start: Float64, goal: Float64) -> NDArray[np.bool_]:
+    """Return whether the tool comes from rest at ``start`` (envs, dof) to ``goal`` (7,) or (envs, 7) (envs,).
+
+    The joints have to stay within their limits, which the law does not know, on the whole way. The model has no
+    contact and no friction.
+    """
+    tree, params = control.tree, control.params
+    if not isinstance(params.decoupling, NoDecoupling):
+        params = params._replace(discretization=TASK_CHOICES["discretization"]["implicit"])
+    k, state = ts.discretise(params, TIMESTEP), control.init(robot, len(start))
+    tool = ts.Tool(tree, control.link, control.point)
+    goal = np.broadcast_to(goal, (len(start), 7)).astype(np.float64)
+    qpos, qvel, inside = start.astype(np.float64), np.zeros(start.shape), np.ones(len(start), bool)
+
+    for _ in range(round(SECONDS / TIMESTEP)):
+        state, terms = ts.osc(k, state, tool, ts.OSCInputs(goal, qpos, qvel), ("effort",))
+        qvel = qvel + TIMESTEP * ts.forward_dynamics(tree, qpos, qvel, terms.effort)
+        qpos = qpos + TIMESTEP * qvel
+        inside &= ((qpos >= robot.lower - SLACK) & (qpos <= robot.upper + SLACK)).all(1)
+    left: Array = np.abs(pose_error(goal, ts.link_poses(tree, qpos, [tool.link], point=tool.point)[:, 0])).max(1)
+    reached: NDArray[np.bool_] = inside & (left <= ARRIVED)
+    return reached
+
+
+def default_goal(robot: Robot, control: OperationalSpace, start: Float64, poses: Float64) -> Float64:
+    """Return the first pose (7,) of the tool at ``poses`` (n, dof) that it reaches from all ``start`` (envs, dof).
+
+    Raises
+    ------
+    InvalidArgumentError
+        There is no such pose.
+    """
+    goals: Float64 = ts.link_poses(control.tree, poses, [control.link], point=control.point)[:, 0]
+    for goal in goals:
+        reached = reaches(robot, control, start, goal)
+        if reached.all():
+            return goal
+    problem = (
+        f"has no default: {len(goals)} poses near the target were tried, and {control.link!r} does not reach the last "
+        f"one within the joint limits from {np.count_nonzero(~reached)} of {len(start)} start poses"
+    )
+    remedy = "give a pose, or start nearer to the robot's target (spread)"
+    raise InvalidArgumentError("setpoint", problem, env=int(np.argmin(reached)), remedy=remedy)

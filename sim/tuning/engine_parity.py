@@ -9,7 +9,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64, Rows
-from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.robot import Robot

@@ -20,8 +20,8 @@ from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.observation import Rollout
-from batchpid.sim.robot.limits import SetpointWarning
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.run_checks import SetpointWarning
 from batchpid.sim.robot.unsettled import absolute_band
 from batchpid.sim.runner import Runner
 from batchpid.sim.tuning.moves import (

@@ -11,7 +11,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
-from batchpid.export.exported import Imported
+from batchpid.export.differences import Imported
 from batchpid.export.ros2_control_reader import from_ros2_control, is_ros2_control
 from batchpid.io import documents
 from batchpid.sim.robot.findings import summary

@@ -29,7 +29,7 @@ from batchpid.checks.validate import integer, number
 from batchpid.errors import BatchPIDError, InvalidArgumentError, RobotError
 from batchpid.sim.processes.fork_server import ONE_THREAD
 from batchpid.sim.robot.parts import MOVING_TYPES
-from batchpid.sim.robot.source import is_mjcf
+from batchpid.sim.robot.urdf import is_mjcf
 from batchpid.sim.robot.xml import SIZE_LIMIT, parse_xml
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 

@@ -37,7 +37,7 @@ from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
-from batchpid.sim.robot.dissipation import DISSIPATION
+from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
 from batchpid.sim.tuning.candidates import HEADROOM, Candidates
@@ -146,6 +146,9 @@ def tune(
         The package ``cmaes`` is missing.
     """
     refuse_searched(runner_options, ("params", "discretization"), "leave it out; bp.design_gains makes implicit gains")
+    if motors is not None and runner_options.get("actuators") is not None:
+        remedy = "leave it out; the control knows the actuators of the robot: Robot.load(..., actuators=...)"
+        raise InvalidArgumentError("actuators", "is given with motors", remedy=remedy)
     seed, generations, population, seconds = checked_effort(seed, generations, population, seconds)
     weights = Weights() if weights is None else weights
     final = random_moves(robot, FINAL_MOVES, seed + _FINAL_SEED) if moves is None else None

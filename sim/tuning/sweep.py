@@ -30,8 +30,8 @@ from batchpid.sim.loop.faults import FaultWarning
 from batchpid.sim.observation import Observation, Rollout
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.recording.recording_files import HDF5, load_h5py, read_recording, write_recording
-from batchpid.sim.robot.limits import SetpointCheck, SetpointWarning
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.run_checks import SetpointCheck, SetpointWarning
 from batchpid.sim.runner import Runner
 from batchpid.sim.tuning.history import REMEDY, other_inputs
 from batchpid.sim.workers.contact_log import MissedContactWarning

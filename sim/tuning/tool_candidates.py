@@ -26,7 +26,7 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.unsettled import PRISMATIC_BAND, REVOLUTE_BAND
 from batchpid.sim.runner import Runner
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
-from batchpid.sim.tool_space.tool_goals import reaches
+from batchpid.sim.tool_space.tool_setpoints import reaches
 from batchpid.sim.tuning.candidates import DIVERGED_COST, PENALTY_RATIO, bounded, response_cost
 from batchpid.sim.tuning.evaluation import SETTLE_SECONDS
 from batchpid.sim.tuning.moves import Moves, smooth_variation

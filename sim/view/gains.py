@@ -5,17 +5,16 @@ from __future__ import annotations
 from contextlib import suppress
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import batchpid as bp
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import at_least, broadcast, choice, integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.input_checks import DRIVE_LACKS
 from batchpid.sim.options import RunnerOptions, default_params
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import ControlMode
-
-Float64 = NDArray[np.float64]
 
 GAINS = ("kp", "ki", "kd", "derivative_filter_time", "setpoint_weight", "effort_limit")
 """Gains that can be changed."""

@@ -6,13 +6,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid.task_space as ts
+from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.robot.robot import Robot
-
-Float64 = NDArray[np.float64]
 
 MAX_ROBOTS = 64
 """Largest number of robots on a page or in a film."""

@@ -1,4 +1,4 @@
-"""Page that shows robots: run a frame, show the previous one, keep real time."""
+"""Page that shows robots: charts of a joint, a frame at the tool, and the loop that keeps real time."""
 
 from __future__ import annotations
 
@@ -6,19 +6,22 @@ import io
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, redirect_stdout, suppress
 from functools import partial
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from batchpid.arrays.array_types import Document
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import MissingDependencyError
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.findings import summary
-from batchpid.sim.view.charts import Charts
-from batchpid.sim.view.data import ViewData
-from batchpid.sim.view.gizmo import TargetGizmo
-from batchpid.sim.view.panel import Panel
+from batchpid.sim.view.panel import Panel, ViewData
+from batchpid.sim.view.playback import HISTORY_SECONDS
 from batchpid.sim.view.scene import RobotScene
 from batchpid.sim.view.simulation import LiveSimulation
 
@@ -94,7 +97,7 @@ class View(SingleOwner, AbstractContextManager["View"]):
         count = 0
         with ThreadPoolExecutor(1) as executor:
             while not self._stopped and (seconds is None or time.monotonic() - began < seconds):
-                panel.run_requests()
+                panel.requests.run()
                 frame = data.frame()
                 # The workers compute the next frame while this one is sent.
                 job = executor.submit(data.advance) if panel.frames_left > 0 else None
@@ -157,3 +160,134 @@ class View(SingleOwner, AbstractContextManager["View"]):
             self._charts.update(panel.env, panel.joint)
         if settling or (not settled and count % STATUS_EVERY == 0):
             panel.update_status(frame, self.factor, self.rate)
+
+
+_COLOURS = ("#15803d", "#d97706")
+"""Colour of each group's curves."""
+_LIMIT_RATIO = 4.0
+"""A limit is drawn where it is less than this many times the largest effort."""
+_MIN_RANGE = {"min": -0.012, "max": 0.012}
+"""Smallest range of a vertical axis [rad, m, N m or N]: noise alone should not fill a chart."""
+_SCALES = {
+    "x": {"time": False, "range": (-HISTORY_SECONDS, 0.0)},  # without a fixed range the axis drifts in viser 1.1
+    "y": {"range": {end: {"pad": 0.1, "soft": soft, "mode": 1} for end, soft in _MIN_RANGE.items()}},
+}
+
+
+class Charts:
+    """Three charts in ``gui``, of one joint of the same robot in every group."""
+
+    def __init__(self, gui: Any, data: ViewData) -> None:
+        self._data = data
+        names = data.groups if len(data.groups) > 1 else ("",)
+
+        def chart(title: str, *series: Document) -> Any:
+            return gui.add_uplot(
+                (np.array([-HISTORY_SECONDS, 0.0]), *[np.zeros(2)] * len(series)),  # flat until the first update
+                ({"label": "s"}, *series),
+                title=title,
+                scales=_SCALES,
+                legend={"show": True, "live": False},
+                height=168,
+                axes=({"size": 30, "stroke": "#6b7280"}, {"size": 56, "stroke": "#6b7280"}),
+                padding=(4, 14, 0, 0),
+            )
+
+        def curves(quantity: str) -> list[Document]:
+            return [
+                {"label": f"{quantity} {name}".strip(), "stroke": colour, "width": 2}
+                for name, colour in zip(names, _COLOURS, strict=False)
+            ]
+
+        dashed = {"width": 1, "dash": [6, 4]}
+        limits = ({"label": f"{end} limit", "stroke": "#b6bcc6", **dashed} for end in ("lower", "upper"))
+        self._sets_positions = data.frame().info.sets_positions
+        target = [{"label": "setpoint", "stroke": "#4a82ff", **dashed}] if self._sets_positions else []
+        self._position = chart("position", *curves("qpos"), *target)
+        self._error = chart("error", *curves("error"))
+        self._error.visible = self._sets_positions
+        self._effort = chart("effort", *limits, *curves("effort"))
+
+    def update(self, env: int, joint: int) -> None:
+        """Draw the recent past of a joint of robot ``env`` of every group."""
+        data, history = self._data, self._data.history()
+        if len(history.time) < 2:
+            return
+        past = history.time - history.time[-1]
+        robots = env + data.per_group * np.arange(len(data.groups))
+        arrays = (history.qpos, history.setpoint if self._sets_positions else history.qpos, history.effort)
+        qpos, setpoint, effort = (array[:, robots, joint].T.astype(np.float64) for array in arrays)
+        # A far limit would flatten the curve, and a gap (NaN) would empty the chart: such a limit repeats the curve.
+        largest = np.abs(effort).max()
+        limits = [
+            np.full(len(past), limit) if abs(limit) < _LIMIT_RATIO * largest else effort[0]
+            for limit in data.effort_limits(env, joint)
+        ]
+        described = data.robot.joints[joint]
+        drawn = [*qpos, setpoint[0]] if self._sets_positions else qpos
+        positions = np.round(drawn, 4)  # smaller differences make a flat line jitter
+        for chart, title, curves in (
+            (self._position, f"{described.name} [{described.unit}]", positions),
+            (self._error, f"setpoint - qpos [{described.unit}]", setpoint - qpos),
+            (self._effort, f"effort [{described.effort_unit}]", [*limits, *effort]),
+        ):
+            if chart.title != title:
+                chart.title = title
+            chart.data = (past, *curves)
+
+
+_SIZE = 0.25
+"""Length of an axis, in reaches of the robot."""
+
+
+class TargetGizmo:
+    """Draggable frame of a viser ``server`` at the setpoint of control "osc".
+
+    Parameters
+    ----------
+    positions
+        Positions of the robots on the page (envs, 3) [m].
+    reach
+        Reach of the robot [m].
+    put
+        Function that queues a request until the next frame.
+    only_watched
+        Function that returns whether a drag moves the target of the watched robot alone.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        live: LiveSimulation,
+        positions: NDArray[np.float64],
+        reach: float,
+        put: Callable[[Callable[[], object]], None],
+        only_watched: Callable[[], bool],
+    ) -> None:
+        self._live, self._positions, self._put, self._only_watched = live, positions, put, only_watched
+        self._env = 0
+        self._shown: bytes | None = None
+        self._frame = server.scene.add_transform_controls("/target", scale=_SIZE * reach, depth_test=False)
+        self._frame.on_update(self._dragged)
+        self.update(0)
+
+    def update(self, env: int) -> None:
+        """Put the frame at the target of a robot, unless it is there."""
+        target = self._live.setpoint[env]
+        if (env, target.tobytes()) != (self._env, self._shown):
+            self._env, self._shown = env, target.tobytes()
+            self._frame.position = tuple(self._positions[env] + target[:3])
+            self._frame.wxyz = tuple(target[3:] / np.linalg.norm(target[3:]))
+
+    async def _dragged(self, event: Any) -> None:
+        if event.phase == "update":
+            pose = np.concatenate([self._frame.position, self._frame.wxyz], dtype=np.float64)
+            self._put(partial(self._move, self._env, pose))
+
+    def _move(self, env: int, pose: NDArray[np.float64]) -> None:
+        """Set the target to a pose on the page, between two frames; a refused one brings the frame back."""
+        self._shown = None
+        target = pose - np.concatenate([self._positions[env], np.zeros(4)])
+        self._live.set_target(target, env=env if self._only_watched() else None)
+        if env == self._env:  # the frame is where the pointer has it
+            self._shown = self._live.setpoint[env].tobytes()

@@ -1,26 +1,129 @@
-"""Control panel of the page: motion, the watched joint, setpoints, gains, disturbances."""
+"""Control panel of the page: motion, the watched joint, setpoints, gains, disturbances, and the requests of controls.
+
+viser calls back from a separate thread, with unchecked data of a page. A control keeps its last valid value; requests
+are queued and carried out between two frames.
+"""
 
 from __future__ import annotations
 
 import html
 import math
+import queue
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.checks.validate import integer
-from batchpid.errors import InvalidArgumentError
+from batchpid.checks.validate import choice, flag, integer, number
+from batchpid.errors import BatchPIDError, InvalidArgumentError
 from batchpid.sim.command import CommandSpec
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.view.controls import Control, Requests
-from batchpid.sim.view.data import ViewData, cause
+from batchpid.sim.robot.unsettled import unsettled_findings
 from batchpid.sim.view.gains import GAINS
 from batchpid.sim.view.playback import Playback
 from batchpid.sim.view.simulation import LiveSimulation
+
+MAX_REQUESTS = 256
+"""Largest number of requests between two frames."""
+
+
+class Requests:
+    """Queue of requests from the pages. ``refuse`` is called with the reason for every request that fails."""
+
+    def __init__(self, refuse: Callable[[str], object]) -> None:
+        self.refuse = refuse
+        self._queue: queue.Queue[Callable[[], object]] = queue.Queue(MAX_REQUESTS)
+
+    def put(self, request: Callable[[], object]) -> None:
+        """Queue a request. Safe to call from any thread."""
+        try:
+            self._queue.put_nowait(request)
+        except queue.Full:
+            self.refuse(f"more than {MAX_REQUESTS} requests in a frame; slow down")
+
+    def run(self) -> None:
+        """Carry out the requests that are queued now."""
+        for _ in range(self._queue.qsize()):
+            try:
+                self._queue.get_nowait()()
+            except BatchPIDError as error:
+                self.refuse(str(error))
+
+
+class Control:
+    """Slider, drop-down, checkbox or group of buttons: a ``handle`` of viser, and its last valid value."""
+
+    def __init__(self, handle: Any, requests: Requests) -> None:
+        self.handle = handle
+        """Handle of viser, for everything but the value."""
+        self._value, self._requests = handle.value, requests
+        self._actions: list[Callable[[Any], object]] = []
+        (handle.on_click if hasattr(handle, "on_click") else handle.on_update)(self._changed)
+
+    @property
+    def value(self) -> Any:
+        """Last valid value. Setting it shows it on every page."""
+        return self._value
+
+    @value.setter
+    def value(self, value: Any) -> None:
+        self._value = self.handle.value = value
+
+    def on_change(self, action: Callable[[Any], object]) -> Control:
+        """Request ``action(value)`` whenever a page, and not this program, changes the control."""
+        self._actions.append(action)
+        return self
+
+    def change(self, value: Any) -> None:
+        """Set the value and carry out the actions, between two frames."""
+        self.value = value
+        for action in self._actions:
+            action(value)
+
+    async def _changed(self, event: Any) -> None:
+        if event.client is None:
+            return
+        try:
+            self._value = _checked(self.handle)
+        except InvalidArgumentError as error:
+            self._requests.refuse(str(error))
+            self.handle.value = self._value
+            return
+        for action in self._actions:
+            self._requests.put(partial(action, self._value))
+
+
+def _checked(handle: Any) -> Any:
+    """Return the value of a control if it is one that the control offers."""
+    if hasattr(handle, "options"):
+        return choice(handle.label, handle.value, handle.options)
+    if hasattr(handle, "max"):
+        return number(handle.label, handle.value, handle.min, handle.max, "as on the slider")
+    return flag(handle.label, handle.value)
+
+
+ViewData = LiveSimulation | Playback
+PATIENCE = 2.0
+"""Time after a change of the setpoint from which a robot should have settled [s]."""
+
+
+def cause(data: ViewData, robot: int) -> str:
+    """Return a sentence on why a robot, numbered over all groups, has not settled since its setpoint last changed.
+
+    Empty if it has, or within :data:`PATIENCE`.
+    """
+    past = data.history().for_envs([robot])
+    changes = np.flatnonzero((past.setpoint != past.setpoint[-1]).any((1, 2)))
+    since = past.for_ticks(slice(int(changes[-1]) + 1 if changes.size else 0, None))
+    if len(since.time) < 3 or since.time[-1] - since.time[0] < PATIENCE:
+        return ""
+    since = replace(since, info=replace(data.info_of(robot), start=since.qpos[0].astype(float)))
+    return next((str(found).partition(": ")[2] for found in unsettled_findings(since, data.robot)), "")
+
 
 _DIRECTIONS = dict(zip(("+x", "+y", "up", "-x", "-y", "down"), np.concatenate([np.eye(3), -np.eye(3)]), strict=True))
 _FINDING_STYLE = "margin: 0.5em 1em; font-size: 0.8em; color: #b45309; overflow-wrap: anywhere"
@@ -106,10 +209,6 @@ class Panel:
         else:
             self.requests.put(partial(self._robot.change, robot % self._data.per_group))
 
-    def run_requests(self) -> None:
-        """Carry out the requests of the page since the last call."""
-        self.requests.run()
-
     def update_status(self, frame: Rollout, factor: float, rate: float) -> None:
         """Show time, real-time factor, frame rate, and the robots that diverged or saturate."""
         data, time = self._data, float(frame.time[0])
@@ -179,8 +278,7 @@ class Panel:
     def _add_target(self, live: LiveSimulation) -> None:
         gui = self._gui
         gui.add_markdown("Drag the frame at the tool: arrows move, arcs turn its target.")
-        watched_only = self._control(gui.add_checkbox("Watched robot only", True))
-        watched_only.on_change(partial(setattr, self, "only_watched"))
+        self._control(gui.add_checkbox("Watched robot only", True)).on_change(partial(setattr, self, "only_watched"))
         back = self._control(gui.add_button_group("Go to", ("start",)))
         back.on_change(lambda _: live.set_target(live.neutral, env=self.env if self.only_watched else None))
 

@@ -12,15 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.shapes import Surface, surfaces
 from batchpid.sim.view.layout import FIELD_OF_VIEW, TILE, RobotLayout, arrange_robots
 from batchpid.task_space.rotations import placed
-
-Float64 = NDArray[np.float64]
 
 _SETPOINT_COLOUR = (70, 130, 255)
 _DIVERGED_COLOUR = np.array([200, 40, 40], np.uint8)

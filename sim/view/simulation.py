@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -11,15 +10,16 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import batchpid as bp
 import batchpid.task_space as ts
+from batchpid.arrays.array_types import Float64
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import array, choice, integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.observation import Observation, Rollout, RunInfo
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options import RunnerOptions, worker_count
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
 from batchpid.sim.runner_keywords import ControlMode
@@ -27,8 +27,6 @@ from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.view.gains import GroupGains, offered_gains
 from batchpid.sim.view.layout import MAX_ROBOTS
 from batchpid.sim.view.playback import HISTORY_SECONDS
-
-Float64 = NDArray[np.float64]
 
 CONTROLS = ("pid", "drive", "osc")
 MAX_DISTANCE = 10.0
@@ -115,7 +113,7 @@ class LiveSimulation(SingleOwner):
         self._push: Float64 = np.zeros(3)
         self._count = self._push_frames = 0
         self._frames: deque[Rollout] = deque(maxlen=round(HISTORY_SECONDS / self.period))
-        cores = len(os.sched_getaffinity(0)) if workers is None else workers
+        cores = worker_count(workers)
         options = dict(substeps=substeps, workers=0 if cores == 0 else max(1, cores // groups), **options)
         with ExitStack() as stack:
             self._pool = stack.enter_context(ThreadPoolExecutor(groups))

@@ -26,7 +26,7 @@ import cloudpickle
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import InvalidArgumentError, WorkerError
 from batchpid.sim.engine import native
-from batchpid.sim.engine.engines import MODULES
+from batchpid.sim.engine.protocol import MODULES
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.failure import Failure, failure_of
 from batchpid.sim.loop.loop import Loop

@@ -1,8 +1,7 @@
 """Cases that the tests of the law share: every option, array libraries, a made-up run."""
 
-import dataclasses
-from collections.abc import Callable
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -52,19 +51,42 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
 }
 
+NUMBERS = {
+    "ki": (0.0, 50.0),
+    "kd": (0.0, 2.0),
+    "effort_rate_limit": (math.inf, 900.0),
+    "derivative_filter_time": (0.0, 0.05),
+    "setpoint_weight": (1.0, 0.9),
+    "setpoint_weight_derivative": (0.0, 0.9),
+    "deadband": (0.0, 0.5),
+    "effort_min": (-math.inf, -30.0),
+    "effort_max": (math.inf, 30.0),
+    "integral_min": (-math.inf, -4.0),
+    "integral_max": (math.inf, 4.0),
+}
+"""Options that are numbers: the value that is off, and one that has an effect."""
+NAMES = {
+    "integration": ("output_first", "integrate_first"),
+    "first_derivative": ("zero", "kick"),
+    "weight_origin": ("zero", "start"),
+    "non_finite": ("propagate", "zero", "hold"),
+}
 
-@dataclasses.dataclass
-class Backend:
-    """An array library in one float type, as the law is used on it."""
 
-    name: str
-    dtype: Any
-    array: Callable[[Any], Any]
-    step: Callable[..., Any]
-
-    @property
-    def tolerance(self) -> float:
-        return 1e-12 if self.dtype == np.float64 else 1e-5
+def generated_options(seed: int, envs: int = ENVS) -> dict[str, Any]:
+    """Return arguments of make_params of any combination, with an entry for each env and joint, some of them off."""
+    rng, shape = np.random.default_rng(seed), (envs, JOINTS)
+    options: dict[str, Any] = {"kp": rng.uniform(0.5, 40, shape)}
+    for name, (off, on) in NUMBERS.items():
+        if rng.random() < 0.6:
+            options[name] = np.where(rng.random(shape) < 0.3, off, on * rng.uniform(0.1, 1.0, shape))
+    strategies = ["none", "conditional", "back_calculation", *(["clamp"] if "effort_max" in options else [])]
+    options["anti_windup"] = rng.choice(strategies, shape).tolist()
+    options["tracking_time"] = (
+        rng.uniform(0.001, 0.3, shape) if "back_calculation" in np.ravel(options["anti_windup"]) else None
+    )
+    options["continuous"] = rng.random(shape) < 0.5
+    return options | {name: rng.choice(names).item() for name, names in NAMES.items()}
 
 
 def read_only(value: Any, dtype: Any = np.float64) -> Any:
@@ -73,12 +95,22 @@ def read_only(value: Any, dtype: Any = np.float64) -> Any:
     return array
 
 
-@dataclasses.dataclass
-class Inputs:
-    """A made-up run: (steps, envs, joints) each."""
+class Inputs(NamedTuple):
+    """Inputs of the law, (steps, envs, joints) each; None for one that is not given."""
 
     setpoint: Any
     measurement: Any
-    measurement_rate: Any
-    setpoint_rate: Any
-    feedforward: Any
+    measurement_rate: Any = None
+    setpoint_rate: Any = None
+    feedforward: Any = None
+
+
+def made_up_inputs(envs: int = ENVS) -> Inputs:
+    """Thirty steps that saturate, wrap and reverse; float32 numbers, so that every executor gets the same."""
+    rng = np.random.default_rng(7)
+    steps = np.arange(30)[:, None, None]
+    phase = rng.uniform(0, 6, (1, envs, JOINTS))
+    measurement = 3 * np.sin(0.15 * steps + phase) + 0.3 * steps
+    setpoint = np.where(steps < 12, 1.0, -2.0) * np.cos(phase) + 0.01 * steps
+    noise = [rng.normal(size=measurement.shape) for _ in range(3)]
+    return Inputs(*(np.asarray(x, np.float32).astype(float) for x in (setpoint, measurement, *noise)))

@@ -39,7 +39,7 @@ class ScalarPID:
         self.measurement = measurement
         self.derivative = 0.0
         self.setpoint = measurement if self.first_derivative == "kick" else None
-        self.effort = 0.0
+        self.effort = self.size = 0.0
         self.origin = measurement if self.weight_origin == "start" else 0.0
 
     def step(
@@ -85,6 +85,8 @@ class ScalarPID:
         else:
             used = before
 
+        terms = proportional, used, self.kd * self.derivative, feedforward or 0.0
+        self.size = sum(map(abs, terms))
         self.unsaturated = proportional + used + self.kd * self.derivative + (feedforward or 0.0)
         change = self.effort_rate_limit * dt
         effort = min(max(self.unsaturated, self.effort - change), self.effort + change)
@@ -110,6 +112,8 @@ class ScalarPID:
 def scalar_pids(params: PIDParams, num_envs: int) -> list[list[ScalarPID]]:
     """Return one :class:`ScalarPID` per env and joint with the options of ``params``."""
     known = {field.name for field in fields(ScalarPID)}
+    if params.ki is None:  # without an integral there is nothing to limit
+        known -= {"integral_min", "integral_max", "anti_windup", "tracking_time"}
     options = {name: value for name, value in params.options().items() if name in known}
 
     def pick(value: Any, env: int, joint: int) -> Any:

@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from batchpid.io.npz import read_npz
+from batchpid.io.files import read_npz
 
 ARRAYS = {
     "text": np.array("abc"),

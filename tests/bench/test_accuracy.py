@@ -6,7 +6,7 @@ from robots import load_bundled
 from scripts import load_script
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.engine.sapien.physics import PHYSICS
+from batchpid.sim.engine.physics import PHYSICS
 
 accuracy = load_script("accuracy")
 

@@ -8,7 +8,7 @@ import pytest
 from robots import load_bundled
 
 from batchpid.sim import Robot, RunnerOptions
-from batchpid.sim.engine.engines import load_engine
+from batchpid.sim.engine.protocol import load_engine
 
 
 @pytest.fixture(params=["sapien", "mujoco"])

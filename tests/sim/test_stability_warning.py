@@ -10,7 +10,7 @@ import pytest
 
 import batchpid as bp
 from batchpid.sim import Robot, Runner, StabilityWarning
-from batchpid.sim.robot.drive_chatter import DriveChatterCheck
+from batchpid.sim.robot.run_checks import DriveChatterCheck
 from batchpid.sim.tuning.candidates import Candidates
 from tests.sim.tiny_urdf import joint, link, one_joint, robot, write
 

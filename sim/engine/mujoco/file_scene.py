@@ -19,8 +19,7 @@ from batchpid.errors import RobotError
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.mjcf.mjcf_compiler import attempt
-from batchpid.sim.robot.mjcf.mjcf_names import Names
+from batchpid.sim.robot.mjcf.mjcf_compiler import Names, attempt
 from batchpid.sim.robot.mjcf.mjcf_reader import content_of, home
 from batchpid.sim.robot.mjcf.mjcf_tree import Tree
 from batchpid.sim.robot.parts import MjcfFile

@@ -17,18 +17,17 @@ from numpy.typing import ArrayLike
 from batchpid.arrays.array_types import Document, MjModel, MjSpec
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError, RobotError
-from batchpid.export.exported import Exported
+from batchpid.export.differences import Exported
 from batchpid.export.pd_drive import Drive
 from batchpid.law.params import PIDParams, make_params
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.guard import Guard, check_guard
-from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.mjcf_actuators import FAR, MjcfActuators
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
-from batchpid.sim.engine.mujoco.solver import SOLVERS
-from batchpid.sim.engine.scene_spec import SceneSpec
+from batchpid.sim.engine.physics import SOLVERS
+from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_friction
 from batchpid.sim.robot.description import RobotDescription
-from batchpid.sim.robot.inertia import nearest_physical
+from batchpid.sim.robot.link_repair import nearest_physical
 from batchpid.sim.robot.simulated_links import body_inertias
 
 

@@ -28,11 +28,10 @@ from batchpid.arrays.array_types import Document, MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.engine.mujoco.file_scene import BodyFrame, file_scene, set_ground
 from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
-from batchpid.sim.engine.mujoco.solver import MujocoSolver
+from batchpid.sim.engine.physics import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import add_geom, link_shapes
-from batchpid.sim.robot.dissipation import CONTACT_FRICTION
-from batchpid.sim.robot.parts import MOVING_TYPES, MjcfFile
+from batchpid.sim.robot.parts import CONTACT_FRICTION, MOVING_TYPES, MjcfFile
 from batchpid.sim.robot.simulated_links import body_inertias, simulated
 from batchpid.sim.robot.xml import numbers
 from batchpid.task_space.rotations import from_rpy

@@ -7,7 +7,7 @@ from typing import Any
 
 from batchpid.sim.engine.mujoco.mujoco_pack import MujocoPack
 from batchpid.sim.engine.mujoco.mujoco_step import obstacle
-from batchpid.sim.engine.mujoco.solver import SOLVERS, MujocoSolver
+from batchpid.sim.engine.physics import SOLVERS, MujocoSolver
 from batchpid.sim.engine.protocol import Capability, Engine
 from batchpid.sim.engine.robot_model import description_tree
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation

@@ -1,6 +1,6 @@
 """Pack of robots in MuJoCo. They share a model where they do not differ, and nothing else.
 
-Longer than 300 lines because that is the whole interface between loop and engine.
+Longer than 350 lines because that is the whole interface between loop and engine.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from batchpid.arrays.array_types import DType, Float64, Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
-from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.mujoco.data_pool import DataPool
 from batchpid.sim.engine.mujoco.link_sensors import MujocoLinkSensors
 from batchpid.sim.engine.mujoco.model_builder import FLOATING, LARGEST_FORCE, RobotMj, robot_model, set_inertia
@@ -28,14 +27,13 @@ from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.protocol import FAILED
 from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_back
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation, varied_inertia
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation, VariedMasses, added_friction, own_friction
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.sim.robot.simulated_links import varied_bodies
 from batchpid.task_space import frames
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.rotations import inverse, multiply
-from batchpid.task_space.spatial_inertia import rotation_matrix, spatial_matrix, total
+from batchpid.task_space.spatial_inertia import rotation_matrix
 
 _STATE = ("qpos", "qvel", "qacc_warmstart")
 """Fields of ``mujoco.MjData`` that a robot's later motion depends on, besides its efforts."""
@@ -66,16 +64,8 @@ class MujocoPack(SingleOwner):
         self.steps_natively = not obstacle()
         self.dof, self._variation = len(spec.joints), variation or Variation()
         varied = self._variation
-        self._masses_vary = any(each is not None for each in (varied.payload, varied.link_mass, varied.center_of_mass))
+        self._masses = VariedMasses(spec, size, varied, carrier, links)
         self._worlds_vary = varied.ground_friction is not None or varied.gravity is not None
-        varies_links = varied.link_mass is not None or varied.center_of_mass is not None
-        self._bodies = (
-            varied_bodies(spec.urdf, spec.merge_fixed, carrier, links if varies_links else [])
-            if self._masses_vary
-            else {}
-        )
-        self._nominal = {name: total([part.inertia for part in body.parts]) for name, body in self._bodies.items()}
-        self._added = {name: np.zeros((size, 6, 6)) for name in self._bodies}  # spatial inertias, to the nominal
         self.qf = np.zeros((size, self.dof))
         self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
         self.friction = own_friction(spec, self._variation)
@@ -177,15 +167,16 @@ class MujocoPack(SingleOwner):
     @cached_property
     def _joint_model(self) -> NativeModel:
         model = NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
-        if self._masses_vary:
-            model.vary(range(self.size), self.size, self._added)
+        if self._masses.added:
+            model.vary(range(self.size), self.size, self._masses.added)
         return model
 
     def joint_mass_matrix(self, qpos: Rows) -> Float64:
         """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
         if self.steps_natively:
             return self._joint_model.mass_matrix(qpos)
-        return ts.mass_matrix(self._tree, qpos, self._tree.varied(self._added) if self._added else None)
+        added = self._masses.added
+        return ts.mass_matrix(self._tree, qpos, self._tree.varied(added) if added else None)
 
     # -- stepping ----------------------------------------------------------------------------------------------
 
@@ -220,7 +211,7 @@ class MujocoPack(SingleOwner):
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
         """Return whether a compiled step reads this part of the passive force."""
-        return gravity and coriolis and not self._masses_vary and self._variation.gravity is None
+        return gravity and coriolis and not self._masses.added and self._variation.gravity is None
 
     @property
     def calls(self) -> object:
@@ -357,7 +348,7 @@ class MujocoPack(SingleOwner):
         """Return to one shared model if neither masses nor worlds nor armature nor drives of the robots differ."""
         first = self.models[0]
         if (
-            not self._masses_vary
+            not self._masses.added
             and not self._worlds_vary
             and all(
                 np.array_equal(getattr(first, field), getattr(model, field))
@@ -393,17 +384,15 @@ class MujocoPack(SingleOwner):
                 model.geom_friction[:, 0] = model.pair_friction[:, :2] = friction[row]
 
     def _change_masses(self, rows: Iterable[int]) -> None:
-        if not self._masses_vary:
+        if not self._masses.added:
             return
         for row in rows:
             model = self._own_model(row)
-            for name, body in self._bodies.items():
-                inertia = varied_inertia(body, self._variation, row)
+            for name, inertia in self._masses.of_robot(row).items():
                 set_inertia(model, self._robot, name, inertia)
-                self._added[name][row] = spatial_matrix(inertia) - spatial_matrix(self._nominal[name])
             mujoco.mj_setConst(model, self._scratch)
         if "_joint_model" in self.__dict__:
-            self._joint_model.vary(list(rows), self.size, self._added)
+            self._joint_model.vary(list(rows), self.size, self._masses.added)
 
     def write_drive(self, stiffness: Rows, damping: Rows, force_limit: Rows) -> None:
         """Set the drive of every joint; each argument broadcasts to (M, dof).

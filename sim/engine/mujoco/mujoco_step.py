@@ -20,7 +20,8 @@ from batchpid.arrays.array_types import Rows
 from batchpid.sim.engine import native
 from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
-from batchpid.sim.engine.native.interface import Group, Mujoco
+from batchpid.sim.engine.native.interface import Mujoco
+from batchpid.sim.engine.native_model import NativeStep
 from batchpid.task_space.spatial_inertia import rotation_matrix
 
 FUNCTIONS = {
@@ -64,8 +65,8 @@ def functions() -> dict[str, int] | None:
     return {field: address or 0 for field, address in found.items()} if has_addresses else None
 
 
-class MujocoStep:
-    """Sim step of robots in MuJoCo. Implements :class:`batchpid.sim.engine.protocol.CompiledStep`.
+class MujocoStep(NativeStep):
+    """Sim step of robots in MuJoCo.
 
     Parameters
     ----------
@@ -108,7 +109,6 @@ class MujocoStep:
         addresses = dict(found)
         kinematics, shapes = addresses.pop("kinematics"), shape_tables(robot)
         clearance = None if shapes is None else GroupClearance(shapes, kinematics, models, data, qf.shape[1])
-        self._native = native.extension("_gateway")
         tables = {
             "models": [model._address for model in models],
             "data": [each._address for each in data],
@@ -123,31 +123,20 @@ class MujocoStep:
         robots.sensor_size = sensed.shape[1]
         robots.base_qpos, robots.base_qvel = robot.base or (0, 0)
         robots.clearance = None if clearance is None else clearance.address
-        limit = None if speed_limit is None else np.broadcast_to(speed_limit, qf.shape[1:]).astype(np.float64)
-        self._group = Group(
+        self._take_data, self._kept = take_data, (models, data, arrays, robots, clearance)
+        super().__init__(
+            len(data),
+            qf.shape[1],
+            {"skip": skip},
+            speed_limit,
             mujoco=ctypes.addressof(robots),
-            robots=len(data),
-            dof=qf.shape[1],
-            skip=skip.ctypes.data,
             gravity=reads_force,
             coriolis=reads_force,
             velocities=True,
             constraint=constraint,
-            speed_limit=None if limit is None else limit.ctypes.data,
         )
-        self._take_data, self._kept = take_data, (models, data, arrays, robots, clearance, skip, limit)
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension or of XLA; the robots are in their states."""
         self._take_data()
-        return ctypes.addressof(self._group)
-
-    def __call__(self, *arrays: NDArray[np.float64]) -> int:
-        """Do one sim step: (effort, qpos, qvel, passive force), each (robots, dof); return the status."""
-        status: int = self._native.sim_step(self.prepare(), *arrays)
-        return status
-
-    @property
-    def message(self) -> str:
-        """Message of MuJoCo's error, after the status FAILED."""
-        return self._group.message.decode(errors="replace")
+        return super().prepare()

@@ -117,25 +117,21 @@ PyObject *step(PyObject *, PyObject *capsule) {
   });
 }
 
-// sim_step(address of a Group, effort, qpos, qvel, passive) -> Status, on arrays (rows, dof) of double.
-PyObject *step_group(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[0]));
-  if (group == nullptr) return nullptr;
-  auto const dof = static_cast<Py_ssize_t>(group->dof), rows = static_cast<Py_ssize_t>(group->robots);
-  Py_ssize_t const count = rows * dof;
-  Buffer arrays[4];
-  if (!open_doubles(arguments + 1, {count, count, count, count}, 1, arrays)) return nullptr;
-  std::int32_t status = 0;
-  PyObject *done = without_gil([&] {
-    status = try_sim_step(*group, rows, arrays[0].as<double>(), arrays[1].as<double>(), arrays[2].as<double>(),
-                      arrays[3].as<double>());
-  });
-  if (done == nullptr) return nullptr;
-  Py_DECREF(done);
-  return PyLong_FromLong(status);
+// Return the structure of Python at an address, or null with an exception.
+template <class T>
+T *structure(PyObject *address) {
+  return static_cast<T *>(PyLong_AsVoidPtr(address));
 }
 
-constexpr char BOUND[] = "batchpid.bound_program";
+// sim_step(address of a Group, effort, qpos, qvel, passive) -> Status, on arrays (rows, dof) of double.
+PyObject *step_group(PyObject *, PyObject *const *arguments, Py_ssize_t) {
+  auto *group = structure<Group>(arguments[0]);
+  if (group == nullptr) return nullptr;
+  Py_ssize_t const rows = group->robots, count = rows * group->dof;
+  std::int32_t status = 0;
+  auto const step = [&](auto const &of) { status = try_sim_step(*group, rows, of[0], of[1], of[2], of[3]); };
+  return on_doubles(arguments + 1, {count, count, count, count}, 1, step, [&] { return PyLong_FromLong(status); });
+}
 
 // bind(arguments of make_program, inputs, outputs): pairs of an array (contiguous, kept alive by the caller) and the
 // numbers in each row of a table (0: it is (rows, columns), -1: one number), and arrays.
@@ -165,9 +161,7 @@ PyObject *bind(PyObject *, PyObject *const *arguments, Py_ssize_t) {
     bound->outputs.push_back({array.as<void>(), array.itemsize() == 1});
   }
   if (!tables_fit(program, program.rows, bound->inputs)) return misfit();
-  return PyCapsule_New(bound.release(), BOUND, [](PyObject *capsule) {
-    delete static_cast<BoundProgram *>(PyCapsule_GetPointer(capsule, BOUND));
-  });
+  return capsule_of(std::move(bound));
 }
 
 // Return the programs of a tick from a tuple; set an exception if they do not fit the group.
@@ -175,7 +169,7 @@ std::vector<BoundProgram *> programs_of(Tick const *arrays, Group const *group, 
   std::vector<BoundProgram *> programs;
   bool fits = arrays != nullptr && group != nullptr && arrays->dof == group->dof;
   for (Py_ssize_t i = 0; fits && i < PyTuple_Size(tuple); ++i) {
-    auto *bound = static_cast<BoundProgram *>(PyCapsule_GetPointer(PyTuple_GetItem(tuple, i), BOUND));
+    auto *bound = held<BoundProgram>(PyTuple_GetItem(tuple, i));
     fits = bound != nullptr && bound->program->rows == static_cast<Index>(group->robots) &&
            bound->program->columns == static_cast<Index>(group->dof);
     programs.push_back(bound);
@@ -187,27 +181,21 @@ std::vector<BoundProgram *> programs_of(Tick const *arrays, Group const *group, 
 // ticks(bound programs, address of a Tick, address of a Group, tick, step, until, steps, drawn, whole)
 //   -> (tick, step, Status); see run_ticks
 PyObject *ticks(PyObject *, PyObject *const *arguments, Py_ssize_t) {
-  auto *arrays = static_cast<Tick *>(PyLong_AsVoidPtr(arguments[1]));
-  auto *group = static_cast<Group *>(PyLong_AsVoidPtr(arguments[2]));
+  auto *arrays = structure<Tick>(arguments[1]);
+  auto *group = structure<Group>(arguments[2]);
   std::vector<BoundProgram *> const programs = programs_of(arrays, group, arguments[0]);
   auto const number = [&](int i) { return static_cast<std::int64_t>(PyLong_AsLongLong(arguments[i])); };
   Place place{number(3), number(4)};
   std::int64_t const until = number(5), steps = number(6), drawn = number(7), whole = number(8);
   if (PyErr_Occurred()) return nullptr;
   std::int32_t status = 0;
-  PyObject *done = without_gil([&] {
+  auto const run = [&] {
     status = run_ticks(programs.data(), *arrays, *group, place, until, steps, drawn, whole != 0);
+  };
+  return without_gil(run, [&] {
+    return Py_BuildValue("LLi", static_cast<long long>(place.tick), static_cast<long long>(place.step),
+                         static_cast<int>(status));
   });
-  if (done == nullptr) return nullptr;
-  Py_DECREF(done);
-  return Py_BuildValue("LLi", static_cast<long long>(place.tick), static_cast<long long>(place.step),
-                       static_cast<int>(status));
-}
-
-// Return the structure of Python at an address, or null with an exception.
-template <class T>
-T const *structure(PyObject *address) {
-  return static_cast<T const *>(PyLong_AsVoidPtr(address));
 }
 
 // joint_matrices(address of a Model, qpos, out, rows): the mass matrices that the joints show.
@@ -215,9 +203,8 @@ PyObject *joint_matrices(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto const *model = structure<Model>(arguments[0]);
   if (model == nullptr) return nullptr;
   Py_ssize_t const rows = PyLong_AsSsize_t(arguments[3]), dof = model->dof;
-  Buffer arrays[2];
-  if (!open_doubles(arguments + 1, {rows * dof, rows * dof * dof}, 1, arrays)) return nullptr;
-  return without_gil([&] { write_joint_matrices(*model, rows, arrays[0].as<double>(), arrays[1].as<double>()); });
+  return on_doubles(arguments + 1, {rows * dof, rows * dof * dof}, 1,
+                    [&](auto const &of) { write_joint_matrices(*model, rows, of[0], of[1]); });
 }
 
 // forces(address of a Model, gravity, coriolis, qpos, qvel, base or None, out, rows)
@@ -227,12 +214,8 @@ PyObject *forces(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Parts const parts{PyObject_IsTrue(arguments[1]) == 1, PyObject_IsTrue(arguments[2]) == 1};
   Py_ssize_t const rows = PyLong_AsSsize_t(arguments[7]), count = rows * model->dof;
   Py_ssize_t const base = arguments[5] == Py_None ? 0 : BASE_SIZE * rows;
-  Buffer arrays[4];
-  if (!open_doubles(arguments + 3, {count, count, base, count}, 3, arrays)) return nullptr;
-  return without_gil([&] {
-    write_forces(*model, parts, rows, arrays[0].as<double>(), arrays[1].as<double>(), arrays[2].as<double>(),
-                 arrays[3].as<double>());
-  });
+  return on_doubles(arguments + 3, {count, count, base, count}, 3,
+                    [&](auto const &at) { write_forces(*model, parts, rows, at[0], at[1], at[2], at[3]); });
 }
 
 // refresh(address of a Refresh, qpos, gain, memory, rows)
@@ -240,11 +223,8 @@ PyObject *refresh_friction(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto const *of = structure<Refresh>(arguments[0]);
   if (of == nullptr) return nullptr;
   Py_ssize_t const rows = PyLong_AsSsize_t(arguments[4]), count = rows * of->model->dof;
-  Buffer arrays[3];
-  if (!open_doubles(arguments + 1, {count, count, count}, 1, arrays)) return nullptr;
-  return without_gil([&] {
-    refresh(*of, rows, arrays[0].as<double>(), arrays[1].as<double>(), arrays[2].as<double>(), nullptr);
-  });
+  return on_doubles(arguments + 1, {count, count, count}, 1,
+                    [&](auto const &at) { refresh(*of, rows, at[0], at[1], at[2], nullptr); });
 }
 
 // update_constraint(address of a Constraint, qpos, passive, mask of robots, rows)
@@ -252,12 +232,10 @@ PyObject *update(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   auto const *of = structure<Constraint>(arguments[0]);
   if (of == nullptr) return nullptr;
   Py_ssize_t const rows = PyLong_AsSsize_t(arguments[4]), count = rows * of->model->dof;
-  Buffer arrays[2], wanted;
-  if (!open_doubles(arguments + 1, {count, count}, 2, arrays)) return nullptr;
+  Buffer wanted;
   if (!wanted.open(arguments[3], rows, 1, PyBUF_C_CONTIGUOUS)) return nullptr;
-  return without_gil([&] {
-    update_constraint(*of, rows, arrays[0].as<double>(), arrays[1].as<double>(), wanted.as<char>());
-  });
+  return on_doubles(arguments + 1, {count, count}, 2,
+                    [&](auto const &at) { update_constraint(*of, rows, at[0], at[1], wanted.as<char>()); });
 }
 
 // xla_functions(): their addresses, by name.

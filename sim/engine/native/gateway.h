@@ -10,7 +10,7 @@
 #include <typeinfo>
 #include <vector>
 
-#include "batchpid/native/buffer.h"
+#include "batchpid/native/extension.h"
 
 namespace sapien::physx {
 // Never defined here: their type_info, which pybind11 compares by name, is all that is used.
@@ -71,23 +71,51 @@ inline void apply(Functions const &call, Articulation *robot, float *qf, std::pt
   call.set_qf(robot, borrowed.vector);
 }
 
-// Run `work` without the GIL; a C++ exception becomes a RuntimeError.
-template <class Work>
-PyObject *without_gil(Work work) {
-  char message[512] = "";
-  Py_BEGIN_ALLOW_THREADS
+// Run `work`. Return whether it ended without a C++ exception, whose message is written otherwise.
+template <std::size_t SIZE, class Work>
+bool succeeds(char (&message)[SIZE], Work work) {
   try {
     work();
+    return true;
   } catch (std::exception const &error) {
-    std::strncpy(message, error.what(), sizeof(message) - 1);
-    if (message[0] == 0) std::strcpy(message, "SAPIEN raised an exception");
+    std::strncpy(message, error.what(), SIZE - 1);
   } catch (...) {
-    std::strcpy(message, "SAPIEN raised an exception");
+    message[0] = 0;
   }
+  if (message[0] == 0) std::strcpy(message, "SAPIEN raised an exception");
+  return false;
+}
+
+inline PyObject *none() { Py_RETURN_NONE; }
+
+// Run `work` without the GIL, and return the `result` after it; a C++ exception becomes a RuntimeError.
+template <class Work, class Result = PyObject *(*)()>
+PyObject *without_gil(Work work, Result result = none) {
+  char message[512] = "";
+  bool done = false;
+  Py_BEGIN_ALLOW_THREADS
+  done = succeeds(message, work);
   Py_END_ALLOW_THREADS
-  if (message[0] == 0) Py_RETURN_NONE;
+  if (done) return result();
   PyErr_SetString(PyExc_RuntimeError, message);
   return nullptr;
+}
+
+// The same with work on the data of arrays of double with these counts of numbers, of which those from `written` on are
+// results. None is an array of no numbers, without data.
+template <std::size_t N, class Work, class Result = PyObject *(*)()>
+PyObject *on_doubles(PyObject *const *given, Py_ssize_t const (&counts)[N], std::size_t written, Work work,
+                     Result result = none) {
+  Buffer arrays[N];
+  double *data[N] = {};
+  for (std::size_t i = 0; i < N; ++i) {
+    int const flags = PyBUF_C_CONTIGUOUS | (i < written ? 0 : PyBUF_WRITABLE);
+    Buffer &array = arrays[i];
+    if (counts[i] == 0 && given[i] == Py_None) continue;
+    if (!array.open(given[i], counts[i], sizeof(double), flags)) return nullptr;
+    data[i] = array.as<double>();
+  }
+  return without_gil([&] { work(data); }, result);
 }
 
 template <class T>

@@ -10,7 +10,7 @@ import ctypes
 
 from batchpid.native.extensions import ROUNDED, VECTORIZED_ONLY, Extension
 from batchpid.native.operations import PROGRAMS
-from batchpid.native.task_space_extension import CALL, COUPLING, LANES, RIGID_BODY, TABLES
+from batchpid.native.task_space_extension import RIGID_BODIES
 
 SYMBOLS = (
     "_ZN6sapien5physx17PhysxArticulation7getQposEv",
@@ -160,33 +160,15 @@ class Transfer(ctypes.Structure):
     ]
 
 
-def _files(*names: str) -> tuple[str, ...]:
-    return (*(f"batchpid/sim/engine/native/{name}" for name in (*names, "interface.py")), "batchpid/native/extension.h")
-
+_NAMES = (
+    *("gateway.cpp", "gateway.h", "model.h", "mujoco_step.h", "clearance.h", "constraint.h", "refresh.h"),
+    *("sim_step.h", "tick.h", "xla_call.h", "interface.py"),
+)
 
 EXTENSIONS = {
     "_gateway": Extension(
         "batchpid.sim.engine.native._gateway",
-        (
-            *_files(
-                "gateway.cpp",
-                "gateway.h",
-                "model.h",
-                "mujoco_step.h",
-                "clearance.h",
-                "constraint.h",
-                "refresh.h",
-                "sim_step.h",
-                "tick.h",
-                "xla_call.h",
-            ),
-            CALL,
-            COUPLING,
-            LANES,
-            RIGID_BODY,
-            TABLES,
-            *PROGRAMS,
-        ),
+        (*(f"batchpid/sim/engine/native/{name}" for name in _NAMES), *RIGID_BODIES, *PROGRAMS),
         (*ROUNDED, *VECTORIZED_ONLY, "-pthread", "-Wno-psabi"),
     ),
 }

@@ -2,7 +2,7 @@
 
 #pragma once
 
-#include "batchpid/native/coupling.h"
+#include "batchpid/native/rigid_body.h"
 #include "model.h"
 
 namespace batchpid {

@@ -56,16 +56,16 @@ inline void constrain_row(Group const &group, std::size_t row, float *qf) {
   for (std::int64_t j = 0; j < dof; ++j) qf[j] = static_cast<float>(effort[static_cast<std::size_t>(j)]);
 }
 
-// Apply efforts (rows, dof), do one sim step, read (rows, dof) each; rows beyond the robots repeat the first one.
-// Robot by robot, each while it is in the cache.
+// One sim step of the robots in SAPIEN: apply efforts and read (robots, dof) each, robot by robot, each while it is in the
+// cache.
 template <class T>
-std::int32_t sim_step_in_sapien(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
+void step_in_sapien(Group const &group, T const *effort, T *qpos, T *qvel, T *passive) {
   Gateway const &gateway = *group.gateway;
   Functions const &call = gateway.functions;
-  std::ptrdiff_t const dof = gateway.dof;
-  auto const robots = gateway.robots.size();
-  std::int32_t status = 0;
-  for (std::size_t row = 0; row < robots; ++row) {
+  std::ptrdiff_t const dof = gateway.dof, all = group.robots * dof;
+  bool const moves = group.velocities != 0 || group.speed_limit != nullptr;
+  bool const bears = group.gravity != 0 || group.coriolis != 0;
+  for (std::size_t row = 0; row < gateway.robots.size(); ++row) {
     Articulation *robot = gateway.robots[row];
     std::ptrdiff_t const at = static_cast<std::ptrdiff_t>(row) * dof;
     float *qf = group.qf + at;
@@ -74,24 +74,14 @@ std::int32_t sim_step_in_sapien(Group &group, std::int64_t rows, T const *effort
     if (!group.skip[row]) apply(call, robot, qf, dof);
     call.step(gateway.systems[row]);
     if (group.sense != nullptr) group.sense(static_cast<std::int64_t>(row));
-    VectorXf const position = call.get_qpos(robot);
-    copy_row(position, qpos + at, dof);
-    if (group.velocities || group.speed_limit) copy_row(call.get_qvel(robot), qvel + at, dof);
-    if (group.gravity || group.coriolis) {
+    copy_row(call.get_qpos(robot), qpos + at, dof);
+    if (moves) copy_row(call.get_qvel(robot), qvel + at, dof);
+    if (bears) {
       copy_row(call.compute_passive_force(robot, group.gravity != 0, group.coriolis != 0), passive + at, dof);
     }
-    for (std::ptrdiff_t joint = 0; joint < dof; ++joint) {
-      if (!(std::fabs(position.data[joint]) <= FARTHEST)) status |= NOT_FINITE;
-      if (group.speed_limit && !(std::fabs(qvel[at + joint]) <= group.speed_limit[joint])) status |= TOO_FAST;
-    }
   }
-  auto const size = static_cast<std::size_t>(dof) * sizeof(T), all = static_cast<std::size_t>(rows) * size;
-  if (!group.gravity && !group.coriolis) std::memset(passive, 0, all);
-  if (!group.velocities && !group.speed_limit) std::memset(qvel, 0, all);
-  for (auto row = static_cast<std::int64_t>(robots); row < rows; ++row) {
-    for (T *table : {qpos, qvel, passive}) std::memcpy(table + row * dof, table, size);
-  }
-  return status;
+  if (!moves) std::fill_n(qvel, all, T{});
+  if (!bears) std::fill_n(passive, all, T{});
 }
 
 // Apply the efforts of a robot in MuJoCo, and those of its constraint.
@@ -110,52 +100,48 @@ inline void apply_efforts(Group const &group, std::int64_t row) {
   }
 }
 
-// The same in MuJoCo; the arrays are those of the robots and of the rows beyond them.
+// The same in MuJoCo. Return false, with a message, after an error of it.
 template <class T>
-std::int32_t sim_step_in_mujoco(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
+bool step_in_mujoco(Group &group, T const *effort, T *qpos, T *qvel, T *passive) {
   Mujoco const &mujoco = *group.mujoco;
   std::int64_t const dof = group.dof;
-  std::int32_t status = 0;
+  bool good = true;
   StoppedClock const stopped(mujoco.clock);
   LogHandler const before = mujoco.set_log_handler(Messages::handle);
   if (before != Messages::handle) Messages::previous = before;
-  for (std::int64_t row = 0; row < group.robots && status != FAILED; ++row) {
+  for (std::int64_t row = 0; row < group.robots && good; ++row) {
     std::int64_t const at = row * dof;
     for (std::int64_t joint = 0; joint < dof; ++joint) mujoco.qf[at + joint] = static_cast<double>(effort[at + joint]);
     if (!group.skip[row]) apply_efforts(group, row);
-    if (!group.skip[row] && !advance(mujoco, row, dof, FARTHEST, group.message)) status = FAILED;
+    if (!group.skip[row]) good = advance(mujoco, row, dof, FARTHEST, group.message);
     for (std::int64_t joint = 0; joint < dof; ++joint) {
       std::int64_t const place = mujoco.qvel_at[joint];
-      double const q = mujoco.qpos[row][mujoco.qpos_at[joint]], v = mujoco.qvel[row][place];
-      qpos[at + joint] = static_cast<T>(q);
-      qvel[at + joint] = static_cast<T>(v);
+      qpos[at + joint] = static_cast<T>(mujoco.qpos[row][mujoco.qpos_at[joint]]);
+      qvel[at + joint] = static_cast<T>(mujoco.qvel[row][place]);
       passive[at + joint] = static_cast<T>(group.gravity ? mujoco.bias[row][place] : 0.0);
-      if (!(std::fabs(q) <= FARTHEST)) status |= NOT_FINITE;
-      if (group.speed_limit && !(std::fabs(v) <= group.speed_limit[joint])) status |= TOO_FAST;
     }
   }
   mujoco.set_log_handler(before);
-  auto const size = static_cast<std::size_t>(dof) * sizeof(T);
-  for (std::int64_t row = group.robots; row < rows; ++row) {
-    for (T *table : {qpos, qvel, passive}) std::memcpy(table + row * dof, table, size);
-  }
-  return status;
+  return good;
 }
 
-// The same for callers that take no exceptions, in the engine of the group.
+// Do one sim step in the engine of the group; rows beyond its robots repeat the first one. Return the status.
 template <class T>
 std::int32_t try_sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
-  if (group.mujoco != nullptr) return sim_step_in_mujoco(group, rows, effort, qpos, qvel, passive);
-  char const *message = "SAPIEN raised an exception";
-  std::size_t const last = sizeof(group.message) - 1;
-  try {
-    return sim_step_in_sapien(group, rows, effort, qpos, qvel, passive);
-  } catch (std::exception const &error) {
-    std::strncpy(group.message, error.what()[0] ? error.what() : message, last);
-  } catch (...) {
-    std::strncpy(group.message, message, last);
+  auto const in_sapien = [&] { step_in_sapien(group, effort, qpos, qvel, passive); };
+  bool const good = group.mujoco != nullptr ? step_in_mujoco(group, effort, qpos, qvel, passive)
+                                            : succeeds(group.message, in_sapien);
+  if (!good) return FAILED;
+  std::int64_t const dof = group.dof;
+  std::int32_t status = 0;
+  for (std::int64_t at = 0; at < group.robots * dof; ++at) {
+    if (!(std::fabs(qpos[at]) <= FARTHEST)) status |= NOT_FINITE;
+    if (group.speed_limit && !(std::fabs(qvel[at]) <= group.speed_limit[at % dof])) status |= TOO_FAST;
   }
-  return FAILED;
+  for (std::int64_t row = group.robots; row < rows; ++row) {
+    for (T *table : {qpos, qvel, passive}) std::copy_n(table, dof, table + row * dof);
+  }
+  return status;
 }
 
 // Set the targets of the drives (robots, dof): write_drive_target of the packs. Without `rate` it is 0.

@@ -5,7 +5,7 @@
 
 #pragma once
 
-#include "batchpid/native/call.h"
+#include "batchpid/native/extension.h"
 #include "batchpid/native/make_program.h"
 #include "refresh.h"
 #include "sim_step.h"
@@ -81,6 +81,8 @@ struct Place {
 
 // A program with its arrays.
 struct BoundProgram {
+  static constexpr char CAPSULE[] = "batchpid.bound_program";
+
   std::unique_ptr<Program> program;
   std::vector<Input> inputs;
   std::vector<Output> outputs;

@@ -38,7 +38,7 @@ def _registered() -> str:
 
 
 def sim_step(address: Any, step: Any, effort: Array) -> tuple[Any, Any, Any, Any]:
-    """Do a sim step of a :class:`batchpid.sim.engine.sapien.sim_step.NativeStep` in a program of JAX.
+    """Do a sim step of a :class:`batchpid.sim.engine.native_model.NativeStep` in a program of JAX.
 
     Order is kept by the data and by the number of the step, which is another in each call.
 

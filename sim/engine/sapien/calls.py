@@ -1,42 +1,30 @@
-"""Calls into the engine for all robots of a pack: reads, efforts, and steps of their systems."""
+"""Calls into SAPIEN for all robots of a pack: reads, efforts, and steps of their systems.
+
+Native calls are one call of the extension for all robots. The extension calls functions that SAPIEN's shared library
+exports, so that it needs nothing of SAPIEN to be compiled. It depends on the layout of two of SAPIEN's types, which no
+header promises: see :data:`batchpid.sim.engine.native.library.TESTED`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+import ctypes
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import DType, Rows
-
-
-class EngineCalls(Protocol):
-    """Reads and writes of M robots, as arrays (M, dof) in SAPIEN's order, SI units."""
-
-    def qpos(self, dtype: DType) -> Rows:
-        """Return the joint positions, a new array."""
-
-    def qvel(self, dtype: DType) -> Rows:
-        """Return the joint velocities, a new array."""
-
-    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType) -> Rows:
-        """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new array."""
-
-    def write_qf(self) -> None:
-        """Apply the efforts in the array ``qf`` that the calls were made with, except to skipped robots."""
-
-    def step(self) -> None:
-        """Do one sim step of every system."""
-
-    def close(self) -> None:
-        """Release robots and systems, so that they can be freed; no other call follows."""
+from batchpid.sim.engine.native import SWITCH, extension
+from batchpid.sim.engine.native.library import functions
+from batchpid.sim.engine.native_model import NativeStep
 
 
 class PythonCalls:
-    """One Python call for each robot and quantity. ``qf`` (M, dof) of float32; ``skip`` (M,): efforts are not applied.
+    """One Python call for each robot and quantity, as arrays (M, dof) in SAPIEN's order, SI units.
 
-    The native calls are tested against these.
+    ``qf`` (M, dof) of float32 are the efforts that :meth:`write_qf` applies, except to the robots of ``skip`` (M,). No
+    call follows :meth:`close`. The native calls are tested against these.
     """
 
     def __init__(
@@ -75,5 +63,141 @@ class PythonCalls:
             step()
 
     def close(self) -> None:
-        """Release robots and systems."""
+        """Release robots and systems, so that they can be freed."""
         self._get_qpos, self._get_qvel, self._passive_force, self._set_qf, self._steps = [], [], [], [], []
+
+
+_ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
+_capsule_name = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(("PyCapsule_GetName", ctypes.pythonapi))
+_capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
+    ("PyCapsule_GetPointer", ctypes.pythonapi)
+)
+
+
+class NativeCalls:
+    """Calls of :class:`PythonCalls`, each for all robots at once; RuntimeError if SAPIEN fails."""
+
+    def __init__(
+        self, robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_]
+    ) -> None:
+        self._objects = [*robots], [*systems]  # kept alive, since the gateway has their pointers
+        pointers = [[pointer(item, kind) for item in items] for kind, items in (("robot", robots), ("system", systems))]
+        self._native = extension("_gateway")
+        self.gateway = self._native.gateway(functions(), *pointers, qf.shape[1])
+        self.qf, self.skip = qf, skip
+
+    def qpos(self, dtype: DType) -> Rows:
+        """Return the joint positions, a new array."""
+        rows = np.empty(self.qf.shape, dtype)
+        self._native.read_qpos(self.gateway, rows)
+        return rows
+
+    def qvel(self, dtype: DType) -> Rows:
+        """Return the joint velocities, a new array."""
+        rows = np.empty(self.qf.shape, dtype)
+        self._native.read_qvel(self.gateway, rows)
+        return rows
+
+    def passive_force(self, gravity: bool, coriolis: bool, dtype: DType) -> Rows:
+        """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new array."""
+        rows = np.empty(self.qf.shape, dtype)
+        self._native.passive_force(self.gateway, rows, gravity, coriolis)
+        return rows
+
+    def write_qf(self) -> None:
+        """Apply the efforts in ``qf``."""
+        self._native.write_qf(self.gateway, self.qf, self.skip)
+
+    def step(self) -> None:
+        """Do one sim step of every system."""
+        self._native.step(self.gateway)
+
+    def close(self) -> None:
+        """Release robots and systems."""
+        self._objects = [], []
+
+
+EngineCalls = PythonCalls | NativeCalls
+
+
+def engine_calls(
+    robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_], native: bool
+) -> EngineCalls:
+    """Return native calls, or Python's; both take the arguments before ``native``."""
+    make = NativeCalls if robots and native else PythonCalls
+    return make(robots, systems, qf, skip)
+
+
+def pointer(wrapper: Any, kind: str) -> int:
+    """Return the address of the C++ object in ``wrapper``, a "robot", "system" or "joint".
+
+    It comes by pybind11's conduit, which checks type and ABI.
+    """
+    capsule = wrapper._pybind11_conduit_v1_(_ABI, extension("_gateway").type_info(kind), b"raw_pointer_ephemeral")
+    if capsule is None:
+        problem = f"SAPIEN's {kind} is not of the type that the extension was made for"
+        raise RuntimeError(f"{problem}; install SAPIEN from PyPI, or set {SWITCH}=0 for Python calls")
+    return _capsule_pointer(capsule, _capsule_name(capsule))
+
+
+_SENSE = ctypes.CFUNCTYPE(None, ctypes.c_int64)
+
+
+class SapienStep(NativeStep):
+    """Sim step of the robots of a pack: apply efforts, step, read, and check whether a robot has failed.
+
+    Parameters
+    ----------
+    calls
+        Present calls of the pack, which have to be native.
+    stepped
+        Mask of the robots that did a sim step (robots,), set in place.
+    gravity, coriolis
+        Parts of the passive force that is read; without both it is zero.
+    velocities
+        Whether to read velocities; otherwise they are zero.
+    speed_limit
+        Joint speed beyond which the status says so (dof,), or None.
+    constraint
+        Address of the constraint of coupled joints, or None.
+    joints
+        Joints of all robots, if the targets of their drives move within a tick.
+    sense
+        Function that reads the sensors of the links of a robot after its sim step, or None.
+    """
+
+    def __init__(
+        self,
+        calls: EngineCalls,
+        stepped: NDArray[np.bool_],
+        gravity: bool,
+        coriolis: bool,
+        velocities: bool,
+        speed_limit: NDArray[np.float64] | None,
+        constraint: int | None = None,
+        joints: Sequence[Any] | None = None,
+        sense: Callable[[int], None] | None = None,
+    ) -> None:
+        assert isinstance(calls, NativeCalls)
+        self._stepped, self._calls, self._sense = stepped, calls, None if sense is None else _SENSE(sense)
+        arrays: dict[str, Rows] = {"qf": calls.qf, "skip": calls.skip}
+        if joints is not None:
+            arrays["joints"] = np.array([pointer(joint, "joint") for joint in joints], np.uint64)
+        robots, dof = calls.qf.shape
+        super().__init__(
+            robots,
+            dof,
+            arrays,
+            speed_limit,
+            gateway=extension("_gateway").address(calls.gateway),
+            gravity=gravity,
+            coriolis=coriolis,
+            velocities=velocities,
+            constraint=constraint,
+            sense=None if self._sense is None else ctypes.cast(self._sense, ctypes.c_void_p),
+        )
+
+    def prepare(self) -> int:
+        """Return the address of the group, for a call of the extension or of XLA that does a sim step."""
+        self._stepped[...] = True
+        return super().prepare()

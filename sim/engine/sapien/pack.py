@@ -3,7 +3,7 @@
 A pack is M scenes, each with one robot and a PhysX system. PhysX solves the contacts of a system in an order that
 depends on everything in the system, so robots that share one would not move bit-identically to a robot alone.
 
-The loop uses only the members of :class:`batchpid.sim.engine.protocol.EnginePack` and its capabilities. Longer than 300
+The loop uses only the members of :class:`batchpid.sim.engine.protocol.EnginePack` and its capabilities. Longer than 350
 lines because that is the whole interface between loop and engine.
 """
 
@@ -22,19 +22,15 @@ from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
-from batchpid.sim.engine.joint_friction import added_friction, own_friction
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native.library import obstacle
 from batchpid.sim.engine.native_model import NativeModel, passive_force_of
 from batchpid.sim.engine.robot_model import turned_back
-from batchpid.sim.engine.sapien.building import build_scene, engine_settings, link_frames, new_system
-from batchpid.sim.engine.sapien.built_tree import scene_tree
-from batchpid.sim.engine.sapien.calls import EngineCalls
+from batchpid.sim.engine.sapien.building import build_scene, engine_settings, link_frames, new_system, scene_tree
+from batchpid.sim.engine.sapien.calls import EngineCalls, SapienStep, engine_calls
 from batchpid.sim.engine.sapien.link_sensors import LinkSensors
-from batchpid.sim.engine.sapien.native_calls import engine_calls
-from batchpid.sim.engine.sapien.sim_step import NativeStep
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation, added_friction, own_friction
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.task_space.frames import matrix_of
 
@@ -142,12 +138,12 @@ class Pack(SingleOwner):
         velocities: bool,
         speed_limit: NDArray[np.float64] | None,
         drives: bool = False,
-    ) -> NativeStep:
+    ) -> SapienStep:
         """Return the sim step as one native call, which holds for the present :attr:`calls`."""
         constraint = None if self._constraint is None else self._constraint.address
         reads, joints = (gravity, coriolis, velocities), self._joints if drives else None
         sense = None if self._sensors is None else self._sensors.add
-        return NativeStep(self.calls, self._stepped, *reads, speed_limit, constraint, joints, sense)
+        return SapienStep(self.calls, self._stepped, *reads, speed_limit, constraint, joints, sense)
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
         """Give the constraint efforts of robots ``rows`` the present mass matrix and passive force."""
@@ -297,7 +293,7 @@ class Pack(SingleOwner):
             self._sensors.place(rows)
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
-        """Raise TypeError: the robots of this pack equal the model; see :mod:`batchpid.sim.engine.sapien.variation`."""
+        """Raise TypeError: the robots of this pack equal the model; see :class:`.sapien_engine.VariedPack`."""
         raise TypeError("the robots of this pack do not vary; make it with a variation")
 
     def state_sizes(self) -> list[int]:

@@ -17,8 +17,8 @@ import numpy as np
 
 from batchpid.arrays.array_types import MjModel
 from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.mjcf.mjcf_compiler import ALONE, Names, label
 from batchpid.sim.robot.mjcf.mjcf_laws import Line, input_range, is_motor, line_of, servo_of, setpoint_range, unread
-from batchpid.sim.robot.mjcf.mjcf_names import ALONE, Names, label
 
 Couplings = dict[str, tuple[str, float, float]]
 """Leader, multiplier and offset of each follower, as in ``<mimic>``."""

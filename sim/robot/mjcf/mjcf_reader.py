@@ -12,10 +12,9 @@ from lxml import etree
 from batchpid.arrays.array_types import MjModel, MjSpec
 from batchpid.arrays.digest import digest
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.mjcf.mjcf_compiler import Attempt, compile_file
+from batchpid.sim.robot.mjcf.mjcf_compiler import ALONE, Attempt, Names, compile_file, label
 from batchpid.sim.robot.mjcf.mjcf_laws import plugin_name
 from batchpid.sim.robot.mjcf.mjcf_motors import Motors, read_couplings, read_motors
-from batchpid.sim.robot.mjcf.mjcf_names import ALONE, Names, label
 from batchpid.sim.robot.mjcf.mjcf_shapes import PLANE, can_collide, excluded_pairs
 from batchpid.sim.robot.mjcf.mjcf_tree import Tree
 from batchpid.sim.robot.parts import MjcfFile

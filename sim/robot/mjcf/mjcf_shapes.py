@@ -21,7 +21,7 @@ from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
 from batchpid.io.files import write_atomically
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.mjcf.mjcf_names import ALONE, Names, label
+from batchpid.sim.robot.mjcf.mjcf_compiler import ALONE, Names, label
 from batchpid.sim.robot.self_collision import DisabledPair
 from batchpid.task_space.rotations import to_rpy
 

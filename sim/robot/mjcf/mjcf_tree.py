@@ -23,8 +23,8 @@ from batchpid.arrays.array_types import MjModel
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.link_repair import MOMENTS
+from batchpid.sim.robot.mjcf.mjcf_compiler import ALONE, Names
 from batchpid.sim.robot.mjcf.mjcf_motors import Couplings, Motors, roots_of_actuators
-from batchpid.sim.robot.mjcf.mjcf_names import ALONE, Names
 from batchpid.sim.robot.mjcf.mjcf_shapes import PLANE, ShapeWriter, can_collide, text_of
 from batchpid.task_space.rotations import about, multiply, rotate, to_rpy
 from batchpid.task_space.spatial_inertia import rotation_matrix

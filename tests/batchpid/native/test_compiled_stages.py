@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid.motors import STAGES, advance_effort, advance_measurement, discretise
-from batchpid.native import compiled_stages as module
+from batchpid.native import compiled as module
 from batchpid.native.availability import SWITCH, obstacle
-from batchpid.native.compiled_stages import compiled_stages
+from batchpid.native.compiled import compiled_stages
 
 DT, SHAPE = 1 / 2000, (3, 4)
 needs_extension = pytest.mark.skipif(bool(obstacle()), reason="there is no extension")

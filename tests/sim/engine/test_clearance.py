@@ -11,11 +11,10 @@ from tiny_urdf import random_tree, robot, write  # noqa: E402
 
 from batchpid.sim import Robot, Runner  # noqa: E402
 from batchpid.sim.engine import native  # noqa: E402
-from batchpid.sim.engine.engines import load_engine  # noqa: E402
 from batchpid.sim.engine.mujoco import mujoco_step  # noqa: E402
 from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
-from batchpid.sim.engine.protocol import SceneSpec  # noqa: E402
+from batchpid.sim.engine.protocol import SceneSpec, load_engine  # noqa: E402
 
 MARGIN = 1e-4  # of clearance.h
 needs_extension = pytest.mark.skipif(bool(native.obstacle()), reason="there are no native calls")

@@ -14,10 +14,10 @@ from robots import RUBBING, load_bundled
 import batchpid
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import MissedContactWarning, Randomization, Robot, Runner, Uniform
-from batchpid.sim.engine.missed_contact import DEPTH
+from batchpid.sim.engine.link_reach import DEPTH
+from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.robot_model import scene_model
-from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.options import default_params
 from batchpid.sim.tuning import random_moves
 

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from batchpid.sim.engine.lazy_module import LazyModule, imported_lazily
+from batchpid.sim.engine.sapien.building import LazyModule, imported_lazily
 
 PROGRAM = """
 import sys

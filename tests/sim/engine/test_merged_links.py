@@ -7,11 +7,11 @@ from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
+from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec, Variation
 from batchpid.sim.engine.sapien.building import parse
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.sapien.physics import PHYSICS
-from batchpid.sim.engine.sapien.variation import VariedPack
+from batchpid.sim.engine.sapien.sapien_engine import VariedPack
 
 BOX = '<collision><origin xyz="0.1 0 0" rpy="0.3 0 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
 CAPSULE = '<collision><geometry><capsule radius="0.05" length="0.2"/></geometry></collision>'

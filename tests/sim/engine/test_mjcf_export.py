@@ -22,7 +22,7 @@ from batchpid.sim.tuning import random_moves
 
 mujoco = pytest.importorskip("mujoco", "3.17")
 from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf  # noqa: E402
-from batchpid.sim.engine.mujoco.solver import SOLVERS  # noqa: E402
+from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
 
 DT = 1 / 2000
 

@@ -26,12 +26,11 @@ from batchpid.sim import (  # noqa: E402
     Runner,
     Uniform,
 )
-from batchpid.sim.engine import engines, native  # noqa: E402
-from batchpid.sim.engine.engines import load_engine  # noqa: E402
+from batchpid.sim.engine import native, protocol  # noqa: E402
 from batchpid.sim.engine.mujoco import model_builder  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import _set_options, robot_model  # noqa: E402
 from batchpid.sim.engine.mujoco.mujoco_step import CLOCK, mujoco_library  # noqa: E402
-from batchpid.sim.engine.protocol import SceneSpec  # noqa: E402
+from batchpid.sim.engine.protocol import SceneSpec, load_engine  # noqa: E402
 from batchpid.sim.engine.robot_model import scene_model  # noqa: E402
 from batchpid.sim.observation import OBSERVED  # noqa: E402
 from batchpid.sim.tuning import arm_joints, random_moves, run_moves, tutorial_move  # noqa: E402
@@ -380,7 +379,7 @@ def test_sapiens_own_friction_is_refused():
 
 
 def test_without_mujoco_the_message_names_the_remedy(panda, monkeypatch):
-    monkeypatch.delitem(sys.modules, engines.MODULES["mujoco"], raising=False)
+    monkeypatch.delitem(sys.modules, protocol.MODULES["mujoco"], raising=False)
     monkeypatch.setitem(sys.modules, "mujoco.batch", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'mujoco>=3.17'"):
         load_engine("mujoco")

@@ -13,12 +13,11 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, robot, write
 from batchpid.native.extensions import NOT_BUILT
 from batchpid.sim import Robot, Runner
 from batchpid.sim.engine import native
+from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.sapien.building import build_scene, new_system
-from batchpid.sim.engine.sapien.calls import PythonCalls
-from batchpid.sim.engine.sapien.native_calls import NativeCalls
+from batchpid.sim.engine.sapien.calls import NativeCalls, PythonCalls
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.sapien.physics import PHYSICS
 
 needs_extension = pytest.mark.skipif(native.obstacle() == NOT_BUILT, reason=NOT_BUILT)
 SOLID = INERTIAL + '<collision><geometry><box size="0.1 0.1 0.3"/></geometry></collision>'

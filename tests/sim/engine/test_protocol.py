@@ -13,7 +13,7 @@ from robots import load_bundled
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Runner, RunnerOptions
-from batchpid.sim.engine import engines
+from batchpid.sim.engine import protocol
 from batchpid.sim.engine.protocol import (
     CompiledPack,
     CompiledStep,
@@ -23,10 +23,9 @@ from batchpid.sim.engine.protocol import (
     Friction,
     RigidTree,
 )
+from batchpid.sim.engine.sapien.calls import SapienStep
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.sapien.sapien_engine import SapienEngine
-from batchpid.sim.engine.sapien.sim_step import NativeStep
-from batchpid.sim.engine.sapien.variation import VariedPack
+from batchpid.sim.engine.sapien.sapien_engine import SapienEngine, VariedPack
 from batchpid.sim.loop.backend import describe
 
 PANDA = load_bundled("panda")
@@ -52,7 +51,7 @@ def check_members(protocol, kind):
         (EnginePack, Pack),
         (DrivenPack, Pack),
         (CompiledPack, VariedPack),
-        (CompiledStep, NativeStep),
+        (CompiledStep, SapienStep),
         (Engine, SapienEngine),
     ],
 )
@@ -64,8 +63,8 @@ def test_mujoco_has_the_members_of_each_protocol():
     pytest.importorskip("mujoco.batch")
     from batchpid.sim.engine.mujoco import mujoco_engine, mujoco_pack, mujoco_step
 
-    for protocol in (EnginePack, DrivenPack, CompiledPack):
-        check_members(protocol, mujoco_pack.MujocoPack)
+    for kind in (EnginePack, DrivenPack, CompiledPack):
+        check_members(kind, mujoco_pack.MujocoPack)
     check_members(CompiledStep, mujoco_step.MujocoStep)
     check_members(Engine, mujoco_engine.MujocoEngine)
 
@@ -179,7 +178,7 @@ ENGINE = ToyEngine()
 @pytest.fixture
 def toy(monkeypatch):
     """Make the toy the engine of all runners of this process."""
-    monkeypatch.setitem(engines.MODULES, "sapien", __name__)
+    monkeypatch.setitem(protocol.MODULES, "sapien", __name__)
 
 
 def runner(**options):
@@ -258,4 +257,4 @@ def test_its_sim_steps_are_no_part_of_a_program_of_xla():
 
 def test_an_unknown_engine_is_an_error():
     with pytest.raises(InvalidArgumentError, match=r"engine: unknown option.*'bullet'.*use one of 'sapien'"):
-        engines.load_engine("bullet")
+        protocol.load_engine("bullet")

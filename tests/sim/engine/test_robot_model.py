@@ -10,11 +10,10 @@ from tiny_urdf import random_tree, robot, write
 import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.sim import OperationalSpace, Robot, Runner
-from batchpid.sim.engine.engines import load_engine
-from batchpid.sim.engine.protocol import SceneSpec
+from batchpid.sim.engine.physics import PHYSICS
+from batchpid.sim.engine.protocol import SceneSpec, load_engine
 from batchpid.sim.engine.robot_model import passive_force, scene_tree
 from batchpid.sim.engine.sapien.building import build_scene, new_system
-from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.plant import Plant
 from batchpid.task_space import osc_state, tree_dynamics

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.sapien.building import build_scene, new_system
-from batchpid.sim.engine.sapien.physics import PHYSICS
 
 
 @pytest.fixture

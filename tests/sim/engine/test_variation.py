@@ -8,11 +8,11 @@ import pytest
 from robots import load_bundled
 
 import batchpid.task_space as ts
+from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec, Variation
 from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.sapien.physics import PHYSICS
-from batchpid.sim.engine.sapien.variation import VariedPack
+from batchpid.sim.engine.sapien.sapien_engine import VariedPack
 
 STEPS = 120
 

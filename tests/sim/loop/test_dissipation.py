@@ -9,9 +9,9 @@ from tiny_urdf import joint, link, one_joint, robot, write
 import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.sim import Randomization, Robot, Runner, Uniform
+from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.robot_model import scene_tree
-from batchpid.sim.engine.sapien.physics import PHYSICS
 
 DT = 1 / 2000
 PRESETS = ["accurate", "fast"]

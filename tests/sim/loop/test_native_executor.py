@@ -15,11 +15,10 @@ from batchpid.motors import friction as friction_model
 from batchpid.sim import Randomization, Robot, Runner, Uniform
 from batchpid.sim.engine import native
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
-from batchpid.sim.engine.engines import load_engine
 from batchpid.sim.engine.native_model import NativeModel, NativeRefresh
-from batchpid.sim.engine.protocol import Friction, SceneSpec, Variation
+from batchpid.sim.engine.physics import PHYSICS
+from batchpid.sim.engine.protocol import Friction, SceneSpec, Variation, load_engine
 from batchpid.sim.engine.robot_model import passive_force, scene_tree
-from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.sim.loop.native_executor import NativeExecutor
 from batchpid.sim.loop.native_ticks import NativeTicks
 from batchpid.sim.loop.numpy_executor import NumPyExecutor

@@ -11,9 +11,9 @@ from tiny_urdf import link, write
 
 import batchpid.task_space as ts
 from batchpid.sim import Robot
+from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.sapien.building import build_scene, new_system
-from batchpid.sim.engine.sapien.physics import PHYSICS
 from batchpid.task_space.rotations import about, from_rpy, multiply, rotate
 
 ODD = """<robot name="odd">

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from batchpid.sim import Robot, Runner, SetpointWarning
-from batchpid.sim.robot.limits import SetpointCheck
+from batchpid.sim.robot.run_checks import SetpointCheck
 from tests.sim.tiny_urdf import joint, link, robot, write
 
 

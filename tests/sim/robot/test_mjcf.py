@@ -17,7 +17,7 @@ pytest.importorskip("mujoco.batch")
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, RobotError  # noqa: E402
 from batchpid.sim import Robot, Runner  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
-from batchpid.sim.engine.mujoco.solver import SOLVERS  # noqa: E402
+from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
 from batchpid.sim.engine.protocol import SceneSpec  # noqa: E402
 from batchpid.sim.engine.robot_model import scene_model  # noqa: E402
 from batchpid.sim.robot.shapes import surfaces  # noqa: E402

@@ -12,7 +12,7 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 from batchpid.errors import RobotError
 from batchpid.sim import Robot
-from batchpid.sim.robot.inertia import ball, nearest_physical, triangle_excess
+from batchpid.sim.robot.link_repair import ball, nearest_physical, triangle_excess
 
 BASE, ARM, TIP = link("base"), link("arm"), link("tip")
 HINGE = joint("hinge", "base", "arm")

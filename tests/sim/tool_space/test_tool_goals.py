@@ -9,8 +9,8 @@ from robots import load_bundled
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace
-from batchpid.sim.tool_space import tool_goals
-from batchpid.sim.tool_space.tool_goals import default_goal, reaches
+from batchpid.sim.tool_space import tool_setpoints
+from batchpid.sim.tool_space.tool_setpoints import default_goal, reaches
 
 HAND = "panda_hand"
 
@@ -33,7 +33,7 @@ def test_a_goal_is_reached_within_the_limits_or_not(panda, control, monkeypatch)
     goal[1, :3] = [2.0, 0.0, 0.5]
     start[2, 3] = panda.upper[3] + 0.1
     np.testing.assert_array_equal(reaches(panda, control, start, goal), [True, False, False])
-    monkeypatch.setattr(tool_goals, "SECONDS", 0.1)  # too short to arrive
+    monkeypatch.setattr(tool_setpoints, "SECONDS", 0.1)  # too short to arrive
     assert not reaches(panda, control, start, goal).any()
 
 

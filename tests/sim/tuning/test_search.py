@@ -41,6 +41,9 @@ def test_gains_and_implicit_laws_are_refused(panda):
     ):
         with pytest.raises(InvalidArgumentError, match=f"{name}: .*{message}"):
             search(panda, workers=0, **{name: value})
+    motors = make_actuators(panda.dof, strength=0.9)
+    with pytest.raises(InvalidArgumentError, match="actuators: is given with motors"):
+        tune(panda, motors=motors, actuators=motors)
 
 
 def test_a_search_of_tool_gains_with_other_motors_is_refused(panda, tmp_path, monkeypatch):

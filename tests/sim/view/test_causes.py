@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from batchpid.sim import Runner
-from batchpid.sim.view.data import cause
+from batchpid.sim.view.panel import cause
 from batchpid.sim.view.playback import Playback
 from batchpid.sim.view.simulation import LiveSimulation
 

@@ -7,7 +7,7 @@ import pytest
 
 from batchpid.sim import Observation, Rollout
 from batchpid.sim.view import Playback
-from batchpid.sim.view.charts import Charts
+from batchpid.sim.view.page import Charts
 
 
 class Gui:

@@ -1,7 +1,7 @@
 """Requests of the page: bounded, and none ends the run."""
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.view.controls import MAX_REQUESTS, Requests
+from batchpid.sim.view.panel import MAX_REQUESTS, Requests
 
 
 def test_requests_run_in_order_and_one_that_fails_is_named():

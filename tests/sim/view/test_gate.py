@@ -23,8 +23,7 @@ from websockets.asyncio.client import connect  # noqa: E402
 from websockets.exceptions import InvalidStatus  # noqa: E402
 
 from batchpid.sim.view.address import listen, resolve  # noqa: E402
-from batchpid.sim.view.gate import Gate  # noqa: E402
-from batchpid.sim.view.messages import MAX_BYTES, check_message  # noqa: E402
+from batchpid.sim.view.gate import MAX_BYTES, Gate, check_message  # noqa: E402
 
 CAMERA = {
     "type": "ViewerCameraMessage",

@@ -25,7 +25,7 @@ from batchpid.sim.identification.logs import Log, LogWarning, read_logs
 from batchpid.sim.identification.plant import Plant, Segment
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import smooth
-from batchpid.sim.identification.statistics import EXPLAINED, uncertainty
+from batchpid.sim.identification.statistics import LARGEST_MISFIT, uncertainty
 from batchpid.sim.identification.unknowns import KINDS, Kind, Motors, Unknowns, take
 
 pytest.importorskip("scipy")
@@ -364,7 +364,7 @@ def test_the_way_of_the_compensation_is_judged_by_the_motion(arm, mujoco_log):
     log = as_log(arm, table, "setpoint")
     found = identify(arm, log, params=params, workers=0, timestep=1e-3, payload=False)
     assert found.drive.through
-    assert found.misfit < EXPLAINED
+    assert found.misfit < LARGEST_MISFIT
     inside = [
         low <= getattr(truth, kind)[joint] <= high
         for kind in PER_JOINT

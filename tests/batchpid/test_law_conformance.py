@@ -1,0 +1,187 @@
+"""Every executor of the law gives the efforts of the law on plain numbers, for params of any combination of options.
+
+The native extension and the exported C give the bytes of NumPy.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+from unittest import mock
+
+import jax
+import numpy as np
+import pytest
+from law_cases import DT, ENVS, JOINTS, Inputs, generated_options, made_up_inputs, read_only
+from quick_jit import quick_jit
+from scalar_pid import ScalarPID, scalar_pids
+
+import batchpid as bp
+from batchpid.export import to_c
+from tests.c_programs import COMPILERS, efforts_in_c
+
+RATES = ("measurement_rate", "setpoint_rate", "feedforward")
+GIVEN = [(), RATES, ("measurement_rate",), ("setpoint_rate",), ("measurement_rate", "setpoint_rate"), ("feedforward",)]
+
+
+def by_steps(params, inputs, step=bp.step, array=read_only):
+    """Return the efforts (steps, envs, joints) of the pure functions on arrays of ``array``, read-only for NumPy."""
+    params = bp.PIDParams(*(array(x, params.dtype) if isinstance(x, np.ndarray) else x for x in params))
+    rows = [[None if x is None else array(x[t], params.dtype) for x in inputs] for t in range(len(inputs.setpoint))]
+    state, efforts = bp.init(params, rows[0][1]), []
+    for setpoint, measurement, *rates in rows:
+        state, effort = step(params, state, setpoint, measurement, DT, **dict(zip(RATES, rates, strict=True)))
+        assert effort.dtype == params.dtype
+        efforts.append(np.asarray(effort, float))
+    return np.array(efforts)
+
+
+def by_jax(params, inputs):
+    return by_steps(params, inputs, quick_jit(bp.step, static_argnames="dt"), jax.numpy.asarray)
+
+
+def by_controller(params, inputs, backend="numpy"):
+    pid = bp.BatchPID(params, inputs.setpoint.shape[1], DT, backend)
+    rows = zip(*(x if x is not None else [None] * len(inputs.setpoint) for x in inputs), strict=True)
+    return np.array([pid(*(None if x is None else x.astype(params.dtype) for x in row)) for row in rows], float)
+
+
+def by_numpys_controller(params, inputs):
+    with mock.patch.dict("os.environ", {"BATCHPID_NATIVE": "0"}):
+        return by_controller(params, inputs)
+
+
+def by_native_code(params, inputs):
+    if not bp.BatchPID(params, ENVS, DT).native:
+        pytest.skip("there is no native extension")
+    return by_controller(params, inputs)
+
+
+def by_jaxs_controller(params, inputs):
+    """By JAX with its optimisations."""
+    return by_controller(params, inputs, "jax")
+
+
+class Executor(NamedTuple):
+    """A way to run the law."""
+
+    run: Any
+    dtype: Any = np.float64
+    seeds: int = 12
+    """Number of generated params that it gets."""
+    bits: bool = False
+    """Whether it gives the bytes of NumPy."""
+
+
+EXECUTORS = {
+    "numpy": Executor(by_steps, seeds=24),
+    "numpy float32": Executor(by_steps, np.float32),
+    "controller": Executor(by_numpys_controller, bits=True),
+    "native": Executor(by_native_code, bits=True),
+    "native float32": Executor(by_native_code, np.float32, bits=True),
+    "jax": Executor(by_jax, seeds=3),
+    "jax float32": Executor(by_jax, np.float32, seeds=3),
+    "jax controller": Executor(by_jaxs_controller, np.float32, seeds=2),
+}
+CASES = [(name, seed) for name, executor in EXECUTORS.items() for seed in range(executor.seeds)]
+
+
+def oracle(params, inputs):
+    """Return the efforts of a scalar controller for each env and joint, and the sums of their terms' magnitudes."""
+    efforts, sizes = np.zeros((2, *inputs.setpoint.shape))
+    for (env, joint), pid in np.ndenumerate(np.array(scalar_pids(params, inputs.setpoint.shape[1]), object)):
+        pid.start(inputs.measurement[0, env, joint])
+        for t in range(len(efforts)):
+            now = {name: None if (x := getattr(inputs, name)) is None else x[t, env, joint] for name in RATES}
+            setpoint, measurement = inputs.setpoint[t, env, joint], inputs.measurement[t, env, joint]
+            efforts[t, env, joint] = pid.step(setpoint, measurement, DT, **now)
+            sizes[t, env, joint] = pid.size
+    return efforts, sizes
+
+
+def check(executor, params, inputs):
+    efforts, sizes = oracle(params, inputs)
+    found = executor.run(params, inputs)
+    error = np.abs(found - efforts) / (1 + np.maximum.accumulate(sizes, axis=0))
+    assert error.max() < (1e-12 if executor.dtype == np.float64 else 1e-5)
+    if executor.bits:
+        np.testing.assert_array_equal(found, by_steps(params, inputs))
+    return found
+
+
+@pytest.mark.parametrize(("name", "seed"), CASES)
+def test_efforts_are_those_of_the_law_on_plain_numbers(name, seed, request):
+    executor = EXECUTORS[name]
+    if executor.run is by_jax and executor.dtype == np.float64:
+        request.getfixturevalue("x64")
+    params = bp.make_params(JOINTS, **generated_options(seed), dtype=executor.dtype)
+    inputs = made_up_inputs()
+    if params.non_finite is not None:
+        inputs.measurement[5, 1, 0], inputs.setpoint[9, 0] = np.nan, np.inf
+    given = GIVEN[seed % len(GIVEN)]
+    inputs = Inputs(*inputs[:2], **{each: getattr(inputs, each) for each in given})
+    check(executor, params, inputs)
+
+
+@pytest.mark.parametrize("given", GIVEN, ids=" ".join)
+def test_efforts_with_each_option_alone_on_any_inputs(options, given, inputs):
+    params = bp.make_params(JOINTS, **options)
+    check(EXECUTORS["numpy"], params, Inputs(*inputs[:2], **{each: getattr(inputs, each) for each in given}))
+
+
+@pytest.mark.skipif(not COMPILERS, reason="no C compiler")
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("seed", range(4))
+def test_exported_c_has_the_bytes_of_numpy(seed, dtype, tmp_path):
+    """For a robot; the other settings of an export: test_c_header.py."""
+    params = bp.make_params(JOINTS, **generated_options(seed, envs=1), dtype=dtype)
+    given = GIVEN[seed]
+    inputs = made_up_inputs(envs=1)
+    inputs = Inputs(*inputs[:2], **{each: getattr(inputs, each) for each in given})
+    columns = {name: x[:, 0] for name, x in inputs._asdict().items() if x is not None}
+    found = efforts_in_c(tmp_path, params, to_c(params, DT, inputs=given).text, columns)
+    np.testing.assert_array_equal(found, by_steps(params, inputs)[:, 0])
+    assert np.abs(found).max() > 0.1
+
+
+def test_terms_add_up_and_say_what_saturates(options, inputs):
+    params = bp.make_params(JOINTS, **options)
+    state, saturated = bp.init(params, inputs.measurement[0]), []
+    for t in range(20):
+        now, given = (params, state, inputs.setpoint[t], inputs.measurement[t], DT), inputs.feedforward[t]
+        (_, alone), (state, terms) = (function(*now, feedforward=given) for function in (bp.step, bp.step_terms))
+        assert np.array_equal(alone, terms.effort)
+        assert np.array_equal(terms.feedforward, inputs.feedforward[t])
+        np.testing.assert_allclose(terms.p + terms.i + terms.d + terms.feedforward, terms.unsaturated, rtol=1e-12)
+        assert np.array_equal(terms.saturated, terms.effort != terms.unsaturated)
+        assert terms.finite.all()
+        saturated.append(terms.saturated)
+    if "effort_limit" in options:
+        assert 0 < np.mean(saturated) < 1, "the case saturates, and not always"
+
+
+def test_an_option_with_a_neutral_value_is_off():
+    """Neutral values are off: the same structure as leaving the option out."""
+    gains = {"kp": 3.0, "ki": 1.0, "kd": 0.2}
+    limits = dict.fromkeys(("effort_limit", "effort_rate_limit", "integral_limit"), np.inf)
+    zeros = dict.fromkeys(("derivative_filter_time", "setpoint_weight_derivative", "deadband"), 0.0)
+    neutral = bp.make_params(JOINTS, **gains, **limits, **zeros, setpoint_weight=1.0, continuous=False)
+    assert {name for name, leaf in neutral._asdict().items() if leaf is not None} == gains.keys()
+
+
+def test_every_option_that_is_on_changes_the_efforts(options, inputs):
+    """Every case of the table changes the efforts of a plain PID, so that no test of it is empty."""
+    if set(options) <= {"kp", "ki", "kd"}:
+        pytest.skip("a plain PID")
+    inputs = Inputs(inputs.setpoint, inputs.measurement)
+    plain = bp.make_params(JOINTS, options["kp"], options["ki"], options["kd"])
+    assert not np.array_equal(by_steps(plain, inputs), by_steps(bp.make_params(JOINTS, **options), inputs))
+
+
+def test_the_scalar_law_by_hand():
+    pid = ScalarPID(2.0, 3.0, 0.5, effort_max=2.1, anti_windup="back_calculation", tracking_time=0.2)
+    pid.start(0.0)
+    assert pid.step(1.0, 0.0, 0.1) == 2.0, "output first, and no derivative at the first measurement"
+    assert pid.integral == pytest.approx(0.3)
+    assert pid.step(1.0, -0.1, 0.1) == 2.1
+    assert pid.unsaturated == pytest.approx(2.2 + 0.3 + 0.5)
+    assert pid.integral == pytest.approx(0.3 + 0.33 + 0.5 * (2.1 - 3.0))
