@@ -21,7 +21,6 @@ import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.choices import PerMassMatrix
 from batchpid.arrays.digest import digest, object_digest
-from batchpid.arrays.field_tables import plain
 from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
@@ -43,7 +42,7 @@ from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
-from batchpid.sim.runner_keywords import Controller, ControlMode, Place, RunnerKeywords, kinds
+from batchpid.sim.runner_keywords import OPTIONS, Controller, ControlMode, Place, RunnerKeywords, checked_option
 from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
 from batchpid.sim.tool_space.tool_setpoints import ToolSetpoints
 
@@ -59,7 +58,7 @@ class RunnerOptions(RunnerKeywords):
     Raises
     ------
     InvalidArgumentError
-        An option is out of range, or no option has this name.
+        An option is out of range.
     """
 
     params: bp.PIDParams
@@ -220,16 +219,6 @@ class RunnerOptions(RunnerKeywords):
         return {name: not default for name, default in switches.items() if getattr(self, name) != default}
 
     @property
-    def contact_list(self) -> list[str] | None:
-        """The option ``contacts`` as plain values."""
-        return None if self.contacts is None else list(self.contacts)
-
-    @property
-    def wrench_list(self) -> list[str] | None:
-        """The option ``wrenches`` as plain values."""
-        return None if self.wrenches is None else list(self.wrenches)
-
-    @property
     def solver(self) -> Any:
         """Solver settings for the option ``physics``."""
         return self.load_engine().physics[self.physics] if isinstance(self.physics, str) else self.physics
@@ -367,12 +356,12 @@ class RunnerOptions(RunnerKeywords):
     def values_for(self, place: Place) -> Document:
         """Return the options that are marked with ``place``, by name.
 
-        - "snapshot": plain values, which two runners must share to restore each other's snapshots;
+        - "snapshot": values that two runners must share to restore each other's snapshots;
         - "recording": fields of :class:`batchpid.sim.RunInfo`, and under "options" those that are no field there;
         - "scene": fields of :class:`batchpid.sim.engine.scene_spec.SceneSpec`.
         """
-        marked = [each for each in fields(self) if place in each.metadata]
-        values = {each.name: getattr(self, each.metadata[place] or each.name) for each in marked}
+        kept = {name: each.kept[place] for name, each in OPTIONS.items() if place in each.kept}
+        values = {name: getattr(self, source or name) for name, source in kept.items()}
         if place == "recording" and (further := sorted(values.keys() - RunInfo.__annotations__)):
             values["options"] = {name: values.pop(name) for name in further}
         return values
@@ -383,7 +372,7 @@ class RunnerOptions(RunnerKeywords):
         return {
             **robot.describe(),
             "joints": list(robot.joint_names),
-            **self.values_for("snapshot"),
+            **{name: _plain(value) for name, value in self.values_for("snapshot").items()},
             "ignored_pairs": digest(robot.ignored_pairs),
             "robot_actuators": digest(known_joints(robot)),
             "controller": self.controller_digest,
@@ -421,11 +410,6 @@ class RunnerOptions(RunnerKeywords):
         return _code_digest(self.build)
 
     @property
-    def speed_limits(self) -> list[float] | None:
-        """The option ``speed_limit`` as plain values."""
-        return None if self.speed_limit is None else self.speed_limit.tolist()
-
-    @property
     def guard_digest(self) -> str:
         """Digest of the setpoint guard."""
         return digest(self.guard is not None and self.guard)
@@ -460,6 +444,11 @@ def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
     return value
 
 
+def _plain(value: object) -> object:
+    """Return the value of an option as a file of JSON holds it."""
+    return value.tolist() if isinstance(value, np.ndarray) else list(value) if isinstance(value, tuple) else value
+
+
 def _code_digest(value: object) -> str | None:
     """Return the digest of a controller or function of the caller's; None for a name, or without a value."""
     return None if value is None or isinstance(value, str) else object_digest(value)
@@ -467,7 +456,7 @@ def _code_digest(value: object) -> str | None:
 
 def worker_count(workers: Any) -> int:
     """Return ``workers`` if it is a number of processes; None: one per available core."""
-    return len(os.sched_getaffinity(0)) if workers is None else plain("workers", kinds()["workers"], workers)
+    return len(os.sched_getaffinity(0)) if workers is None else checked_option("workers", workers)
 
 
 def _places(workers: Any, cluster: Any) -> tuple[int | None, Ray | None]:

@@ -15,7 +15,7 @@ from inspect import Signature, signature
 from operator import itemgetter
 from pathlib import Path
 from time import strftime
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Rows
 from batchpid.checks.single_owner import SingleOwner
-from batchpid.checks.validate import choice, instance, integer
+from batchpid.checks.validate import check_keywords, choice, instance
 from batchpid.checks.warn import warn
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError
 from batchpid.io.versions import package_versions
@@ -47,7 +47,7 @@ from batchpid.sim.runner_commands import (
     restored,
     snapshot_of,
 )
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE, arguments_of
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE, KINDS, OPTIONS, arguments_of, checked_option
 from batchpid.sim.runner_state import RunnerState
 from batchpid.sim.workers.contact_log import MissedContact
 from batchpid.sim.workers.node import NodeInfo
@@ -90,6 +90,7 @@ class Runner(SingleOwner):
 
     @arguments_of(RunnerOptions)
     def __init__(self, *arguments: Any, **options: Any) -> None:
+        check_keywords("Runner", options, OPTIONS)
         if "engine" not in options and DEFAULT_ENGINE != "sapien":
             warn(f"SAPIEN is not installed: the engine is {DEFAULT_ENGINE!r}", UserWarning)
         self.options = checked = RunnerOptions(*arguments, **options)
@@ -231,7 +232,7 @@ class Runner(SingleOwner):
             "feedforward": feedforward,
         }
         command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
-        count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
+        count = self.substeps if substeps is None else checked_option("substeps", substeps)
         self._execute(RunTicks(command, count, self.timestep))
         return self._pool.present.observation.copied(self._tool_pose)
 
@@ -263,7 +264,7 @@ class Runner(SingleOwner):
             "feedforward": feedforward,
         }
         command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
-        count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
+        count = self.substeps if substeps is None else checked_option("substeps", substeps)
         self._begin(RunTicks(command, count, self.timestep))
 
     def recv(self) -> Observation:
@@ -674,4 +675,5 @@ class Runner(SingleOwner):
         return min(most, -(-left // self.options.substeps))
 
 
-Runner.__signature__ = signature(RunnerOptions)
+_PARAMETERS = signature(RunnerOptions).parameters.items()
+Runner.__signature__ = Signature([each.replace(annotation=get_args(KINDS[name])[0]) for name, each in _PARAMETERS])

@@ -10,15 +10,17 @@ of a randomization, and the tables of the guides (docs/tables.py)::
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import NoneType
-from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array
+from batchpid.arrays.array_types import Array, Kind
 from batchpid.checks.validate import at_least, choice, entries, flag, integer, is_traced, number
 from batchpid.errors import InvalidArgumentError
+
+T = TypeVar("T")
 
 
 class Field(NamedTuple):
@@ -50,11 +52,11 @@ class Field(NamedTuple):
         return values
 
 
-def declared(owner: Any) -> dict[str, Field]:
-    """Return the fields that the annotations of a constructor or class declare, by name."""
-    hints = get_type_hints(owner, include_extras=True)
-    found = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
-    return {name: metadata[0] for name, metadata in found.items() if metadata}
+def declared(owner: Callable[..., object], kind: type[T]) -> dict[str, T]:
+    """Return what the annotations of a constructor or class declare by a ``kind``, such as Field, by name."""
+    hints = get_type_hints(owner, include_extras=True).items()
+    found = ((name, each) for name, hint in hints for each in getattr(hint, "__metadata__", ()))
+    return {name: each for name, each in found if isinstance(each, kind)}
 
 
 def in_group(fields: Mapping[str, Field], group: str) -> dict[str, Field]:
@@ -70,14 +72,15 @@ TABLES = ("limit_positions", "limit_efforts")
 """Leaves with a table for each joint (1 | envs, joints, points)."""
 
 
-def plain(name: str, kind: Any, value: Any) -> Any:
+def plain(name: str, kind: Kind, value: Any) -> Any:
     """Return ``value`` in the canonical form of its declared type: a bool, a number, a choice, or one of these or None.
 
     A value of another declared type is returned as it is.
 
     Raises InvalidArgumentError if a number is out of the bounds of its :class:`Field`, or the value of another type.
     """
-    kind, bounds = get_args(kind) if get_origin(kind) is Annotated else (kind, FREE)
+    kind, *metadata = get_args(kind) if get_origin(kind) is Annotated else (kind,)
+    bounds = next((each for each in metadata if isinstance(each, Field)), FREE)
     if get_origin(kind) is Literal:
         return choice(name, value, get_args(kind))
     if NoneType in get_args(kind):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -68,23 +68,16 @@ class LeafBuilder:
         array = self.array(name, value, field)
         return None if _is_everywhere(array, field.neutral) else self.freeze(array)
 
-    def limits(self, name: str, symmetric: Any, low: Array, high: Array) -> tuple[Any, Any]:
-        """Return the leaves of a lower and an upper limit, each None where it is infinite everywhere."""
-        if symmetric is not None:
-            if low is not None or high is not None:
-                raise InvalidArgumentError(
-                    f"{name}_limit",
-                    f"is given together with {name}_min or {name}_max",
-                    remedy="give the symmetric limit, or the two ends",
-                )
-            upper = self.array(f"{name}_limit", symmetric, Field(neutral=math.inf))
-            lower = -upper
-        else:
-            end = Field(neutral=math.inf, low=-math.inf)
-            lower, upper = self.array(f"{name}_min", low, end), self.array(f"{name}_max", high, end)
-        if lower is not None and upper is not None and not (is_traced(lower) or is_traced(upper)):
-            ends = np.broadcast_arrays(lower, upper)
-            entries(f"{name}_min", ends[0], ends[0] <= ends[1], f"exceeds {name}_max", self.names)
+    def limits(self, **given: Any) -> tuple[Any, Any]:
+        """Return the leaves of a lower and an upper limit, each None where it is infinite everywhere.
+
+        ``given`` are the size of both, the lower and the upper end, by the names of their arguments.
+        """
+        end = Field(neutral=math.inf, low=-math.inf)
+        size, *ends = given
+        read = {size: self.array(size, given[size], Field(neutral=math.inf))}
+        read |= {name: self.array(name, given[name], end) for name in ends}
+        lower, upper = checked_ends(read, self.names)
         lower = None if _is_everywhere(lower, -math.inf) else lower
         upper = None if _is_everywhere(upper, math.inf) else upper
         return lower, upper
@@ -166,6 +159,25 @@ class LeafBuilder:
             f"has shape {array.shape}, not {expected}",
             remedy="give one value, one per joint, or one per env and joint",
         )
+
+
+def checked_ends(given: Mapping[str, Array], joint_names: Sequence[str] | None) -> tuple[Array, Array]:
+    """Return the lower and the upper end of limits, None for no limit.
+
+    ``given`` are the size of both, the lower and the upper end, by the names of their arguments.
+
+    Raises InvalidArgumentError if the size is given with an end, or the lower end exceeds the upper one.
+    """
+    (name, size), (low_name, low), (high_name, high) = given.items()
+    if size is not None:
+        if low is not None or high is not None:
+            problem = f"is given together with {low_name} or {high_name}"
+            raise InvalidArgumentError(name, problem, remedy="give the symmetric limit, or the two ends")
+        return -size, size
+    if low is not None and high is not None and not (is_traced(low) or is_traced(high)):
+        ends = np.broadcast_arrays(low, high)
+        entries(low_name, ends[0], ends[0] <= ends[1], f"exceeds {high_name}", joint_names)
+    return low, high
 
 
 def _can_be_written(leaf: Array) -> bool:

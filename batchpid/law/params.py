@@ -251,8 +251,8 @@ def make_params(
     if chosen["discretization"] is not None:
         _check_implicit(chosen["gain_units"], options["derivative_filter_time"])
         d = build.array("kd", 0.0, FIELDS["kd"]) if d is None else d
-    effort_ends = build.limits("effort", effort_limit, effort_min, effort_max)
-    integral_ends = build.limits("integral", integral_limit, integral_min, integral_max)
+    effort_ends = build.limits(effort_limit=effort_limit, effort_min=effort_min, effort_max=effort_max)
+    integral_ends = build.limits(integral_limit=integral_limit, integral_min=integral_min, integral_max=integral_max)
     # The joints may have different strategies: each becomes an array of the joints that use it, or None for none.
     clamp, conditional, back = build.strategies(anti_windup)
     integral_ends = build.clamped(clamp, integral_ends, effort_ends)
@@ -268,7 +268,7 @@ def make_params(
     )
 
 
-FIELDS = declared(make_params)
+FIELDS = declared(make_params, Field)
 """Options of a joint."""
 
 

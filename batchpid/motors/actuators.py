@@ -271,7 +271,7 @@ def make_actuators(
     )
 
 
-FIELDS = declared(make_actuators)
+FIELDS = declared(make_actuators, Field)
 """Numbers of a joint."""
 MOTOR_SIDE = in_group(FIELDS, "motor")
 """Numbers between the effort asked for and the effort delivered."""

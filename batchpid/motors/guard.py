@@ -88,7 +88,7 @@ def make_guard(
     """
     build = LeafBuilder(joints, joint_names, dtype, (lower, upper, rate, acceleration))
     mask = build.mask("continuous", continuous)
-    low, high = build.limits("setpoint", None, lower, upper)
+    low, high = build.limits(size=None, lower=lower, upper=upper)
     if mask is not None:
         xp = namespace(mask)
         low = None if low is None else xp.where(mask > 0, -math.inf, low)
@@ -102,7 +102,7 @@ def make_guard(
     )
 
 
-FIELDS = declared(make_guard)
+FIELDS = declared(make_guard, Field)
 """Options of a joint."""
 
 

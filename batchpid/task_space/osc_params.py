@@ -13,6 +13,7 @@ from batchpid.arrays.choices import CHOICES, NamedChoice
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field, declared
+from batchpid.arrays.leaves import checked_ends
 from batchpid.checks.validate import array, choice, entries, instance, known_keywords, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import RigidTree
@@ -182,19 +183,9 @@ def make_osc_params(
     if force is not None:
         both = force * (np.ones((1, 6)) if motion is None else motion)
         entries("force_axes", both > 0, both == 0, "is an axis of motion, too", AXES, kind="entry")
-    if effort_limit is not None:
-        if effort_min is not None or effort_max is not None:
-            problem = "is given together with effort_min or effort_max"
-            raise InvalidArgumentError("effort_limit", problem, remedy="give the symmetric limit, or the two ends")
-        effort_max = _rows("effort_limit", effort_limit, joints)
-        effort_min = -effort_max
-    low, high = (
-        None if end is None else _rows(name, end, joints)
-        for name, end in (("effort_min", effort_min), ("effort_max", effort_max))
-    )
-    if low is not None and high is not None:
-        ends = np.broadcast_arrays(low, high)
-        entries("effort_min", ends[0], ends[0] <= ends[1], "exceeds effort_max", joints)
+    given = {"effort_limit": effort_limit, "effort_min": effort_min, "effort_max": effort_max}
+    efforts = {name: None if rows is None else _rows(name, rows, joints) for name, rows in given.items()}
+    low, high = checked_ends(efforts, joints)
     # Joints without limits that turn are angles modulo 2 pi for the posture. Followers have no posture and no limits of
     # their own: their leader has them.
     limits, own = np.array([tree.lower, tree.upper]), tree.independent
@@ -228,7 +219,7 @@ def make_osc_params(
     return params
 
 
-FIELDS = declared(make_osc_params)
+FIELDS = declared(make_osc_params, Field)
 """Options that are numbers; units are those with full decoupling."""
 
 

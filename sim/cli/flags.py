@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import tyro
 
-from batchpid.arrays.array_types import Document
+from batchpid.arrays.array_types import Document, Kind
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.runner_keywords import Compensation, EngineName, PhysicsPreset, RunnerKeywords, kinds
+from batchpid.sim.runner_keywords import KINDS, OPTIONS, Compensation, EngineName, PhysicsPreset, RunnerKeywords
 
 
 def _flag(help: str | None = None, **options: Any) -> Any:
@@ -37,24 +37,23 @@ def refuse(command: Any, names: Iterable[str], problem: str) -> None:
             raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
 
 
-_OPTIONS = {each.name: each for each in fields(RunnerKeywords)}
-FLAGS = tuple(name for name, each in _OPTIONS.items() if each.metadata["flag"])
-"""Options that have a flag."""
-SCENE_FLAGS = tuple(name for name in FLAGS if "scene" in _OPTIONS[name].metadata and name != "engine")
+FLAGS = {each.name: each.default for each in fields(RunnerKeywords) if OPTIONS[each.name].flag}
+"""Options that have a flag, with their defaults."""
+SCENE_FLAGS = tuple(name for name in FLAGS if "scene" in OPTIONS[name].kept and name != "engine")
 """Options that change the scenes in an engine."""
 _PLAIN = (NoneType, bool, int, float, str)
-_SWITCHES = [name for name, kind in kinds().items() if kind == bool | None]
+_SWITCHES = [name for name, kind in KINDS.items() if get_args(kind)[0] == bool | None]
 """Options that are on, off, or chosen by the Runner."""
 
 
 def of_option(name: str) -> Any:
     """Return tyro's options of the flag of a Runner's option."""
-    return _flag(_OPTIONS[name].metadata["flag"], metavar="on|off" if name in _SWITCHES else None)
+    return _flag(OPTIONS[name].flag, metavar="on|off" if name in _SWITCHES else None)
 
 
-def _kind(name: str) -> Any:
+def _kind(name: str) -> Kind:
     """Return the type of the flag of a Runner's option: that of its plain values."""
-    kind = Literal["on", "off"] | None if name in _SWITCHES else kinds()[name]
+    kind = Literal["on", "off"] | None if name in _SWITCHES else get_args(KINDS[name])[0]
     if get_origin(kind) not in (Union, UnionType):
         return kind
     return Union[tuple(each for each in get_args(kind) if each in _PLAIN or get_origin(each) is Literal)]  # noqa: UP007
@@ -82,7 +81,7 @@ class RunnerFlags:
 def runner_flags(*names: str) -> type[RunnerFlags]:
     """Return the flags of a Runner's options, by default of all that have one."""
     chosen = names or FLAGS
-    made = [(name, Annotated[_kind(name), of_option(name)], field(default=_OPTIONS[name].default)) for name in chosen]
+    made = [(name, Annotated[_kind(name), of_option(name)], field(default=FLAGS[name])) for name in chosen]
     return make_dataclass("ChosenFlags", made, bases=(RunnerFlags,), frozen=True)
 
 
@@ -155,10 +154,7 @@ GainSets = Annotated[
     ),
 ]
 Engine = Annotated[EngineName, of_option("engine")]
-Engines = Annotated[
-    tuple[EngineName, ...],
-    _flag("Physics engines, one or both."),
-]
+Engines = Annotated[tuple[EngineName, ...], _flag("Physics engines, one or both.")]
 Physics = Annotated[PhysicsPreset, of_option("physics")]
 Compensate = Annotated[Compensation, of_option("compensate")]
 Seconds = Annotated[float, _flag("Simulated time [s].")]

@@ -18,6 +18,7 @@ from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, write_figures
 from batchpid.sim.cli.progress import waiting
 from batchpid.sim.recording.recording_files import HDF5
+from batchpid.sim.runner_keywords import checked_option
 from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tool_space.tool_setpoints import default_goal
 from batchpid.sim.tuning.gain_sets import gain_set
@@ -177,7 +178,7 @@ class RolloutCommand:
             if is_given:
                 remedy = "leave one of them out; a trajectory has joint setpoints, and lasts as long as its file"
                 raise InvalidArgumentError("trajectory", f"excludes {name}", remedy=remedy)
-        setpoints = read_setpoints(robot, path, number("timestep", self.timestep, 1e-6, 0.1, "seconds"))
+        setpoints = read_setpoints(robot, path, checked_option("timestep", self.timestep))
         if self.substeps not in (RolloutCommand.substeps, setpoints.substeps):
             problem, remedy = f"differs from the ticks of {path}", f"leave it out, or use {setpoints.substeps}"
             raise InvalidArgumentError("substeps", problem, value=self.substeps, remedy=remedy)

@@ -30,7 +30,7 @@ from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, ORIGIN, FaultContai
 from batchpid.sim.loop.pushes import COUNTS
 from batchpid.sim.loop.tables import flatten, nest, widen
 from batchpid.sim.observation import observed_by_loop, untouched
-from batchpid.sim.runner_keywords import RunnerKeywords
+from batchpid.sim.runner_keywords import OPTIONS, RunnerKeywords
 
 EPISODE = "episode"
 """Name of the resets of each env with actuators (envs,)."""
@@ -250,7 +250,7 @@ class Snapshot:
             raise ValueError(f"format {head['format']}, not {_FORMAT}")
         about, steps, choices = head["about"], head["steps"], head["markers"]
         for each in fields(RunnerKeywords):  # written before there was this option, which then had its default
-            if each.default is not MISSING and each.metadata.get("snapshot", each.name) is None:
+            if each.default is not MISSING and OPTIONS[each.name].kept.get("snapshot") == "":
                 about.setdefault(each.name, each.default)
         num_envs = integer("num_envs", about["num_envs"], 1, 2**31)
         dof, steps = len(names("joints", about["joints"])), integer("steps", steps, 0, 2**62)

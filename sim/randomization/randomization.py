@@ -272,7 +272,7 @@ class Randomization:
         return cls(**values)
 
 
-FIELDS = declared(Randomization)
+FIELDS = declared(Randomization, Bounds)
 PHYSICAL = in_group(FIELDS, "robot")
 """Fields that change the simulated robot."""
 START = in_group(FIELDS, "start")

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.array_types import Document, Kind, Rows
 from batchpid.checks.validate import file_path, instance, integer
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import read_npz, write_atomically
@@ -295,7 +295,7 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
     )
 
 
-def _plain(kind: Any, value: Any) -> Any:
+def _plain(kind: Kind, value: Rows) -> Any:
     """Return a value of a field of :class:`RunInfo` of this type: a text, number, bool, array, names, or a mapping."""
     if isinstance(kind, UnionType):
         kind = next(each for each in get_args(kind) if each is not NoneType)

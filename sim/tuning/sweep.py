@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.digest import digest
-from batchpid.checks.validate import array, file_path, integer, read_array
+from batchpid.checks.validate import array, check_keywords, file_path, integer, read_array
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.versions import package_versions
@@ -33,6 +33,7 @@ from batchpid.sim.recording.recording_files import HDF5, load_h5py, read_recordi
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.run_checks import SetpointCheck, SetpointWarning
 from batchpid.sim.runner import Runner
+from batchpid.sim.runner_keywords import OPTIONS, checked_option
 from batchpid.sim.tuning.history import REMEDY, other_inputs
 from batchpid.sim.workers.contact_log import MissedContactWarning
 
@@ -93,12 +94,13 @@ def sweep(
     """
     path, part = file_path("path", path, HDF5), integer("part", part, 1, 1_000_000)
     load_h5py()  # raises without it, before anything runs
-    num_envs = integer("num_envs", num_envs, 1, 1_000_000)
-    first = integer("first_env", options.get("first_env", 0), 0, 10**9)
+    num_envs = checked_option("num_envs", num_envs)
+    first = checked_option("first_env", options.get("first_env", 0))
     numbers = first + np.arange(num_envs)
     given: Document = {"params": params, "qpos": qpos, "qvel": qvel, "seed": seed, **options}
     given |= {name: given[name](numbers) for name in PER_ENV if callable(given.get(name))}
     start, streams = [given.pop(name) for name in ("qpos", "qvel")], given.pop("seed")
+    check_keywords("Runner", given, OPTIONS)
     checked = RunnerOptions(robot, num_envs, **given)
     is_finite, shape = checked.on_invalid_input == "raise", (num_envs, robot.dof)
     if start[0] is None:

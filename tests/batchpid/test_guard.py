@@ -112,8 +112,8 @@ def test_jax_agrees_with_numpy(dtype, tolerance, request):
     [
         ({"rate": 0.0}, "rate, joint 0: must be > 0"),
         ({"acceleration": [1.0, -1.0]}, "acceleration, joint 1"),
-        ({"lower": 1.0, "upper": 0.0}, "setpoint_min"),
-        ({"upper": np.nan}, "setpoint_max"),
+        ({"lower": 1.0, "upper": 0.0}, "lower"),
+        ({"upper": np.nan}, "upper"),
     ],
 )
 def test_bad_limits_are_refused(options, message):

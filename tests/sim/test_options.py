@@ -9,6 +9,7 @@ import pickle
 import sys
 from dataclasses import fields
 from itertools import pairwise
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -55,7 +56,8 @@ def test_a_missing_jax_is_named_with_its_extra_before_a_worker_starts(monkeypatc
 
 def test_a_flag_of_an_option_has_its_default_and_reaches_the_runner():
     given = parse(["rollout"]).runner.options()
-    flags = {each.name: each.default for each in fields(RunnerKeywords) if each.metadata["flag"]}
+    kept = {name: hint.__metadata__[-1] for name, hint in get_type_hints(RunnerKeywords, include_extras=True).items()}
+    flags = {each.name: each.default for each in fields(RunnerKeywords) if kept[each.name].flag}
     assert given == {name: value for name, value in flags.items() if name != "ground"}, "on or off, or neither"
     words = ["--no-collisions", "--ground", "off", "--workers", "2", "--backend", "jax"]
     given = parse(["rollout", *words]).runner.options()

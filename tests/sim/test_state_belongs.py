@@ -15,7 +15,7 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Randomization, Robot, Runner, RunnerOptions, Uniform
 from batchpid.sim.gym import ReachVectorEnv, ToolReachVectorEnv
-from batchpid.sim.runner_keywords import Role
+from batchpid.sim.runner_keywords import OPTIONS, Role
 
 pytest.importorskip("mujoco")
 POSTURE = np.array([0, -0.5, 0, -2.2, 0, 1.8, 0.8, 0.02, 0.02])
@@ -103,7 +103,7 @@ def changed(ours, theirs):
 def check(ours, theirs, before=None):
     """Check that a snapshot made under ``ours`` is refused, or gives the same, under ``theirs``."""
     snapshot, (expected, ends) = before or went_on(ours)
-    roles = {each.name: each.metadata["role"] for each in fields(RunnerOptions)}
+    roles = {each.name: OPTIONS[each.name].role for each in fields(RunnerOptions)}
     with made(theirs) as other:
         try:
             other.restore(snapshot)
@@ -140,7 +140,7 @@ def panda():
 
 def test_every_option_is_kept_or_has_a_role_apart():
     for each in fields(RunnerOptions):
-        assert ("snapshot" in each.metadata) != (each.metadata["role"] in get_args(Role)), each.name
+        assert ("snapshot" in OPTIONS[each.name].kept) != (OPTIONS[each.name].role in get_args(Role)), each.name
 
 
 @pytest.mark.filterwarnings("ignore")
