@@ -31,6 +31,7 @@ from batchpid.law.input_checks import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.command import CommandSpec, joint_command, own_command
+from batchpid.sim.engine.physics import MujocoSolver, Physics
 from batchpid.sim.engine.protocol import Capability, Engine, load_engine, require
 from batchpid.sim.engine.scene_spec import added_friction
 from batchpid.sim.observation import Quantity, RunInfo, observed_by_loop
@@ -53,7 +54,8 @@ IDEAL = bp.Actuators()
 class RunnerOptions(RunnerKeywords):
     """Options of a :class:`batchpid.sim.Runner`, checked, copied, and with a value for each default. Immutable.
 
-    The arguments and their attributes are those of :class:`RunnerKeywords`. Attributes that become another type:
+    The arguments are those of :class:`RunnerKeywords`, and so are the attributes; those below have a narrower
+    type. ``workers`` is None on a cluster, ``tool`` where setpoints are no poses, ``actuators`` without any effect.
 
     Raises
     ------
@@ -62,17 +64,11 @@ class RunnerOptions(RunnerKeywords):
     """
 
     params: bp.PIDParams
-    workers: int | None
-    """None on a cluster."""
     control: ControlMode | Controller
-    tool: str | None
-    """Link that setpoints move; None where they are not poses."""
     ground: bool
     contacts: tuple[str, ...] | None
     wrenches: tuple[str, ...] | None
     speed_limit: NDArray[np.float64] | None
-    actuators: bp.Actuators | None
-    """None if every effect is off."""
     guard: bp.Guard | None
     cluster: Ray | None
 
@@ -219,7 +215,7 @@ class RunnerOptions(RunnerKeywords):
         return {name: not default for name, default in switches.items() if getattr(self, name) != default}
 
     @property
-    def solver(self) -> Any:
+    def solver(self) -> Physics | MujocoSolver:
         """Solver settings for the option ``physics``."""
         return self.load_engine().physics[self.physics] if isinstance(self.physics, str) else self.physics
 
@@ -454,7 +450,7 @@ def _code_digest(value: object) -> str | None:
     return None if value is None or isinstance(value, str) else object_digest(value)
 
 
-def worker_count(workers: Any) -> int:
+def worker_count(workers: int | None) -> int:
     """Return ``workers`` if it is a number of processes; None: one per available core."""
     return len(os.sched_getaffinity(0)) if workers is None else checked_option("workers", workers)
 

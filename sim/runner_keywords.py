@@ -70,8 +70,6 @@ DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapie
 PhysicsPreset = Literal["accurate", "fast", "free"]
 FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]
-
-
 Place = Literal["snapshot", "recording", "scene"]
 Role = Literal["restored", "processes", "last bits", "next commands"]
 """Reason for which a snapshot may be restored in a runner with another value of an option.
@@ -186,9 +184,9 @@ class RunnerKeywords:
         bool,
         option("snapshot", "recording", "scene", flag="Robots have no collision shapes: faster, for free motion only."),
     ] = True
-    """Default True. With False robots have no collision shapes, and there is no ground: for free motion only. Masses,
-    inertias and joint limits stay. A :class:`batchpid.sim.MissedContactWarning` says which robots would have touched
-    something."""
+    """Robots have collision shapes; default True. With False they have none, and there is no ground: for free motion
+    only. Masses, inertias and joint limits stay. A :class:`batchpid.sim.MissedContactWarning` says which robots would
+    have touched something."""
     ground: Annotated[
         bool | None,
         option(
@@ -233,7 +231,7 @@ class RunnerKeywords:
     """``"raise"`` (the default) an error for NaN or infinity in a command or in a pose to reset to, or ``"contain"``
     it: only the env concerned fails."""
     recover: Annotated[bool, option(role="processes")] = True
-    """Default True: replace a worker process that dies or gets stuck, and replay its envs: results are bit-identical to
+    """Replace a worker process that dies or gets stuck, and replay its envs; default True: results are bit-identical to
     an undisturbed run. With False :class:`batchpid.errors.WorkerError` is raised."""
     checkpoint_steps: Annotated[int | None, Field(low=1, high=1e9), option(role="last bits")] = 8000
     """Sim steps between checkpoints, from which a replay starts, by default 8000; None: one replay from the start, for

@@ -223,7 +223,7 @@ def row_checksums(arrays: Mapping[str, Rows]) -> NDArray[np.int64]:
     return sums
 
 
-def attribute_checksum(attributes: Mapping[str, Any]) -> int:
+def attribute_checksum(attributes: Document) -> int:
     """Return the CRC-32 of all ``attributes`` but the checksum."""
     values = {name: np.asarray(value).tolist() for name, value in attributes.items() if name != "checksum"}
     return zlib.crc32(json.dumps(values, sort_keys=True).encode())
@@ -259,7 +259,7 @@ def _attributes(info: RunInfo, num_envs: int, tick: float) -> Document:
     return known | {"checksum": attribute_checksum(known)}
 
 
-def _info(attributes: Mapping[str, Any]) -> RunInfo:
+def _info(attributes: Document) -> RunInfo:
     """Return the :class:`RunInfo` in the attributes of a recording."""
     if (found := str(attributes.get("format", FORMAT))) != FORMAT:
         raise ValueError(f"its format is {found!r}, not {FORMAT!r}")

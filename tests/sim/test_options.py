@@ -6,9 +6,11 @@ import ast
 import dataclasses
 import inspect
 import pickle
+import re
 import sys
 from dataclasses import fields
 from itertools import pairwise
+from pathlib import Path
 from typing import get_type_hints
 
 import numpy as np
@@ -69,6 +71,17 @@ def test_every_option_is_documented_where_it_is_declared():
     pairs = {one.target.id: next_one for one, next_one in pairwise(body) if isinstance(one, ast.AnnAssign)}
     assert pairs.keys() == {each.name for each in fields(RunnerKeywords)}
     assert not [name for name, text in pairs.items() if not isinstance(text, ast.Expr)]
+
+
+def test_commands_and_recordings_take_switches_from_their_declaration():
+    """Adding one touches the record, and the place where it acts."""
+    switches = [each.name for each in fields(RunnerKeywords) if isinstance(each.default, bool)]
+    assert {"collisions", "recover"} <= {*switches}
+    root = Path(inspect.getfile(RunnerKeywords)).parent
+    texts = {path.name: path.read_text() for folder in ("cli", "recording") for path in (root / folder).glob("*.py")}
+    assert {"rollout.py", "recording_files.py"} <= texts.keys()
+    named = [(path, name) for path, text in texts.items() for name in switches if re.search(rf"\b{name}\b", text)]
+    assert named == []
 
 
 def test_an_option_without_a_field_in_recordings_is_kept_among_their_options(tmp_path, monkeypatch):
