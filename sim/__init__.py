@@ -46,7 +46,9 @@ from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContact, MissedContactWarning
 
 if TYPE_CHECKING:
+    from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
     from batchpid.sim.engine.physics import MujocoSolver, Physics
+    from batchpid.sim.robot.urdf_export import to_urdf
     from batchpid.sim.runner import Runner
     from batchpid.sim.tuning.sweep import sweep
     from batchpid.sim.workers.pool import RecoveryWarning
@@ -85,6 +87,8 @@ __all__ = [
     "Uniform",
     "read_recording",
     "sweep",
+    "to_mjcf",
+    "to_urdf",
     "write_recording",
 ]
 
@@ -94,6 +98,8 @@ _LOADED_LATE = {
     "Runner": "batchpid.sim.runner",
     "RecoveryWarning": "batchpid.sim.workers.pool",
     "sweep": "batchpid.sim.tuning.sweep",
+    "to_mjcf": "batchpid.sim.engine.mujoco.mjcf_export",
+    "to_urdf": "batchpid.sim.robot.urdf_export",
 }
 
 

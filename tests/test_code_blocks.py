@@ -35,8 +35,7 @@ SHORTER = {
     "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
     "rollout": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
     "excite": ["--duration", "1"],
-    "parity": ["--moves", "1", "--seconds", "0.1", "--workers", "0"],
-    "compare": ["--moves", "1", "--workers", "0", "--seconds", "0.1"],
+    "compare": ["--moves", "1", "--workers", "0", "--seconds", "0.1", "--engine", "mujoco"],
     "view": ["--num-envs", "2", "--workers", "0", "--time-limit", "0.1", "--port", "8765"],
 }
 MJCF = """<mujoco>
@@ -53,10 +52,13 @@ TWO_JOINTS = robot(*map(link, "abc"), joint("one", "a", "b"), joint("two", "b", 
 ON_TWO_JOINTS = ("docs/sim-to-real.md",)  # a fit of all joints of the panda is slow
 RARE = {
     # pages whose blocks seldom change and take seconds: slow
-    "python": ("docs/sim-to-real.md", "docs/runner.md", "docs/controllers.md", "docs/view.md", "docs/task-space.md"),
+    "python": (
+        *("docs/sim-to-real.md", "docs/runner.md", "docs/controllers.md", "docs/view.md", "docs/task-space.md"),
+        *("docs/moving-setpoints.md", "docs/it-does-not-settle.md"),
+    ),
     "sh": ("docs/two-engines.md", "docs/view.md", "docs/deploy.md", "docs/sim-to-real.md"),
 }
-ONLY_PARSED = ("tune", "identify", "render", "survey")
+ONLY_PARSED = ("tune", "identify", "render", "survey", "parity")
 
 
 def name(page: Path) -> str:

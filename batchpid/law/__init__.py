@@ -1,1 +1,6 @@
-"""The PID law: params, state, coefficients and one pure step."""
+"""The PID law: params, state, coefficients and one pure step; gains per inertia with a robot's mass matrix."""
+
+from batchpid.law.computed_torque import advance_with_mass_matrix, check_gain_units, convert_integral, per_inertia
+from batchpid.law.implicit import as_explicit
+
+__all__ = ["advance_with_mass_matrix", "as_explicit", "check_gain_units", "convert_integral", "per_inertia"]

@@ -28,6 +28,7 @@ from batchpid.motors.actuator_dynamics import (
 from batchpid.motors.actuator_files import dumps_actuators, load_actuators, loads_actuators, save_actuators
 from batchpid.motors.actuator_state import ActuatorState
 from batchpid.motors.actuators import DRIVEN, JOINT_SIDE, Actuators, check_actuators, make_actuators
+from batchpid.motors.coupling import Coupling, Follower
 
 __all__ = [
     "DRIVEN",
@@ -35,6 +36,8 @@ __all__ = [
     "STAGES",
     "ActuatorState",
     "Actuators",
+    "Coupling",
+    "Follower",
     "MotorCoefficients",
     "Stages",
     "advance_effort",

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from batchpid.sim.identification.columns import Reading
     from batchpid.sim.identification.confidence_region import Region, draw_motors, read_region
     from batchpid.sim.identification.effort_ratios import measured_motors
-    from batchpid.sim.identification.excitation import excite
+    from batchpid.sim.identification.excitation import excite, is_feasible
     from batchpid.sim.identification.held_out import held_out_error
     from batchpid.sim.identification.identification import identify
     from batchpid.sim.identification.log import Log, LogWarning
@@ -27,6 +27,7 @@ __all__ = [
     "excite",
     "held_out_error",
     "identify",
+    "is_feasible",
     "logs_of_rollout",
     "measured_motors",
     "read_logs",
@@ -37,7 +38,7 @@ _MODULES = {
     "columns": ("Reading",),
     "confidence_region": ("Region", "draw_motors", "read_region"),
     "effort_ratios": ("measured_motors",),
-    "excitation": ("excite",),
+    "excitation": ("excite", "is_feasible"),
     "held_out": ("held_out_error",),
     "identification": ("identify",),
     "log": ("Log", "LogWarning"),

@@ -150,28 +150,6 @@ def test_sapien_orders_the_joints_as_the_file_does(name: str, world: World) -> N
     np.testing.assert_allclose([joint.damping for joint in world.joints], DAMPING[name], rtol=1e-6)
 
 
-def test_sapien_orders_joints_breadth_first(tmp_path: Path) -> None:
-    # The rule that assets/README.md states, on an uneven tree with a fixed joint, listed out of order.
-    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
-    links = "".join(f'<link name="{link}">{inertial}</link>' for link in "gfedcba")
-    kinds = {
-        "ef": "prismatic",
-        "ab": "revolute",
-        "ac": "revolute",
-        "ce": "revolute",
-        "bd": "fixed",
-        "dg": "revolute",
-    }
-    joints = "".join(
-        f'<joint name="{pair}" type="{kind}"><parent link="{pair[0]}"/><child link="{pair[1]}"/>'
-        '<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
-        for pair, kind in kinds.items()
-    )
-    world = World(etree.fromstring(f'<robot name="tree">{links}{joints}</robot>'), tmp_path)
-    assert [joint.name for joint in world.robot.get_joints()][1:] == ["ab", "ac", "bd", "ce", "dg", "ef"]
-    assert [joint.name for joint in world.joints] == ["ab", "ac", "ce", "dg", "ef"]
-
-
 def test_the_total_mass_is_that_of_the_source_and_no_link_is_massless(name: str, world: World) -> None:
     masses = [link.mass for link in world.robot.links]
     assert sum(masses) == pytest.approx(MASS[name], abs=1e-6)

@@ -55,31 +55,6 @@ joints:
     assert actuators.limit_efforts[0].tolist() == [[3, 4, 4], [np.inf] * 3, [5, 6, 7]]
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("format: batchpid-params-1\njoints: {a: {kp: 1}}", "holds no actuators"),
-        ("format: batchpid-actuators-1\njoints: {a: {kp: 1}}", "kp, joint 'a': unknown option"),
-        ("format: batchpid-actuators-1\njoints: {a: {strength: strong}}", "strength, joint 'a': is 'strong'"),
-        ("format: batchpid-actuators-1\njoints: {a: {strength: -1}}", "strength, joint 'a': must be finite and >= 0"),
-        ("format: batchpid-actuators-1\njoints: {b: {}}", r"unknown joints \['b'\]"),
-        ("format: batchpid-actuators-1\njoints: {a: [1]}", "must map options"),
-        ("format: batchpid-actuators-1\nseed: soon\njoints: {a: {}}", "seed: must be a whole number"),
-        ("format: batchpid-actuators-1\njoints: {a: {position_limit: [1, 2]}}", "two lists of as many numbers"),
-        ("format: batchpid-actuators-1\njoints: {a: {position_limit: [[0], [1, 2]]}}", "two lists of as many numbers"),
-        ("format: batchpid-actuators-1\njoints: {a: {position_limit: [[1, 0], [1, 2]]}}", "do not ascend"),
-        ("- 1", "holds no actuators"),
-        ("format: [", "cannot be read"),
-    ],
-)
-def test_bad_files_are_refused_by_file_joint_and_key(text, said, tmp_path):
-    path = tmp_path / "bad.yaml"
-    path.write_text(text)
-    with pytest.raises(bp.InvalidArgumentError, match=said) as caught:
-        bp.load_actuators(path, ["a"])
-    assert str(path) in str(caught.value)
-
-
 def test_limits_by_position_that_differ_from_env_to_env_are_in_no_file(tmp_path):
     efforts = np.arange(1.0, 13.0).reshape(2, 2, 3)
     both = bp.make_actuators(2, position_limit=([0.0, 1.0, 2.0], efforts))

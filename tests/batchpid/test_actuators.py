@@ -9,35 +9,6 @@ from batchpid.errors import InvalidArgumentError
 DT = 1 / 2000
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"strength": -0.1}, "strength, joint 0: must be finite and >= 0"),
-        ({"strength": [1, np.nan, 1]}, "strength, joint 1"),
-        ({"command_delay": 1.5}, "command_delay, joint .*: out of range"),
-        ({"sensor_delay": -1e-3}, "sensor_delay"),
-        ({"sensor_delay": 0.01, "max_delay": 0.005}, "sensor_delay: out of range"),
-        ({"static": 0.1, "coulomb": [0.1, 0.2, 0.0]}, "static, joint 1: is less than coulomb"),
-        ({"position_limit": [1.0, 2.0, 3.0]}, "position_limit: must be a pair"),
-        ({"position_limit": ([0.0, 1.0], [1.0, 2.0, 3.0])}, "2 positions and 3 efforts"),
-        ({"position_limit": ([1.0, 0.0], [1.0, 2.0])}, "do not ascend"),
-        ({"position_limit": ([0.0, 1.0], [1.0, np.inf])}, "not finite"),
-        ({"seed": -1}, "seed: out of range"),
-        ({"saturation_effort": 10.0}, "no_load_speed: is missing"),
-        ({"no_load_speed": 10.0}, "saturation_effort: is missing"),
-        ({"saturation_effort": 0.0, "no_load_speed": 1.0}, "saturation_effort, joint 0: must be > 0"),
-        ({"armature": np.inf}, "armature"),
-        ({"coulomb": np.ones((2, 2))}, "coulomb: has shape"),
-        ({"stribeck": 0.1, "coulomb": 0.2}, "stribeck: has no effect without static"),
-        ({"load_friction": 1.1}, "load_friction, joint 0: out of range"),
-        ({"bias": "much"}, "bias: cannot be read"),
-    ],
-)
-def test_bad_input_is_refused(options, message):
-    with pytest.raises(InvalidArgumentError, match=message):
-        bp.make_actuators(3, **options)
-
-
 def test_a_neutral_value_is_off():
     actuators = bp.make_actuators(2, command_delay=0.0, strength=1.0, bias=0.0, effort_limit=np.inf, armature=0.0)
     assert all(leaf is None for leaf in actuators)
@@ -78,17 +49,6 @@ def test_a_longer_delay_in_flight_keeps_the_history():
     for step in range(7, 12):
         state, effort = bp.motors.deliver(long, state, q + step, q, q, DT)
     assert effort == 7.0
-
-
-def test_a_history_that_is_long_enough_from_the_start_knows_everything():
-    short = bp.make_actuators(1, command_delay=2 * DT, max_delay=4 * DT)
-    long = short.replace(command_delay=4 * DT)
-    q = np.zeros((1, 1))
-    state = bp.motors.init(short, q, DT)
-    for step in range(6):
-        state, _ = bp.motors.deliver(short, state, q + step, q, q, DT)
-    assert bp.motors.deliver(long, state, q + 6, q, q, DT)[1] == 2.0
-    assert float(short.replace(command_delay=0.5, max_delay=None).max_delay[0, 0]) == 0.5
 
 
 def test_a_time_step_far_shorter_than_the_delay_is_refused():

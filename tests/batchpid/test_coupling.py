@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from batchpid.motors.coupling import Coupling, Follower
+from batchpid.motors import Coupling, Follower
 
 NUMBER = st.floats(-3, 3, allow_subnormal=False)
 

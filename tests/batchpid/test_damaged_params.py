@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid.law.params import FIELDS
 
 NAMES = ["shoulder", "elbow"]
 PARAMS = bp.make_params(
@@ -53,8 +52,8 @@ def flips(folder, suffix, count, seed):
 
 
 @pytest.mark.parametrize("suffix", ["yaml", "json"])
-def test_60_flipped_bits(suffix, tmp_path):
-    flips(tmp_path, suffix, 60, seed=0)
+def test_40_flipped_bits(suffix, tmp_path):
+    flips(tmp_path, suffix, 40, seed=0)
 
 
 @pytest.mark.slow
@@ -66,20 +65,20 @@ def test_1000_flipped_bits(suffix, tmp_path):
 @pytest.mark.parametrize("suffix", ["yaml", "json"])
 def test_texts_cut_short(suffix):
     whole = bp.dumps_params(PARAMS, NAMES, format=suffix)
-    for length in range(0, len(whole), 17):
+    for length in range(0, len(whole), 29):
         check(whole[:length])
 
 
 ODD = st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5) | st.sampled_from([10**400, "inf"])
 VALUES = ODD | st.lists(ODD, max_size=3) | st.dictionaries(st.text(max_size=2), ODD, max_size=2)
+OPTIONS = st.sampled_from(bp.PIDParams._fields)
 DOCUMENTS = st.fixed_dictionaries(
     {
         "format": st.just("batchpid-params-1") | VALUES,
         "joints": VALUES
         | st.dictionaries(
             st.sampled_from(NAMES) | st.text(max_size=3),
-            VALUES
-            | st.dictionaries(st.sampled_from(list(FIELDS)), VALUES, max_size=4).map(lambda some: {"kp": 1.0} | some),
+            VALUES | st.dictionaries(OPTIONS, VALUES, max_size=4).map(lambda some: {"kp": 1.0} | some),
             max_size=3,
         ),
     },
@@ -92,7 +91,7 @@ DOCUMENTS = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(DOCUMENTS)
 def test_any_document_is_refused_or_valid(document):
     check(json.dumps(document))

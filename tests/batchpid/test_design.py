@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid import spectral_radius, stability_bound
-from batchpid.errors import InvalidArgumentError
-from batchpid.gains.design import FILTER_SHARE, FILTER_STEPS, pid_from_inertia
+from batchpid.gains import pid_from_inertia
 from batchpid.metrics import step_metrics
 
 DT = 1 / 2000
@@ -81,7 +80,7 @@ def test_designed_gains_are_stable_at_every_pose(seed, units):
     assert stability_bound(mass, kp * scale, kd * scale, DT, filter_time=tau).ratio.max() <= 0.5 + 1e-9
     assert (spectral_radius(mass, kp * scale, ki * scale, kd * scale, DT, filter_time=tau) < 1).all()
     w = np.sqrt(kp / (np.diagonal(robot.mass, axis1=1, axis2=2).max(0) if units == "effort" else 1.0))
-    assert (tau <= np.maximum(FILTER_SHARE / w, FILTER_STEPS * DT) * 1.01).all()
+    assert (tau <= np.maximum(0.3 / w, 4 * DT) * 1.01).all()
 
 
 def test_a_step_settles_within_two_periods_without_overshoot():
@@ -98,28 +97,6 @@ def test_a_step_settles_within_two_periods_without_overshoot():
     assert (m.settling_time < 2 / 2.0 + 0.05).all()
     assert (m.overshoot < 1e-3).all()
     assert (m.steady_state_error < 1e-3).all()
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("bandwidth_hz", {"bandwidth_hz": 0.0}),
-        ("damping_ratio", {"damping_ratio": -1.0}),
-        ("margin", {"margin": 1.5}),
-        ("dt", {"dt": 0.0}),
-        ("gain_units", {"gain_units": "torque"}),
-        ("load", {"load": -1.0}),
-        ("load", {"load": 1.0, "gain_units": "inertia"}),
-        ("discretization", {"discretization": "tustin"}),
-        ("discretization", {"discretization": "implicit"}),
-        ("mass_matrix", {}),
-    ],
-)
-def test_bad_arguments_are_named(name, options):
-    robot = Chain(-np.eye(2)[None]) if not options else random_chain(0)
-    with pytest.raises(InvalidArgumentError) as caught:
-        bp.design_gains(robot, **options)
-    assert caught.value.argument == name
 
 
 def test_the_implicit_law_keeps_the_bandwidth_at_any_time_step():

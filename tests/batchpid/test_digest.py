@@ -46,26 +46,6 @@ VALUES = st.recursive(
     max_leaves=8,
 )
 GAINS = st.lists(st.integers(0, 5).map(float), min_size=3, max_size=3)
-PARAMS = st.fixed_dictionaries(
-    {"kp": GAINS},
-    optional={
-        "ki": GAINS,
-        "kd": GAINS,
-        "effort_limit": st.sampled_from([5.0, [5.0, 6.0, 7.0]]),
-        "effort_rate_limit": st.just(900.0),
-        "derivative_filter_time": st.just(0.01),
-        "setpoint_weight": st.just(0.7),
-        "deadband": st.just(0.3),
-        "anti_windup": st.sampled_from(["none", "conditional", ["none", "conditional", "none"]]),
-        "integration": st.just("integrate_first"),
-        "weight_origin": st.just("start"),
-        "non_finite": st.sampled_from(["zero", "hold"]),
-        "measurement_rate": st.just("measured"),
-        "gain_units": st.sampled_from(["inertia", "mass_matrix"]),
-        "continuous": st.sampled_from([True, [True, False, False]]),
-        "dtype": st.sampled_from(["float32", "float64"]),
-    },
-)
 
 
 def described(value: Any) -> str:
@@ -84,14 +64,6 @@ def described(value: Any) -> str:
 @given(VALUES, VALUES)
 def test_digests_are_equal_if_and_only_if_the_content_is(one, two):
     assert (digest(one) == digest(two)) == (described(one) == described(two))
-
-
-@settings(max_examples=25)
-@given(PARAMS, PARAMS)
-def test_params_that_differ_in_a_leaf_have_other_digests(one, two):
-    first, second = bp.make_params(3, **one), bp.make_params(3, **two)
-    assert (digest(first) == digest(second)) == (described(first) == described(second))
-    assert digest(first) == digest(bp.make_params(3, **one))
 
 
 @settings(max_examples=25)
@@ -125,16 +97,6 @@ def test_values_do_not_run_into_each_other():
     parts = [(Pair("ab", "c"),), (Other("ab", "c"),), (Record("ab", "c"),)]
     alike = [*texts, *parts, (1,), (1.0,), (True,), (0.0,), (-0.0,), (None,), ()]
     assert len({digest(*values) for values in alike}) == len(alike)
-
-
-def test_digest_is_the_same_in_another_process():
-    make = (
-        "bp.make_params(2, kp=[3.0, 1.0], gain_units='inertia', non_finite='hold'), {'b': {'x', 'y', 'z'}, 'a': None}"
-    )
-    program = f"import batchpid as bp; from batchpid.arrays.digest import digest; print(digest({make}))"
-    environment = {"PYTHONPATH": ":".join(filter(None, sys.path)), "PYTHONHASHSEED": "7"}
-    out = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == digest(*eval(f"({make})"))
 
 
 @pytest.mark.parametrize("value", [object(), len, np.array([object()]), np.zeros(2, "f8, f4"), np.longdouble(1), int])
@@ -214,23 +176,18 @@ KINDS = [
 CONTROLLERS = st.tuples(st.sampled_from(KINDS), st.integers(0, 9).map(lambda number: number / 8))
 
 
-@settings(max_examples=60)
+@settings(max_examples=80)
 @given(CONTROLLERS, CONTROLLERS)
 def test_objects_have_equal_digests_if_and_only_if_they_act_alike(one, two):
     first, second = (object_digest(SCRIPT["made"](*each)) for each in (one, two))
     assert (first == second) == (one == two)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_each_kind_of_attribute_counts(kind):
-    assert object_digest(SCRIPT["made"](kind, 0.5)) == object_digest(SCRIPT["made"](kind, 0.5))
-    assert object_digest(SCRIPT["made"](kind, 0.5)) != object_digest(SCRIPT["made"](kind, 0.25))
-
-
-def test_objects_have_the_same_digest_in_another_process():
-    ours = [object_digest(SCRIPT["made"](kind, 0.5)) for kind in KINDS]
-    program = f"from batchpid.arrays.digest import object_digest\n{PROGRAM}\nfor kind in {KINDS}:\n"
-    program += "    print(object_digest(made(kind, 0.5)))"
+def test_digests_are_the_same_in_another_process():
+    make = "bp.make_params(2, [3.0, 1.0], non_finite='hold'), {'b': {'x', 'y', 'z'}, 'a': None}"
+    ours = [digest(*eval(f"({make})")), *(object_digest(SCRIPT["made"](kind, 0.5)) for kind in KINDS)]
+    program = "import batchpid as bp; from batchpid.arrays.digest import digest, object_digest\n"
+    program += f"{PROGRAM}\nprint(digest({make}))\nfor kind in {KINDS}:\n    print(object_digest(made(kind, 0.5)))"
     environment = {"PYTHONPATH": ":".join(filter(None, sys.path)), "PYTHONHASHSEED": "7"}
     out = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
     assert out.stdout.split() == ours

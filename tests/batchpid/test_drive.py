@@ -34,7 +34,7 @@ def test_integral_action_removes_the_sag_under_load(ki):
     params = bp.make_params(1, 30.0, ki, 8.0, effort_limit=50.0, anti_windup="conditional")
     x, v = np.zeros((1, 1)), np.zeros((1, 1))
     state, setpoint = bp.init(params, x), np.ones((1, 1))
-    for _ in range(3000):
+    for _ in range(1200):
         state, target = bp.drive_target(params, state, setpoint, x, DT, measurement_rate=v)
         v = (v + DT * (30.0 * (target - x) - 9.81)) / (1 + 8.0 * DT + 30.0 * DT**2)
         x = x + v * DT

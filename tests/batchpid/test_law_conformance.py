@@ -42,7 +42,9 @@ def by_jax(params, inputs):
 def by_controller(params, inputs, backend="numpy"):
     pid = bp.BatchPID(params, inputs.setpoint.shape[1], DT, backend)
     rows = zip(*(x if x is not None else [None] * len(inputs.setpoint) for x in inputs), strict=True)
-    return np.array([pid(*(None if x is None else x.astype(params.dtype) for x in row)) for row in rows], float)
+    efforts = np.array([pid(*(None if x is None else x.astype(params.dtype) for x in row)) for row in rows])
+    assert efforts.dtype == params.dtype
+    return efforts.astype(float)
 
 
 def by_numpys_controller(params, inputs):

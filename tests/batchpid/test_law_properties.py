@@ -51,16 +51,15 @@ def test_effort_stays_within_its_limits_and_rate(case, run):
 
 
 @pytest.mark.parametrize("strategy", ["clamp", "conditional", "back_calculation"])
-@given(seeds)
-@settings(max_examples=3)
+@pytest.mark.parametrize("seed", range(2))
 def test_the_integral_is_bounded_by_anti_windup(strategy, seed):
     """For an error of any duration, by the limits and the other terms."""
-    rng, envs = np.random.default_rng(seed), 16
+    rng, envs = np.random.default_rng(seed), 40
     kp, ki, limit = rng.uniform(0, 10, (envs, 1)), rng.uniform(0.1, 50, (envs, 1)), rng.uniform(0.1, 10, (envs, 1))
     params = bp.make_params(1, kp, ki, effort_limit=limit, anti_windup=strategy)
     free = bp.make_params(1, kp, ki, effort_limit=limit)
-    r, y = rng.uniform(-3, 3, (2, 1000, envs, 1))
-    r[:500] = np.abs(r[:500]) + 4
+    r, y = rng.uniform(-3, 3, (2, 300, envs, 1))
+    r[:200] = np.abs(r[:200]) + 4
     bounded, wound_up = (np.max([np.abs(s.integral) for s in roll(p, r, y)[0]], axis=0) for p in (params, free))
     time = 0.0 if params.tracking_time is None else params.tracking_time
     most = {
@@ -69,7 +68,7 @@ def test_the_integral_is_bounded_by_anti_windup(strategy, seed):
         "back_calculation": limit + 10 * (kp + ki * (time + DT)),
     }
     assert (bounded <= most[strategy] * (1 + 1e-9)).all()
-    assert (wound_up > 500 * ki * DT).all()
+    assert (wound_up > 200 * ki * DT).all()
 
 
 @given(cases, runs, seeds)
@@ -183,7 +182,7 @@ def test_a_change_of_ki_is_bumpless(run, ki):
     assert before.tobytes() == after.tobytes()
 
 
-@pytest.mark.parametrize("turns", [-2, -1, 0, 1, 3])
+@pytest.mark.parametrize("turns", [-2, 1])
 @pytest.mark.parametrize(
     "options",
     [{"kd": 0.5}, {"kd": 0.5, "setpoint_weight": 0.3, "setpoint_weight_derivative": 0.8}, {"setpoint_weight": 0.3}],
@@ -229,15 +228,6 @@ def test_recovery_from_saturation_overshoots_less_with_anti_windup():
     assert max(others) < 0.7 * without
 
 
-def test_the_first_step_has_no_derivative_kick():
-    y = np.full((1, 1), 5.0)
-    for options in ({}, {"setpoint_weight_derivative": 1.0}):
-        params = bp.make_params(1, 0.0, 0.0, 1.0, **options)
-        assert bp.step(params, bp.init(params, y), y + 3, y, DT)[1] == 0
-    kick = bp.make_params(1, 0.0, 0.0, 1.0, setpoint_weight_derivative=1.0, first_derivative="kick")
-    assert bp.step(kick, bp.init(kick, y), y + 3, y, DT)[1] == pytest.approx(3 / DT)
-
-
 @given(cases, runs, npst.arrays(bool, ENVS), st.booleans())
 @settings(max_examples=25)
 def test_reset_restarts_the_masked_envs_alone(case, run, mask, keep):
@@ -276,14 +266,6 @@ def test_arguments_are_neither_written_to_nor_kept(case, run):
     assert np.array_equal(terms.unsaturated, expected.unsaturated)
 
 
-@pytest.mark.parametrize("dt", [0, 0.0, -1e-3, math.nan, math.inf])
-def test_a_time_step_that_is_not_positive_and_finite_is_refused(dt):
-    params = bp.make_params(1, 1.0)
-    y = np.zeros((1, 1))
-    with pytest.raises(bp.InvalidArgumentError, match="dt: must be positive"):
-        bp.step(params, bp.init(params, y), y, y, dt)
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_decayed_filters_never_hold_denormal_numbers(dtype):
     params = bp.make_params(
@@ -300,8 +282,48 @@ def test_decayed_filters_never_hold_denormal_numbers(dtype):
     zero, one = np.zeros((1, 1), dtype), np.ones((1, 1), dtype)
     state, _ = bp.step(params, bp.init(params, zero), zero, one, DT)
     tiny = np.finfo(dtype).tiny
-    for _ in range(2_500):
+    state = state._replace(**{name: getattr(state, name) * tiny**0.9 for name in ("derivative", "integral")})
+    for _ in range(400):
         state, _ = bp.step(params, state, one, one, DT)
         for leaf in (state.derivative, state.integral):
             assert leaf == 0 or abs(leaf) >= tiny
     assert abs(state.derivative) < np.sqrt(tiny)
+
+
+# -- Inputs ----------------------------------------------------------------------------------------------------------
+
+Y = np.zeros((4, 3))
+PARAMS = bp.make_params(3, 40.0, 5.0, 2.0, effort_limit=10.0)
+STATE = bp.init(PARAMS, Y)
+
+
+def test_lists_are_arrays():
+    state = bp.init(PARAMS, [[0, 0, 0]] * 4)
+    given = bp.step(PARAMS, state, [1, 1, 1], [[0, 0, 0]] * 4, DT, feedforward=1)
+    same = bp.step(PARAMS, STATE, np.ones((4, 3)), Y, DT, feedforward=np.ones(3))
+    np.testing.assert_array_equal(given[1], same[1])
+    np.testing.assert_array_equal(given[0].integral, same[0].integral)
+    fresh = bp.reset(PARAMS, given[0], Y + 2, [True, False, False, False])
+    np.testing.assert_array_equal(fresh.measurement[:, 0], [2, 0, 0, 0])
+
+
+@pytest.mark.parametrize("dt", [DT, np.float64(DT), np.float32(DT), np.array(DT), np.full((4, 1), DT)])
+def test_the_time_step_does_not_change_the_dtype(dt):
+    params = bp.make_params(3, 40.0, 5.0, 2.0, dtype="float32")
+    y = Y.astype(np.float32)
+    state, effort = bp.step(params, bp.init(params, y), y + 1, y, dt)
+    assert {effort.dtype, *(leaf.dtype for leaf in state.leaves().values())} == {np.dtype(np.float32)}
+
+
+def test_jax_names_them_while_it_traces():
+    jax = pytest.importorskip("jax")
+
+    @jax.jit
+    def step(setpoint, mask):
+        return bp.step(PARAMS, bp.reset(PARAMS, STATE, Y, mask), setpoint, Y, DT)[1]
+
+    assert step(np.ones((4, 3)), np.ones(4, bool)).shape == (4, 3)
+    with pytest.raises(bp.InvalidArgumentError, match=r"^setpoint: has shape"):
+        step(np.ones((4, 2)), np.ones(4, bool))
+    with pytest.raises(bp.InvalidArgumentError, match=r"^mask: must be bools"):
+        step(np.ones((4, 3)), np.ones(4, int))

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
 
 
@@ -126,21 +125,3 @@ def test_statistics_over_envs_leave_out_what_is_undefined():
     assert m.worst().rise_time[0] == np.inf
     assert m.over_envs(np.min).rise_time[0] == 1.0
     assert StepMetrics(*[np.full(shape, np.nan)] * len(figures)).median().iae.shape == (1,)
-
-
-@pytest.mark.parametrize(
-    ("argument", "call"),
-    [
-        ("measurement", lambda: step_metrics(1.0, 0.0, np.zeros((2, 1)))),
-        ("measurement", lambda: step_metrics(1.0, 0.0, np.zeros((1, 1, 1)))),
-        ("dt", lambda: step_metrics(0.0, 0.0, np.zeros((2, 1, 1)))),
-        ("setpoint", lambda: step_metrics(1.0, [0.0, 1.0, 2.0], np.zeros((2, 1, 2)))),
-        ("effort", lambda: step_metrics(1.0, 0.0, np.zeros((2, 1, 2)), effort=np.zeros((3, 1, 2)))),
-        ("saturated", lambda: step_metrics(1.0, 0.0, np.zeros((2, 1, 2)), saturated=np.zeros((2, 1, 2)))),
-        ("band", lambda: step_metrics(1.0, 0.0, np.zeros((2, 1, 1)), band=0.0)),
-    ],
-)
-def test_bad_arguments_are_named(argument, call):
-    with pytest.raises(InvalidArgumentError) as caught:
-        call()
-    assert caught.value.argument == argument

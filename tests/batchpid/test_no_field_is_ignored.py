@@ -12,14 +12,11 @@ from trees import planar
 
 import batchpid as bp
 import batchpid.task_space as ts
-from batchpid.arrays.choices import CHOICES
 from batchpid.errors import InvalidArgumentError
 from batchpid.export import to_c, to_isaac_lab, to_maniskill, to_newton, to_ros2_control
-from batchpid.law.computed_torque import advance_with_mass_matrix, per_inertia
-from batchpid.law.input_checks import DRIVE_LACKS
+from batchpid.law import advance_with_mass_matrix, per_inertia
 from batchpid.motors import guard as guards
-from batchpid.motors.actuators import FIELDS
-from batchpid.sim import Robot
+from batchpid.sim import Robot, to_mjcf
 
 DT, JOINTS = 0.01, ["a", "b", "c"]
 MIXED = ["back_calculation", "conditional", "none"]
@@ -39,6 +36,28 @@ SETPOINT = 4 * np.sin(np.arange(40)[:, None, None] * DT * np.array([9.0, 15.0, 2
 MEASURED = -0.5 * SETPOINT + 0.1 * rng.normal(size=SETPOINT.shape)
 SETPOINT[20, 1, 0] = np.nan
 TURNED = MEASURED + 2 * np.pi * (np.arange(40)[:, None, None] > 7) * [1, 0, 0]
+
+
+PLAIN = bp.make_params(1, 1.0)
+NAMES = {
+    "integration": ("output_first", "integrate_first"),
+    "first_derivative": ("zero", "kick"),
+    "weight_origin": ("zero", "start"),
+    "non_finite": ("propagate", "zero", "hold"),
+    "measurement_rate": ("difference", "measured"),
+    "gain_units": ("effort", "inertia", "mass_matrix"),
+}
+CHOICES = {
+    option: {name: getattr(PLAIN.replace(**{option: name}), option) for name in names}
+    for option, names in NAMES.items()
+}
+IMPLICIT = PLAIN.replace(gain_units="mass_matrix", discretization="implicit").discretization
+CHOICES["discretization"] = {"explicit": None, "implicit": IMPLICIT}
+DRIVE_LACKS = {
+    *("effort_rate_limit", "derivative_filter_time", "setpoint_weight", "setpoint_weight_derivative", "deadband"),
+    "non_finite",
+}
+"""Options of the law that a drive does not have."""
 
 
 def changes(params, choices):
@@ -105,11 +124,11 @@ def test_every_field_of_params_changes_the_efforts_or_is_refused(law):
             assert outcome(LAWS[law], params) != bases[law], label
             tried.add(name)
     without_effect = {"first_derivative", "weight_origin"} if law == "drive" else set()
-    lacking = DRIVE_LACKS.keys() - {"non_finite"} if law == "drive" else set()
+    lacking = DRIVE_LACKS - {"non_finite"} if law == "drive" else set()
     assert tried == set(bp.PIDParams._fields) - without_effect - lacking
 
 
-@pytest.mark.parametrize("name", DRIVE_LACKS)
+@pytest.mark.parametrize("name", sorted(DRIVE_LACKS))
 def test_a_drive_refuses_options_that_it_does_not_have(name):
     value = "hold" if name == "non_finite" else 0.3
     params, y = bp.make_params(1, 4.0, 1.0, 1.0, **{name: value}), np.zeros((1, 1))
@@ -163,7 +182,9 @@ def test_every_field_of_params_is_exported_or_a_difference(target):
         assert not same or {LABELS.get(name, name), PART_OF.get(name)} & listed, label
 
 
-MOTORS = dict.fromkeys(FIELDS, 0.25) | {"no_load_speed": 9.0, "position_limit": ([0.0, 1.0], [5.0, 6.0])}
+OWN = {"limit_positions", "limit_efforts", "continuous", "max_delay", "seed"}
+MOTORS = {name: 0.25 for name in bp.Actuators._fields if name not in OWN}
+MOTORS |= {"no_load_speed": 9.0, "position_limit": ([0.0, 1.0], [5.0, 6.0])}
 PART_OF_MOTORS = {"no_load_speed": "saturation_effort", "limit_positions": "position_limit"}
 PART_OF_MOTORS["limit_efforts"] = "position_limit"
 
@@ -183,8 +204,6 @@ def test_every_field_of_motors_is_exported_or_a_difference(target):
 @pytest.mark.parametrize("line", [{}, {"saturation_effort": 9.0, "no_load_speed": 5.0, "lag": 0.01}], ids=["pid", "dc"])
 def test_every_field_is_in_an_mjcf_or_a_difference(line, tmp_path):
     pytest.importorskip("mujoco")
-    from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
-
     hinge, part_of = Robot.load(write(tmp_path, one_joint())), PART_OF | PART_OF_MOTORS
 
     def exported(params, motors):

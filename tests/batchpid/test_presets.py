@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 import batchpid as bp
 from batchpid.gains import presets
-from batchpid.law.reference import SimplePID
 
 DT = 0.01
 series = st.lists(st.tuples(st.floats(-10, 10), st.floats(-10, 10)), min_size=2, max_size=25)
@@ -33,9 +32,15 @@ def close(a, b):
 
 
 @given(series, gain, gain, gain)
+@settings(max_examples=25)
 def test_tutorial(path, kp, ki, kd):
-    pid = SimplePID(kp, ki, kd)
-    close(run(presets.tutorial(1, kp, ki, kd), path), [pid.compute(r - y, DT) for r, y in path])
+    """SimplePID of SAPIEN's tutorial "Drive Robot with PID Controller": its last error is 0 at the start."""
+    integral, last, expected = 0.0, 0.0, []
+    for r, y in path:
+        integral += (r - y) * DT
+        expected.append(kp * (r - y) + ki * integral + kd * (r - y - last) / DT)
+        last = r - y
+    close(run(presets.tutorial(1, kp, ki, kd), path), expected)
 
 
 @given(
@@ -47,7 +52,7 @@ def test_tutorial(path, kp, ki, kd):
     st.booleans(),
     st.booleans(),
 )
-@settings(max_examples=100)
+@settings(max_examples=40)
 def test_simple_pid(path, kp, ki, kd, limits, on_measurement, differential_on_measurement):
     options = {
         "output_limits": limits,
@@ -92,7 +97,7 @@ def test_simple_pid_in_flight(path, tunings, steps, starting_output, restart, di
 
 
 @given(series, gain, gain)
-@settings(max_examples=50)
+@settings(max_examples=20)
 def test_simple_pid_with_an_error_map_equals_a_continuous_joint_without_d(path, kp, ki):
     """P and I alone: its D spikes, see below."""
     assume(all(abs(math.remainder(r - y, 2 * math.pi)) < math.pi - 1e-6 for r, y in path))
@@ -161,6 +166,7 @@ class ControlToolbox:
     st.sampled_from([0, 0.05, 1.0]),
     st.sampled_from([math.inf, 1.0]),
 )
+@settings(max_examples=25)
 def test_control_toolbox(path, p, i, d, antiwindup, tracking_time, i_max):
     if antiwindup == "back_calculation" and tracking_time == 0 and (math.sqrt(d / i) if d else p / i) < DT:
         return  # there the peer oscillates, or divides by 0: not reproduced
@@ -173,6 +179,7 @@ def test_control_toolbox(path, p, i, d, antiwindup, tracking_time, i_max):
 
 
 @given(series, gain, gain, gain, st.sampled_from([math.inf, 0.05]), st.sampled_from([None, 6.0]))
+@settings(max_examples=25)
 def test_newton(path, kp, ki, kd, integral_max, limit):
     rng = np.random.default_rng(1)
     v, v_d, ff = rng.normal(size=(3, len(path)))
@@ -196,14 +203,6 @@ def test_the_integral_does_not_wind_up_behind_its_clamp():
     assert efforts[-1] == pytest.approx(-1.0)
 
 
-def test_the_tracking_time_is_what_was_given_and_its_default_the_rule():
-    """(control_toolbox #511)"""
-    given = bp.make_params(1, 4.0, 1.0, 9.0, effort_limit=1, anti_windup="back_calculation", tracking_time=0.7)
-    ruled = given.replace(anti_windup="back_calculation")
-    without_d = bp.make_params(1, 4.0, 2.0, effort_limit=1, anti_windup="back_calculation")
-    assert [p.tracking_time.item() for p in (given, ruled, without_d)] == pytest.approx([0.7, 3.0, 2.0])
-
-
 def test_integral_gain_alone_with_back_calculation_is_finite():
     params = bp.make_params(1, 0.0, 5.0, effort_limit=1.0, anti_windup="back_calculation")
     efforts = run(params, [(1.0, 0.0)] * 100 + [(-1.0, 0.0)] * 2)
@@ -220,21 +219,3 @@ def test_a_refused_time_step_and_a_nan_leave_the_state_unchanged():
         bp.step(params, state, y + 1, y, 0.0)
     after, _ = bp.step(params, state, y * math.nan, y, DT)
     assert all(a is b is None or np.array_equal(a, b) for a, b in zip(state, after, strict=True))
-
-
-@pytest.mark.parametrize("name", ["kp", "ki", "kd"])
-def test_negative_gains_are_refused(name):
-    with pytest.raises(bp.InvalidArgumentError, match=f"{name}.*-0.1"):
-        bp.make_params(2, **{"kp": 1.0, name: [1.0, -0.1]})
-
-
-def test_wrong_limits_are_refused_before_anything_changes():
-    """(control_toolbox #554)"""
-    pid = bp.BatchPID(bp.make_params(1, 1.0, 1.0, effort_limit=2.0), 1, DT)
-    pid(1.0, np.zeros((1, 1)))
-    before = pid.params, pid.state
-    with pytest.raises(bp.InvalidArgumentError, match="effort_min"):
-        pid.params = pid.params.replace(effort_min=3.0)
-    with pytest.raises(bp.InvalidArgumentError, match=r"params\.kp"):
-        pid.params = pid.params._replace(kp=np.array([[np.nan]]))
-    assert (pid.params, pid.state) == before

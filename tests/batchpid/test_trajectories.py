@@ -121,27 +121,6 @@ def test_trajectories_can_be_joined_and_held():
         there.then(minimum_jerk([0.0], [1.0], DT, duration=0.1))
 
 
-@pytest.mark.parametrize(
-    ("call", "named"),
-    [
-        (lambda: minimum_jerk([0, 0], [1, 1], DT), "duration"),
-        (lambda: minimum_jerk([0, 0], [1, 1], DT, duration=1.0, max_velocity=1.0), "duration"),
-        (lambda: minimum_jerk([0, 0], [1, 1], DT, max_velocity=[1.0, np.inf]), "max_velocity"),
-        (lambda: minimum_jerk([0, np.nan], [1, 1], DT, duration=1.0), "start, joint 1"),
-        (lambda: minimum_jerk([0, 0], [1, 1, 1], DT, duration=1.0), "target"),
-        (lambda: minimum_jerk(0.0, 1.0, DT, duration=1.0), "target"),
-        (lambda: minimum_jerk([0, 0], [1, 1], 0.0, duration=1.0), "dt"),
-        (lambda: trapezoidal([0, 0], [1, 1], DT, max_velocity=[1, -1], max_acceleration=1), "max_velocity, joint 1"),
-        (lambda: trapezoidal([0, 0], [1, 1], DT, max_velocity=1, max_acceleration=np.inf), "max_acceleration"),
-        (lambda: trapezoidal([0, 0], [1, 1], DT, max_velocity=[1, 1, 1], max_acceleration=1), "max_velocity"),
-        (lambda: trapezoidal(["a"], [1], DT, max_velocity=1, max_acceleration=1), "start"),
-    ],
-)
-def test_bad_input_is_named(call, named):
-    with pytest.raises(InvalidArgumentError, match=named):
-        call()
-
-
 JERK_LIMITS = {"max_velocity": [1.0, 2.0], "max_acceleration": [3.0, 8.0], "max_jerk": 40.0}
 
 

@@ -6,7 +6,6 @@ from robots import load_bundled
 from scripts import load_script
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.engine.physics import PHYSICS
 
 accuracy = load_script("accuracy")
 
@@ -76,7 +75,8 @@ def test_limit_moves_leave_the_limits_of_one_joint(panda):
 @pytest.mark.slow
 def test_free_motion_hardly_depends_on_the_solver(panda):
     errors = accuracy.measure_errors(panda, "free", count=1, seconds=0.1)
-    accurate, *others = (errors[name, "equation of motion"] for name in PHYSICS)
+    accurate, *others = errors.values()
+    assert len(others) >= 2
     for other in others:
         assert 0 < other.rms <= other.largest
         assert other.largest == pytest.approx(accurate.largest, rel=0.05)

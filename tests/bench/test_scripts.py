@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from robots import load_bundled
 from scripts import ROOT, load_script
 
 from batchpid.sim import Robot, Runner, write_recording
+from batchpid.sim.view import LiveSimulation
 
 TESTED = {"accuracy", "circles", "cluster", "draw", "film", "measure", "motions", "newcomer", "scale"}
 TESTED |= {"trajectories", "view"}
@@ -27,8 +29,9 @@ def test_every_script_has_a_test():
     assert {path.stem for path in scripts} == TESTED
 
 
-def test_accuracy(tmp_path, capsys):
+def test_accuracy(tmp_path, monkeypatch, capsys):
     accuracy = load_script("accuracy")
+    monkeypatch.setattr(Robot, "bundled", lambda: ["panda"])
     accuracy.main(accuracy.Options(count=1, seconds=0.02, json=tmp_path / "new" / "accuracy.json"))
     figures = json.loads((tmp_path / "new" / "accuracy.json").read_text())["accuracy"]
     assert {row["motion"] for row in figures} == {"free", "contact", "limit"}
@@ -45,6 +48,7 @@ def test_circles(monkeypatch):
     np.testing.assert_allclose(np.linalg.norm(wanted - center, axis=1), circles.RADIUS)
 
 
+@pytest.mark.slow
 def test_film(tmp_path):
     """Few and short: the gains by hand overshoot, the designed ones do not, and every picture shows robots."""
     film, path = load_script("film"), tmp_path / "new" / "film.gif"
@@ -117,12 +121,13 @@ def test_measure(tmp_path, capsys):
     assert "passive" in out
 
 
-def test_motions(tmp_path, capsys):
+def test_motions(tmp_path, monkeypatch, capsys):
     motions = load_script("motions")
+    monkeypatch.setattr(motions, "REPEATS", 1)
     path = tmp_path / "motions.json"
-    motions.main(motions.Options(num_envs=2, moves=1, ticks=5, rounds=1, json=path))
+    motions.main(motions.Options(("panda",), num_envs=2, moves=1, ticks=5, rounds=1, json=path))
     figures = json.loads(path.read_text())["motions"]
-    assert set(figures) == {"panda", "jaco2"}
+    assert set(figures) == {"panda"}
     assert all(ratio > 0 for robot in figures.values() for variant in robot.values() for ratio in variant.values())
     assert "median" in capsys.readouterr().out
 
@@ -179,7 +184,8 @@ def test_view(monkeypatch, capsys):
     pytest.importorskip("selenium")
     view, page = load_script("view"), Page()
     monkeypatch.setattr(view, "open_browser", lambda options, profile: page)
-    view.main(view.Options("panda", num_envs=1, seconds=1.0, loading=0.0, port=18290))
+    monkeypatch.setattr(view, "LiveSimulation", partial(LiveSimulation, workers=0))
+    view.main(view.Options("panda", num_envs=1, seconds=0.5, loading=0.0, port=18290))
     assert page.url.startswith("http")
     assert "frames/s served" in capsys.readouterr().out
 
@@ -202,7 +208,8 @@ class TestOnRay:
 def test_trajectories(sines, monkeypatch, capsys):
     trajectories = load_script("trajectories")
     monkeypatch.setattr(trajectories, "MOVES", 1)
-    trajectories.Trajectories(("jaco2",), sines=sines).run()
+    monkeypatch.setattr(trajectories, "Runner", partial(Runner, workers=0))
+    trajectories.Trajectories(("jaco2",), engine="mujoco", sines=sines).run()
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 + (4 if sines else 10)
     assert all(line.startswith("jaco2") for line in lines[2:])

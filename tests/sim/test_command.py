@@ -442,7 +442,7 @@ def test_the_recorder_streams_them(arm, tmp_path):
 
 def test_a_labelled_dataset_has_entries(rollout):
     pytest.importorskip("xarray")
-    from batchpid.sim.recording.dataset import to_dataset
+    from batchpid.sim.recording import to_dataset
 
     data = to_dataset(rollout)
     assert data.setpoint.dims == ("time", "env", "entry")
@@ -488,7 +488,7 @@ def test_a_recording_plays_back_with_numbers_by_name(arm, rollout):
 
 
 def test_identification_and_metrics_refuse_such_runs(arm, rollout):
-    from batchpid.sim.identification.logs import logs_of_rollout
+    from batchpid.sim.identification import logs_of_rollout
     from batchpid.sim.tuning import step_response_metrics
 
     with pytest.raises(InvalidArgumentError, match=r"setpoints of x, z, gain <b>, not of joints"):

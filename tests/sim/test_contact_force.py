@@ -8,7 +8,7 @@ from identical import assert_identical
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Recorder, Robot, Runner, read_recording, write_recording
-from batchpid.sim.recording.dataset import to_dataset
+from batchpid.sim.recording import to_dataset
 
 GRAVITY = 9.81
 BALL = '<collision><origin xyz="0 0 -0.3"/><geometry><sphere radius="0.03"/></geometry></collision>'

@@ -15,53 +15,22 @@ from law_cases import OPTIONS
 from trees import planar, states, tree_of
 
 import batchpid as bp
-from batchpid.errors import InvalidArgumentError
 from batchpid.export import to_c, to_c_project
-from batchpid.law.computed_torque import advance_with_mass_matrix, per_inertia
+from batchpid.law import advance_with_mass_matrix, per_inertia
 from batchpid.motors import guard as guards
 from batchpid.task_space import bias, gravity, mass_matrix
-from tests.c_programs import COMPILERS, STRICT, TABLE, compiled
+from tests.c_programs import COMPILERS, STRICT, TABLE, compiled, efforts_in_c
 
 pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 SINGLE = {name: case for name, case in OPTIONS.items() if not name.endswith("per env")}
-# The others run in float32 among the random settings.
-IN_FLOAT32 = ("p", "rate and limits", "kick", "back calculation", "mixed", "continuous", "hold effort", "everything")
 SANITIZED = ("-std=c99", "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 DT = 0.003
 
 
-def program(header: str, inputs: list[tuple[str, int]], prefix: str, kind: str, joints: int) -> str:
-    """Return a program that reads steps from stdin and writes their efforts to stdout."""
-    arrays = "".join(f"  {kind} {name}[{size}];\n" for name, size in inputs)
-    reads = "".join(f"    if (fread({n}, sizeof({kind}), {size}, stdin) != {size}) return 0;\n" for n, size in inputs)
-    arguments = ", ".join(name for name, _ in inputs)
-    return f"""#include <stdio.h>
-#include <string.h>
-{header}
-int main(void) {{
-  {prefix}_state state;
-  {kind} effort[{joints}];
-{arrays}  memset(&state, 0, sizeof state);
-  for (int at = 0;; ++at) {{
-{reads}    if (at == 0) {prefix}_init(&state, measurement);
-    if (at == 60) {prefix}_reset(&state, measurement);
-    {prefix}_step(&state, {arguments}, effort);
-    fwrite(effort, sizeof({kind}), {joints}, stdout);
-  }}
-}}
-"""
-
-
-def efforts_in_c(folder, params, options, columns, *flags, compiler=None):
-    header = to_c(params, DT, **options).text
-    kind = "float" if params.dtype == np.float32 else "double"
-    sizes = [(name, column[0].size) for name, column in columns.items()]
-    text = program(header, sizes, options.get("prefix", "batchpid"), kind, params.num_joints)
-    chosen = {} if compiler is None else {"compiler": compiler}
-    binary = compiled(folder, text, *(flags or ("-std=c99", "-O2")), **chosen)
-    rows = np.concatenate([column.reshape(len(column), -1) for column in columns.values()], axis=1)
-    ran = subprocess.run([binary], input=rows.astype(params.dtype).tobytes(), capture_output=True, check=True)
-    return np.frombuffer(ran.stdout, params.dtype).reshape(-1, params.num_joints)
+def in_c(folder, params, options, columns, *flags, compiler=None):
+    """Return the efforts of the header with these options."""
+    header, prefix = to_c(params, DT, **options).text, options.get("prefix", "batchpid")
+    return efforts_in_c(folder, params, header, columns, *flags, prefix=prefix, compiler=compiler)
 
 
 def efforts_in_numpy(params, columns, guard=None):
@@ -101,26 +70,6 @@ def motion(seed: int, joints: int, dtype, names, steps: int = 100) -> dict[str, 
         root = rng.normal(0, 1, (steps, joints, joints))
         columns["mass_matrix"] = root @ root.transpose(0, 2, 1)
     return {name: column.astype(dtype) for name, column in columns.items()}
-
-
-@pytest.mark.quick_rows(8)
-@pytest.mark.parametrize(
-    ("name", "dtype"),
-    [
-        *((name, np.float64) for name in IN_FLOAT32),
-        *(pytest.param(name, np.float64, marks=pytest.mark.slow) for name in SINGLE if name not in IN_FLOAT32),
-        *((name, np.float32) for name in IN_FLOAT32),
-    ],
-)
-def test_every_option_is_bit_identical(name, dtype, tmp_path):
-    params = bp.make_params(3, **SINGLE[name], dtype=dtype)
-    columns = motion(1, 3, dtype, ("feedforward",))
-    if "non_finite" in SINGLE[name]:
-        columns["measurement"][20:23, 1] = np.nan
-        columns["feedforward"][70, 2] = np.inf
-    expected = efforts_in_numpy(params, columns)
-    assert np.abs(expected[np.isfinite(expected)]).max() > 0.1
-    np.testing.assert_array_equal(efforts_in_c(tmp_path, params, {}, columns), expected)
 
 
 def settings_of_a_law(draw) -> tuple[bp.PIDParams, dict, list[str]]:
@@ -173,13 +122,13 @@ def check_random_settings(folder, data, compiler, steps, *flags):
         columns["measurement"][steps // 3, 0] = np.nan
         columns["setpoint"][steps // 2, -1] = np.inf
     expected = efforts_in_numpy(params, columns, options["guard"])
-    np.testing.assert_array_equal(efforts_in_c(folder, params, options, columns, *flags, compiler=compiler), expected)
+    np.testing.assert_array_equal(in_c(folder, params, options, columns, *flags, compiler=compiler), expected)
 
 
-@pytest.mark.slow
+@pytest.mark.quick_rows(1)
 @pytest.mark.parametrize("compiler", COMPILERS)
 @given(data=st.data())
-@settings(max_examples=10)
+@settings(max_examples=8)
 def test_random_settings_are_bit_identical(tmp_path_factory, compiler, data):
     check_random_settings(tmp_path_factory.mktemp("c"), data, compiler, 100)
 
@@ -200,7 +149,7 @@ def test_sanitizers_find_nothing(tmp_path):
     )
     columns = motion(2, 8, np.float64, ("feedforward",))
     try:
-        found = efforts_in_c(tmp_path, params, {}, columns, *SANITIZED)
+        found = in_c(tmp_path, params, {}, columns, *SANITIZED)
     except subprocess.CalledProcessError as error:
         if "law.c" in str(error.cmd) and error.stderr is None:
             pytest.skip("this compiler has no sanitizer")
@@ -276,19 +225,3 @@ def test_the_project_is_a_program_with_the_laws_efforts(tmp_path):
     columns = {"setpoint": r, "measurement": q, "measurement_rate": v, "feedforward": bias(tree, q, v)}
     columns = {name: column[:, 0] for name, column in columns.items()} | {"mass_matrix": mass_matrix(tree, q)[:, 0]}
     np.testing.assert_allclose(found, efforts_in_numpy(params, columns), rtol=1e-12, atol=1e-12)
-
-
-def test_what_cannot_be_exported_is_an_error():
-    params = bp.make_params(2, kp=1.0)
-    cases = {
-        r"params: are for 2 envs": lambda: to_c(bp.make_params(2, kp=[[1.0, 2.0], [3.0, 4.0]]), DT),
-        r"prefix.* cannot be a name in C": lambda: to_c(params, DT, prefix="a-b"),
-        r"inputs.* lack measurement_rate": lambda: to_c(params.replace(measurement_rate="measured"), DT, inputs=()),
-        r"dt": lambda: to_c(params, 0.0),
-        r"inputs": lambda: to_c(params, DT, inputs=("velocity",)),
-        r"tree: has the joints": lambda: to_c(params, DT, tree=planar()),
-        r"header: unknown file format": lambda: to_c_project(params, DT, header="pid.c"),
-    }
-    for message, call in cases.items():
-        with pytest.raises(InvalidArgumentError, match=message):
-            call()

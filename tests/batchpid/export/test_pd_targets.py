@@ -14,11 +14,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import batchpid as bp
-from batchpid.errors import InvalidArgumentError
-from batchpid.export import to_isaac_lab, to_maniskill, to_newton
-from batchpid.export.pd_drive import EFFECTS
-from batchpid.law.computed_torque import advance_with_mass_matrix
-from batchpid.motors import JOINT_SIDE, envelope, make_actuators
+from batchpid.export import to_isaac_lab, to_maniskill
+from batchpid.law import advance_with_mass_matrix
+from batchpid.motors import envelope, make_actuators
 
 PD = {"measurement_rate": "measured"}
 
@@ -236,39 +234,3 @@ def test_nothing_is_lost_that_is_not_listed(params, target):
         "law": target != "ideal_pd",
     }
     assert {name for name, lost in needed.items() if lost} == listed - {"effort_limit"}
-
-
-EVERY_EFFECT = {name: 0.25 for name in EFFECTS} | {"no_load_speed": 9.0, "position_limit": ([0.0, 1.0], [5.0, 6.0])}
-
-
-ISAAC_JOINT = set(JOINT_SIDE) - {"stribeck", "load_friction"}
-
-
-@pytest.mark.parametrize(
-    ("to", "options", "has"),
-    [
-        (to_isaac_lab, {"model": "implicit"}, ISAAC_JOINT),
-        (to_isaac_lab, {"model": "dc_motor"}, {*ISAAC_JOINT, "saturation_effort"}),
-        (to_maniskill, {}, set()),
-        (to_newton, {}, {"armature", "viscous", "coulomb", "saturation_effort", "position_limit"}),
-    ],
-)
-def test_every_effect_of_motors_and_sensors_is_written_or_listed(to, options, has):
-    params, motors = bp.make_params(3, 1.0, **PD), make_actuators(3, **EVERY_EFFECT)
-    differences = to(params, JOINTS, DT, actuators=motors, **options).differences
-    listed = {each.partition(":")[0] for each in differences} - {"law"}
-    assert listed == {*EFFECTS, "position_limit"} - has
-
-
-def test_bad_requests_are_refused():
-    params = bp.make_params(1, 1.0)
-    for options in (
-        {"model": "dc_motor"},
-        {"model": "net"},
-        {"name": "a b"},
-        {"actuators": make_actuators(2, lag=0.1)},
-    ):
-        with pytest.raises(InvalidArgumentError):
-            to_isaac_lab(params, ["a"], DT, **options)
-    with pytest.raises(InvalidArgumentError):
-        to_maniskill(params, ["a"], DT, name="1")

@@ -275,13 +275,3 @@ def test_what_cannot_be_read_is_refused_by_name(before, after, named):
     text = FILE.replace(before, after)
     with pytest.raises(InvalidArgumentError, match=named):
         from_ros2_control(text, controller="arm_controller" if after == "gain:" else None)
-
-
-def test_params_that_the_target_cannot_hold_are_refused():
-    fixed = bp.make_params(1, 1.0, effort_min=2.0, effort_max=2.0)
-    for params in (bp.make_params(1, 1.0, gain_units="inertia"), bp.make_params(1, [[1.0], [2.0]]), fixed):
-        with pytest.raises(InvalidArgumentError):
-            to_ros2_control(params, ["a"], DT)
-    for inertia in ([0.0], [[1.0, 2.0]], []):
-        with pytest.raises(InvalidArgumentError, match="inertia"):
-            to_ros2_control(bp.make_params(1, 1.0), ["a"], DT, inertia=inertia)

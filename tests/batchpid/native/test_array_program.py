@@ -10,11 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_compiled_law import bits, numbers
 
-import batchpid as bp
 from batchpid.arrays.elementwise import matrix_vector, push_history, read_history, row_minimum, take_columns
-from batchpid.motors import STAGES, delay, friction, guard
-from batchpid.motors import MotorCoefficients as ActuatorCoefficients
-from batchpid.motors.envelope import Envelope
+from batchpid.motors import delay
 from batchpid.native import array_program
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
@@ -142,27 +139,6 @@ def test_results_may_be_written_over_inputs_that_are_read_later():
     assert_identical(out, swap(a, b))
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize(
-    "options", [{}, {"rate": 2.0}, {"acceleration": [30.0, np.inf]}, {"continuous": [True, False]}]
-)
-def test_the_guard_can_be_traced(options, dtype):
-    limits = bp.make_guard(2, lower=-1.0, upper=[1.0, np.inf], **options, dtype=dtype)
-    rng, shape = np.random.default_rng(0), (60, 2)
-    inputs = [numbers(rng, shape, 0.1, dtype) for _ in range(3)]
-    given = [leaf for leaf in limits if leaf is not None]
-
-    def function(*arrays):
-        rest = iter(arrays)
-        mine = guard.Guard(*(None if leaf is None else next(rest) for leaf in limits))
-        state, changed = guard.advance(mine, guard.GuardState(next(rest), next(rest)), next(rest), 1e-3)
-        return [*state, changed]
-
-    program = ArrayProgram(trace(function, len(given), 3, dtype), given, 3, shape, dtype)
-    with np.errstate(all="ignore"):
-        assert_identical(program(*inputs), function(*given, *inputs))
-
-
 @given(SHAPES, st.integers(2, 40), st.booleans(), st.integers(0, 2**32), st.integers(1, 4))
 @settings(max_examples=25)
 def test_histories_are_changed_in_place(shape, samples, is_pair, seed, threads):
@@ -209,40 +185,59 @@ def test_histories_that_do_not_fit_are_refused():
         ArrayProgram(traced, [places], 2, value.shape)(history, history.ravel()[:12].reshape(4, 3))
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("static", [None, 2.0])
-def test_friction_can_be_traced(static, dtype):
-    rng, shape = np.random.default_rng(0), (60, 2)
-    k = [np.full((1, 2), value, dtype) for value in (1.0, 0.1, static) if value is not None]
-    inputs = [*(numbers(rng, shape, 0.1, dtype) for _ in range(6)), (rng.random(shape) < 0.5).astype(dtype)]
-
-    def function(*arrays):
-        rubs, (effort, velocity, *state) = friction.Friction(*arrays[: len(k)]), arrays[len(k) :]
-        new, total = friction.advance(rubs, friction.FrictionState(*state), effort, velocity)
-        return [new.effort, new.sliding, total]
-
-    program = ArrayProgram(trace(function, len(k), 7, dtype), k, 7, shape, dtype)
-    with np.errstate(all="ignore"):
-        assert_identical(program(*inputs), function(*k, *inputs))
+# -- Traces ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stage", STAGES._fields)
-def test_the_stages_of_actuators_can_be_traced(stage):
-    rng, shape = np.random.default_rng(0), (60, 2)
-    names = "intake", "strength", "bias", "play", "position_resolution", "velocity_resolution", "turns"
-    ends = "stall", "reverse", "slope", "limit", "least"
-    values = rng.uniform(0.5, 1.0, (len(names) + 2 * len(ends), 1, 2))
-    inputs = [numbers(rng, shape, 0.1, float) for _ in range({"limits": 2, "play": 3}.get(stage, 4))]
+def test_an_operation_that_programs_do_not_have_is_an_error():
+    with pytest.raises(AttributeError, match="no operation 'arctan'"):
+        trace(lambda a: [a.__array_namespace__().arctan(a)], 0, 1)
 
-    def function(*arrays):
-        k, first, second = (arrays[a:b] for a, b in ((0, 7), (7, 12), (12, 17)))
-        envelopes = {
-            name: Envelope(**dict(zip(ends, each, strict=True)))
-            for name, each in (("envelope", first), ("commands", second))
-        }
-        coefficients = ActuatorCoefficients(**dict(zip(names, k, strict=True)), **envelopes)
-        return getattr(STAGES, stage)(coefficients, *arrays[17:])
 
-    program = ArrayProgram(trace(function, 17, len(inputs)), list(values), len(inputs), shape)
-    with np.errstate(all="ignore"):
-        assert_identical(program(*inputs), function(*values, *inputs))
+def test_a_trace_holds_what_its_results_need_and_no_more():
+    def function(a, b):
+        unused = a * b
+        assert isinstance(unused.__array_namespace__(), Namespace)
+        return [a - b, b]
+
+    noted = trace(function, 1, 1)
+    assert len(noted.operations) == 5 * 4
+    assert np.frombuffer(noted.results, np.int32).tolist() == [2, 1]
+    assert noted.literals == ()
+
+
+def test_literals_of_a_trace_keep_their_sign():
+    assert [repr(number) for number in trace(lambda x: [x + 0.0, x + -0.0, x + 0.0], 0, 1).literals] == ["0.0", "-0.0"]
+
+
+def test_what_depends_on_constants_alone_is_a_prelude():
+    traced = trace(lambda k, x: [x * (1 - k) > 0.5], 1, 1)
+    assert len(traced.operations) == 5 * 4 * 2
+    assert len(traced.prelude.operations) == 5 * 4
+    assert traced.prelude.literals == ()
+    assert traced.masks == (True,)
+
+
+def test_a_branch_on_entries_cannot_be_traced():
+    with pytest.raises(TypeError, match="depend on the entries"):
+        trace(lambda x: [x if x > 0 else -x], 0, 1)
+
+
+def test_a_scalar_that_would_widen_the_result_is_refused():
+    assert trace(lambda x: [x * np.float32(2)], 0, 1).literals == (2.0,)
+    assert trace(lambda x: [x * 0.1], 0, 1, np.float32).literals == (0.1,)
+    with pytest.raises(TypeError, match="float64"):
+        trace(lambda x: [x * np.float64(2)], 0, 1, np.float32)
+
+
+def test_pairs_of_operations_are_one_where_nothing_else_needs_the_first():
+    def count(function):
+        return len(trace(function, 0, 3).operations) // (5 * 4)
+
+    assert count(lambda a, b, c: [a * b + c]) == count(lambda a, b, c: [c + a * b]) == 1
+    assert count(lambda a, b, c: [a * b - c]) == 2
+
+    def both(a, b, c):
+        product = a * b
+        return [product + c, product]
+
+    assert count(both) == 2

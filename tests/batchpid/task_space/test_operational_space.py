@@ -206,30 +206,3 @@ def test_inputs_of_a_step_are_checked(monkeypatch):
     for_three = ts.discretise(ts.make_osc_params(tree, stiffness=np.ones((3, 6))), DT)
     with pytest.raises(InvalidArgumentError, match=r"k\.kp: has rows for 3 envs"):
         ts.osc(for_three, state, ts.Tool(tree, "tip"), inputs)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"stiffness": [1.0, 2.0]}, r"stiffness: has shape \(2,\).*rz"),
-        ({"stiffness": [1, 1, -1, 1, 1, 1]}, "stiffness, .* 'z'"),
-        ({"damping_ratio": np.nan}, "damping_ratio, .* 'x'"),
-        ({"axes": [1, 0, 1, 1, 1, 1]}, "axes: cannot be read as an array of bools"),
-        ({"axes": [True] * 6, "force_axes": [True] + [False] * 5}, "force_axes, entry 'x': is an axis of motion"),
-        ({"posture_stiffness": [1.0] * 3}, "posture_stiffness: has shape .*joint1"),
-        ({"effort_min": 1.0, "effort_max": 0.0}, "effort_min, joint 'joint1': exceeds effort_max"),
-        ({"effort_limit": 1.0, "effort_max": 2.0}, "given together"),
-        ({"smallest_eigenvalue": 0.0}, "smallest_eigenvalue, .*must be finite and > 0"),
-        ({"position_error_limit": -1.0}, "position_error_limit"),
-        ({"decoupling": "half"}, "decoupling: unknown option"),
-        ({"decoupling": "none"}, "damping: is missing"),
-        ({"frame": "body"}, "frame: unknown option"),
-        ({"stifness": 1.0}, "did you mean 'stiffness'"),
-        ({"stiffness": np.ones((3, 6)), "effort_limit": np.ones((2, 2))}, "effort_m.*rows for 2 envs"),
-    ],
-)
-def test_options_are_checked(options, message):
-    with pytest.raises(InvalidArgumentError, match=message):
-        ts.make_osc_params(planar(), **options)
-    with pytest.raises(InvalidArgumentError, match="tree: must be a RigidTree"):
-        ts.make_osc_params("panda")

@@ -177,21 +177,3 @@ def test_a_setpoint_out_of_reach_for_2_s_and_back(name):
     assert np.linalg.norm(errors[1295, 0, :3]) > 0.02
     assert np.abs(np.diff(efforts[800:1295], n=2, axis=0)).max() < 0.01
     assert np.linalg.norm(errors[-1, 0, :3]) < 0.05e-3
-
-
-def test_other_envs_do_not_notice_a_singular_one_or_nan():
-    tree = tree_of("panda")
-    qpos = np.tile(START, (4, 1))
-    qpos[1, [1, 3, 5]] = 0.0, -0.0698, 0.0
-    qpos[2, 4] = np.nan
-    goal = ts.link_poses(tree, np.nan_to_num(qpos), [HAND])[:, 0]
-    goal[:, :3] += [0.05, 0.1, 0.0]
-    params = ts.make_osc_params(tree, effort_limit=80.0)
-    _, efforts, ends = run(tree, HAND, params, qpos, goal, 60, DT)
-    for row in (0, 3):
-        chosen = slice(row, row + 1)
-        _, alone, end = run(tree, HAND, params, qpos[chosen], goal[chosen], 60, DT)
-        np.testing.assert_array_equal(alone, efforts[:, chosen])
-        np.testing.assert_array_equal(end[0], ends[row])
-    assert np.isnan(ends[2]).any()
-    assert np.isfinite(ends[1]).all()

@@ -12,8 +12,8 @@ from disks import fill, limited_file_size, make_read_only, small_disk
 from tiny_urdf import one_joint, write
 
 import batchpid as bp
-from batchpid.io.files import try_writing
 from batchpid.sim import Recorder, Runner, Snapshot, plots, write_recording
+from batchpid.sim.cli import outputs
 from batchpid.sim.cli import run as cli_run
 from batchpid.sim.tuning import robot_survey as surveying
 from batchpid.sim.view import film, renderer
@@ -138,6 +138,8 @@ def test_files_and_folders_without_permission_are_refused_before_the_run(name, c
 def run_while_filling(command, name: str, disk: Path, free: int, monkeypatch) -> int:
     """Run a command on a disk on which ``free`` bytes are left after the trial, and return its exit status."""
     (path := disk / COMMANDS[name][1]).write_text("older")
+
+    try_writing = outputs.try_writing
 
     def try_and_fill(place):
         try_writing(place)

@@ -52,12 +52,6 @@ def test_followers_are_reported_and_refused_with_strict(batchpid, tmp_path):
     assert not (tmp_path / "strict.h").exists()
 
 
-@pytest.mark.parametrize("gains", ["drive", "nobody"])
-def test_gains_without_a_law_are_refused(gains, batchpid, tmp_path):
-    status, _, complaint = batchpid("export", "panda", "--gains", gains, "--out", tmp_path / "a.h")
-    assert (status, complaint.count("\n")) == (2, 1)
-
-
 @pytest.mark.filterwarnings("default:.*effort_limit")
 def test_controllers_of_ros2_control_are_written_and_read(batchpid, tmp_path):
     out = tmp_path / "controllers.yaml"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import io
+import sys
 import warnings
 from functools import cache
 from pathlib import Path
@@ -11,7 +13,7 @@ import pytest
 import tyro
 from test_outputs import OUT, SUFFIXES, WORDS, files, output_flags  # noqa: F401
 
-from batchpid.sim.cli import COMMANDS
+from batchpid.sim.cli import COMMANDS, parse
 from batchpid.sim.cli.progress import bar, waiting
 
 RUNS_ROBOTS = {"demo", "rollout", "tune", "compare", "view"}
@@ -34,12 +36,27 @@ SEVERAL = {("compare", "--gains"), ("compare", "--engine")}
 
 
 @cache
-def flags(command: str) -> dict[str, str]:
-    """Return the flags of a command, with the kind of value that each takes."""
+def actions(command: str) -> list[argparse.Action]:
+    """Return the declared arguments of a command."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         parser = tyro.extras.get_parser(COMMANDS[command], config=(tyro.conf.FlagCreatePairsOff,))
-    return {name: str(action.metavar) for action in parser._actions for name in action.option_strings}
+    return parser._actions
+
+
+def flags(command: str) -> dict[str, str]:
+    """Return the flags of a command, with the kind of value that each takes."""
+    return {name: str(action.metavar) for action in actions(command) for name in action.option_strings}
+
+
+def choices(command: str) -> set[str]:
+    """Return the flags of a command that take one of several words."""
+    return {name for action in actions(command) if action.choices for name in action.option_strings}
+
+
+def aliases(command: str, flag: str) -> list[str]:
+    """Return all names of a flag."""
+    return next([*action.option_strings] for action in actions(command) if flag in action.option_strings)
 
 
 @pytest.mark.parametrize("flag", HAVE)
@@ -70,16 +87,100 @@ def test_an_output_without_a_folder_is_refused_before_the_run(command, flag, fil
     assert not path.parent.exists()
 
 
-@pytest.mark.parametrize("command", sorted(HAVE["--gains"] - {"identify"}))
-def test_misspelled_gains_are_answered_with_the_nearest_name(command, batchpid):
-    status, _, complaint = batchpid(command, "panda", "--gains", "tunned")
+BAD = {"INT": "-1", "FLOAT": "nan", "FILE": "nothing.xyz", "PATH": "nothing.xyz", "LINK": "nothing", "NAME": "nothing"}
+"""Bad value of a flag, by the kind of value that it takes. Any text is good for the other kinds."""
+SHORT = {
+    "demo": ("demo", "--num-envs", 1, "--workers", 0, "--seconds", 0.02),
+    "rollout": ("rollout", "arm.urdf", "--num-envs", 1, "--workers", 0, "--seconds", 0.02),
+    "identify": (*WORDS["identify"], "--gains", "designed"),
+    "view": ("view", "arm.urdf", "--num-envs", 1, "--workers", 0, "--time-limit", 0.1),
+    "render": (*WORDS["render"], "arm.urdf"),
+}
+"""Words of commands, where they are other ones than in WORDS."""
+UNCHECKED = {
+    *(("compare", flag) for flag in ("--moves", "--seed", "--seconds", "--payload", "--friction")),
+    *(("parity", flag) for flag in ("--moves", "--seed", "--seconds")),
+    *(("tune", flag) for flag in ("--payload", "--friction", "--time-limit")),
+    *(("view", flag) for flag in ("--spread", "--time-limit", "--workers")),
+    *(("export", "--timestep"), ("survey", "--workers"), ("identify", "--command-topic")),
+}
+"""Flags whose bad values are not refused yet, or under another name."""
+
+
+def bad_values(command: str) -> list[tuple[str, str, str]]:
+    """Return each flag of a command with a bad value; the command names the flag."""
+    found = []
+    for flag, kind in flags(command).items():
+        bad = "other" if flag in choices(command) else next((BAD[each] for each in BAD if each in kind), None)
+        if bad is not None and (command, flag) not in UNCHECKED:
+            found.append((command, flag, bad))
+    return found
+
+
+@pytest.mark.parametrize(("command", "flag", "bad"), [row for command in COMMANDS for row in bad_values(command)])
+def test_a_bad_value_is_answered_by_the_name_of_its_flag(command, flag, bad, files, batchpid, monkeypatch):  # noqa: F811
+    monkeypatch.chdir(files)
+    before = written(files)
+    status, _, complaint = batchpid(*(WORDS | SHORT)[command], flag, bad)
     assert status == 2
-    assert "gains: is neither a name nor a file (got 'tunned'); did you mean 'tuned'?" in complaint
+    names = {each.strip("-").replace("-", "_") for each in aliases(command, flag)}
+    assert any(name in complaint.replace("-", "_") for name in names) or bad in complaint
+    assert written(files) == before
+
+
+def written(folder: Path) -> set[Path]:
+    """Return the files below a folder."""
+    return {path for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("demo pander", "no robot 'pander'"),
+        ("demo --picture demo.jpg", "picture: unknown file format"),
+        ("rollout --setpoint 1 2", "setpoint: has shape (2,)"),
+        ("rollout --control osc --setpoint 1 2", "setpoint: has shape (2,)"),
+        ("rollout --control osc --gains tuned", "gains: is not a file, and --control osc has no gains by name"),
+        ("rollout --tool panda_hand", "tool: is for control 'osc'"),
+        ("rollout --substeps 0", "substeps: out of range"),
+        ("rollout --resume", "resume: has no file to continue"),
+        ("rollout --resume --out a.npz", "out: unknown file format"),
+        ("rollout --gains tunned", "did you mean 'tuned'?"),
+        ("tune --tool arm", "tool: is for --control osc"),
+        ("tune --control osc --per-joint", "per_joint: is not available with --control osc"),
+        ("tune panda --control osc --tool hand", "link: unknown link"),
+        ("tune nobody", "no robot 'nobody'"),
+        ("tune arm.urdf --population 1", "population: out of range"),
+        ("compare --gains drive:a,b", "DAMPING"),
+        ("compare --gains tuned --picture x.png", "gains: names a single set"),
+        ("compare --engine", "engine: is missing"),
+        ("identify arm.urdf", "logs: are missing"),
+        ("identify arm.urdf run.npz", "fit its setpoints"),
+        ("identify arm.urdf run.npz --evaluations 0", "evaluations: is 0"),
+        ("identify arm.urdf run.npz --actuators a.yaml", "actuators: are not the start of a fit"),
+        ("identify arm.urdf run.npz --evaluations 0 --actuators a.yaml --out b.yaml", "out: is for a fit"),
+        ("identify arm.urdf run.npz --evaluations 0 --actuators a.yaml --extras slew", "extras: is for"),
+        ("export panda --gains drive", "gains: are a drive's"),
+        ("inspect panda2", "'panda2'"),
+        ("survey .", "hold no file *.urdf"),
+        ("plot /dev/null", "/dev/null"),
+        ("plot .", "."),
+        ("view --control", "controls: out of range (got 0)"),
+        ("view --port 99999", "port: out of range (got 99999)"),
+        ("view --num-envs 65", "num_envs: out of range"),
+        ("view --play nothing.npz", "nothing.npz: there is no such file"),
+    ],
+)
+def test_flags_that_contradict_each_other_are_answered_in_one_line(words, message, files, batchpid, monkeypatch):  # noqa: F811
+    if words != "survey .":
+        monkeypatch.chdir(files)
+    status, said, complaint = batchpid(*words.split())
+    assert (status, said, complaint.count("\n")) == (2, "", 1)
+    assert complaint.startswith("batchpid: ")
+    assert message in complaint
 
 
 def test_former_names_of_flags_work():
-    from batchpid.sim.cli import parse
-
     assert parse(["tune", "--search-seconds", "0.5"]) == parse(["tune", "--seconds", "0.5"])
     assert parse(["excite", "--duration", "3"]) == parse(["excite", "--seconds", "3"])
     assert parse(["identify", "--params", "a.yaml"]) == parse(["identify", "--gains", "a.yaml"])
@@ -102,8 +203,6 @@ def test_bars_are_for_terminals_alone(is_terminal, monkeypatch):
     with waiting("building", delay=0.0):
         shown = bar("working", delay=0.0, mininterval=0.0)
         assert list(shown(range(3))) == [0, 1, 2]
-    import sys
-
     written = sys.stderr.getvalue()
     assert ("working" in written) == ("building" in written) == is_terminal
 

@@ -12,7 +12,7 @@ import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.export import to_ros2_control
 from batchpid.sim import Robot, Runner, write_recording
-from batchpid.sim.identification.excitation import excite
+from batchpid.sim.identification import excite
 
 pytest.importorskip("scipy")
 pytest.importorskip("cmaes")
@@ -152,25 +152,6 @@ def test_a_motion_that_nothing_explains_ends_in_an_error_and_no_file(batchpid, t
     before, after = map(float, ERROR.search(said).groups())
     assert after > before
     assert not out.exists()
-
-
-def test_what_is_missing_is_named(batchpid, log, tmp_path):
-    robot, recording, _ = log
-    for words, message in (
-        (("identify", robot), "logs: are missing"),
-        (("identify", robot, recording), "fit its setpoints"),
-        (("identify", robot, recording, "--evaluations", 0), "evaluations: is 0"),
-        (("identify", robot, recording, "--actuators", "motors.yaml"), "actuators: are not the start of a fit"),
-        (("identify", robot, recording, "--evaluations", 0, "--actuators", "a.yaml"), "out: is for a fit"),
-        (
-            ("identify", robot, recording, "--evaluations", 0, "--actuators", "a.yaml", "--extras", "slew"),
-            "extras: is for",
-        ),
-        (("identify", robot, recording, "--gains", "nothing.yaml"), "gains: is neither a name nor a file of gains"),
-    ):
-        status, _, error = batchpid(*words, "--out", tmp_path / "motors.yaml")
-        assert status != 0
-        assert message in error
 
 
 @pytest.mark.filterwarnings("ignore:.*u_clamp")

@@ -117,12 +117,6 @@ def test_gains_are_checked_too(batchpid):
     assert "Under gains tutorial:\nwarning:" in out
 
 
-def test_unknown_robot(batchpid):
-    status, out, err = batchpid("inspect", "panda2")
-    assert (status, out) == (2, "")
-    assert "'panda2'" in err
-
-
 def test_inspects_an_mjcf_file(tmp_path, batchpid):
     pytest.importorskip("mujoco")
     path = tmp_path / "arm.xml"

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tiny_urdf import one_joint, write
 
-import batchpid as bp
-from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner, write_recording
 from batchpid.sim.cli import COMMANDS, parse
-from batchpid.sim.cli.outputs import OutputFiles, beside
 
 SHORT = ("--num-envs", 1, "--workers", 0, "--seconds", 0.02)
 WORDS = {
@@ -46,8 +44,8 @@ def files(tmp_path_factory):
     """A folder with a robot and a recording of it."""
     folder = tmp_path_factory.mktemp("files")
     robot = Robot.load(write(folder, one_joint(), "arm.urdf"))
-    with Runner(robot, 1, workers=0, substeps=2) as runner:
-        rollout = runner.rollout(np.tile(robot.start, (4, 1, 1)))
+    with Runner(robot, 1, workers=0, substeps=10) as runner:
+        rollout = runner.rollout(np.tile(robot.start, (60, 1, 1)))
     write_recording(rollout, folder / "run.npz")
     return folder
 
@@ -112,43 +110,28 @@ def test_the_demo_can_be_repeated_for_another_robot_and_with_force(batchpid, tmp
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"panda-demo.png", "jaco2-demo.png"}
 
 
-def test_a_recording_that_is_not_complete_names_its_picture_as_the_complete_one():
-    assert beside(Path("a/run.2.h5.partial"), "film", ".mp4") == Path("a/run.2-film.mp4")
-
-
-def test_inputs_are_never_replaced_and_no_two_outputs_are_one_file(tmp_path):
+def test_inputs_are_never_replaced_and_no_two_outputs_are_one_file(files, batchpid, tmp_path):
+    arm, recording = files / "arm.urdf", files / "run.npz"
     (path := tmp_path / "motors.yaml").write_text("kept")
     (link := tmp_path / "link.yaml").symlink_to(path)
-    outputs = OutputFiles(force=True, inputs=(None, path))
     for each in (path, link, tmp_path / "." / "motors.yaml"):
-        with pytest.raises(InvalidArgumentError, match="is a file to read"):
-            outputs.path("out", each, (".yaml",))
-    assert outputs.path("out", tmp_path / "a.json", (".json",)) == tmp_path / "a.json"
-    with pytest.raises(InvalidArgumentError, match="is another output of this run"):
-        outputs.path("json", tmp_path / "a.json", (".json",))
+        _, _, complaint = batchpid("identify", arm, path, "--out", each, "--force")
+        assert "out: is a file to read" in complaint
+    _, _, complaint = batchpid("survey", arm, "--json", tmp_path / "a.json", "--out", tmp_path / "a.json", "--force")
+    assert "out: unknown file format" in complaint
+    _, _, complaint = batchpid("identify", arm, recording, "--out", tmp_path / "a.json", "--json", tmp_path / "a.json")
+    assert "json: is another output of this run" in complaint
+    assert {each.name for each in tmp_path.iterdir()} == {"motors.yaml", "link.yaml"}
+    assert path.read_text() == "kept"
 
 
-def test_a_stopped_search_is_neither_lost_nor_continued_unasked(tmp_path):
-    path = tmp_path / "a.search.json"
-    assert OutputFiles(force=False).history(path, resume=True) == path  # nothing to continue yet
-    path.write_text("costs")
-    with pytest.raises(InvalidArgumentError, match=r"exists already.*--resume to continue.*--force to begin anew"):
-        OutputFiles(force=False).history(path, resume=False)
-    assert OutputFiles(force=False).history(path, resume=True).read_text() == "costs"
-    OutputFiles(force=True).history(path, resume=True)
-    assert path.read_text() == "costs"
-    OutputFiles(force=True).history(path, resume=False)
-    assert not path.exists()
-
-
-def test_gains_of_the_user_are_kept_by_tune(files, batchpid, tmp_path):
-    robot = Robot.load(files / "arm.urdf")
-    bp.save_params(path := tmp_path / "gains.yaml", robot.params(kp=3.0), robot.joint_names)
-    before = path.read_bytes()
-    status, _, complaint = batchpid("tune", files / "arm.urdf", "--out", path)
+def test_a_stopped_search_is_neither_lost_nor_continued_unasked(files, batchpid, tmp_path):
+    arm, history = files / "arm.urdf", tmp_path / "a.search.json"
+    history.write_text("costs")
+    status, _, complaint = batchpid("tune", arm, "--out", tmp_path / "a.yaml")
     assert status == 2
-    assert f"out: exists already (got '{path}'); add --force to replace it, or choose another name" in complaint
-    assert path.read_bytes() == before
+    assert re.search(r"exists already.*--resume to continue.*--force to begin anew", complaint)
+    assert history.read_text() == "costs"
 
 
 def test_make_can_repeat_its_runs():

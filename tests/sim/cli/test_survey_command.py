@@ -14,20 +14,18 @@ KEYS = {
 
 def test_prints_a_table_and_writes_the_reports(batchpid, tmp_path):
     write(tmp_path, one_joint(), "arm.urdf")
-    write(tmp_path, "<robot/>", "nothing.urdf")
+    write(tmp_path, "<robot name='table'><link name='top'/></robot>", "scenery.urdf")
     reports, page = tmp_path / "reports.json", tmp_path / "table.md"
-    status, out, _ = batchpid("survey", tmp_path, "--moves", 1, "--seconds", 2.5, "--json", reports, "--out", page)
+    files = ("--json", reports, "--out", page)
+    status, out, _ = batchpid("survey", tmp_path, "--moves", 1, "--seconds", 2.5, "--engine", "mujoco", *files)
     assert status == 0
     assert "1 of 1 files with a moving joint load, 1 get moves, 1 settle on all of them (1 files without" in out
-    arm, nothing = json.loads(reports.read_text())
-    assert set(arm) == set(nothing) == KEYS
-    assert (arm["dof"], arm["settled"], arm["error"]) == (1, 1, None)
-    assert nothing["error"] in out
+    arm, scenery = json.loads(reports.read_text())
+    assert set(arm) == set(scenery) == KEYS
+    assert (arm["dof"], arm["loads"], arm["moves"], arm["settled"], arm["error"]) == (1, True, 1, 1, None)
+    assert 0 <= arm["worst_error"] < 1e-3
+    assert (scenery["dof"], scenery["loads"], scenery["moves"]) == (0, False, 0)
+    assert scenery["error"].startswith("reading the description: a robot without moving joints")
+    assert scenery["error"] in out
     assert page.read_text().startswith("| file ")
     assert "| arm.urdf " in page.read_text()
-
-
-def test_no_urdf_at_all(batchpid, tmp_path):
-    status, out, err = batchpid("survey", tmp_path)
-    assert (status, out) == (2, "")
-    assert "hold no file *.urdf" in err

@@ -11,9 +11,10 @@ from robots import load_bundled
 from tiny_urdf import one_joint, write
 
 import batchpid as bp
+import batchpid.task_space as ts
 from batchpid.sim import Robot
 from batchpid.sim.cli import parse
-from batchpid.sim.identification.confidence_region import KEY, Region
+from batchpid.sim.identification import Region
 from batchpid.sim.tuning import Weights, random_moves, tune
 
 pytest.importorskip("cmaes")
@@ -74,7 +75,8 @@ def test_tune_within_prints_what_holds_for_all_drawn_motors(batchpid, tmp_path, 
     (joint,) = robot.joint_names
     names, ends = (("strength", joint), ("delay", None)), (np.array([0.9, 3e-3]), np.array([0.05, 5e-4]))
     known = Region(names, *ends, np.eye(2)).to_dict()
-    bp.save_actuators(motors, bp.make_actuators(1, command_delay=3e-3, strength=0.9), [joint], {KEY: known})
+    late = bp.make_actuators(1, command_delay=3e-3, strength=0.9)
+    bp.save_actuators(motors, late, [joint], {"confidence_region": known})
     status, said, _ = batchpid("tune", urdf, *SHORT, "--actuators", motors, "--within", "--out", out)
     assert status == 0
     assert "5 draws of motors" in said
@@ -126,12 +128,13 @@ def test_the_last_line_is_a_command_that_works(batchpid, tmp_path, monkeypatch):
     assert status == 0, error
 
 
-def test_the_search_says_by_which_figures_it_rejected_its_candidates(monkeypatch):
-    robot = load_bundled("panda")
+def test_the_search_says_by_which_figures_it_rejected_its_candidates(tmp_path, monkeypatch):
+    robot = Robot.load(write(tmp_path, one_joint()))
+    short = {"generations": 1, "seconds": 0.05, "workers": 0, "engine": "mujoco"}
     monkeypatch.setattr(
         "batchpid.sim.tuning.candidates.Candidates.costs", lambda self, runner, points: (*points[:, 0] ** 2,)
     )
-    found = tune(robot, generations=1, population=4, seconds=0.05, workers=0)  # the designed gains are at 0
+    found = tune(robot, population=4, **short)  # the designed gains are at 0
     assert found.rejected.startswith("cost in the search: best candidate 0.")
     assert found.rejected.endswith(", designed 0.0000")
 
@@ -139,7 +142,7 @@ def test_the_search_says_by_which_figures_it_rejected_its_candidates(monkeypatch
         return (*points[:, 0] ** 2 * (-1 if len(points) == 5 else 1),)
 
     monkeypatch.setattr("batchpid.sim.tuning.candidates.Candidates.costs", worse_in_the_final)
-    found = tune(robot, generations=1, population=5, seconds=0.05, workers=0, timestep=0.0005)
+    found = tune(robot, population=5, timestep=0.0005, **short)
     assert found.rejected.startswith("cost in the final: best candidate 0.")
     assert found.rejected.endswith(", designed 0.0000")
     assert found.settings["timestep"] == 0.0005
@@ -185,20 +188,20 @@ def test_each_weight_of_the_search_has_a_flag():
     assert parse(["tune"]).weights == Weights()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        (("compare", "--gains", "nothing.yaml"), "neither a name nor a file"),
-        (("compare", "--gains", "drive:a,b"), "DAMPING"),
-        (("compare", "--gains", "tuned", "--picture", "x.png"), "name two"),
-        (("compare", "--engine"), "name sapien, mujoco or both"),
-        (("tune", "nobody"), "no robot 'nobody'"),
-        (("tune", "panda", "--population", "1"), "population"),
-        (("tune", "panda", "--out", "gains.txt"), "gains.txt"),
-    ],
-)
-def test_bad_input_is_an_error_of_status_2(batchpid, tmp_path, monkeypatch, arguments, complaint):
-    monkeypatch.chdir(tmp_path)
-    status, _, said = batchpid(*arguments)
-    assert status == 2
-    assert complaint in said
+@pytest.mark.slow
+def test_tune_writes_gains_of_a_tool_that_rollout_reads(batchpid, tmp_path, monkeypatch):
+    for name in ("MOVES", "FINAL_MOVES"):
+        monkeypatch.setattr(f"batchpid.sim.tuning.tool_search.{name}", 1)
+    out = tmp_path / "arm.yaml"
+    flags = ("--control", "osc", "--tool", "panda_hand", "--out", out)
+    status, said, error = batchpid("tune", "panda", *SHORT, *flags)
+    assert status == 0, error
+    assert "as tuned" in said
+    assert "Not settled under the gains written" in said  # in so short a time
+    assert "WHY: " in said
+    assert ts.load_osc_options(out).keys() == {"stiffness", "damping_ratio", "posture_stiffness"}
+    assert not out.with_suffix(".search.json").exists()
+    command = shlex.split(said.splitlines()[-1].removeprefix("next: "))
+    status, said, error = batchpid(*command[1:], "--num-envs", 2, "--workers", 0, "--seconds", 0.02)
+    assert status == 0, error
+    assert "Tool: panda_hand" in said

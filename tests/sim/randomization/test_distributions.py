@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Choice, LogUniform, Normal, Uniform
-from batchpid.sim.randomization.distributions import read_distribution
+from batchpid.sim import Choice, LogUniform, Normal, Randomization, Uniform
 
 COUNT = 20_000
 numbers = st.floats(-1e3, 1e3, allow_nan=False)
@@ -24,6 +23,10 @@ distributions = st.one_of(
     st.builds(lambda mean, std: Normal(mean, std, low=mean - std, high=mean + 2 * std), numbers, st.floats(1e-3, 1e3)),
     st.builds(lambda values, rest: Choice(values, **rest), st.lists(numbers, min_size=1, max_size=5), options),
 )
+
+
+def read(described):
+    return Randomization.from_dict({"qpos": described})
 
 
 def moments(distribution):
@@ -74,7 +77,7 @@ def test_draws_are_within_the_support(distribution):
 
 @given(distributions)
 def test_a_distribution_is_what_its_dict_describes(distribution):
-    assert read_distribution("field", distribution.to_dict()) == distribution
+    assert read(distribution.to_dict()) == Randomization(qpos=distribution)
 
 
 @pytest.mark.parametrize(("operation", "expected"), [("add", [5, 7]), ("scale", [6, 12]), ("abs", [3, 3])])
@@ -94,11 +97,17 @@ def test_operations(operation, expected):
         (lambda: Normal(0, 1, low=5), "low: and high leave"),
         (lambda: Choice([]), "values: must be a list of numbers"),
         (lambda: Choice([math.nan]), "values: out of range"),
-        (lambda: read_distribution("kp", {"gamma": [1, 2]}), "kp: is not a distribution.*uniform, log_uniform"),
-        (lambda: read_distribution("kp", {"uniform": [1, 2, 3]}), "kp: is not a distribution"),
-        (lambda: read_distribution("kp", {"uniform": 1}), "kp: is not a distribution: uniform needs a list"),
-        (lambda: read_distribution("kp", {"uniform": [0, 1], "mode": "add"}), "kp: .*operation, shared"),
-        (lambda: read_distribution("kp", {"uniform": [2, 1]}), "kp: high is less than low"),
+        (
+            lambda: read({"gamma": [1, 2]}),
+            "qpos: is not a distribution.*uniform, log_uniform",
+        ),
+        (lambda: read({"uniform": [1, 2, 3]}), "qpos: is not a distribution"),
+        (
+            lambda: read({"uniform": 1}),
+            "qpos: is not a distribution: uniform needs a list",
+        ),
+        (lambda: read({"uniform": [0, 1], "mode": "add"}), "qpos: .*operation, shared"),
+        (lambda: read({"uniform": [2, 1]}), "qpos: high is less than low"),
     ],
 )
 def test_what_is_no_distribution_is_refused(make, message):

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("xarray")
 
 from batchpid.sim import Runner, write_recording
-from batchpid.sim.recording.dataset import open_dataset, to_dataset
+from batchpid.sim.recording import open_dataset, to_dataset
 
 
 @pytest.fixture(scope="module")

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import os
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+from disks import limited_file_size, small_disk
 from identical import assert_identical
 from robots import load_bundled
 
@@ -230,24 +229,9 @@ def test_a_file_that_cannot_be_made_leaves_none(tmp_path, monkeypatch):
         assert runner.recorder is None
 
 
-@contextmanager
 def limited_disk(folder, kind, size):
     """Make ``folder`` a disk of ``size`` bytes, or let this process write files of that size at most."""
-    if kind == "file size":
-        old = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
-        try:
-            yield
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, old)
-        return
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)]
-    if os.geteuid() or subprocess.run(mount, capture_output=True).returncode:
-        pytest.skip("this process cannot mount a small disk")
-    try:
-        yield
-    finally:
-        subprocess.run(["umount", str(folder)], check=True)
+    return small_disk(folder, size) if kind == "disk" else limited_file_size(size)
 
 
 @pytest.mark.parametrize("kind", ["disk", pytest.param("file size", marks=pytest.mark.slow)])
@@ -255,7 +239,7 @@ def test_a_nearly_full_disk_raises_and_what_was_recorded_can_be_read(kind, tmp_p
     monkeypatch.setattr(files, "CHUNK_BYTES", 2048)
     monkeypatch.setattr(partial_file, "METADATA_BYTES", 1 << 15)
     ticks, outcomes = 40, set()
-    for size in (4096, 28_672, *range(53_248, 260_000, 49_152)):
+    for size in (4096, 28_672, *range(53_248, 260_000, 98_304)):
         folder = tmp_path / str(size)
         folder.mkdir()
         path, rollouts, message = folder / "run.h5", [], ""

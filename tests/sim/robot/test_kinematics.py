@@ -1,5 +1,6 @@
 """Forward kinematics against SAPIEN's link poses."""
 
+import math
 import re
 
 import numpy as np
@@ -14,7 +15,7 @@ from batchpid.sim import Robot
 from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.sapien.building import build_scene, new_system
-from batchpid.task_space.rotations import about, from_rpy, multiply, rotate
+from batchpid.task_space.rotations import about, from_rpy, multiply, rotate, to_rpy
 
 ODD = """<robot name="odd">
   <link name="tip"/><link name="base"/><link name="mid"/><link name="side"/><link name="bracket"/>
@@ -77,3 +78,14 @@ def test_rotations_compose_keep_lengths_and_follow_the_urdf_order(roll, pitch, y
     np.testing.assert_allclose(np.linalg.norm(rotate(q, v)), np.linalg.norm(v), atol=1e-12)
     cos, sin = np.cos(yaw), np.sin(yaw)
     np.testing.assert_allclose(rotate(z, v)[:2], [[cos, -sin], [sin, cos]] @ v[:2], atol=1e-12)
+
+
+SPECIAL = st.sampled_from([0.0, math.pi / 2, -math.pi / 2, math.pi, 1.5707963])
+
+
+@given(st.tuples(*[st.floats(-math.pi, math.pi) | SPECIAL] * 3))
+def test_rpy_of_a_rotation_gives_the_rotation_also_at_a_right_angle(rpy):
+    q = from_rpy(rpy)
+    again = from_rpy(to_rpy(q))
+    assert abs(again @ q) > 1 - 1e-15  # q and -q are one rotation
+    np.testing.assert_allclose(again * np.sign(again @ q), q, atol=1e-14)

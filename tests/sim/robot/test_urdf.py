@@ -11,8 +11,7 @@ import pytest
 from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 from batchpid.errors import BatchPIDError, RobotError, RobotNotFoundError
-from batchpid.sim import Robot, Runner
-from batchpid.sim.robot.urdf_export import to_urdf
+from batchpid.sim import Robot, Runner, to_mjcf, to_urdf
 
 BASE, ARM, TIP = link("base"), link("arm"), link("tip")
 HINGE = joint("hinge", "base", "arm")
@@ -287,8 +286,6 @@ def test_links_may_have_the_names_of_added_bodies(engine, tmp_path):
     with Runner(loaded, 1, workers=0, engine=engine, params=loaded.params(kp=1.0)) as runner:
         assert runner.step(loaded.start).ok.all()
     if engine == "mujoco":
-        from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
-
         text = to_mjcf(loaded, loaded.designed("effort"), 1e-3).text
         assert 'name="world_link_3"' in text
         assert 'name="a (shapes)_3"' in text

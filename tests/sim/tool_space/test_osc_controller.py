@@ -358,9 +358,8 @@ def test_sim_steps_in_native_code_give_the_bytes_of_the_called_controller(reques
     assert np.flatnonzero(~seen[0][-1].all(0)).tolist() == [3]
 
 
-@pytest.mark.quick_rows(2)
 @pytest.mark.parametrize("kind", [OperationalSpace, Called])
-@pytest.mark.parametrize("backend", ["numpy", "jax"])
+@pytest.mark.parametrize("backend", ["numpy", pytest.param("jax", marks=pytest.mark.slow)])
 def test_joints_with_limited_efforts_are_reported(panda, kind, backend):
     """The law scales its efforts to the limits, so that the runner has nothing to clip."""
     if backend == "jax":

@@ -16,7 +16,7 @@ OUT, STOPS, BACK, END = 0.6, 1.0, 2.6, 4.4
 """The setpoint is out of reach; the arm has stretched; the setpoint returns; the arm is at rest [s]."""
 
 
-@pytest.fixture(params=["straight elbow", "aligned wrist"])
+@pytest.fixture(params=["aligned wrist", "straight elbow"])
 def arm(request, tmp_path):
     """Robot, link, start, and the way of the setpoint out of reach [m]."""
     if request.param == "straight elbow":
@@ -24,9 +24,9 @@ def arm(request, tmp_path):
     return six(tmp_path), "l6", np.array([0.3, 0.4, 0.9, 0.2, 0.0, 0.1]), [0, 0.3, 0]
 
 
-@pytest.mark.quick_rows(2)
+@pytest.mark.quick_rows(1)
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
-@pytest.mark.parametrize(("engine", "rest"), [("sapien", 0.1e-3), ("mujoco", 0.01e-3)])
+@pytest.mark.parametrize(("engine", "rest"), [("mujoco", 0.01e-3), ("sapien", 0.1e-3)])
 def test_a_setpoint_out_of_reach_for_2_s_and_back(arm, engine, rest):
     """Chatter is the second difference of the efforts of successive sim steps [N m]; ``rest`` the final error [m].
 

@@ -11,6 +11,7 @@ import pytest
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
+from batchpid.sim.cli import main
 from batchpid.sim.tuning import gain_set
 
 
@@ -67,12 +68,13 @@ def test_python_is_refused_with_what_is_read(panda, tmp_path):
 
 def test_gains_of_an_mjcf_file_are_those_of_its_servos(panda, tmp_path):
     pytest.importorskip("mujoco", "3.17")
-    from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
-
     params = bp.make_params(
         9, np.linspace(5, 80, 9), 3.0, 2.0, effort_limit=20.0, integral_limit=7.0, measurement_rate="measured"
     )
-    (path := tmp_path / "arm.xml").write_text(to_mjcf(panda, params, 1 / 2000).text)
+    path, gains = tmp_path / "arm.xml", tmp_path / "gains.yaml"
+    bp.save_params(gains, params, panda.joint_names)
+    words = ("export", "panda", "--to", "mjcf", "--timestep", 1 / 2000, "--gains", gains, "--out", path)
+    assert not main([*map(str, words)])
     assert same(gain_set(panda, str(path)).params, params)
     other = 'forcerange="-20.0 30.0" delay="0.01" nsample="9"'
     path.write_text(path.read_text().replace('forcerange="-20.0 20.0"', other))

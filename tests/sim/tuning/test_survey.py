@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import sys
 
@@ -22,21 +21,6 @@ def folder(tmp_path_factory):
     (folder / "truncated.urdf").write_text(one_joint()[:200])
     (folder / "notes.txt").write_text("no robot")
     return folder
-
-
-@pytest.mark.slow
-def test_reports_come_in_order_with_all_that_is_known(folder):
-    good, scenery, truncated = survey(find_robots([folder]), moves=2, seconds=2.5, processes=2)
-    assert good.urdf.endswith("arm.urdf")
-    assert good.error is None
-    assert good.loads
-    assert (good.moves, good.settled) == (2, 2)
-    assert 0 <= good.worst_error < 1e-3
-    assert json.loads(json.dumps(good.asdict()))["findings"] == list(good.findings)
-    assert (scenery.dof, scenery.loads, scenery.moves) == (0, False, 0)
-    assert scenery.error.startswith("reading the description: a robot without moving joints")
-    assert not truncated.loads
-    assert truncated.error.startswith("reading the description: ")
 
 
 @pytest.mark.slow

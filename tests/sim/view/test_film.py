@@ -154,6 +154,11 @@ def test_the_window_plays_for_the_given_time(rollout):
     film.show_window(rollout, seconds=1.0)
 
 
+def test_frames_of_a_film_follow_the_recorded_time(rollout):
+    assert film.film_rows(rollout, 50.0).tolist() == list(range(0, 20, 2))
+    assert film.film_rows(rollout, 200.0)[:5].tolist() == [0, 1, 1, 2, 2]
+
+
 def test_the_demo_with_a_window_fails_before_it_runs_where_nothing_renders(monkeypatch, capsys):
     monkeypatch.setattr(renderer, "render_problem", lambda: "no device")
     assert main(["demo", "--viewer"]) == 2

@@ -8,7 +8,6 @@ import pytest
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Runner
 from batchpid.sim.view import Playback
-from batchpid.sim.view.film import film_rows
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +58,3 @@ def test_non_finite_numbers_are_shown_as_zero(rollout):
 def test_a_rollout_of_another_robot_is_refused(jaco2, rollout):
     with pytest.raises(InvalidArgumentError, match="joints"):
         Playback(rollout, jaco2)
-
-
-def test_frames_of_a_film_follow_the_recorded_time(rollout):
-    assert film_rows(rollout.for_ticks(slice(0, 20)), 50.0).tolist() == list(range(0, 20, 2))
-    assert film_rows(rollout, 200.0)[:5].tolist() == [0, 1, 1, 2, 2]

@@ -9,7 +9,7 @@ import yaml
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
-from batchpid.sim.identification.confidence_region import KEY, Region, draw_motors, read_region
+from batchpid.sim.identification import Region, draw_motors, read_region
 from batchpid.sim.tuning import random_moves
 from batchpid.sim.tuning.within import within
 from tests.sim.tuning.identification.test_identify import ARM
@@ -31,7 +31,7 @@ def region(spread=1.0):
 
 def saved(path, robot, known):
     motors = bp.make_actuators(2, command_delay=4e-3, strength=[0.9, 1.0], position_resolution=1e-5)
-    bp.save_actuators(path, motors, robot.joint_names, {KEY: known})
+    bp.save_actuators(path, motors, robot.joint_names, {"confidence_region": known})
     return path
 
 
@@ -73,7 +73,7 @@ def test_all_draws_are_within_the_ellipsoid():
 def test_a_file_without_a_region_is_refused(robot, tmp_path, change, problem):
     path = saved(tmp_path / "motors.yaml", robot, region().to_dict())
     document = yaml.safe_load(path.read_text())
-    document["about"] = {KEY: change(document["about"][KEY])}
+    document["about"] = {"confidence_region": change(document["about"]["confidence_region"])}
     path.write_text(yaml.safe_dump(document))
     with pytest.raises(InvalidArgumentError, match=problem):
         read_region(path, robot)
@@ -81,12 +81,12 @@ def test_a_file_without_a_region_is_refused(robot, tmp_path, change, problem):
 
 def test_what_holds_for_all_draws(robot, tmp_path):
     """Slow gains hold; gains beyond the bound of the latest motor do not, and that draw is named."""
-    drawn = draw_motors(saved(tmp_path / "motors.yaml", robot, region().to_dict()), robot, 12)
-    moves, options = random_moves(robot, 2, 0), {"workers": 0, "collisions": False, "ground": False}
+    drawn = draw_motors(saved(tmp_path / "motors.yaml", robot, region().to_dict()), robot, 6)
+    moves, options = random_moves(robot, 1, 0), {"workers": 0, "engine": "mujoco", "ground": False}
     good = bp.design_gains(robot, 3.0, gain_units="mass_matrix", measurement_rate="measured")
     found = within(robot, good, drawn.actuators, moves, **options)
     assert found.holds
-    assert found.settling.shape == (12,)
+    assert found.settling.shape == (6,)
     assert found.settling[found.binding] <= found.settling.max()
     assert "delay" in drawn.describe(found.stability.env, "shoulder")
     with pytest.warns(UserWarning, match="stability bound"):

@@ -2,9 +2,7 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from batchpid.sim.identification.excitation import excite, is_feasible
-from batchpid.sim.identification.logs import read_logs
-from batchpid.sim.identification.setpoint_files import read_setpoints, setpoint_csv
+from batchpid.sim.identification import excite, is_feasible, read_logs
 
 
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
@@ -25,25 +23,12 @@ def test_the_seed_decides(panda):
     assert not np.array_equal(first.position, other.position)
 
 
-def test_the_file_reads_back_as_the_motion(panda, tmp_path):
-    motion = excite(panda, 1.0, rate=50)
-    text = setpoint_csv(panda, motion)
-    names = [f"{quantity}:{name}" for quantity in ("setpoint", "setpoint_rate") for name in panda.joint_names]
-    assert text.splitlines()[0].split(",") == ["time", *names]
-    path = tmp_path / "motion.csv"
-    path.write_text(text)
-    found = read_setpoints(panda, path, 1 / 2000)
-    assert (found.substeps, found.has_rates, len(found.position)) == (40, True, 49)
-    np.testing.assert_allclose(np.vstack([found.start, found.position]), motion.position, atol=1e-8)
-    np.testing.assert_allclose(found.rate, motion.velocity[1:], atol=1e-8)
-
-
 def test_a_log_may_keep_the_rates_of_the_setpoints(panda, tmp_path):
     motion = excite(panda, 1.0, rate=100)
-    header, *rows = setpoint_csv(panda, motion).splitlines()
-    header += "".join(f",qpos:{name}" for name in panda.joint_names)
-    rows = [row + "".join(f",{value:.9g}" for value in pose) for row, pose in zip(rows, motion.position, strict=True)]
-    (tmp_path / "log.csv").write_text("\n".join([header, *rows]))
+    quantities = ("setpoint", "setpoint_rate", "qpos")
+    header = ",".join(["time", *(f"{quantity}:{name}" for quantity in quantities for name in panda.joint_names)])
+    table = np.column_stack([motion.time, motion.position, motion.velocity, motion.position])
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=header, comments="")
     (log,) = read_logs(panda, [tmp_path / "log.csv"])
     assert log.kind == "setpoint"
     np.testing.assert_allclose(log.command, motion.position[:, list(log.joints)], atol=1e-8)

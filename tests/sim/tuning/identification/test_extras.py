@@ -6,8 +6,7 @@ import pytest
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
-from batchpid.sim.identification import held_out_error, identify
-from batchpid.sim.identification.logs import Log
+from batchpid.sim.identification import Log, held_out_error, identify
 
 pytest.importorskip("scipy")
 pytest.importorskip("cmaes")

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import batchpid as bp
-from batchpid.sim.identification.columns import Reading
-from batchpid.sim.identification.logs import Log, LogWarning, read_logs
+from batchpid.sim.identification import Log, LogWarning, Reading, read_logs
 
 JOINTS = [f"panda_joint{number}" for number in range(1, 8)]
 

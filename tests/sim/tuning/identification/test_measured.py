@@ -11,9 +11,7 @@ import pytest
 
 import batchpid as bp
 from batchpid.sim import Robot
-from batchpid.sim.identification import identify
-from batchpid.sim.identification.effort_ratios import measured_motors
-from batchpid.sim.identification.logs import Log
+from batchpid.sim.identification import Log, identify, measured_motors
 from batchpid.sim.identification.statistics import jackknife_variance
 
 pytest.importorskip("scipy")

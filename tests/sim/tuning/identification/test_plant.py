@@ -10,11 +10,13 @@ from robots import load_bundled
 from tiny_urdf import LIMIT, joint, link, random_tree, robot, write
 
 import batchpid as bp
-from batchpid.sim import Robot
+from batchpid.sim import Robot, Runner
+from batchpid.sim.identification import Log, excite, identify
 from batchpid.sim.identification.logged_control import LoggedControl, LoggedDrive
 from batchpid.sim.identification.plant import Plant, Segment
-from batchpid.sim.identification.unknowns import ADDED, KINDS, Motors
+from batchpid.sim.identification.unknowns import ADDED, KINDS, Kind, Motors, take
 from batchpid.task_space import native_rows
+from tests.sim.tuning.identification.test_identify import ARM
 
 DT, ROWS = 5e-4, 5
 EFFORTS = LoggedDrive(DT, None, "none")
@@ -203,3 +205,39 @@ def test_joints_that_are_fixed_keep_their_place(panda):
     np.testing.assert_allclose(bp.task_space.mass_matrix(fixed, qpos[moves]), matrix, atol=1e-9)
     force = bp.task_space.bias(tree, qpos, qvel)[:4]
     np.testing.assert_allclose(bp.task_space.bias(fixed, qpos[moves], qvel[moves]), force, atol=1e-9)
+
+
+def test_rows_of_a_simulation_do_not_depend_on_their_company(tmp_path):
+    arm = Robot.load(write(tmp_path, ARM))
+    plant = Plant(arm, (0, 1), LoggedDrive(1 / 2000, arm.designed("effort"), "gravity"))
+    rng = np.random.default_rng(0)
+    motors = motors_of(2, 3) | {"payload": np.array([[0.0], [0.3], [0.3]])}
+    segments = [
+        Segment(q, np.zeros(2), np.tile(q + 0.2, (50, 1)), np.zeros((50, 2))) for q in rng.uniform(-1, 1, (3, 2))
+    ]
+    together = plant.simulate(motors, segments, 0)
+    for k in range(3):
+        assert np.array_equal(plant.simulate(take(motors, [k]), [segments[k]], 0)[0], together[k])
+
+
+def test_an_effect_of_the_motors_is_identified_by_a_line_in_the_table(monkeypatch, tmp_path):
+    """Here the lag: from a log of the Runner, and in the file that is saved."""
+    monkeypatch.setitem(KINDS, "lag", Kind("lag", True, 1e-3, 0.1, 5e-3, 20.0, 5e-3))
+    monkeypatch.setattr("batchpid.sim.identification.start.GENERATIONS", 1)
+    monkeypatch.setattr("batchpid.sim.identification.fit_search.NEIGHBOUR_EVALUATIONS", 2)
+    arm, dt = Robot.load(write(tmp_path, ARM)), 1e-3
+    truth, params = [0.006, 0.012], arm.designed("effort").replace(setpoint_weight=1.0)
+    plain = {"armature": [0.1, 0.03], "viscous": [0.5, 0.2], "command_delay": 0.003}
+    motion = excite(arm, 1.6, rate=1 / dt, lowest=0.6).position
+    options = {"params": params, "compensate": "none", "timestep": dt, "workers": 0}
+    with Runner(arm, 1, substeps=1, **options, actuators=bp.make_actuators(2, **plain, lag=truth)) as runner:
+        begin = runner.reset(motion[:1]).qpos
+        qpos = np.concatenate([begin, runner.rollout(motion[:, None]).qpos[:, 0]])[:-1]
+    time = dt * np.arange(len(qpos))
+    log = Log("log", (0, 1), "setpoint", time, qpos, time, motion, False)
+    found = identify(arm, log, **options, payload=False, evaluations=8)
+    for number, wanted in enumerate(truth):
+        assert found.interval("lag", number)[0] == pytest.approx(wanted, rel=0.1)
+    found.save(tmp_path / "motors.yaml")
+    saved = bp.load_actuators(tmp_path / "motors.yaml", arm.joint_names)[0]
+    np.testing.assert_allclose(saved.lag[0], truth, rtol=0.1)

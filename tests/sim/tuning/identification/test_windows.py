@@ -13,8 +13,8 @@ from tiny_urdf import joint, link, robot, write
 
 import batchpid as bp
 from batchpid.sim import Robot
+from batchpid.sim.identification import Log
 from batchpid.sim.identification.logged_control import LoggedDrive
-from batchpid.sim.identification.logs import Log
 from batchpid.sim.identification.plant import Segment
 from batchpid.sim.identification.regression import smooth
 from batchpid.sim.identification.unknowns import Unknowns

@@ -1,4 +1,4 @@
-"""First candidates of a search: their poles, their phase margin, the delay that they are for."""
+"""Candidates of searches: first ones, by their poles, phase margin and delay, and gains of a tool."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import batchpid.task_space as ts
 from batchpid import make_actuators
-from batchpid.sim import Randomization, Uniform
-from batchpid.sim.tuning import Weights, random_moves
+from batchpid.sim import OperationalSpace, Randomization, Uniform
+from batchpid.sim.tuning import Weights, random_moves, tune
 from batchpid.sim.tuning.candidates import Candidates
 from batchpid.sim.tuning.first_candidates import (
     FASTEST,
@@ -21,7 +22,9 @@ from batchpid.sim.tuning.first_candidates import (
     loop_delay,
     phase_margin,
 )
+from batchpid.sim.tuning.tool_candidates import GAINS, SearchedSpace, osc_options, stability_penalty
 
+HAND = "panda_hand"
 SPEED = st.floats(0.5, 50.0)
 DELAY = st.floats(0.0, 0.2)
 
@@ -80,3 +83,36 @@ def test_delay_of_the_loop_is_that_of_the_latest_joint_and_draw(panda):
     assert loop_delay(late, None, 0.002) == pytest.approx(0.016)
     assert loop_delay(late, drawn, 0.002) == pytest.approx(0.036)
     assert loop_delay(panda, drawn, 0.0) == pytest.approx(0.02)
+
+
+@pytest.mark.slow
+def test_first_generation_of_robots_that_differ_are_designs_for_their_delay(panda):
+    late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=0.003))
+    options = {"moves": random_moves(panda, 1, 0), "workers": 0, "seconds": 0.2, "population": 4}
+    found = tune(late, generations=1, **options)
+    own = 1 / 2000 + float(np.max(found.start_params.derivative_filter_time))
+    designs = [*first_gains(0.003 + own)[:3]]
+    gains = np.array([leaf[0, 0] for leaf in (found.params.ki, found.params.kp, found.params.kd)])
+    assert min(np.abs(gains / design - 1).max() for design in designs) < 1e-9 or found.cost == found.start_cost
+
+
+def test_gains_of_a_setpoint_are_those_of_the_options(panda):
+    """Each env has the effort of a controller that is made with its gains; the defaults are the library's."""
+    rng, searched = np.random.default_rng(0), SearchedSpace(panda, HAND)
+    gains = rng.uniform(0.5, 2, (3, 5)) * [value for _, value in GAINS.values()]
+    gains[0] = [value for _, value in GAINS.values()]
+    qpos, qvel = panda.settings.target + 0.1 * rng.normal(size=(2, 3, 9))
+    pose = ts.link_poses(searched.tree, qpos + 0.05, [HAND])[:, 0]
+    inputs = searched.init(panda, 3), np.concatenate([pose, gains], axis=1), qpos, qvel, np.zeros((3, 9))
+    efforts = searched(*inputs)[1]
+    for row, own in enumerate(gains):
+        alone = OperationalSpace(panda, HAND, **osc_options(own) if row else {})
+        state, *rest = inputs
+        part = ts.OSCState(state.posture[row : row + 1]), pose[row : row + 1], *(x[row : row + 1] for x in rest[1:])
+        np.testing.assert_allclose(efforts[row], alone(*part)[1][0], rtol=1e-12, atol=1e-9)
+
+
+def test_gains_near_the_stability_bound_have_a_penalty():
+    """With ratio 1 the explicit law is stable for w dt < 0.828."""
+    gains = np.array([[0.828, 0.1, 0.1, 1, 1], [0.1, 0.828, 0.1, 1, 1], [0.1, 0.1, 0.828, 1, 1], [0.3, 0.3, 0.3, 1, 1]])
+    np.testing.assert_allclose(stability_penalty(gains * [1e3, 1e3, 1e3, 1, 1], 1e-3), [2, 2, 2, 0], atol=0.01)

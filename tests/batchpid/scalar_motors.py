@@ -1,0 +1,155 @@
+"""Guard, friction, motors and sensors on plain Python numbers, one joint at a time: slow, obvious oracles."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+def difference(a: float, b: float, continuous: bool) -> float:
+    """Return a - b, the short way round on a continuous joint."""
+    return math.remainder(a - b, 2 * math.pi) if continuous else a - b
+
+
+def within(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
+
+
+@dataclass
+class ScalarGuard:
+    """Guard of one setpoint, at rest at ``setpoint``."""
+
+    setpoint: float
+    lower: float = -math.inf
+    upper: float = math.inf
+    rate: float = math.inf
+    acceleration: float = math.inf
+    continuous: bool = False
+    speed: float = 0.0
+
+    def step(self, asked: float, dt: float) -> float:
+        target = asked if self.continuous else within(asked, self.lower, self.upper)
+        error = difference(target, self.setpoint, self.continuous)
+        wanted = speed = error / dt
+        change = self.acceleration * dt
+        if math.isfinite(change):
+            steps = 1
+            while change * dt * steps * (steps + 1) / 2 < abs(error):
+                steps += 1
+            speed = math.copysign(abs(error) / (steps * dt) + (steps - 1) * change / 2, error) if error else 0.0
+        speed = within(within(speed, -self.rate, self.rate), self.speed - change, self.speed + change)
+        self.setpoint, self.speed = (target if speed == wanted else self.setpoint + dt * speed), speed
+        return self.setpoint
+
+
+@dataclass
+class ScalarFriction:
+    """Friction of one joint that moves at ``velocity`` under ``effort``; ``gain`` is K and ``share`` w."""
+
+    velocity: float
+    effort: float
+    gain: float
+    share: float
+    coulomb: float = 0.0
+    viscous: float = 0.0
+    static: float = 0.0
+    stribeck: float | None = None
+    load: float = 0.0
+    slides: bool = False
+
+    def step(self, effort: float, velocity: float) -> float:
+        bound, rest = self.coulomb, max(self.coulomb, self.static)
+        if not self.slides:
+            bound = rest
+        elif self.stribeck:
+            bound += (rest - bound) / (1 + (velocity / self.stribeck) ** 2)
+        bound += self.load * abs(effort)
+        held = self.effort - self.gain * (velocity + self.share * (velocity - self.velocity))
+        self.effort, self.velocity = within(held, effort - bound, effort + bound), velocity
+        self.slides = self.effort != held
+        return self.effort - self.viscous * velocity
+
+
+def friction_gains(mass: np.ndarray, viscous: np.ndarray, rubs: np.ndarray, dt: float) -> tuple[list, list]:
+    """Return K and w of the joints of one robot with a ``mass`` matrix; ``rubs`` says which joints have friction."""
+    inverse, joints = np.linalg.inv(mass + dt * np.diag(viscous)), range(len(mass))
+    gains = []
+    for j in joints:
+        correlations = [abs(inverse[i, j]) / math.sqrt(inverse[i, i] * inverse[j, j]) for i in joints if rubs[i]]
+        gains.append(0.7 / (dt * inverse[j, j] * sum(correlations)) if rubs[j] else 0.0)
+    return gains, [1 - dt * viscous[j] * inverse[j, j] for j in joints]
+
+
+@dataclass
+class ScalarMotor:
+    """Motor and sensor of one joint, at rest at ``start`` with an effort of 0."""
+
+    start: float
+    command_delay: float = 0.0
+    sensor_delay: float = 0.0
+    lag: float = 0.0
+    strength: float = 1.0
+    bias: float = 0.0
+    saturation_effort: float = math.inf
+    no_load_speed: float = math.inf
+    effort_limit: float = math.inf
+    position_limit: tuple = ()
+    position_offset: float = 0.0
+    backlash: float = 0.0
+    position_resolution: float = 0.0
+    velocity_resolution: float = 0.0
+    continuous: bool = False
+    efforts: list = field(default_factory=list)
+    measured: list = field(default_factory=list)
+    delivered: float | None = None
+
+    def ends(self, position: float, velocity: float) -> tuple[float, float]:
+        """Return the least and the largest effort that the motor delivers."""
+        limit = self.effort_limit
+        if self.position_limit:
+            limit = min(limit, float(np.interp(position, *self.position_limit)))
+        if math.isinf(self.saturation_effort):
+            return -limit, limit
+        lost = self.saturation_effort * velocity / self.no_load_speed
+        stall = self.saturation_effort
+        return within(-stall - lost, -limit, limit), within(stall - lost, -limit, limit)
+
+    def deliver(self, effort: float, position: float, velocity: float, dt: float) -> float:
+        low, high = self.ends(position, velocity)
+        if self.delivered is None:
+            self.delivered = within(self.bias, *self.ends(self.start, 0.0))
+        self.efforts.append(effort)
+        late = self.late(self.efforts, self.command_delay / dt, 0.0, lambda a, b: a - b)
+        motor = within(self.strength * late + self.bias, low, high)
+        if self.lag > 0:
+            motor = within(self.delivered - math.expm1(-dt / self.lag) * (motor - self.delivered), low, high)
+        self.delivered = motor
+        return motor
+
+    def measure(self, position: float, velocity: float, dt: float) -> tuple[float, float]:
+        if self.backlash > 0:
+            behind = difference(self.measured[-1][0] if self.measured else self.start, position, self.continuous)
+            offset = within(behind, -self.backlash / 2, self.backlash / 2)
+            position, velocity = position + offset, (velocity if offset != behind else 0.0)
+        self.measured.append((position, velocity))
+        positions, velocities = ([each[at] for each in self.measured] for at in (0, 1))
+        steps = self.sensor_delay / dt
+        position = self.late(positions, steps, self.start, lambda a, b: difference(a, b, self.continuous))
+        velocity = self.late(velocities, steps, 0.0, lambda a, b: a - b)
+        return (
+            rounded(position + self.position_offset, self.position_resolution),
+            rounded(velocity, self.velocity_resolution),
+        )
+
+    def late(self, values: list, steps: float, before: float, less) -> float:
+        """Return the last of ``values`` as it was ``steps`` ago, interpolated; ``before`` the first it was that."""
+        whole = math.floor(steps + 1e-5)
+        near, far = (values[-1 - k] if k < len(values) else before for k in (whole, whole + 1))
+        share = steps - whole
+        return near if share < 1e-5 else near + share * less(far, near)
+
+
+def rounded(value: float, step: float) -> float:
+    return round(value / step) * step if step else value

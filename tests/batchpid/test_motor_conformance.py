@@ -1,0 +1,246 @@
+"""Guard, friction, motors and sensors by every executor against plain numbers, for any combination of options.
+
+Executors are NumPy on read-only arrays, JAX, and programs of the native extension, which give the bytes of NumPy.
+"""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+from law_cases import read_only
+from quick_jit import quick_jit
+from scalar_motors import ScalarFriction, ScalarGuard, ScalarMotor, friction_gains
+
+import batchpid as bp
+from batchpid import motors
+from batchpid.motors import friction, guard
+from batchpid.native.array_program import ArrayProgram
+from batchpid.native.availability import obstacle
+from batchpid.native.compiled import compiled_stages
+from batchpid.native.tracing import trace
+
+DT, STEPS, ENVS, JOINTS = 1 / 500, 40, 5, 3
+SHAPE = ENVS, JOINTS
+
+
+def drawn(rng, ranges, dtype):
+    """Return options of any combination, (envs, joints) each, in a third of the entries with the value that is off."""
+    chosen = {name: each for name, each in ranges.items() if rng.random() < 0.7}
+    return {
+        name: np.where(rng.random(SHAPE) < 0.3, off, on * rng.uniform(0.2, 1.0, SHAPE)).astype(dtype)
+        for name, (off, on) in chosen.items()
+    }
+
+
+def entry(options, env, joint):
+    """Return the options of one joint, as plain numbers."""
+    return {name: value[env, joint].item() for name, value in options.items()}
+
+
+GUARD = {"lower": (-np.inf, -2.0), "upper": (np.inf, 2.0), "rate": (np.inf, 5.0), "acceleration": (np.inf, 60.0)}
+FRICTION = {"viscous": (0.0, 3.0), "static": (0.0, 3.0), "stribeck": (0.0, 0.5), "load": (0.0, 0.3)}
+MOTORS = {
+    "command_delay": (0.0, 0.012),
+    "sensor_delay": (0.0, 0.009),
+    "lag": (0.0, 0.01),
+    "strength": (1.0, 0.9),
+    "bias": (0.0, 0.5),
+    "effort_limit": (np.inf, 12.0),
+    "position_offset": (0.0, 0.1),
+    "backlash": (0.0, 0.3),
+    "position_resolution": (0.0, 0.01),
+    "velocity_resolution": (0.0, 0.1),
+}
+"""Options that are numbers: the value that is off, and one that has an effect."""
+
+
+class GuardCase:
+    """A guard of setpoints that jump."""
+
+    def __init__(self, rng, dtype):
+        self.options = drawn(rng, GUARD, dtype) | {"continuous": rng.random(SHAPE) < 0.4}
+        self.start = rng.uniform(-2, 2, SHAPE).astype(dtype)
+        self.inputs = [np.repeat(rng.normal(0, 2.5, (STEPS // 8, *SHAPE)), 8, axis=0).astype(dtype)]
+        self.model = bp.make_guard(JOINTS, **self.options, dtype=dtype)
+
+    def begin(self, model, start):
+        return guard.init(model, start)
+
+    def step(self, model, state, asked):
+        state, changed = guard.advance(model, state, asked, DT)
+        return state, (state.setpoint, changed)
+
+    def oracle(self, env, joint):
+        scalar = ScalarGuard(self.start[env, joint].item(), **entry(self.options, env, joint))
+        for (asked,) in self.rows(env, joint):
+            setpoint = scalar.step(asked, DT)
+            yield setpoint, setpoint != asked
+
+    def rows(self, env, joint):
+        return zip(*(each[:, env, joint].tolist() for each in self.inputs), strict=True)
+
+
+class FrictionCase(GuardCase):
+    """Joints with friction under efforts and velocities that change sign."""
+
+    def __init__(self, rng, dtype):
+        self.options = {"coulomb": np.where(rng.random(SHAPE) < 0.3, 0.0, rng.uniform(0.2, 2, SHAPE)).astype(dtype)}
+        self.options |= drawn(rng, FRICTION, dtype)
+        root = rng.normal(size=(ENVS, JOINTS, JOINTS))
+        self.mass = (0.02 * (root @ root.transpose(0, 2, 1) + np.eye(JOINTS))).astype(dtype)
+        self.start = rng.normal(size=SHAPE).astype(dtype)
+        self.load = rng.normal(size=SHAPE).astype(dtype)
+        scale = np.array([3.0, 0.3])[:, None, None, None]
+        self.inputs = list((scale * rng.normal(size=(2, STEPS, *SHAPE))).astype(dtype))
+        self.model = friction.Friction(**self.options)
+
+    def begin(self, model, start):
+        return friction.init(
+            model, start, np.zeros_like(start) + self.load, np.zeros_like(start)[..., None] + self.mass, DT
+        )
+
+    def step(self, model, state, effort, velocity):
+        state, total = friction.advance(model, state, effort, velocity)
+        return state, (total,)
+
+    def oracle(self, env, joint):
+        own = {name: value[env].astype(float) for name, value in self.options.items()}
+        rubs = sum(own.get(name, 0.0) for name in ("coulomb", "static", "load")) > 0
+        mass = self.mass[env].astype(float)
+        gains, shares = friction_gains(mass, own.get("viscous", np.zeros(JOINTS)), rubs, DT)
+        begin = self.start[env, joint].item(), self.load[env, joint].item()
+        options = entry(self.options, env, joint) | ({"slides": True} if "static" not in own else {})
+        scalar = ScalarFriction(*begin, gains[joint], shares[joint], **options)
+        for row in self.rows(env, joint):
+            yield (scalar.step(*row),)
+            scalar.slides |= "static" not in own
+
+
+class MotorCase(GuardCase):
+    """Motors and sensors with every effect but noise."""
+
+    def __init__(self, rng, dtype):
+        self.options = drawn(rng, MOTORS, dtype) | {"continuous": rng.random(SHAPE) < 0.4}
+        if rng.random() < 0.6:
+            self.options |= {"saturation_effort": rng.uniform(5, 20, SHAPE), "no_load_speed": rng.uniform(2, 9, SHAPE)}
+        self.table = (np.array([-1.0, 0.0, 2.0]), np.array([4.0, 11.0, 6.0])) if rng.random() < 0.5 else ()
+        limit = {"position_limit": self.table} if self.table else {}
+        self.model = bp.make_actuators(JOINTS, **self.options, **limit, dtype=dtype)
+        velocity = 4 * rng.normal(size=(STEPS, *SHAPE))
+        position = np.cumsum(0.1 * rng.normal(size=(STEPS + 1, *SHAPE)), axis=0)
+        self.start = position[0].astype(dtype)
+        self.inputs = [each.astype(dtype) for each in (10 * rng.normal(size=(STEPS, *SHAPE)), position[1:], velocity)]
+        self.samples = motors.init(self.model, self.start, DT)
+
+    def begin(self, model, start):
+        lengths = [leaf.shape[1] for leaf in self.samples if leaf is not None and leaf.ndim == 3]
+        return motors.init(model, start, DT, samples=lengths[0] if lengths else None)
+
+    def step(self, model, state, effort, qpos, qvel, stages=motors.STAGES, k=None):
+        k = motors.discretise(model, state, DT, ENVS) if k is None else k
+        state, *seen = motors.advance_measurement(k, state, qpos, qvel, stages=stages)
+        state, delivered = motors.advance_effort(k, state, effort, qpos, qvel, stages)
+        return state, (*seen, delivered)
+
+    def oracle(self, env, joint):
+        limit = {"position_limit": self.table} if self.table else {}
+        scalar = ScalarMotor(self.start[env, joint].item(), **entry(self.options, env, joint), **limit)
+        for effort, qpos, qvel in self.rows(env, joint):
+            seen = scalar.measure(qpos, qvel, DT)
+            yield (*seen, scalar.deliver(effort, qpos, qvel, DT))
+
+
+def by_numpy(case, dtype):
+    model = type(case.model)(*(leaf if leaf is None else read_only(leaf, leaf.dtype) for leaf in case.model))
+    state, found = case.begin(model, read_only(case.start, dtype)), []
+    for row in zip(*case.inputs, strict=True):
+        state, seen = case.step(model, state, *(read_only(each, dtype) for each in row))
+        found.append(seen)
+    return found
+
+
+def by_jax(case, dtype):
+    model, step = jax.tree.map(jax.numpy.asarray, case.model), quick_jit(case.step)
+    state, found = quick_jit(case.begin)(model, jax.numpy.asarray(case.start)), []
+    for row in zip(*case.inputs, strict=True):
+        state, seen = step(model, state, *row)
+        assert all(each.dtype in (dtype, bool) for each in seen)
+        found.append(seen)
+    return found
+
+
+def by_programs(case, dtype):
+    """Motors by their stages, as the control step runs them; guard and friction traced as a whole."""
+    state, found = case.begin(case.model, case.start), []
+    if isinstance(case, MotorCase):
+        k = motors.discretise(case.model, state, DT, ENVS)
+        stages = compiled_stages(k, SHAPE)
+        for row in zip(*case.inputs, strict=True):
+            state, seen = case.step(case.model, state, *row, stages=stages, k=k)
+            found.append(seen)
+        return found
+    constants = [leaf for leaf in case.model if leaf is not None]
+    kept = [leaf for leaf in state if leaf is not None]
+
+    def function(*arrays):
+        rest = iter(arrays)
+        model, begun = (
+            type(each)(*(None if leaf is None else next(rest) for leaf in each)) for each in (case.model, state)
+        )
+        new, seen = case.step(model, begun, *rest)
+        return [*(leaf for leaf in new if leaf is not None), *seen]
+
+    inputs = len(kept) + len(case.inputs)
+    program = ArrayProgram(trace(function, len(constants), inputs, dtype), constants, inputs, SHAPE, dtype)
+    for row in zip(*case.inputs, strict=True):
+        results = program(*kept, *row)
+        kept, seen = [each.copy() for each in results[: len(kept)]], results[len(kept) :]
+        found.append(seen)
+    return found
+
+
+CASES = {"guard": GuardCase, "friction": FrictionCase, "motors": MotorCase}
+EXECUTORS = {"numpy": (by_numpy, 12), "programs": (by_programs, 8), "jax": (by_jax, 1)}
+ROWS = [(case, name, seed) for case in CASES for name, (_, seeds) in EXECUTORS.items() for seed in range(seeds)]
+
+
+@pytest.mark.parametrize(("case", "name", "seed"), ROWS)
+def test_signals_are_those_of_plain_numbers(case, name, seed, request):
+    is_narrow = (name == "jax" or seed % 2) and case != "friction"  # which sticks or slides, by rounding
+    dtype = np.float32 if is_narrow else np.float64
+    if name == "programs" and (obstacle() or dtype != np.float64):
+        pytest.skip("there are no programs")
+    if name == "jax" and dtype == np.float64:
+        request.getfixturevalue("x64")
+    made = CASES[case](np.random.default_rng(seed), dtype)
+    run, _ = EXECUTORS[name]
+    found = [[np.broadcast_to(np.asarray(each, float), SHAPE) for each in row] for row in run(made, dtype)]
+    found = np.moveaxis(np.array(found), 0, 1)  # signals, steps, envs, joints
+    wanted = np.array([[list(made.oracle(env, joint)) for joint in range(JOINTS)] for env in range(ENVS)], float)
+    wanted = np.moveaxis(wanted, (3, 2), (0, 1))
+    tolerance = 1e-9 if dtype == np.float64 else 2e-3  # a resolution, or the last step to a setpoint, may round away
+    np.testing.assert_allclose(found, wanted, rtol=tolerance, atol=tolerance)
+    if name == "programs":
+        plain = [[np.broadcast_to(np.asarray(each, float), SHAPE) for each in row] for row in by_numpy(made, dtype)]
+        np.testing.assert_array_equal(found, np.moveaxis(np.array(plain), 0, 1))
+
+
+@pytest.mark.skipif(bool(obstacle()), reason="there are no programs")
+def test_programs_of_stages_hold_for_their_coefficients_alone():
+    qpos = np.zeros(SHAPE)
+    weak, strong = (bp.make_actuators(JOINTS, strength=strength, bias=0.1, lag=0.01) for strength in (0.5, 2.0))
+    state = motors.init(weak, qpos, DT)
+    k, other = (motors.discretise(each, state, DT, ENVS) for each in (weak, strong))
+    stages = compiled_stages(k, SHAPE)
+    assert stages is not motors.STAGES
+    for each in (k, other):
+        wanted = motors.STAGES.delivered(each, qpos, qpos + 1.0, qpos, qpos)
+        np.testing.assert_array_equal(stages.delivered(each, qpos, qpos + 1.0, qpos, qpos), wanted)
+
+
+def test_without_the_extension_stages_are_numpys(monkeypatch):
+    monkeypatch.setenv("BATCHPID_NATIVE", "0")
+    actuators = bp.make_actuators(JOINTS, strength=0.5)
+    k = motors.discretise(actuators, motors.init(actuators, np.zeros(SHAPE), DT), DT, ENVS)
+    assert compiled_stages(k, SHAPE) is motors.STAGES

@@ -1,0 +1,356 @@
+"""Misuse of the public functions: each wrong value is refused by an error that names its argument and a remedy.
+
+Wrong values of the options of joints come from the declared fields, those of other arguments from a table by name.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+
+import numpy as np
+import pytest
+from trees import planar, robot_of
+
+import batchpid as bp
+import batchpid.export
+import batchpid.task_space as ts
+from batchpid import metrics, motors, trajectories
+from batchpid.errors import InvalidArgumentError
+from batchpid.law.params import FIELDS as LAW_FIELDS
+from batchpid.motors import friction, guard
+from batchpid.motors.actuators import FIELDS as MOTOR_FIELDS
+from batchpid.task_space import osc_params
+
+NAMES = ["shoulder", "elbow"]
+
+
+def refused(argument, function, *arguments, **keywords):
+    """Return the error of a call, which names ``argument`` and a remedy."""
+    with pytest.raises(InvalidArgumentError) as caught:
+        function(*arguments, **keywords)
+    # A field, "params.kp", or a place in a text, "text: kp", may be named within its owner.
+    assert argument in (caught.value.argument, *caught.value.argument.split(": "), *caught.value.argument.split("."))
+    assert caught.value.remedy
+    return caught.value
+
+
+# -- Options of joints, from the declared fields ---------------------------------------------------------------------
+
+OPTIONS = [
+    *((bp.make_params, {"kp": 1.0, "ki": 1.0}, name, field) for name, field in LAW_FIELDS.items()),
+    *((bp.make_actuators, {}, name, field) for name, field in MOTOR_FIELDS.items()),
+    *((bp.make_guard, {}, name, field) for name, field in guard.FIELDS.items() if name not in ("lower", "upper")),
+]
+
+NEEDS = {"tracking_time": {"anti_windup": "back_calculation", "effort_limit": 1.0}}
+NEEDS |= {name: {"saturation_effort": 1.0, "no_load_speed": 1.0} for name in ("saturation_effort", "no_load_speed")}
+"""Options without which an option is refused."""
+
+
+def outside(field):
+    """Return numbers outside of the bounds of a declared field."""
+    low = [] if math.isinf(field.low) else [field.low if field.above else field.low - 0.1]
+    high = [] if math.isinf(field.high) else [1.5 * field.high]
+    return [math.nan, *low, *high, *([] if math.isinf(field.neutral) else [math.inf])]
+
+
+@pytest.mark.parametrize(("make", "base", "name", "field"), OPTIONS, ids=lambda each: each if type(each) is str else "")
+def test_options_of_joints(make, base, name, field):
+    def error(value):
+        both = (
+            {"saturation_effort": 1.0, "no_load_speed": 1.0} if name in ("saturation_effort", "no_load_speed") else {}
+        )
+        back = {"anti_windup": "back_calculation", "effort_limit": 1.0} if name == "tracking_time" else {}
+        return refused(name, make, 2, **(base | both | back | {name: value}), joint_names=NAMES)
+
+    if name != "anti_windup":
+        error([[1.0, 2.0], [1.0]])
+    for value in (1j, np.ones(3), np.ones((1, 1, 2)), np.ones((0, 2))):
+        error(value)
+    if isinstance(field.neutral, float):
+        for value in ("much", True):
+            error(value)
+        for value in outside(field):
+            found = error([[1.0, 1.0], [1.0, value]] if field.high >= 1 else [[0.1, 0.1], [0.1, value]])
+            assert (found.joint, found.env) == ("elbow", 1)
+            assert found.value == value or math.isnan(value)
+
+
+CHOICES = [name for name, each in inspect.signature(bp.make_params).parameters.items() if type(each.default) is str]
+
+
+@pytest.mark.parametrize("name", CHOICES)
+def test_choices_of_the_law(name):
+    for value in ("other", None, []):
+        refused(name, bp.make_params, 2, 1.0, **{name: value})
+
+
+ROW, AXIS = np.ones((1, 2)), [True] + [False] * 5
+COMBINATIONS = [
+    (bp.make_params, "kp", {"kp": None}),
+    (bp.make_params, "kd", {"kp": np.ones((2, 2)), "kd": np.ones((4, 2))}),
+    (bp.make_params, "effort_min", {"effort_min": [0, 2], "effort_max": 1}),
+    (bp.make_params, "effort_limit", {"effort_limit": 1, "effort_max": 2}),
+    (bp.make_params, "effort_limit", {"effort_limit": [1, math.nan]}),
+    (bp.make_params, "integral_limit", {"integral_limit": -1}),
+    (bp.make_params, "anti_windup", {"anti_windup": ["none", "wind"]}),
+    (bp.make_params, "anti_windup", {"anti_windup": "clamp"}),
+    (bp.make_params, "tracking_time", {"tracking_time": 1.0}),
+    (bp.make_params, "discretization", {"discretization": "implicit", "gain_units": "inertia"}),
+    (
+        bp.make_params,
+        "derivative_filter_time",
+        {"derivative_filter_time": 1e-3, "gain_units": "mass_matrix", "discretization": "implicit"},
+    ),
+    (bp.make_actuators, "position_limit", {"position_limit": [1.0, 2.0, 3.0]}),
+    (bp.make_actuators, "position_limit", {"position_limit": ([0.0, 1.0], [1.0, 2.0, 3.0])}),
+    (bp.make_actuators, "position_limit", {"position_limit": ([1.0, 0.0], [1.0, 2.0])}),
+    (bp.make_actuators, "position_limit", {"position_limit": ([0.0, 1.0], [1.0, math.inf])}),
+    (bp.make_actuators, "sensor_delay", {"sensor_delay": 0.01, "max_delay": 0.005}),
+    (bp.make_actuators, "static", {"static": 0.1, "coulomb": [0.1, 0.2]}),
+    (bp.make_actuators, "no_load_speed", {"saturation_effort": 10.0}),
+    (bp.make_actuators, "saturation_effort", {"no_load_speed": 10.0}),
+    (bp.make_actuators, "stribeck", {"stribeck": 0.1, "coulomb": 0.2}),
+    (bp.make_guard, "lower", {"lower": 1.0, "upper": 0.0}),
+    (bp.make_guard, "setpoint_max", {"upper": math.nan}),
+    (ts.make_osc_params, "stiffness", {"stiffness": [1.0, 2.0]}),
+    (ts.make_osc_params, "stiffness", {"stiffness": [1, 1, -1, 1, 1, 1]}),
+    (ts.make_osc_params, "damping_ratio", {"damping_ratio": math.nan}),
+    (ts.make_osc_params, "axes", {"axes": [1, 0, 1, 1, 1, 1]}),
+    (ts.make_osc_params, "force_axes", {"axes": [True] * 6, "force_axes": AXIS}),
+    (ts.make_osc_params, "posture_stiffness", {"posture_stiffness": [1.0] * 3}),
+    (ts.make_osc_params, "effort_min", {"effort_min": 1.0, "effort_max": 0.0}),
+    (ts.make_osc_params, "effort_limit", {"effort_limit": 1.0, "effort_max": 2.0}),
+    (ts.make_osc_params, "smallest_eigenvalue", {"smallest_eigenvalue": 0.0}),
+    (ts.make_osc_params, "position_error_limit", {"position_error_limit": -1.0}),
+    (ts.make_osc_params, "damping", {"decoupling": "none"}),
+    (ts.make_osc_params, "effort_min", {"stiffness": np.ones((3, 6)), "effort_limit": np.ones((2, 2))}),
+    (ts.make_osc_params, "integral_gain", {"integral_gain": -1.0}),
+    (ts.make_osc_params, "integral_limit", {"integral_gain": 1.0, "integral_limit": math.nan}),
+    (ts.make_osc_params, "integral_limit", {"integral_limit": 1.0}),
+    (ts.make_osc_params, "limit_margin", {"limit_margin": -0.1}),
+    (ts.make_osc_params, "limit_stiffness", {"limit_stiffness": [10.0, 20.0]}),
+    (ts.make_osc_params, "damping_ratio", {"damping": 9.0, "damping_ratio": 0.7}),
+    (ts.make_osc_params, "discretization", {"discretization": "implicit", "decoupling": "none", "damping": 1.0}),
+    *((ts.make_osc_params, name, {name: "other"}) for name in osc_params.TASK_CHOICES),
+    (motors.presets.delayed_pd, "max_delay", {"min_delay": 3, "max_delay": 2, "timestep": 0.01}),
+    (motors.presets.newton, "timestep", {"delay_steps": 1}),
+    (batchpid.export.to_c, "params", {"params": bp.make_params(2, np.ones((2, 2)))}),
+    (batchpid.export.to_c, "inputs", {"params": bp.make_params(2, 1.0, measurement_rate="measured"), "inputs": ()}),
+    (batchpid.export.to_c, "inputs", {"inputs": ("velocity",)}),
+    (batchpid.export.to_c, "prefix", {"prefix": "a-b"}),
+    (batchpid.export.to_c, "tree", {"tree": planar((1.0,))}),
+    (batchpid.export.to_c_project, "header", {"header": "pid.c"}),
+    (batchpid.export.to_isaac_lab, "model", {"model": "dc_motor"}),
+    (batchpid.export.to_isaac_lab, "model", {"model": "net"}),
+    (batchpid.export.to_isaac_lab, "name", {"name": "a b"}),
+    (batchpid.export.to_maniskill, "name", {"name": "1"}),
+    (batchpid.export.to_newton, "name", {"name": "a b"}),
+    (batchpid.export.to_ros2_control, "inertia", {"params": bp.make_params(2, 1.0, gain_units="inertia")}),
+    (batchpid.export.to_ros2_control, "inertia", {"inertia": [0.0, 1.0]}),
+    (batchpid.export.to_ros2_control, "effort_min", {"params": bp.make_params(2, 1.0, effort_min=2, effort_max=2)}),
+    (trajectories.minimum_jerk, "duration", {"duration": None}),
+    (trajectories.minimum_jerk, "duration", {"duration": 1.0, "max_velocity": 1.0}),
+    (trajectories.minimum_jerk, "max_velocity", {"max_velocity": [1.0, math.inf]}),
+    (trajectories.trapezoidal, "max_velocity", {"max_velocity": [1.0, -1.0]}),
+    (trajectories.trapezoidal, "max_acceleration", {"max_acceleration": math.inf}),
+    (metrics.step_metrics, "measurement", {"measurement": np.zeros((1, 1, 2))}),
+    (metrics.step_metrics, "setpoint", {"setpoint": np.zeros(3)}),
+    (metrics.step_metrics, "effort", {"effort": np.zeros((3, 1, 2))}),
+    (metrics.step_metrics, "saturated", {"saturated": np.zeros((9, 1, 2))}),
+    (metrics.step_metrics, "band", {"band": 0.0}),
+    *((bp.design_gains, name, {name: 0.0}) for name in ("bandwidth_hz", "dt")),
+    (bp.design_gains, "damping_ratio", {"damping_ratio": -1.0}),
+    (bp.design_gains, "margin", {"margin": 1.5}),
+    (bp.design_gains, "gain_units", {"gain_units": "torque"}),
+    (bp.design_gains, "load", {"load": -1.0}),
+    (bp.design_gains, "load", {"load": 1.0, "gain_units": "inertia"}),
+    (bp.design_gains, "discretization", {"discretization": "implicit", "gain_units": "effort"}),
+    (bp.stability_bound, "mass_matrix", {"mass_matrix": -np.eye(2)}),
+    (bp.stability_bound, "mass_matrix", {"mass_matrix": np.full((2, 2), math.nan)}),
+    (bp.stability_bound, "kp", {"kp": [1.0, 2.0, 3.0]}),
+    (ts.inverse_kinematics, "pose", {"pose": 2 * np.ones((1, 7))}),
+    (ts.inverse_kinematics, "starts", {"starts": 0}),
+    (ts.inverse_kinematics, "rotation_tolerance", {"rotation_tolerance": 0.0}),
+    (ts.inverse_kinematics, "on_failure", {"on_failure": "ignore"}),
+    (ts.inverse_kinematics, "start", {"pose": np.tile(np.eye(7)[3], (3, 1)), "start": np.zeros((2, 2))}),
+    (ts.make_osc_params, "tree", {"tree": "panda"}),
+]
+
+
+@pytest.mark.parametrize(
+    ("function", "argument", "changes"), [pytest.param(*row, id=f"{row[0].__name__}-{row[1]}") for row in COMBINATIONS]
+)
+def test_options_that_do_not_go_together(function, argument, changes):
+    refused(argument, function, **needed(function, changes) | changes)
+
+
+# -- Other arguments, by their names ---------------------------------------------------------------------------------
+
+MODULES = (bp, batchpid.export, ts, motors, motors.presets, friction, guard, metrics, trajectories)
+Y, TREE = np.zeros((1, 2)), planar()
+PARAMS = bp.make_params(2, 4.0, 1.0, 1.0, integration="integrate_first")
+OSC = ts.make_osc_params(TREE, integral_gain=1.0)
+POSE = ts.link_poses(TREE, Y, ["tip"])[:, 0]
+MOTORS, GUARD = bp.make_actuators(2, lag=0.1), bp.make_guard(2, rate=1.0)
+RUBBING = friction.Friction(np.ones((1, 2)), np.ones((1, 2)))
+VALUES = {
+    "num_envs": 1, "joints": 2, "joint_names": ["a", "b"], "measurement": Y, "setpoint": Y, "effort": Y, "qpos": Y,
+    "qvel": Y, "tree": TREE, "link": "tip", "mass_matrix": np.eye(2), "inertia": np.ones((1, 2)), "kp": 1.0, "ki": 1.0,
+    "kd": 1.0, "params": PARAMS, "actuators": MOTORS, "min_delay": 0, "max_delay": 1, "load": Y, "mask": [True],
+    "guard": GUARD, "friction": RUBBING, "velocity": Y, "start": Y, "target": Y + 1, "end": Y + 1, "max_velocity": 1.0,
+    "max_acceleration": 1.0, "max_jerk": 1.0, "robot": robot_of("panda"), "pose": POSE, "qacc": Y,
+    "saturation_effort": 9.0, "velocity_limit": 5.0, "joint_parameter_lookup": [[0.0, 1.0, 1.0], [1.0, 1.0, 1.0]],
+}  # fmt: skip
+"""Values of required arguments, by their names."""
+OWN = {
+    "batchpid": {"state": bp.init(PARAMS, Y)},
+    "batchpid.task_space": {
+        "params": OSC,
+        "state": ts.init(OSC, Y),
+        "setpoint": POSE,
+        "dynamics": ts.task_dynamics(TREE, Y, Y, "tip"),
+    },
+    "batchpid.metrics": {"setpoint": np.ones((9, 1, 2)), "measurement": np.zeros((9, 1, 2))},
+    "batchpid.motors": {"state": motors.init(MOTORS, Y, 0.01)},
+    "batchpid.motors.guard": {"state": guard.init(GUARD, Y)},
+    "batchpid.motors.friction": {
+        "mass_matrix": np.eye(2)[None],
+        "state": friction.init(RUBBING, Y, Y, np.eye(2)[None], 0.01),
+    },
+}
+"""Those of the functions of a module."""
+WRONG = {
+    "dt": [0, -1e-3, math.nan, math.inf, "fast", 2000, np.float32(50.0), np.int64(240)],
+    "joints": [0, 2.5, True, "two"],
+    "num_envs": [0, 2.0, True],
+    "backend": ["torch"],
+    "threads": [0],
+    "dtype": [np.float16, "number"],
+    "joint_names": [["a"], "ab", ["a", "a"], ["a", 2]],
+    "params": [{"kp": 1}],
+    "link": ["top", 3],
+    "frame": ["body"],
+    "point": [[0.1, 0.2]],
+    "qpos": [np.zeros((1, 3)), "here"],
+    "qvel": [np.zeros((1, 3))],
+    "measurement": [np.zeros((4, 5)), "here", 1j * Y, [["1", "2"]], np.array([["2020-01-01"] * 2], "datetime64")],
+    "setpoint": [np.zeros((1, 3)), "there"],
+    "effort": [np.ones((1, 3))],
+    **{name: [np.ones((1, 3))] for name in ("measurement_rate", "setpoint_rate", "feedforward")},
+    "mask": [[0], np.ones(3, bool)],
+    "actuators": [bp.make_actuators(3, lag=0.1)],
+    "seed": [-1, 0.5],
+}
+WRONG["timestep"] = WRONG["dt"]
+
+
+def public(module):
+    """Yield the public callables of a module."""
+    own = (name for name, each in vars(module).items() if getattr(each, "__module__", None) == module.__name__)
+    for name in getattr(module, "__all__", [name for name in own if not name.startswith("_")]):
+        each = getattr(module, name)
+        if callable(each) and not (isinstance(each, type) and issubclass(each, Exception | tuple)):
+            yield name, each
+
+
+PUBLIC = [(module.__name__, name, each) for module in MODULES for name, each in public(module)]
+
+
+def needed(function, more=(), module=None):
+    """Return good values of the required arguments of a function, and of ``more``."""
+    module = module or next(owner for owner, _, each in PUBLIC if each is function)
+    values = VALUES | OWN.get(module, {}) | {"duration": 1.0, "dt": 0.01, "timestep": 0.01}
+    values |= {"setpoint": np.ones((9, 1, 2))} if function is metrics.step_metrics else {}
+    parameters = inspect.signature(function).parameters.items()
+    required = {name for name, each in parameters if each.default is each.empty and each.kind is not each.VAR_KEYWORD}
+    required |= {"dt"} if function is bp.track else set()
+    if function is trajectories.minimum_jerk and not more:
+        required |= {"duration"}
+    return {name: values[name] for name in required}
+
+
+STEPS = {"dt", "timestep"}
+CORE = {"batchpid.motors", "batchpid.motors.guard", "batchpid.motors.friction"}
+HOT = {"advance", "discretise", "drive_target", "osc", "init", "reset", "track", "dumps_params"}
+"""Functions of the loop, which check their time steps alone, besides those of the law."""
+
+
+def checked(module, name, function):
+    """Return the arguments of WRONG that a function checks."""
+    arguments = WRONG.keys() & inspect.signature(function).parameters.keys()
+    is_law = module == "batchpid" and name in ("init", "reset", "track")
+    return arguments & STEPS if module in CORE or (name in HOT and not is_law) else arguments
+
+
+def rows():
+    for module, name, function in PUBLIC:
+        if not {"path", "text", "parent"} & inspect.signature(function).parameters.keys():
+            for argument in checked(module, name, function):
+                yield pytest.param(module, function, argument, id=f"{module}.{name}-{argument}")
+
+
+@pytest.mark.parametrize(("module", "function", "argument"), sorted(rows(), key=lambda row: row.id))
+def test_arguments_of_every_public_function(module, function, argument):
+    if function is trajectories.jerk_limited:
+        pytest.importorskip("ruckig")
+    good = needed(function, module=module)
+    function(**good)
+    numbers = {"fast"} if checked(module, function.__name__, function) <= STEPS else set()  # the loop reads no text
+    for value in (each for each in WRONG[argument] if type(each) is not str or each not in numbers):
+        error = refused(argument, function, **good | {argument: value})
+        if argument in ("dt", "timestep") and isinstance(value, int | np.number) and value > 1:
+            assert f"seconds, 1/{value:g}" in error.remedy, "a rate in place of a time step"
+
+
+def test_an_unknown_option_is_answered_with_the_nearest():
+    params, actuators = bp.make_params(2, 1.0), bp.make_actuators(2, lag=0.01)
+    for function in (bp.make_params, bp.make_actuators, motors.presets.remotized):
+        assert "'effort_limit'" in refused("efort_limit", function, **needed(function), efort_limit=3.0).remedy
+    for function in (params.replace, actuators.replace, lambda **options: bp.presets.tutorial(2, **options)):
+        assert "'effort_limit'" in refused("efort_limit", function, efort_limit=3.0).remedy
+    assert "joints, kp, ki, kd" in refused("zzzzzzz", bp.make_params, 2, kp=1.0, zzzzzzz=1).remedy
+
+
+# -- Texts -----------------------------------------------------------------------------------------------------------
+
+PID = '{"format": "batchpid-params-1", "joints": {"elbow": {%s}}}'
+MOTOR = "format: batchpid-actuators-1\njoints: {elbow: {%s}}"
+TEXTS = [
+    *((text, "text", None) for text in ("", '{"joints": {}}', "[1, 2]", '{"format": "batchpid')),
+    ('{"format": "batchpid-params-1", "joint": {}}', "key", None),
+    ('{"format": "batchpid-params-1", "joints": {}}', "joints", None),
+    (PID % '"kd": 1.0', "joints", "elbow"),
+    (PID % '"kp": 1.0, "kq": 2.0', "kq", "elbow"),
+    (PID % '"kp": 1.0, "kp": 2.0', "text", None),
+    *((PID % f'"kp": {value}', "kp", "elbow") for value in ("-1.0", '"nan"', '"1e3"', "true", "null", "[[1.0]]", "[]")),
+    (PID % f'"kp": 1{"0" * 400}', "kp", "elbow"),
+    (PID % '"kp": 1.0, "anti_windup": "magic"', "anti_windup", "elbow"),
+    ('{"format": "batchpid-params-1", "integration": [], "joints": {"a": {"kp": 1.0}}}', "integration", None),
+    ('{"format": "batchpid-params-1", "dtype": "object", "joints": {"a": {"kp": 1.0}}}', "dtype", None),
+    ('{"format": "batchpid-params-1", "about": 3, "joints": {"a": {"kp": 1.0}}}', "about", None),
+    ("format: batchpid-params-1\njoints: {elbow: {kp: 1}}", "text", None),
+    (MOTOR % "kp: 1", "kp", "elbow"),
+    (MOTOR % "strength: strong", "strength", "elbow"),
+    (MOTOR % "strength: -1", "strength", "elbow"),
+    *((MOTOR % f"position_limit: {value}", "position_limit", "elbow") for value in ("[1, 2]", "[[0], [1, 2]]")),
+    (MOTOR % "position_limit: [[1, 0], [1, 2]]", "position_limit", "elbow"),
+    ("format: batchpid-actuators-1\njoints: {shoulder: {}}", "text", None),
+    ("format: batchpid-actuators-1\njoints: {elbow: [1]}", "joints", "elbow"),
+    ("format: batchpid-actuators-1\nseed: soon\njoints: {elbow: {}}", "seed", None),
+    *((text, "text", None) for text in ("- 1", "format: [")),
+]
+"""Text of params or of actuators, the key that is wrong, and its joint."""
+
+
+@pytest.mark.parametrize(("text", "key", "joint"), TEXTS, ids=range(len(TEXTS)))
+def test_texts(text, key, joint, tmp_path):
+    """As a text and as a file, whose error names the file."""
+    is_motor = "actuators" in text or text in ("- 1", "format: [") or text.endswith("{elbow: {kp: 1}}")
+    read, load = (motors.loads_actuators, bp.load_actuators) if is_motor else (bp.loads_params, bp.load_params)
+    names = [["elbow"]] if is_motor else []
+    assert refused(key, read, text, *names).joint == joint
+    for suffix in (".yaml", ".json")[: 1 if is_motor else 2]:
+        (path := tmp_path / f"file{suffix}").write_text(text)
+        assert str(path) in str(refused(str(path) if key == "text" else key, load, path, *names))
