@@ -40,7 +40,7 @@ def refused(argument, function, *arguments, **keywords):
 OPTIONS = [
     *((bp.make_params, {"kp": 1.0, "ki": 1.0}, name, field) for name, field in LAW_FIELDS.items()),
     *((bp.make_actuators, {}, name, field) for name, field in MOTOR_FIELDS.items()),
-    *((bp.make_guard, {}, name, field) for name, field in guard.FIELDS.items() if name not in ("lower", "upper")),
+    *((bp.make_guard, {}, name, field) for name, field in guard.FIELDS.items()),
 ]
 
 NEEDS = {"tracking_time": {"anti_windup": "back_calculation", "effort_limit": 1.0}}
