@@ -37,8 +37,7 @@ from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import STAGES, control_step
 from batchpid.sim.loop.pid_law import PIDLaw
-from batchpid.sim.loop.step_constants import acting_gains
-from batchpid.sim.loop.step_state import reset_friction
+from batchpid.sim.loop.step_setup import acting_gains, reset_friction
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
 from batchpid.sim.robot.description import Dynamics
 from batchpid.sim.robot.robot import Robot
@@ -187,15 +186,15 @@ def contact_moves(robot: Robot, count: int, seed: int = 0) -> Moves:
     """Return ``count`` seeded moves from free poses until some link presses gently on the ground or on another."""
     rng, dynamics, line = np.random.default_rng(seed), robot.dynamics(), np.linspace(0, 1, _LINE)[:, None]
 
-    def draw(_: int) -> tuple[Float64, Float64, str] | None:
+    def draw(_: int) -> list[tuple[Float64, Float64, str]]:
         here, there = robot.sample(2, seed=int(rng.integers(2**31)))
         touches = dynamics.in_contact(here + line * (there - here))
         touch = here + line[np.argmax(touches)] * (there - here)
         if touches[0] or not touches.any() or np.abs(touch - here).max() < APPROACH:
-            return None
+            return []
         direction = (there - here) / np.abs(there - here).max()
         target = np.clip(touch + PRESS * direction, robot.lower, robot.upper)
-        return touch - APPROACH * direction, target, "contact"
+        return [(touch - APPROACH * direction, target, "contact")]
 
     return draw_moves(robot, count, draw)
 
@@ -206,16 +205,16 @@ def limit_moves(robot: Robot, count: int, seed: int = 0) -> Moves:
     bounded = np.isfinite(robot.lower) & np.isfinite(robot.upper)
     joints = [j for j, joint in enumerate(robot.joints) if joint.type != "prismatic" and bounded[j]]
 
-    def draw(_: int) -> tuple[Float64, Float64, str] | None:
+    def draw(_: int) -> list[tuple[Float64, Float64, str]]:
         if not joints:
-            return None
+            return []
         start = robot.sample(1, seed=int(rng.integers(2**31)))[0]
         joint = rng.choice(joints)
         limit, sign = (robot.upper[joint], 1) if rng.integers(2) else (robot.lower[joint], -1)
         start[joint] = limit - sign * APPROACH
         target = start.copy()
         target[joint] = limit + sign * BEYOND
-        return None if dynamics.in_contact(start + line * (target - start)).any() else (start, target, "limit")
+        return [] if dynamics.in_contact(start + line * (target - start)).any() else [(start, target, "limit")]
 
     return draw_moves(robot, count, draw)
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from batchpid.sim import Robot, Rollout, Runner, read_recording
-from batchpid.sim.view.painter import Triangles, paint
+from batchpid.sim.view.film import Triangles, paint
 from batchpid.task_space.rotations import about, placed, rotate
 
 PICTURE = Path(__file__).resolve().parent.parent / "docs" / "images" / "two-gains.gif"

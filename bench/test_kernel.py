@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import simple_pid
+from tutorial import SimplePID
 
 import batchpid as bp
 from batchpid.law.blocks import advance_in_blocks
-from batchpid.law.reference import SimplePID
 from batchpid.native.availability import SWITCH
 
 numba = pytest.importorskip("numba")

@@ -22,7 +22,7 @@ from batchpid.sim.loop.custom import initial_state
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
 from batchpid.sim.observation import untouched
 from batchpid.sim.options import IDEAL, RunnerOptions
-from batchpid.sim.randomization.draws import NOTHING, Draws
+from batchpid.sim.randomization.distributions import NOTHING, Draws
 from batchpid.sim.robot.run_checks import SetpointCheck
 from batchpid.sim.runner_arguments import accelerated, base_rows, joint_rows
 from batchpid.sim.runner_state import RunnerState

@@ -11,7 +11,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.loop.faults import FaultLog
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.randomization.draws import NOTHING, Draws
+from batchpid.sim.randomization.distributions import NOTHING, Draws
 from batchpid.sim.workers.contact_log import MissedContactLog
 
 Motion = tuple[Float64, Float64 | None]

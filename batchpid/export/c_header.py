@@ -21,7 +21,7 @@ from batchpid.checks.validate import choice, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.c_rigid_body import rigid_body
 from batchpid.export.c_step import Dialect, Value, helpers, statements
-from batchpid.export.differences import Exported
+from batchpid.export.differences import Exported, check_one_env
 from batchpid.law import pid
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.computed_torque import advance_with_mass_matrix, check_gain_units, per_inertia
@@ -95,12 +95,9 @@ class Header:
         prefix: str,
         tree: RigidTree | None,
     ) -> None:
-        instance("params", params, PIDParams, "build them with make_params()")
+        check_one_env(params)
         time_step("dt", dt)
         joints = params.num_joints
-        if params.num_envs > 1:
-            remedy = "choose one env: params.for_envs(slice(k, k + 1))"
-            raise InvalidArgumentError("params", f"are for {params.num_envs} envs", remedy=remedy)
         unnamed = [f"joint {at}" for at in range(joints)]
         labels = unnamed if joint_names is None else names("joint_names", joint_names, joints)
         if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):

@@ -27,6 +27,14 @@ from batchpid.law.implicit import as_explicit
 from batchpid.law.params import PIDParams
 
 
+def check_one_env(params: PIDParams) -> None:
+    """Raise InvalidArgumentError unless these are params of one env."""
+    instance("params", params, PIDParams, "build them with make_params()")
+    if params.num_envs > 1:
+        remedy = "choose one env: params.for_envs(slice(k, k + 1))"
+        raise InvalidArgumentError("params", f"are for {params.num_envs} envs", remedy=remedy)
+
+
 class Exported(NamedTuple):
     """Text of a file for a target, and the differences of the target's law from :func:`batchpid.step`."""
 
@@ -60,10 +68,7 @@ class Differences(list[str]):
         implicit: bool = False,
     ) -> None:
         super().__init__()
-        instance("params", params, PIDParams, "build them with make_params()")
-        if params.num_envs > 1:
-            remedy = "choose one env: params.for_envs(slice(k, k + 1))"
-            raise InvalidArgumentError("params", f"are for {params.num_envs} envs", remedy=remedy)
+        check_one_env(params)
         self.joints = names("joint_names", joint_names, params.num_joints)
         self.dt = time_step("dt", dt)
         params.check(1, self.joints)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import DType, Rows
+from batchpid.arrays.trees import leaves, mapped, structure
 from batchpid.law.coefficients import Coefficients
 from batchpid.law.pid import advance
 from batchpid.law.state import PIDState, Terms
@@ -21,7 +22,6 @@ from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
 from batchpid.native.operations import OPERATION
 from batchpid.native.tracing import Trace, trace_trees
-from batchpid.native.trees import leaves, mapped, structure
 
 _MEASUREMENT = 1
 """Index of the measurement among the inputs: the only input that must be (envs, joints)."""

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import DType
+from batchpid.arrays.trees import filled, leaves
 from batchpid.native.operations import OPERATIONS
 from batchpid.native.symbols import Namespace, Symbol
-from batchpid.native.trees import filled, leaves
 
 _Operation = tuple[str, tuple[Symbol, ...], Symbol]
 
@@ -63,7 +63,7 @@ def trace(function: Callable[..., Any], constants: int, inputs: int, dtype: DTyp
 def trace_trees(function: Callable[..., Any], *structures: Any, dtype: DType = np.float64) -> Trace:
     """Return the trace of a function of nested tuples, as :func:`trace` does.
 
-    ``structures`` (:func:`batchpid.native.trees.structure`) describe its arguments; the first one has the constants.
+    ``structures`` (:func:`batchpid.arrays.trees.structure`) describe its arguments; the first one has the constants.
     """
 
     def flat(*symbols: Symbol) -> list[Any]:

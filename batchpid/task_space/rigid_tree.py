@@ -29,6 +29,8 @@ from batchpid.task_space.frames import matrix_of, turned, wxyz_of
 from batchpid.task_space.spatial_inertia import SpatialInertia, inertia_rows, moved_matrix, spatial_matrix
 
 JOINT_TYPES = ("fixed", "revolute", "prismatic")
+GRAVITY = (0.0, 0.0, -9.81)
+"""Gravity of a tree, and in the engines, unless another one is given [m/s^2]."""
 
 
 class Bodies(NamedTuple):
@@ -102,7 +104,7 @@ class RigidTree:
     lower: ArrayLike = -np.inf
     """Lower position limits (dof,) [rad or m], for inverse kinematics."""
     upper: ArrayLike = np.inf
-    gravity: ArrayLike = (0.0, 0.0, -9.81)
+    gravity: ArrayLike = GRAVITY
     """Acceleration of free fall in the world (3,) [m/s^2]."""
     coupling: Coupling = None  # type: ignore[assignment]
     """Coupling of the joints; None: all are independent. Jacobians, mass matrices and efforts are reduced to the

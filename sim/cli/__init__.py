@@ -28,8 +28,8 @@ from batchpid.sim.cli.excite import ExciteCommand
 from batchpid.sim.cli.export import ExportCommand
 from batchpid.sim.cli.identify import IdentifyCommand
 from batchpid.sim.cli.inspect import InspectCommand
+from batchpid.sim.cli.outputs import close_bars
 from batchpid.sim.cli.plot import PlotCommand, RenderCommand
-from batchpid.sim.cli.progress import close_bars
 from batchpid.sim.cli.rollout import RolloutCommand
 from batchpid.sim.cli.survey import SurveyCommand
 from batchpid.sim.cli.tune import TuneCommand

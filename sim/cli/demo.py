@@ -11,8 +11,7 @@ from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, beside, write_figures
-from batchpid.sim.cli.progress import waiting
+from batchpid.sim.cli.outputs import OutputFiles, beside, waiting, write_figures
 from batchpid.sim.tuning.gain_sets import gain_set
 
 RUNNER = flags.runner_flags("ground", "workers", "engine", "backend")

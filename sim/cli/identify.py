@@ -11,8 +11,7 @@ import tyro
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, beside, write_figures
-from batchpid.sim.cli.progress import AT_MOST, bar
+from batchpid.sim.cli.outputs import AT_MOST, OutputFiles, bar, beside, write_figures
 
 if TYPE_CHECKING:
     from batchpid.sim.identification.log import Log

@@ -1,4 +1,4 @@
-"""Output files of the commands: default names, and the checks of every one before the run.
+"""Output of the commands: files, with default names and checks of every one before the run, and bars of progress.
 
 A run may take hours, so every possible check is made before it. No file is replaced without ``--force``.
 """
@@ -9,13 +9,21 @@ import json
 import math
 import os
 import shlex
-from collections.abc import Collection, Iterable, Mapping
+import sys
+import weakref
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import try_writing, write_atomically
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 FOLDER = Path("out")
 """Folder of default outputs, which is made when a file is written; other folders have to exist."""
@@ -102,3 +110,49 @@ def stem(path: Path) -> str:
 def beside(path: Path, shown: str, suffix: str = ".png") -> Path:
     """Return the default path of a picture or film of ``path``, in the same folder: NAME-SHOWN.png."""
     return path.with_name(f"{stem(path)}-{shown}{suffix}")
+
+
+AT_MOST = "{desc}: {n_fmt} of at most {total_fmt} evaluations, {elapsed}, at most {remaining} more{postfix}"
+"""Format of a bar for work that usually ends long before the last step."""
+_bars: weakref.WeakSet[tqdm[Any]] = weakref.WeakSet()
+
+
+def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
+    """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; ``options`` go to tqdm.
+
+    In a file there is no bar.
+    """
+    from tqdm import tqdm
+
+    options = {"delay": 1.0} | options | {"leave": False, "dynamic_ncols": True, "disable": not sys.stderr.isatty()}
+
+    def wrap(items: Iterable[Any]) -> Iterable[Any]:
+        shown = tqdm(items, desc=label, **options)
+        _bars.add(shown)
+        return shown
+
+    return wrap
+
+
+@contextmanager
+def waiting(label: str, **options: Any) -> Iterator[None]:
+    """Show ``label`` and the time since on stderr, from 1 s on, while the block runs; ``options`` go to tqdm."""
+    ended = Event()
+
+    def show() -> None:
+        for _ in bar(label, bar_format="{desc}: {elapsed}", **options)(iter(partial(ended.wait, 0.5), True)):
+            pass
+
+    thread = Thread(target=show, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def close_bars() -> None:
+    """Remove all bars, so that a message gets a separate line; an error may have left some."""
+    for each in list(_bars):
+        each.close()

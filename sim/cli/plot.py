@@ -13,8 +13,7 @@ from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Rollout, read_recording
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, beside, stem
-from batchpid.sim.cli.progress import bar
+from batchpid.sim.cli.outputs import OutputFiles, bar, beside, stem
 
 
 @dataclass(frozen=True)

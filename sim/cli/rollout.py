@@ -15,8 +15,7 @@ from batchpid.checks.validate import array, file_path, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Recorder, Robot, write_recording
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, write_figures
-from batchpid.sim.cli.progress import waiting
+from batchpid.sim.cli.outputs import OutputFiles, waiting, write_figures
 from batchpid.sim.recording.recording_files import HDF5
 from batchpid.sim.runner_keywords import checked_option
 from batchpid.sim.tool_space.osc_controller import default_tool

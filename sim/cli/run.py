@@ -18,7 +18,7 @@ from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, Runner, read_recording
 from batchpid.sim.cli.flags import MeshOptions
-from batchpid.sim.cli.progress import bar
+from batchpid.sim.cli.outputs import bar
 from batchpid.sim.cli.report import run_report, tool_report, trajectory_report
 from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.identification.setpoint_files import Setpoints

@@ -12,7 +12,7 @@ import tyro
 
 from batchpid.io.files import write_atomically
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, write_figures
+from batchpid.sim.cli.outputs import OutputFiles, bar, write_figures
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
@@ -57,7 +57,6 @@ class SurveyCommand:
 
     def run(self) -> int:
         """Run the command; the exit status is 1 if a robot crashed its process."""
-        from batchpid.sim.cli.progress import bar
         from batchpid.sim.options import worker_count
         from batchpid.sim.tuning.robot_survey import find_robots, survey
 

@@ -15,16 +15,15 @@ from batchpid.arrays.array_types import Document
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, beside
-from batchpid.sim.cli.progress import bar
+from batchpid.sim.cli.outputs import OutputFiles, bar, beside
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
+from batchpid.sim.tuning.cost import Weights
 from batchpid.sim.tuning.gain_sets import GainSet
-from batchpid.sim.tuning.weights import Weights
 from batchpid.task_space import save_osc_options
 
 if TYPE_CHECKING:
     from batchpid.sim.identification.confidence_region import DrawnMotors
-    from batchpid.sim.tuning.within import Within
+    from batchpid.sim.tuning.evaluation import Within
 
 DRAWS, MOVES_WITHIN = 100, 1
 """Motors that ``--within`` draws, and random moves that are made with each, besides the tutorial's."""
@@ -188,8 +187,8 @@ class TuneCommand:
 
         The designed gains are tried too where the search ``rejected`` the tuned ones, or these do not hold for all.
         """
+        from batchpid.sim.tuning.evaluation import within
         from batchpid.sim.tuning.moves import random_moves, tutorial_move
-        from batchpid.sim.tuning.within import within
 
         moves = tutorial_move(robot) + random_moves(robot, MOVES_WITHIN, self.seed + 1)
         options = flags.chosen(self, "workers cluster engine") | self.runner.options()

@@ -17,6 +17,7 @@ from batchpid.motors.friction import Friction
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION, Joint, MjcfFile
 from batchpid.sim.robot.simulated_links import Body, varied_bodies
+from batchpid.task_space.rigid_tree import GRAVITY
 from batchpid.task_space.spatial_inertia import SpatialInertia, spatial_matrix, total
 
 Build = Callable[[Any, int], Any]
@@ -49,7 +50,7 @@ class SceneSpec:
     merge_fixed: bool = True
     collisions: bool = True
     build: Build | None = field(default=None, compare=False)
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    gravity: tuple[float, float, float] = GRAVITY
     engine: str = "sapien"
     contacts: tuple[str, ...] | None = None
     wrenches: tuple[str, ...] | None = None

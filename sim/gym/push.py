@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -83,7 +84,12 @@ class PushVectorEnv(ToolVectorEnv):
         """Return the control of the tool, the box and the ground."""
         options = super().runner_options()
         self._place = self._home[:2] + AHEAD
-        return {**options, "build": _Box(tuple(self._place.tolist())), "ground": True, "collisions": True}
+        return {
+            **options,
+            "build": partial(_build_box, tuple(self._place.tolist())),
+            "ground": True,
+            "collisions": True,
+        }
 
     def task_bounds(self) -> tuple[Float64, Float64]:
         """Return the bounds of the box's pose and of the goal."""
@@ -122,20 +128,15 @@ class PushVectorEnv(ToolVectorEnv):
         return distance
 
 
-class _Box:
-    """Function ``build`` of the Runner: a box on the ground at ``place`` (2,) [m]. A class, so that it is picklable."""
+def _build_box(place: tuple[float, ...], scene: SapienScene, env: int) -> Any:
+    """Build a box on the ground at ``place`` (2,) [m], as ``build`` of the Runner."""
+    import sapien
 
-    def __init__(self, place: tuple[float, ...]) -> None:
-        self.place = place
-
-    def __call__(self, scene: SapienScene, env: int) -> Any:
-        import sapien
-
-        builder = scene.create_actor_builder()
-        builder.add_box_collision(half_size=[BOX] * 3, density=DENSITY)
-        builder.add_box_visual(half_size=[BOX] * 3, material=[0.8, 0.3, 0.1])
-        builder.set_initial_pose(sapien.Pose([*self.place, BOX]))
-        return builder.build(name="box")
+    builder = scene.create_actor_builder()
+    builder.add_box_collision(half_size=[BOX] * 3, density=DENSITY)
+    builder.add_box_visual(half_size=[BOX] * 3, material=[0.8, 0.3, 0.1])
+    builder.set_initial_pose(sapien.Pose([*place, BOX]))
+    return builder.build(name="box")
 
 
 class PushEnv(RobotEnv):

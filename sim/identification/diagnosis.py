@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.plant import Plant
-from batchpid.sim.identification.regression import Motion, Regression
+from batchpid.sim.identification.regression import LEAST_ROWS, Motion, Regression
 from batchpid.task_space.rigid_tree import RigidTree
 
 SPREAD, MOMENT_SPREAD = 0.5, 0.05
@@ -36,6 +36,8 @@ DECREASE, LEAST_EXPLAINED = 0.03, 0.5
 """Smallest relative decrease of the residual, and smallest explained share of the efforts, for a report of a link."""
 ALIKE = 1.1
 """Largest ratio of the residuals of two explanations that count as equally good."""
+LEAST_RESIDUAL = 1e-3
+"""Residual, over the joint's effort, below which a decrease shows nothing."""
 LEAST_CHANGE = 0.05
 """Smallest relative change of a link's mass that is reported."""
 MOST_LINKS = 3
@@ -137,7 +139,7 @@ class _Solved(NamedTuple):
     residual: Float64
     """(rows, joints)."""
     held_out: float
-    """Residual of the held-out rows, weighted by joint."""
+    """Geometric mean over joints of the residual of the held-out rows, over the joint's effort."""
     explained: float
 
 
@@ -151,7 +153,7 @@ class _System:
         self.rows, self.joints = a.shape
         self._motion = np.stack([a, v, sign, np.ones_like(a)], axis=2)
         fast = np.abs(v) > SLOW * np.sqrt((v**2).mean(0))
-        self._moves = fast | (fast.mean(0) < 0.2)
+        self._moves = fast | (fast.sum(0) < LEAST_ROWS)
         stretch = round(2 * STRETCH / regression.plants[0].drive.timestep)
         self._held_out = np.concatenate([(rows // stretch) % 4 == 3 for rows, *_ in self._of_logs()])
         self._size = np.sqrt((self._effort**2).mean(0)) + 1e-9
@@ -217,9 +219,15 @@ class _System:
 
     def _solved(self, values: Float64, residual: Float64) -> _Solved:
         kept = self._moves & self._held_out[:, None]
-        weighed = np.where(kept, residual / self._size, 0.0)
+        squares = np.where(kept, residual / self._size, 0.0) ** 2
+        of_joints = np.sqrt(squares.sum(0) / np.maximum(kept.sum(0), 1))
         left, whole = (float(np.linalg.norm(np.where(kept, each, 0.0))) for each in (residual, self._effort))
-        return _Solved(values, residual, float(np.linalg.norm(weighed)), float(1 - left / max(whole, 1e-12)))
+        return _Solved(
+            values,
+            residual,
+            float(np.exp(np.log(of_joints + LEAST_RESIDUAL).mean())),
+            float(1 - left / max(whole, 1e-12)),
+        )
 
     def disturbance(self, solved: _Solved, logs: list[Log], joints: list[str]) -> Disturbance | None:
         """Return the part with the largest residual over the median of all parts; None if none is large enough."""

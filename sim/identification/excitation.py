@@ -27,15 +27,13 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.tuning.moves import easy_pose, motion_effort
+from batchpid.sim.tuning.moves import FREE_VELOCITY, easy_pose, motion_effort
 from batchpid.trajectories import Trajectory
 
 REACH = {"rad": 0.8, "m": 0.1}
 """Largest amplitude, by the joint's unit."""
 VELOCITY_SHARE, EFFORT_SHARE = 0.6, 0.7
 """Shares of the limits of velocity and effort that the motion takes."""
-FREE_VELOCITY = {"rad": 2.0, "m": 0.3}
-"""Velocity limit of joints without one, per second."""
 CLEARANCE = 0.01
 """Least distance from contact [m]; half of the distance at the center for links that are nearer there."""
 _EDGE = 0.1

@@ -12,17 +12,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Document, Float64
 from batchpid.sim.identification.fit import LEAST_GAIN, FitStep, Solution, fit
-from batchpid.sim.identification.fit_history import History, State
 from batchpid.sim.identification.plant import plants_of
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import Regression
 from batchpid.sim.identification.unknowns import LAW
+from batchpid.sim.tuning.history import HistoryFile
 
 NEIGHBOURS, NEIGHBOUR_EVALUATIONS = 6, 8
 """Most fits at other delays, and most evaluations of each."""
@@ -30,6 +30,36 @@ EXTRA_EVALUATIONS = 12
 """Most evaluations of a fit with further unknowns."""
 ACCEPTED = 0.99
 """Largest error on the held-out part with further unknowns that are kept, over the error without."""
+
+
+class State(NamedTuple):
+    """State of a search: all that the rest of it depends on, and what its history holds before each step."""
+
+    step: FitStep
+    """State of the fit that is being done."""
+    done: tuple[tuple[int, list[float]], ...] = ()
+    """Fits that were done: number of the problem, and solution."""
+
+    def plain(self) -> Document:
+        """Return the state as plain values."""
+        theta, left, last, cost = self.step
+        return {"theta": theta.tolist(), "left": left, "last": last.tolist(), "cost": cost, "done": self.done}
+
+    @classmethod
+    def of_plain(cls, found: Document, unknowns: int, evaluations: int, problems: int) -> State:
+        """Return the state of plain values.
+
+        Raises an error if it does not fit the numbers of ``unknowns``, ``evaluations`` and ``problems``.
+        """
+        theta, last = (np.array(found[name], float) for name in ("theta", "last"))
+        done = tuple((int(number), [float(value) for value in point]) for number, point in found["done"])
+        step = FitStep(theta, int(found["left"]), last, float(found["cost"]))
+        points = [theta, last, *(np.array(point) for _, point in done)]
+        if not all(point.shape == (unknowns,) and np.isfinite(point).all() for point in points):
+            raise ValueError(f"its points are not {unknowns} finite numbers")
+        if not 0 <= step.left <= evaluations or not all(0 <= number < problems for number, _ in done):
+            raise ValueError("its counts are out of range")
+        return cls(step, done)
 
 
 class Progress:
@@ -49,7 +79,7 @@ class Progress:
 
 
 def search(
-    problems: list[Problem], state: State, evaluations: int, record: History, progress: Progress
+    problems: list[Problem], state: State, evaluations: int, record: HistoryFile, progress: Progress
 ) -> tuple[Problem, Solution]:
     """Return the likeliest solution of the search from ``state`` on, and its problem, one of ``problems``.
 
@@ -62,7 +92,7 @@ def search(
         before = tuple((number, solution.theta.tolist()) for number, solution in done)
 
         def report(step: FitStep, cost: float, before: Any = before) -> None:
-            record.write(State(step, before))
+            record.write(State(step, before).plain())
             progress(len(before), step.left, cost)
 
         done.append((number, fit(problems[number], begin or start, report)))

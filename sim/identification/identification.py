@@ -24,8 +24,7 @@ from batchpid.native.availability import obstacle
 from batchpid.sim.identification.diagnosis import diagnose
 from batchpid.sim.identification.effort_ratios import EffortRatios, effort_ratios
 from batchpid.sim.identification.fit import FitStep, Solution
-from batchpid.sim.identification.fit_history import History, State
-from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, extended, search
+from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, State, extended, search
 from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_of, residuals_of_ideal
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.log import Log
@@ -41,6 +40,7 @@ from batchpid.sim.identification.windows import rows_of
 from batchpid.sim.options import worker_count
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Compensation
+from batchpid.sim.tuning.history import HistoryFile
 
 
 def identify(
@@ -144,7 +144,7 @@ def identify(
         "native": not obstacle(),
         "versions": package_versions(("batchpid", "sapien", "numpy", "scipy", "cmaes")),
     }
-    record = History(history, settings)
+    record = HistoryFile(history, "fit", settings)
     motions = [smooth(log, timestep) for log in found]
     fitted = [log for log in found if not log.settings.held_out]
     fitted_motions = [each for each, log in zip(motions, found, strict=True) if not log.settings.held_out]
@@ -160,12 +160,13 @@ def identify(
         pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
     with pool as executor:
 
-        def fit_under(drive: LoggedDrive, regression: Regression, record: History) -> tuple[Problem, Solution]:
+        def fit_under(drive: LoggedDrive, regression: Regression, record: HistoryFile) -> tuple[Problem, Solution]:
             """Return the likeliest fit under ``drive``."""
             problems = [
                 Problem(resting, joints, each, found, motions, unknowns, executor) for each in variants(drive, motions)
             ]
-            known = record.state(len(unknowns.names), max(evaluations, NEIGHBOUR_EVALUATIONS), len(problems))
+            counts = len(unknowns.names), max(evaluations, NEIGHBOUR_EVALUATIONS), len(problems)
+            known = record.state(lambda found: State.of_plain(found, *counts))
             state = known or State(FitStep.first(begin(problems[0], regression, ideal, seed), evaluations))
             return search(problems, state, evaluations, record, Progress(len(problems), evaluations, progress))
 
@@ -176,7 +177,7 @@ def identify(
                     plants = plants_of(resting, joints, way, fitted)
                     regression = Regression(plants, fitted, fitted_motions, payload, gains_known)
                     regressions[way.compensation] = regression
-                    fits_of_ways.append(fit_under(way, regression, History(None, settings)))
+                    fits_of_ways.append(fit_under(way, regression, HistoryFile(None, "fit", settings)))
         problem, best = min(fits_of_ways, key=lambda each: each[1].cost)
         for name in extras:
             if name in EXTRAS:

@@ -13,6 +13,7 @@ import batchpid as bp
 from batchpid import motors as actuator_model
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import TURN, namespace
+from batchpid.arrays.trees import leaves, mapped, structure
 from batchpid.motors import guard as guard_model
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.coupling import Coupling
@@ -21,7 +22,6 @@ from batchpid.motors.guard import Guard
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
 from batchpid.native.tracing import Trace, trace_trees
-from batchpid.native.trees import leaves, mapped, structure
 from batchpid.sim.identification.unknowns import LAW, Motors
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import control_step, mass_matrix

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -14,6 +14,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Float64, Rows
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.arrays.read_only import read_only
+from batchpid.arrays.trees import flatten, unflatten
 from batchpid.errors import ControllerError, InvalidArgumentError
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
@@ -159,35 +160,3 @@ def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
             problem = f"returned a state {name!r} of {leaf.dtype}, which does not fit into {old.dtype}"
         raise InvalidArgumentError("control", problem, remedy="return a state as init does")
     return new
-
-
-def flatten(state: Any, name: str = "", read: Callable[[Any], Any] = np.asarray) -> Document:
-    """Return the arrays of a nested state by name: keys of mappings and fields of tuples, joined by "/"."""
-    if state is None:
-        return {}
-    if not isinstance(state, Mapping | tuple | list):
-        return {name or "state": read(state)}
-    return {
-        leaf: rows
-        for key, part in _items(state)
-        for leaf, rows in flatten(part, f"{name}/{key}" if name else key, read).items()
-    }
-
-
-def unflatten(like: Any, leaves: Mapping[str, Rows], name: str = "") -> Any:
-    """Return a state of the structure of ``like`` with the arrays ``leaves``."""
-    if like is None:
-        return None
-    if not isinstance(like, Mapping | tuple | list):
-        return leaves[name or "state"]
-    parts = {key: unflatten(part, leaves, f"{name}/{key}" if name else key) for key, part in _items(like)}
-    if isinstance(like, Mapping):
-        return dict(zip(like, parts.values(), strict=True))
-    return type(like)(**parts) if hasattr(like, "_fields") else type(like)(parts.values())
-
-
-def _items(state: Any) -> list[tuple[str, Any]]:
-    if isinstance(state, Mapping):
-        return [(str(key), part) for key, part in state.items()]
-    names = getattr(state, "_fields", None) or map(str, range(len(state)))
-    return list(zip(names, state, strict=True))

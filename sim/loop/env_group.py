@@ -26,13 +26,20 @@ from batchpid.sim.loop.numpy_executor import NumPyExecutor, Span, passive_forces
 from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.loop.pushes import Pushes
 from batchpid.sim.loop.snapshot import AGE, CHANGED, EPISODE, EnvStates
-from batchpid.sim.loop.step_constants import make_constants, make_layout
-from batchpid.sim.loop.step_state import init_motors, reset_friction, reset_guard, with_friction, with_params
+from batchpid.sim.loop.step_setup import (
+    init_motors,
+    make_constants,
+    make_layout,
+    reset_friction,
+    reset_guard,
+    with_friction,
+    with_params,
+)
 from batchpid.sim.loop.step_values import StepState
 from batchpid.sim.loop.xla_executor import XLAExecutor
 from batchpid.sim.observation import untouched
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.randomization.draws import Draws
+from batchpid.sim.randomization.distributions import Draws
 
 
 class EnvGroup:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from batchpid.arrays.trees import leaves, mapped
 from batchpid.native.operations import MOST_SUMMED
-from batchpid.native.trees import leaves, mapped
 from batchpid.sim.engine.protocol import FAILED, CompiledModel, CompiledPack, CompiledStep, DrivenPack
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.native_ticks import NativeTicks, Table

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Pytree, Rows
+from batchpid.arrays.trees import filled, leaves, mapped, structure
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.symbols import Symbol
 from batchpid.native.tracing import Trace, trace
-from batchpid.native.trees import filled, leaves, mapped, structure
 from batchpid.sim.engine import native
 from batchpid.sim.engine.native import interface
 from batchpid.sim.engine.protocol import CompiledModel, CompiledPack, CompiledStep

@@ -18,7 +18,7 @@ from batchpid.sim.loop.control_step import COUPLING_STEPS, REFRESH_STEPS, sim_st
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.faults import sound
 from batchpid.sim.loop.jitted import jitted_controller, jitted_law
-from batchpid.sim.loop.step_constants import needs_qvel
+from batchpid.sim.loop.step_setup import needs_qvel
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
 from batchpid.sim.options import RunnerOptions
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.choices import CHOICES, Everywhere
+from batchpid.arrays.trees import flatten, unflatten
 from batchpid.checks.validate import file_path, integer, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import read_npz, write_atomically
@@ -28,7 +29,6 @@ from batchpid.motors.friction import FrictionState
 from batchpid.motors.guard import GuardState
 from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, ORIGIN, FaultContainment
 from batchpid.sim.loop.pushes import COUNTS
-from batchpid.sim.loop.tables import flatten, nest, widen
 from batchpid.sim.observation import observed_by_loop, untouched
 from batchpid.sim.runner_keywords import OPTIONS, RunnerKeywords
 
@@ -76,14 +76,18 @@ class EnvStates:
 
     def for_envs(self, envs: slice) -> EnvStates:
         """Return the state of some envs, as copies."""
-        return EnvStates(**nest({name: rows[envs].copy() for name, rows in flatten(vars(self)).items()}))
+        tables = flatten(vars(self), ".")
+        return EnvStates(**unflatten(vars(self), {name: rows[envs].copy() for name, rows in tables.items()}, "."))
 
     @staticmethod
     def join(parts: Sequence[EnvStates]) -> EnvStates:
         """Return the states of the envs of all ``parts``."""
         width = max(part.engine.shape[1] for part in parts)
-        tables = [flatten(vars(replace(part, engine=widen(part.engine, width)))) for part in parts]
-        return EnvStates(**nest({name: np.concatenate([table[name] for table in tables]) for name in tables[0]}))
+        missing = [((0, 0), (0, width - part.engine.shape[1])) for part in parts]
+        wide = [np.pad(part.engine, each, constant_values=np.nan) for part, each in zip(parts, missing, strict=True)]
+        tables = [flatten(vars(part) | {"engine": rows}, ".") for part, rows in zip(parts, wide, strict=True)]
+        joined = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+        return EnvStates(**unflatten(vars(parts[0]), joined, "."))
 
     def check(
         self,
@@ -122,7 +126,7 @@ class EnvStates:
             sensors=sensors,
             pushes=dict.fromkeys(COUNTS, row.astype(np.int64)) if pushes else {},
         )
-        ours, theirs = flatten(vars(expected)), flatten(vars(self))
+        ours, theirs = (flatten(vars(each), ".") for each in (expected, self))
         for name in sorted(ours | theirs):
             if name not in theirs:
                 problem = f"no {name}"
@@ -213,7 +217,7 @@ class Snapshot:
         head = {"format": _FORMAT, "about": self.about, "steps": self.steps, "markers": choices}
         tables: Document = {
             "head": np.array(json.dumps(head)),
-            **flatten({"params": arrays, _ACTUATORS: _options(self.actuators), **vars(self.states)}),
+            **flatten({"params": arrays, _ACTUATORS: _options(self.actuators), **vars(self.states)}, "."),
         }
         for name in ("episodes", "targets", "motion"):
             if (rows := getattr(self, name)) is not None:
@@ -271,7 +275,7 @@ class Snapshot:
         if targets is not None and (targets.shape != (num_envs, dof) or not np.isfinite(targets).all()):
             raise ValueError(f"its targets are not positions of {num_envs} envs of {dof} joints")
         motion = tables.pop("motion", None)
-        groups = nest(tables)
+        groups = _groups(tables)
         motors = groups.pop(_ACTUATORS, None)
         motors = {name: leaf if leaf.ndim else leaf.item() for name, leaf in (motors or {}).items()}
         actuators = bp.make_actuators(dof, **motors) if motors else None
@@ -325,3 +329,16 @@ def _options(actuators: bp.Actuators | None) -> dict[str, Rows]:
     if actuators is None:
         return {}
     return {name: np.asarray(value) for name, value in actuators.options().items() if name != "dtype"}
+
+
+def _groups(tables: Mapping[str, Rows]) -> Document:
+    """Return the arrays of a file by name, and those with a dot in their name in groups; a group may be empty."""
+    names = ("controller", "friction", "actuators", "guard", "containment", "sensors", "pushes")
+    groups: Document = {name: {} for name in names}
+    for name, rows in tables.items():
+        group, dot, leaf = name.partition(".")
+        if dot:
+            groups.setdefault(group, {})[leaf] = rows
+        else:
+            groups[name] = rows
+    return groups

@@ -15,7 +15,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, Rows
 from batchpid.arrays.jax_settings import own_settings
-from batchpid.native.trees import mapped
+from batchpid.arrays.trees import mapped
 from batchpid.sim.engine.native import xla
 from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep
 from batchpid.sim.engine.robot_model import scene_tree
@@ -24,7 +24,7 @@ from batchpid.sim.loop.control_step import sim_step
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.jitted import padded, put
 from batchpid.sim.loop.numpy_executor import Ran, Span, passive_forces
-from batchpid.sim.loop.step_constants import needs_qvel
+from batchpid.sim.loop.step_setup import needs_qvel
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
 from batchpid.sim.options import RunnerOptions
 

@@ -23,8 +23,7 @@ from batchpid.arrays.field_tables import declared, in_group
 from batchpid.checks.validate import choice, integer, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
-from batchpid.sim.randomization.distributions import Distribution
-from batchpid.sim.randomization.draws import Draws, generators
+from batchpid.sim.randomization.distributions import Distribution, Draws, generators
 from batchpid.sim.randomization.fields import (
     GROUPS,
     SINGLE,

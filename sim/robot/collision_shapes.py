@@ -18,7 +18,7 @@ from batchpid.arrays.read_only import read_only
 from batchpid.errors import RobotError
 from batchpid.sim.robot.link_repair import DENSITY
 from batchpid.sim.robot.merging import place_links
-from batchpid.sim.robot.meshes import note_meshes
+from batchpid.sim.robot.meshes import note_meshes, read_mesh
 from batchpid.sim.robot.xml import number, numbers
 from batchpid.task_space.rotations import from_rpy, multiply, rotate
 from batchpid.task_space.spatial_inertia import SpatialInertia
@@ -97,20 +97,16 @@ def _read(element: etree._Element, link: str) -> LinkShape:
 def mesh_vertices(filename: str) -> Float64:
     """Return the vertices (n, 3) of the convex hull of a mesh file, unscaled [m]. Raises RobotError."""
     import mujoco
-    from trimesh import load
 
     note_meshes([filename])
     try:
-        mesh: Any = load(filename, force="mesh", process=False)
-        factor, _, unit = str(mesh.metadata.get("units", "")).partition(" * ")  # of COLLADA: "0.01 * meters"
-        metres = float(factor) if unit == "meters" else 1.0
-        rows = np.ascontiguousarray(mesh.vertices, float) * metres + 0.0  # no -0.0
+        rows = np.ascontiguousarray(read_mesh(filename).vertices, float) + 0.0  # no -0.0
         vertices = np.unique(rows.view("V24")).view(float)  # by their bytes, which is much faster than along an axis
         spec = mujoco.MjSpec()
         spec.add_mesh(name="mesh", uservert=vertices, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
         spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
         model = spec.compile()
-    except Exception as error:  # trimesh raises errors of many types
+    except Exception as error:
         raise RobotError(f"{filename}: cannot be read: {error}; repair the file, or remove that <collision>") from error
     graph = model.mesh_graph[model.mesh_graphadr[0] :]
     count = int(graph[0])

@@ -17,6 +17,7 @@ import numpy as np
 from lxml import etree
 
 from batchpid.arrays.read_only import read_only
+from batchpid.sim.robot.link_repair import MOMENTS, from_entries
 from batchpid.sim.robot.parts import MOVING_TYPES, Placement
 from batchpid.sim.robot.xml import number, numbers
 from batchpid.task_space.rotations import from_rpy, multiply, rotate, to_rpy
@@ -186,9 +187,7 @@ def _inertial(link: etree._Element) -> SpatialInertia | None:
     element = link.find("inertial")
     if element is None:
         return None
-    tensor = np.zeros((3, 3))
-    for row, column, key in zip(*np.triu_indices(3), ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), strict=True):
-        tensor[row, column] = tensor[column, row] = number(element.find("inertia"), key, "0", "inertia")
+    tensor = from_entries([number(element.find("inertia"), key, "0", "inertia") for key in MOMENTS])
     mass = number(element.find("mass"), "value", "0", "mass")
     at = _composed(_IDENTITY, element)
     return SpatialInertia(mass, np.zeros(3), tensor).moved(at.position, at.wxyz)
@@ -198,7 +197,7 @@ def _write_inertial(inertia: SpatialInertia) -> etree._Element:
     element = etree.Element("inertial")
     etree.SubElement(element, "origin", xyz=_text(inertia.center), rpy="0 0 0")
     etree.SubElement(element, "mass", value=repr(float(inertia.mass)))
-    entries = zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), inertia.tensor[np.triu_indices(3)], strict=True)
+    entries = zip(MOMENTS, inertia.tensor[np.triu_indices(3)], strict=True)
     etree.SubElement(element, "inertia", {key: repr(float(value)) for key, value in entries})
     return element
 

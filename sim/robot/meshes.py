@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -84,6 +85,17 @@ def _ros_packages(package: str) -> Iterator[Path]:
             yield root
         for pattern in (package, f"*/{package}", f"*/*/{package}"):  # rospack searches any depth
             yield from sorted(root.glob(pattern))
+
+
+def read_mesh(path: str | Path) -> Any:
+    """Return what ``trimesh`` reads from a mesh file, in metres. Raises errors of many types."""
+    from trimesh import load
+
+    mesh: Any = load(path, force="mesh", process=False)
+    factor, _, unit = str(mesh.metadata.get("units", "")).partition(" * ")  # of COLLADA: "0.01 * meters"
+    if unit == "meters":
+        mesh.vertices = np.asarray(mesh.vertices) * float(factor)
+    return mesh
 
 
 _in_use: dict[str, str] = {}

@@ -30,8 +30,8 @@ from batchpid.sim.robot.description import POSES, RobotDescription
 from batchpid.sim.robot.findings import Finding, finding_of
 from batchpid.sim.robot.parts import Joint
 from batchpid.sim.robot.xml import numbers
+from batchpid.task_space.rigid_tree import GRAVITY
 
-GRAVITY = 9.81
 LARGEST, SMALLEST = 20.0, 1 / 200
 """Bounds of the ratio of the shapes' size to the reach."""
 SPARSEST, DENSEST = 0.1, 30_000.0
@@ -96,7 +96,7 @@ def _loads(robot: RobotDescription, length: float, by_shapes: bool) -> Iterator[
     inertia = np.diagonal(robot.mass_matrix(poses), axis1=1, axis2=2).max(0)
     for joint, force, moved in zip(robot.joints, gravity, inertia, strict=True):
         arm = 1.0 if joint.type == "prismatic" else length
-        if max(force / (GRAVITY * arm), moved / arm**2) <= LOAD * length**3:
+        if max(force / (-GRAVITY[2] * arm), moved / arm**2) <= LOAD * length**3:
             continue
         unit = "kg" if joint.type == "prismatic" else "kg m^2"
         text = f"no robot whose chain of joints is up to {length:.3g} m long has such a load"

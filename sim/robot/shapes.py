@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.meshes import find_mesh, mesh_problem
+from batchpid.sim.robot.meshes import find_mesh, mesh_problem, read_mesh
 from batchpid.sim.robot.urdf import is_mjcf
 from batchpid.sim.robot.xml import numbers, parse_xml
 from batchpid.task_space.rotations import from_rpy, rotate
@@ -136,23 +136,18 @@ class _UnreadableMesh(Exception):
 
 
 def _read_mesh(name: str, robot: RobotDescription) -> Any:
-    """Return what ``trimesh`` reads from a mesh file, in metres. Raises _UnreadableMesh."""
-    from trimesh import load
-
+    """Return what ``trimesh`` reads from a mesh file of the robot, in metres. Raises _UnreadableMesh."""
     path = find_mesh(name, robot.path, robot.package_dirs)
     if path is None:
         remedy = "put the file next to the URDF, or pass package_dirs=[...] to Robot.load (--package-dirs)"
         raise _UnreadableMesh(name, "not found", remedy)
     problem = "no triangles"
     try:
-        loaded: Any = load(path, force="mesh", process=False)
-    except Exception as error:  # trimesh raises errors of many types
+        loaded = read_mesh(path)
+    except Exception as error:
         loaded, problem = None, f"{type(error).__name__}: {error}"
     if loaded is None or not len(loaded.faces):
         raise _UnreadableMesh(name, f"cannot be read ({mesh_problem(path) or problem})", "repair the file")
-    factor, _, unit = str(loaded.metadata.get("units", "")).partition(" * ")  # of COLLADA: "0.01 * meters"
-    if unit == "meters":
-        loaded.apply_scale(float(factor))
     return loaded
 
 

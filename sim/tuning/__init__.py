@@ -9,6 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from batchpid.sim.tuning.cost import Weights
     from batchpid.sim.tuning.engine_parity import compare_engines
     from batchpid.sim.tuning.evaluation import (
         Evaluation,
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from batchpid.sim.tuning.robot_survey import find_robots, survey
     from batchpid.sim.tuning.search import Tuning, tune
     from batchpid.sim.tuning.tool_search import ToolTuning, tune_tool
-    from batchpid.sim.tuning.weights import Weights
 
 __all__ = [
     "Evaluation",
@@ -53,6 +53,7 @@ __all__ = [
 ]
 
 _MODULES = {
+    "cost": ("Weights",),
     "engine_parity": ("compare_engines",),
     "evaluation": (
         "Evaluation",
@@ -68,7 +69,6 @@ _MODULES = {
     "robot_survey": ("find_robots", "survey"),
     "search": ("Tuning", "tune"),
     "tool_search": ("ToolTuning", "tune_tool"),
-    "weights": ("Weights",),
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}
 

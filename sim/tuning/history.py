@@ -1,11 +1,14 @@
-"""File from which a search or a fit resumes: its state, the inputs that it depends on, and a digest of both."""
+"""File from which a search or a fit resumes: its state, the inputs that it depends on, and a digest of both.
+
+The inputs are the key: work resumes only under equal ones, and an error names those that differ.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,6 +20,7 @@ from batchpid.io.files import write_atomically
 from batchpid.io.versions import package_versions
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 
+Value = TypeVar("Value")
 REMEDY = "use the same inputs, remove it, or name another file"
 """Remedy where a file is of other work."""
 
@@ -24,32 +28,25 @@ REMEDY = "use the same inputs, remove it, or name another file"
 class HistoryFile:
     """File with the state of a ``kind`` of work, "search" or "fit", that depends on ``settings``, plain values.
 
-    Nothing is kept if ``path`` is None.
+    Nothing is kept if ``path`` is None. Raises InvalidArgumentError if the file exists, and is damaged or has other
+    settings, which the message names.
     """
 
     def __init__(self, path: Path | str | None, kind: str, settings: Mapping[str, Any]) -> None:
         self._path, self._kind = None if path is None else file_path("history", path), kind
         self._settings = json.loads(json.dumps(dict(settings)))
+        self._found: Any = None
+        if self._path is not None and self._path.exists():
+            theirs, self._found = self._checked(self._read)
+            if (problem := other_inputs(kind, theirs, self._settings)) is not None:
+                raise self._error(problem)
 
-    def read(self) -> Any:
-        """Return the state in the file, None if there is no file.
+    def state(self, parse: Callable[[Any], Value]) -> Value | None:
+        """Return the state that the file had, as ``parse`` makes it from plain values; None if there was no file.
 
-        Raises InvalidArgumentError if the file is damaged, or its settings differ; the message names these.
+        Raises InvalidArgumentError if ``parse`` raises an error: the state is impossible under these settings.
         """
-        if self._path is None or not self._path.exists():
-            return None
-        try:
-            document = json.loads(self._path.read_bytes())
-            theirs, state = document["settings"], document["state"]
-            if document["digest"] != digest(theirs, state):
-                raise ValueError("it was damaged or edited")
-            problem = other_inputs(self._kind, theirs, self._settings)
-        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-            reason = error if isinstance(error, OSError | ValueError) else type(error).__name__
-            raise self.damaged(str(reason)) from None
-        if problem is not None:
-            raise self._error(problem)
-        return state
+        return None if self._found is None else self._checked(lambda: parse(self._found))
 
     def write(self, state: Any) -> None:
         """Write the file with a ``state`` of plain values."""
@@ -58,9 +55,22 @@ class HistoryFile:
             document = {"settings": self._settings, "state": state, "digest": digest(self._settings, state)}
             write_atomically(self._path, json.dumps(document))
 
-    def damaged(self, problem: str) -> InvalidArgumentError:
-        """Return the error for a state that is impossible under these settings."""
-        return self._error(f"is not a history of a {self._kind}: {problem}")
+    def _read(self) -> tuple[Document, Any]:
+        """Return the settings and the state in the file."""
+        assert self._path is not None
+        document = json.loads(self._path.read_bytes())
+        theirs, state = dict(document["settings"]), document["state"]
+        if document["digest"] != digest(theirs, state):
+            raise ValueError("it was damaged or edited")
+        return theirs, state
+
+    def _checked(self, read: Callable[[], Value]) -> Value:
+        """Return the result of ``read``, whose errors mean that the file is damaged."""
+        try:
+            return read()
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+            reason = error if isinstance(error, OSError | ValueError) else type(error).__name__
+            raise self._error(f"is not a history of a {self._kind}: {reason}") from None
 
     def _error(self, problem: str) -> InvalidArgumentError:
         return InvalidArgumentError("history", problem, value=str(self._path), remedy=REMEDY)

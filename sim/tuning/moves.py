@@ -128,7 +128,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
     clearance = 0.0 if dynamics.in_contact(center[None], _CLEARANCE)[0] else _CLEARANCE
     share, in_vain = 1.0, 0
 
-    def draw(index: int) -> tuple[Float64, Float64, str] | None:
+    def draw(index: int) -> list[tuple[Float64, Float64, str]]:
         nonlocal share, in_vain
         if in_vain == _PATIENCE:
             share, in_vain = share / 2, 0
@@ -149,9 +149,9 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
         free = not any(dynamics.in_contact(qpos, clearance).any() for qpos in (path[[0, -1]], path))
         if not free or shortest_durations(robot, Moves(start[None], target[None], (kind,)))[0] > LONGEST:
             in_vain += 1
-            return None
+            return []
         in_vain = 0
-        return start, target, kind
+        return [(start, target, kind)]
 
     return draw_moves(robot, count, draw)
 
@@ -189,27 +189,27 @@ def easy_pose(robot: Robot, dynamics: Dynamics, poses: Float64) -> tuple[Float64
     return center, movable
 
 
-def draw_moves(robot: Robot, count: int, draw: Callable[[int], tuple[Float64, Float64, str] | None]) -> Moves:
-    """Return ``count`` moves: the start, target and name that ``draw(moves so far)`` returns, skipping None.
+def draw_moves(
+    robot: Robot, count: int, draw: Callable[[int], list[tuple[Float64, Float64, str]]], draws: int | None = None
+) -> Moves:
+    """Return ``count`` moves: starts, targets and names that ``draw(moves so far)`` returns, which may be none.
 
-    Raises InvalidArgumentError where nearly every draw is None.
+    Raises InvalidArgumentError if ``draws`` (200 for each move, and 200 more) return too few.
     """
     moves: list[tuple[Float64, Float64, str]] = []
-    for _ in range(200 * count + 200):
-        if len(moves) == count:
+    for _ in range(200 * count + 200 if draws is None else draws):
+        if len(moves) >= count:
             break
-        move = draw(len(moves))
-        if move is not None:
-            moves.append(move)
+        moves += draw(len(moves))
     if len(moves) < count:
         raise InvalidArgumentError(
             "robot",
-            f"{robot.name!r} touches itself or the ground where it should not, or is too weak, in nearly every draw of "
-            f"a move: {len(moves)} of {count} were found",
-            remedy="give the moves yourself, or correct what batchpid inspect lists as touching or weak",
+            f"{robot.name!r} touches itself or the ground where it should not, is too weak, or leaves its limits, in "
+            f"nearly every draw of a move: {len(moves)} of {count} were found",
+            remedy="give the moves or gains yourself, or correct what batchpid inspect lists as touching or weak",
         )
-    starts, targets = (np.array([move[end] for move in moves]).reshape(-1, robot.dof) for end in (0, 1))
-    return Moves(starts, targets, tuple(name for _, _, name in moves))
+    starts, targets = (np.array([move[end] for move in moves[:count]]).reshape(-1, robot.dof) for end in (0, 1))
+    return Moves(starts, targets, tuple(name for _, _, name in moves[:count]))
 
 
 def shortest_durations(robot: Robot, moves: Moves) -> Float64:

@@ -1,9 +1,9 @@
 r"""Candidates of a search for gains of operational-space control: from points in log space to options and costs.
 
 A point holds factors of the bandwidths of positions, of rotations and of the posture, and of the damping ratios of
-positions and rotations. The tool makes moves within its reach, and the cost of a candidate is the mean over moves plus
-the worst move of the terms of :mod:`batchpid.sim.tuning.candidates`: for the response the mean over the six axes, with
-the error of each axis as its response; for chatter and saturation the mean over the joints.
+positions and rotations. The tool makes moves within its reach, as steps of the pose. The cost has the terms of
+:mod:`batchpid.sim.tuning.cost`: for the response the mean over the six axes, with the error of each axis as its
+response; for chatter and saturation the mean over the joints.
 
 All candidates run in one runner: the setpoint of each env holds the pose and the gains.
 """
@@ -18,7 +18,6 @@ import numpy as np
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array, Document, Float64
 from batchpid.arrays.elementwise import namespace
-from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.command import CommandSpec
 from batchpid.sim.observation import Rollout
@@ -27,10 +26,19 @@ from batchpid.sim.robot.unsettled import PRISMATIC_BAND, REVOLUTE_BAND
 from batchpid.sim.runner import Runner
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.tool_space.tool_setpoints import reaches
-from batchpid.sim.tuning.candidates import DIVERGED_COST, PENALTY_RATIO, bounded, response_cost
+from batchpid.sim.tuning.cost import (
+    PENALTY_RATIO,
+    Trial,
+    Weights,
+    bounded,
+    chatter,
+    late,
+    over_moves,
+    response_cost,
+    with_divergence,
+)
 from batchpid.sim.tuning.evaluation import SETTLE_SECONDS
-from batchpid.sim.tuning.moves import Moves, smooth_variation
-from batchpid.sim.tuning.weights import Weights
+from batchpid.sim.tuning.moves import Moves, draw_moves, smooth_variation
 from batchpid.task_space.frames import pose_error
 
 GAINS = {
@@ -49,7 +57,8 @@ AT_LIMIT = 0.999
 """Share of its limit at which an effort counts as saturated."""
 SIZE = 0.5
 """Largest distance of a joint from the posture at the ends of a move [rad or m]."""
-_ROUNDS = 4
+ROUNDS = 4
+"""Draws of all moves."""
 
 
 def osc_options(gains: Float64) -> Document:
@@ -105,18 +114,17 @@ def tool_moves(robot: Robot, control: OperationalSpace, count: int, seed: int) -
         There are no such moves.
     """
     random, dynamics, center = np.random.default_rng(seed), robot.dynamics(), control.init(robot, 1).posture
-    reach, found = np.minimum(SIZE, (robot.upper - robot.lower) / 4), np.zeros((0, 2, robot.dof))
-    for _ in range(_ROUNDS):
+    reach = np.minimum(SIZE, (robot.upper - robot.lower) / 4)
+
+    def draw(_: int) -> list[tuple[Float64, Float64, str]]:
         drawn = center + reach * random.uniform(-1, 1, (count, 2, robot.dof))
         drawn = robot.coupled(np.clip(drawn, robot.lower, robot.upper))
-        goal = _poses(control, drawn[:, 1])
         touching = dynamics.in_contact(drawn.reshape(-1, robot.dof), 0.0).reshape(count, 2).any(1)
-        found = np.concatenate([found, drawn[reaches(robot, control, drawn[:, 0], goal) & ~touching]])[:count]
-    if len(found) < count:
-        problem = f"has few moves on which {control.link!r} reaches its goal within the joint limits: {len(found)}"
-        raise InvalidArgumentError("robot", problem, remedy="give the gains yourself")
-    start, target = found[:, 0], found[:, 1]
-    return ToolMoves(Moves(start, target, ("of the tool",) * count), _poses(control, target))
+        good = reaches(robot, control, drawn[:, 0], _poses(control, drawn[:, 1])) & ~touching
+        return [(start, target, "of the tool") for start, target in drawn[good]]
+
+    joints = draw_moves(robot, count, draw, draws=ROUNDS)
+    return ToolMoves(joints, _poses(control, joints.target))
 
 
 def _poses(control: OperationalSpace, qpos: Float64) -> Float64:
@@ -140,46 +148,53 @@ def tool_metrics(rollout: Rollout, goal: Float64, start: Float64) -> StepMetrics
 
 
 class ToolCandidates:
-    """Candidates of a search, and the costs of their rollouts on ``moves``."""
+    """Candidates of a search as points in log space, of which 0 are the default gains, on ``moves``."""
+
+    start, dimension = "default", len(GAINS)
 
     def __init__(
         self, robot: Robot, control: SearchedSpace, moves: ToolMoves, seconds: float, weights: Weights
     ) -> None:
-        self.robot, self.control, self.moves, self.seconds, self.weights = robot, control, moves, seconds, weights
+        self.control, self.moves, self.seconds, self.weights = control, moves, seconds, weights
         self._start = _poses(control, moves.joints.start)
         self._size = np.maximum(np.abs(pose_error(moves.goal, self._start)), BAND / 0.02)
         self._smooth, self._limit = smooth_variation(robot, moves.joints, 1.0), control.params.effort_max
+
+    @property
+    def envs(self) -> int:
+        """Number of envs of a candidate."""
+        return len(self.moves.goal)
+
+    def options(self, count: int) -> Document:
+        """Return the options of a runner: the control."""
+        return {"control": self.control}
 
     def gains(self, points: Float64) -> Float64:
         """Return the GAINS (n, 5) of ``points`` (n, 5)."""
         return np.array([value for _, value in GAINS.values()]) * np.exp(SPREAD * points)
 
-    def evaluate(self, runner: Runner, gains: Float64) -> tuple[tuple[float, ...], StepMetrics, Rollout]:
-        """Run all moves under each of ``gains`` (n, 5).
-
-        Return the costs (n,), metrics of the axes (n x moves, 6), and the rollout, whose setpoints are poses.
-        """
-        count, w, lead = len(gains), self.weights, (len(gains), len(self.moves.goal))
-        goal, start = np.tile(self.moves.goal, (count, 1)), np.tile(self._start, (count, 1))
-        setpoint = np.concatenate([goal, np.repeat(gains, lead[1], axis=0)], axis=1)
+    def trial(self, runner: Runner, points: Float64) -> Trial:
+        """Run all moves under the gains of each of ``points`` (n, 5); the setpoints of the rollout are poses."""
+        gains, w, lead = self.gains(points), self.weights, (len(points), self.envs)
+        goal, start = (np.tile(poses, (len(points), 1)) for poses in (self.moves.goal, self._start))
+        setpoint = np.concatenate([goal, np.repeat(gains, self.envs, axis=0)], axis=1)
         ticks = max(2, round(self.seconds / (runner.timestep * runner.substeps)))
-        runner.reset(np.tile(self.moves.joints.start, (count, 1)))
+        runner.reset(np.tile(self.moves.joints.start, (len(points), 1)))
         rollout = runner.rollout(np.broadcast_to(setpoint, (ticks, *setpoint.shape)))
         info = replace(rollout.info, own_command=self.control.pose_command)
         poses = replace(rollout, setpoint=rollout.setpoint[..., :7], info=info)
-        metrics = tool_metrics(rollout, goal, start)
-        m = StepMetrics(*(bounded(figure).reshape(*lead, 6) for figure in metrics))
+        metrics = StepMetrics(*(figure.reshape(*lead, 6) for figure in tool_metrics(rollout, goal, start)))
+
+        m = StepMetrics(*map(bounded, metrics))
         settling = np.minimum(m.settling_time, 1.5 * self.seconds)
         variation = bounded(np.abs(np.diff(rollout.effort, axis=0)).sum(0)).reshape(*lead, -1)
-        chatter = np.log1p(np.maximum(variation / self._smooth - 1, 0)).mean(2)
-        cost = response_cost(w, m._replace(settling_time=settling), self._size, BAND).mean(2)
         saturated = np.abs(rollout.effort) >= AT_LIMIT * self._limit  # the law scales its efforts: none is clipped
-        cost = cost + w.chatter * chatter + w.saturation * saturated.mean((0, 2)).reshape(lead)
-        late = np.maximum(settling.max(2) / SETTLE_SECONDS - 1, 0)
-        total = cost.mean(1) + cost.max(1) + w.late * np.log1p(late / 0.05).mean(1)
-        lasted = rollout.ok.mean(0).reshape(lead)
-        total = np.where(lasted.min(1) < 1, DIVERGED_COST * (2 - lasted.mean(1)), np.minimum(total, DIVERGED_COST))
-        return tuple((total + stability_penalty(gains, runner.timestep)).tolist()), metrics, poses
+        cost = response_cost(w, m._replace(settling_time=settling), self._size, BAND).mean(2)
+        cost = cost + w.chatter * chatter(variation, self._smooth).mean(2)
+        cost = cost + w.saturation * saturated.mean((0, 2)).reshape(lead)
+        total = over_moves(cost) + w.late * late(settling.max(2), SETTLE_SECONDS)
+        total = with_divergence(total, rollout.ok) + stability_penalty(gains, runner.timestep)
+        return Trial(tuple(total.tolist()), metrics, poses)
 
 
 def stability_penalty(gains: Float64, dt: float) -> Float64:

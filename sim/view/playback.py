@@ -39,8 +39,8 @@ class Playback:
             )
         self.robot, self.per_group = robot, rollout.num_envs
         self.groups = ("recorded",)
-        self.ground = had_ground(rollout, robot)
-        """True if the run had a ground at height 0."""
+        self.ground = robot.has_ground if rollout.info.ground is None else rollout.info.ground
+        """True if the run had a ground at height 0; for an older recording, the default of the robot."""
         self._rollout = replace(rollout, time=rollout.time - rollout.time[0])
         self.duration = float(self._rollout.time[-1])
         """Time from the first row to the last [s]."""
@@ -85,11 +85,6 @@ class Playback:
         part = self._rollout.for_ticks(slice(first, last + 1))
         finite = part.observation.map(lambda array: np.nan_to_num(array, posinf=0.0, neginf=0.0))
         return replace(part, observation=finite)
-
-
-def had_ground(rollout: Rollout, robot: Robot) -> bool:
-    """Return whether the scenes of ``rollout`` had a ground; for an older recording, the default of the robot."""
-    return robot.has_ground if rollout.info.ground is None else rollout.info.ground
 
 
 def rows_at(rollout: Rollout, seconds: float | NDArray[np.float64]) -> NDArray[np.int64]:

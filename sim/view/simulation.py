@@ -27,6 +27,7 @@ from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.view.gains import GroupGains, offered_gains
 from batchpid.sim.view.layout import MAX_ROBOTS
 from batchpid.sim.view.playback import HISTORY_SECONDS
+from batchpid.task_space.rigid_tree import GRAVITY
 
 CONTROLS = ("pid", "drive", "osc")
 MAX_DISTANCE = 10.0
@@ -35,8 +36,6 @@ PUSH_SECONDS = 0.25
 """Duration of a push [s]."""
 FASTEST = 3.0
 """Fastest motion of a setpoint that counts as a drag, if the joint's velocity limit is not lower [rad/s or m/s]."""
-GRAVITY = 9.81
-"""Acceleration of a payload [m/s^2]."""
 
 
 class LiveSimulation(SingleOwner):
@@ -234,7 +233,7 @@ class LiveSimulation(SingleOwner):
     def _disturbance(self) -> Float64:
         """Return the joint efforts (robots, dof) [N m or N] of payload and push."""
         frame = self._frames[-1]
-        force = np.array([0.0, 0.0, -GRAVITY * self.payload]) + self._push * (self._push_frames > 0)
+        force = self.payload * np.array(GRAVITY) + self._push * (self._push_frames > 0)
         if not force.any():
             return np.zeros(frame.qpos.shape[1:])
         jacobian = ts.jacobian(self.robot.rigid_tree, frame.qpos[0], self.load_link)[:, :3]

@@ -29,7 +29,7 @@ class NodeInfo(NamedTuple):
     processor: str
     """Model of the processor."""
     digest: str
-    """Digest of the canonical episode (:mod:`batchpid.sim.workers.canonical`)."""
+    """Digest of the canonical episode (:func:`batchpid.sim.workers.requests.canonical_digest`)."""
 
 
 class NodeShare(NamedTuple):

@@ -25,6 +25,7 @@ import cloudpickle
 
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import InvalidArgumentError, WorkerError
+from batchpid.io.files import read_bytes
 from batchpid.sim.engine import native
 from batchpid.sim.engine.protocol import MODULES
 from batchpid.sim.loop.arrays import Arrays
@@ -35,7 +36,6 @@ from batchpid.sim.processes.background import BACKGROUND
 from batchpid.sim.processes.descriptors import standard_streams_occupied
 from batchpid.sim.processes.fork_server import Child, fork
 from batchpid.sim.workers.channel import Channel
-from batchpid.sim.workers.liveness import Liveness
 from batchpid.sim.workers.requests import Request, Start
 from batchpid.sim.workers.serve import ANSWER, ANSWER_TAG
 from batchpid.sim.workers.shared_memory import MemoryFile, SharedArrays
@@ -43,6 +43,9 @@ from batchpid.sim.workers.shared_memory import MemoryFile, SharedArrays
 _TRANSFER_LIMITS = (10.0, 60.0)
 """Seconds asleep, and at work, while the rest of a message is on its way: a new process imports a lot first."""
 _STOP_LIMIT = 0.7  # seconds: Ctrl-Z and fg stop and continue parent and workers together
+_STATE, _CPU = 0, slice(11, 13)  # fields of /proc/PID/stat after the name: the state, user and system time
+_RUNNABLE, _IDLE, _STOPPED = "R", "ST", "T"  # S: asleep; others: D waits for the disk, t is held by a debugger
+_CLOCK = os.sysconf("SC_CLK_TCK")
 
 
 class WorkerLost(WorkerError):
@@ -251,6 +254,40 @@ class ProcessWorker(Worker):
         text = os.pread(self._trace.fileno(), 4000, 0).decode(errors="replace")
         trace = text.partition("\nExtension modules:")[0].strip()  # a long list, of no use here
         return WorkerLost(f"{self._name} {cause}" + (f"; its last stack:\n{trace}\n" if trace else ""))
+
+
+class Liveness:
+    """Idle and busy time of one process while it has a request, from samples of its ``stat`` file in /proc.
+
+    A process that waits for a core on a crowded machine is neither idle nor busy. A gap between two samples counts as
+    ``max_gap`` seconds at most: the sampling process may have been stopped as well.
+    """
+
+    def __init__(self, stat: Path, max_gap: float = 0.2) -> None:
+        self._stat, self._max_gap = str(stat), max_gap
+        self.idle = 0.0
+        """Seconds for which it has been asleep or stopped in every sample, without processor time between them."""
+        self.busy = 0.0
+        """Seconds since the first sample, without those in which it waited for a core."""
+        self.stopped = False
+        """Stopped, as by SIGSTOP."""
+        self._last: tuple[float, float] | None = None
+
+    def sample(self, now: float, is_first: bool = False) -> None:
+        """Update the times at time ``now`` [s]; the first sample of a request resets them."""
+        if is_first:
+            self.idle, self.busy, self._last = 0.0, 0.0, None
+        try:
+            fields = read_bytes(self._stat).rpartition(b")")[2].decode().split()
+        except OSError:
+            return  # it has ended; its socket reports that
+        state, cpu = fields[_STATE], sum(map(int, fields[_CPU])) / _CLOCK
+        self.stopped = state == _STOPPED
+        if self._last is not None:
+            passed, ran = min(now - self._last[0], self._max_gap), cpu - self._last[1]
+            self.idle = self.idle + passed if state in _IDLE and not ran else 0.0
+            self.busy += ran if state == _RUNNABLE else max(ran, passed)
+        self._last = now, cpu
 
 
 def pickled(message: Any, options: RunnerOptions) -> bytes:

@@ -133,24 +133,6 @@ def test_the_lag_is_mujocos_exact_filter():
     np.testing.assert_allclose(run_motor(chosen, asked)[:, 0, 0], expected, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("velocity", "low", "high"),
-    [
-        (0.0, -8.0, 8.0),  # the limit, below the stall effort of 10
-        (2.5, -8.0, 5.0),  # first quadrant: on the line
-        (5.0, -8.0, 0.0),  # no-load speed
-        (7.0, -8.0, -4.0),  # driven faster: it brakes
-        (20.0, -8.0, -8.0),  # and no more than the limit
-        (-2.5, -5.0, 8.0),  # second quadrant and third
-        (-7.0, 4.0, 8.0),
-    ],
-)
-def test_the_envelope_in_every_quadrant(velocity, low, high):
-    chosen = bp.make_actuators(1, saturation_effort=10.0, no_load_speed=5.0, effort_limit=8.0)
-    delivered = run_motor(chosen, [-100.0, 100.0], qvel=velocity)
-    np.testing.assert_allclose(delivered.ravel(), [low, high])
-
-
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=50)
 def test_the_command_limits_are_where_the_motor_clips(seed):
@@ -202,22 +184,6 @@ def test_backlash_has_the_describing_function_of_the_play(ratio):
     assert quadrature == pytest.approx(4 * b / np.pi * (b / amplitude - 1), abs=2e-3)
 
 
-def test_the_sensor_stands_still_within_the_play():
-    positions = np.array([0.0, 0.4, 0.6, 1.0, 0.8, 0.1, -0.1])[:, None, None]
-    seen, rate = run_sensor(bp.make_actuators(1, backlash=1.0), positions, np.ones_like(positions))
-    np.testing.assert_allclose(seen.ravel(), [0, 0, 0.1, 0.5, 0.5, 0.5, 0.4])
-    np.testing.assert_allclose(rate.ravel(), [0, 0, 1, 1, 0, 0, 1])
-
-
-def test_a_continuous_joint_is_interpolated_and_dragged_the_short_way_round():
-    turning = np.array([6.1, 6.2, 6.3 - 4 * np.pi, 6.4 - 4 * np.pi, 6.5 - 4 * np.pi])[:, None, None]
-    late, _ = run_sensor(bp.make_actuators(1, sensor_delay=0.5 * DT, continuous=True), turning)
-    dragged, _ = run_sensor(bp.make_actuators(1, backlash=0.1, continuous=True), turning)
-    for seen, behind in ((late, 0.05), (dragged, 0.05)):
-        away = (seen - (turning - behind))[1:]
-        np.testing.assert_allclose(away - 2 * np.pi * np.rint(away / (2 * np.pi)), 0.0, atol=1e-12)
-
-
 def test_noise_has_the_moments_of_a_normal_distribution():
     key = noise.keys(np.array([[1, 2]], np.uint32), np.arange(50), np.zeros(50), np)
     both = noise.normals(key, np.arange(1000, dtype=np.uint32)[:, None] + np.zeros(50, np.uint32), 7, np.float64, np)
@@ -267,22 +233,6 @@ def test_noise_is_the_same_in_jax():
         both = np.array(traced(state.key, step)), noise.normals(state.key, step, 3, np.float32, np)
         np.testing.assert_allclose(*both, rtol=1e-6)
         assert np.ptp(both[0]) > 1.0
-
-
-def test_a_joint_sticks_up_to_its_static_friction_and_slides_under_coulombs():
-    inertia, model = 0.1, friction.Friction(np.array([[1.0]]), None, np.array([[2.0]]))
-    mass, v = np.array([[[inertia]]]), np.zeros((1, 1))
-    state, rows = friction.init(model, v, v, mass, DT), []
-    efforts = np.concatenate((np.linspace(0, 1.95, 2000), np.full(400, 2.2), np.full(2000, 1.5), np.full(600, 0.9)))
-    for effort in efforts:
-        state, total = friction.advance(model, state, np.full((1, 1), effort), v)
-        v = v + DT * total / inertia
-        rows.append(v.item())
-    speed = np.array(rows)
-    assert np.abs(speed[:2000]).max() < 1e-3, "it sticks"
-    np.testing.assert_allclose(np.diff(speed[2010:2400]) / DT, (2.2 - 1.0) / inertia, rtol=1e-9)
-    np.testing.assert_allclose(np.diff(speed[2410:4400]) / DT, (1.5 - 1.0) / inertia, rtol=1e-9)
-    assert speed[-1] < speed[4400], "it is braked, and does not stick at once"
 
 
 def accelerations(model, efforts, inertia=0.1):

@@ -60,10 +60,3 @@ def test_what_is_allowed_passes_unchanged():
     np.testing.assert_array_equal(setpoint[:, 0], path)
     assert not changed.any()
     assert run(bp.make_guard(1), 9 * path)[2].sum() == 0
-
-
-def test_a_continuous_joint_takes_the_short_way_round():
-    limits = bp.make_guard(1, lower=-1.0, upper=1.0, rate=10.0, continuous=True)
-    setpoint, _, changed = run(limits, np.full((4, 1), -3.0), start=3.0)
-    np.testing.assert_allclose(setpoint.ravel(), [3.1, 3.2, -3.0, -3.0])
-    assert changed.ravel().tolist() == [True, True, False, False]

@@ -96,9 +96,7 @@ class FrictionCase(GuardCase):
         self.model = friction.Friction(**self.options)
 
     def begin(self, model, start):
-        return friction.init(
-            model, start, np.zeros_like(start) + self.load, np.zeros_like(start)[..., None] + self.mass, DT
-        )
+        return friction.init(model, start, 0 * start + self.load, self.mass, DT)
 
     def step(self, model, state, effort, velocity):
         state, total = friction.advance(model, state, effort, velocity)

@@ -127,7 +127,7 @@ def test_candidates_of_a_search_do_not_warn(arm, monkeypatch):
     with make(arm, search.envs, params=arm.params(**GOOD)) as runner, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", StabilityWarning)
-        search.costs(runner, np.zeros((1, search.dimension)))
+        search.trial(runner, np.zeros((1, search.dimension)))
 
 
 def light_joint(folder, inertia, effort, damping):

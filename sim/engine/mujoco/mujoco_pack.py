@@ -14,11 +14,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-import batchpid.task_space as ts
 from batchpid.arrays.array_types import DType, Float64, Rows
-from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
+from batchpid.sim.engine.model_pack import ModelPack
 from batchpid.sim.engine.mujoco.data_pool import DataPool
 from batchpid.sim.engine.mujoco.link_sensors import MujocoLinkSensors
 from batchpid.sim.engine.mujoco.model_builder import FLOATING, LARGEST_FORCE, RobotMj, robot_model, set_inertia
@@ -27,7 +26,7 @@ from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.protocol import FAILED
 from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_back
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation, VariedMasses, added_friction, own_friction
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.task_space import frames
 from batchpid.task_space.frames import matrix_of
@@ -41,12 +40,10 @@ _JOINTS = ("dof_armature", "dof_damping", "actuator_biasprm", "actuator_forceran
 """Fields of ``mujoco.MjModel`` that joints and drives change."""
 
 
-class MujocoPack(SingleOwner):
+class MujocoPack(ModelPack):
     """M robots of ``spec``. Arrays are (M, dof), in the order of ``spec.joints``, SI units.
 
-    ``variation`` holds their differences from the model, one row for each; ``carrier`` is the link of the URDF that
-    carries the payload, ``links`` are the links with varying mass or center. Implements
-    :class:`batchpid.sim.engine.protocol.CompiledPack` and DrivenPack.
+    Implements :class:`batchpid.sim.engine.protocol.CompiledPack` and DrivenPack.
     """
 
     def __init__(
@@ -59,24 +56,16 @@ class MujocoPack(SingleOwner):
         links: Sequence[str] = (),
         workspace: dict[Any, Any] | None = None,
     ) -> None:
-        self.spec, self.size, self.first_env = spec, size, first_env
+        super().__init__(spec, size, first_env, variation, carrier, links, not obstacle())
         self._workspace = {} if workspace is None else workspace
-        self.steps_natively = not obstacle()
-        self.dof, self._variation = len(spec.joints), variation or Variation()
         varied = self._variation
-        self._masses = VariedMasses(spec, size, varied, carrier, links)
         self._worlds_vary = varied.ground_friction is not None or varied.gravity is not None
         self.qf = np.zeros((size, self.dof))
-        self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
-        self.friction = own_friction(spec, self._variation)
-        self.armature = self._motors = np.zeros((1, self.dof)) if varied.armature is None else varied.armature
-        viscous = self.friction.viscous
-        self._implicit = spec.timestep * (np.zeros((1, self.dof)) if viscous is None else viscous)
         self._actuators: Actuators | None = None
-        coupling, self._constraint = coupling_of(spec.joints), None
+        coupling, viscous = coupling_of(spec.joints), self.friction.viscous
         if not coupling.is_identity and spec.mjcf is None:  # else MuJoCo has the file's equalities
             self._constraint = ConstraintEfforts(size, coupling, np.zeros(self.dof, bool), spec.timestep)
-            self._constraint.implicit[...] = self._implicit
+            self._constraint.implicit[...] = spec.timestep * (0.0 if viscous is None else viscous)
             if self.steps_natively:
                 reads = spec.fixed_base and self.steps_read_force(True, True)
                 self._constraint.use(self._joint_model, None if reads else self._bias_model)
@@ -125,63 +114,29 @@ class MujocoPack(SingleOwner):
     # -- reading -----------------------------------------------------------------------------------------------
 
     def read_qpos(self, dtype: DType = np.float64) -> Rows:
-        """Return the joint positions [rad or m], a new array."""
         return np.array([data.qpos[self._at] for data in self._data], dtype)
 
     def read_qvel(self, dtype: DType = np.float64) -> Rows:
-        """Return the joint velocities [rad/s or m/s], a new array."""
         return np.array([data.qvel[self._moves] for data in self._data], dtype)
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
-        """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N], by the model."""
         if self.steps_read_force(gravity, coriolis):
             return np.array([data.qfrc_bias[self._moves] for data in self._data], dtype)
-        return self._model_force(self._force_model, self._tree.held, gravity, coriolis).astype(dtype)
-
-    def _model_force(self, model: NativeModel, tree: RigidTree, gravity: bool, coriolis: bool) -> Float64:
-        """Return the passive force of a native model, or of a tree without native code."""
         state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
-        return model.passive_force(*state) if self.steps_natively else passive_force(tree, *state)
+        return self._passive_force(*state).astype(dtype)
 
     @cached_property
-    def _tree(self) -> RigidTree:
+    def _tree(self) -> RigidTree:  # type: ignore[override]
         return scene_tree(self.spec)
-
-    def force_model(self) -> NativeModel:
-        """Return the model of the passive force where compiled steps do not read it."""
-        return self._force_model
-
-    @cached_property
-    def _force_model(self) -> NativeModel:
-        return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "held")
 
     @cached_property
     def _bias_model(self) -> NativeModel:
         """Model of the forces in the equations of motion of the joints, for constraint efforts."""
         return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
 
-    def joint_model(self) -> NativeModel:
-        """Return the model of :meth:`joint_mass_matrix` in native code."""
-        return self._joint_model
-
-    @cached_property
-    def _joint_model(self) -> NativeModel:
-        model = NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
-        if self._masses.added:
-            model.vary(range(self.size), self.size, self._masses.added)
-        return model
-
-    def joint_mass_matrix(self, qpos: Rows) -> Float64:
-        """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
-        if self.steps_natively:
-            return self._joint_model.mass_matrix(qpos)
-        added = self._masses.added
-        return ts.mass_matrix(self._tree, qpos, self._tree.varied(added) if added else None)
-
     # -- stepping ----------------------------------------------------------------------------------------------
 
     def write_qf(self, effort: Rows) -> None:
-        """Apply joint efforts [N m or N]. They persist until written again."""
         self.qf[...] = effort
 
     def step(self) -> None:
@@ -210,12 +165,10 @@ class MujocoPack(SingleOwner):
             mujoco.set_mju_user_warning(handler)
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
-        """Return whether a compiled step reads this part of the passive force."""
-        return gravity and coriolis and not self._masses.added and self._variation.gravity is None
+        return gravity and coriolis and self._is_model
 
     @property
     def calls(self) -> object:
-        """Object that is replaced when the robots or their models change."""
         return self._calls
 
     def compiled_step(
@@ -226,7 +179,6 @@ class MujocoPack(SingleOwner):
         speed_limit: NDArray[np.float64] | None,
         drives: bool = False,
     ) -> MujocoStep:
-        """Return the sim step as one native call, which holds for the present :attr:`calls`."""
         return self._make_step(gravity and coriolis, speed_limit, drives)
 
     def _make_step(
@@ -240,18 +192,18 @@ class MujocoPack(SingleOwner):
         )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
-        """Give the constraint efforts of robots ``rows`` the present mass matrix and passive force."""
         if self._constraint is not None:
             if self.spec.fixed_base:  # the bias is the passive force, with the bits that native steps read
                 bias = self.passive_force(True, True)
             else:
-                bias = self._model_force(self._bias_model, self._tree, True, True)
+                state = self.read_qpos(), self.read_qvel(), True, True, self.read_base_motion()
+                natively, model = self.steps_natively, self._bias_model
+                bias = model.passive_force(*state) if natively else passive_force(self._tree, *state)
             self._constraint.update(self.joint_mass_matrix, self.read_qpos(), bias, rows)
 
     # -- changes -----------------------------------------------------------------------------------------------
 
     def read_base(self) -> Float64:
-        """Return pose and twist of floating bases (M, 13), as :class:`batchpid.sim.engine.protocol.EnginePack` says."""
         rows, turn = self._bases(), self._robot.turn
         rows[:, 10:] = turned_back(inverse(rows[:, 3:7]), rows[:, 10:])  # MuJoCo's are in the body's axes
         if turn[0] != 1.0:
@@ -271,13 +223,11 @@ class MujocoPack(SingleOwner):
         return ~np.array([np.abs(data.qpos).max() <= FARTHEST for data in self._data])
 
     def take_sensed(self) -> dict[str, Float64]:
-        """Return the sums of the links' sensors since the last call, as EnginePack says, and begin again."""
         sums = self._sensors.quantities(self._sensed) if self._sensors.size else {}
         self._sensed[...] = 0.0
         return sums
 
     def read_base_motion(self) -> Float64 | None:
-        """Return gravity and the rate at which floating bases turn, in their own axes (M, 6); None for fixed ones."""
         if self.spec.fixed_base:
             return None
         rows, turn = self._bases(), rotation_matrix(self._robot.turn)  # a matrix: it rounds as native code does
@@ -285,7 +235,6 @@ class MujocoPack(SingleOwner):
         return np.concatenate([frames.rotate(turn, part) for part in parts], axis=1)
 
     def push(self, rows: Sequence[int], twists: Float64) -> None:
-        """Add ``twists`` (len(rows), 6) to the twists of floating bases, as :meth:`read_base` has them."""
         data, turns = self._data, matrix_of(self._bases()[rows, 3:7])
         _, at = self._robot.base or (0, 0)
         for row, twist, turn in zip(rows, twists, turns, strict=True):
@@ -322,17 +271,9 @@ class MujocoPack(SingleOwner):
         self._suspended[...] = mask
 
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
-        """Add friction, damping and reflected inertia of ``actuators`` to the description's, for ``rows`` or all."""
         self._actuators = actuators
-        self.friction = added_friction(own_friction(self.spec, self._variation), actuators)
-        added = None if actuators is None else actuators.armature
-        self.armature = self._motors + (0.0 if added is None else added)
-        viscous = self.friction.viscous
-        self._implicit = self.armature + self.spec.timestep * (0.0 if viscous is None else viscous)
-        if self._constraint is not None:
-            self._constraint.implicit[...] = self._implicit
         armature, damping = self._robot.own
-        values = {"dof_armature": np.maximum(armature + self._implicit, 0.0)}
+        values = {"dof_armature": np.maximum(armature + self._add_joints(actuators), 0.0)}
         if self.spec.mjcf is not None and self._variation.damping is not None:
             values["dof_damping"] = np.maximum(damping + self._variation.damping, 0.0)
         tables = {name: np.broadcast_to(table, self.qf.shape) for name, table in values.items()}
@@ -366,9 +307,7 @@ class MujocoPack(SingleOwner):
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
         """Change the robots ``rows`` to ``variation``, one row for each of them."""
-        for mine, new in zip(self._variation, variation, strict=True):
-            if mine is not None:
-                mine[rows] = new
+        self._change(rows, variation)
         self._change_world(rows)
         self._change_masses(rows)
         self._update(rows)
@@ -383,7 +322,7 @@ class MujocoPack(SingleOwner):
             if friction is not None:
                 model.geom_friction[:, 0] = model.pair_friction[:, :2] = friction[row]
 
-    def _change_masses(self, rows: Iterable[int]) -> None:
+    def _change_masses(self, rows: Sequence[int]) -> None:
         if not self._masses.added:
             return
         for row in rows:
@@ -391,8 +330,7 @@ class MujocoPack(SingleOwner):
             for name, inertia in self._masses.of_robot(row).items():
                 set_inertia(model, self._robot, name, inertia)
             mujoco.mj_setConst(model, self._scratch)
-        if "_joint_model" in self.__dict__:
-            self._joint_model.vary(list(rows), self.size, self._masses.added)
+        self._change_model(rows)
 
     def write_drive(self, stiffness: Rows, damping: Rows, force_limit: Rows) -> None:
         """Set the drive of every joint; each argument broadcasts to (M, dof).
@@ -423,7 +361,6 @@ class MujocoPack(SingleOwner):
         self._update(range(self.size))
 
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
-        """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
         if velocity is not None:
             self._target_rate = velocity
         values = self._stiffness * position + self._rate_gain * self._target_rate
@@ -442,7 +379,6 @@ class MujocoPack(SingleOwner):
         return np.array([np.concatenate([getattr(data, name) for name in _STATE]) for data in self._data])
 
     def write_state_rows(self, states: Float64) -> None:
-        """Put the robots of this new pack into the states that :meth:`read_state` returned."""
         for data, state in zip(self._data, states, strict=True):
             begin = 0
             for name in _STATE:
@@ -457,7 +393,6 @@ class MujocoPack(SingleOwner):
         return [np.hstack([data.xpos[numbers], data.xquat[numbers]]) for data in self._data]
 
     def close(self) -> None:
-        """Free the robots. The pack cannot be used afterwards."""
         self._release()
         self.models = []
 

@@ -3,41 +3,50 @@
 A pack is M scenes, each with one robot and a PhysX system. PhysX solves the contacts of a system in an order that
 depends on everything in the system, so robots that share one would not move bit-identically to a robot alone.
 
-The loop uses only the members of :class:`batchpid.sim.engine.protocol.EnginePack` and its capabilities. Longer than 350
-lines because that is the whole interface between loop and engine.
+The engine takes changed payloads, masses, centers of mass and friction while a robot exists, and then moves
+bit-identically to a robot that was built with them. The loop uses only the members of
+:class:`batchpid.sim.engine.protocol.EnginePack` and its capabilities. Longer than 350 lines because that is the whole
+interface between loop and engine.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sapien import Pose, physx
 
-import batchpid.task_space as ts
 from batchpid.arrays.array_types import DType, Float32, Float64, Rows
-from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
-from batchpid.motors.friction import Friction
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
+from batchpid.sim.engine.model_pack import ModelPack
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native.library import obstacle
-from batchpid.sim.engine.native_model import NativeModel, passive_force_of
 from batchpid.sim.engine.robot_model import turned_back
-from batchpid.sim.engine.sapien.building import build_scene, engine_settings, link_frames, new_system, scene_tree
+from batchpid.sim.engine.sapien.building import (
+    RESTITUTION,
+    build_scene,
+    engine_settings,
+    link_frames,
+    new_system,
+    scene_tree,
+    set_inertia,
+)
 from batchpid.sim.engine.sapien.calls import EngineCalls, SapienStep, engine_calls
 from batchpid.sim.engine.sapien.link_sensors import LinkSensors
 from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation, added_friction, own_friction
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.task_space.frames import matrix_of
+from batchpid.task_space.rigid_tree import RigidTree
 
 _ORIGIN = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], np.float32)
 
 
-class Pack(SingleOwner):
+class Pack(ModelPack):
     """M scenes of ``spec``. Arrays are (M, dof), in SAPIEN's order, SI units.
 
     Attributes
@@ -54,8 +63,18 @@ class Pack(SingleOwner):
         Whether the calls into the engine are native.
     """
 
-    def __init__(self, spec: SceneSpec, size: int, first_env: int = 0) -> None:
-        self.spec, self.first_env, self.steps_natively = spec, first_env, not obstacle()
+    def __init__(
+        self,
+        spec: SceneSpec,
+        size: int,
+        first_env: int = 0,
+        variation: Variation | None = None,
+        carrier: str = "",
+        links: Sequence[str] = (),
+    ) -> None:
+        super().__init__(spec, size, first_env, variation, carrier, links, not obstacle())
+        self._shapes: dict[int, list[Any]] = {}
+        self._frames: list[tuple[Pose, Pose] | None] = []
         self.systems = [self._system(row) for row in range(size)]
         built = [self._build(row, system) for row, system in enumerate(self.systems)]
         # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.
@@ -69,38 +88,37 @@ class Pack(SingleOwner):
                 self._contents = [
                     SceneContent(spec, spec.build, scene, env, frames[env - first_env]) for env, scene in envs
                 ]
-        self.size, self.dof = size, self.robots[0].dof
-        self.friction = self._friction()
-        self._implicit = np.array([[joint.armature[0] for joint in self.robots[0].active_joints]])
-        self.armature = self._motors = np.zeros((1, self.dof))
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
-        self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
-        coupling = coupling_of(spec.joints)
-        self._constraint, self._joint_qf = None, self.qf
+        coupling, self._joint_qf = coupling_of(spec.joints), self.qf
         self._turning = np.array([], np.intp)
         if not coupling.is_identity:
             self._joint_qf = np.zeros_like(self.qf)
             continuous = np.array([joint.continuous for joint in spec.joints])
             self._turning = np.flatnonzero(continuous)
             self._constraint = ConstraintEfforts(size, coupling, continuous, spec.timestep, self.qf)
-            self._constraint.implicit[...] = self._implicit
+            self._constraint.implicit[...] = [[joint.armature[0] for joint in self.robots[0].active_joints]]
             if self.steps_natively:
                 self._constraint.use(self._joint_model, None)
         self._sensors = LinkSensors(spec, self.robots, self.systems) if spec.contacts or spec.wrenches else None
         self._bind()
+        if variation is not None:
+            self.write_joints(None)
 
     def _system(self, row: int) -> Any:
         """Return a new system for ``row``."""
-        return new_system(self.spec)
+        gravity = self._variation.gravity
+        return new_system(self.spec, None if gravity is None else gravity[row])
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
-        """Return a new scene in ``system`` and the robot in it, for ``row``."""
-        return build_scene(self.spec, system)
-
-    def _friction(self) -> Friction:
-        """Return the friction and damping of the joints that the engine does not simulate."""
-        return own_friction(self.spec)
+        """Return a new scene in ``system`` and the robot in it, for ``row``, with its masses and friction."""
+        scene, robot = build_scene(self.spec, system)
+        self._change_masses(robot, row)
+        if self._variation.ground_friction is not None:
+            owners = *robot.links, *system.rigid_static_components
+            self._shapes[row] = [shape for owner in owners for shape in owner.collision_shapes]
+            self._change_friction(row)
+        return scene, robot
 
     def _bind(self) -> None:
         """Prepare the calls of every sim step, for the present robots and systems."""
@@ -124,12 +142,10 @@ class Pack(SingleOwner):
 
     @property
     def calls(self) -> EngineCalls:
-        """Calls into the engine, other ones since robots or systems were replaced."""
         return self._calls
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
-        """Return whether :meth:`compiled_step` reads this part of the force of :meth:`passive_force`."""
-        return self.spec.fixed_base
+        return self.spec.fixed_base and self._is_model
 
     def compiled_step(
         self,
@@ -139,29 +155,19 @@ class Pack(SingleOwner):
         speed_limit: NDArray[np.float64] | None,
         drives: bool = False,
     ) -> SapienStep:
-        """Return the sim step as one native call, which holds for the present :attr:`calls`."""
         constraint = None if self._constraint is None else self._constraint.address
         reads, joints = (gravity, coriolis, velocities), self._joints if drives else None
         sense = None if self._sensors is None else self._sensors.add
         return SapienStep(self.calls, self._stepped, *reads, speed_limit, constraint, joints, sense)
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
-        """Give the constraint efforts of robots ``rows`` the present mass matrix and passive force."""
         if self._constraint is not None:
             passive = self._calls.passive_force(True, True, np.float64)
             self._constraint.update(self.joint_mass_matrix, self._calls.qpos(np.float64), passive, rows)
 
-    def joint_model(self) -> NativeModel:
-        """Return the model of :meth:`joint_mass_matrix` in native code."""
-        return self._joint_model
-
     @cached_property
-    def _joint_model(self) -> NativeModel:
-        return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
-
-    def force_model(self) -> NativeModel:
-        """Return the model of the passive force where compiled steps do not read it."""
-        return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "held")
+    def _tree(self) -> RigidTree:  # type: ignore[override]
+        return scene_tree(self.spec)
 
     def _renew(self, rows: Sequence[int]) -> None:
         """Rebuild the robots ``rows`` in new systems, in which earlier contacts have no influence on the next ones.
@@ -202,21 +208,11 @@ class Pack(SingleOwner):
     def read_qvel(self, dtype: DType = np.float64) -> Rows:
         return self._calls.qvel(dtype)
 
-    def joint_mass_matrix(self, qpos: Rows) -> NDArray[np.float64]:
-        return self._joint_model.mass_matrix(qpos) if self.steps_natively else self._joint_mass_matrix(qpos)
-
-    def _joint_mass_matrix(self, qpos: Rows) -> Float64:
-        return ts.mass_matrix(scene_tree(self.spec), qpos)
-
     def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
         if self.steps_read_force(gravity, coriolis):
             return self._calls.passive_force(gravity, coriolis, dtype)
         state = self.read_qpos(), self.read_qvel(), gravity, coriolis, self.read_base_motion()
         return self._passive_force(*state).astype(dtype)
-
-    @cached_property
-    def _passive_force(self) -> Callable[..., Float64]:
-        return passive_force_of(self.spec, self.steps_natively)
 
     def write_qf(self, effort: Rows) -> None:
         self.qf[...] = effort
@@ -293,8 +289,38 @@ class Pack(SingleOwner):
             self._sensors.place(rows)
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
-        """Raise TypeError: the robots of this pack equal the model; see :class:`.sapien_engine.VariedPack`."""
-        raise TypeError("the robots of this pack do not vary; make it with a variation")
+        self._change(rows, variation)
+        if self._variation.gravity is not None:  # a system keeps its gravity
+            self._rebuild(rows)
+        else:
+            for row in rows:
+                self._change_masses(self.robots[row], row)
+                self._change_friction(row)
+        self._change_model(rows)
+
+    def _change_friction(self, row: int) -> None:
+        """Set the friction of the robot's shapes and of the ground."""
+        if (friction := self._variation.ground_friction) is not None:
+            material = physx.PhysxMaterial(friction[row], friction[row], RESTITUTION)
+            for shape in self._shapes[row]:
+                shape.set_physical_material(material)
+
+    def _change_masses(self, robot: Any, row: int) -> None:
+        """Set the masses of a robot. They move the frames of its joints by rounding, so that these are set again."""
+        if not self._masses.added:
+            return
+        if not self._frames:  # of a robot as it is built
+            moves = [joint.parent_link is not None for joint in robot.joints]
+            pairs = zip(robot.joints, moves, strict=True)
+            self._frames = [(joint.pose_in_parent, joint.pose_in_child) if move else None for joint, move in pairs]
+        inertias = self._masses.of_robot(row)
+        for link in robot.links:
+            if link.name in inertias:
+                set_inertia(link, inertias[link.name])
+        for joint, frames in zip(robot.joints, self._frames, strict=True):
+            if frames is not None:
+                joint.set_pose_in_parent(frames[0])
+                joint.set_pose_in_child(frames[1])
 
     def state_sizes(self) -> list[int]:
         """Return the number of values in the state of each scene: of the robot, and of its content."""
@@ -336,13 +362,7 @@ class Pack(SingleOwner):
         return [content.poses() for content in self._contents]
 
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
-        self.friction = added_friction(self._friction(), actuators)
-        armature, viscous = None if actuators is None else actuators.armature, self.friction.viscous
-        self.armature = self._motors + (0.0 if armature is None else armature)
-        self._implicit = self.armature + self.spec.timestep * (0.0 if viscous is None else viscous)
-        if self._constraint is not None:
-            self._constraint.implicit[...] = self._implicit
-        values = np.broadcast_to(self._implicit, self.qf.shape).astype(np.float32)
+        values = np.broadcast_to(self._add_joints(actuators), self.qf.shape).astype(np.float32)
         for row in range(self.size) if rows is None else rows:
             for joint, value in zip(self.robots[row].active_joints, values[row, :, None], strict=True):
                 joint.set_armature(value)

@@ -19,8 +19,8 @@ from batchpid.sim.robot.mjcf.mjcf_shapes import PLANE, can_collide, excluded_pai
 from batchpid.sim.robot.mjcf.mjcf_tree import Tree
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.self_collision import DisabledPair
+from batchpid.task_space.rigid_tree import GRAVITY
 
-GRAVITY = (0.0, 0.0, -9.81)
 _EQ = mujoco.mjtEq
 _KEYFRAME = "home"
 """Keyframe with the start pose."""

@@ -14,7 +14,7 @@ import tyro
 from test_outputs import OUT, SUFFIXES, WORDS, files, output_flags  # noqa: F401
 
 from batchpid.sim.cli import COMMANDS, parse
-from batchpid.sim.cli.progress import bar, waiting
+from batchpid.sim.cli.outputs import bar, waiting
 
 RUNS_ROBOTS = {"demo", "rollout", "tune", "compare", "view"}
 HAVE = {

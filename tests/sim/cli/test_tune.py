@@ -16,6 +16,7 @@ from batchpid.sim import Robot
 from batchpid.sim.cli import parse
 from batchpid.sim.identification import Region
 from batchpid.sim.tuning import Weights, random_moves, tune
+from batchpid.sim.tuning.cost import Trial
 
 pytest.importorskip("cmaes")
 
@@ -132,16 +133,17 @@ def test_the_search_says_by_which_figures_it_rejected_its_candidates(tmp_path, m
     robot = Robot.load(write(tmp_path, one_joint()))
     short = {"generations": 1, "seconds": 0.05, "workers": 0, "engine": "mujoco"}
     monkeypatch.setattr(
-        "batchpid.sim.tuning.candidates.Candidates.costs", lambda self, runner, points: (*points[:, 0] ** 2,)
+        "batchpid.sim.tuning.candidates.Candidates.trial",
+        lambda self, runner, points: Trial((*points[:, 0] ** 2,), None, None),
     )
     found = tune(robot, population=4, **short)  # the designed gains are at 0
     assert found.rejected.startswith("cost in the search: best candidate 0.")
     assert found.rejected.endswith(", designed 0.0000")
 
     def worse_in_the_final(self, runner, points):
-        return (*points[:, 0] ** 2 * (-1 if len(points) == 5 else 1),)
+        return Trial((*points[:, 0] ** 2 * (-1 if len(points) == 5 else 1),), None, None)
 
-    monkeypatch.setattr("batchpid.sim.tuning.candidates.Candidates.costs", worse_in_the_final)
+    monkeypatch.setattr("batchpid.sim.tuning.candidates.Candidates.trial", worse_in_the_final)
     found = tune(robot, population=5, timestep=0.0005, **short)
     assert found.rejected.startswith("cost in the final: best candidate 0.")
     assert found.rejected.endswith(", designed 0.0000")

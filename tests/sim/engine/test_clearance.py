@@ -12,8 +12,8 @@ from tiny_urdf import random_tree, robot, write  # noqa: E402
 from batchpid.sim import Robot, Runner  # noqa: E402
 from batchpid.sim.engine import native  # noqa: E402
 from batchpid.sim.engine.mujoco import mujoco_step  # noqa: E402
-from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
+from batchpid.sim.engine.mujoco.mujoco_step import GroupClearance, shape_tables  # noqa: E402
 from batchpid.sim.engine.protocol import SceneSpec, load_engine  # noqa: E402
 
 MARGIN = 1e-4  # of clearance.h

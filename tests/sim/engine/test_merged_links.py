@@ -11,7 +11,6 @@ from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec, Variation
 from batchpid.sim.engine.sapien.building import parse
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.sapien.sapien_engine import VariedPack
 
 BOX = '<collision><origin xyz="0.1 0 0" rpy="0.3 0 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
 CAPSULE = '<collision><geometry><capsule radius="0.05" length="0.2"/></geometry></collision>'
@@ -100,7 +99,7 @@ def test_mass_is_that_of_all_links(tool, tmp_path):
 def test_payload_acts_at_the_link_that_carries_it(name, tmp_path):
     loaded = arm(tmp_path)
     variation = Variation(payload=np.array([1.5]))
-    merged, unmerged = (VariedPack(spec_of(loaded, merge), 1, 0, variation, name, []) for merge in (True, False))
+    merged, unmerged = (Pack(spec_of(loaded, merge), 1, 0, variation, name, []) for merge in (True, False))
     empty = Pack(spec_of(loaded, True), 1)
     np.testing.assert_allclose(mass_matrix(merged), mass_matrix(unmerged), atol=2e-5)
     assert mass_matrix(merged)[0, 0] > mass_matrix(empty)[0, 0] + 1e-3

@@ -25,7 +25,7 @@ from batchpid.sim.engine.protocol import (
 )
 from batchpid.sim.engine.sapien.calls import SapienStep
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.sapien.sapien_engine import SapienEngine, VariedPack
+from batchpid.sim.engine.sapien.sapien_engine import SapienEngine
 from batchpid.sim.loop.backend import describe
 
 PANDA = load_bundled("panda")
@@ -50,7 +50,7 @@ def check_members(protocol, kind):
     [
         (EnginePack, Pack),
         (DrivenPack, Pack),
-        (CompiledPack, VariedPack),
+        (CompiledPack, Pack),
         (CompiledStep, SapienStep),
         (Engine, SapienEngine),
     ],

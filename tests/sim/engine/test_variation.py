@@ -12,7 +12,6 @@ from batchpid.sim.engine.physics import PHYSICS
 from batchpid.sim.engine.protocol import SceneSpec, Variation
 from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.engine.sapien.pack import Pack
-from batchpid.sim.engine.sapien.sapien_engine import VariedPack
 
 STEPS = 120
 
@@ -43,7 +42,7 @@ def random_variation(robot, seed, rows=1):
 
 def make(robot, variation, rows=1, spec=None):
     carrier = "panda_hand" if "panda" in robot.name else "j2s7s300_link_7"
-    return VariedPack(spec or spec_of(robot), rows, 0, variation, carrier, links_of(robot))
+    return Pack(spec or spec_of(robot), rows, 0, variation, carrier, links_of(robot))
 
 
 def swing(pack, robot, steps=STEPS, seed=0):

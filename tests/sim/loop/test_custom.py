@@ -14,9 +14,9 @@ from identical import assert_identical
 from tiny_urdf import LIMIT, joint, link, robot, write
 
 import batchpid as bp
+from batchpid.arrays.trees import flatten, unflatten
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import FaultWarning, Robot, Runner, Snapshot
-from batchpid.sim.loop.custom import flatten, unflatten
 from batchpid.sim.loop.faults import CAUSES
 
 N, TICKS = 5, 12

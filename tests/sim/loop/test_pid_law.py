@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import batchpid as bp
+from batchpid.arrays.trees import filled, leaves, structure
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.tracing import trace
-from batchpid.native.trees import filled, leaves, structure
 from batchpid.sim.engine import native
 from batchpid.sim.loop.pid_law import PIDLaw
 from tests.batchpid.native.test_compiled_law import CHOICES, bits, numbers

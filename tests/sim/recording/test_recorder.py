@@ -239,7 +239,7 @@ def test_a_nearly_full_disk_raises_and_what_was_recorded_can_be_read(kind, tmp_p
     monkeypatch.setattr(files, "CHUNK_BYTES", 2048)
     monkeypatch.setattr(partial_file, "METADATA_BYTES", 1 << 15)
     ticks, outcomes = 40, set()
-    for size in (4096, 28_672, *range(53_248, 260_000, 98_304)):
+    for size in (4096, 28_672, *range(53_248, 260_000, 49_152)):
         folder = tmp_path / str(size)
         folder.mkdir()
         path, rollouts, message = folder / "run.h5", [], ""

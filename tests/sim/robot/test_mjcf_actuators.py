@@ -131,7 +131,8 @@ CASES = [*SHORTCUTS, *generals()]
 @pytest.mark.parametrize("targets", [TARGETS[:1], TARGETS[1:]], ids=["joint", "others"])
 def test_every_actuator_acts_as_in_mujoco_or_is_named(tmp_path, targets):
     path, rng, read, named = tmp_path / "robot.xml", np.random.default_rng(0), 0, 0
-    cases = [*SHORTCUTS, *rng.choice(CASES, 60 if len(targets) == 1 else 4)]
+    own = SHORTCUTS if len(targets) == 1 else rng.choice(SHORTCUTS, 8, replace=False)
+    cases = [*own, *rng.choice(CASES, 90 if len(targets) == 1 else 4)]
     for case, target in itertools.product(cases, targets):
         extras = " ".join((target, *rng.choice(["", *RANGES], 1), *rng.choice(["", 'name="motor"'], 1)))
         text = FILE.format(extension=PID, beside='<geom size=".1"/>', actuators=case.format(extras))
@@ -147,7 +148,7 @@ def test_every_actuator_acts_as_in_mujoco_or_is_named(tmp_path, targets):
         elif not any(each.code in ("actuator", "limits") and each.joint == "j" for each in robot.repairs):
             check_law(robot, model, text)
             read += 1
-    assert min(read, named) > 5
+    assert min(read, named) > 3
 
 
 @pytest.fixture

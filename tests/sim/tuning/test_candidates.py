@@ -13,10 +13,10 @@ import batchpid.task_space as ts
 from batchpid import make_actuators
 from batchpid.sim import OperationalSpace, Randomization, Uniform
 from batchpid.sim.tuning import Weights, random_moves, tune
-from batchpid.sim.tuning.candidates import Candidates
-from batchpid.sim.tuning.first_candidates import (
+from batchpid.sim.tuning.candidates import (
     FASTEST,
     PHASE_MARGIN,
+    Candidates,
     first_gains,
     gains_of_poles,
     loop_delay,

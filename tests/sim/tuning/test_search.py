@@ -70,7 +70,7 @@ def test_robots_touch_things_in_the_final_and_where_the_moves_are_given(panda, f
         options.append((kwargs.get("collisions", True), kwargs.get("physics")))
         return Runner(*args, **kwargs)
 
-    monkeypatch.setattr("batchpid.sim.tuning.search.Runner", runner)
+    monkeypatch.setattr("batchpid.sim.tuning.evolution.Runner", runner)
     tune(panda, workers=0, physics="fast", **SMALL)
     assert options == [(False, "free"), (True, "fast")]
     options.clear()

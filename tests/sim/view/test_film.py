@@ -10,7 +10,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Runner
 from batchpid.sim.cli import main
 from batchpid.sim.view import film, renderer
-from batchpid.sim.view.painter import PaintedScene
+from batchpid.sim.view.film import PaintedScene
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from batchpid.sim.workers.liveness import Liveness
+from batchpid.sim.workers.worker import Liveness
 
 
 class FakeProcess:

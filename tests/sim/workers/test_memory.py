@@ -15,7 +15,7 @@ from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Runner, RunnerOptions
-from batchpid.sim.workers.memory import estimate_memory
+from batchpid.sim.workers.placement import estimate_memory
 
 ROBOT = load_bundled("panda")
 
@@ -58,7 +58,7 @@ def test_the_estimate_is_below_what_the_envs_take_but_not_far(engine):
     pytest.importorskip("mujoco.batch" if engine == "mujoco" else "sapien")
     program = (  # a new process, so that no memory is reused
         "import psutil, warnings; warnings.simplefilter('ignore'); from sim import Robot, Runner\n"
-        "from batchpid.sim.workers.memory import estimate_memory\n"
+        "from batchpid.sim.workers.placement import estimate_memory\n"
         "robot = Robot.load('jaco2'); "
         f"options = dict(params=robot.params(), workers=0, engine={engine!r})\n"
         "rss = lambda: psutil.Process().memory_info().rss\n"

@@ -11,7 +11,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.identification import Region, draw_motors, read_region
 from batchpid.sim.tuning import random_moves
-from batchpid.sim.tuning.within import within
+from batchpid.sim.tuning.evaluation import within
 from tests.sim.tuning.identification.test_identify import ARM
 
 

@@ -17,7 +17,7 @@ from tests.sim.tuning.identification.test_identify import ARM
 
 pytest.importorskip("scipy")
 pytest.importorskip("mujoco.batch")
-SECONDS, TICK = 4.0, 5
+SECONDS, TICK = 5.0, 5
 PUSH = 3.0
 
 

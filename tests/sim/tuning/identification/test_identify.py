@@ -369,6 +369,7 @@ def test_the_example_writes_a_log_that_reads_back(arm, mujoco_log, runs, tmp_pat
     np.testing.assert_allclose(log.qpos, table["qpos"], atol=1e-8)
 
 
+@pytest.mark.usefixtures("short_search")
 def test_the_intervals_of_several_motors_hold_the_truth(tmp_path):
     """Of a pendulum under sweeps of effort, whose log has the noise of an encoder."""
     (tmp_path / "pendulum.urdf").write_text(PENDULUM)

@@ -1,0 +1,106 @@
+"""What the packs of all engines share: the models of their robots, and the friction and armature of the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+import batchpid.task_space as ts
+from batchpid.arrays.array_types import Float64, Rows
+from batchpid.checks.single_owner import SingleOwner
+from batchpid.motors import Actuators
+from batchpid.sim.engine.coupled_joints import ConstraintEfforts
+from batchpid.sim.engine.native_model import NativeModel, passive_force_of
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation, VariedMasses, added_friction, own_friction
+from batchpid.task_space.rigid_tree import RigidTree
+
+
+class ModelPack(SingleOwner):
+    """Robots of ``spec`` with mass matrices and forces of its model.
+
+    ``variation`` holds their differences from the model, one row for each; ``carrier`` is the link of the URDF that
+    carries the payload, ``links`` are the links with varying mass or center. ``natively`` says whether native code is
+    used.
+    """
+
+    _tree: RigidTree
+    """Tree of the model on the base that the robots have."""
+
+    def __init__(
+        self,
+        spec: SceneSpec,
+        size: int,
+        first_env: int,
+        variation: Variation | None,
+        carrier: str,
+        links: Sequence[str],
+        natively: bool,
+    ) -> None:
+        self.spec, self.size, self.first_env, self.steps_natively = spec, size, first_env, natively
+        self.dof, self._variation = len(spec.joints), variation or Variation()
+        self._masses = VariedMasses(spec, size, self._variation, carrier, links)
+        self._suspended: NDArray[np.bool_] = np.zeros(size, bool)
+        self.friction = own_friction(spec, self._variation)
+        armature = self._variation.armature  # vary() changes its rows
+        self.armature = self._motors = np.zeros((1, self.dof)) if armature is None else armature
+        self._constraint: ConstraintEfforts | None = None
+
+    @property
+    def _is_model(self) -> bool:
+        """Whether masses and gravity of the robots are those of the model."""
+        return not self._masses.added and self._variation.gravity is None
+
+    def joint_model(self) -> NativeModel:
+        """Return the native model of :meth:`joint_mass_matrix`."""
+        return self._joint_model
+
+    @cached_property
+    def _joint_model(self) -> NativeModel:
+        model = NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
+        if self._masses.added:
+            model.vary(range(self.size), self.size, self._masses.added)
+        return model
+
+    def force_model(self) -> NativeModel:
+        """Return the native model of the passive force, for compiled steps that do not read it."""
+        return self._force_model
+
+    @cached_property
+    def _force_model(self) -> NativeModel:
+        return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "held")
+
+    def joint_mass_matrix(self, qpos: Rows) -> Float64:
+        """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
+        if self.steps_natively:
+            return self._joint_model.mass_matrix(qpos)
+        added = self._masses.added
+        return ts.mass_matrix(self._tree, qpos, self._tree.varied(added) if added else None)
+
+    @cached_property
+    def _passive_force(self) -> Callable[..., Float64]:
+        return passive_force_of(self.spec, self.steps_natively)
+
+    def _change(self, rows: Sequence[int], variation: Variation) -> None:
+        """Give the robots ``rows`` these differences from the model."""
+        for mine, new in zip(self._variation, variation, strict=True):
+            if mine is not None:
+                mine[rows] = new
+
+    def _change_model(self, rows: Sequence[int]) -> None:
+        """Give the native model the masses of the robots ``rows``."""
+        if self._masses.added and "_joint_model" in self.__dict__:
+            self._joint_model.vary(rows, self.size, self._masses.added)
+
+    def _add_joints(self, actuators: Actuators | None) -> Float64:
+        """Add friction and armature of ``actuators``; return the inertia that the engine has to add to the joints'."""
+        self.friction = added_friction(own_friction(self.spec, self._variation), actuators)
+        added = None if actuators is None else actuators.armature
+        self.armature = self._motors + (0.0 if added is None else added)
+        viscous = self.friction.viscous
+        implicit: Float64 = self.armature + self.spec.timestep * (0.0 if viscous is None else viscous)
+        if self._constraint is not None:
+            self._constraint.implicit[...] = implicit
+        return implicit
