@@ -1,4 +1,4 @@
-"""Atomic writes of files, trials of whether a file can be written, and .npz files that may be made to do harm."""
+"""Files: atomic writes, trials of whether one can be written, .npz files that may be made to do harm, descriptors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import secrets
 import stat
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -20,6 +20,21 @@ from batchpid.arrays.array_types import Rows
 
 TRIAL_BYTES = 4096
 """Size of the file that :func:`try_writing` writes: a block of most file systems [B]."""
+
+
+@contextmanager
+def standard_streams_occupied() -> Iterator[None]:
+    """Give files that are opened inside a number above 2.
+
+    The numbers 0 to 2 belong to the standard streams. In a program that has closed these, the next file would get such
+    a number, and printed text would go into it.
+    """
+    with ExitStack() as files:
+        number = 0
+        while number <= 2:
+            number = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
+            files.callback(os.close, number)
+        yield
 
 
 def read_bytes(path: str) -> bytes:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.plant import Plant
-from batchpid.sim.identification.regression import LEAST_ROWS, Motion, Regression
+from batchpid.sim.identification.regression import LEAST_ROWS, STRENGTHS, Motion, Regression
 from batchpid.task_space.rigid_tree import RigidTree
 
 SPREAD, MOMENT_SPREAD = 0.5, 0.05
@@ -148,8 +148,7 @@ class _System:
 
     def __init__(self, regression: Regression) -> None:
         self.regression, best = regression, regression.best.motors
-        self.delay, self.kg = best["delay"][0, 0], best["payload"][0, 0]
-        self._required, a, v, sign, self._effort = regression.tables(self.delay, self.kg)
+        self._required, a, v, sign, self._effort = regression.tables(best["delay"][0, 0], best["payload"][0, 0])
         self.rows, self.joints = a.shape
         self._motion = np.stack([a, v, sign, np.ones_like(a)], axis=2)
         fast = np.abs(v) > SLOW * np.sqrt((v**2).mean(0))
@@ -201,15 +200,11 @@ class _System:
         return self._solved(found[count:], residual)
 
     def with_strengths(self) -> tuple[_Solved, Float64]:
-        """Return the solution with free strengths in place of further columns, and the strengths (joints,)."""
-        motors = self.regression.at(self.delay, self.kg).motors
-        residual = np.zeros((self.rows, self.joints))
-        for joint in range(self.joints):
-            names = ("armature", "damping", "friction", "bias")
-            own = np.array([motors[name][0, joint] for name in names]) * [1, 1, 1, -1]
-            asked = self._required[:, joint] + self._motion[:, joint] @ own
-            residual[:, joint] = self._effort[:, joint] - asked / motors["strength"][0, joint]
-        return self._solved(np.zeros(0), residual), motors["strength"][0]
+        """Return the solution with free strengths, where more than ratios to them show, and the strengths (joints,)."""
+        free = np.diag(~self.regression.ratios_only)
+        found = self.solve(self._effort[..., None] * free)  # (1 - strength) times the effort
+        strengths = np.clip(1 - found.values, *STRENGTHS)
+        return self._solved(found.values, found.residual / strengths), strengths
 
     def _spread_of(self, residual: Float64) -> Float64:
         """Return a robust standard deviation of the fitted residuals (joints,), from their median."""
@@ -222,12 +217,8 @@ class _System:
         squares = np.where(kept, residual / self._size, 0.0) ** 2
         of_joints = np.sqrt(squares.sum(0) / np.maximum(kept.sum(0), 1))
         left, whole = (float(np.linalg.norm(np.where(kept, each, 0.0))) for each in (residual, self._effort))
-        return _Solved(
-            values,
-            residual,
-            float(np.exp(np.log(of_joints + LEAST_RESIDUAL).mean())),
-            float(1 - left / max(whole, 1e-12)),
-        )
+        held_out = float(np.exp(np.log(of_joints + LEAST_RESIDUAL).mean()))
+        return _Solved(values, residual, held_out, float(1 - left / max(whole, 1e-12)))
 
     def disturbance(self, solved: _Solved, logs: list[Log], joints: list[str]) -> Disturbance | None:
         """Return the part with the largest residual over the median of all parts; None if none is large enough."""

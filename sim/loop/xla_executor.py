@@ -29,13 +29,6 @@ from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Ou
 from batchpid.sim.options import RunnerOptions
 
 
-class TracedBodies(NamedTuple):
-    """Arguments of :func:`batchpid.sim.engine.native.xla.mass_matrix`; None where nothing needs them."""
-
-    tree: Any = None
-    table: Any = None
-
-
 class Carry(NamedTuple):
     """State of the loop over sim steps."""
 
@@ -83,7 +76,7 @@ class XLAExecutor:
         rows = (pack.size, pack.dof)
         with own_settings(options.dtype):
             self._constants = put(arrays)
-            self._bodies = put(TracedBodies() if tables is None else TracedBodies(*tables))
+            self._bodies = put(tables)
             self._zero = put(padded(np.zeros(rows)))
 
     def measure(self) -> Measured:
@@ -159,7 +152,7 @@ def tick(
     gravity: bool,
     span: Any,
     constants: Constants,
-    bodies: TracedBodies,
+    bodies: tuple[Any, Any] | None,
     state: StepState,
     measured: Measured,
     command: Command,
@@ -176,7 +169,8 @@ def tick(
     end, address = span[1], lax.bitcast_convert_type(span[2:], np.uint32)
 
     def mass_matrix(qpos: Array) -> Array:
-        return xla.mass_matrix(bodies.tree, bodies.table, qpos)
+        assert bodies is not None
+        return xla.mass_matrix(*bodies, qpos)
 
     def when(due: Any, function: Any, otherwise: Array) -> Any:
         return lax.cond(due.any(), function, lambda: otherwise)

@@ -8,6 +8,10 @@ Children inherit from the caller, at each fork, the environment (another one sta
 working folder, cores, resource limits, and the standard output and error; and the umask and priority that it had when
 the server started. The kernel ends them when the server ends, and the server when the caller ends. For the kernel, the
 parent is the thread that started the server; that is :data:`BACKGROUND`, which lives as long as the caller.
+
+The forkserver of :mod:`multiprocessing` is no substitute: its children import the caller's ``__main__``, which needs a
+main guard and takes as long again as the fork; they have the environment and the standard streams of the first start;
+and it is shared with the caller's own use, preloaded modules included.
 """
 
 from __future__ import annotations
@@ -34,7 +38,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Document
-from batchpid.sim.processes.descriptors import is_open, standard_streams_occupied
+from batchpid.io.files import standard_streams_occupied
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 ONE_THREAD |= {"NPROC": "1", "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0", "JAX_PLATFORMS": "cpu"}
@@ -134,7 +138,7 @@ def fork(
     OSError
         No process can be started.
     """
-    streams = [number for number in (1, 2) if is_open(number)]
+    streams = [number for number in (1, 2) if _is_open(number)]
     with standard_streams_occupied():
         here = os.open(".", os.O_PATH | os.O_CLOEXEC)
         reader, writer = Pipe(duplex=False)
@@ -202,7 +206,7 @@ def _start(environment: dict[str, str]) -> _Server:
         raise OSError("sys.executable does not say which Python to run")
     with standard_streams_occupied():
         ours, theirs = socket.socketpair(type=socket.SOCK_SEQPACKET)
-    quiet = [(os.POSIX_SPAWN_OPEN, each, os.devnull, os.O_RDWR, 0) for each in (0, 1, *(() if is_open(2) else (2,)))]
+    quiet = [(os.POSIX_SPAWN_OPEN, each, os.devnull, os.O_RDWR, 0) for each in (0, 1, *(() if _is_open(2) else (2,)))]
     with theirs:
         pid = os.posix_spawn(
             sys.executable,
@@ -212,6 +216,14 @@ def _start(environment: dict[str, str]) -> _Server:
             file_actions=[(os.POSIX_SPAWN_DUP2, theirs.fileno(), _SOCKET), *quiet],
         )
     return _Server(pid, os.getpid(), environment, ours)
+
+
+def _is_open(descriptor: int) -> bool:
+    """Return whether this process has a file open under the number ``descriptor``."""
+    with contextlib.suppress(OSError):
+        os.fstat(descriptor)
+        return True
+    return False
 
 
 def _import_path() -> list[str]:

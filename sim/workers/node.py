@@ -32,15 +32,6 @@ class NodeInfo(NamedTuple):
     """Digest of the canonical episode (:func:`batchpid.sim.workers.requests.canonical_digest`)."""
 
 
-class NodeShare(NamedTuple):
-    """Part of a runner's envs that the pool of a node has."""
-
-    first_env: int
-    num_envs: int
-    ticks: int
-    """Most ticks of a request."""
-
-
 class Answer(NamedTuple):
     """Answer of a node to a request."""
 
@@ -70,12 +61,11 @@ class Node:
         pool_type, start, ticks, canonical = message
         # The caller replaces a node that has lost a worker: it keeps the requests to replay.
         options = start.options.with_values(workers=workers, cluster=None, recover=False)
-        envs = start.envs
-        self._pool = pool_type(options, start.params, NodeShare(envs.start, envs.stop - envs.start, ticks))
+        self._pool = pool_type(options, start.params, start.envs, ticks)
         self._pool.open()
         digest = self._run(ReadDigest(canonical)).result
         pids = tuple(worker.pid for worker in self._pool.workers)
-        return NodeInfo(address, envs, os.getpid(), pids, _processor(), digest)
+        return NodeInfo(address, start.envs, os.getpid(), pids, _processor(), digest)
 
     def execute(self, request: Request) -> Answer:
         """Execute a request, which has the part of this node's envs."""

@@ -10,13 +10,13 @@ from concurrent.futures import Future
 from typing import Any, Self
 
 from batchpid.errors import InvalidArgumentError
+from batchpid.io.files import standard_streams_occupied
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.processes.background import BACKGROUND, Job
-from batchpid.sim.processes.descriptors import standard_streams_occupied
 from batchpid.sim.workers.cluster import Cluster
+from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.node import Answer, Node, NodeInfo
 from batchpid.sim.workers.requests import Request, Run, Start
-from batchpid.sim.workers.shared_memory import SharedArrays
 from batchpid.sim.workers.worker import Worker, WorkerLost, pickled
 
 START_LIMIT, SILENCE_LIMIT = 60.0, 20.0

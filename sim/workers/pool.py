@@ -26,11 +26,11 @@ from batchpid.sim.loop.arrays import Arrays, Ticks
 from batchpid.sim.loop.failure import Failure, order
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.workers.cluster import NODE_STEPS, Cluster
-from batchpid.sim.workers.node import NodeInfo, NodeShare
+from batchpid.sim.workers.exchange import SharedArrays
+from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.node_worker import NodeWorker
 from batchpid.sim.workers.placement import check_memory, pinned_cores, split_envs
 from batchpid.sim.workers.requests import Request, Start
-from batchpid.sim.workers.shared_memory import SharedArrays
 from batchpid.sim.workers.worker import LocalWorker, ProcessWorker, Worker, WorkerLost
 
 MAX_LOSSES = 5
@@ -95,14 +95,17 @@ class WorkerPool(SingleOwner):
     """Workers of a runner: processes, or with ``options.workers`` 0 the loop in this process.
 
     The loops start with ``params``, and the workers with :meth:`open`. With ``options.cluster`` the workers are nodes.
-    Each node has its own pool, for a ``share`` of the envs.
+    Each node has its own pool, of the ``envs`` (default: all) and with requests of ``ticks`` at most.
     """
 
-    def __init__(self, options: RunnerOptions, params: bp.PIDParams, share: NodeShare | None = None) -> None:
+    def __init__(
+        self, options: RunnerOptions, params: bp.PIDParams, envs: slice | None = None, ticks: int | None = None
+    ) -> None:
         self._options, self._params = options, params
         self.messages: dict[type[Warning], str] = {}
         """Latest message of each category, for warnings."""
-        self._first_env, num_envs, ticks = share or (0, options.num_envs, None)
+        envs = slice(0, options.num_envs) if envs is None else envs
+        self._first_env, num_envs = envs.start, envs.stop - envs.start
         count = 1 if options.workers is None else options.workers
         self.is_local = not count
         """True if the loop runs in this process."""

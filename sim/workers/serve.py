@@ -16,9 +16,8 @@ from typing import Any
 
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.failure import failure_of
-from batchpid.sim.workers.channel import Channel
+from batchpid.sim.workers.exchange import Channel, SharedArrays
 from batchpid.sim.workers.requests import decode
-from batchpid.sim.workers.shared_memory import SharedArrays
 
 _DONE = struct.Struct("<cd")  # b"D", seconds of work: the answer on the hot path, all others are pickled
 ANSWER, ANSWER_TAG = struct.Struct("<Qcd"), slice(8, 9)

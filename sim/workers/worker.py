@@ -25,7 +25,7 @@ import cloudpickle
 
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import InvalidArgumentError, WorkerError
-from batchpid.io.files import read_bytes
+from batchpid.io.files import read_bytes, standard_streams_occupied
 from batchpid.sim.engine import native
 from batchpid.sim.engine.protocol import MODULES
 from batchpid.sim.loop.arrays import Arrays
@@ -33,12 +33,10 @@ from batchpid.sim.loop.failure import Failure, failure_of
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.processes.background import BACKGROUND
-from batchpid.sim.processes.descriptors import standard_streams_occupied
 from batchpid.sim.processes.fork_server import Child, fork
-from batchpid.sim.workers.channel import Channel
+from batchpid.sim.workers.exchange import Channel, MemoryFile, SharedArrays
 from batchpid.sim.workers.requests import Request, Start
 from batchpid.sim.workers.serve import ANSWER, ANSWER_TAG
-from batchpid.sim.workers.shared_memory import MemoryFile, SharedArrays
 
 _TRANSFER_LIMITS = (10.0, 60.0)
 """Seconds asleep, and at work, while the rest of a message is on its way: a new process imports a lot first."""

@@ -64,6 +64,7 @@ def test_the_lag_answers_a_step_by_an_exponential(lag, effort):
 
 
 @given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=15)
 def test_the_envelope_is_that_of_isaac_lab_and_of_newton(seed):
     """Their formulas stated again: of DCMotor with its clip of the speed, and of ClampingDCMotor."""
     rng = np.random.default_rng(seed)

@@ -34,22 +34,6 @@ def equal_bits(a, b):
     )
 
 
-@given(cases, runs)
-@settings(max_examples=25)
-def test_effort_stays_within_its_limits_and_rate(case, run):
-    params = bp.make_params(JOINTS, **OPTIONS[case])
-    _, terms = roll(params, *run)
-    before = np.zeros((ENVS, JOINTS))
-    for shown in terms:
-        if params.effort_min is not None:
-            assert (shown.effort >= params.effort_min).all()
-        if params.effort_max is not None:
-            assert (shown.effort <= params.effort_max).all()
-        if params.effort_rate_limit is not None:
-            assert (np.abs(shown.effort - before) <= params.effort_rate_limit * DT * (1 + 1e-9)).all()
-        before = shown.effort
-
-
 @pytest.mark.parametrize("strategy", ["clamp", "conditional", "back_calculation"])
 @pytest.mark.parametrize("seed", range(2))
 def test_the_integral_is_bounded_by_anti_windup(strategy, seed):
@@ -69,17 +53,6 @@ def test_the_integral_is_bounded_by_anti_windup(strategy, seed):
     }
     assert (bounded <= most[strategy] * (1 + 1e-9)).all()
     assert (wound_up > 200 * ki * DT).all()
-
-
-@given(cases, runs, seeds)
-@settings(max_examples=25)
-def test_permuting_envs_permutes_the_results(case, run, seed):
-    order = np.random.default_rng(seed).permutation(ENVS)
-    params = bp.make_params(JOINTS, **OPTIONS[case])
-    states, terms = roll(params, *run)
-    others, shown = roll(params.for_envs(order), *(x[:, order] for x in run))
-    assert equal_bits(states[-1].for_envs(order), others[-1])
-    assert equal_bits([x[order] for x in terms[-1]], shown[-1])
 
 
 @given(cases, runs, st.integers(1, ENVS - 1), st.booleans())
@@ -202,6 +175,7 @@ def test_whole_turns_of_a_continuous_joint_change_no_term(turns, options):
             np.testing.assert_allclose(x, z, atol=1e-9)
 
 
+@settings(max_examples=25)
 @given(st.floats(-50, 50), st.lists(st.floats(-50, 50), min_size=2, max_size=20))
 def test_a_constant_error_has_no_derivative_under_wrap(error, path):
     y = np.array(path)[:, None, None]

@@ -95,6 +95,7 @@ def test_stacks_and_bad_arguments():
         stability_bound(np.eye(2), [1.0, 2.0, 3.0], 1.0, DT)
 
 
+@settings(max_examples=25)
 @given(st.floats(0.02, 0.6), st.floats(0.3, 3.0), st.floats(0.01, 10.0))
 def test_the_least_damped_oscillation_of_one_joint(zeta, hertz, inertia):
     """Of I q'' = -I w^2 q - 2 zeta w I q', as long as it lasts."""

@@ -27,7 +27,7 @@ def with_start(trajectory: Trajectory, start: np.ndarray) -> np.ndarray:
 
 
 @each_move
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=15)
 @given(start=poses, target=st.lists(st.floats(-3, 3), min_size=3, max_size=3).map(np.array))
 @example(start=np.array([[0.0, 0.7, 0.0]]), target=np.array([0.0, -3.0, 0.0]))  # ends by rounding
 def test_a_move_ends_at_its_target_at_rest_and_stays_between(move, start, target):
@@ -42,7 +42,7 @@ def test_a_move_ends_at_its_target_at_rest_and_stays_between(move, start, target
 
 
 @each_move
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=15)
 @given(start=poses, target=st.lists(st.floats(-3, 3), min_size=3, max_size=3).map(np.array))
 def test_positions_are_the_integral_of_velocities(move, start, target):
     t = move(start, target)
@@ -52,7 +52,7 @@ def test_positions_are_the_integral_of_velocities(move, start, target):
     np.testing.assert_allclose(np.diff(position, axis=0), trapezium, rtol=0, atol=DT**2 * 20)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=15)
 @given(start=poses, target=poses)
 @pytest.mark.parametrize("name", ["minimum_jerk", "trapezoidal", "trapezoidal_each"])
 def test_limits_are_kept_at_every_tick(name, start, target):
@@ -61,7 +61,7 @@ def test_limits_are_kept_at_every_tick(name, start, target):
     assert (np.abs(t.acceleration) <= np.array(LIMITS["max_acceleration"]) * (1 + 1e-9)).all()
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=15)
 @given(start=poses, target=poses)
 @pytest.mark.parametrize("name", ["minimum_jerk", "trapezoidal"])
 def test_synchronised_joints_move_on_a_straight_line(name, start, target):
@@ -72,7 +72,7 @@ def test_synchronised_joints_move_on_a_straight_line(name, start, target):
     assert (spread < 1e-9).all()
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=15)
 @given(distance=st.floats(0.01, 5), v=st.floats(0.1, 5), a=st.floats(0.1, 20))
 def test_a_trapezoid_takes_the_time_that_the_textbook_gives(distance, v, a):
     t = trapezoidal([0.0], [distance], 1e-3, max_velocity=v, max_acceleration=a)

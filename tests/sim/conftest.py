@@ -30,6 +30,13 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
     return name
 
 
+@pytest.fixture
+def small_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let runners in this process have several groups of envs."""
+    for name in ("sapien", "mujoco"):
+        monkeypatch.setattr(type(load_engine(name)), "group_size", 3)
+
+
 @pytest.fixture(scope="session")
 def panda() -> Robot:
     """The bundled panda: 7 joints and 2 fingers."""

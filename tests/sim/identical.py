@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.sim.observation import OBSERVED, OPTIONAL
+from batchpid.sim import Observation
 
 
 def assert_identical(first: Any, second: Any, envs: Any = slice(None), skip: Collection[str] = ()) -> None:
@@ -17,7 +17,7 @@ def assert_identical(first: Any, second: Any, envs: Any = slice(None), skip: Col
     differ.
     """
     rows = (*[slice(None)] * (second.ok.ndim - 1), envs)
-    seen = {*OBSERVED, *(name for name in OPTIONAL if getattr(second, name) is not None)}
+    seen = {name for name in Observation._fields if getattr(second, name) is not None}
     for name in (seen | {"setpoint", "time"} if hasattr(second, "time") else seen) - set(skip):
         ours, theirs = getattr(first, name), getattr(second, name)
         if name != "time":

@@ -11,7 +11,6 @@ import pytest
 
 from batchpid.errors import NotCopyableError
 from batchpid.sim import Recorder, Robot, Runner
-from batchpid.sim.workers.pool import WorkerPool
 from tests.sim.tiny_urdf import one_joint, write
 
 COPIES = (copy.copy, copy.deepcopy, pickle.dumps, cloudpickle.dumps)
@@ -35,15 +34,6 @@ def test_a_runner(hinge, workers):
         assert runner.step([0.1]).ok.all()
     with pytest.raises(NotCopyableError):
         copy.copy(runner)  # a closed one, too
-
-
-def test_a_pool_and_its_workers(hinge):
-    with Runner(hinge, 1, workers=0) as runner:
-        pool = WorkerPool(runner.options, runner.params)
-        pool.open()
-        refuses(pool)
-        refuses(pool.workers[0])
-        pool.close()
 
 
 def test_a_recorder(hinge, tmp_path):

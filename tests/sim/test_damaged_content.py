@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -280,10 +281,24 @@ def test_bytes_of_hdf5(good, data):
     check(good, data.draw(changed_bytes(good[2])))
 
 
+@st.composite
+def encoded_changes(draw: st.DrawFn, suffix: str, content: bytes) -> bytes:
+    """Draw the file of a content with another key, value or length."""
+    leaves = CELLS if suffix == ".csv" else LEAVES
+    return encoded(suffix, draw(changed_tree(decoded(suffix, content), leaves)))
+
+
 @kinds("drawn.yaml", "runs.yaml")
 @settings(max_examples=30, **EXAMPLES)
 @given(st.data())
 def test_keys_values_and_lengths(good, data):
-    suffix = good[1].suffix
-    tree = decoded(suffix, good[2])
-    check(good, encoded(suffix, data.draw(changed_tree(tree, CELLS if suffix == ".csv" else LEAVES))))
+    check(good, data.draw(encoded_changes(good[1].suffix, good[2])))
+
+
+@pytest.mark.slow
+@kinds("drawn.yaml", "runs.yaml")
+@settings(max_examples=int(os.environ.get("BATCHPID_SOAK_EXAMPLES", "500")), **EXAMPLES)
+@given(st.data())
+def test_many_changes(good, data):
+    content = good[2]
+    check(good, data.draw(changed_bytes(content) | encoded_changes(good[1].suffix, content)))

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import contextlib
 
-import mujoco
 import numpy as np
 import pytest
-from identical import assert_identical
 
-from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Randomization, Recorder, Robot, Runner, Uniform, read_recording, write_recording
+from batchpid.sim import Randomization, Robot, Runner, Uniform
 
 GRAVITY = 9.81
 LEG = """
@@ -89,60 +86,6 @@ def test_the_twist_is_that_of_the_root_link_in_the_world(quadruped, engine):
     np.testing.assert_allclose(rates[:, 1], 0.5 * (wx * w + wy * z - wz * y), atol=0.01)
 
 
-def test_the_base_is_that_of_the_engine(quadruped, engine):
-    with Runner(quadruped, 1, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:
-        runner.reset(base_pose=[0, 0, 0.5, 0.9, 0.1, 0.3, 0.2], base_twist=[0.3, 0.1, 0, 0, 1, 0])
-        seen = runner.step(quadruped.start)
-        pack = runner._pool.workers[0]._loop.groups[0].pack
-        if engine == "mujoco":
-            data, velocity = pack._data[0], np.zeros(6)
-            mujoco.mj_objectVelocity(pack.models[0], data, mujoco.mjtObj.mjOBJ_XBODY, 1, velocity, 0)
-            pose, twist = data.qpos[:7], [*velocity[3:], *velocity[:3]]
-            np.testing.assert_allclose(seen.base_twist[0, :3], data.qvel[:3], atol=1e-6)
-        else:
-            robot = pack.robots[0]
-            pose, twist = [*robot.get_root_pose().p, *robot.get_root_pose().q], None
-            np.testing.assert_allclose(seen.base_twist[0, 3:], robot.get_root_angular_velocity(), atol=1e-6)
-        np.testing.assert_allclose(seen.base_pose[0], pose, atol=1e-6)
-        if twist is not None:
-            np.testing.assert_allclose(seen.base_twist[0, 3:], twist[3:], atol=1e-6)
-
-
-def test_it_is_recorded_and_goes_on_from_a_snapshot(quadruped, engine, tmp_path):
-    table = quadruped.start + 0.02 * np.sin(np.arange(12.0))[:, None]
-    with Runner(quadruped, 2, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:
-        with Recorder(tmp_path / "run.h5", runner):
-            runner.rollout(table[:6])
-        kept = runner.snapshot()
-        first = runner.rollout(table[6:])
-        runner.restore(kept)
-        assert_identical(first, runner.rollout(table[6:]))
-    assert first.info.fixed_base is False
-    recording = read_recording(tmp_path / "run.h5")
-    assert recording.base_pose.shape == (6, 2, 7)
-    assert np.ptp(recording.base_pose[..., 2]) > 1e-4
-    write_recording(first, tmp_path / "run.npz")
-    again = read_recording(tmp_path / "run.npz")
-    np.testing.assert_array_equal(again.base_twist, first.base_twist)
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_falls_are_the_same_for_any_number_of_workers(quadruped, engine, workers):
-    options = {
-        "engine": engine,
-        "params": quadruped.params(**GAINS),
-        "randomization": Randomization(link_mass=Uniform(0.8, 1.2)),
-    }
-    runs = []
-    for count in (0, workers):
-        with Runner(quadruped, 5, workers=count, **options) as runner:
-            runner.reset(base_pose=[0, 0, 0.6, 0.9, 0.3, 0.2, 0.1], base_twist=[0.5, 0, 0, 0, 2.0, 0], seed=3)
-            runs.append(runner.rollout(np.tile(quadruped.start, (40, 1))))
-    assert_identical(*runs)
-    np.testing.assert_array_equal(runs[0].base_pose, runs[1].base_pose)
-    assert np.ptp(runs[0].base_pose[-1], axis=0).max() > 1e-4
-
-
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 def test_an_env_that_fails_is_placed_where_it_began(quadruped, engine):
     options = {"params": quadruped.params(**GAINS), "workers": 0, "engine": engine, "on_invalid_input": "contain"}
@@ -155,61 +98,6 @@ def test_an_env_that_fails_is_placed_where_it_began(quadruped, engine):
     assert seen.ok.tolist() == [False, True]
     assert abs(seen.base_pose[0, 2] - 0.36) < 5e-3
     assert np.isfinite(seen.base_twist).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"base_pose": np.zeros(7)}, "base_pose.*quaternion of length 0"),
-        ({"base_pose": np.zeros(3)}, "base_pose"),
-        ({"base_twist": [0, 0, np.nan, 0, 0, 0]}, "base_twist.*'vz'"),
-    ],
-    ids=str,
-)
-def test_a_wrong_base_is_refused(quadruped, options, text):
-    with Runner(quadruped, 1, params=quadruped.params(**GAINS), workers=0, engine="mujoco") as runner:
-        before = runner.observe()
-        with pytest.raises(InvalidArgumentError, match=text):
-            runner.reset(**options)
-        assert_identical(before, runner.observe())
-
-
-def test_a_fixed_base_has_no_pose(panda):
-    with Runner(panda, 1, workers=0, engine="mujoco") as runner:
-        assert runner.observe().base_pose is None
-        with pytest.raises(InvalidArgumentError, match=r"base_twist.*fixed"):
-            runner.reset(base_twist=np.zeros(6))
-
-
-WORLD = {
-    "ground_friction": Uniform(0.1, 0.9, operation="abs"),
-    "gravity": {"x": Uniform(-1, 1), "z": Uniform(-1, 1)},
-    "link_mass": {"trunk": Uniform(0.5, 1.5, operation="scale")},
-    "center_of_mass": {"trunk": Uniform(-0.05, 0.05)},
-}
-PUSHES = {"push": {"vx": Uniform(0.5, 1.0), "wz": Uniform(-2, 2)}, "push_interval": Uniform(0.02, 0.06)}
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_pushes_of_the_same_seeds_are_the_same_falls(quadruped, engine, workers):
-    """For any number of workers, from a snapshot on, and again after a reset to the same seeds."""
-    options = {"engine": engine, "params": quadruped.params(**GAINS), "contacts": ["foot0"]}
-    options["randomization"] = Randomization(**WORLD, **PUSHES)
-    table, runs = np.tile(quadruped.start, (12, 1)), []
-    for count in (0, workers):
-        with Runner(quadruped, 5, workers=count, **options) as runner:
-            runner.reset(seed=3)
-            first = runner.rollout(table)
-            kept = runner.snapshot()
-            runs += [first, runner.rollout(table)]
-            if not count:
-                runner.restore(kept)
-                assert_identical(runs[-1], runner.rollout(table))
-                runner.reset(seed=3)
-                assert_identical(first, runner.rollout(table), skip=["time"])
-    assert_identical(runs[0], runs[2])
-    assert_identical(runs[1], runs[3])
-    assert np.ptp(runs[1].base_pose[-1, :, 0]) > 1e-3
 
 
 def test_a_push_changes_the_twist_of_the_base_at_a_tick(quadruped, engine):
@@ -274,29 +162,6 @@ def test_gravity_is_compensated_as_if_the_base_were_held(quadruped, engine):
         effort = runner.step(quadruped.start, substeps=1).effort[0]
         np.testing.assert_allclose(effort, 0.3 * (GRAVITY + 9.0 * 0.2), rtol=1e-4)
     assert "floating-base" in {each.code for each in quadruped.check() if each.severity == "note"}
-
-
-@pytest.mark.parametrize(
-    ("world", "text"),
-    [
-        ({"push": Uniform(0, 1)}, "push_interval.*is missing"),
-        ({"push": Uniform(0, 1), "push_interval": Uniform(0, 1)}, "push_interval: may become 0"),
-        ({"push": {"vq": Uniform(0, 1)}, "push_interval": Uniform(1, 2)}, "push.*vq"),
-        ({"ground_friction": Uniform(-1, 1)}, "ground_friction.*>= 0"),
-    ],
-    ids=str,
-)
-def test_wrong_worlds_are_refused(quadruped, world, text):
-    with pytest.raises(InvalidArgumentError, match=text):
-        Runner(quadruped, 1, workers=0, engine="mujoco", randomization=Randomization(**world))
-
-
-def test_pushes_need_a_floating_base_and_friction_contacts(panda):
-    with pytest.raises(InvalidArgumentError, match=r"push: needs a floating base"):
-        Runner(panda, 1, workers=0, engine="mujoco", randomization=Randomization(**PUSHES))
-    world = Randomization(ground_friction=Uniform(0.1, 1))
-    with pytest.raises(InvalidArgumentError, match=r"ground_friction: has no effect without collisions"):
-        Runner(panda, 1, workers=0, engine="mujoco", collisions=False, randomization=world)
 
 
 LIMB = """

@@ -302,11 +302,11 @@ def fuzz(count: int, check: Callable[..., None], *arguments: Any) -> None:
 
 
 def test_entry_points_accept_or_name_any_argument():
-    fuzz(180, check_entry)
+    fuzz(100, check_entry)
 
 
 def test_a_call_that_a_runner_refuses_changes_nothing(runner):
-    fuzz(120, check_method, runner)
+    fuzz(60, check_method, runner)
 
 
 @pytest.mark.slow

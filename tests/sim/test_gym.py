@@ -13,8 +13,8 @@ from gymnasium.utils.env_checker import check_env, data_equivalence  # noqa: E40
 from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 
 from batchpid.errors import CallOrderError, InvalidArgumentError  # noqa: E402
-from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Uniform  # noqa: E402
-from batchpid.sim.gym import ReachEnv, ReachVectorEnv  # noqa: E402
+from batchpid.sim import CommandSpec, FaultWarning, Randomization, Robot, Runner, Uniform  # noqa: E402
+from batchpid.sim.gym import PushVectorEnv, ReachEnv, ReachVectorEnv, ToolReachVectorEnv, WalkVectorEnv  # noqa: E402
 from batchpid.sim.view import renderer  # noqa: E402
 from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write  # noqa: E402
 
@@ -170,28 +170,6 @@ def test_a_failed_env_terminates_with_a_finite_observation_and_begins_again(pand
     env.close()
 
 
-def test_bad_arguments_are_named():
-    with pytest.raises(InvalidArgumentError, match="actions"):
-        ReachVectorEnv(1, actions="torque")
-    with pytest.raises(InvalidArgumentError, match="render_mode"):
-        ReachVectorEnv(1, render_mode="human")
-    env = ReachVectorEnv(2, workers=0, autoreset_mode="Disabled", max_episode_steps=1)
-    for seed in ([1], -1, [0, -1], [0, 1.5], "ab"):
-        with pytest.raises(InvalidArgumentError, match="seed"):
-            env.reset(seed=seed)
-    with pytest.raises(InvalidArgumentError, match="did you mean 'reset_mask'"):
-        env.reset(options={"reset_masks": [True, False]})
-    with pytest.raises(InvalidArgumentError, match="reset_mask"):
-        env.reset(options={"reset_mask": np.zeros(2, bool)})
-    env.reset(seed=[1, None])
-    with pytest.raises(InvalidArgumentError, match="actions"):
-        env.step(np.full((2, 9), np.nan))
-    env.step(np.zeros((2, 9)))
-    with pytest.raises(gymnasium.error.ResetNeeded):
-        env.step(np.zeros((2, 9)))
-    env.close()
-
-
 def test_gymnasiums_vector_wrappers_wrap_the_vector_env():
     from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
@@ -307,23 +285,75 @@ def test_a_reset_while_a_step_is_under_way_is_an_error(carousel):
     carousel.reset(seed=1)
 
 
-@pytest.mark.parametrize(
-    ("make", "options", "message"),
-    [
-        (ReachVectorEnv, {"robto": "panda"}, r"robto: is not an argument of ReachVectorEnv; did you mean 'robot'"),
-        (ReachVectorEnv, {"worker": 0}, "did you mean 'workers'"),
-        (ReachVectorEnv, {"substeps": 5}, "substeps: is not an argument"),
-        (ReachVectorEnv, {"timestep": 0}, "timestep"),
-        (ReachVectorEnv, {"autoreset_mode": "Never"}, "autoreset_mode.*'NextStep'"),
-        (ReachVectorEnv, {"terminate_on_success": "no"}, "terminate_on_success"),
-        (ReachEnv, {"max_episode_steps": 9}, "max_episode_steps: is not an argument of ReachEnv"),
-        (ReachEnv, {"autoreset_mode": "NextStep"}, "autoreset_mode: is not an argument of ReachEnv"),
-        (lambda **options: gymnasium.make_vec(ID, 2, **options), {"robto": "panda"}, "did you mean 'robot'"),
-    ],
-)
-def test_a_wrong_argument_is_named_with_the_nearest(make, options, message):
-    with pytest.raises(InvalidArgumentError, match=message):
-        make(**options)
+class Hold:
+    """Controller of a command without bounds."""
+
+    command = ("x", "z")
+
+    def init(self, robot, num_envs):
+        return None
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        return state, passive
+
+
+class Bounded(Hold):
+    command = CommandSpec(("x", "z"), lower=0.0, upper=1.0)
+
+
+WALK = {"engine": "mujoco", "workers": 0}
+REFUSED = [
+    (ReachVectorEnv, {"robto": "panda"}, "robto"),
+    (ReachVectorEnv, {"substeps": 5}, "substeps"),
+    (ReachVectorEnv, {"timestep": 0}, "timestep"),
+    (ReachVectorEnv, {"actions": "torque"}, "actions"),
+    (ReachVectorEnv, {"render_mode": "human"}, "render_mode"),
+    (ReachVectorEnv, {"autoreset_mode": "Never"}, "autoreset_mode"),
+    (ReachVectorEnv, {"terminate_on_success": "no"}, "terminate_on_success"),
+    (ReachVectorEnv, {"control": Hold()}, "control"),
+    (ReachVectorEnv, {"control": Bounded(), "actions": "increment"}, "max_increment"),
+    (ReachEnv, {"max_episode_steps": 9}, "max_episode_steps"),
+    (lambda num, **options: gymnasium.make_vec(ID, num, **options), {"robto": "panda"}, "robto"),
+    (ToolReachVectorEnv, {"robot": "jaco2"}, "posture"),
+    (ToolReachVectorEnv, {"control": "pid"}, "control"),
+    (ToolReachVectorEnv, {"tool": "hand"}, "tool"),
+    (ToolReachVectorEnv, {"workspace": -1.0}, "workspace"),
+    (ToolReachVectorEnv, {"posture": np.zeros(3)}, "posture"),
+    (PushVectorEnv, {"build": print}, "build"),
+    (PushVectorEnv, {"engine": "mujoco"}, "build"),
+    (WalkVectorEnv, WALK | {"robot": Robot.load("quadruped")}, "robot"),
+    (WalkVectorEnv, WALK | {"control": "effort"}, "control"),
+    (WalkVectorEnv, WALK | {"ground": False}, "ground"),
+    (WalkVectorEnv, WALK | {"commands": [[1.0, 0, 0], [0.5, 0, 0]]}, "commands"),
+    (WalkVectorEnv, WALK | {"gait": np.zeros((2, 12))}, "gait"),
+    (WalkVectorEnv, WALK | {"posture": np.zeros(3)}, "posture"),
+]
+
+
+@pytest.mark.parametrize(("make", "options", "argument"), REFUSED)
+def test_refused_arguments_are_named(make, options, argument):
+    with pytest.raises(InvalidArgumentError) as caught:
+        make(**options) if make is ReachEnv else make(1, **options)
+    assert caught.value.argument == argument
+
+
+def test_refused_calls_name_their_argument_and_the_env_goes_on():
+    env = ReachVectorEnv(2, workers=0, autoreset_mode="Disabled", max_episode_steps=1)
+    mask = np.zeros(2, bool)
+    for arguments, argument in (
+        *(({"seed": seed}, "seed") for seed in ([1], -1, [0, -1], [0, 1.5], "ab")),
+        ({"options": {"reset_masks": [True, False]}}, "reset_masks"),
+        ({"options": {"reset_mask": mask}}, "reset_mask"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=argument):
+            env.reset(**arguments)
+    env.reset(seed=[1, None])
+    with pytest.raises(InvalidArgumentError, match="actions"):
+        env.step(np.full((2, 9), np.nan))
+    env.step(np.zeros((2, 9)))
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros((2, 9)))
+    env.close()
 
 
 class WithoutRates(ReachVectorEnv):
@@ -353,15 +383,3 @@ def test_increments_are_followed_closely():
     assert behind[ReachVectorEnv][0] < 0.045
     assert behind[ReachVectorEnv][1] < 0.02
     assert behind[WithoutRates][1] > 0.2
-
-
-def test_the_rates_of_a_task_are_checked():
-    class Wrong(ReachVectorEnv):
-        def rate(self, setpoint, last):
-            return setpoint[:, :2]
-
-    envs = Wrong(2, workers=0)
-    envs.reset(seed=0)
-    with pytest.raises(InvalidArgumentError, match=r"Wrong\.rate: returned an array of shape \(2, 2\)"):
-        envs.step(np.zeros((2, 9)))
-    envs.close()

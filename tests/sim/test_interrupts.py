@@ -102,7 +102,7 @@ def test_ctrl_c_in_a_tick_is_raised_when_it_is_done(workers, tmp_path):
 def test_a_rollout_ends_after_the_request_in_progress(workers, tmp_path):
     with make(workers, 1) as runner, Recorder(tmp_path / "run.h5", runner) as recorder:
         with pytest.raises(KeyboardInterrupt):
-            runner.rollout(np.tile(NEAR, (100_000, 1)))
+            runner.rollout(np.tile(NEAR, (5_000, 1)))
         ticks = round(runner.time / (SUBSTEPS * runner.timestep))
         recorder.close()
     assert 0 < ticks <= 8000 / (SUBSTEPS * (N if workers == 0 else 1))

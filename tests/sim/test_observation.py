@@ -8,7 +8,6 @@ from identical import assert_identical
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, RunInfo, Runner
-from batchpid.sim.observation import Redraw
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +91,7 @@ def test_every_field_of_a_rollout_is_joined_or_has_to_be_the_same(name, rollout)
 
 
 def test_redraws_and_faults_of_all_parts_are_joined(rollout):
-    redraws = [Redraw(0.1, 0, 0, 1), Redraw(0.2, 1, 1, 1), Redraw(0.3, 2, 2, 1)]
+    redraws = [(0.1, 0, 0, 1), (0.2, 1, 1, 1), (0.3, 2, 2, 1)]
     known = [(redraws[:1], ("a",)), (redraws[:2], ("a",)), (redraws[2:], ("a", "b"))]
     parts = [
         dataclasses.replace(rollout, info=dataclasses.replace(rollout.info, redraws=tuple(seen), faults=faults))

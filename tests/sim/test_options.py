@@ -11,14 +11,14 @@ import sys
 from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
-from typing import get_type_hints
 
 import numpy as np
 import pytest
+from option_values import DECLARED
 from robots import load_bundled
 
 import batchpid as bp
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.errors import MissingDependencyError
 from batchpid.sim import RunInfo, Runner, RunnerKeywords, RunnerOptions, read_recording, write_recording
 from batchpid.sim.cli import parse
 from batchpid.sim.engine.protocol import SceneSpec
@@ -37,19 +37,6 @@ def test_every_keyword_is_an_option_and_is_shown_with_its_default():
         assert shown[each.name].default == each.default, each.name
 
 
-@pytest.mark.parametrize(
-    ("name", "near"), [("worker", "workers"), ("time_step", "timestep"), ("actuator", "actuators"), ("param", "params")]
-)
-def test_a_misspelled_option_names_the_nearest_one(name, near):
-    with pytest.raises(InvalidArgumentError, match=rf"{name}: is not an argument of Runner.*did you mean '{near}'"):
-        Runner(PANDA, 1, **{name: None})
-
-
-def test_an_unknown_engine_is_an_error_that_lists_the_known_ones():
-    with pytest.raises(InvalidArgumentError, match=r"engine: unknown option.*'bullet'.*use one of.*'sapien'"):
-        Runner(PANDA, 1, engine="bullet")
-
-
 def test_a_missing_jax_is_named_with_its_extra_before_a_worker_starts(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax", None)
     with pytest.raises(MissingDependencyError, match=r"backend='jax' needs the package 'jax'.*batchpid\[jax\]"):
@@ -58,8 +45,7 @@ def test_a_missing_jax_is_named_with_its_extra_before_a_worker_starts(monkeypatc
 
 def test_a_flag_of_an_option_has_its_default_and_reaches_the_runner():
     given = parse(["rollout"]).runner.options()
-    kept = {name: hint.__metadata__[-1] for name, hint in get_type_hints(RunnerKeywords, include_extras=True).items()}
-    flags = {each.name: each.default for each in fields(RunnerKeywords) if kept[each.name].flag}
+    flags = {each.name: each.default for each in fields(RunnerKeywords) if DECLARED[each.name].flag}
     assert given == {name: value for name, value in flags.items() if name != "ground"}, "on or off, or neither"
     words = ["--no-collisions", "--ground", "off", "--workers", "2", "--backend", "jax"]
     given = parse(["rollout", *words]).runner.options()
@@ -157,10 +143,3 @@ def test_no_actuators_are_those_of_the_robot_at_construction_and_when_assigned(c
         runner.restore(ideal)
         assert runner.actuators is None, "as in the snapshot"
         runner.step(PANDA.start)
-
-
-@pytest.mark.parametrize("value", [np.array([]), np.array(["pid", "osc"]), ["pid"], 0])
-@pytest.mark.parametrize("name", ["control", "tool"])
-def test_a_control_or_tool_of_another_type_is_refused_by_name(name, value):
-    with pytest.raises(InvalidArgumentError, match=name):
-        Runner(PANDA, 1, workers=0, **{"control": "osc", name: value})

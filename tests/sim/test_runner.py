@@ -7,7 +7,6 @@ import pytest
 import tiny_urdf
 
 from batchpid.sim import Robot, Runner
-from batchpid.sim.options import default_params
 
 
 def same(first, second):
@@ -32,20 +31,23 @@ def test_another_robot_is_given_designed_params(hinge):
         assert same(runner.params, hinge.designed())
 
 
+def params_of(robot, control):
+    with Runner(robot, 1, workers=0, control=control) as runner:
+        return runner.params
+
+
 def test_a_drive_is_given_the_bundled_gains_or_designed_ones(panda, hinge):
-    bundled = default_params(panda, "drive")
+    bundled = params_of(panda, "drive")
     assert (bundled.kp == panda.settings.drive_stiffness).all()
     assert (bundled.kd == panda.settings.drive_damping).all()
-    assert same(
-        default_params(hinge, "drive"),
-        hinge.designed("effort").replace(ki=0.0, setpoint_weight=None, derivative_filter_time=None),
-    )
+    designed = hinge.designed("effort").replace(ki=0.0, setpoint_weight=None, derivative_filter_time=None)
+    assert same(params_of(hinge, "drive"), designed)
 
 
 @pytest.mark.parametrize("name", ["panda", "hinge"])
 def test_control_by_effort_is_given_effort_limits(name, request):
     robot = request.getfixturevalue(name)
-    params = default_params(robot, "effort")
+    params = params_of(robot, "effort")
     assert not params.kp.any()
     np.testing.assert_array_equal(params.effort_max, np.atleast_2d(robot.effort_limit))
 

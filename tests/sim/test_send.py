@@ -27,17 +27,6 @@ def exchange(runner, setpoint, **arguments):
     return runner.recv()
 
 
-@pytest.mark.usefixtures("engine")
-@pytest.mark.parametrize("workers", [0, 1])
-def test_send_and_recv_are_bit_identical_to_step(workers):
-    arguments = {"setpoint_rate": 0.1, "feedforward": 0.2, "substeps": 3}
-    with make(workers, checkpoint_steps=10) as runner, make(0, checkpoint_steps=10) as model:
-        for number, setpoint in enumerate(SETPOINTS):
-            each = arguments if number % 2 else {}
-            assert_identical(exchange(runner, setpoint, **each), model.step(setpoint, **each))
-        assert runner.time == model.time
-
-
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_runner_that_was_closed_after_send_has_nothing_to_settle(workers):
     with make(workers) as runner:

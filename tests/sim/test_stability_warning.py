@@ -10,8 +10,7 @@ import pytest
 
 import batchpid as bp
 from batchpid.sim import Robot, Runner, StabilityWarning
-from batchpid.sim.robot.run_checks import DriveChatterCheck
-from batchpid.sim.tuning.candidates import Candidates
+from batchpid.sim.tuning import tune
 from tests.sim.tiny_urdf import joint, link, one_joint, robot, write
 
 BAD, GOOD = {"kp": 10.0, "ki": 0.0, "kd": [1.0, 5e4]}, {"kp": 10.0, "ki": 0.0, "kd": 1.0}
@@ -117,17 +116,11 @@ def test_bundled_gains_do_not_warn(panda, jaco2):
             assert none == []
 
 
-def test_candidates_of_a_search_do_not_warn(arm, monkeypatch):
-    monkeypatch.setattr(Candidates, "params", lambda self, points: arm.params(**BAD, derivative_filter_time=1e-6))
-    import batchpid.sim.tuning.moves as moves
-    from batchpid.sim.tuning import Weights
-
-    some = moves.random_moves(arm, 2, 0)
-    search = Candidates(arm, "effort", False, some, 0.02, Weights(), headroom=1.0, varied=False)
-    with make(arm, search.envs, params=arm.params(**GOOD)) as runner, warnings.catch_warnings():
+def test_candidates_of_a_search_do_not_warn(arm):
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", StabilityWarning)
-        search.trial(runner, np.zeros((1, search.dimension)))
+        tune(arm, generations=1, population=6, seconds=0.1, workers=0)
 
 
 def light_joint(folder, inertia, effort, damping):
@@ -207,11 +200,3 @@ def test_drives_of_bundled_robots_do_not_warn(panda, jaco2, engine):
         with make(each, **DRIVEN | {"engine": engine}) as runner:
             goal = np.clip(each.start + 1.0, each.lower, each.upper)
             assert warned(lambda runner=runner, goal=goal: runner.rollout(np.tile(goal, (30, 1))))[1] == []
-
-
-def test_only_drives_that_can_stick_are_watched(arm):
-    check = DriveChatterCheck(arm, 1 / 2000)
-    assert not check.is_watching
-    for gains, watches in ((BAD, True), (GOOD, False)):
-        check.set_gains(arm.params(**gains), None)
-        assert check.is_watching == watches

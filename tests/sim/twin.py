@@ -6,6 +6,7 @@ import contextlib
 import gc
 import os
 import signal
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -21,7 +22,6 @@ from robots import load_bundled
 
 from batchpid.errors import CallOrderError
 from batchpid.sim import Recorder, RecoveryWarning, Runner, Snapshot, read_recording
-from batchpid.sim.processes.background import start_thread
 
 ROBOT = load_bundled("panda")
 N = 2
@@ -45,7 +45,7 @@ class CtrlC:
         self._delays: SimpleQueue[float] = SimpleQueue()
         self._armed = False
         self.happened = 0
-        start_thread(self._send)
+        threading.Thread(target=self._send, daemon=True).start()
 
     def after(self, seconds: float) -> Disturbance:
         def disturb(act: Callable[[], object]) -> None:

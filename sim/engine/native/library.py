@@ -12,7 +12,7 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.native.interface import SYMBOLS
 
 TESTED = ("3.0.3",)
-"""Versions of SAPIEN that native code calls; tests/sim/engine/test_native.py must pass with each.
+"""Versions of SAPIEN that native code calls; tests/sim/test_conformance.py must pass with each.
 
 The gateway repeats the layout of two types of SAPIEN (gateway.h). No header promises it, and the names of the
 functions do not contain the type that they return: a version that changes it would corrupt memory.

@@ -34,6 +34,7 @@ def assert_same(found, wanted, tolerance):
     assert np.abs(found - wanted).max(initial=0) <= tolerance * np.abs(wanted).max(initial=1.0)
 
 
+@settings(max_examples=20)
 @given(st.lists(st.floats(-1e9, 1e9) | st.floats(-7.0, 7.0), min_size=1, max_size=9))
 def test_sine_and_cosine_are_exact_to_the_last_bits_at_any_angle(angles):
     at = np.array(angles)[:, None]
@@ -185,6 +186,7 @@ def test_a_step_with_a_tree_has_the_bytes_of_its_two_parts(seed):
     np.testing.assert_array_equal(whole.effort, parts.effort)
 
 
+@settings(max_examples=20)
 @given(st.lists(st.floats(0.0, np.pi) | st.floats(0.0, 1e-3), min_size=1, max_size=9))
 def test_rotation_errors_are_exact_to_the_last_bits(angles):
     angle, zero = np.array(angles), np.zeros(len(angles))

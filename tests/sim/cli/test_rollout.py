@@ -25,7 +25,7 @@ def saved(batchpid, path, *flags):
 
 
 def test_the_file_holds_the_rollout_of_a_runner_with_tuned_gains(batchpid, tmp_path, panda):
-    file = saved(batchpid, tmp_path / "run.npz", "--workers", 1, "--spread", 0, "--substeps", 10)
+    file = saved(batchpid, tmp_path / "run.npz", "--spread", 0, "--substeps", 10)
     with Runner(panda, 3, params=panda.tuned(), workers=0, substeps=10) as runner:
         expected = runner.rollout(np.broadcast_to(panda.settings.target, (10, panda.dof)))
     for name, value in expected.arrays().items():
@@ -333,20 +333,15 @@ def in_column(column, function):
     ("change", "message"),
     [
         (cut(lambda lines: lines.pop(20)), "line 21: time is 0.1 s, and not 0.095 s; .*resample"),
-        (cut(lambda lines: lines.insert(5, lines[2])), "line 6: time does not increase"),
         (in_column(0, lambda cell: str(1000 * float(cell))), "rows every 5 s; .*seconds"),
         (in_column(0, lambda cell: str(0.0033 + float(cell))), "line 2: the first row is at 0.0033 s; begin at 0"),
         (in_column(0, lambda cell: str(0.74 * float(cell))), "rows every 0.0037 s, .*use --timestep 0.0005285714"),
         (in_column(4, lambda cell: str(57.3 * float(cell))), "panda_joint4' is outside .*got -.*within -3.07"),
         (in_column(3, lambda cell: "nan"), "line 2, column 'setpoint:panda_joint3' is empty or not finite"),
-        (in_column(3, lambda cell: ""), "line 2, column 'setpoint:panda_joint3' is empty or not finite"),
         (in_column(12, lambda cell: "fast"), "line 2, column 'setpoint_rate:panda_joint3' is not a number"),
-        (cut(lambda lines: lines[0].__setitem__(0, "t")), "no column 'time'"),
         (cut(lambda lines: lines[0].__setitem__(3, "qpos:panda_joint3")), "unknown column 'qpos:panda_joint3'"),
-        (cut(lambda lines: lines[0].__setitem__(3, "setpoint:elbow")), "'setpoint:elbow': joint: unknown"),
         (cut(lambda lines: lines[0].__setitem__(3, " setpoint: panda_joint1")), "'setpoint:panda_joint1' twice"),
         (cut(lambda lines: [line.pop(3) for line in lines]), "column setpoint:panda_joint3: is missing"),
-        (cut(lambda lines: [line.pop(12) for line in lines]), "column setpoint_rate:panda_joint3: is missing"),
         (cut(lambda lines: lines.__delitem__(slice(2, None))), "line 2: the only row is at 0 s"),
         (
             lambda text: text.replace(",", ";").replace(".", ","),

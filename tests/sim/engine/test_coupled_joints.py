@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import signal
-
 import numpy as np
 import pytest
 
 import batchpid as bp
-from batchpid.sim import RecoveryWarning, Robot, Runner
-from tests.sim.identical import assert_identical
+from batchpid.sim import Robot, Runner
 from tests.sim.tiny_urdf import write
 
 FREE_LIMIT = '<limit lower="-3" upper="3" effort="200" velocity="10"/>'
@@ -140,34 +136,6 @@ def test_free_motion_is_that_of_the_reduced_equations(physics, tmp_path):
     np.testing.assert_allclose(seen.qpos[-1, 0, free], q[0, free], atol=1e-3)
 
 
-@pytest.mark.quick_rows(1)
-@pytest.mark.parametrize("control", ["pid", "drive", "effort"])
-def test_results_do_not_depend_on_workers_or_snapshots(control, tmp_path):
-    robot = arm(tmp_path, joints=2)
-    start = robot.sample(9, seed=1)
-    setpoints = np.zeros((6, 9, robot.dof)) if control == "effort" else np.tile(robot.sample(9, seed=2), (6, 1, 1))
-    params = robot.designed() if control == "pid" else None
-
-    def run(envs=slice(None), again: bool = False, **options):
-        options = {"control": control, "params": params, "substeps": 7, "workers": 0} | options
-        with Runner(robot, len(start[envs]), **options) as runner:
-            runner.reset(start[envs])
-            runner.rollout(setpoints[:3, envs])
-            snapshot = runner.snapshot()
-            rest = runner.rollout(setpoints[3:, envs])
-            if not again:
-                return rest
-            runner.restore(snapshot)
-            return runner.rollout(setpoints[3:, envs])
-
-    reference = run()
-    for options in ({"workers": 2}, {"again": True}):
-        assert_identical(reference, run(**options), skip={"time"})
-    few = run(slice(3, 5))
-    for name in ("qpos", "qvel", "effort"):
-        assert getattr(reference, name)[:, 3:5].tobytes() == getattr(few, name).tobytes()
-
-
 def add_post(scene, env):
     builder = scene.create_actor_builder()
     builder.add_box_collision(half_size=[0.025, 0.01, 0.15])
@@ -218,26 +186,6 @@ def test_free_fall_is_that_of_mujocos_equality_constraint(tmp_path):
     for _ in range(4000):
         mujoco.mj_step(model, data)
     np.testing.assert_allclose(qpos[robot.independent], data.qpos[columns][robot.independent], atol=1e-4)
-
-
-@pytest.mark.slow
-def test_a_lost_worker_is_replaced_bit_identically(tmp_path):
-    robot = arm(tmp_path, joints=2)
-    start, goal = robot.sample(4, seed=1), robot.sample(4, seed=2)
-    courses = []
-    for kill in (False, True):
-        with Runner(robot, 4, workers=2, checkpoint_steps=100) as runner:
-            runner.reset(start)
-            for tick in range(12):
-                if kill and tick == 7:
-                    os.kill(runner.pids[0], signal.SIGKILL)
-                    with pytest.warns(RecoveryWarning):
-                        runner.step(goal)
-                else:
-                    runner.step(goal)
-            assert runner.recoveries == kill
-            courses.append(runner.observe())
-    assert_identical(*courses)
 
 
 def test_actuators_and_guard_act_on_leaders_and_keep_the_coupling(tmp_path):

@@ -16,13 +16,9 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.motors import actuator_dynamics as motor_model
 from batchpid.motors import guard as guard_model
 from batchpid.sim import Robot, Runner
-from batchpid.sim.engine.protocol import SceneSpec
-from batchpid.sim.engine.robot_model import scene_model
-from batchpid.sim.tuning import random_moves
 
 mujoco = pytest.importorskip("mujoco", "3.17")
 from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf  # noqa: E402
-from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
 
 DT = 1 / 2000
 
@@ -39,16 +35,7 @@ def plain(loaded, **options):
 def test_the_loaded_model_has_the_dynamics_of_the_robot(name):
     loaded = Robot.load(name)
     model = model_of(to_mjcf(loaded, plain(loaded), DT))
-    spec = SceneSpec(
-        loaded.urdf,
-        loaded.ignored_pairs,
-        loaded.joints,
-        DT,
-        SOLVERS["accurate"],
-        ground=loaded.has_ground,
-        engine="mujoco",
-    )
-    oracle = scene_model(spec)
+    oracle = loaded.dynamics()
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     columns = [model.joint(each).dofadr[0] for each in loaded.joint_names]
     for qpos in loaded.sample(3):
@@ -334,41 +321,6 @@ def test_a_locked_joint_may_be_guarded(tmp_path):
     low, high = model_of(to_mjcf(loaded, plain(loaded), DT, guard=loaded.guard())).actuator_ctrlrange[0]
     assert low == 1.0
     assert high == np.nextafter(1.0, 2.0)
-
-
-@pytest.mark.slow
-def test_the_tuned_panda_makes_the_test_moves_of_the_runner():
-    """Under what the target has of the tuned gains: efforts at one inertia, no filter, weight or anti-windup."""
-    loaded = Robot.load("panda")
-    inertia = np.diagonal(loaded.mass_matrix(loaded.start)[0])
-    exported = to_mjcf(loaded, loaded.tuned(), DT, inertia=inertia)
-    lost = {each.partition(":")[0] for each in exported.differences}
-    assert lost == {"gain_units", "setpoint_weight", "derivative_filter_time", "anti_windup"}
-    tuned = loaded.tuned()
-    gains = {name: getattr(tuned, name) * inertia for name in ("kp", "ki", "kd")}
-    limits = {"effort_min": tuned.effort_min, "effort_max": tuned.effort_max}
-    params = bp.make_params(9, **gains, **limits, measurement_rate="measured")
-    model = model_of(exported)
-    np.testing.assert_allclose(-model.actuator_biasprm[:, 1:3], np.stack([gains["kp"][0], gains["kd"][0]], 1), 1e-12)
-    np.testing.assert_allclose(model.actuator_gainprm[:, 0], gains["ki"][0], rtol=1e-12)
-    np.testing.assert_allclose(model.actuator_forcerange, np.stack([each[0] for each in limits.values()], 1), 1e-12)
-    moves, ticks = random_moves(loaded, 8), 750
-    options = {"workers": 0, "timestep": DT, "substeps": 2, "engine": "mujoco", "compensate": "gravity+coriolis"}
-    with Runner(loaded, 8, params=params, **options) as runner:
-        runner.reset(moves.start)
-        ours = runner.rollout(np.broadcast_to(moves.target, (ticks, 8, 9))).qpos
-    for move in range(8):
-        data = mujoco.MjData(model)
-        data.qpos[:] = moves.start[move]
-        reached = []
-        for _ in range(2 * ticks):
-            mujoco.mj_forward(model, data)
-            data.ctrl[:] = np.stack([moves.target[move], np.zeros(9), data.qfrc_bias], axis=1).ravel()
-            mujoco.mj_step(model, data)
-            reached.append(data.qpos.copy())
-        apart = np.abs(np.array(reached[1::2]) - ours[:, move]).max()
-        assert apart < 2e-3, (move, apart)
-    assert np.abs(ours[-1] - moves.start).max() > 0.5
 
 
 def test_a_robot_read_from_its_file_is_written_with_the_same_actuators(tmp_path):

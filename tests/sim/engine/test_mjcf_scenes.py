@@ -11,7 +11,6 @@ pytest.importorskip("mujoco.batch")
 
 from batchpid.errors import InvalidArgumentError, RobotError  # noqa: E402
 from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, Uniform  # noqa: E402
-from batchpid.task_space.rotations import multiply  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits")
 
@@ -307,7 +306,8 @@ def test_a_floating_base_behind_an_object(load):
             np.testing.assert_allclose(obs.base_pose[0], pose, atol=1e-6)
             np.testing.assert_allclose(obs.base_twist[0], twist, atol=1e-5)
             if engine == "mujoco":
-                np.testing.assert_allclose(runner.bodies(["trunk"])[0, 0, 3:], multiply(np.array(pose[3:]), turn))
+                mujoco.mju_mulQuat(turned := np.zeros(4), np.array(pose[3:]), turn)
+                np.testing.assert_allclose(runner.bodies(["trunk"])[0, 0, 3:], turned)
             for _ in range(20):
                 obs = runner.step([0.02])
             seen.append(np.concatenate([obs.qpos[0], obs.base_pose[0], obs.base_twist[0]]))
@@ -345,3 +345,11 @@ def test_the_planes_of_the_file_are_the_ground(load):
             heights[name] = runner.bodies(["cube"])[0, 0, 2]
     np.testing.assert_allclose((heights["file"], heights["ours"]), (-0.46, 0.04), atol=2e-3)
     assert heights["off"] < -3
+
+
+def test_an_error_of_mujoco_closes_the_runner(load):
+    robot = load(ARM.replace("<worldbody>", '<size memory="16K"/><worldbody>', 1))
+    with Runner(robot, 2, workers=0, engine="mujoco", control="effort") as runner:
+        with pytest.raises(Exception, match="memory"):
+            runner.rollout(np.full((100, 2, robot.dof), 3.0))
+        assert runner.closed

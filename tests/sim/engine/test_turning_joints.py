@@ -24,13 +24,11 @@ def wheel(folder, kind: str = "", multiplier: float = 0.0) -> Robot:
     return Robot.load(write(folder, f'<robot name="wheel">{"".join(parts)}</robot>'))
 
 
-@pytest.mark.parametrize("native", ["0", "1"])
 @pytest.mark.parametrize(
     ("kind", "multiplier"), [("continuous", 0.25), ("revolute", -1.0), ("prismatic", 0.01), ("continuous", np.sqrt(2))]
 )
-def test_a_follower_stays_with_its_leader_over_many_turns(kind, multiplier, native, tmp_path, monkeypatch):
+def test_a_follower_stays_with_its_leader_over_many_turns(kind, multiplier, tmp_path):
     """q = tau t^2 / (2 J), with J = J_leader + m^2 J_follower; half way the robot is saved and restored."""
-    monkeypatch.setenv("BATCHPID_NATIVE", native)
     robot, effort, ticks = wheel(tmp_path, kind, multiplier), np.tile([0.5, 0.0], (60, 1)), 120
     inertia = 0.02 + multiplier**2 * (0.2 if kind == "prismatic" else 0.002)
     options = {"control": "effort", "workers": 0, "ground": False, "compensate": "none", "engine": "sapien"}
@@ -49,6 +47,7 @@ def test_a_follower_stays_with_its_leader_over_many_turns(kind, multiplier, nati
     np.testing.assert_allclose(qvel[-1, 0], 0.5 / inertia * ticks * 0.01, rtol=3e-3)
 
 
+@pytest.mark.quick_rows(8)
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 @pytest.mark.parametrize("options", [{}, {"guard": True}, {"params": "designed"}], ids=["plain", "guard", "integral"])
 @pytest.mark.parametrize(("start", "goal"), [(3.0, -3.0), (6.2, 6.6), (-5.9, -26.0), (0.3, 7.0)])

@@ -93,3 +93,11 @@ def test_gains_change_in_flight_without_a_bump(panda):
         after = runner.step(POSE, substeps=1)
     assert np.abs(before.effort).max() > 5.0
     np.testing.assert_allclose(after.effort[:, ARM], before.effort[:, ARM], atol=0.05)
+
+
+def test_the_feedforward_of_one_tick_does_not_act_in_the_next(panda):
+    """Under control "drive", without compensation, nothing else is written to the joints."""
+    params = panda.params(kp=0.0, ki=0.0, kd=0.0)
+    with Runner(panda, 1, workers=0, control="drive", compensate="none", params=params) as runner:
+        runner.step(panda.start, feedforward=np.full(panda.dof, 2.0))
+        assert (runner.step(panda.start).effort == 0).all()

@@ -7,11 +7,7 @@ import pytest
 from tiny_urdf import joint, link, one_joint, robot, write
 
 import batchpid as bp
-import batchpid.task_space as ts
 from batchpid.sim import Randomization, Robot, Runner, Uniform
-from batchpid.sim.engine.physics import PHYSICS
-from batchpid.sim.engine.protocol import SceneSpec
-from batchpid.sim.engine.robot_model import scene_tree
 
 DT = 1 / 2000
 PRESETS = ["accurate", "fast"]
@@ -217,17 +213,3 @@ def test_light_joints_neither_chatter_nor_diverge(control, tmp_path):
         rollout = runner.rollout(np.zeros((800, 1, 1)) + (0.0 if control == "effort" else 0.3))
     assert rollout.ok.all()
     assert np.abs(rollout.qvel[700:]).max() < 0.05
-
-
-@pytest.mark.parametrize("fixed_base", [True, False])
-def test_the_mass_matrix_of_the_joints_is_the_engines(fixed_base, tmp_path):
-    robot, pose = Robot.load(pendulum(tmp_path, 3, 0.0, 0.0).path, fixed_base=fixed_base), np.array([0.3, 0.4, -0.2])
-    efforts = np.eye(3)
-    with Runner(robot, 3, control="effort", compensate="none", ground=False, substeps=1, workers=0) as runner:
-        runner.reset(pose)
-        fall = runner.step(np.zeros(3)).qvel
-        runner.reset(pose)
-        velocity = runner.step(efforts).qvel - fall
-    spec = SceneSpec(robot.urdf, (), robot.joints, DT, PHYSICS["fast"], ground=False, fixed_base=fixed_base)
-    matrix = ts.mass_matrix(scene_tree(spec), pose[None])[0]
-    np.testing.assert_allclose(velocity @ matrix / DT, efforts, atol=2e-3)

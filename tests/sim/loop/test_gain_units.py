@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from identical import assert_identical
 from robots import load_bundled
 
 import batchpid as bp
-from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import step_metrics
 from batchpid.sim import Runner
 
@@ -41,23 +39,6 @@ def test_one_set_of_gains_settles_every_arm_joint_of_every_robot(name):
     assert (m.steady_state_error[0, arm] < 1e-3).all()
 
 
-@pytest.mark.quick_rows(1)
-@pytest.mark.parametrize("units", ["inertia", "mass_matrix"])
-def test_any_packing_and_workers_are_bit_identical(units, panda):
-    robot = panda
-    rng = np.random.default_rng(0)
-    start = robot.start + rng.uniform(-0.2, 0.0, (5, robot.dof)) * [1, 1, 1, 1, 1, 0, 1, 0, 0]
-    goal = np.clip(start + rng.uniform(-0.5, 0.5, start.shape), robot.lower, robot.upper)
-    outcome = []
-    for workers in (0, 2):
-        params = acceleration_params(robot, units)
-        with Runner(robot, 5, params=params, workers=workers) as runner:
-            runner.reset(start)
-            outcome.append(runner.rollout(np.broadcast_to(goal, (10, 5, robot.dof))))
-    assert np.abs(outcome[0].qpos[-1] - start).max() > 0.05
-    assert_identical(outcome[1], outcome[0])
-
-
 def test_inertia_means_gains_times_the_diagonal_of_the_mass_matrix(jaco2):
     """In the first sim step the effort equals the one with gains per effort, multiplied by hand."""
     robot = jaco2
@@ -86,24 +67,6 @@ def test_gain_units_change_in_flight_without_a_bump(units, panda):
             runner.params = params
             after = runner.step(setpoint, substeps=1).effort
             np.testing.assert_allclose(after, before, atol=0.1)
-
-
-def test_gain_units_are_for_pid_control_only(panda):
-    with pytest.raises(InvalidArgumentError, match="gain_units"):
-        Runner(panda, 1, params=acceleration_params(panda, "inertia"), control="drive", workers=0)
-
-
-def test_mass_matrix_is_that_of_the_engine(jaco2):
-    """In one free step under a small effort, M times the acceleration is the effort."""
-    robot = jaco2
-    rng = np.random.default_rng(1)
-    start = robot.start + 0.1 + 0.2 * rng.random(robot.dof)
-    matrix = robot.mass_matrix(start)[0]
-    effort = matrix @ rng.uniform(-1, 1, robot.dof)
-    with Runner(robot, 1, control="effort", workers=0, substeps=1, ground=False) as runner:
-        runner.reset(start)
-        acceleration = runner.step(effort).qvel[0] * 2000
-    np.testing.assert_allclose(matrix @ acceleration, effort, rtol=2e-3, atol=2e-3 * np.abs(effort).max())
 
 
 @pytest.mark.parametrize("substeps", [5, 20])

@@ -6,11 +6,10 @@ import warnings
 
 import numpy as np
 import pytest
-from identical import assert_identical
 from robots import load_bundled
-from tiny_urdf import joint, link, random_tree, robot, write
+from tiny_urdf import random_tree, robot, write
 
-from batchpid.sim import Robot, Runner, Snapshot, StabilityWarning
+from batchpid.sim import Robot, Runner, StabilityWarning
 from batchpid.trajectories import minimum_jerk
 from tests.sim.robot.test_design_on_robots import load
 
@@ -96,20 +95,6 @@ def test_setpoint_steps_in_long_ticks_settle():
     np.testing.assert_allclose(rollout.qpos[-1, 0], target, atol=1e-4)
 
 
-def test_any_packing_and_backend_gives_the_same_motion(panda):
-    start = np.broadcast_to(panda.start, (3, panda.dof)) - [[0.0], [0.1], [0.2]] * np.arange(9).clip(0, 1)
-    goal, outcome = panda.settings.target, []
-    options = {"timestep": 1 / 200, "params": params_of(panda, 50.0, ki=1e4, effort_limit=80.0)}
-    for more in ({}, {"workers": 2}, {"backend": "jax"}):
-        if "backend" in more:
-            pytest.importorskip("jax")
-        with Runner(panda, 3, **options, **{"workers": 0, **more}) as runner:
-            runner.reset(np.clip(start, panda.lower, panda.upper))
-            outcome.append(runner.rollout(np.broadcast_to(goal, (4, 3, panda.dof))))
-    assert_identical(outcome[1], outcome[0])
-    np.testing.assert_allclose(outcome[2].qpos, outcome[0].qpos, atol=1e-5)
-
-
 def test_no_gain_passes_the_stability_bound(panda):
     params = params_of(panda, 1e4)
     with warnings.catch_warnings():
@@ -119,24 +104,3 @@ def test_no_gain_passes_the_stability_bound(panda):
     assert [one.severity for one in found] == ["note"]
     assert "1.52 times" in found[0].text  # w dt = 5
     assert not [one for one in panda.check(params=params_of(panda, 30.0)) if "implicit" in one.text]
-
-
-def test_a_snapshot_in_a_file_continues_it(panda, tmp_path):
-    options = {"timestep": 1 / 100, "substeps": 2, "workers": 0}
-    params, goal = params_of(panda, 60.0, ki=1e4), np.broadcast_to(panda.settings.target, (4, panda.dof))
-    with Runner(panda, 1, params=params, **options) as runner:
-        runner.rollout(goal)
-        runner.snapshot().save(tmp_path / "s.npz")
-        expected = runner.rollout(goal)
-    with Runner(panda, 1, params=params.replace(discretization="explicit", kp=1.0), **options) as runner:
-        runner.restore(Snapshot.load(tmp_path / "s.npz"))
-        assert runner.params.discretization == params.discretization
-        assert_identical(runner.rollout(goal), expected)
-
-
-def test_coupled_joints_move_together(tmp_path):
-    limit = '<limit lower="-1" upper="1" effort="50" velocity="2"/>'
-    follower = joint("two", "b", "c", inner=f'{limit}<mimic joint="one" multiplier="-0.5"/>')
-    path = write(tmp_path, robot(*map(link, "abc"), joint("one", "a", "b", inner=limit), follower))
-    arm = Robot.load(path, self_collision="none")
-    assert largest_error(arm, 1 / 100, params_of(arm, 100.0))[0] < 1e-3

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import signal
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from identical import assert_identical
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import RecoveryWarning, Robot, Runner, Snapshot, read_recording, write_recording
+from batchpid.sim import Robot, Runner, Snapshot, read_recording, write_recording
 
 N = 5
 
@@ -48,66 +46,6 @@ def actuators(robot, seed=0, **more):
 def commands(robot, ticks, seed=0):
     noise = np.random.default_rng(seed).uniform(-0.3, 0.3, (ticks, N, robot.dof))
     return np.clip(robot.settings.target + noise, robot.lower, robot.upper)
-
-
-@pytest.mark.slow
-def test_neither_workers_nor_a_restore_nor_company_show(panda, tmp_path):
-    chosen, table = actuators(panda), commands(panda, 12)
-    with Runner(panda, N, workers=0, substeps=5, actuators=chosen) as runner:
-        first = runner.rollout(table[:6])
-        snapshot = runner.snapshot()
-        second = runner.rollout(table[6:])
-        runner.restore(snapshot)
-        assert_identical(second, runner.rollout(table[6:]))
-    snapshot.save(tmp_path / "at6.npz")
-    with Runner(panda, N, workers=2, substeps=5, actuators=chosen) as runner:
-        assert_identical(first, runner.rollout(table[:6]))
-        runner.restore(Snapshot.load(tmp_path / "at6.npz"))
-        assert_identical(second, runner.rollout(table[6:]))
-    with Runner(panda, 2, workers=0, substeps=5, actuators=chosen.for_envs(slice(2))) as runner:
-        assert_identical(first.for_envs(slice(2)), runner.rollout(table[:6, :2]))
-
-
-@pytest.mark.slow
-def test_delays_that_differ_from_group_to_group_are_independent_of_workers(panda):
-    """In flight too: a history is as long as the largest delay of all envs, in every group."""
-    envs, table = 20, np.tile(panda.settings.target, (4, 1))
-    delays = np.zeros((envs, panda.dof))
-    delays[10:], delays[-1] = 0.001, 0.003
-    short = bp.make_actuators(panda.dof, command_delay=delays, sensor_delay=delays / 2)
-    long = short.replace(command_delay=3 * delays[::-1])
-
-    def run(**options):
-        with Runner(panda, envs, substeps=5, actuators=short, **options) as runner:
-            rollouts = [runner.rollout(table)]
-            snapshot = runner.snapshot()
-            runner.actuators = long
-            rollouts.append(runner.rollout(table))
-            runner.restore(snapshot)
-            assert runner.actuators.command_delay.max() == 0.003
-            return [*rollouts, runner.rollout(table)]
-
-    for ours, theirs in zip(run(workers=0), run(workers=2), strict=True):
-        assert_identical(ours, theirs)
-
-
-@pytest.mark.slow
-def test_a_lost_worker_leaves_no_trace(panda):
-    chosen, table = actuators(panda), commands(panda, 6)
-    other = actuators(panda, seed=1, command_delay=0.006, lag=None)
-
-    def run(workers):
-        with Runner(panda, N, workers=workers, actuators=chosen) as runner:
-            runner.rollout(table[:2])
-            runner.actuators = other
-            runner.rollout(table[2:4])
-            for pid in runner.pids:
-                os.kill(pid, signal.SIGKILL)
-            return runner.rollout(table[4:])
-
-    with pytest.warns(RecoveryWarning):
-        lost = run(1)
-    assert_identical(run(0), lost)
 
 
 def test_actuators_that_are_off_change_no_bit(panda):
@@ -184,24 +122,6 @@ def test_joints_alone_leave_signals_alone_and_are_in_snapshots(panda, tmp_path):
         runner.restore(Snapshot.load(tmp_path / "worn.npz"))
         assert_identical(second, runner.rollout(table[4:]))
         assert runner.actuators.armature.max() == 0.1
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"joints": 3}, "shape"),
-        ({"joints": 9, "strength": np.ones((4, 9)) * 0.5}, "one row per env"),
-        ("strong", "must be a Actuators"),
-    ],
-)
-def test_actuators_that_do_not_fit_are_refused_before_anything_changes(panda, wrong, message):
-    built = bp.make_actuators(**{"strength": 0.9, **wrong}) if isinstance(wrong, dict) else wrong
-    with Runner(panda, N, workers=0) as runner:
-        with pytest.raises(InvalidArgumentError, match=message):
-            runner.actuators = built
-        assert runner.actuators is None
-    with pytest.raises(InvalidArgumentError, match=message):
-        Runner(panda, N, workers=0, actuators=built)
 
 
 def test_drives_take_friction_and_armature_alone(panda):

@@ -9,10 +9,8 @@ from tiny_urdf import joint, link, write
 from tiny_urdf import robot as urdf
 
 import batchpid as bp
-from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Robot, Runner, Snapshot
+from batchpid.sim import Robot, Runner
 
-N = 3
 ARM = """<robot name="arm">
 <link name="base"/>
 <link name="upper">
@@ -51,41 +49,11 @@ def test_the_setpoint_ramps_at_the_largest_rate_and_the_observation_tells(tmp_pa
         assert not runner.step([1.0]).guarded.any()
 
 
-@pytest.mark.parametrize("control", ["pid", "drive"])
-def test_neither_workers_nor_a_restore_show(panda, control, tmp_path):
-    rng = np.random.default_rng(0)
-    table = rng.uniform(-1, 1, (8, N, panda.dof)) + panda.settings.target
-    options = {"control": control, "guard": panda.guard(acceleration=20.0)}
-    with Runner(panda, N, workers=0, on_invalid_input="contain", **options) as runner:
-        first = runner.rollout(np.clip(table[:4], panda.lower, panda.upper))
-        assert first.guarded.any()
-        runner.snapshot().save(tmp_path / "guarded.npz")
-        second = runner.rollout(table[4:], setpoint_rates=np.zeros_like(table[4:]))
-    with Runner(panda, N, workers=1, **options) as runner:
-        assert_identical(first, runner.rollout(np.clip(table[:4], panda.lower, panda.upper)))
-        runner.restore(Snapshot.load(tmp_path / "guarded.npz"))
-        assert_identical(second, runner.rollout(table[4:], setpoint_rates=np.zeros_like(table[4:])))
-    with Runner(panda, N, workers=0, control=control) as plain, pytest.raises(InvalidArgumentError, match="guard"):
-        plain.restore(Snapshot.load(tmp_path / "guarded.npz"))
-
-
 def test_a_reset_starts_at_rest_at_the_pose(panda):
     with Runner(panda, 1, workers=0, guard=panda.guard(rate=0.5)) as runner:
         first = runner.rollout(panda.settings.target[None].repeat(5, 0)).observation
         runner.reset()
         assert_identical(first, runner.rollout(panda.settings.target[None].repeat(5, 0)).observation)
-
-
-def test_a_guard_that_does_not_fit_is_refused(panda, tmp_path):
-    for guard, control, message in (
-        (True, "effort", "limits positions"),
-        (load(tmp_path).guard(), "pid", r"has shape \(1, 1\)"),
-        ("safe", "pid", "must be a Guard"),
-    ):
-        with pytest.raises(InvalidArgumentError, match=message):
-            Runner(panda, 1, workers=0, guard=guard, control=control)
-    with pytest.raises(InvalidArgumentError, match="rate, joint 'panda_joint1'"):
-        panda.guard(rate=-1.0)
 
 
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])

@@ -76,14 +76,6 @@ def test_no_setting_changes_a_motion(case, name):
         assert_identical(motion(case), wanted)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("case", "wide"), [("pid", True), ("controller", False)])
-def test_all_that_leave_programs_compiled_at_once(case, wide):
-    wanted = expected(case)
-    with changed(**{**SETTINGS, "jax_disable_jit": False, "jax_enable_x64": wide}):
-        assert_identical(motion(case), wanted)
-
-
 @pytest.mark.quick_rows(2)
 @pytest.mark.parametrize("case", OPTIONS)
 def test_all_of_them_at_once(case):

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
@@ -67,6 +67,7 @@ def test_choice_draws_all_values_alike_often():
     np.testing.assert_allclose(counts / COUNT, 1 / 3, atol=0.015)
 
 
+@settings(max_examples=40)
 @given(distributions)
 def test_draws_are_within_the_support(distribution):
     drawn = distribution.sample(np.random.default_rng(1), 50)
@@ -75,6 +76,7 @@ def test_draws_are_within_the_support(distribution):
     assert ((drawn >= low) & (drawn <= high)).all()
 
 
+@settings(max_examples=40)
 @given(distributions)
 def test_a_distribution_is_what_its_dict_describes(distribution):
     assert read(distribution.to_dict()) == Randomization(qpos=distribution)

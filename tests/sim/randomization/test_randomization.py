@@ -35,7 +35,7 @@ def drawn(randomization, rows):
     return randomization.draw(PANDA, np.array(rows, np.int64)).values
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(rows=episodes, seed=counts, order=st.randoms())
 def test_an_env_draws_the_same_in_any_company(rows, seed, order):
     randomization, shuffled = Randomization(seed=seed, **FIELDS), order.sample(range(len(rows)), len(rows))
@@ -46,7 +46,7 @@ def test_an_env_draws_the_same_in_any_company(rows, seed, order):
         np.testing.assert_array_equal(values[shuffled], mixed[name], name)
 
 
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(names=st.sets(st.sampled_from(sorted(FIELDS)), min_size=1), seed=counts)
 def test_a_field_draws_the_same_with_any_other_fields(names, seed):
     rows = [(0, 0), (3, 7)]

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
@@ -213,6 +213,7 @@ def symmetric(entries: list[float]) -> np.ndarray:
     return half + half.T
 
 
+@settings(max_examples=30)
 @given(ENTRIES)
 def test_the_nearest_tensor_is_physical(entries):
     moments = np.linalg.eigvalsh(nearest_physical(symmetric(entries)))
@@ -220,6 +221,7 @@ def test_the_nearest_tensor_is_physical(entries):
     assert moments[2] <= moments[0] + moments[1] + 1e-12
 
 
+@settings(max_examples=30)
 @given(ENTRIES, st.lists(st.floats(0.1, 1), min_size=3, max_size=3))
 def test_no_physical_tensor_is_nearer_than_the_nearest(entries, covariance):
     """A body's tensor is tr(C) - C for a covariance C: any other is at least as far, but for the least slenderness."""
@@ -231,6 +233,7 @@ def test_no_physical_tensor_is_nearer_than_the_nearest(entries, covariance):
     assert np.linalg.norm(nearest - tensor) <= np.linalg.norm(other - tensor) + slack
 
 
+@settings(max_examples=30)
 @given(ENTRIES)
 def test_a_physical_tensor_is_its_own_nearest(entries):
     vectors = np.reshape(entries, (3, 3))

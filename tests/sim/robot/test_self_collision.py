@@ -17,7 +17,6 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
 from batchpid.sim.engine.protocol import SceneSpec
 from batchpid.sim.engine.robot_model import contacts_of
-from batchpid.sim.robot.self_collision import disabled_pairs, read_srdf
 
 BOX = '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
 SLIDE = '<limit lower="-0.5" upper="0.5" effort="10" velocity="2"/>'
@@ -95,7 +94,6 @@ def test_an_srdf_disables_and_enables_pairs_whatever_their_reason(tmp_path):
     assert reasons(loaded) == {("l1", "l2"): "Default", ("l2", "l0"): "Never"}
     assert reasons(Robot.load(path, self_collision="urdf")) == {("l2", "l0"): "Never"}
     assert [finding.code for finding in loaded.check() if finding.severity == "warning"].count("srdf-link") == 2
-    assert [pair.reason for pair in read_srdf(tmp_path / "test.srdf", ["base", "l0"]).disabled] == ["User"]
 
 
 def test_the_pairs_of_a_robot_travel_with_it(tmp_path):
@@ -164,18 +162,3 @@ def test_contacts_are_of_all_pairs_but_the_disabled_and_the_neighbours(seed, mer
     far = {pair for pair in map(frozenset, pairs) if len({body[name] for name in pair}) == 2}
     neighbours = {frozenset((a, b)) for a, b in pairs if {body[a], body[b]} == {"arm0", "arm4"}}
     assert set(seen) - neighbours == far - neighbours - set(map(frozenset, disabled))
-
-
-@given(st.integers(0, 2**32), st.integers(1, 60))
-@settings(deadline=None, max_examples=30)
-def test_each_pair_is_listed_once_with_its_first_reason(seed, count):
-    rng, pairs = np.random.default_rng(seed), [frozenset(pair) for pair in combinations("abcdef", 2)]
-    share = rng.choice([0.05, 0.9, 0.95, 1.0], len(pairs))
-    adjacent, rest = ([pair for pair in pairs if rng.random() < 0.2] for _ in range(2))
-    samples = [[pair for pair, s in zip(pairs, share, strict=True) if rng.random() < s] for _ in range(count)]
-    listed = {pair.links: pair.reason for pair in disabled_pairs("abcdef", adjacent, rest, samples)}
-    for pair in pairs:
-        always = sum(pair in sample for sample in samples) > 0.95 * count
-        reasons = {"Adjacent": pair in adjacent, "Default": pair in rest, "Always": always}
-        assert listed.get(pair) == next((reason for reason, applies in reasons.items() if applies), None)
-    assert len(disabled_pairs("abcdef", adjacent, rest, samples)) == len(listed)

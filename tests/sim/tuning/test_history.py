@@ -135,7 +135,7 @@ def test_a_history_is_refused_or_has_no_effect_under_another_value_of_each_input
 
 
 @pytest.mark.filterwarnings("ignore")
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(cheap(tune))
 @example(({"robot": ROBOTS[-2], "actuators": None}, {"robot": ROBOTS[-3], "actuators": None}))
 def test_a_history_under_two_inputs_is_refused_or_has_no_effect(pair):

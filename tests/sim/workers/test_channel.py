@@ -9,7 +9,7 @@ import threading
 import numpy as np
 import pytest
 
-from batchpid.sim.workers.channel import Channel
+from batchpid.sim.workers.exchange import Channel
 
 
 class WaitEnded(Exception):

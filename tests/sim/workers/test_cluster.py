@@ -14,14 +14,11 @@ from functools import partial
 import numpy as np
 import pytest
 from clusters import FILTERS, ROBOT, SMALL, Machines, N, make_runner, pids_of, setpoints
-from hypothesis import given
-from hypothesis import strategies as st
 from identical import assert_identical
 from processes import have_ended, shared_memory
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import ClusterWarning, Ray, RecoveryWarning, Runner
-from batchpid.sim.workers.placement import split_in_shares
 
 ray = pytest.importorskip("ray")
 pytestmark = FILTERS
@@ -256,20 +253,6 @@ def test_nothing_is_left_of_a_program_that_is_killed(local, machines):
     assert shared_memory() <= shared
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"cluster": "slurm"}, "cluster: must be a Ray"),
-        ({"cluster": "ray", "workers": 2}, "workers: is not for a cluster"),
-        ({"cluster": Ray("127.0.0.1:9")}, "cluster: does not answer at 127.0.0.1:9"),
-    ],
-)
-def test_bad_options_are_refused(options, message, monkeypatch):
-    monkeypatch.setattr(ray, "is_initialized", lambda: False)
-    with pytest.raises(InvalidArgumentError, match=message):
-        make_runner(**options)
-
-
 @pytest.mark.parametrize("error", [ConnectionError("failed"), ray.exceptions.AuthenticationError("no token")])
 def test_a_cluster_that_refuses_says_what_a_token_needs(error, monkeypatch):
     """Ray names a wrong token in its log alone, and an absent one by an error of its own."""
@@ -283,19 +266,3 @@ def test_a_cluster_that_refuses_says_what_a_token_needs(error, monkeypatch):
         address = f"127.0.0.1:{head.getsockname()[1]}"
         with pytest.raises(InvalidArgumentError, match=rf"at {address} cannot be joined.*RAY_AUTH_MODE=token"):
             make_runner(cluster=Ray(address))
-
-
-@given(st.integers(1, 300), st.lists(st.integers(1, 64), min_size=1, max_size=9))
-def test_envs_are_shared_in_proportion(num_envs, shares):
-    slices = split_in_shares(num_envs, shares)
-    assert [env for envs in slices for env in range(num_envs)[envs]] == list(range(num_envs))
-    for envs, share in zip(slices, shares, strict=True):
-        assert abs((envs.stop - envs.start) - num_envs * share / sum(shares)) <= 1
-
-
-@pytest.mark.parametrize(
-    "options", [{"address": "ray://host:1"}, {"nodes": 0}, {"cpus_per_node": 0.5}, {"placement": "WIDE"}]
-)
-def test_bad_options_of_a_cluster_are_refused(options):
-    with pytest.raises(InvalidArgumentError, match=next(iter(options))):
-        Ray(**options)

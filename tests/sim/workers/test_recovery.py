@@ -20,7 +20,6 @@ from robots import load_bundled
 
 from batchpid.errors import ClosedError, WorkerError
 from batchpid.sim import RecoveryWarning, Runner
-from batchpid.sim.processes.fork_server import server_pid
 
 ROBOT = load_bundled("panda")
 N, TICKS = 8, 30
@@ -68,16 +67,37 @@ def later(seconds, act):
         timer.join()
 
 
-def replace_run(act, in_env=None):
-    """Return a ``build`` that lets the loops run ``act`` for a tick: all, or the one of a given env."""
+class Acts:
+    """Controller that calls ``act`` in the worker whose envs have a setpoint beyond 0.5."""
 
-    def build(scene, env):
-        import batchpid.sim.loop.loop
+    def __init__(self, act):
+        self.act = act
 
-        if in_env in (None, env):
-            batchpid.sim.loop.loop.Loop.run = act
+    def init(self, robot, num_envs):
+        return None
 
-    return build
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        if (setpoint[:, 0] > 0.5).any():
+            self.act()
+        return state, passive
+
+
+def marked(env):
+    """Return setpoints that let the worker of ``env`` act."""
+    return np.where((np.arange(N) == env)[:, None], 1.0, 0.0) * np.ones(ROBOT.dof)
+
+
+def work_for_ever():
+    while True:
+        pass
+
+
+def sleep_for_ever():
+    import threading as threads
+
+    lock = threads.Lock()
+    lock.acquire()
+    lock.acquire()
 
 
 def test_a_lost_worker_is_replaced(undisturbed):
@@ -132,28 +152,13 @@ def test_only_the_requests_since_the_last_checkpoint_are_replayed(tmp_path):
     assert 10 <= path.stat().st_size - before <= 20
 
 
-@pytest.mark.slow
-def test_workers_that_end_with_their_fork_server_are_replaced(undisturbed):
-    with make_runner() as runner:
-        lost, acts = runner.pids, {7: lambda: send(server_pid(), signal.SIGKILL)}
-        with pytest.warns(RecoveryWarning):
-            rollout = runner.rollout(setpoints(), progress=at_ticks(acts))
-        assert runner.recoveries == 2
-        assert not {*lost} & {*runner.pids}
-    assert_identical(undisturbed, rollout)
-
-
 def test_a_worker_that_dies_is_noticed_while_another_works():
-    def work_for_ever(*_):
-        while True:
-            pass
-
     with (
-        make_runner(recover=False, build=replace_run(work_for_ever, in_env=4)) as runner,
+        make_runner(recover=False, control=Acts(work_for_ever), params=None) as runner,
         later(0.5, lambda: send(runner.pids[0], signal.SIGKILL)),
     ):
         with pytest.raises(WorkerError, match=r"envs 0 to 3\) died \(SIGKILL\).*recover=True"):
-            runner.step(ROBOT.settings.target, substeps=1_000_000)
+            runner.step(marked(4))
         assert runner.closed
         with pytest.raises(ClosedError):
             runner.observe()
@@ -169,33 +174,23 @@ def test_a_worker_that_is_stopped_during_a_tick_is_noticed():
 
 @pytest.mark.slow
 def test_the_error_of_a_worker_that_is_asleep_holds_its_stack():
-    def sleep_for_ever(*_):
-        import threading as threads
-
-        lock = threads.Lock()
-        lock.acquire()
-        lock.acquire()
-
     with (
-        make_runner(recover=False, build=replace_run(sleep_for_ever, in_env=4)) as runner,
+        make_runner(recover=False, control=Acts(sleep_for_ever), params=None) as runner,
         pytest.raises(WorkerError, match="is stuck: asleep") as info,
     ):
-        runner.step(ROBOT.settings.target)
+        runner.step(marked(4))
     assert "last stack" in str(info.value)
     assert "in sleep_for_ever" in str(info.value)
 
 
 @pytest.mark.slow
 def test_a_worker_that_exceeds_the_timeout_is_noticed():
-    def work_for_ever(*_):
-        while True:
-            pass
-
+    options = {"workers": 1, "recover": False, "params": None, "timeout": 0.5}
     with (
-        make_runner(workers=1, recover=False, build=replace_run(work_for_ever), timeout=0.5) as runner,
+        make_runner(control=Acts(work_for_ever), **options) as runner,
         pytest.raises(WorkerError, match="no answer within"),
     ):
-        runner.step(ROBOT.settings.target)
+        runner.step(marked(0))
 
 
 @pytest.mark.slow
@@ -257,112 +252,36 @@ def test_resets_params_and_snapshots_are_replayed():
         assert runner.recoveries == 4
 
 
-@pytest.mark.slow
-def test_a_worker_killed_at_the_end_of_any_request_is_replaced(tmp_path):
-    """In the first call of each method of the loop the worker dies after the work, before its answer."""
-    methods = ("reset", "set_params", "run", "snapshot", "restore", "poses")
-
-    def build(scene, env):
-        import batchpid.sim.loop.loop
-
-        for name in methods:
-            method, killed = getattr(batchpid.sim.loop.loop.Loop, name), tmp_path / name
-            if hasattr(method, "__wrapped__"):
-                continue
-
-            def lethal(self, *args, method=method, killed=killed):
-                result = method(self, *args)
-                if armed.exists() and not killed.exists():
-                    killed.touch()
-                    os.kill(os.getpid(), signal.SIGKILL)
-                return result
-
-            lethal.__wrapped__ = method
-            setattr(batchpid.sim.loop.loop.Loop, name, lethal)
-        return []
-
-    def program(runner):
-        runner.params = ROBOT.params(kp=30.0)
-        runner.reset(qpos=ROBOT.settings.target, mask=np.arange(2) == 1)
-        runner.rollout(setpoints(3)[:, :2])
-        snapshot = runner.snapshot()
-        runner.step(setpoints()[3, :2])
-        assert runner.poses().shape == (2, 0, 7)
-        runner.restore(snapshot)
-        return runner.rollout(setpoints(4)[:, :2])
-
-    armed = tmp_path / "armed"
-    with Runner(ROBOT, 2, params=ROBOT.params(), workers=0, build=lambda scene, env: []) as runner:
-        expected = program(runner)
-    with Runner(ROBOT, 2, params=ROBOT.params(), workers=1, build=build) as runner, warnings.catch_warnings():
-        warnings.simplefilter("ignore", RecoveryWarning)
-        armed.touch()
-        assert_identical(expected, program(runner))
-    assert sorted(os.listdir(tmp_path)) == sorted([*methods, "armed"])
-
-
 def test_a_request_that_kills_every_worker_is_given_up(monkeypatch, tmp_path):
     monkeypatch.setattr("batchpid.sim.workers.pool.MAX_LOSSES", 2)
 
-    def crash(*_):
+    def crash():
         (tmp_path / str(os.getpid())).touch()
         os.kill(os.getpid(), signal.SIGSEGV)
 
     with (
-        make_runner(workers=1, build=replace_run(crash)) as runner,
+        make_runner(workers=1, control=Acts(crash), params=None) as runner,
         pytest.raises(WorkerError, match=r"(?s)SIGSEGV.*lost 2 times.*workers=0"),
     ):
-        runner.step(ROBOT.settings.target)
+        runner.step(marked(0))
     assert len(os.listdir(tmp_path)) == 2
 
 
-def test_an_error_in_a_loop_is_raised_with_its_traceback():
-    def fail(*_):
-        raise ZeroDivisionError("in the worker")
-
-    with (
-        make_runner(workers=1, build=replace_run(fail)) as runner,
-        pytest.raises(WorkerError, match=r"(?s)worker \d.*envs.*Traceback.*ZeroDivisionError: in the worker"),
-    ):
-        runner.step(ROBOT.settings.target)
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-def test_a_runner_works_on_after_ctrl_c_in_a_rollout(workers):
-    with make_runner(workers=workers) as runner, warnings.catch_warnings():
-        warnings.simplefilter("ignore", RecoveryWarning)
-        for tick in (0, 1, 150):
-            interrupt = at_ticks({tick: lambda: signal.raise_signal(signal.SIGINT)})
-            with pytest.raises(KeyboardInterrupt):
-                runner.rollout(setpoints(200), progress=interrupt)
-        ended, steps = runner.observe(), round(runner.time * 2000)
-        again = runner.rollout(setpoints(3))
-    assert 0 < steps < 3 * 200 * 20
-    assert ended.ok.all()
-    assert again.ok.all()
-
-
-@pytest.mark.quick_rows(1)
-@pytest.mark.parametrize("workers", [0, 2])
-def test_an_interrupted_tick_is_done_completely(workers):
-    results = []
-    for interrupted in (False, True):
-        with make_runner(workers=workers if interrupted else 0) as runner:
-            runner.rollout(setpoints(5))
-            if interrupted:
-                with (
-                    later(0.02, lambda: signal.raise_signal(signal.SIGINT)),
-                    pytest.raises(KeyboardInterrupt),
-                ):
-                    runner.step(setpoints()[5], substeps=1500)
-            else:
-                runner.step(setpoints()[5], substeps=1500)
-            results.append((runner.observe(), runner.rollout(setpoints(5)), runner.time))
-    for first, second in zip(*results, strict=True):
-        if hasattr(first, "qpos"):
-            assert_identical(first, second)
-        else:
-            assert first == second
+def test_a_replay_does_not_see_later_writes_to_the_callers_arrays():
+    target = ROBOT.settings.target
+    start = np.tile(0.9 * ROBOT.start + 0.1 * target, (N, 1))
+    given = {"qpos": start.copy(), "mask": np.arange(N) < 2}
+    with make_runner(workers=1) as runner, make_runner(workers=0) as other:
+        runner.reset(**given)
+        other.reset(start, mask=np.arange(N) < 2)
+        setpoint = np.tile(target, (N, 1))
+        assert_identical(runner.step(setpoint), other.step(target))
+        given["qpos"][...] = setpoint[...] = ROBOT.start
+        given["mask"][...] = ~given["mask"]
+        send(runner.pids[0], signal.SIGKILL)
+        with pytest.warns(RecoveryWarning):
+            again = runner.step(target)
+        assert_identical(again, other.step(target))
 
 
 @pytest.mark.slow

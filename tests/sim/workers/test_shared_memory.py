@@ -7,7 +7,7 @@ from robots import load_bundled
 
 from batchpid.errors import WorkerError
 from batchpid.sim import Runner
-from batchpid.sim.workers.shared_memory import SharedArrays
+from batchpid.sim.workers.exchange import SharedArrays
 
 
 @pytest.mark.parametrize("workers", [0, 1])

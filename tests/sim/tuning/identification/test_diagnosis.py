@@ -13,7 +13,8 @@ from batchpid.sim.identification import excite, identify
 from batchpid.sim.identification.diagnosis import diagnose
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.regression import best_drive, smooth
-from tests.sim.tuning.identification.test_identify import ARM
+from batchpid.sim.robot.urdf_export import to_urdf
+from tests.sim.tuning.identification.test_identify import ARM, six_joints
 
 pytest.importorskip("scipy")
 pytest.importorskip("mujoco.batch")
@@ -33,14 +34,15 @@ def arms(tmp_path_factory):
     return {name: Robot.load(folder / f"{name}.urdf") for name in ("described", "heavy")}
 
 
-def diagnosed(arms, folder, real, *, strength=1.0, push=0.0):
+def diagnosed(arms, folder, real, *, push=0.0, **motors):
     """Return the diagnosis of a log of the ``real`` robot, with a push at PUSH seconds that it does not hold."""
     robot, path = arms["described"], folder / "log.npz"
     inertia = np.diagonal(robot.mass_matrix(robot.start)[0])
-    motors = bp.make_actuators(2, command_delay=0.003, strength=strength, coulomb=0.4, viscous=0.3 * inertia)
+    motors = {"command_delay": 0.003, "coulomb": 0.4, "viscous": 0.3 * inertia} | motors
+    motors = bp.make_actuators(robot.dof, **motors)
     gains = bp.design_gains(robot, 1.2, derivative_filter_time=2e-3).replace(setpoint_weight=1.0)
     motion = excite(robot, SECONDS, lowest=0.3, rate=2000 / TICK)
-    pushes = np.zeros((len(motion.position), 1, 2))
+    pushes = np.zeros((len(motion.position), 1, robot.dof))
     pushes[round(PUSH * 2000 / TICK) :, 0, 1][: round(0.2 * 2000 / TICK)] = push
     options = {"workers": 0, "substeps": TICK, "compensate": "none", "actuators": motors, "engine": "mujoco"}
     with Runner(arms[real], 1, params=gains, collisions=False, ground=False, **options) as runner:
@@ -60,6 +62,15 @@ def test_a_heavier_link_is_named(arms, tmp_path):
     assert described < 0.96 < free
     assert found.strengths is None
     assert re.search(r"link fore seems (19|20|21) % heavier", " ".join(found.sentences()))
+
+
+def test_a_joint_that_sticks_does_not_hide_a_heavier_link(tmp_path):
+    (tmp_path / "six.urdf").write_text(six_joints())
+    robot = Robot.load(tmp_path / "six.urdf")
+    (tmp_path / "heavy.urdf").write_text(to_urdf(robot, mass_factors={"l3": 1.3}).text)
+    arms = {"described": robot, "heavy": Robot.load(tmp_path / "heavy.urdf")}
+    found = diagnosed(arms, tmp_path, "heavy", coulomb=0.003 * robot.design_effort_limit)[0]
+    assert found.links == pytest.approx({"l3": 1.3}, rel=0.05)
 
 
 @pytest.mark.slow

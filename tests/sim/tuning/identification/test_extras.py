@@ -56,9 +56,9 @@ def log_of(robot: Robot, *, gains=GAINS, rate=None, kind="setpoint", seconds=2.4
 @pytest.mark.parametrize(
     ("extra", "made", "kind", "truth"),
     [
+        ("load_friction", {"load_friction": 0.2}, "load_friction", 0.2),
         ("slew", {"rate": 3.0}, "slew", 3.0),
         ("saturation", {"gains": GAINS.replace(effort_max=5.0, effort_min=-5.0)}, "saturation", 0.25),
-        ("load_friction", {"load_friction": 0.2}, "load_friction", 0.2),
     ],
 )
 def test_an_effect_is_found_and_kept(pendulum, extra, made, kind, truth):

@@ -1,15 +1,31 @@
-"""Messages between two processes over a stream socket, with a callback while the other side is slow."""
+"""What a worker and its caller exchange: messages over a stream socket, and arrays in memory that both have.
+
+The memory is an anonymous file (memfd), handed to the worker by file descriptor. The kernel frees it with its last
+user, however that one ends: nothing can be left behind in /dev/shm.
+"""
 
 from __future__ import annotations
 
+import io
+import mmap
+import os
 import select
 import socket
 import struct
 from collections.abc import Callable
 
+import numpy as np
+
+from batchpid.arrays.array_types import Rows
+from batchpid.checks.single_owner import SingleOwner
+from batchpid.errors import WorkerError
+from batchpid.io.files import standard_streams_occupied
+from batchpid.sim.loop.arrays import Layout
+
 _HEAD = struct.Struct("<Q")  # bytes of the message that follows
 _WAIT_INTERVAL = 0.1  # seconds between two calls of ``on_wait``
 _MIN_READ, _MAX_READ = 1 << 12, 1 << 20  # bytes to read at once
+_ALIGN = 64  # a cache line, so that two workers never write to the same one
 
 
 class Channel:
@@ -88,3 +104,50 @@ class Channel:
         poll.register(self._socket, event)
         if not poll.poll(1e3 * _WAIT_INTERVAL) and (on_wait := self._on_wait) is not None:
             on_wait()
+
+
+class SharedArrays(SingleOwner):
+    """Named arrays of given ``layout`` in one block of shared memory: a new one, or with ``fd`` an existing one."""
+
+    def __init__(self, layout: Layout, fd: int | None = None) -> None:
+        self.layout = layout
+        offsets, size = {}, 0
+        for name, (shape, dtype) in layout.items():
+            offsets[name] = size
+            nbytes = int(np.prod(shape)) * np.dtype(dtype).itemsize
+            size += -(-nbytes // _ALIGN) * _ALIGN
+        if fd is None:
+            self._file: MemoryFile | None = MemoryFile("batchpid")
+            fd = self._file.fileno()
+            try:
+                os.ftruncate(fd, max(size, 1))
+            except OSError as error:
+                self._file.close()
+                remedy = "raise the limit of file sizes (ulimit -f), or use fewer envs"
+                raise WorkerError(f"{size} bytes of shared memory cannot be had: {error.strerror}; {remedy}") from error
+        else:
+            self._file = None
+        self.fd = fd
+        with standard_streams_occupied():
+            memory = mmap.mmap(fd, max(size, 1))  # it holds a copy of the descriptor
+        self.arrays: dict[str, Rows] = {
+            name: np.ndarray(shape, dtype, buffer=memory, offset=offsets[name])
+            for name, (shape, dtype) in layout.items()
+        }
+
+    def close(self) -> None:
+        """Close the descriptor. The memory is freed when no array refers to it."""
+        if self._file is not None:
+            self._file.close()
+        self.arrays = {}
+
+
+class MemoryFile(io.FileIO):
+    """New anonymous file in memory, closed with its last reference."""
+
+    def __init__(self, name: str) -> None:
+        with standard_streams_occupied():
+            super().__init__(os.memfd_create(name, os.MFD_CLOEXEC), "r+")
+
+    def __del__(self) -> None:
+        self.close()  # without the ResourceWarning of its base

@@ -1,0 +1,424 @@
+"""Every feature, in each engine, gives the results of the plain NumPy loop, however it is run.
+
+A case is a feature: options of a Runner. Its program is a rollout in which one env fails, a reset of some envs, a
+snapshot, and another rollout. Each path of :data:`PATHS` runs this program in another way.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+import signal
+import tempfile
+from collections.abc import Iterator
+from importlib.util import find_spec
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from featured import robot_with
+from identical import assert_identical
+from option_values import ARM, MOTORS, box
+from robots import load_bundled
+
+import batchpid as bp
+from batchpid.sim import LogUniform, Normal, Randomization, Robot, Runner, RunnerKeywords, Snapshot, Uniform
+from batchpid.sim.loop.numpy_executor import NumPyExecutor
+
+N, TICKS, SPLIT, FAILING = 5, 5, 3, 2
+"""Envs and ticks of the program, ticks before its snapshot, and the env that fails."""
+RESET = np.arange(N) % 2 == 0
+ENGINES = ("sapien", "mujoco")
+pytestmark = [
+    pytest.mark.usefixtures("small_groups"),
+    pytest.mark.filterwarnings("ignore::UserWarning"),  # of faults, lost workers, missed contacts and past bounds
+]
+
+
+class Damped:
+    """Controller of the caller's own, for NumPy and JAX: a PD whose damping grows with the number of its sim steps."""
+
+    def init(self, robot: Any, num_envs: int) -> Any:
+        return {"steps": np.zeros(num_envs), "last": (np.zeros((num_envs, robot.dof)), None)}
+
+    def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:
+        steps = state["steps"] + 1
+        effort = passive + 8.0 * (setpoint - qpos) - (1 + 0.01 * steps[:, None]) * qvel + 0.1 * state["last"][0]
+        return {"steps": steps, "last": (setpoint - qpos, None)}, effort
+
+
+class Feature(NamedTuple):
+    """Options of a Runner, and what is known of its results."""
+
+    options: Any = MappingProxyType({})
+    params: Any = None
+    """Arguments of ``robot.params()``; None for the gains that the Runner chooses."""
+    engines: tuple[str, ...] = ENGINES
+    accelerations: bool = False
+    repeats: bool = True
+    """Whether an episode can be repeated: not with noise, nor where checkpoints have another phase in it."""
+    exact: bool = False
+    """Whether results are bit-identical without native code, which rounds nothing differently for this feature."""
+    alike: bool = True
+    """Whether the engines agree on the motion: not in contact, nor under drives or efforts that are large for them."""
+
+
+EFFORTS = {"kp": 20.0, "ki": 5.0, "kd": 2.0}
+LAW = EFFORTS | {
+    **{"derivative_filter_time": 2e-3, "setpoint_weight": 0.7, "deadband": 1e-3, "effort_rate_limit": 5e3},
+    **{"anti_windup": "back_calculation", "tracking_time": 0.05, "integral_limit": 2.0, "effort_limit": 4.0},
+}
+SIGNALS = {"command_delay": 2e-3, "lag": 1e-3, "strength": 0.9, "bias": 0.1, "effort_limit": 6.0}
+SENSORS = {"sensor_delay": 1e-3, "position_offset": 0.01, "backlash": 1e-3, "position_resolution": 1e-4}
+NOISE = {"position_noise": 1e-5, "velocity_noise": 1e-3, "velocity_resolution": 1e-3}
+LINE = {"saturation_effort": 8.0, "no_load_speed": 3.0, "position_limit": ([-1.0, 0.0, 1.0], [6.0, 9.0, 5.0])}
+FRICTION = {"coulomb": 0.2, "static": 0.3, "stribeck": 0.05, "load_friction": 0.05, "viscous": 0.1, "armature": 0.02}
+DRAWN = {
+    **{"payload": Uniform(0, 0.5), "link_mass": Uniform(0.7, 1.3, operation="scale"), "qvel": Normal(0, 0.1)},
+    **{"center_of_mass": Uniform(-0.01, 0.01), "friction": Uniform(0, 0.1), "damping": Uniform(0, 0.1)},
+    **{"armature": LogUniform(1e-3, 0.05), "qpos": Uniform(-0.1, 0.1)},
+    "actuators": {"command_delay": Uniform(0, 3e-3, shared=True), "coulomb": Uniform(0, 0.1)},
+}
+PUSHES = {
+    **{"push": {"vx": Uniform(0.1, 0.5), "wz": Uniform(-1, 1)}, "push_interval": Uniform(0.01, 0.03)},
+    "gravity": {"x": Uniform(-1, 1), "z": Uniform(-1, 1)},
+}
+GUARD = bp.make_guard(2, rate=0.5, acceleration=20.0)
+SAPIEN, MUJOCO = ENGINES[:1], ENGINES[1:]
+
+
+def motors(*effects: dict[str, Any], joints: int = 2) -> dict[str, Any]:
+    return {"actuators": bp.make_actuators(joints, **{name: value for each in effects for name, value in each.items()})}
+
+
+FEATURES: dict[str, Feature] = {
+    "default gains": Feature(),
+    "accelerations": Feature(accelerations=True),
+    "gains in efforts": Feature(params=EFFORTS, exact=True),
+    "gains per inertia": Feature(params=EFFORTS | {"gain_units": "inertia"}),
+    "implicit law": Feature(
+        params={"gain_units": "mass_matrix", "discretization": "implicit", "kp": 4e3, "ki": 1e4, "kd": 120.0}
+    ),
+    "every option of the law": Feature(params=LAW, exact=True),
+    "drive": Feature({"control": "drive"}, exact=True),
+    "drive with an integral": Feature({"control": "drive"}, EFFORTS, exact=True),
+    "efforts": Feature({"control": "effort"}, exact=True),
+    "osc": Feature({"control": "osc"}),
+    "setpoints of a tool": Feature({"setpoint_space": "tool", "tool": "hand"}),
+    "own controller": Feature({"control": Damped()}, exact=True),
+    "guard": Feature({"guard": GUARD}),
+    "guarded drive": Feature({"control": "drive", "guard": GUARD}, exact=True),
+    "motors": Feature(motors(SIGNALS, LINE)),
+    "sensors": Feature(motors(SENSORS)),
+    "noise": Feature(motors(NOISE), repeats=False),
+    "friction": Feature(motors(FRICTION)),
+    "friction under a drive": Feature({"control": "drive", **motors({"coulomb": 0.2, "armature": 0.02})}),
+    "friction under osc": Feature({"control": "osc", **motors({"coulomb": 0.2, "lag": 1e-3})}),
+    "friction that the controller knows": Feature({"robot": "worn"}),
+    "randomization": Feature({"randomization": Randomization(**DRAWN, seed=3)}),
+    "a randomized drive": Feature({"control": "drive", "randomization": Randomization(payload=Uniform(0.1, 0.5))}),
+    "compensation of gravity alone": Feature({"compensate": "gravity"}),
+    "no compensation": Feature({"compensate": "none", "physics": "fast"}),
+    "no collisions": Feature({"collisions": False, "ground": False}),
+    "checkpoints": Feature({"checkpoint_steps": 25}, repeats=False),
+    "a reset at a fault": Feature({"on_fault": "reset", "speed_limit": 2.0}),
+    "contact sensors": Feature({"contacts": ["hand"], "wrenches": ["arm"]}),
+    "user content": Feature({"build": functools.partial(box, 0.05)}, engines=SAPIEN),
+    "links in contact": Feature({"robot": "jaco2", "control": "effort"}, exact=True, alike=False),
+    "mimic joints": Feature({"robot": "chain of mimics"}),
+    "mimic joints under a drive": Feature({"robot": "mimic", "control": "drive"}, alike=False),
+    "mimic joints with motors": Feature({"robot": "sliding mimic", **motors(SIGNALS, FRICTION, joints=9)}),
+    "turning mimic joints": Feature({"robot": "sliding mimic of a continuous joint"}),
+    "continuous joints": Feature({"robot": "continuous"}),
+    "armature": Feature({"robot": "armature"}),
+    "floating base": Feature({"robot": "floating base"}),
+    "floating base under efforts": Feature({"robot": "floating base", "control": "effort"}, alike=False),
+    "pushes": Feature({"robot": "floating base", "randomization": Randomization(**PUSHES)}),
+}
+
+
+def random_feature(seed: int) -> Feature:
+    """Return a control with about half of the effects of motors and sensors, and other options at random."""
+    rng = np.random.default_rng(seed)
+    control = ("pid", "effort", "drive")[seed % 3]
+    effects = SIGNALS | SENSORS | LINE | FRICTION
+    chosen = {name: value for name, value in effects.items() if rng.random() < 0.5 and name != "no_load_speed"}
+    if "saturation_effort" in chosen:
+        chosen["no_load_speed"] = LINE["no_load_speed"]
+    if not {"coulomb", "static"} <= chosen.keys():
+        chosen = {name: value for name, value in chosen.items() if name not in ("static", "stribeck")}
+    if control == "drive":
+        chosen = {name: value for name, value in chosen.items() if name in ("coulomb", "armature")}
+    options = {"control": control, "compensate": str(rng.choice(["gravity+coriolis+friction", "gravity", "none"]))}
+    options |= motors(chosen) | ({"guard": GUARD} if control != "effort" and rng.random() < 0.5 else {})
+    if rng.random() < 0.5:
+        options["randomization"] = Randomization(payload=Uniform(0.0, 0.5), friction=Uniform(0.0, 0.1))
+    law = {"pid": {name: value for name, value in LAW.items() if name not in ("anti_windup", "tracking_time")}}
+    return Feature(options, law.get(control))
+
+
+FEATURES |= {f"random options {seed}": random_feature(seed) for seed in range(9)}
+
+
+@functools.cache
+def robot_of(name: str) -> Robot:
+    """Return a robot of the table of features: by default an arm of two joints, whose links have shapes."""
+    if name == "arm":
+        return ARM
+    if name == "worn":
+        return dataclasses.replace(ARM, actuators=MOTORS)
+    return load_bundled(name) if name in Robot.bundled() else robot_with(name)
+
+
+def make(case: tuple[str, str], num_envs: int = N, **more: Any) -> Runner:
+    """Return a runner of a case; ``more`` are further options."""
+    feature = FEATURES[case[0]]
+    options = {
+        "robot": "arm",
+        "workers": 0,
+        "substeps": 12,
+        "timestep": 1e-3,
+        "on_invalid_input": "contain",
+        "engine": case[1],
+    }
+    options |= {**feature.options, **more}
+    robot = robot_of(options.pop("robot"))
+    if not robot.fixed_base:
+        options["ground"] = False
+    if feature.params is not None:
+        options["params"] = robot.params(**feature.params)
+    return Runner(robot, num_envs, **options)
+
+
+def commands(case: tuple[str, str], runner: Runner) -> dict[str, np.ndarray]:
+    """Return the commands of a rollout (TICKS, envs, ...); those of an env do not depend on the others."""
+    rng, robot, envs = np.random.default_rng(0), runner.robot, runner.num_envs
+    start = runner.observe()
+    noise, slope, extra = rng.uniform(-1, 1, (3, TICKS, N, robot.dof))[:, :, :envs]
+    if runner.control == "effort":
+        setpoint = 0.3 * noise * np.minimum(robot.effort_limit, 50.0)
+    elif start.tool_pose is None:
+        setpoint = robot.coupled(np.clip(robot.start + 0.2 * noise, robot.lower + 1e-3, robot.upper - 1e-3))
+    else:
+        setpoint = np.tile(start.tool_pose.astype(float), (TICKS, 1, 1))
+        setpoint[..., :2] += 0.02 * noise[..., :2]
+    given = {"setpoints": setpoint}
+    if runner.control in ("pid", "drive"):
+        size = 6 if start.tool_pose is not None else robot.dof  # a pose has a twist
+        given |= {"setpoint_rates": 0.1 * np.tile(slope[..., :1], size), "feedforwards": 0.1 * extra}
+    if FEATURES[case[0]].accelerations:
+        given["setpoint_accelerations"] = slope
+    if envs > FAILING:
+        setpoint[1, FAILING, 0] = np.nan
+    return given
+
+
+def part(given: dict[str, np.ndarray], ticks: slice) -> dict[str, np.ndarray]:
+    return {name: rows[ticks] for name, rows in given.items()}
+
+
+class Result(NamedTuple):
+    """Results of the program."""
+
+    first: Any
+    """Rollout before the snapshot."""
+    placed: Any
+    """Observation of the reset."""
+    snapshot: Snapshot
+    second: Any
+    """Rollout after the snapshot."""
+    end: Snapshot
+    faults: Any
+    missed: Any
+    poses: Any
+    """Of the user's content."""
+
+
+def second_half(runner: Runner, given: dict[str, np.ndarray], rollout: Any) -> tuple[Any, ...]:
+    second = rollout(runner, part(given, slice(SPLIT, None)))
+    poses = None if runner.options.build is None else runner.poses()
+    return second, runner.snapshot(), runner.faults, runner.missed_contacts, poses
+
+
+def program(runner: Runner, case: tuple[str, str], rollout: Any = None, disturb: Any = None) -> Result:
+    """Run the program; ``disturb`` is called with the runner between the snapshot and the second rollout."""
+    rollout = rollout or (lambda runner, given: runner.rollout(**given))
+    given = commands(case, runner)
+    first = rollout(runner, part(given, slice(SPLIT)))
+    placed = runner.reset(mask=RESET[: runner.num_envs])
+    snapshot = runner.snapshot()
+    if disturb is not None:
+        disturb(runner)
+    return Result(first, placed, snapshot, *second_half(runner, given, rollout))
+
+
+@functools.cache
+def reference(case: tuple[str, str], backend: str = "numpy") -> Result:
+    """Return the results in this process, with native code."""
+    with make(case, backend=backend) as runner:
+        result = program(runner, case)
+    assert not result.first.ok[1, FAILING]
+    assert result.placed.ok.all()
+    assert np.ptp(result.first.qpos, axis=0).max() > 1e-4
+    return result
+
+
+def leaves(value: Any, path: str = "") -> Any:
+    """Yield the arrays and numbers of a result with their names, without those that no promise is about."""
+    if value is None or isinstance(value, str | bool | int | float | np.ndarray):
+        yield path, value
+    elif isinstance(value, Snapshot):
+        yield from leaves([vars(value.states), value.params, value.steps], path)
+    elif isinstance(value, dict):
+        yield from (leaf for name, each in value.items() for leaf in leaves(each, f"{path}.{name}"))
+    elif isinstance(value, list | tuple):
+        yield from (leaf for number, each in enumerate(value) for leaf in leaves(each, f"{path}.{number}"))
+
+
+def check_equal(ours: Result, theirs: Result) -> None:
+    """Raise AssertionError unless two results are bit-identical."""
+    for name in ("first", "placed", "second"):
+        assert_identical(getattr(ours, name), getattr(theirs, name))
+    for name in ("snapshot", "end", "faults", "missed", "poses"):
+        pairs = zip(leaves(getattr(ours, name)), leaves(getattr(theirs, name)), strict=True)
+        for (path, mine), (other_path, other) in pairs:
+            assert path == other_path
+            np.testing.assert_array_equal(mine, other, f"{name}{path}")
+
+
+def check_close(ours: Result, theirs: Result, atol: float) -> None:
+    """Raise AssertionError unless two results are close, and report the same faults."""
+    for name in ("first", "second"):
+        mine, other = getattr(ours, name), getattr(theirs, name)
+        np.testing.assert_allclose(mine.qpos, other.qpos, rtol=0, atol=atol, err_msg=name)
+        np.testing.assert_allclose(mine.qvel, other.qvel, rtol=0, atol=300 * atol, err_msg=name)
+        np.testing.assert_array_equal(mine.ok, other.ok)
+    assert [fault[:2] for fault in ours.faults] == [fault[:2] for fault in theirs.faults]
+
+
+# -- paths -------------------------------------------------------------------------------------------------------------
+
+
+def in_python(case: tuple[str, str]) -> None:
+    """Without native code: NumPy computes the law and its models, and Python calls the engine."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("BATCHPID_NATIVE", "0")
+        with make(case) as runner:
+            assert "native calls into" not in runner.backend
+            result = program(runner, case)
+    check = check_equal if FEATURES[case[0]].exact else functools.partial(check_close, atol=1e-6)
+    check(reference(case), result)
+
+
+def in_numpy(case: tuple[str, str]) -> None:
+    """NumPy, with mass matrices and passive forces of the extension."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("batchpid.sim.loop.env_group.NativeExecutor", NumPyExecutor)
+        with make(case) as runner:
+            check_equal(program(runner, case), reference(case))
+
+
+def tick_by_tick(case: tuple[str, str]) -> None:
+    """A rollout is its ticks, by step or by send and recv."""
+
+    def rollout(runner: Runner, given: dict[str, np.ndarray]) -> Any:
+        seen = []
+        for tick in range(len(given["setpoints"])):
+            row = {name.removesuffix("s"): rows[tick] for name, rows in given.items()}
+            if tick % 2:
+                runner.send(**row)
+            seen.append(runner.recv() if tick % 2 else runner.step(**row))
+        return type(seen[0]).join([each.map(lambda rows: rows[None]) for each in seen])
+
+    with make(case) as runner:
+        result = program(runner, case, rollout)
+    expected = reference(case)
+    check_equal(result, expected._replace(first=expected.first.observation, second=expected.second.observation))
+
+
+def alone(case: tuple[str, str]) -> None:
+    """An env does not depend on the other envs."""
+    with make(case, num_envs=1) as runner:
+        result = program(runner, case)
+    for name in ("first", "second"):
+        assert_identical(getattr(result, name), getattr(reference(case), name).for_envs(slice(1)))
+
+
+def restored(case: tuple[str, str]) -> None:
+    """Another runner goes on from the file of a snapshot."""
+    expected = reference(case)
+    with make(case) as runner, tempfile.TemporaryDirectory() as folder:
+        expected.snapshot.save(path := f"{folder}/half.npz")
+        given = commands(case, runner)
+        runner.rollout(**part(given, slice(2)))
+        runner.restore(Snapshot.load(path))
+        second, end, *_, poses = second_half(runner, given, lambda runner, given: runner.rollout(**given))
+    check_equal(expected._replace(second=second, end=end, poses=poses), expected)
+
+
+def again(case: tuple[str, str]) -> None:
+    """An episode does not depend on the episodes before it."""
+    with make(case) as runner:
+        given = commands(case, runner)
+        seed = {} if runner.options.randomization is None else {"seed": 0}
+        episodes = []
+        for _ in range(2):
+            runner.reset(**seed)
+            episodes.append(runner.rollout(**given))
+    assert_identical(*episodes, skip={"time"})
+
+
+def in_workers(case: tuple[str, str]) -> None:
+    """Two workers, one of which is killed and replaced."""
+    with make(case, workers=2) as runner:
+        result = program(runner, case, disturb=lambda runner: os.kill(runner.pids[1], signal.SIGKILL))
+        assert runner.recoveries == 1
+    check_equal(result, reference(case))
+
+
+def in_xla(case: tuple[str, str]) -> None:
+    """The law in XLA; again bit-identical in a worker."""
+    check_close(reference(case, "jax"), reference(case), 1e-5)
+    with make(case, workers=1, backend="jax") as runner:
+        check_equal(program(runner, case), reference(case, "jax"))
+
+
+def in_the_other_engine(case: tuple[str, str]) -> None:
+    """The engines agree where nothing touches."""
+    check_close(reference(case), reference((case[0], "sapien")), 1e-3)
+
+
+PATHS = (in_python, in_numpy, tick_by_tick, alone, restored, again, in_workers, in_xla, in_the_other_engine)
+QUICK = {in_workers: 5, in_xla: 50}
+"""Every so many rows of a path are quick; of the other paths every feature in one of the engines."""
+
+
+def rows() -> Iterator[Any]:
+    for path_number, path in enumerate(PATHS):
+        for number, (name, feature) in enumerate(FEATURES.items()):
+            for engine in feature.engines:
+                if path is again and not feature.repeats:
+                    continue
+                if path is in_the_other_engine and (not feature.alike or engine == "sapien"):
+                    continue
+                every = QUICK.get(path, 2 if len(feature.engines) > 1 and path is not in_the_other_engine else 1)
+                is_quick = (number + ENGINES.index(engine) + (path_number if every == 2 else 0)) % every == 0
+                marks = () if is_quick else pytest.mark.slow
+                yield pytest.param(path, (name, engine), id=f"{path.__name__}-{name}-{engine}", marks=marks)
+
+
+@pytest.mark.parametrize(("path", "case"), [*rows()])
+def test_every_feature_is_the_same_on_every_path(path: Any, case: tuple[str, str]) -> None:
+    if path is in_xla and find_spec("jax") is None:
+        pytest.skip("needs JAX")
+    path(case)
+
+
+def test_every_option_has_a_row() -> None:
+    """A new option needs a row in FEATURES, unless it says how a program is run."""
+    of_paths = {"first_env", "workers", "cluster", "recover", "timeout", "engine", "backend", "dtype", "params"}
+    of_programs = {"timestep", "substeps", "on_invalid_input"}
+    options = {name for feature in FEATURES.values() for name in feature.options}
+    assert options >= RunnerKeywords.__annotations__.keys() - of_paths - of_programs

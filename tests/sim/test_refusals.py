@@ -1,0 +1,269 @@
+"""Table of calls that are refused: each error names the argument, and changes nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from featured import robot_with
+from identical import assert_identical
+from option_values import ARM, box
+from robots import load_bundled
+
+import batchpid as bp
+from batchpid.errors import InvalidArgumentError
+from batchpid.sim import (
+    CommandSpec,
+    MujocoSolver,
+    OperationalSpace,
+    Physics,
+    Randomization,
+    Ray,
+    Robot,
+    Runner,
+    RunnerKeywords,
+    Uniform,
+)
+
+pytest.importorskip("mujoco.batch")
+DOF, N = ARM.dof, 2
+JUNK = (object(), b"bytes", "no such value", -1.5, float("nan"), [object()], {"a": 1}, 1j)
+FREE = robot_with("floating base")
+SAPIENS_OWN = dataclasses.replace(ARM, dissipation="sapien")
+
+
+class Hold:
+    """Controller that compensates the passive force; ``more`` are its attributes."""
+
+    def __init__(self, **more: Any) -> None:
+        vars(self).update(more)
+
+    def init(self, robot: Any, num_envs: int) -> Any:
+        return None
+
+    def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:
+        return None, passive
+
+
+def named(call: Callable[[], Any]) -> str:
+    """Return the argument that the error of a call names."""
+    with pytest.raises(InvalidArgumentError) as caught:
+        call()
+    assert len(str(caught.value)) > 20
+    return str(caught.value.argument)
+
+
+# -- each option by itself ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["robot", "num_envs", "params", *RunnerKeywords.__annotations__])
+def test_values_of_no_use_are_refused_for_every_option(name: str) -> None:
+    options = {"robot": ARM, "num_envs": N, "workers": 0}
+    if name in ("tool", "cluster"):
+        options |= {"tool": {"control": "osc"}, "cluster": {"workers": None}}[name]
+    refused = []
+    for value in JUNK:
+        try:
+            Runner(**{**options, name: value}).close()
+        except InvalidArgumentError as error:
+            refused.append(error.argument)
+    assert len(refused) >= len(JUNK) - 1  # a number may be a name of a Ray cluster
+    assert set(refused) <= {name, "link"} if name == "tool" else {*refused} == {name}
+
+
+# -- options that do not go together -----------------------------------------------------------------------------------
+
+MOTORS = bp.make_actuators(DOF, strength=0.9)
+PUSHES = {"push": Uniform(0, 1), "push_interval": Uniform(1, 2)}
+RUNNERS: list[tuple[dict[str, Any], str]] = [
+    ({"worker": 1}, "worker"),
+    ({"engine": "bullet"}, "engine"),
+    ({"backend": "torch"}, "backend"),
+    ({"dtype": "float32"}, "dtype"),
+    ({"cluster": "ray", "workers": 2}, "workers"),
+    ({"cluster": "slurm"}, "cluster"),
+    ({"physics": MujocoSolver(), "engine": "sapien"}, "physics"),
+    ({"physics": Physics("PGS", 4), "engine": "mujoco"}, "physics"),
+    ({"build": box, "engine": "mujoco"}, "build"),
+    ({"build": box, "collisions": False}, "build"),
+    ({"ground": True, "collisions": False}, "ground"),
+    ({"contacts": ["hand"], "collisions": False}, "contacts"),
+    ({"contacts": ["foot"]}, "contacts"),
+    ({"contacts": "hand"}, "contacts"),
+    ({"wrenches": ["base"]}, "wrenches"),
+    ({"robot": FREE, "collisions": False}, "collisions"),
+    ({"robot": FREE, "control": "osc"}, "control"),
+    ({"robot": FREE, "setpoint_space": "tool"}, "setpoint_space"),
+    ({"robot": SAPIENS_OWN, "engine": "mujoco"}, "robot"),
+    ({"speed_limit": np.full(DOF, np.inf)}, "speed_limit"),
+    ({"speed_limit": np.ones(3)}, "speed_limit"),
+    ({"guard": True, "control": "effort"}, "guard"),
+    ({"guard": True, "control": Hold(command=CommandSpec(("x",)))}, "guard"),
+    ({"guard": bp.make_guard(1, rate=1.0)}, "guard"),
+    ({"control": print}, "control"),
+    ({"control": Hold(command="xy")}, "control"),
+    ({"control": Hold(command=("x", "x"))}, "control"),
+    ({"control": ["pid"]}, "control"),
+    ({"control": "osc", "tool": ["hand"]}, "tool"),
+    ({"tool": "hand"}, "tool"),
+    ({"control": "effort", "setpoint_space": "tool"}, "setpoint_space"),
+    ({"params": load_bundled("panda").params()}, "params"),
+    ({"params": ARM.params(kp=np.ones((3, DOF)))}, "params"),
+    ({"params": ARM.params(kp=1.0, gain_units="inertia"), "control": "drive"}, "gain_units"),
+    ({"actuators": bp.make_actuators(3, strength=0.9)}, "actuators"),
+    ({"actuators": bp.make_actuators(DOF, strength=np.full((3, DOF), 0.9))}, "actuators"),
+    ({"actuators": MOTORS, "control": "drive"}, "actuators"),
+    ({"randomization": Randomization(**PUSHES)}, "push"),
+    ({"robot": FREE, "randomization": Randomization(push=Uniform(0, 1))}, "push_interval"),
+    (
+        {"robot": FREE, "randomization": Randomization(push=Uniform(0, 1), push_interval=Uniform(0, 1))},
+        "push_interval",
+    ),
+    ({"robot": FREE, "randomization": Randomization(push={"vq": Uniform(0, 1)}, push_interval=Uniform(1, 2))}, "push"),
+    ({"randomization": Randomization(ground_friction=Uniform(0, 1)), "collisions": False}, "ground_friction"),
+    ({"num_envs": 10**6, "workers": 2}, "num_envs"),
+]
+
+
+@pytest.mark.parametrize(("options", "argument"), RUNNERS, ids=str)
+def test_options_that_do_not_go_together_are_refused_by_name(options: dict[str, Any], argument: str) -> None:
+    options = {"robot": ARM, "num_envs": N, **options}
+    options.setdefault("workers", None if "cluster" in options else 0)
+    assert argument in named(lambda: Runner(**options))
+
+
+# -- calls of a runner -------------------------------------------------------------------------------------------------
+
+ROW, ROWS, NAN = np.zeros(DOF), np.zeros((N, DOF)), np.array([[0.0, 0.0], [np.nan, 0.0]])
+CALLS: list[tuple[str, dict[str, Any], str]] = [
+    ("step", {"setpoint": None}, "setpoint"),
+    ("step", {"setpoint": NAN}, "setpoint"),
+    ("step", {"setpoint": np.zeros(3)}, "setpoint"),
+    ("step", {"setpoint": ROW, "setpoint_rate": NAN}, "setpoint_rate"),
+    ("step", {"setpoint": ROW, "setpoint_rate": np.zeros(3)}, "setpoint_rate"),
+    ("step", {"setpoint": ROW, "feedforward": NAN}, "feedforward"),
+    ("step", {"setpoint": ROW, "feedforward": np.zeros(3)}, "feedforward"),
+    ("step", {"setpoint": ROW, "setpoint_acceleration": ROW}, "setpoint_acceleration"),
+    ("step", {"setpoint": ROW, "setpoint_rate": ROW, "setpoint_acceleration": np.zeros(3)}, "setpoint_acceleration"),
+    ("step", {"setpoint": ROW, "substeps": 0}, "substeps"),
+    ("send", {"setpoint": NAN}, "setpoint"),
+    ("rollout", {"setpoints": ROW}, "setpoints"),
+    ("rollout", {"setpoints": np.zeros((4, 3, DOF))}, "setpoints"),
+    ("rollout", {"setpoints": NAN[None]}, "setpoints"),
+    ("rollout", {"setpoints": ROWS[None], "setpoint_rates": np.zeros(3)}, "setpoint_rates"),
+    ("reset", {"qpos": NAN}, "qpos"),
+    ("reset", {"qvel": np.zeros(3)}, "qvel"),
+    ("reset", {"mask": [True]}, "mask"),
+    ("reset", {"seed": 0}, "seed"),
+    ("reset", {"base_pose": np.zeros(7)}, "base_pose"),
+    ("reset", {"base_twist": np.zeros(6)}, "base_twist"),
+    ("restore", {"snapshot": ROW}, "snapshot"),
+    ("poses", {}, "build"),
+    ("bodies", {"names": ["ball"]}, "names"),
+    ("params", {"value": 3}, "params"),
+    ("params", {"value": load_bundled("panda").params()}, "params"),
+    ("actuators", {"value": "strong"}, "actuators"),
+    ("actuators", {"value": bp.make_actuators(3, strength=0.9)}, "actuators"),
+]
+
+
+@pytest.fixture(scope="module")
+def runner() -> Any:
+    with Runner(ARM, N, workers=0, substeps=2) as made:
+        yield made
+
+
+def call(runner: Runner, name: str, arguments: dict[str, Any]) -> str:
+    """Return the argument that the error of a refused call names, after which nothing has changed."""
+    before, time = runner.observe(), runner.time
+    act = (lambda: setattr(runner, name, arguments["value"])) if "value" in arguments else None
+    argument = named(act or (lambda: getattr(runner, name)(**arguments)))
+    assert_identical(runner.observe(), before)
+    assert runner.time == time
+    assert runner.step(ROW if runner.robot.fixed_base else runner.robot.start).ok.all()
+    return argument
+
+
+@pytest.mark.parametrize(("name", "arguments", "argument"), CALLS, ids=str)
+def test_a_refused_call_names_its_argument(runner: Runner, name: str, arguments: dict[str, Any], argument: str) -> None:
+    assert argument.removesuffix("s") in call(runner, name, arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "argument"),
+    [
+        ({"base_pose": np.zeros(7)}, "base_pose"),
+        ({"base_pose": np.zeros(3)}, "base_pose"),
+        ({"base_twist": [0, 0, np.nan, 0, 0, 0]}, "base_twist"),
+        *(({"seed": seed}, "seed") for seed in (-1, 0.5, [1, 2, 3], [-1] * N)),
+    ],
+)
+def test_a_refused_reset_of_a_floating_base_names_its_argument(arguments: dict[str, Any], argument: str) -> None:
+    drawn = Randomization(payload=Uniform(0, 1))
+    with Runner(FREE, N, workers=0, engine="mujoco", ground=False, randomization=drawn) as runner:
+        assert call(runner, "reset", arguments) == argument
+
+
+@pytest.mark.parametrize("options", [{"params": ARM.params(kp=9.0)}, {"control": "drive"}, {"control": "effort"}])
+def test_an_acceleration_that_no_gain_uses_is_refused(options: dict[str, Any]) -> None:
+    with Runner(ARM, N, workers=0, **options) as runner:
+        given = {"setpoint_rate": ROW, "setpoint_acceleration": ROW}
+        assert call(runner, "step", {"setpoint": ROW, **given}) == "setpoint_acceleration"
+        given = {f"{name}s": rows[None] for name, rows in given.items()}
+        assert call(runner, "rollout", {"setpoints": ROW[None], **given}) == "setpoint_accelerations"
+
+
+def test_a_refused_command_of_entries_names_the_entry() -> None:
+    control = Hold(command=CommandSpec(("x", "y", "z")))
+    bad = np.zeros((N, 3))
+    bad[1, 2] = np.nan
+    with Runner(ARM, N, workers=0, control=control) as runner:
+        with pytest.raises(InvalidArgumentError) as caught:
+            runner.step(bad)
+        assert (caught.value.argument, caught.value.entry, caught.value.joint, caught.value.env) == (
+            "setpoint",
+            "z",
+            None,
+            1,
+        )
+        for arguments, argument in (
+            ({"setpoint": np.zeros((N, 2))}, "setpoint"),
+            ({"setpoint": np.zeros(3), "setpoint_rate": np.zeros(2)}, "setpoint_rate"),
+            ({"setpoint": np.zeros(3), "feedforward": np.zeros(3)}, "feedforward"),
+        ):
+            assert named(lambda arguments=arguments: runner.step(**arguments)) == argument
+        assert runner.step(np.zeros(3)).ok.all()
+
+
+# -- constructors ------------------------------------------------------------------------------------------------------
+
+MADE: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
+    *(
+        (Ray, options, next(iter(options)))
+        for options in ({"address": "ray://host:1"}, {"nodes": 0}, {"cpus_per_node": 0.5}, {"placement": "WIDE"})
+    ),
+    *(
+        (lambda **options: CommandSpec(("x", "y"), **options), options, argument)
+        for options, argument in (
+            ({"units": ("m",)}, "units"),
+            ({"lower": (0, 1, 2)}, "lower"),
+            ({"lower": 2.0, "upper": 1.0}, "lower"),
+            ({"upper": np.nan}, "lower"),
+            ({"upper": (1, 1), "neutral": (0, 3)}, "neutral"),
+            ({"neutral": (np.inf, 0)}, "neutral"),
+        )
+    ),
+    (ARM.guard, {"rate": -1.0}, "rate"),
+    (Robot.load, {"name_or_path": "panda", "dissipation": "none"}, "dissipation"),
+    (OperationalSpace, {"robot": ARM, "link": "foot"}, "link"),
+]
+
+
+@pytest.mark.parametrize(("make", "options", "argument"), MADE)
+def test_refused_constructors_name_their_argument(
+    make: Callable[..., Any], options: dict[str, Any], argument: str
+) -> None:
+    assert argument in named(lambda: make(**options))
