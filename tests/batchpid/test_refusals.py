@@ -113,7 +113,7 @@ COMBINATIONS = [
     (bp.make_actuators, "saturation_effort", {"no_load_speed": 10.0}),
     (bp.make_actuators, "stribeck", {"stribeck": 0.1, "coulomb": 0.2}),
     (bp.make_guard, "lower", {"lower": 1.0, "upper": 0.0}),
-    (bp.make_guard, "setpoint_max", {"upper": math.nan}),
+    (bp.make_guard, "upper", {"upper": math.nan}),
     (ts.make_osc_params, "stiffness", {"stiffness": [1.0, 2.0]}),
     (ts.make_osc_params, "stiffness", {"stiffness": [1, 1, -1, 1, 1, 1]}),
     (ts.make_osc_params, "damping_ratio", {"damping_ratio": math.nan}),
