@@ -10,17 +10,18 @@ import inspect
 import math
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import batchpid as bp
 from batchpid.arrays.choices import CHOICES
-from batchpid.arrays.field_tables import Field
+from batchpid.arrays.field_tables import Field, declared
 from batchpid.law.params import FIELDS as PARAMS
-from batchpid.motors.actuator_fields import FIELDS as ACTUATORS
-from batchpid.sim.randomization.fields import EVENTS, PHYSICAL, START
-from batchpid.sim.randomization.randomization import Randomization
+from batchpid.motors.actuators import FIELDS as ACTUATORS
+from batchpid.sim.randomization.randomization import EVENTS, PHYSICAL, START, Randomization
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE, OPTIONS, RunnerKeywords
 
 DOCS = Path(__file__).parent
 
@@ -48,10 +49,27 @@ def cells(names: list[str], text: str, fields: Mapping[str, Field]) -> tuple[str
     bounds = dict.fromkeys(bound(field) for field in numbers)
     off = dict.fromkeys(shown(field.neutral) for field in some)
     off |= {f"`{next(iter(CHOICES[name]))}`": None for name in names if name in CHOICES}
-    meaning = re.sub(r" \[[^]`]*\]|,? >=? 0(?=[ ,.]|$)|:\w+:|\*", "", " ".join(text.split())).replace("``", "`")
-    meaning = re.match(r".*?(?<!e\.g)(?=\. |\.?$)", meaning)[0].replace("|", "\\|")  # type: ignore[index]
+    meaning = re.sub(r" \[[^]`]*\]|,? >=? 0(?=[ ,.]|$)", "", " ".join(text.split()))
     columns = [f"`{name}`" for name in names], units, bounds, off
-    return *(", ".join(column) for column in columns), meaning
+    return *(", ".join(column) for column in columns), first_sentence(meaning)
+
+
+def first_sentence(text: str) -> str:
+    """Return the first sentence of a docstring, in Markdown."""
+    plain = re.sub(r":\w+:|\*", "", " ".join(text.split())).replace("``", "`")
+    return re.match(r".*?(?<!e\.g)(?=\. |\.?$)", plain)[0].replace("|", "\\|")  # type: ignore[index]
+
+
+def options() -> str:
+    """Return the table of the Runner's options, with their defaults and the places that keep them."""
+    defaults, bounds = {each.name: each.default for each in fields(RunnerKeywords)}, declared(RunnerKeywords, Field)
+    rows = [("option", "range", "default", "kept in", "flag", "meaning"), ("---",) * 6]
+    for (name,), text in attributes(RunnerKeywords):
+        kept, flag = OPTIONS[name].kept, f"`--{name}`" if OPTIONS[name].flag else ""
+        default = "" if defaults[name] in (MISSING, DEFAULT_ENGINE) else f"`{defaults[name]}`"
+        range_ = bound(bounds[name]) if name in bounds else ""
+        rows.append((f"`{name}`", range_, default, ", ".join(kept), flag, first_sentence(text)))
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def bound(field: Field) -> str:
@@ -85,6 +103,7 @@ def tables() -> dict[tuple[str, str], str]:
         ("randomization.md", "randomization"): table(
             attributes(Randomization), PHYSICAL | START | EVENTS, ("seed", "each"), off=False
         ),
+        ("runner.md", "options"): options(),
     }
 
 

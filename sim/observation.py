@@ -251,6 +251,8 @@ class RunInfo:
     """Robot (:class:`batchpid.sim.Robot`) of the run, for :meth:`Rollout.findings`; not recorded."""
     sweep: Mapping[str, Any] | None = None
     """Inputs of a :func:`batchpid.sim.sweep`, as plain values or digests."""
+    options: Mapping[str, Any] | None = None
+    """Further options of the runner that recordings keep, by name."""
 
     @property
     def command(self) -> CommandSpec:

@@ -1,10 +1,8 @@
 """Options of a runner, checked: one definition for :class:`batchpid.sim.Runner`, its loops, snapshots and recordings.
 
-Longer than 350 lines because the checks of all options are here; :mod:`batchpid.sim.runner_keywords` documents them.
-
-A new option is a keyword with its type and documentation there, and, in the same order, a field with its places and its
-check here. One that is kept in recordings is a field of :class:`batchpid.sim.RunInfo`, too; one that changes scenes, of
-:class:`batchpid.sim.engine.scene_spec.SceneSpec`.
+Longer than 350 lines because the checks of options that depend on the robot or on each other are here. A new option is
+a field of :class:`batchpid.sim.RunnerKeywords`; one that changes scenes is a field of
+:class:`batchpid.sim.engine.scene_spec.SceneSpec`, too.
 """
 
 from __future__ import annotations
@@ -12,10 +10,9 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Callable
-from dataclasses import astuple, dataclass, field, fields
+from dataclasses import astuple, fields
 from functools import cached_property
-from inspect import Parameter
-from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,26 +24,17 @@ from batchpid.arrays.digest import digest, object_digest
 from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
-from batchpid.checks.validate import (
-    AxisKind,
-    check_keywords,
-    choice,
-    flag,
-    instance,
-    integer,
-    joint_speeds,
-    names,
-    number,
-)
+from batchpid.checks.validate import AxisKind, choice, instance, joint_speeds, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.input_checks import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.command import CommandSpec, joint_command, own_command
+from batchpid.sim.engine.physics import MujocoSolver, Physics
 from batchpid.sim.engine.protocol import Capability, Engine, load_engine, require
 from batchpid.sim.engine.scene_spec import added_friction
-from batchpid.sim.observation import Quantity, observed_by_loop
+from batchpid.sim.observation import Quantity, RunInfo, observed_by_loop
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
@@ -55,142 +43,47 @@ from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
-from batchpid.sim.runner_keywords import (
-    DEFAULT_ENGINE,
-    Backend,
-    Compensation,
-    Controller,
-    ControlMode,
-    EngineName,
-    FaultAction,
-    InvalidInputAction,
-    PhysicsPreset,
-    Precision,
-    RunnerKeywords,
-    SetpointSpace,
-)
+from batchpid.sim.runner_keywords import OPTIONS, Controller, ControlMode, Place, RunnerKeywords, checked_option
 from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
 from batchpid.sim.tool_space.tool_setpoints import ToolSetpoints
 
-if TYPE_CHECKING:
-    from batchpid.sim.engine.physics import MujocoSolver, Physics
-
-Place = Literal["snapshot", "recording", "scene"]
-Role = Literal["restored", "processes", "last bits", "next commands"]
-"""Reason for which a snapshot may be restored in a runner with another value of an option.
-
-- "restored": the snapshot holds the value, and the runner takes it over;
-- "processes": the value says where and how fast the envs run, and results are bit-identical for any;
-- "last bits": so, but the last bits of results differ;
-- "next commands": the value is a default of the commands to come (``substeps``), or says which of them are refused.
-"""
 IDEAL = bp.Actuators()
 """Actuators without any effect."""
-_DERIVED: Any = None
-"""Default that depends on the robot or on other options."""
 
 
-def _in(*places: Place, **sources: str) -> dict[str, str | None]:
-    """Return the metadata of an option that is kept in ``places``: see :meth:`RunnerOptions.values_for`.
-
-    Where a place keeps another value than the option itself, ``sources`` names the attribute that holds it.
-    """
-    return {**dict.fromkeys(places), **sources}
-
-
-def _apart(role: Role, *places: Place) -> dict[str, str | None]:
-    """Return the metadata of an option that a snapshot leaves out, with its ``role`` for a runner that restores it."""
-    return {**_in(*places), "role": role}
-
-
-@dataclass(frozen=True, eq=False, init=False)
-class RunnerOptions:
+class RunnerOptions(RunnerKeywords):
     """Options of a :class:`batchpid.sim.Runner`, checked, copied, and with a value for each default. Immutable.
 
-    Parameters
-    ----------
-    robot
-        From :meth:`batchpid.sim.Robot.load`.
-    num_envs
-        Number of robots, one in each scene.
-    workers, timestep, ...
-        See :class:`RunnerKeywords`. The attribute of each has the same name.
+    The arguments are those of :class:`RunnerKeywords`, and so are the attributes; those below have a narrower
+    type. ``workers`` is None on a cluster, ``tool`` where setpoints are no poses, ``actuators`` without any effect.
 
     Raises
     ------
     InvalidArgumentError
-        An option is out of range, or no option has this name.
+        An option is out of range.
     """
 
-    robot: Robot = field(metadata=_in(snapshot="robot_name"))
-    num_envs: int = field(metadata=_in("snapshot"))
-    first_env: int = field(default=0, metadata=_in("snapshot"))
-    workers: int | None = field(default=None, metadata=_apart("processes"))
-    """None on a cluster."""
-    timestep: float = field(default=1 / 2000, metadata=_in("snapshot", "recording", "scene"))
-    substeps: int = field(default=20, metadata=_apart("next commands", "recording"))
-    control: ControlMode | Controller = field(
-        default="pid", metadata=_in(snapshot="control_name", recording="control_name")
-    )
-    tool: str | None = field(default=None, metadata=_in("snapshot", "recording"))
-    """Link that setpoints move; None where they are not poses."""
-    setpoint_space: SetpointSpace = field(default="joints", metadata=_in("snapshot"))
-    backend: Backend = field(default="numpy", metadata=_in("snapshot"))
-    dtype: Precision = field(default="float64", metadata=_in("snapshot"))
-    compensate: Compensation = field(default="gravity+coriolis+friction", metadata=_in("snapshot", "recording"))
-    engine: EngineName = field(
-        default=DEFAULT_ENGINE, metadata=_in("scene", snapshot="engine_name", recording="engine_name")
-    )
-    physics: PhysicsPreset | Physics | MujocoSolver = field(
-        default="accurate",
-        metadata=_in(snapshot="solver_settings", recording="physics_name", scene="solver"),
-    )
-    collisions: bool = field(default=True, metadata=_in("snapshot", "recording", "scene"))
-    ground: bool = field(default=_DERIVED, metadata=_in("snapshot", "recording", "scene"))
-    contacts: tuple[str, ...] | None = field(default=None, metadata=_in("scene", "recording", snapshot="contact_list"))
-    wrenches: tuple[str, ...] | None = field(default=None, metadata=_in("scene", "recording", snapshot="wrench_list"))
-    build: Callable[[Any, int], Any] | None = field(default=None, metadata=_in("scene", snapshot="build_digest"))
-    on_fault: FaultAction = field(default="hold", metadata=_in("snapshot"))
-    speed_limit: NDArray[np.float64] | None = field(default=None, metadata=_in(snapshot="speed_limits"))
-    actuators: bp.Actuators | None = field(default=None, metadata=_apart("restored"))
-    """None if every effect is off."""
-    randomization: Randomization | None = field(
-        default=None, metadata=_in(snapshot="distributions", recording="distributions")
-    )
-    guard: bp.Guard | None = field(default=None, metadata=_in(snapshot="guard_digest"))
-    on_invalid_input: InvalidInputAction = field(default="raise", metadata=_apart("next commands"))
-    recover: bool = field(default=True, metadata=_apart("processes"))
-    checkpoint_steps: int | None = field(default=8000, metadata=_apart("last bits"))
-    timeout: float = field(default=60.0, metadata=_apart("processes"))
-    cluster: Ray | None = field(default=None, metadata=_apart("processes"))
+    params: bp.PIDParams
+    control: ControlMode | Controller
+    ground: bool
+    contacts: tuple[str, ...] | None
+    wrenches: tuple[str, ...] | None
+    speed_limit: NDArray[np.float64] | None
+    guard: bp.Guard | None
+    cluster: Ray | None
 
-    def __init__(self, robot: Robot, num_envs: int, **options: Unpack[RunnerKeywords]) -> None:
-        check_keywords("Runner", options, [*RunnerKeywords.__annotations__, "params"])
-        instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
-        given: Document = {each.name: each.default for each in fields(self)} | options
-        vars(self).update(given | {"robot": robot, "num_envs": integer("num_envs", num_envs, 1, 1_000_000)})
-        own = vars(self)
-        own |= {
-            "first_env": integer("first_env", self.first_env, 0, 1_000_000_000),
-            "timestep": number("timestep", self.timestep, 1e-6, 0.1, "seconds, not a rate: 1/2000"),
-            "substeps": integer("substeps", self.substeps, 1, 1_000_000),
-            "setpoint_space": choice("setpoint_space", self.setpoint_space, get_args(SetpointSpace)),
-            "control": _control(self.control, robot, given["tool"], self.setpoint_space),
-            "backend": choice("backend", self.backend, get_args(Backend)),
-            "dtype": choice("dtype", self.dtype, get_args(Precision)),
-            "compensate": choice("compensate", self.compensate, get_args(Compensation)),
-            "collisions": (collisions := flag("collisions", self.collisions)),
-            "ground": collisions and self._has_ground if given["ground"] is None else flag("ground", self.ground),
-            "on_fault": choice("on_fault", self.on_fault, get_args(FaultAction)),
-            "on_invalid_input": choice("on_invalid_input", self.on_invalid_input, get_args(InvalidInputAction)),
-            "recover": flag("recover", self.recover),
-            "timeout": number("timeout", self.timeout, 1e-3, 1e9, "seconds"),
-        }
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        own, given = vars(self), dict(vars(self))
+        robot = instance("robot", self.robot, Robot, "load one with Robot.load('panda') or a URDF path")
+        own["control"] = _control(self.control, robot, given["tool"], self.setpoint_space)
+        if given["ground"] is None:
+            own["ground"] = self.collisions and self._has_ground
         if isinstance(self.control, OperationalSpace):
             own["control"], own["tool"] = self.control.in_runner(self.timestep, self.compensate), self.control.link
         if self.tool_setpoints is not None:
             own["tool"] = self.tool_setpoints.link
-        own["workers"], own["cluster"] = _places(given["workers"], given["cluster"])
+        own["workers"], own["cluster"] = _places(self.workers, given["cluster"])
         if self.backend == "numpy" and self.dtype != "float64":
             raise InvalidArgumentError(
                 "dtype", "is that of backend 'jax'; NumPy's law is in float64", value=self.dtype, remedy="leave it out"
@@ -205,8 +98,6 @@ class RunnerOptions:
         if given["speed_limit"] is not None:
             limit = joint_speeds("speed_limit", given["speed_limit"], robot.joint_names)
             own["speed_limit"] = read_only(limit.copy())
-        if self.checkpoint_steps is not None:
-            own["checkpoint_steps"] = integer("checkpoint_steps", self.checkpoint_steps, 1, 10**9)
         if self.randomization is not None:
             remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
             check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
@@ -215,6 +106,8 @@ class RunnerOptions:
         own["guard"] = fit_guard(given["guard"], robot.joints, self.num_envs, self.control_name, self.sets_positions)
         own["actuators"] = self.check_actuators(given["actuators"])
         self._check_collisions()
+        params = default_params(robot, self.control, self.loops) if given["params"] is None else given["params"]
+        own["params"] = self.check_params(params)
         for name in ("contacts", "wrenches"):
             own[name] = self._sensed_links(name, given[name])
         for name in ("controller_digest", "build_digest"):  # of the objects as they are now
@@ -311,14 +204,15 @@ class RunnerOptions:
         return observed_by_loop(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
 
     @property
-    def contact_list(self) -> list[str] | None:
-        """The option ``contacts`` as plain values."""
-        return None if self.contacts is None else list(self.contacts)
+    def misses_contacts(self) -> bool:
+        """True if robots pass through each other and the ground, and the contacts that they would have are reported."""
+        return not self.collisions
 
     @property
-    def wrench_list(self) -> list[str] | None:
-        """The option ``wrenches`` as plain values."""
-        return None if self.wrenches is None else list(self.wrenches)
+    def switched(self) -> dict[str, bool]:
+        """Switches that are not at their default, by name."""
+        switches = {each.name: each.default for each in fields(self) if isinstance(each.default, bool)}
+        return {name: not default for name, default in switches.items() if getattr(self, name) != default}
 
     @property
     def solver(self) -> Physics | MujocoSolver:
@@ -458,12 +352,15 @@ class RunnerOptions:
     def values_for(self, place: Place) -> Document:
         """Return the options that are marked with ``place``, by name.
 
-        - "snapshot": plain values, which two runners must share to restore each other's snapshots;
-        - "recording": fields of :class:`batchpid.sim.RunInfo`;
+        - "snapshot": values that two runners must share to restore each other's snapshots;
+        - "recording": fields of :class:`batchpid.sim.RunInfo`, and under "options" those that are no field there;
         - "scene": fields of :class:`batchpid.sim.engine.scene_spec.SceneSpec`.
         """
-        marked = [each for each in fields(self) if place in each.metadata]
-        return {each.name: getattr(self, each.metadata[place] or each.name) for each in marked}
+        kept = {name: each.kept[place] for name, each in OPTIONS.items() if place in each.kept}
+        values = {name: getattr(self, source or name) for name, source in kept.items()}
+        if place == "recording" and (further := sorted(values.keys() - RunInfo.__annotations__)):
+            values["options"] = {name: values.pop(name) for name in further}
+        return values
 
     def describe(self) -> Document:
         """Return robot and options that two runners must share to restore each other's snapshots, as plain values."""
@@ -471,7 +368,7 @@ class RunnerOptions:
         return {
             **robot.describe(),
             "joints": list(robot.joint_names),
-            **self.values_for("snapshot"),
+            **{name: _plain(value) for name, value in self.values_for("snapshot").items()},
             "ignored_pairs": digest(robot.ignored_pairs),
             "robot_actuators": digest(known_joints(robot)),
             "controller": self.controller_digest,
@@ -509,11 +406,6 @@ class RunnerOptions:
         return _code_digest(self.build)
 
     @property
-    def speed_limits(self) -> list[float] | None:
-        """The option ``speed_limit`` as plain values."""
-        return None if self.speed_limit is None else self.speed_limit.tolist()
-
-    @property
     def guard_digest(self) -> str:
         """Digest of the setpoint guard."""
         return digest(self.guard is not None and self.guard)
@@ -522,12 +414,6 @@ class RunnerOptions:
     def distributions(self) -> Document | None:
         """The randomization as plain values."""
         return None if self.randomization is None else self.randomization.to_dict()
-
-
-def keyword_parameters() -> list[Parameter]:
-    """Return the fields of :class:`RunnerKeywords` as parameters, for the signatures that interpreters show."""
-    types, default = RunnerKeywords.__annotations__, {each.name: each.default for each in fields(RunnerOptions)}
-    return [Parameter(name, Parameter.KEYWORD_ONLY, default=default[name], annotation=types[name]) for name in types]
 
 
 def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
@@ -554,14 +440,19 @@ def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
     return value
 
 
+def _plain(value: object) -> object:
+    """Return the value of an option as a file of JSON holds it."""
+    return value.tolist() if isinstance(value, np.ndarray) else list(value) if isinstance(value, tuple) else value
+
+
 def _code_digest(value: object) -> str | None:
     """Return the digest of a controller or function of the caller's; None for a name, or without a value."""
     return None if value is None or isinstance(value, str) else object_digest(value)
 
 
-def worker_count(workers: Any) -> int:
+def worker_count(workers: int | None) -> int:
     """Return ``workers`` if it is a number of processes; None: one per available core."""
-    return len(os.sched_getaffinity(0)) if workers is None else integer("workers", workers, 0, 1024)
+    return len(os.sched_getaffinity(0)) if workers is None else checked_option("workers", workers)
 
 
 def _places(workers: Any, cluster: Any) -> tuple[int | None, Ray | None]:

@@ -11,11 +11,11 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
-from inspect import Parameter, Signature, signature
+from inspect import Signature, signature
 from operator import itemgetter
 from pathlib import Path
 from time import strftime
-from typing import ClassVar, Protocol, Unpack
+from typing import Any, ClassVar, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Rows
 from batchpid.checks.single_owner import SingleOwner
-from batchpid.checks.validate import choice, instance, integer
+from batchpid.checks.validate import check_keywords, choice, instance
 from batchpid.checks.warn import warn
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError
 from batchpid.io.versions import package_versions
@@ -32,8 +32,7 @@ from batchpid.sim.loop.backend import describe
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation
-from batchpid.sim.options import RunnerOptions, default_params, keyword_parameters
-from batchpid.sim.robot.robot import Robot
+from batchpid.sim.options import RunnerOptions
 from batchpid.sim.run_warnings import RunWarnings
 from batchpid.sim.runner_arguments import count_ticks, read_command
 from batchpid.sim.runner_commands import (
@@ -48,7 +47,7 @@ from batchpid.sim.runner_commands import (
     restored,
     snapshot_of,
 )
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE, RunnerKeywords
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE, KINDS, OPTIONS, arguments_of, checked_option
 from batchpid.sim.runner_state import RunnerState
 from batchpid.sim.workers.contact_log import MissedContact
 from batchpid.sim.workers.node import NodeInfo
@@ -77,13 +76,7 @@ class Runner(SingleOwner):
 
     Parameters
     ----------
-    robot
-        From :meth:`batchpid.sim.Robot.load`.
-    num_envs
-        Number of robots, one in each scene.
-    params
-        PID parameters of one row, or one row per env. Default: see :func:`batchpid.sim.options.default_params`.
-    workers, timestep, ...
+    robot, num_envs, params, workers, timestep, ...
         See :class:`batchpid.sim.RunnerKeywords`.
 
     Raises
@@ -95,29 +88,21 @@ class Runner(SingleOwner):
     __signature__: ClassVar[Signature]
     instead = "make another Runner with the same options, and restore a runner.snapshot() in it"
 
-    def __init__(
-        self,
-        robot: Robot,
-        num_envs: int,
-        *,
-        params: bp.PIDParams | None = None,
-        **options: Unpack[RunnerKeywords],
-    ) -> None:
+    @arguments_of(RunnerOptions)
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        check_keywords("Runner", options, OPTIONS)
         if "engine" not in options and DEFAULT_ENGINE != "sapien":
             warn(f"SAPIEN is not installed: the engine is {DEFAULT_ENGINE!r}", UserWarning)
-        self.options = checked = RunnerOptions(robot, num_envs, **options)
+        self.options = checked = RunnerOptions(*arguments, **options)
         """Options, checked."""
         self.robot, self.num_envs, self.control = checked.robot, checked.num_envs, checked.control
         self.timestep, self.substeps = checked.timestep, checked.substeps
-        params = checked.check_params(
-            default_params(robot, checked.control, checked.loops) if params is None else params
-        )
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call, self._warnings = OneCall(), RunWarnings(checked)
         self._tool_pose = checked.tool_pose
         self._checkpoint_steps = math.inf if checked.checkpoint_steps is None else checked.checkpoint_steps
-        self._state = RunnerState.first(checked, params)
+        self._state = RunnerState.first(checked)
         self._sent: RunTicks | None = None  # and not completed yet
         self._unreceived: Observation | None = None
         self._cause: BaseException | None = None  # of the end
@@ -152,11 +137,11 @@ class Runner(SingleOwner):
     def __repr__(self) -> str:
         options, workers, nodes = self.options, len(self.pids), len(self.nodes)
         where = "closed" if self.closed else f"{workers} workers" if workers else "in this process"
-        collisions = "" if options.collisions else ", no collisions"
+        further = "".join(f", {name} {value}" for name, value in options.switched.items())
         where = f"{nodes} nodes" if nodes else where
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control {options.control_name!r}, compensate "
-            f"{options.compensate!r},\n       physics {options.physics!r}{collisions}, timestep {self.timestep:g} s, "
+            f"{options.compensate!r},\n       physics {options.physics!r}{further}, timestep {self.timestep:g} s, "
             f"{self.substeps} substeps, at {self.time:g} s)"
         )
 
@@ -247,7 +232,7 @@ class Runner(SingleOwner):
             "feedforward": feedforward,
         }
         command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
-        count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
+        count = self.substeps if substeps is None else checked_option("substeps", substeps)
         self._execute(RunTicks(command, count, self.timestep))
         return self._pool.present.observation.copied(self._tool_pose)
 
@@ -279,7 +264,7 @@ class Runner(SingleOwner):
             "feedforward": feedforward,
         }
         command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
-        count = self.substeps if substeps is None else integer("substeps", substeps, 1, 1_000_000)
+        count = self.substeps if substeps is None else checked_option("substeps", substeps)
         self._begin(RunTicks(command, count, self.timestep))
 
     def recv(self) -> Observation:
@@ -491,7 +476,7 @@ class Runner(SingleOwner):
 
     @property
     def missed_contacts(self) -> tuple[MissedContact, ...]:
-        """First contact that each robot would have had since its reset, without collisions; latest last."""
+        """First contact that each robot without shapes would have had since its reset; latest last."""
         contacts = self._settled().contacts
         return () if contacts is None else tuple(contacts.contacts)
 
@@ -690,5 +675,5 @@ class Runner(SingleOwner):
         return min(most, -(-left // self.options.substeps))
 
 
-_NAMED = [each for each in signature(Runner).parameters.values() if each.kind != Parameter.VAR_KEYWORD]
-Runner.__signature__ = Signature(_NAMED + keyword_parameters())
+_PARAMETERS = signature(RunnerOptions).parameters.items()
+Runner.__signature__ = Signature([each.replace(annotation=get_args(KINDS[name])[0]) for name, each in _PARAMETERS])

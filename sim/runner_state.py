@@ -26,7 +26,7 @@ class RunnerState(NamedTuple):
     draws: Draws
     faults: FaultLog
     contacts: MissedContactLog | None
-    """None with collisions."""
+    """None where none is missed."""
     targets: Float64 | None
     """Last joint setpoints (envs, dof), where searches for poses of the tool start; None without such poses."""
     motion: Motion | None
@@ -37,7 +37,7 @@ class RunnerState(NamedTuple):
     """Seconds of each worker in the last run, and the ticks of that run."""
 
     @classmethod
-    def first(cls, options: RunnerOptions, params: bp.PIDParams) -> RunnerState:
+    def first(cls, options: RunnerOptions) -> RunnerState:
         """Return the state before the first reset, which places all envs."""
         robot, own, count = options.robot, options.own_command, options.num_envs
         draws = NOTHING
@@ -45,10 +45,10 @@ class RunnerState(NamedTuple):
             draws = options.randomization.first(robot, count, options.first_env)
         names = None if own is None else own.names
         faults, contacts = FaultLog(count, robot.joint_names, options.timestep, options.on_fault, names), None
-        if not options.collisions:
+        if options.misses_contacts:
             nearest = lambda qpos: robot_model(robot).nearest_links(qpos)  # noqa: E731
             contacts = MissedContactLog(count, options.timestep, nearest)
         start = np.tile(robot.start, (count, 1))
         targets = None if options.tool_setpoints is None else start
         motion = (start, None) if options.sets_positions else None
-        return cls(params, options.actuators, draws, faults, contacts, targets, motion)
+        return cls(options.params, options.actuators, draws, faults, contacts, targets, motion)

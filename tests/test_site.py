@@ -98,6 +98,7 @@ LONGER = {
     "robots.md": 205,
     "architecture.md": 170,
     "performance.md": 225,
+    "runner.md": 190,
     "training.md": 260,
     "deploy.md": 260,
     "notes.md": 460,

@@ -24,6 +24,9 @@ Document = dict[str, Any]
 MjModel: TypeAlias = Any
 """A mujoco.MjModel: MuJoCo is optional, and is imported where it is used."""
 
+Kind: TypeAlias = Any
+"""The type of a field, as its annotation declares it."""
+
 DType: TypeAlias = Any
 """What ``np.dtype`` takes."""
 

@@ -1,20 +1,26 @@
-"""Tables of the numbers that params, actuators, guards and randomizations hold: unit, bounds, and the value for off.
+"""Declared fields: the unit, the bounds and the value for off of an option, in the annotation of its argument.
 
-Each named tuple has one such table, from which come the checks of its options and leaves, the keys of its files, the
-values that are off, the bounds of a randomization, and the tables of the guides (docs/tables.py).
+Params, actuators, guards, params of a task, randomizations and options of a runner declare each option once, where it
+is an argument. From there come the checks of options and leaves, the keys of files, the values that are off, the bounds
+of a randomization, and the tables of the guides (docs/tables.py)::
+
+    def make_guard(joints: int, *, rate: Annotated[Array, Field("rad/s or m/s", math.inf, above=True)] = None, ...)
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from types import NoneType
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array
-from batchpid.checks.validate import at_least, entries, is_traced
+from batchpid.arrays.array_types import Array, Kind
+from batchpid.checks.validate import at_least, choice, entries, flag, integer, is_traced, number
 from batchpid.errors import InvalidArgumentError
+
+T = TypeVar("T")
 
 
 class Field(NamedTuple):
@@ -29,6 +35,8 @@ class Field(NamedTuple):
     """Whether values must be greater than ``low``."""
     high: float = math.inf
     """Largest value."""
+    group: str = ""
+    """Name of the fields that it belongs to."""
 
     def checked(self, name: str, values: Array, joint_names: Sequence[str] | None, *, infinite: bool = False) -> Any:
         """Return ``values`` (..., envs, joints), unless they are traced, if all are within the bounds.
@@ -44,12 +52,47 @@ class Field(NamedTuple):
         return values
 
 
+def declared(owner: Callable[..., object], kind: type[T]) -> dict[str, T]:
+    """Return what the annotations of a constructor or class declare by a ``kind``, such as Field, by name."""
+    hints = get_type_hints(owner, include_extras=True).items()
+    found = ((name, each) for name, hint in hints for each in getattr(hint, "__metadata__", ()))
+    return {name: each for name, each in found if isinstance(each, kind)}
+
+
+def in_group(fields: Mapping[str, Field], group: str) -> dict[str, Field]:
+    """Return the ``fields`` of a group."""
+    return {name: field for name, field in fields.items() if field.group == group}
+
+
 FREE = Field(low=-math.inf)
 """A leaf that may hold any number."""
 WHOLE = ("max_delay", "seed")
 """Leaves for all joints together."""
 TABLES = ("limit_positions", "limit_efforts")
 """Leaves with a table for each joint (1 | envs, joints, points)."""
+
+
+def plain(name: str, kind: Kind, value: Any) -> Any:
+    """Return ``value`` in the canonical form of its declared type: a bool, a number, a choice, or one of these or None.
+
+    A value of another declared type is returned as it is.
+
+    Raises InvalidArgumentError if a number is out of the bounds of its :class:`Field`, or the value of another type.
+    """
+    kind, *metadata = get_args(kind) if get_origin(kind) is Annotated else (kind,)
+    bounds = next((each for each in metadata if isinstance(each, Field)), FREE)
+    if get_origin(kind) is Literal:
+        return choice(name, value, get_args(kind))
+    if NoneType in get_args(kind):
+        kinds = [each for each in get_args(kind) if each is not NoneType]
+        if value is None or len(kinds) > 1:
+            return value
+        (kind,) = kinds
+    if kind is bool:
+        return flag(name, value)
+    if kind is int:
+        return integer(name, value, int(bounds.low), int(bounds.high))
+    return number(name, value, bounds.low, bounds.high, bounds.unit) if kind is float else value
 
 
 def check_leaves(

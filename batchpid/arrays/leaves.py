@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,8 +22,8 @@ from batchpid.errors import InvalidArgumentError
 
 ANTI_WINDUP = ("none", "clamp", "conditional", "back_calculation")
 MOST_JOINTS = 100_000
-
-
+Ends = tuple[Array, Array]
+"""A lower and an upper limit, each None for none."""
 Leaves = TypeVar("Leaves", bound=tuple[Any, ...])
 
 
@@ -55,7 +55,7 @@ class LeafBuilder:
         if self.dtype not in (np.float32, np.float64):
             raise InvalidArgumentError("dtype", "unknown dtype", value=str(dtype), remedy="use float32 or float64")
 
-    def array(self, name: str, value: Any, field: Field) -> Array:
+    def array(self, name: str, value: Array, field: Field) -> Array:
         """Return ``value`` as (1 | envs, joints) with every entry within the bounds of ``field``; None stays."""
         if value is None:
             return None
@@ -63,33 +63,26 @@ class LeafBuilder:
             array = read_array(name, value, traced=True).astype(self.dtype)
         return field.checked(name, self._by_env_and_joint(name, array), self.names)
 
-    def option(self, name: str, value: Any, field: Field) -> Any:
+    def option(self, name: str, value: Array, field: Field) -> Array:
         """Return an option's leaf: None where it is neutral on every joint of every env."""
         array = self.array(name, value, field)
         return None if _is_everywhere(array, field.neutral) else self.freeze(array)
 
-    def limits(self, name: str, symmetric: Any, low: Array, high: Array) -> tuple[Any, Any]:
-        """Return the leaves of a lower and an upper limit, each None where it is infinite everywhere."""
-        if symmetric is not None:
-            if low is not None or high is not None:
-                raise InvalidArgumentError(
-                    f"{name}_limit",
-                    f"is given together with {name}_min or {name}_max",
-                    remedy="give the symmetric limit, or the two ends",
-                )
-            upper = self.array(f"{name}_limit", symmetric, Field(neutral=math.inf))
-            lower = -upper
-        else:
-            end = Field(neutral=math.inf, low=-math.inf)
-            lower, upper = self.array(f"{name}_min", low, end), self.array(f"{name}_max", high, end)
-        if lower is not None and upper is not None and not (is_traced(lower) or is_traced(upper)):
-            ends = np.broadcast_arrays(lower, upper)
-            entries(f"{name}_min", ends[0], ends[0] <= ends[1], f"exceeds {name}_max", self.names)
+    def limits(self, **given: Array) -> Ends:
+        """Return the leaves of a lower and an upper limit, each None where it is infinite everywhere.
+
+        ``given`` are the size of both, the lower and the upper end, by the names of their arguments.
+        """
+        end = Field(neutral=math.inf, low=-math.inf)
+        size, *ends = given
+        read = {size: self.array(size, given[size], Field(neutral=math.inf))}
+        read |= {name: self.array(name, given[name], end) for name in ends}
+        lower, upper = checked_ends(read, self.names)
         lower = None if _is_everywhere(lower, -math.inf) else lower
         upper = None if _is_everywhere(upper, math.inf) else upper
         return lower, upper
 
-    def mask(self, name: str, value: Any) -> Array:
+    def mask(self, name: str, value: Array) -> Array:
         """Return a mask of 1.0 and 0.0, None where it is False everywhere."""
         if value is None:
             return None
@@ -110,7 +103,7 @@ class LeafBuilder:
         clamp, conditional, back = (mask if mask.any() else None for mask in masks)
         return clamp, conditional, back
 
-    def clamped(self, clamp: Any, integral: tuple[Any, Any], effort: tuple[Any, Any]) -> tuple[Any, Any]:
+    def clamped(self, clamp: Array, integral: Ends, effort: Ends) -> Ends:
         """Return the integral's limits: for the strategy ``clamp`` without limits, the effort limits."""
         if clamp is None or any(end is not None for end in integral):
             return integral
@@ -126,7 +119,7 @@ class LeafBuilder:
         )
         return low, high
 
-    def tracking_time(self, value: Any, back: Any, kp: Array, ki: Array, kd: Array) -> Any:
+    def tracking_time(self, value: Array, back: Array, kp: Array, ki: Array, kd: Array) -> Array:
         """Return the leaf of back-calculation's time constant, inf where a joint is not ``back``."""
         if back is None:
             if value is not None:
@@ -145,13 +138,13 @@ class LeafBuilder:
         """Return the params entry of a named choice."""
         return CHOICES[name][choice(name, chosen, CHOICES[name])]
 
-    def freeze(self, array: Array) -> Any:
+    def freeze(self, array: Array) -> Array:
         """Return the leaf in the params' dtype and read-only: params are replaced, not edited."""
         if array is None or is_traced(array):
             return array
         return _read_only(np.array(array, dtype=self.dtype))
 
-    def _by_env_and_joint(self, name: str, array: Array) -> Any:
+    def _by_env_and_joint(self, name: str, array: Array) -> Array:
         """Return a scalar, (joints,) or (envs, joints) as (1 | envs, joints)."""
         expected = f"(), ({self.joints},) or (envs, {self.joints})"
         rows = array[None] if array.ndim == 1 else array
@@ -168,11 +161,30 @@ class LeafBuilder:
         )
 
 
+def checked_ends(given: Mapping[str, Array], joint_names: Sequence[str] | None) -> Ends:
+    """Return the lower and the upper end of limits, None for no limit.
+
+    ``given`` are the size of both, the lower and the upper end, by the names of their arguments.
+
+    Raises InvalidArgumentError if the size is given with an end, or the lower end exceeds the upper one.
+    """
+    (name, size), (low_name, low), (high_name, high) = given.items()
+    if size is not None:
+        if low is not None or high is not None:
+            problem = f"is given together with {low_name} or {high_name}"
+            raise InvalidArgumentError(name, problem, remedy="give the symmetric limit, or the two ends")
+        return -size, size
+    if low is not None and high is not None and not (is_traced(low) or is_traced(high)):
+        ends = np.broadcast_arrays(low, high)
+        entries(low_name, ends[0], ends[0] <= ends[1], f"exceeds {high_name}", joint_names)
+    return low, high
+
+
 def _can_be_written(leaf: Array) -> bool:
     return isinstance(leaf, np.ndarray) and (leaf.flags.writeable or not leaf.flags.owndata)
 
 
-def _read_only(array: Array) -> Any:
+def _read_only(array: Array) -> Array:
     array.setflags(write=False)
     return array
 
@@ -182,7 +194,7 @@ def _is_everywhere(array: Array, value: float) -> bool:
     return array is None or (not is_traced(array) and bool((array == value).all()))
 
 
-def _rule_of_thumb(kp: Array, ki: Array, kd: Array) -> Any:
+def _rule_of_thumb(kp: Array, ki: Array, kd: Array) -> Array:
     """Return Tt = sqrt(Ti Td) = sqrt(kd/ki), or Ti = kp/ki without kd; inf, no correction, where ki is 0."""
     xp = namespace(kp, ki, kd)
     if ki is None:

@@ -14,8 +14,7 @@ from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.differences import Differences, strategies
 from batchpid.law.params import PIDParams
-from batchpid.motors.actuator_fields import FIELDS
-from batchpid.motors.actuators import Actuators
+from batchpid.motors.actuators import FIELDS, Actuators
 
 EFFECTS = {name: field for name, field in FIELDS.items() if name not in ("no_load_speed", "effort_limit")}
 """Effects of actuators that a target may lack."""

@@ -148,16 +148,16 @@ def is_number(entry: Any) -> bool:
 def columns(source: str, joints: dict[str, Document], schema: Schema) -> Document:
     """Return each option that some joint has, as an array (1 or envs, joints)."""
     columns: Document = {}
-    for key, (_, neutral, *_) in schema.fields.items():
+    for key, field in schema.fields.items():
         if not any(key in options for options in joints.values()):
             continue
-        values = {name: options.get(key, neutral) for name, options in joints.items()}
+        values = {name: options.get(key, field.neutral) for name, options in joints.items()}
         lists = {name: value if isinstance(value, list) else [value] for name, value in values.items()}
         envs = max(map(len, lists.values()))
         for name, value in lists.items():
             if len(value) not in (1, envs):
                 raise error(source, key, f"has {len(value)} values, others {envs}", "give one per env", name)
-        dtype: DType = {float: float, bool: bool, str: object}[type(neutral)]
+        dtype: DType = {float: float, bool: bool, str: object}[type(field.neutral)]
         columns[key] = np.array([value * (envs // len(value)) for value in lists.values()], dtype=dtype).T
     return columns
 

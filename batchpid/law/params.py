@@ -10,36 +10,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document, DType
 from batchpid.arrays.choices import CHOICES, Everywhere, PerMassMatrix
 from batchpid.arrays.display import params_summary
-from batchpid.arrays.field_tables import Field, check_leaves
+from batchpid.arrays.field_tables import Field, check_leaves, declared
 from batchpid.arrays.leaves import LeafBuilder
 from batchpid.checks.validate import is_traced, known_keywords
 from batchpid.errors import InvalidArgumentError
 
-FIELDS = {
-    "kp": Field("N m/rad or N/m"),
-    "ki": Field("N m/(rad s) or N/(m s)"),
-    "kd": Field("N m s/rad or N s/m"),
-    "effort_min": Field("N m or N", -math.inf, low=-math.inf),
-    "effort_max": Field("N m or N", math.inf, low=-math.inf),
-    "effort_rate_limit": Field("N m/s or N/s", math.inf, above=True),
-    "integral_min": Field("N m or N", -math.inf, low=-math.inf),
-    "integral_max": Field("N m or N", math.inf, low=-math.inf),
-    "derivative_filter_time": Field("s"),
-    "setpoint_weight": Field("1", 1.0),
-    "setpoint_weight_derivative": Field("1"),
-    "deadband": Field("rad or m"),
-    "tracking_time": Field("s", math.inf),
-    "anti_windup": Field(neutral="none"),
-    "continuous": Field(neutral=False),
-}
-"""Options of a joint."""
 PLAIN = "effort_rate_limit", "derivative_filter_time", "setpoint_weight", "setpoint_weight_derivative", "deadband"
 """Options that become a leaf without regard to others."""
 
@@ -164,24 +146,24 @@ class PIDParams(NamedTuple):
 @known_keywords
 def make_params(
     joints: int,
-    kp: Array,
-    ki: Array = None,
-    kd: Array = None,
+    kp: Annotated[Array, Field("N m/rad or N/m")],
+    ki: Annotated[Array, Field("N m/(rad s) or N/(m s)")] = None,
+    kd: Annotated[Array, Field("N m s/rad or N s/m")] = None,
     *,
     effort_limit: Array = None,
-    effort_min: Array = None,
-    effort_max: Array = None,
-    effort_rate_limit: Array = None,
+    effort_min: Annotated[Array, Field("N m or N", -math.inf, low=-math.inf)] = None,
+    effort_max: Annotated[Array, Field("N m or N", math.inf, low=-math.inf)] = None,
+    effort_rate_limit: Annotated[Array, Field("N m/s or N/s", math.inf, above=True)] = None,
     integral_limit: Array = None,
-    integral_min: Array = None,
-    integral_max: Array = None,
-    derivative_filter_time: Array = None,
-    setpoint_weight: Array = None,
-    setpoint_weight_derivative: Array = None,
-    deadband: Array = None,
-    anti_windup: str | Sequence[Any] = "none",
-    tracking_time: Array = None,
-    continuous: Array = None,
+    integral_min: Annotated[Array, Field("N m or N", -math.inf, low=-math.inf)] = None,
+    integral_max: Annotated[Array, Field("N m or N", math.inf, low=-math.inf)] = None,
+    derivative_filter_time: Annotated[Array, Field("s")] = None,
+    setpoint_weight: Annotated[Array, Field("1", 1.0)] = None,
+    setpoint_weight_derivative: Annotated[Array, Field("1")] = None,
+    deadband: Annotated[Array, Field("rad or m")] = None,
+    anti_windup: Annotated[str | Sequence[Any], Field(neutral="none")] = "none",
+    tracking_time: Annotated[Array, Field("s", math.inf)] = None,
+    continuous: Annotated[Array, Field(neutral=False)] = None,
     integration: str = "output_first",
     first_derivative: str = "zero",
     weight_origin: str = "zero",
@@ -269,8 +251,8 @@ def make_params(
     if chosen["discretization"] is not None:
         _check_implicit(chosen["gain_units"], options["derivative_filter_time"])
         d = build.array("kd", 0.0, FIELDS["kd"]) if d is None else d
-    effort_ends = build.limits("effort", effort_limit, effort_min, effort_max)
-    integral_ends = build.limits("integral", integral_limit, integral_min, integral_max)
+    effort_ends = build.limits(effort_limit=effort_limit, effort_min=effort_min, effort_max=effort_max)
+    integral_ends = build.limits(integral_limit=integral_limit, integral_min=integral_min, integral_max=integral_max)
     # The joints may have different strategies: each becomes an array of the joints that use it, or None for none.
     clamp, conditional, back = build.strategies(anti_windup)
     integral_ends = build.clamped(clamp, integral_ends, effort_ends)
@@ -284,6 +266,10 @@ def make_params(
         **options,
         **chosen,
     )
+
+
+FIELDS = declared(make_params, Field)
+"""Options of a joint."""
 
 
 def _is_array(leaf: Array) -> bool:

@@ -25,10 +25,9 @@ from batchpid.motors.actuator_dynamics import (
     measure,
     measurement_noise,
 )
-from batchpid.motors.actuator_fields import DRIVEN, JOINT_SIDE
 from batchpid.motors.actuator_files import dumps_actuators, load_actuators, loads_actuators, save_actuators
 from batchpid.motors.actuator_state import ActuatorState
-from batchpid.motors.actuators import Actuators, check_actuators, make_actuators
+from batchpid.motors.actuators import DRIVEN, JOINT_SIDE, Actuators, check_actuators, make_actuators
 from batchpid.motors.coupling import Coupling, Follower
 
 __all__ = [

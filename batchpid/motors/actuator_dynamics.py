@@ -19,7 +19,7 @@ A prime is the value of the step before. The play is the backlash hysteresis (G.
 of Systems with Actuator and Sensor Nonlinearities, Wiley, 1996, chapter 2). Friction and armature are the simulator's:
 see :mod:`batchpid.motors.friction`.
 
-A new effect is a line in :mod:`batchpid.motors.actuator_fields`, a field of :class:`Actuators` and of
+A new effect is a line in :mod:`batchpid.motors.actuators`, a field of :class:`Actuators` and of
 :class:`MotorCoefficients`, and a term here, also in :func:`command_limits` where it changes the limits of commands. It
 uses the operations of :mod:`batchpid.native.operations` alone: then NumPy, JAX and native code have it.
 """

@@ -26,8 +26,7 @@ from batchpid.arrays.field_tables import Field
 from batchpid.checks.validate import names
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.motors.actuator_fields import FIELDS
-from batchpid.motors.actuators import Actuators, make_actuators
+from batchpid.motors.actuators import FIELDS, Actuators, make_actuators
 
 _FIELDS = {**FIELDS, "continuous": Field(neutral=False)}
 _SCHEMA = documents.Schema("batchpid-actuators-1", "actuators", ("dtype", "seed", "max_delay"), _FIELDS)

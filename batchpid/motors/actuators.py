@@ -2,22 +2,29 @@
 
 :class:`Actuators` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without registration. An effect
 that is off is ``None``: it is not a leaf and costs nothing.
+
+Longer than 300 lines because every effect is declared and documented here, as an option of the constructor.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Document, DType
 from batchpid.arrays.display import span, summary
-from batchpid.arrays.field_tables import check_leaves
+from batchpid.arrays.field_tables import WHOLE, Field, check_leaves, declared, in_group
 from batchpid.arrays.leaves import LeafBuilder
 from batchpid.checks.validate import entries, integer, is_traced, known_keywords, number, read_array
 from batchpid.errors import InvalidArgumentError
-from batchpid.motors.actuator_fields import FIELDS, JOINT_SIDE, MAX_DELAY, MOTOR_SIDE, SENSOR_SIDE, TABLE
+
+MAX_DELAY = 1.0
+"""Longest delay [s]."""
+TABLE = {"limit_efforts": Field("N m or N", math.inf)}
+"""Numbers of each point of a joint's position-dependent limit."""
 
 
 class Actuators(NamedTuple):
@@ -89,9 +96,8 @@ class Actuators(NamedTuple):
 
     def for_joints(self, joints: Any) -> Actuators:
         """Return the actuators of some joints (an index array or a mask)."""
-        whole = ("max_delay", "seed")
         leaves = self._asdict().items()
-        return Actuators(**{name: leaf if leaf is None or name in whole else leaf[:, joints] for name, leaf in leaves})
+        return Actuators(**{name: leaf if leaf is None or name in WHOLE else leaf[:, joints] for name, leaf in leaves})
 
     def joint_side(self) -> Actuators:
         """Return the friction and reflected inertia alone, which also joints of ideal motors and sensors have."""
@@ -137,27 +143,27 @@ class Actuators(NamedTuple):
 def make_actuators(
     joints: int,
     *,
-    command_delay: Array = None,
-    sensor_delay: Array = None,
-    lag: Array = None,
-    strength: Array = None,
-    bias: Array = None,
-    saturation_effort: Array = None,
-    no_load_speed: Array = None,
-    effort_limit: Array = None,
+    command_delay: Annotated[Array, Field("s", high=MAX_DELAY, group="motor")] = None,
+    lag: Annotated[Array, Field("s", group="motor")] = None,
+    strength: Annotated[Array, Field("1", 1.0, group="motor")] = None,
+    bias: Annotated[Array, Field("N m or N", low=-math.inf, group="motor")] = None,
+    saturation_effort: Annotated[Array, Field("N m or N", math.inf, above=True, group="motor")] = None,
+    no_load_speed: Annotated[Array, Field("rad/s or m/s", math.inf, above=True, group="motor")] = None,
+    effort_limit: Annotated[Array, Field("N m or N", math.inf, group="motor")] = None,
     position_limit: tuple[Array, Array] | None = None,
-    coulomb: Array = None,
-    static: Array = None,
-    stribeck: Array = None,
-    load_friction: Array = None,
-    viscous: Array = None,
-    armature: Array = None,
-    position_offset: Array = None,
-    backlash: Array = None,
-    position_resolution: Array = None,
-    velocity_resolution: Array = None,
-    position_noise: Array = None,
-    velocity_noise: Array = None,
+    coulomb: Annotated[Array, Field("N m or N", group="joint")] = None,
+    static: Annotated[Array, Field("N m or N", group="joint")] = None,
+    stribeck: Annotated[Array, Field("rad/s or m/s", group="joint")] = None,
+    load_friction: Annotated[Array, Field("1", high=1.0, group="joint")] = None,
+    viscous: Annotated[Array, Field("N m s/rad or N s/m", group="joint")] = None,
+    armature: Annotated[Array, Field("kg m^2 or kg", group="joint")] = None,
+    sensor_delay: Annotated[Array, Field("s", high=MAX_DELAY, group="sensor")] = None,
+    position_offset: Annotated[Array, Field("rad or m", low=-math.inf, group="sensor")] = None,
+    backlash: Annotated[Array, Field("rad or m", group="sensor")] = None,
+    position_resolution: Annotated[Array, Field("rad or m", group="sensor")] = None,
+    velocity_resolution: Annotated[Array, Field("rad/s or m/s", group="sensor")] = None,
+    position_noise: Annotated[Array, Field("rad or m", group="sensor")] = None,
+    velocity_noise: Annotated[Array, Field("rad/s or m/s", group="sensor")] = None,
     seed: int = 0,
     max_delay: float | None = None,
     continuous: Array = None,
@@ -263,6 +269,18 @@ def make_actuators(
         max_delay=build.freeze(np.array([[longest]])) if delays else None,
         seed=np.array([[words & 0xFFFFFFFF, words >> 32]], np.uint32) if noisy else None,
     )
+
+
+FIELDS = declared(make_actuators, Field)
+"""Numbers of a joint."""
+MOTOR_SIDE = in_group(FIELDS, "motor")
+"""Numbers between the effort asked for and the effort delivered."""
+JOINT_SIDE = in_group(FIELDS, "joint")
+"""Numbers that act on the joint and not on the signals: :class:`batchpid.sim.Runner` gives them to the simulator."""
+DRIVEN = tuple(name for name in JOINT_SIDE if name != "load_friction")
+"""Effects that joints under drives of the engine have; friction by load needs the motor's effort, which is unknown."""
+SENSOR_SIDE = in_group(FIELDS, "sensor")
+"""Numbers between the joint's state and its measurement."""
 
 
 def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Array, Array]:

@@ -20,22 +20,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from batchpid.arrays.array_types import Array, ArrayModule, DType
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, clip, namespace, wrap
-from batchpid.arrays.field_tables import Field, check_leaves
+from batchpid.arrays.field_tables import Field, check_leaves, declared
 from batchpid.arrays.leaves import LeafBuilder
 from batchpid.checks.validate import check_time_step
-
-FIELDS = {
-    "lower": Field("rad or m", -math.inf, low=-math.inf),
-    "upper": Field("rad or m", math.inf, low=-math.inf),
-    "rate": Field("rad/s or m/s", math.inf, above=True),
-    "acceleration": Field("rad/s^2 or m/s^2", math.inf, above=True),
-}
-"""Options of a joint."""
 
 
 class Guard(NamedTuple):
@@ -70,10 +62,10 @@ class GuardState(NamedTuple):
 def make_guard(
     joints: int,
     *,
-    lower: Array = None,
-    upper: Array = None,
-    rate: Array = None,
-    acceleration: Array = None,
+    lower: Annotated[Array, Field("rad or m", -math.inf, low=-math.inf)] = None,
+    upper: Annotated[Array, Field("rad or m", math.inf, low=-math.inf)] = None,
+    rate: Annotated[Array, Field("rad/s or m/s", math.inf, above=True)] = None,
+    acceleration: Annotated[Array, Field("rad/s^2 or m/s^2", math.inf, above=True)] = None,
     continuous: Array = None,
     joint_names: Sequence[str] | None = None,
     dtype: DType = None,
@@ -96,7 +88,7 @@ def make_guard(
     """
     build = LeafBuilder(joints, joint_names, dtype, (lower, upper, rate, acceleration))
     mask = build.mask("continuous", continuous)
-    low, high = build.limits("setpoint", None, lower, upper)
+    low, high = build.limits(size=None, lower=lower, upper=upper)
     if mask is not None:
         xp = namespace(mask)
         low = None if low is None else xp.where(mask > 0, -math.inf, low)
@@ -108,6 +100,10 @@ def make_guard(
         acceleration=build.option("acceleration", acceleration, FIELDS["acceleration"]),
         turns=None if mask is None else build.freeze(mask / TURN),
     )
+
+
+FIELDS = declared(make_guard, Field)
+"""Options of a joint."""
 
 
 def init(guard: Guard, qpos: Array) -> GuardState:

@@ -68,7 +68,7 @@ def load_osc_options(path: str | os.PathLike[str]) -> Document:
         if name in TASK_CHOICES:
             choice(f"{source}: {name}", value, TASK_CHOICES[name])
             continue
-        listed, is_mask = isinstance(value, list), name in ("axes", "force_axes")
+        listed, is_mask = isinstance(value, list), isinstance(FIELDS[name].neutral, bool)
         for entry in value if listed else [value]:
             if not (isinstance(entry, bool) if is_mask else documents.is_number(entry)):
                 remedy = "give true or false for each axis" if is_mask else "give a number, or one per axis or joint"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +12,8 @@ from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.choices import CHOICES, NamedChoice
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
-from batchpid.arrays.field_tables import Field
+from batchpid.arrays.field_tables import Field, declared
+from batchpid.arrays.leaves import checked_ends
 from batchpid.checks.validate import array, choice, entries, instance, known_keywords, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import RigidTree
@@ -20,27 +21,6 @@ from batchpid.task_space.tree_dynamics import check_masses
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Names of the axes of a task."""
-
-FIELDS = {
-    "stiffness": Field("1/s^2"),
-    "damping_ratio": Field("1", 1.0),
-    "damping": Field("1/s"),
-    "integral_gain": Field("1/s^3"),
-    "integral_limit": Field("m/s^2 or rad/s^2", math.inf),
-    "axes": Field(neutral=1.0),
-    "force_axes": Field(),
-    "posture_stiffness": Field("1/s^2"),
-    "posture_damping_ratio": Field("1", 1.0),
-    "limit_margin": Field("rad or m"),
-    "limit_stiffness": Field("1/s^2"),
-    "position_error_limit": Field("m", math.inf, above=True),
-    "rotation_error_limit": Field("rad", math.inf, above=True),
-    "smallest_eigenvalue": Field("1/kg or 1/(kg m^2)", above=True),
-    "effort_limit": Field("N m or N", math.inf),
-    "effort_min": Field("N m or N", -math.inf, low=-math.inf),
-    "effort_max": Field("N m or N", math.inf, low=-math.inf),
-}
-"""Options that are numbers; units are those with full decoupling."""
 
 
 class PartialDecoupling(NamedChoice):
@@ -120,23 +100,23 @@ class OSCParams(NamedTuple):
 def make_osc_params(
     tree: RigidTree,
     *,
-    stiffness: ArrayLike = 150.0,
-    damping_ratio: ArrayLike = 1.0,
-    damping: ArrayLike | None = None,
-    integral_gain: ArrayLike | None = None,
-    integral_limit: ArrayLike = math.inf,
-    axes: ArrayLike | None = None,
-    force_axes: ArrayLike | None = None,
-    posture_stiffness: ArrayLike = 10.0,
-    posture_damping_ratio: ArrayLike = 1.0,
-    limit_margin: ArrayLike | None = None,
-    limit_stiffness: ArrayLike = 400.0,
-    position_error_limit: ArrayLike = 0.1,
-    rotation_error_limit: ArrayLike = 0.5,
-    smallest_eigenvalue: ArrayLike = 0.02,
-    effort_limit: ArrayLike | None = None,
-    effort_min: ArrayLike | None = None,
-    effort_max: ArrayLike | None = None,
+    stiffness: Annotated[ArrayLike, Field("1/s^2")] = 150.0,
+    damping_ratio: Annotated[ArrayLike, Field("1", 1.0)] = 1.0,
+    damping: Annotated[ArrayLike | None, Field("1/s")] = None,
+    integral_gain: Annotated[ArrayLike | None, Field("1/s^3")] = None,
+    integral_limit: Annotated[ArrayLike, Field("m/s^2 or rad/s^2", math.inf)] = math.inf,
+    axes: Annotated[ArrayLike | None, Field(neutral=True)] = None,
+    force_axes: Annotated[ArrayLike | None, Field(neutral=False)] = None,
+    posture_stiffness: Annotated[ArrayLike, Field("1/s^2")] = 10.0,
+    posture_damping_ratio: Annotated[ArrayLike, Field("1", 1.0)] = 1.0,
+    limit_margin: Annotated[ArrayLike | None, Field("rad or m")] = None,
+    limit_stiffness: Annotated[ArrayLike, Field("1/s^2")] = 400.0,
+    position_error_limit: Annotated[ArrayLike, Field("m", math.inf, above=True)] = 0.1,
+    rotation_error_limit: Annotated[ArrayLike, Field("rad", math.inf, above=True)] = 0.5,
+    smallest_eigenvalue: Annotated[ArrayLike, Field("1/kg or 1/(kg m^2)", above=True)] = 0.02,
+    effort_limit: Annotated[ArrayLike | None, Field("N m or N", math.inf)] = None,
+    effort_min: Annotated[ArrayLike | None, Field("N m or N", -math.inf, low=-math.inf)] = None,
+    effort_max: Annotated[ArrayLike | None, Field("N m or N", math.inf, low=-math.inf)] = None,
     decoupling: str = "full",
     frame: str = "world",
     discretization: str = "explicit",
@@ -203,19 +183,9 @@ def make_osc_params(
     if force is not None:
         both = force * (np.ones((1, 6)) if motion is None else motion)
         entries("force_axes", both > 0, both == 0, "is an axis of motion, too", AXES, kind="entry")
-    if effort_limit is not None:
-        if effort_min is not None or effort_max is not None:
-            problem = "is given together with effort_min or effort_max"
-            raise InvalidArgumentError("effort_limit", problem, remedy="give the symmetric limit, or the two ends")
-        effort_max = _rows("effort_limit", effort_limit, joints)
-        effort_min = -effort_max
-    low, high = (
-        None if end is None else _rows(name, end, joints)
-        for name, end in (("effort_min", effort_min), ("effort_max", effort_max))
-    )
-    if low is not None and high is not None:
-        ends = np.broadcast_arrays(low, high)
-        entries("effort_min", ends[0], ends[0] <= ends[1], "exceeds effort_max", joints)
+    given = {"effort_limit": effort_limit, "effort_min": effort_min, "effort_max": effort_max}
+    efforts = {name: None if rows is None else _rows(name, rows, joints) for name, rows in given.items()}
+    low, high = checked_ends(efforts, joints)
     # Joints without limits that turn are angles modulo 2 pi for the posture. Followers have no posture and no limits of
     # their own: their leader has them.
     limits, own = np.array([tree.lower, tree.upper]), tree.independent
@@ -247,6 +217,10 @@ def make_osc_params(
     )
     _check_rows(params)
     return params
+
+
+FIELDS = declared(make_osc_params, Field)
+"""Options that are numbers; units are those with full decoupling."""
 
 
 def _rows(name: str, value: ArrayLike, columns: tuple[str, ...]) -> NDArray[np.float64]:

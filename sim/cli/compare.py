@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, write_figures
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import gain_set
+
+RUNNER = flags.runner_flags(*flags.SCENE_FLAGS, "workers")
 
 
 @dataclass(frozen=True)
@@ -33,10 +36,7 @@ class CompareCommand:
     payload: flags.Payload = 2.0
     friction: flags.Friction = 0.1
     engine: flags.Engines = (DEFAULT_ENGINE,)
-    physics: flags.Physics = "accurate"
-    collisions: flags.Collisions = True
-    ground: flags.Ground = None
-    workers: flags.Workers = None
+    runner: Annotated[flags.RunnerFlags, flags.group(RUNNER)] = field(default_factory=RUNNER)
     actuators: flags.Actuators = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     picture: flags.OptionalPath = None
@@ -64,7 +64,7 @@ class CompareCommand:
             raise InvalidArgumentError("gains", "names a single set", remedy="name two, or two engines, for a picture")
         variation = (self.payload, self.friction) if self.variation else None
         robot, randomization = read_variation(robot, self.randomize, variation)
-        options = flags.chosen(self, "moves seed seconds workers physics collisions ground")
+        options = flags.chosen(self, "moves seed seconds") | self.runner.options()
         evaluations = evaluate_sets(robot, sets, randomization=randomization, engines=self.engine, **options)
         print(f"{robot.name}: {len(evaluations[0].moves.start)} moves, seed {self.seed}, {self.seconds:g} s each\n")
         print(evaluation_table(robot, evaluations))

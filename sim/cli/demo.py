@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import number
@@ -11,8 +12,9 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, beside, waiting, write_figures
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import gain_set
+
+RUNNER = flags.runner_flags("ground", "workers", "engine", "backend")
 
 
 @dataclass(frozen=True)
@@ -30,10 +32,7 @@ class DemoCommand:
     seed: int = 0
     """Seed of the start poses."""
     spread: flags.Spread = 0.3
-    ground: flags.Ground = None
-    workers: flags.Workers = None
-    engine: flags.Engine = DEFAULT_ENGINE
-    backend: flags.Backend = "numpy"
+    runner: Annotated[flags.RunnerFlags, flags.group(RUNNER)] = field(default_factory=RUNNER)
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     picture: flags.OptionalPath = None
     """Step responses to draw: .png or .svg. Default: out/ROBOT-demo.png."""
@@ -69,8 +68,7 @@ class DemoCommand:
         start = start_poses(robot, self.num_envs, self.spread, self.seed)
         gains = gain_set(robot, self.gains)
         title = f"{robot.name}: {self.num_envs} robots, {gains.control} at {settings.rate_hz:g} Hz, gains {gains.name}"
-        options: Document = {"params": gains.params, "control": gains.control}
-        options |= flags.chosen(self, "workers engine backend ground")
+        options: Document = {"params": gains.params, "control": gains.control} | self.runner.options()
         with waiting(f"building {self.num_envs} robots"):
             made = Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options)
         with made as runner:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import tyro
 
-from batchpid.arrays.array_types import Document
+from batchpid.arrays.array_types import Document, Kind
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.runner_keywords import KINDS, OPTIONS, Compensation, EngineName, PhysicsPreset, RunnerKeywords
 
 
 def _flag(help: str | None = None, **options: Any) -> Any:
@@ -24,10 +26,7 @@ def _flag(help: str | None = None, **options: Any) -> Any:
 
 def chosen(command: Any, names: str) -> Document:
     """Return the values of some flags of a command, as arguments of the same names, which are separated by blanks."""
-    values = {name: getattr(command, name) for name in names.split()}
-    if "ground" in values and (ground := values.pop("ground")) is not None:
-        values["ground"] = ground == "on"
-    return values
+    return {name: getattr(command, name) for name in names.split()}
 
 
 def refuse(command: Any, names: Iterable[str], problem: str) -> None:
@@ -36,6 +35,59 @@ def refuse(command: Any, names: Iterable[str], problem: str) -> None:
     for name in names:
         if (value := getattr(command, name)) != defaults[name]:
             raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
+
+
+FLAGS = {each.name: each.default for each in fields(RunnerKeywords) if OPTIONS[each.name].flag}
+"""Options that have a flag, with their defaults."""
+SCENE_FLAGS = tuple(name for name in FLAGS if "scene" in OPTIONS[name].kept and name != "engine")
+"""Options that change the scenes in an engine."""
+_PLAIN = (NoneType, bool, int, float, str)
+_SWITCHES = [name for name, kind in KINDS.items() if get_args(kind)[0] == bool | None]
+"""Options that are on, off, or chosen by the Runner."""
+
+
+def of_option(name: str) -> Any:
+    """Return tyro's options of the flag of a Runner's option."""
+    return _flag(OPTIONS[name].flag, metavar="on|off" if name in _SWITCHES else None)
+
+
+def _kind(name: str) -> Kind:
+    """Return the type of the flag of a Runner's option: that of its plain values."""
+    kind = Literal["on", "off"] | None if name in _SWITCHES else get_args(KINDS[name])[0]
+    if get_origin(kind) not in (Union, UnionType):
+        return kind
+    return Union[tuple(each for each in get_args(kind) if each in _PLAIN or get_origin(each) is Literal)]  # noqa: UP007
+
+
+@dataclass(frozen=True)
+class RunnerFlags:
+    """Flags that are options of a Runner, by :func:`runner_flags`."""
+
+    def options(self) -> Document:
+        """Return the options as arguments of a Runner; switches that are left out are left to it."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        given = {name: values.pop(name) for name in _SWITCHES if name in values}
+        return values | {name: value == "on" for name, value in given.items() if value is not None}
+
+    def words(self) -> list[str]:
+        """Return the words of a command line that gives the flags that are not at their defaults."""
+        words = list[str]()
+        for each in fields(self):
+            if (value := getattr(self, each.name)) != each.default:
+                words += [f"--no-{each.name}"] if value is False else [f"--{each.name}", str(value)]
+        return words
+
+
+def runner_flags(*names: str) -> type[RunnerFlags]:
+    """Return the flags of a Runner's options, by default of all that have one."""
+    chosen = names or FLAGS
+    made = [(name, Annotated[_kind(name), of_option(name)], field(default=FLAGS[name])) for name in chosen]
+    return make_dataclass("ChosenFlags", made, bases=(RunnerFlags,), frozen=True)
+
+
+def group(made: type[RunnerFlags]) -> Any:
+    """Return tyro's options of a field that holds the flags of :func:`runner_flags`."""
+    return tyro.conf.arg(name="", constructor=made)
 
 
 OptionalPath = Annotated[Path | None, _flag()]
@@ -71,11 +123,8 @@ class MeshOptions:
 
 Meshes = Annotated[MeshOptions, tyro.conf.arg(name="")]
 NumEnvs = Annotated[int, _flag("Number of robots, one in each scene.")]
-Workers = Annotated[int | None, _flag("Processes that step the scenes; 0: this one. Default: one per available core.")]
-Cluster = Annotated[
-    Literal["ray"] | None,
-    _flag("Run on a Ray cluster: that of RAY_ADDRESS, else of this machine (extra `ray`; docs/cluster.md)."),
-]
+Workers = Annotated[int | None, of_option("workers")]
+Cluster = Annotated[Literal["ray"] | None, of_option("cluster")]
 Gains = Annotated[
     str | None,
     _flag(
@@ -104,31 +153,11 @@ GainSets = Annotated[
         metavar="NAME|FILE [NAME|FILE ...]",
     ),
 ]
-Engine = Annotated[
-    Literal["sapien", "mujoco"],
-    _flag("Physics engine; mujoco is several times as fast, and its contacts differ."),
-]
-Engines = Annotated[
-    tuple[Literal["sapien", "mujoco"], ...],
-    _flag("Physics engines, one or both."),
-]
-Physics = Annotated[
-    Literal["accurate", "fast", "free"],
-    _flag("Solver settings: SAPIEN's, fewer iterations, or one, for motion without contact."),
-]
-Collisions = Annotated[bool, _flag("Robots have no collision shapes: faster, for free motion only.")]
-Compensate = Annotated[
-    Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"],
-    _flag("Passive force and known friction, added at every sim step."),
-]
-Backend = Annotated[Literal["numpy", "jax"], _flag("Library of the law: NumPy, or JAX, as one program with the steps.")]
+Engine = Annotated[EngineName, of_option("engine")]
+Engines = Annotated[tuple[EngineName, ...], _flag("Physics engines, one or both.")]
+Physics = Annotated[PhysicsPreset, of_option("physics")]
+Compensate = Annotated[Compensation, of_option("compensate")]
 Seconds = Annotated[float, _flag("Simulated time [s].")]
-Ground = Annotated[
-    Literal["on", "off"] | None,
-    _flag(
-        "Ground at height 0. Default: on, unless links of a fixed robot reach it at the start pose.", metavar="on|off"
-    ),
-]
 Spread = Annotated[float, _flag("Largest distance of a start pose from that of env 0 [rad or m].")]
 Json = Annotated[Path | None, _flag("Figures to write: .json.", metavar="FILE")]
 Fps = Annotated[float, _flag("Frames per second.")]

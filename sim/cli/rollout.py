@@ -17,7 +17,7 @@ from batchpid.sim import OperationalSpace, Recorder, Robot, write_recording
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, waiting, write_figures
 from batchpid.sim.recording.recording_files import HDF5
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE
+from batchpid.sim.runner_keywords import checked_option
 from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tool_space.tool_setpoints import default_goal
 from batchpid.sim.tuning.gain_sets import gain_set
@@ -25,6 +25,8 @@ from batchpid.task_space import load_osc_options
 
 if TYPE_CHECKING:
     from batchpid.sim.identification.setpoint_files import Setpoints
+
+RUNNER = flags.runner_flags()
 
 
 @dataclass(frozen=True)
@@ -62,17 +64,10 @@ class RolloutCommand:
     spread: float = 0.3
     """Largest distance of a start pose from the robot's own, with --control osc from the bundled robot's target, with
     --trajectory from its first row at time 0 [rad or m]; env 0 starts at that itself."""
-    compensate: flags.Compensate = "gravity+coriolis+friction"
-    engine: flags.Engine = DEFAULT_ENGINE
-    physics: flags.Physics = "accurate"
-    backend: flags.Backend = "numpy"
-    collisions: flags.Collisions = True
-    ground: flags.Ground = None
+    runner: Annotated[flags.RunnerFlags, flags.group(RUNNER)] = field(default_factory=RUNNER)
     dissipation: Literal["urdf", "sapien"] = "urdf"
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""
     randomize: flags.Randomize = None
-    workers: flags.Workers = None
-    cluster: flags.Cluster = None
     actuators: flags.Actuators = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
@@ -142,8 +137,9 @@ class RolloutCommand:
                 self.num_envs,
                 params=params,
                 control=control,
-                **flags.chosen(self, "tool workers cluster timestep compensate engine physics backend"),
-                **flags.chosen(self, "collisions ground"),
+                tool=self.tool,
+                timestep=self.timestep,
+                **self.runner.options(),
                 substeps=self.substeps if setpoints is None else setpoints.substeps,
                 randomization=randomization,
             )
@@ -181,7 +177,7 @@ class RolloutCommand:
             if is_given:
                 remedy = "leave one of them out; a trajectory has joint setpoints, and lasts as long as its file"
                 raise InvalidArgumentError("trajectory", f"excludes {name}", remedy=remedy)
-        setpoints = read_setpoints(robot, path, number("timestep", self.timestep, 1e-6, 0.1, "seconds"))
+        setpoints = read_setpoints(robot, path, checked_option("timestep", self.timestep))
         if self.substeps not in (RolloutCommand.substeps, setpoints.substeps):
             problem, remedy = f"differs from the ticks of {path}", f"leave it out, or use {setpoints.substeps}"
             raise InvalidArgumentError("substeps", problem, value=self.substeps, remedy=remedy)

@@ -32,6 +32,8 @@ GENERATIONS, GENERATIONS_WITHIN = 10, 4
 SUFFIXES = ".yaml", ".yml", ".json"
 """Formats of a params file."""
 
+RUNNER = flags.runner_flags(*flags.SCENE_FLAGS)
+
 
 @dataclass(frozen=True)
 class TuneCommand:
@@ -65,9 +67,7 @@ class TuneCommand:
     friction: flags.Friction = 0.1
     engine: Annotated[Literal["sapien", "mujoco"] | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """Default: sapien; mujoco with --within, where it is installed."""
-    physics: flags.Physics = "accurate"
-    collisions: flags.Collisions = True
-    ground: flags.Ground = None
+    runner: Annotated[flags.RunnerFlags, flags.group(RUNNER)] = field(default_factory=RUNNER)
     workers: flags.Workers = None
     cluster: flags.Cluster = None
     time_limit: flags.TimeLimit = None
@@ -124,14 +124,14 @@ class TuneCommand:
             motors=None if drawn is None else drawn.actuators,
             progress=bar("tuning", unit="generation"),
             **flags.chosen(self, "seed generations population gain_units per_joint weights time_limit"),
-            **flags.chosen(self, "workers cluster engine physics collisions ground"),
+            **flags.chosen(self, "workers cluster engine") | self.runner.options(),
         )
         print(
             f"{robot.name}: cost {found.start_cost:.4f} as designed, {found.cost:.4f} as tuned; weight of the settling "
             f"time {self.weights.settling:g}, of the following error {self.weights.following:g}\n"
         )
         sets = GainSet("designed", found.start_params), GainSet("tuned", found.params)
-        options = flags.chosen(self, "seed workers cluster physics collisions ground")
+        options = flags.chosen(self, "seed workers cluster") | self.runner.options()
         evaluations = evaluate_sets(
             robot, sets, moves=20, randomization=randomization, engines=(self.engine or DEFAULT_ENGINE,), **options
         )
@@ -191,7 +191,7 @@ class TuneCommand:
         from batchpid.sim.tuning.moves import random_moves, tutorial_move
 
         moves = tutorial_move(robot) + random_moves(robot, MOVES_WITHIN, self.seed + 1)
-        options = flags.chosen(self, "workers cluster engine physics collisions ground")
+        options = flags.chosen(self, "workers cluster engine") | self.runner.options()
         found = within(robot, sets[1].params, drawn.actuators, moves, **options)
         designed = None
         if rejected or not found.holds:
@@ -224,7 +224,7 @@ class TuneCommand:
             history=history,
             progress=bar("tuning", unit="generation"),
             **flags.chosen(self, "seed generations population weights time_limit"),
-            **flags.chosen(self, "workers engine physics collisions ground"),
+            **flags.chosen(self, "workers engine") | self.runner.options(),
         )
         tool, (before, after) = found.settings["tool"], found.costs
         print(f"{robot.name}, {tool}: cost {before:.4f} by default, {after:.4f} as tuned\n")
@@ -244,9 +244,10 @@ class TuneCommand:
         if self.control == "osc":
             words += ["--control", "osc", *([] if self.tool is None else ["--tool", self.tool])]
         defaults = {each.name: each.default for each in fields(self)} | {"engine": DEFAULT_ENGINE}
-        for name in ("randomize", "engine", "physics", "collisions", "ground", "cluster", "actuators"):
+        for name in ("randomize", "engine", "cluster", "actuators"):
             if (value := getattr(self, name)) != defaults[name]:
-                words += [f"--no-{name}"] if value is False else [f"--{name}", str(value)]
+                words += [f"--{name}", str(value)]
+        words += self.runner.words()
         if self.meshes.missing_meshes != "skip":
             words += ["--missing-meshes", self.meshes.missing_meshes]
         if self.meshes.package_dirs:

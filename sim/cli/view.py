@@ -7,19 +7,20 @@ import sys
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import gain_set
 
 if TYPE_CHECKING:
     from batchpid.sim.view import LiveSimulation, Playback
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+RUNNER = flags.runner_flags("compensate", "engine", "physics", "ground", "workers")
 
 
 @dataclass(frozen=True)
@@ -38,12 +39,8 @@ class ViewCommand:
     tool: flags.OptionalName = None
     """With --control osc: link of the tool. Default: the last link of the robot's longest chain."""
     gains: flags.Gains = None
-    compensate: flags.Compensate = "gravity+coriolis+friction"
-    engine: flags.Engine = DEFAULT_ENGINE
-    physics: flags.Physics = "accurate"
     spread: flags.Spread = 0.2
-    ground: flags.Ground = None
-    workers: flags.Workers = None
+    runner: Annotated[flags.RunnerFlags, flags.group(RUNNER)] = field(default_factory=RUNNER)
     actuators: flags.Actuators = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     play: flags.OptionalPath = None
@@ -95,7 +92,8 @@ class ViewCommand:
             controls=self.control,
             tool=self.tool,
             period=1 / self.fps,
-            **flags.chosen(self, "compensate engine physics spread ground workers"),
+            spread=self.spread,
+            **self.runner.options(),
             params=gains and gains.params,
         )
         if robot.settings is not None and live.command is None:

@@ -160,7 +160,7 @@ def description_tree(spec: SceneSpec) -> RigidTree:
 
 
 def contacts_of(spec: SceneSpec, ground: bool) -> Contacts:
-    """Return the contacts of the robot of ``spec``, even without ``collisions``; ``ground`` is at height 0."""
+    """Return the contacts of the robot of ``spec``, even of one without shapes there; ``ground`` is at height 0."""
     ignored = {frozenset(pair) for pair in spec.ignored}
     return Contacts(description_tree(spec), link_shapes(spec.urdf, spec.merge_fixed), ignored, ground)
 

@@ -26,9 +26,9 @@ from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import LARGEST
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner import Runner
-from batchpid.sim.runner_keywords import RunnerKeywords
+from batchpid.sim.runner_keywords import OPTIONS, checked_option
 
-RUNNER_OPTIONS = tuple({"params", *RunnerKeywords.__annotations__} - {"substeps"})
+RUNNER_OPTIONS = tuple(OPTIONS.keys() - {"robot", "num_envs", "substeps"})
 """Options of the runner, without ``substeps``, which follow from ``rate_hz``."""
 
 
@@ -110,7 +110,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         name = type(self).__name__
         check_keywords(name, options, arguments_of(type(self)))
         self.robot = robot if isinstance(robot, Robot) else Robot.load(robot)
-        self.num_envs = integer("num_envs", num_envs, 1, 1_000_000)
+        self.num_envs = checked_option("num_envs", num_envs)
         self.terminate_on_success = flag("terminate_on_success", terminate_on_success)
         self.max_episode_steps = (
             None if max_episode_steps is None else integer("max_episode_steps", max_episode_steps, 1, 10**9)
@@ -118,7 +118,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         modes = {mode.value: mode for mode in AutoresetMode}
         mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         self.autoreset_mode = modes[choice("autoreset_mode", mode, modes)]
-        timestep = number("timestep", options.get("timestep", RunnerOptions.timestep), 1e-6, 0.1, "seconds")
+        timestep = checked_option("timestep", options.get("timestep", RunnerOptions.timestep))
         substeps = round(1 / (number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second") * timestep))
         self.step_seconds = substeps * timestep
         own = dict(self.runner_options())

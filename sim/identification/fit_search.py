@@ -26,7 +26,7 @@ from batchpid.sim.tuning.history import HistoryFile
 
 NEIGHBOURS, NEIGHBOUR_EVALUATIONS = 6, 8
 """Most fits at other delays, and most evaluations of each."""
-EXTRA_EVALUATIONS = 12
+EXTRA_EVALUATIONS = 25
 """Most evaluations of a fit with further unknowns."""
 ACCEPTED = 0.99
 """Largest error on the held-out part with further unknowns that are kept, over the error without."""

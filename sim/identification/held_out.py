@@ -13,7 +13,7 @@ import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
-from batchpid.motors.actuator_fields import FIELDS
+from batchpid.motors.actuators import FIELDS
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.problem import Problem

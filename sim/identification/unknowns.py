@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
-from batchpid.motors.actuator_fields import FIELDS
-from batchpid.motors.actuators import Actuators
+from batchpid.motors.actuators import FIELDS, Actuators
 
 Motors = dict[str, Float64]
 """Values of n candidates by kind of unknown: (n, joints), or (n, 1) for a value that all joints share."""

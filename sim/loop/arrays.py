@@ -49,7 +49,7 @@ class FaultArrays(NamedTuple):
 
     Where the cause is one of :data:`batchpid.sim.loop.faults.COMMAND_CAUSES`, ``joint`` is the entry of the command.
 
-    Without collisions, ``missed_contact`` is the sim step of its first missed contact (0: none).
+    ``missed_contact`` is the sim step of its first missed contact (0: none).
     """
 
     step: NDArray[np.int64]

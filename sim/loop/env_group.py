@@ -74,8 +74,8 @@ class EnvGroup:
         observed = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
         self._observes_natively = observed and not self._sensed and self._pushes is None
         self._steps = 0
-        collides, ground = options.collisions, options.robot.has_ground
-        self._contacts = None if collides else MissedContacts(pack.spec, pack.size, ground)
+        missed = MissedContacts(pack.spec, pack.size, options.robot.has_ground) if options.misses_contacts else None
+        self._contacts = missed
         qpos = pack.read_qpos()
         self._state = StepState(bp.init(params, qpos) if controller is None else controller.init(pack.size))
         self._prepare()

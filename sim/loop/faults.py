@@ -134,7 +134,7 @@ class FaultContainment:
     step, joint, cause
         Last fault of each env (M,): sim step (-1: none), joint, and index into :data:`CAUSES`.
     missed_contact
-        Sim step of the first missed contact of each env since its reset (M,); 0: none, as with collisions.
+        Sim step of the first missed contact of each env since its reset (M,); 0: none.
     """
 
     _STATE = (

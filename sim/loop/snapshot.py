@@ -12,7 +12,7 @@ import json
 import os
 import reprlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ from batchpid.motors.guard import GuardState
 from batchpid.sim.loop.faults import CAUSES, COMMAND_CAUSES, ORIGIN, FaultContainment
 from batchpid.sim.loop.pushes import COUNTS
 from batchpid.sim.observation import observed_by_loop, untouched
+from batchpid.sim.runner_keywords import OPTIONS, RunnerKeywords
 
 EPISODE = "episode"
 """Name of the resets of each env with actuators (envs,)."""
@@ -252,7 +253,9 @@ class Snapshot:
         if head["format"] not in (_FORMAT, _AT_ORIGIN, _WITH_ISOLATION):
             raise ValueError(f"format {head['format']}, not {_FORMAT}")
         about, steps, choices = head["about"], head["steps"], head["markers"]
-        about.setdefault("first_env", 0)  # written before there was this option
+        for each in fields(RunnerKeywords):  # written before there was this option, which then had its default
+            if each.default is not MISSING and OPTIONS[each.name].kept.get("snapshot") == "":
+                about.setdefault(each.name, each.default)
         num_envs = integer("num_envs", about["num_envs"], 1, 2**31)
         dof, steps = len(names("joints", about["joints"])), integer("steps", steps, 0, 2**62)
         if head["format"] == _WITH_ISOLATION and about["engine"] == "sapien":
@@ -267,7 +270,7 @@ class Snapshot:
         ):
             raise ValueError(f"its episodes are not counts (envs, 2) of {num_envs} envs")
         targets = tables.pop("targets", None)
-        if (targets is None) != (about.get("setpoint_space", "joints") == "joints"):
+        if (targets is None) != (about["setpoint_space"] == "joints"):
             raise ValueError("its targets do not fit its setpoint_space")
         if targets is not None and (targets.shape != (num_envs, dof) or not np.isfinite(targets).all()):
             raise ValueError(f"its targets are not positions of {num_envs} envs of {dof} joints")

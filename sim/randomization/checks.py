@@ -11,9 +11,9 @@ from batchpid.arrays.array_types import Rows
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN
-from batchpid.motors.actuator_fields import FIELDS, TABLE
-from batchpid.sim.randomization.fields import EVENTS, PHYSICAL, START, Field, elements, nominal_values, parts
-from batchpid.sim.randomization.randomization import Randomization
+from batchpid.motors.actuators import FIELDS, TABLE
+from batchpid.sim.randomization.fields import Field, elements, nominal_values, parts
+from batchpid.sim.randomization.randomization import EVENTS, PHYSICAL, START, Randomization
 from batchpid.sim.robot.robot import Robot
 
 _HUGE = 1e300
@@ -121,11 +121,12 @@ def prepared_actuators(
 
 def _check_range(name: str, each: Field, robot: Robot) -> None:
     """Check the results of the least and the largest draws."""
-    columns, nominal, (_, _, lowest, strict, _) = elements(name, robot), nominal_values(name, robot), PHYSICAL[name]
+    columns, nominal, bounds = elements(name, robot), nominal_values(name, robot), PHYSICAL[name]
+    strict = bounds.above
     for _, chosen, distribution in parts(name, each, columns):
         if name in ("payload", "center_of_mass") and distribution.operation == "scale":
             raise InvalidArgumentError(name, "is 0, which cannot be scaled", remedy="use operation 'add'")
-        if np.isinf(lowest):
+        if np.isinf(bounds.low):
             continue
         known = nominal[chosen]
         if strict and distribution.operation == "scale":

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.field_tables import Field as Bounds
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.command import TWIST_UNITS
@@ -19,23 +18,6 @@ from batchpid.sim.robot.robot import Robot
 Field = Distribution | Mapping[str, Distribution]
 """Distribution for all joints or links, or one for each of those that are named."""
 
-PHYSICAL = {
-    "payload": Bounds("kg"),
-    "link_mass": Bounds("kg", above=True),
-    "center_of_mass": Bounds("m", low=-np.inf),
-    "friction": Bounds("N m or N"),
-    "damping": Bounds("N m s/rad or N s/m"),
-    "armature": Bounds("kg m^2 or kg"),
-    "ground_friction": Bounds("1"),
-    "gravity": Bounds("m/s^2", low=-np.inf),
-}
-"""Fields that change the simulated robot."""
-MASSES = frozenset({"payload", "link_mass", "center_of_mass"})
-"""Those by which its masses differ from the model."""
-START = {"qpos": Bounds("rad or m", low=-np.inf), "qvel": Bounds("rad/s or m/s", low=-np.inf)}
-"""Fields that change the state at a reset."""
-EVENTS = {"push": Bounds("m/s or rad/s", low=-np.inf), "push_interval": Bounds("s", above=True)}
-"""Fields that change the state during an episode."""
 GROUPS = ("params", "actuators")
 """Fields that are mappings, by name of a further field."""
 
@@ -54,7 +36,7 @@ def elements(name: str, robot: Robot) -> Sequence[str]:
     if name == "center_of_mass":
         return [f"{link}.{axis}" for link in elements("link_mass", robot) for axis in "xyz"]
     if name == "link_mass":
-        return [link.name for link in robot.links if link.mass or (link.mass is None and link.collisions)]
+        return [link.name for link in robot.links if link.mass or (link.mass is None and link.num_shapes)]
     return robot.joint_names
 
 

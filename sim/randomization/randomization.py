@@ -8,25 +8,25 @@ on other envs, fields or earlier episodes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64, Rows
+from batchpid.arrays.field_tables import Field as Bounds
+from batchpid.arrays.field_tables import declared, in_group
 from batchpid.checks.validate import choice, integer, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import JOINT_SIDE
 from batchpid.sim.randomization.distributions import Distribution, Draws, generators
 from batchpid.sim.randomization.fields import (
-    EVENTS,
     GROUPS,
-    PHYSICAL,
     SINGLE,
-    START,
     Field,
     elements,
     mapping,
@@ -60,33 +60,33 @@ class Randomization:
     """Seed of all draws."""
     each: Literal["episode", "env"] = "episode"
     """Draw for each ``"episode"``, when it begins with a reset, or once for each ``"env"``."""
-    payload: Distribution | None = None
+    payload: Annotated[Distribution | None, Bounds("kg", group="robot")] = None
     """Mass at the center of mass of ``payload_link`` [kg]; nominal 0."""
     payload_link: str | None = None
     """Link that carries the payload; default the last before the fingers."""
-    link_mass: Field | None = None
+    link_mass: Annotated[Field | None, Bounds("kg", above=True, group="robot")] = None
     """Masses of the links of the URDF [kg]; their inertia tensors change in proportion."""
-    center_of_mass: Field | None = None
+    center_of_mass: Annotated[Field | None, Bounds("m", low=-math.inf, group="robot")] = None
     """Displacement of the centers of mass of the links, along each of the three axes of the link [m]; nominal 0."""
-    friction: Field | None = None
+    friction: Annotated[Field | None, Bounds("N m or N", group="robot")] = None
     """Coulomb friction of the joints [N m or N]; nominal as in the URDF."""
-    damping: Field | None = None
+    damping: Annotated[Field | None, Bounds("N m s/rad or N s/m", group="robot")] = None
     """Viscous damping of the joints [N m s/rad or N s/m]; nominal as in the URDF."""
-    armature: Field | None = None
+    armature: Annotated[Field | None, Bounds("kg m^2 or kg", group="robot")] = None
     """Reflected inertia of the motors [kg m^2 or kg]; nominal 0."""
-    qpos: Field | None = None
+    qpos: Annotated[Field | None, Bounds("rad or m", low=-math.inf, group="start")] = None
     """Position at a reset [rad or m], within the joint limits; nominal the argument of ``reset``."""
-    qvel: Field | None = None
+    qvel: Annotated[Field | None, Bounds("rad/s or m/s", low=-math.inf, group="start")] = None
     """Velocity at a reset [rad/s or m/s]."""
-    ground_friction: Distribution | None = None
+    ground_friction: Annotated[Distribution | None, Bounds("1", group="robot")] = None
     """Coefficient of sliding friction of the ground and of all shapes of the robot; nominal 0.3."""
-    gravity: Field | None = None
+    gravity: Annotated[Field | None, Bounds("m/s^2", low=-math.inf, group="robot")] = None
     """Gravity along the axes x, y and z of the world [m/s^2]; nominal 0, 0 and -9.81. The compensation has the nominal
     one."""
-    push: Field | None = None
+    push: Annotated[Field | None, Bounds("m/s or rad/s", low=-math.inf, group="event")] = None
     """Velocity change of a floating base, along the axes of the world: vx, vy, vz [m/s], wx, wy, wz [rad/s]; nominal
     0. Pushes come at the beginning of the first tick after each ``push_interval``."""
-    push_interval: Distribution | None = None
+    push_interval: Annotated[Distribution | None, Bounds("s", above=True, group="event")] = None
     """Time from the reset to the first push, and from each to the next [s]."""
     params: Mapping[str, Field] = field(default_factory=dict)
     """Fields of :class:`batchpid.PIDParams` that the runner's params have, e.g. ``{"kp": ...}``."""
@@ -269,3 +269,12 @@ class Randomization:
             given = mapping(group, values.get(group, {}))
             values[group] = {name: read_field(f"{group}.{name}", value) for name, value in given.items()}
         return cls(**values)
+
+
+FIELDS = declared(Randomization, Bounds)
+PHYSICAL = in_group(FIELDS, "robot")
+"""Fields that change the simulated robot."""
+START = in_group(FIELDS, "start")
+"""Fields that change the state at a reset."""
+EVENTS = in_group(FIELDS, "event")
+"""Fields that change the state during an episode."""

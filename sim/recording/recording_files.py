@@ -15,14 +15,16 @@ import os
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, fields, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.array_types import Document, Kind, Rows
 from batchpid.checks.validate import file_path, instance, integer
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.io.files import read_npz, write_atomically
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 FORMAT = "batchpid-recording-1"
 HDF5 = (".h5", ".hdf5")
 _DRAW = "draw."  # in front of the names of draws
+_TEXTS = ("versions", "randomization", "sweep", "options")  # mappings, as JSON
 _COMMAND_NAMES, _COMMAND_UNITS = "command_names", "command_units"
 CHUNK_BYTES = 1 << 18  # approximate size of a chunk of an .h5 file
 DTYPES: Document = {"time": np.float64} | {name: quantity.dtype for name, quantity in RECORDED.items()}
@@ -220,7 +223,7 @@ def row_checksums(arrays: Mapping[str, Rows]) -> NDArray[np.int64]:
     return sums
 
 
-def attribute_checksum(attributes: Mapping[str, Any]) -> int:
+def attribute_checksum(attributes: Document) -> int:
     """Return the CRC-32 of all ``attributes`` but the checksum."""
     values = {name: np.asarray(value).tolist() for name, value in attributes.items() if name != "checksum"}
     return zlib.crc32(json.dumps(values, sort_keys=True).encode())
@@ -247,7 +250,7 @@ def _attributes(info: RunInfo, num_envs: int, tick: float) -> Document:
         known["params"] = bp.dumps_params(info.params, info.joint_names, format="json")
     if info.actuators is not None:
         known["actuators"] = bp.motors.dumps_actuators(info.actuators, info.joint_names, format="json")
-    for name in ("versions", "randomization", "sweep"):
+    for name in _TEXTS:
         if name in known:
             known[name] = json.dumps(dict(known[name]))
     known["redraws"] = redraws_text(info.redraws)
@@ -256,7 +259,7 @@ def _attributes(info: RunInfo, num_envs: int, tick: float) -> Document:
     return known | {"checksum": attribute_checksum(known)}
 
 
-def _info(attributes: Mapping[str, Any]) -> RunInfo:
+def _info(attributes: Document) -> RunInfo:
     """Return the :class:`RunInfo` in the attributes of a recording."""
     if (found := str(attributes.get("format", FORMAT))) != FORMAT:
         raise ValueError(f"its format is {found!r}, not {FORMAT!r}")
@@ -270,21 +273,14 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
     if "checksum" in attributes and attributes["checksum"] != attribute_checksum(attributes):
         raise ValueError("its attributes are damaged: the checksum differs")
     names = tuple(map(str, known["joint_names"]))
-    texts = ("robot", "urdf", "dissipation", "control", "tool", "compensate", "engine", "physics", "begun")
-    decode: dict[str, Callable[[Any], Any]] = {
-        **dict.fromkeys(texts, str),
-        **dict.fromkeys(("joint_names", "units", "contacts", "wrenches"), lambda value: tuple(map(str, value))),
-        **dict.fromkeys(("lower", "upper", "effort_limit", "start", "episodes"), _numbers),
-        "timestep": float,
-        "substeps": int,
-        **dict.fromkeys(("complete", "merge_fixed", "fixed_base", "collisions", "ground", "rates"), bool),
+    readers: dict[str, Callable[[Any], Any]] = {
         "params": lambda text: bp.loads_params(str(text), names)[0],
         "actuators": lambda text: bp.motors.loads_actuators(str(text), names)[0],
         "seed": lambda value: None if str(value) == "none" else int(value),
-        **dict.fromkeys(("versions", "randomization", "sweep"), lambda text: dict(json.loads(str(text)))),
         "redraws": lambda text: tuple(Redraw(*redraw) for redraw in json.loads(str(text))),
         "faults": lambda text: tuple(Fault(**fault) for fault in json.loads(str(text))),
     }
+    kinds = get_type_hints(RunInfo)
     for name in ("units", "lower", "upper", "effort_limit"):
         if np.shape(known[name]) != (len(names),):
             raise ValueError(f"its {name} are {np.shape(known[name])}, not one for each of {len(names)} joints")
@@ -293,10 +289,21 @@ def _info(attributes: Mapping[str, Any]) -> RunInfo:
     if _COMMAND_NAMES in attributes:
         command = CommandSpec(attributes[_COMMAND_NAMES].tolist(), attributes[_COMMAND_UNITS].tolist())
     return RunInfo(
-        **{name: decode[name](value) for name, value in known.items()},
+        **{name: readers.get(name, partial(_plain, kinds[name]))(value) for name, value in known.items()},
         draws=draws or None,
         own_command=command,
     )
+
+
+def _plain(kind: Kind, value: Rows) -> Any:
+    """Return a value of a field of :class:`RunInfo` of this type: a text, number, bool, array, names, or a mapping."""
+    if isinstance(kind, UnionType):
+        kind = next(each for each in get_args(kind) if each is not NoneType)
+    if kind in (str, float, int, bool):
+        return kind(value)
+    if get_origin(kind) is Mapping:
+        return dict(json.loads(str(value)))
+    return tuple(map(str, value)) if kind == tuple[str, ...] else _numbers(value)
 
 
 def _numbers(value: Rows) -> Rows:

@@ -122,7 +122,7 @@ class RobotDescription(Urdf):
 
     def __repr__(self) -> str:
         given = sum(link.mass or 0.0 for link in self.links)
-        shaped = sum(not link.inertial and link.collisions > 0 for link in self.links)
+        shaped = sum(not link.inertial and link.num_shapes > 0 for link in self.links)
         masses = [f"{given:.4g} kg"] * (given > 0 or not shaped) + [f"{shaped} links with the mass of shapes"] * (
             shaped > 0
         )

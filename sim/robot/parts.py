@@ -73,7 +73,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Link:
-    """Link of a URDF: its mass [kg] (None without ``<inertial>``) and number of collision shapes.
+    """Link of a URDF: its mass [kg] (None without ``<inertial>``) and ``num_shapes`` that collide.
 
     ``inertial`` is True if SAPIEN takes mass and inertia from the URDF. ``triangle_excess`` is positive if no body has
     that inertia tensor: see :func:`batchpid.sim.robot.link_repair.triangle_excess`.
@@ -81,7 +81,7 @@ class Link:
 
     name: str
     mass: float | None
-    collisions: int
+    num_shapes: int
     inertial: bool
     triangle_excess: float = 0.0
 

@@ -68,7 +68,7 @@ def check(
 def _links(robot: RobotDescription) -> Iterator[Finding]:
     carriers = {joint.child_link: joint for joint in robot.all_joints}
     bodies = {link.name: robot.bodies[link.name].link for link in robot.links}
-    solid = {bodies[link.name] for link in robot.links if link.inertial or link.collisions}
+    solid = {bodies[link.name] for link in robot.links if link.inertial or link.num_shapes}
     loaded = set(solid)  # bodies with mass in them or in the links that they carry
     for joint in reversed(robot.all_joints):
         if bodies[joint.child_link] in loaded:
@@ -80,10 +80,10 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
             yield Finding("note", "inertia", text, "correct <inertia>", link=link.name, detail=detail)
         if link.inertial or (robot.fixed_base and bodies[link.name] not in carriers):
             continue
-        if not link.collisions and (link.name != bodies[link.name] or link.name in solid):
+        if not link.num_shapes and (link.name != bodies[link.name] or link.name in solid):
             continue  # adds nothing to its body
         fixed = link.name in carriers and not carriers[link.name].moves
-        if link.collisions:
+        if link.num_shapes:
             effect = f"mass and inertia are those of the collision shapes, at {DENSITY:g} kg/m^3"
         elif fixed:
             effect = "it becomes a link of 1e-6 kg, which costs time in every step"
@@ -91,9 +91,9 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
             effect = "it becomes a link of 1e-6 kg; only the links that it carries have mass"
         else:
             effect = "it becomes a link of 1e-6 kg, without load: gains per unit of effort cannot control it"
-        light = not link.collisions and bodies[link.name] in loaded
+        light = not link.num_shapes and bodies[link.name] in loaded
         severity, text = "note" if fixed or light else "warning", f"no <inertial>: {effect}"
-        detail = f"{robot.link_masses[link.name].mass:.3g} kg" if link.collisions else ""
+        detail = f"{robot.link_masses[link.name].mass:.3g} kg" if link.num_shapes else ""
         yield Finding(
             severity, "no-inertia", text, "add <inertial> with mass and inertia", link=link.name, detail=detail
         )

@@ -119,7 +119,7 @@ def self_contact(robot: Any) -> SelfContact:
 
     Deterministic: the poses are seeded. Raises RobotError for a mesh that cannot be read.
     """
-    solid = [link.name for link in robot.links if link.collisions]
+    solid = [link.name for link in robot.links if link.num_shapes]
     bodies = _rigid_bodies(robot.all_joints)
     shapes, tree = link_shapes(robot.urdf, robot.merge_fixed), robot.simulated_tree
     contacts = Contacts(tree, shapes, frozenset(), ground=False)

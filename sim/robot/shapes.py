@@ -64,7 +64,7 @@ def surfaces(
         for material in original.iter("material")
         if material.find("color") is not None
     }
-    collisions = {link.get("name"): link.findall("collision") for link in sanitised.findall("link")}
+    solid = {link.get("name"): link.findall("collision") for link in sanitised.findall("link")}
     result = []
     undrawn = {link.name for link in robot.links}
     for link in original.findall("link"):
@@ -75,7 +75,7 @@ def surfaces(
         where = f"{robot.path}: link {name!r}"
         parts: dict[Rgba, list[Any]] = {}
         unreadable: list[_UnreadableMesh] = []
-        for elements in (link.findall("visual"), collisions.get(name, [])):
+        for elements in (link.findall("visual"), solid.get(name, [])):
             try:
                 meshes = [_mesh(element, robot, deviation, where) for element in elements]
             except _UnreadableMesh as error:

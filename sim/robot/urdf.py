@@ -182,14 +182,14 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
 def _read_link(element: etree._Element, path: Path) -> Link:
     """Return a repaired link."""
     name, inertial = element.get("name", ""), element.find("inertial")
-    where, collisions = f"{path}: link {name!r}", element.findall("collision")
-    for part in [each for each in (inertial, *collisions) if each is not None]:
+    where, shapes = f"{path}: link {name!r}", element.findall("collision")
+    for part in [each for each in (inertial, *shapes) if each is not None]:
         _origin(part, where)
     if inertial is None:
-        return Link(name, None, len(collisions), False)
+        return Link(name, None, len(shapes), False)
     mass, inertia = inertial.find("mass"), inertial.find("inertia")
     excess = triangle_excess(from_entries([number(inertia, key, "0", where) for key in MOMENTS]))
-    return Link(name, number(mass, "value", "0", where), len(collisions), True, excess)
+    return Link(name, number(mass, "value", "0", where), len(shapes), True, excess)
 
 
 def _origin(element: etree._Element, where: str) -> dict[str, tuple[float, ...]]:

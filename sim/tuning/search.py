@@ -97,7 +97,7 @@ def tune(
         robots with actuators or a randomization, the search uses the tutorial's move and VARIED_MOVES random ones
         (with drawn ``motors`` DRAWN_MOVES),
         because the hardest moves within the effort limits of the model are too hard for such robots. Given moves
-        replace them, with collisions, since they may touch something. There is then no final round.
+        replace them, with contacts, since they may touch something. There is then no final round.
     randomization
         The robot of each move is drawn from it, the same for all candidates. None: the robot as described.
     motors

@@ -22,17 +22,18 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.digest import digest
-from batchpid.checks.validate import array, file_path, integer, read_array
+from batchpid.checks.validate import array, check_keywords, file_path, integer, read_array
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.sim.loop.faults import FaultWarning
 from batchpid.sim.observation import Observation, Rollout
-from batchpid.sim.options import RunnerOptions, default_params
+from batchpid.sim.options import RunnerOptions
 from batchpid.sim.recording.recording_files import HDF5, load_h5py, read_recording, write_recording
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.run_checks import SetpointCheck, SetpointWarning
 from batchpid.sim.runner import Runner
+from batchpid.sim.runner_keywords import OPTIONS, checked_option
 from batchpid.sim.tuning.history import REMEDY, other_inputs
 from batchpid.sim.workers.contact_log import MissedContactWarning
 
@@ -93,14 +94,14 @@ def sweep(
     """
     path, part = file_path("path", path, HDF5), integer("part", part, 1, 1_000_000)
     load_h5py()  # raises without it, before anything runs
-    num_envs = integer("num_envs", num_envs, 1, 1_000_000)
-    first = integer("first_env", options.get("first_env", 0), 0, 10**9)
+    num_envs = checked_option("num_envs", num_envs)
+    first = checked_option("first_env", options.get("first_env", 0))
     numbers = first + np.arange(num_envs)
     given: Document = {"params": params, "qpos": qpos, "qvel": qvel, "seed": seed, **options}
     given |= {name: given[name](numbers) for name in PER_ENV if callable(given.get(name))}
-    gains, *start, streams = (given.pop(name) for name in PER_ENV[:4])
+    start, streams = [given.pop(name) for name in ("qpos", "qvel")], given.pop("seed")
+    check_keywords("Runner", given, OPTIONS)
     checked = RunnerOptions(robot, num_envs, **given)
-    gains = checked.check_params(default_params(robot, checked.control, checked.loops) if gains is None else gains)
     is_finite, shape = checked.on_invalid_input == "raise", (num_envs, robot.dof)
     if start[0] is None:
         start[0] = robot.start
@@ -118,7 +119,8 @@ def sweep(
         **{name: getattr(checked, name) for name in ("substeps", "checkpoint_steps", "on_invalid_input")},
         **{name: digest(rows) for name, rows in command.items()},
         **{
-            name: digest(rows) for name, rows in zip(PER_ENV, (gains, *start, streams, checked.actuators), strict=False)
+            name: digest(rows)
+            for name, rows in zip(PER_ENV, (checked.params, *start, streams, checked.actuators), strict=False)
         },
         "versions": package_versions(("batchpid", checked.engine, "numpy", *jax)),
     }
@@ -138,7 +140,7 @@ def sweep(
     for envs in (progress or iter)(spans := _spans(num_envs, part, done)):
         if envs.start not in done:
             own = {name: _rows(given[name], envs) for name in PER_ENV[4:] if name in given}
-            known = given | own | {"params": _rows(gains, envs), "first_env": first + envs.start}
+            known = given | own | {"params": _rows(checked.params, envs), "first_env": first + envs.start}
             with warnings.catch_warnings(), Runner(robot, envs.stop - envs.start, **known) as runner:
                 for kind in (FaultWarning, MissedContactWarning, SetpointWarning):  # they count from the part's first
                     warnings.simplefilter("ignore", kind)
@@ -148,7 +150,7 @@ def sweep(
             _warn(MissedContactWarning, runner.missed_contacts, envs)
             done[envs.start] = replace(rollout, info=replace(rollout.info, sweep=inputs))
             write_recording(done[envs.start], folder / f"{envs.start}.h5", overwrite=True)
-    whole = _joined([done[envs.start] for envs in spans], gains, checked.actuators)
+    whole = _joined([done[envs.start] for envs in spans], checked.params, checked.actuators)
     write_recording(whole, path)
     shutil.rmtree(folder, ignore_errors=True)
     return whole

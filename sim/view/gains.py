@@ -105,7 +105,7 @@ def offered_gains(robot: Robot, control: ControlMode, params: bp.PIDParams | Non
     """
     if control == "drive":
         return {"designed" if robot.settings is None else "tutorial": default_params(robot, control)}
-    sets = {} if params is None else {"given": RunnerOptions(robot, 1).check_params(params)}
+    sets = {} if params is None else {"given": RunnerOptions(robot, 1, params=params).params}
     for name, make in (("tuned", robot.tuned), ("designed", robot.designed), ("tutorial", robot.params)):
         with suppress(InvalidArgumentError):  # not every robot has them
             sets[name] = make()

@@ -186,10 +186,10 @@ class LiveSimulation(SingleOwner):
     def info_of(self, robot: int) -> RunInfo:
         """Return the options of the run of one robot, numbered over all groups."""
         group, runner = robot // self.per_group, self._runners[robot // self.per_group]
-        options = {name: getattr(runner.options, name) for name in ("timestep", "substeps", "collisions", "tool")}
-        control = self.groups[group]
-        params = self.gains[control].params if control in self.gains else None
-        return replace(self._info, control=control, params=params, actuators=runner.options.actuators, **options)
+        known = runner.options.values_for("recording") | {"control": self.groups[group]}
+        gains = self.gains.get(self.groups[group])
+        known |= {"params": gains and gains.params, "actuators": runner.options.actuators}
+        return replace(self._info, **known)
 
     def effort_limits(self, robot: int, joint: int) -> tuple[float, float]:
         """Return the effort limits of a joint [N m or N]."""

@@ -19,7 +19,7 @@ from batchpid import metrics, motors, trajectories
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import FIELDS as LAW_FIELDS
 from batchpid.motors import friction, guard
-from batchpid.motors.actuator_fields import FIELDS as MOTOR_FIELDS
+from batchpid.motors.actuators import FIELDS as MOTOR_FIELDS
 from batchpid.task_space import osc_params
 
 NAMES = ["shoulder", "elbow"]
@@ -40,7 +40,7 @@ def refused(argument, function, *arguments, **keywords):
 OPTIONS = [
     *((bp.make_params, {"kp": 1.0, "ki": 1.0}, name, field) for name, field in LAW_FIELDS.items()),
     *((bp.make_actuators, {}, name, field) for name, field in MOTOR_FIELDS.items()),
-    *((bp.make_guard, {}, name, field) for name, field in guard.FIELDS.items() if name not in ("lower", "upper")),
+    *((bp.make_guard, {}, name, field) for name, field in guard.FIELDS.items()),
 ]
 
 NEEDS = {"tracking_time": {"anti_windup": "back_calculation", "effort_limit": 1.0}}
@@ -112,8 +112,8 @@ COMBINATIONS = [
     (bp.make_actuators, "no_load_speed", {"saturation_effort": 10.0}),
     (bp.make_actuators, "saturation_effort", {"no_load_speed": 10.0}),
     (bp.make_actuators, "stribeck", {"stribeck": 0.1, "coulomb": 0.2}),
-    (bp.make_guard, "setpoint_min", {"lower": 1.0, "upper": 0.0}),
-    (bp.make_guard, "setpoint_max", {"upper": math.nan}),
+    (bp.make_guard, "lower", {"lower": 1.0, "upper": 0.0}),
+    (bp.make_guard, "upper", {"upper": math.nan}),
     (ts.make_osc_params, "stiffness", {"stiffness": [1.0, 2.0]}),
     (ts.make_osc_params, "stiffness", {"stiffness": [1, 1, -1, 1, 1, 1]}),
     (ts.make_osc_params, "damping_ratio", {"damping_ratio": math.nan}),

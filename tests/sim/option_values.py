@@ -82,7 +82,9 @@ VALUES = {
 }  # fmt: skip
 """Values of options to try, besides those that their types list."""
 
-TYPES = get_type_hints(RunnerKeywords, localns={"Physics": Physics, "MujocoSolver": MujocoSolver})
+TYPES = get_type_hints(RunnerKeywords)
+DECLARED = {name: hint.__metadata__[-1] for name, hint in get_type_hints(RunnerKeywords, include_extras=True).items()}
+"""Where each option is kept and shown."""
 
 
 def option_values(name):

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import inspect
 import pickle
+import re
 import sys
 from dataclasses import fields
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
+from option_values import DECLARED
 from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import MissingDependencyError
-from batchpid.sim import RunInfo, Runner, RunnerKeywords, RunnerOptions
+from batchpid.sim import RunInfo, Runner, RunnerKeywords, RunnerOptions, read_recording, write_recording
+from batchpid.sim.cli import parse
 from batchpid.sim.engine.protocol import SceneSpec
 
 PANDA = load_bundled("panda")
@@ -23,19 +29,59 @@ GEARED = dataclasses.replace(PANDA, actuators=OWN)
 
 
 def test_every_keyword_is_an_option_and_is_shown_with_its_default():
-    options = {each.name: each.default for each in fields(RunnerOptions)}
+    robot, num_envs, *options = fields(RunnerKeywords)
     shown = inspect.signature(Runner).parameters
-    assert list(options) == ["robot", "num_envs", *RunnerKeywords.__annotations__]
-    assert list(shown) == ["robot", "num_envs", "params", *RunnerKeywords.__annotations__]
-    for name in RunnerKeywords.__annotations__:
-        assert shown[name].kind is inspect.Parameter.KEYWORD_ONLY
-        assert shown[name].default == options[name], name
+    assert list(shown) == [robot.name, num_envs.name, *(each.name for each in options)]
+    for each in options:
+        assert shown[each.name].kind is inspect.Parameter.KEYWORD_ONLY
+        assert shown[each.name].default == each.default, each.name
 
 
 def test_a_missing_jax_is_named_with_its_extra_before_a_worker_starts(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax", None)
     with pytest.raises(MissingDependencyError, match=r"backend='jax' needs the package 'jax'.*batchpid\[jax\]"):
         Runner(PANDA, 1, backend="jax")
+
+
+def test_a_flag_of_an_option_has_its_default_and_reaches_the_runner():
+    given = parse(["rollout"]).runner.options()
+    flags = {each.name: each.default for each in fields(RunnerKeywords) if DECLARED[each.name].flag}
+    assert given == {name: value for name, value in flags.items() if name != "ground"}, "on or off, or neither"
+    words = ["--no-collisions", "--ground", "off", "--workers", "2", "--backend", "jax"]
+    given = parse(["rollout", *words]).runner.options()
+    assert (given["collisions"], given["ground"], given["workers"], given["backend"]) == (False, False, 2, "jax")
+
+
+def test_every_option_is_documented_where_it_is_declared():
+    body = ast.parse(inspect.getsource(RunnerKeywords)).body[0].body
+    pairs = {one.target.id: next_one for one, next_one in pairwise(body) if isinstance(one, ast.AnnAssign)}
+    assert pairs.keys() == {each.name for each in fields(RunnerKeywords)}
+    assert not [name for name, text in pairs.items() if not isinstance(text, ast.Expr)]
+
+
+def test_commands_and_recordings_take_switches_from_their_declaration():
+    """Adding one touches the record, and the place where it acts."""
+    switches = [each.name for each in fields(RunnerKeywords) if isinstance(each.default, bool)]
+    assert {"collisions", "recover"} <= {*switches}
+    root = Path(inspect.getfile(RunnerKeywords)).parent
+    texts = {path.name: path.read_text() for folder in ("cli", "recording") for path in (root / folder).glob("*.py")}
+    assert {"rollout.py", "recording_files.py"} <= texts.keys()
+    named = [(path, name) for path, text in texts.items() for name in switches if re.search(rf"\b{name}\b", text)]
+    assert named == []
+
+
+def test_an_option_without_a_field_in_recordings_is_kept_among_their_options(tmp_path, monkeypatch):
+    annotations = {name: kind for name, kind in RunInfo.__annotations__.items() if name not in ("ground", "tool")}
+    monkeypatch.setattr(RunInfo, "__annotations__", annotations)
+    kept = RunnerOptions(PANDA, 2).values_for("recording")
+    assert kept["options"] == {"ground": PANDA.has_ground, "tool": None}
+    assert "ground" not in kept
+    monkeypatch.undo()
+    with Runner(PANDA, 1, workers=0) as runner:
+        run = runner.rollout(np.tile(PANDA.start, (2, 1)))
+    run = dataclasses.replace(run, info=dataclasses.replace(run.info, options=kept["options"]))
+    for name in ("run.npz", "run.h5"):
+        assert read_recording(write_recording(run, tmp_path / name)).info.options == kept["options"]
 
 
 def test_options_are_plain_values_of_their_documented_type():

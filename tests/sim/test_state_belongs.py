@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from identical import assert_identical
-from option_values import ARM, VALUES, is_slow, option_values
+from option_values import ARM, DECLARED, VALUES, is_slow, option_values
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
@@ -45,7 +45,7 @@ CONTEXTS = [
     {"workers": None, "build": None, "ground": None},
 ]
 """Further options that a value may need."""
-NAMES = [each.name for each in fields(RunnerOptions)] + ["params"]
+NAMES = [each.name for each in fields(RunnerOptions)]
 
 
 def quick(name):
@@ -101,7 +101,7 @@ def changed(ours, theirs):
 def check(ours, theirs, before=None):
     """Check that a snapshot made under ``ours`` is refused, or gives the same, under ``theirs``."""
     snapshot, (expected, ends) = before or went_on(ours)
-    roles = {each.name: each.metadata.get("role") for each in fields(RunnerOptions)} | {"params": "restored"}
+    roles = {each.name: DECLARED[each.name].role for each in fields(RunnerOptions)}
     with made(theirs) as other:
         try:
             other.restore(snapshot)
@@ -138,7 +138,7 @@ def panda():
 
 def test_every_option_is_kept_or_has_a_role_apart():
     for each in fields(RunnerOptions):
-        assert ("snapshot" in each.metadata) != ("role" in each.metadata), each.name
+        assert ("snapshot" in DECLARED[each.name].kept) != (DECLARED[each.name].role is not None), each.name
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -162,7 +162,7 @@ def test_a_snapshot_is_refused_or_goes_on_as_before_under_each_value_of_each_opt
 
 def test_each_option_has_a_value_to_try_besides_its_default():
     """A new option needs a line in VALUES, unless its type lists its values."""
-    default = {each.name: each.default for each in fields(RunnerOptions)} | {"params": None}
+    default = {each.name: each.default for each in fields(RunnerOptions)}
     assert not [name for name in NAMES if {repr(each) for each in option_values(name)} <= {repr(default[name])}]
 
 

@@ -91,7 +91,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
 
 
 def set_ground(scene: MjSpec, ground: bool) -> None:
-    """Switch collisions with the planes of the world on or off. A scene without planes gets one at height 0 for on."""
+    """Switch contacts with the planes of the world on or off. A scene without planes gets one at height 0 for on."""
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     planes = [each for each in scene.worldbody.geoms if each.type == plane and (each.contype or each.conaffinity)]
     if ground and not planes:

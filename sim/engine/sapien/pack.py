@@ -37,7 +37,7 @@ from batchpid.sim.engine.sapien.building import (
 )
 from batchpid.sim.engine.sapien.calls import EngineCalls, SapienStep, engine_calls
 from batchpid.sim.engine.sapien.link_sensors import LinkSensors
-from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, refuse_shapes, write_root
+from batchpid.sim.engine.sapien.user_content import ROOT_SIZE, SceneContent, read_root, write_root
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.task_space.frames import matrix_of
@@ -85,10 +85,9 @@ class Pack(ModelPack):
             with engine_settings(spec):
                 envs = enumerate(self._scenes, start=first_env)
                 frames = [link_frames(spec, robot) for robot in self.robots]
-                self._contents = [SceneContent(spec.build, scene, env, frames[env - first_env]) for env, scene in envs]
-                if not spec.collisions:
-                    for env, scene in enumerate(self._scenes, start=first_env):
-                        refuse_shapes(scene, env)
+                self._contents = [
+                    SceneContent(spec, spec.build, scene, env, frames[env - first_env]) for env, scene in envs
+                ]
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
         coupling, self._joint_qf = coupling_of(spec.joints), self.qf
@@ -176,7 +175,8 @@ class Pack(ModelPack):
         Robots without shapes have no contacts. Scenes with user content stay, because ``build`` is called only once.
         """
         used = [row for row in rows if self._stepped[row]]
-        if used and self.spec.collisions and not self._contents:
+        has_shapes = any(link.collision_shapes for link in self.robots[0].links)
+        if used and has_shapes and not self._contents:
             self._rebuild(used)
 
     def _rebuild(self, rows: Sequence[int]) -> None:

@@ -27,7 +27,7 @@ from sapien.wrapper.articulation_builder import ArticulationBuilder, LinkBuilder
 
 from batchpid.arrays.array_types import Array, SapienScene
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.engine.scene_spec import Build
+from batchpid.sim.engine.scene_spec import Build, SceneSpec
 
 
 class MirroringBuilder(ArticulationBuilder):
@@ -122,9 +122,11 @@ class SceneContent:
     number of values in the state. ``links`` are the links of the scene's robot.
     """
 
-    def __init__(self, build: Build, scene: SapienScene, env: int, links: Frames) -> None:
+    def __init__(self, spec: SceneSpec, build: Build, scene: SapienScene, env: int, links: Frames) -> None:
         before = {entity.per_scene_id for entity in scene.entities}  # the robot and the ground
         self.watched = _call(build, scene, env, links)
+        if not spec.collisions:
+            _refuse_shapes(scene, env)
         self._bodies, self._articulations = [], []
         for entity in scene.entities:
             if entity.per_scene_id in before:
@@ -183,7 +185,7 @@ class SceneContent:
         return np.array(rows, np.float32).reshape(len(rows), 7)
 
 
-def refuse_shapes(scene: SapienScene, env: int) -> None:
+def _refuse_shapes(scene: SapienScene, env: int) -> None:
     """Raise InvalidArgumentError if an entity of ``scene``, which belongs to env ``env``, has a collision shape."""
     for entity in scene.entities:
         for component in entity.components:

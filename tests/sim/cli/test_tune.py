@@ -123,7 +123,7 @@ def test_the_last_line_is_a_command_that_works(batchpid, tmp_path, monkeypatch):
     command = shlex.split(said.splitlines()[-1].removeprefix("next: "))
     assert command[:5] == ["batchpid", "rollout", "my arm.urdf", "--gains", "gains.yaml"]
     again = parse(command[1:])
-    assert (again.physics, again.collisions, again.randomize) == ("fast", False, "payload")
+    assert (again.runner.physics, again.runner.collisions, again.randomize) == ("fast", False, "payload")
     assert again.actuators == Path("motors.yaml")
     status, said, error = batchpid(*command[1:], "--num-envs", 1, "--workers", 0, "--seconds", 0.05)
     assert status == 0, error

@@ -51,7 +51,7 @@ SEARCHES = {
 def inputs(search):
     """Return the names of the inputs of a search."""
     own = [name for name in inspect.signature(search).parameters if name not in ("history", "runner_options")]
-    chosen = {tune: {"params"}, tune_tool: {"params", "control"}}[search]
+    chosen = {tune: {"num_envs", "params"}, tune_tool: {"num_envs", "params", "control"}}[search]
     return [*own, *(name for name in RunnerKeywords.__annotations__ if name not in chosen and name not in own)]
 
 

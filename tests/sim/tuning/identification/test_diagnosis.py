@@ -14,12 +14,30 @@ from batchpid.sim.identification.diagnosis import diagnose
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.regression import best_drive, smooth
 from batchpid.sim.robot.urdf_export import to_urdf
-from tests.sim.tuning.identification.test_identify import ARM, several_joints
+from tests.sim.tuning.identification.test_identify import ARM
 
 pytest.importorskip("scipy")
 pytest.importorskip("mujoco.batch")
 SECONDS, TICK = 5.0, 5
 PUSH = 3.0
+
+
+def six_joints() -> str:
+    """Return the URDF of an arm of six joints, j0 to j5."""
+    parts = ['<robot name="arm6"><link name="l0"/>']
+    sizes = [(4, 0.2, 150), (5, 0.4, 150), (3, 0.35, 100), (1.5, 0.1, 30), (1.2, 0.1, 30), (0.5, 0.08, 15)]
+    above = 0.1
+    for number, (mass, length, effort) in enumerate(sizes):
+        axis = "0 0 1" if number in (0, 4) else "0 1 0"
+        across = mass * (length**2 / 12 + 0.002)
+        tensor = f'ixx="{across}" iyy="{across}" izz="{0.003 * mass}" ixy="0" ixz="0" iyz="0"'
+        inertial = f'<origin xyz="0.01 0 {length / 2}"/><mass value="{mass}"/><inertia {tensor}/>'
+        ends = f'<parent link="l{number}"/><child link="l{number + 1}"/><origin xyz="0 0 {above}"/><axis xyz="{axis}"/>'
+        limit = f'<limit lower="-2.5" upper="2.5" effort="{effort}" velocity="4"/>'
+        parts.append(f'<link name="l{number + 1}"><inertial>{inertial}</inertial></link>')
+        parts.append(f'<joint name="j{number}" type="revolute">{ends}{limit}</joint>')
+        above = length
+    return "".join([*parts, "</robot>"])
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +83,7 @@ def test_a_heavier_link_is_named(arms, tmp_path):
 
 
 def test_a_joint_that_sticks_does_not_hide_a_heavier_link(tmp_path):
-    (tmp_path / "six.urdf").write_text(several_joints(6))
+    (tmp_path / "six.urdf").write_text(six_joints())
     robot = Robot.load(tmp_path / "six.urdf")
     (tmp_path / "heavy.urdf").write_text(to_urdf(robot, mass_factors={"l3": 1.3}).text)
     arms = {"described": robot, "heavy": Robot.load(tmp_path / "heavy.urdf")}
