@@ -1,7 +1,7 @@
 """Draw the figures of docs/performance.md, and write its tables: ``python bench/draw.py [FOLDER]``.
 
 FOLDER holds the measurements of ``make figures``; they go into docs/performance.json first. Without it everything is
-drawn from that file. Longer than 300 lines because every table and picture of one page is made here.
+drawn from that file. It makes every table and picture of one page.
 """
 
 from __future__ import annotations

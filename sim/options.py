@@ -2,7 +2,7 @@
 
 Longer than 350 lines because the checks of options that depend on the robot or on each other are here. A new option is
 a field of :class:`batchpid.sim.RunnerKeywords`; one that changes scenes is a field of
-:class:`batchpid.sim.engine.scene_spec.SceneSpec`, too.
+:class:`batchpid.sim.engine.scene_spec.SceneSpec`, too. CONTRIBUTING.md lists all steps.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ IDEAL = bp.Actuators()
 class RunnerOptions(RunnerKeywords):
     """Options of a :class:`batchpid.sim.Runner`, checked, copied, and with a value for each default. Immutable.
 
-    The arguments are those of :class:`RunnerKeywords`, and so are the attributes; those below have a narrower
-    type. ``workers`` is None on a cluster, ``tool`` where setpoints are no poses, ``actuators`` without any effect.
+    Arguments and attributes are the same as in :class:`RunnerKeywords`; the attributes below have a narrower type.
+    ``workers`` is None on a cluster, ``tool`` unless setpoints are poses, and ``actuators`` if every effect is off.
 
     Raises
     ------
@@ -205,12 +205,12 @@ class RunnerOptions(RunnerKeywords):
 
     @property
     def misses_contacts(self) -> bool:
-        """True if robots pass through each other and the ground, and the contacts that they would have are reported."""
+        """True if robots have no collision shapes, and contacts that they would have had are reported."""
         return not self.collisions
 
     @property
     def switched(self) -> dict[str, bool]:
-        """Switches that are not at their default, by name."""
+        """Options of type bool that are not at their default, by name."""
         switches = {each.name: each.default for each in fields(self) if isinstance(each.default, bool)}
         return {name: not default for name, default in switches.items() if getattr(self, name) != default}
 
@@ -353,7 +353,7 @@ class RunnerOptions(RunnerKeywords):
         """Return the options that are marked with ``place``, by name.
 
         - "snapshot": values that two runners must share to restore each other's snapshots;
-        - "recording": fields of :class:`batchpid.sim.RunInfo`, and under "options" those that are no field there;
+        - "recording": fields of :class:`batchpid.sim.RunInfo`, and in its field "options" the values without a field;
         - "scene": fields of :class:`batchpid.sim.engine.scene_spec.SceneSpec`.
         """
         kept = {name: each.kept[place] for name, each in OPTIONS.items() if place in each.kept}
@@ -387,7 +387,7 @@ class RunnerOptions(RunnerKeywords):
 
     @property
     def solver_settings(self) -> list[Any]:
-        """Values of :attr:`solver`."""
+        """Values of the fields of :attr:`solver`."""
         return list(astuple(self.solver))
 
     @property
@@ -441,7 +441,7 @@ def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
 
 
 def _plain(value: object) -> object:
-    """Return the value of an option as a file of JSON holds it."""
+    """Return the value of an option in JSON's types."""
     return value.tolist() if isinstance(value, np.ndarray) else list(value) if isinstance(value, tuple) else value
 
 
@@ -451,12 +451,12 @@ def _code_digest(value: object) -> str | None:
 
 
 def worker_count(workers: int | None) -> int:
-    """Return ``workers`` if it is a number of processes; None: one per available core."""
+    """Return the number of worker processes for the option ``workers``; None selects one per available core."""
     return len(os.sched_getaffinity(0)) if workers is None else checked_option("workers", workers)
 
 
 def _places(workers: Any, cluster: Any) -> tuple[int | None, Ray | None]:
-    """Return the options ``workers`` and ``cluster``, of which a runner has one."""
+    """Return the options ``workers`` and ``cluster``, checked; one of them is None."""
     if cluster is None:
         return worker_count(workers), None
     cluster = instance("cluster", Ray() if cluster == "ray" else cluster, Ray, "pass 'ray' or Ray(...)")

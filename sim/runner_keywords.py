@@ -3,7 +3,7 @@
 An option has its type, default, bounds and documentation here, the places that keep it, and the help of its flag. From
 this record come the signature of :class:`batchpid.sim.Runner`, the checks of plain numbers, bools and choices, the
 values that snapshots, recordings and scenes keep, and the flags of the command line. Checks of options that depend on
-the robot or on each other are in :mod:`batchpid.sim.options`.
+the robot or on each other are in :mod:`batchpid.sim.options`. CONTRIBUTING.md lists the steps for a new option.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ControlMode = Literal["pid", "drive", "effort"]
 
 
 class Controller(Protocol):
-    """Controller of the caller's own, for the option ``control``; arrays are (envs, dof), in SAPIEN's order, SI units.
+    """Controller of the caller's own, for the option ``control``; arrays are (envs, dof), as in ``robot.joint_names``.
 
     It is called at every sim step, in the worker processes, for some of the envs at a time: the effort of an env must
     depend on its own rows alone. It travels to the workers by cloudpickle, and may call NumPy or a jitted function.
@@ -75,9 +75,9 @@ Role = Literal["restored", "processes", "last bits", "next commands"]
 """Reason for which a snapshot may be restored in a runner with another value of an option.
 
 - "restored": the snapshot holds the value, and the runner takes it over;
-- "processes": the value says where and how fast the envs run, and results are bit-identical for any;
-- "last bits": so, but the last bits of results differ;
-- "next commands": the value is a default of the commands to come (``substeps``), or says which of them are refused.
+- "processes": the value decides where and how fast the envs run; results are bit-identical for all values;
+- "last bits": like "processes", except that the last bits of results depend on the value;
+- "next commands": the value is a default of later commands (``substeps``), or decides which of them are refused.
 """
 
 
@@ -85,16 +85,16 @@ class Option(NamedTuple):
     """Where an argument of a Runner is kept and shown, by :func:`option`."""
 
     kept: Mapping[str, str]
-    """Places, with the attribute of :class:`batchpid.sim.RunnerOptions` that each of them keeps, "" for the argument's
-    own."""
+    """Attribute of :class:`batchpid.sim.RunnerOptions` that each place keeps; "" for the attribute of the argument's
+    name."""
     role: Role | None
-    """Role of an argument that a snapshot does not hold against the runner that restores it."""
+    """Reason for which the value may differ in the runner that restores a snapshot; None if it may not."""
     flag: str
-    """Help of the flag of this name, which `batchpid rollout` has; "" for none."""
+    """Help of the flag of `batchpid rollout` with the argument's name; "" for no flag."""
 
 
 def option(*kept: Place, role: Role | None = None, flag: str = "", **kept_as: str) -> Option:
-    """Return the option that the places ``kept`` have; those of ``kept_as`` keep another attribute in its place."""
+    """Return the option that the places ``kept`` keep; ``kept_as`` are further places and the attributes they keep."""
     return Option(dict.fromkeys(kept, "") | kept_as, role, flag)
 
 
@@ -113,8 +113,8 @@ class RunnerKeywords:
     """PID parameters of one row, or one row per env. Default: see :func:`batchpid.sim.options.default_params`."""
 
     first_env: Annotated[int, Field(high=1e9), option("snapshot")] = 0
-    """Number of the first env; default 0. A runner with 100 for it is bit-identical to the envs from 100 on of a larger
-    one: the noise of sensors, the streams of a randomization and ``build`` go by the numbers of envs."""
+    """Number of the first env; default 0. With ``first_env=100`` a runner is bit-identical to envs 100, ... of a larger
+    one: sensor noise, the streams of a randomization and ``build`` depend on the number of the env."""
     workers: Annotated[
         int | None,
         Field(high=1024),
@@ -127,7 +127,7 @@ class RunnerKeywords:
     ] = 1 / 2000
     """Time step of simulation and control [s]; default 1/2000."""
     substeps: Annotated[int, Field(low=1, high=1_000_000), option("recording", role="next commands")] = 20
-    """Sim steps of one tick, all under the same setpoint; the control runs at every one of them. Default 20."""
+    """Sim steps of one tick, all under the same setpoint; default 20. The control runs at every sim step."""
     control: Annotated[
         ControlMode | Literal["osc"] | Controller, option(snapshot="control_name", recording="control_name")
     ] = "pid"
@@ -146,18 +146,18 @@ class RunnerKeywords:
     backend: Annotated[
         Backend, option("snapshot", flag="Library of the law: NumPy, or JAX, as one program with the steps.")
     ] = "numpy"
-    """Library of the law: ``"numpy"``, the default, or ``"jax"``, which runs law and sim steps of a tick as one program
-    of XLA on the CPU, and a :class:`Controller` in it (docs/performance.md). Between the two, and between processors,
-    the last bits of results differ."""
+    """Library of the law: ``"numpy"``, the default, or ``"jax"``, which compiles law and sim steps of a tick, and a
+    :class:`Controller`, into one XLA program for the CPU (docs/performance.md). The last bits of results differ between
+    the two, and between processors."""
     dtype: Annotated[Precision, option("snapshot")] = "float64"
     """Floating-point type of the law under backend ``"jax"``: ``"float64"``, the default, or ``"float32"``."""
     compensate: Annotated[
         Compensation, option("snapshot", "recording", flag="Passive force and known friction, added at every sim step.")
     ] = "gravity+coriolis+friction"
-    """Passive force, and the known Coulomb friction on the way to the setpoint, added at every sim step.
-    ``"gravity+coriolis+friction"``, the default, or a part of it; under control "effort" friction is not
-    compensated. On a floating base the passive force is the joints' own share, as if the base were held where it is:
-    what the legs carry of the base depends on their contacts, and is left to the law."""
+    """Compensation added to the effort at every sim step: the passive force (gravity, Coriolis and centrifugal forces)
+    and the known Coulomb friction on the way to the setpoint. ``"gravity+coriolis+friction"``, the default, or a part
+    of it; under control "effort" friction is not compensated. On a floating base the passive force is computed as if
+    the base were fixed: the weight of the base on the legs depends on their contacts, and the law carries it."""
     engine: Annotated[
         EngineName,
         option(
@@ -178,14 +178,14 @@ class RunnerKeywords:
             flag="Solver settings: SAPIEN's, fewer iterations, or one, for motion without contact.",
         ),
     ] = "accurate"
-    """``"accurate"`` (the default: SAPIEN's solver settings), ``"fast"``, ``"free"`` (for motion without contact), or a
-    :class:`batchpid.sim.Physics`, with the engine MuJoCo a :class:`batchpid.sim.MujocoSolver`."""
+    """Solver settings: ``"accurate"`` (the default: those of SAPIEN), ``"fast"``, ``"free"`` (for motion without
+    contact), a :class:`batchpid.sim.Physics` for SAPIEN, or a :class:`batchpid.sim.MujocoSolver` for MuJoCo."""
     collisions: Annotated[
         bool,
         option("snapshot", "recording", "scene", flag="Robots have no collision shapes: faster, for free motion only."),
     ] = True
-    """Robots have collision shapes; default True. With False they have none, and there is no ground: for free motion
-    only. Masses, inertias and joint limits stay. A :class:`batchpid.sim.MissedContactWarning` says which robots would
+    """Robots have collision shapes; default True. False removes the shapes and the ground, for free motion only.
+    Masses, inertias and joint limits stay. A :class:`batchpid.sim.MissedContactWarning` names the robots that would
     have touched something."""
     ground: Annotated[
         bool | None,
@@ -196,48 +196,47 @@ class RunnerKeywords:
             flag="Ground at height 0. Default: on, unless links of a fixed robot reach it at the start pose.",
         ),
     ] = None
-    """Add a ground plane at height 0 to every scene; default :attr:`Robot.has_ground`: unless the robot's base is fixed
-    so low that other links reach the ground at its start pose. With engine "mujoco" the planes in the world of an MJCF
-    file take its place, by default as in the file."""
+    """Add a ground plane at height 0 to every scene. Default :attr:`Robot.has_ground`: True, unless the base is fixed
+    so low that other links reach the ground at the start pose. With engine "mujoco" the planes in the world of an MJCF
+    file replace the ground; by default they are as in the file."""
     contacts: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
-    """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``. Links that fixed joints join
-    are one body, and count as one. Default none. The links must move; with SAPIEN the robot has
-    ``dissipation="urdf"``."""
+    """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``; default none. Links that are
+    connected by fixed joints count as one. A fixed base is refused. SAPIEN needs ``dissipation="urdf"``."""
     wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
-    """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``. Default none. A
-    link that a fixed joint holds needs a robot with ``merge_fixed=False``."""
+    """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``; default none. A
+    link on a fixed joint needs a robot with ``merge_fixed=False``, and SAPIEN one with ``dissipation="urdf"``."""
     build: Annotated[Callable[[Any, int], Any] | None, option("scene", snapshot="build_digest")] = None
-    """``build(scene, env)`` adds user content to the ``sapien.Scene`` of each env. Visuals and lights are left out, so
-    that code written for a screen runs unchanged. It may return the entities that :meth:`batchpid.sim.Runner.poses`
-    reports. A reset puts the content back to where ``build`` left it."""
+    """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env. Visuals and lights are
+    ignored, so code that was written for a screen runs unchanged. It may return the entities that
+    :meth:`batchpid.sim.Runner.poses` reports. A reset returns the content to the poses that ``build`` gave it."""
     on_fault: Annotated[FaultAction, option("snapshot")] = "hold"
-    """``"hold"`` (the default) an env that fails at rest in its last valid state, with ``ok`` False until it is reset;
-    or ``"reset"`` it to its last start, with ``ok`` False for that tick. An env fails when its state is not finite,
-    when a position is beyond 1e6 rad or m, or by ``speed_limit``. The other envs are not affected."""
+    """Action when an env fails: ``"hold"`` (default) keeps it at rest in its last valid state, with ``ok`` False until
+    it is reset; ``"reset"`` returns it to its last start, with ``ok`` False for that tick. An env fails when its state
+    is not finite, when a position is beyond 1e6 rad or m, or by ``speed_limit``. The other envs are not affected."""
     speed_limit: Annotated[ArrayLike | None, option("snapshot")] = None
     """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
     actuators: Annotated[bp.Actuators | None, option(role="restored")] = None
     """Delays, limits, friction and errors of motors and sensors: :func:`batchpid.make_actuators`, of one row, or one
-    row per env. None, the default, selects the robot's actuators: under control "drive" their friction and
-    armature. ``bp.Actuators()`` is ideal. The control sees measured positions and velocities; observations hold the
-    true ones, and the effort that was delivered."""
+    row per env. None, the default, selects the robot's actuators; control "drive" uses only their friction and
+    armature. ``bp.Actuators()`` is ideal. The control gets measured positions and velocities. Observations hold the
+    true ones, and the delivered effort."""
     randomization: Annotated[Randomization | None, option(snapshot="distributions", recording="distributions")] = None
     """Distributions from which payload, masses, friction, gains and more are drawn for each env and episode
     (docs/randomization.md); default none."""
     guard: Annotated[bool | bp.Guard | None, option(snapshot="guard_digest")] = None
     """Limits of setpoints, applied at every sim step: True for :meth:`batchpid.sim.Robot.guard`, or
-    :func:`batchpid.make_guard`; default none. ``obs.guarded`` tells which setpoints were changed."""
+    :func:`batchpid.make_guard`; default none. ``obs.guarded`` is True where a setpoint was changed."""
     on_invalid_input: Annotated[InvalidInputAction, option(role="next commands")] = "raise"
-    """``"raise"`` (the default) an error for NaN or infinity in a command or in a pose to reset to, or ``"contain"``
-    it: only the env concerned fails."""
+    """Response to NaN or infinity in a command or in a pose to reset to: ``"raise"`` (default) raises an error, and
+    ``"contain"`` lets only the env concerned fail."""
     recover: Annotated[bool, option(role="processes")] = True
-    """Replace a worker process that dies or gets stuck, and replay its envs; default True: results are bit-identical to
+    """Replace a worker process that dies or gets stuck, and replay its envs; default True. Results are bit-identical to
     an undisturbed run. With False :class:`batchpid.errors.WorkerError` is raised."""
     checkpoint_steps: Annotated[int | None, Field(low=1, high=1e9), option(role="last bits")] = 8000
-    """Sim steps between checkpoints, from which a replay starts, by default 8000; None: one replay from the start, for
-    which all commands are kept. After contacts the last bits of the results depend on it."""
+    """Sim steps between checkpoints; default 8000. A replay starts from the last checkpoint. With None it starts from
+    the beginning, and all commands are kept. After contacts the last bits of the results depend on this option."""
     timeout: Annotated[float, Field("seconds", low=1e-3, high=1e9), option(role="processes")] = 60.0
-    """Seconds, by default 60, beyond an upper bound of the time that its work takes, before a worker counts as stuck. A
+    """Time [s], beyond an upper bound of the work's duration, after which a worker counts as stuck; default 60. A
     worker that is stopped or asleep within a tick counts as stuck within a second."""
     cluster: Annotated[
         Literal["ray"] | Ray | None,
@@ -250,7 +249,7 @@ class RunnerKeywords:
     results (docs/cluster.md)."""
 
     def __post_init__(self) -> None:
-        """Bring plain options to their declared type, within their bounds."""
+        """Convert plain options to their declared type, and check their bounds."""
         for each in fields(self):
             object.__setattr__(self, each.name, checked_option(each.name, getattr(self, each.name)))
 
@@ -270,5 +269,5 @@ def checked_option(name: str, value: Any) -> Any:
 
 
 def arguments_of(record: Callable[P, object]) -> Callable[[Callable[..., None]], Callable[Concatenate[Any, P], None]]:
-    """Decorate an ``__init__`` that passes its arguments on to ``record``, for editors to show those of ``record``."""
+    """Decorate an ``__init__`` that forwards its arguments to ``record``, so that editors show that signature."""
     return lambda init: init

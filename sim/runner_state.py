@@ -26,7 +26,7 @@ class RunnerState(NamedTuple):
     draws: Draws
     faults: FaultLog
     contacts: MissedContactLog | None
-    """None where none is missed."""
+    """None if contacts are not watched: the robots have collision shapes."""
     targets: Float64 | None
     """Last joint setpoints (envs, dof), where searches for poses of the tool start; None without such poses."""
     motion: Motion | None

@@ -1,8 +1,8 @@
-"""Declared fields: the unit, the bounds and the value for off of an option, in the annotation of its argument.
+"""Declared fields: unit, bounds and neutral value of an option, in the annotation of its argument.
 
-Params, actuators, guards, params of a task, randomizations and options of a runner declare each option once, where it
-is an argument. From there come the checks of options and leaves, the keys of files, the values that are off, the bounds
-of a randomization, and the tables of the guides (docs/tables.py)::
+Params, actuators, guards, params of operational-space control, randomizations and options of a runner declare each
+option once, as an annotated argument. The checks of options and leaves, the keys of files, the neutral values, the
+bounds of a randomization and the tables of the guides (docs/tables.py) come from these annotations::
 
     def make_guard(joints: int, *, rate: Annotated[Array, Field("rad/s or m/s", math.inf, above=True)] = None, ...)
 """
@@ -24,11 +24,11 @@ T = TypeVar("T")
 
 
 class Field(NamedTuple):
-    """Option of a joint: a number, or of the type of ``neutral``."""
+    """Declaration of an option: a number, or a value of the type of ``neutral``."""
 
     unit: str = ""
     neutral: Any = 0.0
-    """Value that is off; an infinite one allows infinite values."""
+    """Value without effect. If it is infinite, infinite values are allowed."""
     low: float = 0.0
     """Smallest value."""
     above: bool = False
@@ -36,10 +36,10 @@ class Field(NamedTuple):
     high: float = math.inf
     """Largest value."""
     group: str = ""
-    """Name of the fields that it belongs to."""
+    """Name of the group of fields to which it belongs, such as "motor"; see :func:`in_group`."""
 
     def checked(self, name: str, values: Array, joint_names: Sequence[str] | None, *, infinite: bool = False) -> Any:
-        """Return ``values`` (..., envs, joints), unless they are traced, if all are within the bounds.
+        """Return ``values`` (..., envs, joints) after a check of the bounds; values that JAX traces are not checked.
 
         Raises InvalidArgumentError if an entry is out of bounds, or infinite where neither ``infinite`` nor ``neutral``
         allows it.
@@ -53,31 +53,31 @@ class Field(NamedTuple):
 
 
 def declared(owner: Callable[..., object], kind: type[T]) -> dict[str, T]:
-    """Return what the annotations of a constructor or class declare by a ``kind``, such as Field, by name."""
+    """Return the metadata of type ``kind``, such as Field, in the annotations of a constructor or class, by name."""
     hints = get_type_hints(owner, include_extras=True).items()
     found = ((name, each) for name, hint in hints for each in getattr(hint, "__metadata__", ()))
     return {name: each for name, each in found if isinstance(each, kind)}
 
 
 def in_group(fields: Mapping[str, Field], group: str) -> dict[str, Field]:
-    """Return the ``fields`` of a group."""
+    """Return the fields that belong to ``group``."""
     return {name: field for name, field in fields.items() if field.group == group}
 
 
 FREE = Field(low=-math.inf)
-"""A leaf that may hold any number."""
+"""Field without bounds."""
 WHOLE = ("max_delay", "seed")
-"""Leaves for all joints together."""
+"""Leaves with one value for all joints."""
 TABLES = ("limit_positions", "limit_efforts")
 """Leaves with a table for each joint (1 | envs, joints, points)."""
 
 
 def plain(name: str, kind: Kind, value: Any) -> Any:
-    """Return ``value`` in the canonical form of its declared type: a bool, a number, a choice, or one of these or None.
+    """Return ``value`` as a bool, number or choice, if its declared type is one of these, or one of these and None.
 
-    A value of another declared type is returned as it is.
+    A value of another declared type is returned unchanged and unchecked.
 
-    Raises InvalidArgumentError if a number is out of the bounds of its :class:`Field`, or the value of another type.
+    Raises InvalidArgumentError if a number is out of the bounds of its :class:`Field`, or the value has another type.
     """
     kind, *metadata = get_args(kind) if get_origin(kind) is Annotated else (kind,)
     bounds = next((each for each in metadata if isinstance(each, Field)), FREE)
@@ -100,8 +100,8 @@ def check_leaves(
 ) -> None:
     """Check the leaves of a named tuple that may have been edited by hand.
 
-    Raises InvalidArgumentError if a leaf has neither one row nor ``num_envs``, not one column per joint, or values out
-    of the bounds of ``fields``; a leaf without a field may hold any numbers.
+    Raises InvalidArgumentError if a leaf has a wrong shape, or values out of the bounds of ``fields``. A leaf has one
+    row or ``num_envs`` rows, and one column per joint. A leaf without a field may hold any numbers.
     """
     for name, leaf in leaves._asdict().items():
         if leaf is None or isinstance(leaf, tuple) or name in WHOLE:

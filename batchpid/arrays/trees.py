@@ -1,7 +1,8 @@
-"""Trees of arrays: nested tuples, lists and mappings, whose leaves are arrays, symbols in a trace, or their places.
+"""Trees of arrays: nested tuples, lists and mappings. A leaf is an array, a traced symbol, or a placeholder (``...``).
 
-A program takes the leaves in order, a file and a snapshot take them by name. None is a tree without leaves. Numbers and
-other values in a tree are constants: they have no place among the leaves in order.
+Programs take the leaves of a tree of tuples in order: :func:`leaves`, :func:`mapped`, :func:`structure` and
+:func:`filled`. Numbers and other values are constants there, not leaves. Files and snapshots take all values by name:
+:func:`flatten` and :func:`unflatten`. None is a tree without leaves.
 """
 
 from __future__ import annotations
@@ -15,38 +16,39 @@ from batchpid.arrays.array_types import Array, Document, Pytree
 
 
 def is_leaf(tree: Pytree) -> bool:
-    """Return whether ``tree`` is an array, a symbol, or the place of one (``...``)."""
+    """Return whether ``tree`` is an array, a symbol, or a placeholder (``...``)."""
     return tree is ... or (hasattr(tree, "__array_namespace__") and not isinstance(tree, np.generic))
 
 
 def leaves(tree: Pytree) -> list[Any]:
-    """Return the arrays in a tree of tuples, in order."""
+    """Return the leaves of a tree of tuples, in order."""
     if is_leaf(tree):
         return [tree]
     return [leaf for part in tree for leaf in leaves(part)] if isinstance(tree, tuple) else []
 
 
 def mapped(function: Callable[[Any], Any], tree: Pytree) -> Any:
-    """Return a tree of tuples with ``function`` applied to its arrays."""
+    """Return a tree of tuples with ``function`` applied to its leaves."""
     if is_leaf(tree):
         return function(tree)
     return _rebuilt(tree, [mapped(function, part) for part in tree]) if isinstance(tree, tuple) and tree else tree
 
 
 def structure(tree: Pytree) -> Any:
-    """Return a tree of tuples with ``...`` in place of each array; it is hashable."""
+    """Return a tree of tuples with ``...`` in place of each leaf; the result is hashable."""
     return mapped(lambda _: ..., tree)
 
 
 def filled(tree: Pytree, given: Iterator[Any]) -> Any:
-    """Return a structure with its places filled from an iterator."""
+    """Return a :func:`structure` with its placeholders replaced by values of ``given``, in order."""
     return mapped(lambda _: next(given), tree)
 
 
 def flatten(tree: Pytree, separator: str = "/", read: Callable[[Any], Array] = np.asarray, name: str = "") -> Document:
-    """Return all values in a tree, as ``read`` makes arrays of them, by name: keys and fields, joined by ``separator``.
+    """Return all values in a tree by name, converted to arrays by ``read``.
 
-    A tree that is a value itself has the name "state".
+    A name consists of the keys and fields on the way to the value, joined by ``separator``. A tree that is one value
+    has the name "state".
     """
     if tree is None:
         return {}
@@ -59,7 +61,7 @@ def flatten(tree: Pytree, separator: str = "/", read: Callable[[Any], Array] = n
 
 
 def unflatten(like: Pytree, named: Mapping[str, Array], separator: str = "/", name: str = "") -> Any:
-    """Return a tree of the structure of ``like`` with the arrays of :func:`flatten`."""
+    """Return a tree with the structure of ``like`` from the arrays that :func:`flatten` returned."""
     if like is None:
         return None
     if not isinstance(like, Mapping | tuple | list):
@@ -79,7 +81,7 @@ def _parts(tree: Pytree) -> Document:
 
 
 def _rebuilt(like: Pytree, parts: list[Any]) -> Any:
-    """Return a tree of the kind of ``like`` with other parts."""
+    """Return a mapping, tuple or list of the type of ``like`` with other parts."""
     if isinstance(like, Mapping):
         return dict(zip(like, parts, strict=True))
     return type(like)(*parts) if hasattr(like, "_fields") else type(like)(parts)

@@ -19,9 +19,11 @@ A prime is the value of the step before. The play is the backlash hysteresis (G.
 of Systems with Actuator and Sensor Nonlinearities, Wiley, 1996, chapter 2). Friction and armature are the simulator's:
 see :mod:`batchpid.motors.friction`.
 
-A new effect is a line in :mod:`batchpid.motors.actuators`, a field of :class:`Actuators` and of
-:class:`MotorCoefficients`, and a term here, also in :func:`command_limits` where it changes the limits of commands. It
-uses the operations of :mod:`batchpid.native.operations` alone: then NumPy, JAX and native code have it.
+A new effect is, in :mod:`batchpid.motors.actuators`, an argument of ``make_actuators`` with its ``Field`` and an entry
+in the docstring, and a field of :class:`Actuators` of the same name. Here it is a field of :class:`MotorCoefficients`,
+a value in :func:`discretise`, and a term in ``_delivered`` (motor), ``_play`` or ``_encode`` (sensor). An effect that
+changes the limits of commands has a term in :func:`command_limits`, too. Terms may use the operations of
+:mod:`batchpid.native.operations` only, so that they also run in JAX and in native code.
 """
 
 from __future__ import annotations

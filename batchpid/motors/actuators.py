@@ -3,7 +3,7 @@
 :class:`Actuators` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without registration. An effect
 that is off is ``None``: it is not a leaf and costs nothing.
 
-Longer than 300 lines because every effect is declared and documented here, as an option of the constructor.
+Every effect is declared once, by an argument of :func:`make_actuators` with its unit, bounds and group.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from batchpid.errors import InvalidArgumentError
 MAX_DELAY = 1.0
 """Longest delay [s]."""
 TABLE = {"limit_efforts": Field("N m or N", math.inf)}
-"""Numbers of each point of a joint's position-dependent limit."""
+"""Declared field of the efforts at the points of a position-dependent limit."""
 
 
 class Actuators(NamedTuple):
@@ -272,15 +272,15 @@ def make_actuators(
 
 
 FIELDS = declared(make_actuators, Field)
-"""Numbers of a joint."""
+"""Declared fields of all effects that are one number for each joint."""
 MOTOR_SIDE = in_group(FIELDS, "motor")
-"""Numbers between the effort asked for and the effort delivered."""
+"""Effects between the effort asked for and the effort delivered."""
 JOINT_SIDE = in_group(FIELDS, "joint")
-"""Numbers that act on the joint and not on the signals: :class:`batchpid.sim.Runner` gives them to the simulator."""
+"""Effects on the joint instead of the signals: :class:`batchpid.sim.Runner` simulates them in the robot's joints."""
 DRIVEN = tuple(name for name in JOINT_SIDE if name != "load_friction")
-"""Effects that joints under drives of the engine have; friction by load needs the motor's effort, which is unknown."""
+"""Effects on joints under the engine's drives, whose effort is unknown; friction by load needs the effort."""
 SENSOR_SIDE = in_group(FIELDS, "sensor")
-"""Numbers between the joint's state and its measurement."""
+"""Effects between the joint's state and its measurement."""
 
 
 def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Array, Array]:

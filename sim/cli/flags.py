@@ -52,7 +52,7 @@ def of_option(name: str) -> Any:
 
 
 def _kind(name: str) -> Kind:
-    """Return the type of the flag of a Runner's option: that of its plain values."""
+    """Return the type of the flag of a Runner's option: the part of its declared type that has plain values."""
     kind = Literal["on", "off"] | None if name in _SWITCHES else get_args(KINDS[name])[0]
     if get_origin(kind) not in (Union, UnionType):
         return kind

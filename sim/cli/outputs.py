@@ -120,7 +120,7 @@ _bars: weakref.WeakSet[tqdm[Any]] = weakref.WeakSet()
 def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
     """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; ``options`` go to tqdm.
 
-    In a file there is no bar.
+    A file as stderr gets no bar.
     """
     from tqdm import tqdm
 

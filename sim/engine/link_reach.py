@@ -1,8 +1,8 @@
-"""Upper bounds, at any pose, of the motion of a robot's links per unit of motion of its joints, and their use.
+"""Missed contacts of robots without collision shapes; upper bounds of the motion of links per motion of joints.
 
-Robots that are simulated without collision shapes are checked for contacts that they would have had, by the shapes of
-their description, when they leave a region of joint positions, around q0, in which no links can touch. Two links have
-the distance d at q0, and unit speed of joint j brings them together at the speed r_j at most. They cannot touch while
+A robot that is simulated without collision shapes is checked for contacts that it would have had, by the shapes of its
+description. A check is due when its joint positions leave a region around q0 in which no links can touch. Two links
+have the distance d at q0, and unit speed of joint j brings them together at most at speed r_j. They cannot touch while
 ``sum_j r_j |q_j - q0_j| < d``. That is conservative advancement (B. Mirtich, Impulse-based Dynamic Simulation of Rigid
 Body Systems, PhD thesis, University of California, Berkeley, 1996, section 2.3). A robot in motion is checked at about
 every twentieth tick.
@@ -91,7 +91,7 @@ def _add_reach(reach: Float64, link: LinkExtent, links: Sequence[LinkExtent]) ->
 
 
 DEPTH = 1e-3
-"""Depth [m] from which an overlap counts as a contact: bodies at rest on each other may overlap by less."""
+"""Smallest depth [m] of an overlap that counts as a contact: bodies at rest on each other may overlap by less."""
 
 
 class MissedContacts:

@@ -1,4 +1,4 @@
-"""What the packs of all engines share: the models of their robots, and the friction and armature of the joints."""
+"""Base class of the engines' packs: models of the robots, and friction and armature of their joints."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from batchpid.task_space.rigid_tree import RigidTree
 
 
 class ModelPack(SingleOwner):
-    """Robots of ``spec`` with mass matrices and forces of its model.
+    """Pack of ``size`` robots of ``spec``, numbered from ``first_env``, with mass matrices and forces from its model.
 
-    ``variation`` holds their differences from the model, one row for each; ``carrier`` is the link of the URDF that
-    carries the payload, ``links`` are the links with varying mass or center. ``natively`` says whether native code is
-    used.
+    ``variation`` holds the robots' differences from the model, one row for each. ``carrier`` is the link of the URDF
+    that carries the payload; ``links`` are the links with varying mass or center of mass. ``natively`` selects native
+    code.
     """
 
     _tree: RigidTree
-    """Tree of the model on the base that the robots have."""
+    """Rigid tree of the model, with a fixed or floating base."""
 
     def __init__(
         self,
@@ -50,11 +50,11 @@ class ModelPack(SingleOwner):
 
     @property
     def _is_model(self) -> bool:
-        """Whether masses and gravity of the robots are those of the model."""
+        """Whether the robots have the masses and the gravity of the model."""
         return not self._masses.added and self._variation.gravity is None
 
     def joint_model(self) -> NativeModel:
-        """Return the native model of :meth:`joint_mass_matrix`."""
+        """Return the native code's model for :meth:`joint_mass_matrix`."""
         return self._joint_model
 
     @cached_property
@@ -65,7 +65,7 @@ class ModelPack(SingleOwner):
         return model
 
     def force_model(self) -> NativeModel:
-        """Return the native model of the passive force, for compiled steps that do not read it."""
+        """Return the native code's model of the passive force, for compiled steps that do not read it in the engine."""
         return self._force_model
 
     @cached_property
@@ -73,7 +73,7 @@ class ModelPack(SingleOwner):
         return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "held")
 
     def joint_mass_matrix(self, qpos: Rows) -> Float64:
-        """Return the mass matrices that the joints show at ``qpos`` (M, dof, dof) [kg m^2 or kg]."""
+        """Return the mass matrices of the joints at ``qpos`` (M, dof, dof) [kg m^2 or kg]; a floating base yields."""
         if self.steps_natively:
             return self._joint_model.mass_matrix(qpos)
         added = self._masses.added
@@ -84,18 +84,18 @@ class ModelPack(SingleOwner):
         return passive_force_of(self.spec, self.steps_natively)
 
     def _change(self, rows: Sequence[int], variation: Variation) -> None:
-        """Give the robots ``rows`` these differences from the model."""
+        """Set the differences of the robots ``rows`` from the model, in the fields that vary."""
         for mine, new in zip(self._variation, variation, strict=True):
             if mine is not None:
                 mine[rows] = new
 
     def _change_model(self, rows: Sequence[int]) -> None:
-        """Give the native model the masses of the robots ``rows``."""
+        """Update the masses of the robots ``rows`` in the native code's model."""
         if self._masses.added and "_joint_model" in self.__dict__:
             self._joint_model.vary(rows, self.size, self._masses.added)
 
     def _add_joints(self, actuators: Actuators | None) -> Float64:
-        """Add friction and armature of ``actuators``; return the inertia that the engine has to add to the joints'."""
+        """Set friction and armature of ``actuators``; return the inertia that the engine has to add to the joints."""
         self.friction = added_friction(own_friction(self.spec, self._variation), actuators)
         added = None if actuators is None else actuators.armature
         self.armature = self._motors + (0.0 if added is None else added)

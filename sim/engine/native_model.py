@@ -138,7 +138,7 @@ class NativeRefresh:
 
 
 class NativeStep:
-    """Sim step of ``robots`` with ``dof`` joints as one native call, which a program of XLA can make as well.
+    """Sim step of ``robots`` with ``dof`` joints as one native call, from Python or from an XLA program.
 
     ``arrays`` and ``fields`` are those of :class:`.interface.Group`; ``speed_limit`` (dof,) is the joint speed beyond
     which the status says so. Implements :class:`batchpid.sim.engine.protocol.CompiledStep`.

@@ -19,7 +19,7 @@ PHYSICS = {
     "accurate": Physics("TGS", 10),
     # At 2 kHz PGS keeps its error with 4 iterations, which TGS does not; see docs/performance.md.
     "fast": Physics("PGS", 4),
-    # Without contact there are joint limits alone to iterate on.
+    # Without contact only joint limits need iterations.
     "free": Physics("PGS", 1),
 }
 

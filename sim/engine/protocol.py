@@ -314,7 +314,7 @@ MODULES = {
     "sapien": "batchpid.sim.engine.sapien.sapien_engine",
     "mujoco": "batchpid.sim.engine.mujoco.mujoco_engine",
 }
-"""Module of each engine; its constant ENGINE is the engine."""
+"""Module of each engine by name. Its constant ENGINE is the :class:`Engine`."""
 
 
 def load_engine(name: str = "sapien") -> Engine:

@@ -92,7 +92,7 @@ class VariedMasses:
     Attributes
     ----------
     added
-        Spatial inertias (size, 6, 6) of the links that vary, by name, less those of the model; none if no mass varies.
+        Spatial inertias (size, 6, 6) of the links that vary, by name, minus the model's; empty if no mass varies.
     """
 
     def __init__(self, spec: SceneSpec, size: int, variation: Variation, carrier: str, links: Sequence[str]) -> None:

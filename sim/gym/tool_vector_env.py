@@ -212,7 +212,7 @@ ANGLE_WEIGHT = 0.1
 
 
 class ToolReachVectorEnv(ToolVectorEnv):
-    """N robots, each with a pose of its tool to reach. Goals are drawn from the poses that an action can be.
+    """N robots, each of which has to reach a pose with its tool. Goals are drawn from poses that actions can command.
 
     - *Observation*: qpos, qvel (joints), pose of the tool (7), goal (7): position [m] and quaternion (w, x, y, z).
     - *Action*: see :class:`batchpid.sim.gym.tool_vector_env.ToolVectorEnv`.

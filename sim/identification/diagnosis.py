@@ -37,7 +37,7 @@ DECREASE, LEAST_EXPLAINED = 0.03, 0.5
 ALIKE = 1.1
 """Largest ratio of the residuals of two explanations that count as equally good."""
 LEAST_RESIDUAL = 1e-3
-"""Residual, over the joint's effort, below which a decrease shows nothing."""
+"""Residual, over the joint's effort, below which a decrease is not significant."""
 LEAST_CHANGE = 0.05
 """Smallest relative change of a link's mass that is reported."""
 MOST_LINKS = 3
@@ -200,7 +200,7 @@ class _System:
         return self._solved(found[count:], residual)
 
     def with_strengths(self) -> tuple[_Solved, Float64]:
-        """Return the solution with free strengths, where more than ratios to them show, and the strengths (joints,)."""
+        """Return the solution with free strengths, at joints where logs determine them, and the strengths (joints,)."""
         free = np.diag(~self.regression.ratios_only)
         found = self.solve(self._effort[..., None] * free)  # (1 - strength) times the effort
         strengths = np.clip(1 - found.values, *STRENGTHS)

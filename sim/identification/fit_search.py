@@ -33,12 +33,12 @@ ACCEPTED = 0.99
 
 
 class State(NamedTuple):
-    """State of a search: all that the rest of it depends on, and what its history holds before each step."""
+    """State of a search: everything on which its next steps depend; the history keeps it before each step."""
 
     step: FitStep
-    """State of the fit that is being done."""
+    """State of the present fit."""
     done: tuple[tuple[int, list[float]], ...] = ()
-    """Fits that were done: number of the problem, and solution."""
+    """Completed fits: number of the problem, and solution."""
 
     def plain(self) -> Document:
         """Return the state as plain values."""

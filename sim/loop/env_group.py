@@ -1,4 +1,4 @@
-"""Group of envs that advance together: their state, and its changes by resets, params, actuators and failures."""
+"""Group of envs that advance together: their state, and its changes by ticks, resets, params, actuators and faults."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Ticks of a group of envs in one native call: the stages of a sim step as programs and native functions; see tick.h.
 
-It is made in three steps: buffers for everything that the stages read and write, programs of the stages that are pure
-functions of arrays (traced, neighbours together), and the table of stages that native code runs.
+The constructor has three steps: buffers for everything that the stages read and write; programs, traced from the stages
+that are pure functions of arrays, one for each run of neighbouring stages; the table of stages that native code runs.
 
 Longer than 350 lines because all three steps work on the same buffers.
 """

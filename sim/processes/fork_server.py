@@ -9,7 +9,7 @@ working folder, cores, resource limits, and the standard output and error; and t
 the server started. The kernel ends them when the server ends, and the server when the caller ends. For the kernel, the
 parent is the thread that started the server; that is :data:`BACKGROUND`, which lives as long as the caller.
 
-The forkserver of :mod:`multiprocessing` is no substitute: its children import the caller's ``__main__``, which needs a
+The forkserver of :mod:`multiprocessing` does not suffice: its children import the caller's ``__main__``, which needs a
 main guard and takes as long again as the fork; they have the environment and the standard streams of the first start;
 and it is shared with the caller's own use, preloaded modules included.
 """

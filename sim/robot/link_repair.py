@@ -29,11 +29,11 @@ def from_entries(entries: Sequence[float]) -> Float64:
 
 
 def nearest_physical(tensor: Float64) -> Float64:
-    """Return the physical inertia tensor (3, 3) that is nearest to a symmetric one in the Frobenius norm.
+    """Return the physically possible inertia tensor (3, 3) nearest to a symmetric one in the Frobenius norm.
 
     The nearest has the same principal axes, so the moments are projected on the cone of the triangle inequalities: on
     its face c = a + b or, if a would be negative there, on its edge (0, m, m). Then a is raised to SLENDER times c. The
-    result is zero if there is no positive part.
+    result is zero if no moment is positive.
     """
     (a, b, c), axes = np.linalg.eigh(tensor)
     excess = max(c - a - b, 0.0) / 3
@@ -46,7 +46,7 @@ def nearest_physical(tensor: Float64) -> Float64:
 
 
 def triangle_excess(tensor: Float64) -> float:
-    """Return (c - a - b) / c of the principal moments of a tensor (3, 3): positive if no body has it."""
+    """Return (c - a - b) / c of the principal moments of a tensor (3, 3): positive if the tensor is impossible."""
     a, b, c = np.linalg.eigvalsh(tensor)
     return float((c - a - b) / c)
 

@@ -88,7 +88,7 @@ def _ros_packages(package: str) -> Iterator[Path]:
 
 
 def read_mesh(path: str | Path) -> Any:
-    """Return what ``trimesh`` reads from a mesh file, in metres. Raises errors of many types."""
+    """Return the result of ``trimesh`` for a mesh file, in metres. Raises errors of many types."""
     from trimesh import load
 
     mesh: Any = load(path, force="mesh", process=False)

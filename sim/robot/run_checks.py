@@ -184,7 +184,7 @@ class DriveChatterCheck:
         self._has_warned = False
 
     def set_gains(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
-        """Find the joints that can chatter with these gains, effort limits and armature."""
+        """Find the joints that may chatter with these gains, effort limits and armature."""
         self._speed = self._seen = None
         kp, kd = (np.zeros((1, self._robot.dof)) if leaf is None else leaf for leaf in (params.kp, params.kd))
         armature = None if actuators is None else actuators.armature
@@ -205,7 +205,7 @@ class DriveChatterCheck:
         return self._speed is not None and not self._has_warned
 
     def see(self, observation: Observation, seconds: float) -> None:
-        """Look at the ticks (ticks, envs, ...) of ``observation``, each of which lasted ``seconds``."""
+        """Check the ticks (ticks, envs, ...) of ``observation``, each of ``seconds``."""
         if self._speed is None or self._has_warned:
             return
         for tick in range(len(observation.ok)):

@@ -136,7 +136,7 @@ class _UnreadableMesh(Exception):
 
 
 def _read_mesh(name: str, robot: RobotDescription) -> Any:
-    """Return what ``trimesh`` reads from a mesh file of the robot, in metres. Raises _UnreadableMesh."""
+    """Return the result of ``trimesh`` for a mesh file of the robot, in metres. Raises _UnreadableMesh."""
     path = find_mesh(name, robot.path, robot.package_dirs)
     if path is None:
         remedy = "put the file next to the URDF, or pass package_dirs=[...] to Robot.load (--package-dirs)"

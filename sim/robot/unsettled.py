@@ -6,7 +6,7 @@ out of reach, links that start in contact or are pressed together, gains beyond 
 joint, whether it is at rest, oscillates or still moves, compared with the effort that gravity and friction need. Joints
 of an env in which links are pressed together are not examined further: their errors follow from the contact.
 
-Longer than 350 lines because each cause is here, with its evidence and its words.
+Longer than 350 lines because every cause is here, with its evidence and its message.
 """
 
 from __future__ import annotations

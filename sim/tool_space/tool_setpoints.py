@@ -1,4 +1,4 @@
-"""Poses of a tool: as setpoints of joint control, by inverse kinematics; and those that operational space reaches."""
+"""Poses of a tool: setpoints of joint control, by inverse kinematics; reachable poses of operational-space control."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ SLACK = 1e-3
 
 
 def reaches(robot: Robot, control: OperationalSpace, start: Float64, goal: Float64) -> NDArray[np.bool_]:
-    """Return whether the tool comes from rest at ``start`` (envs, dof) to ``goal`` (7,) or (envs, 7) (envs,).
+    """Return whether the tool gets from rest at ``start`` (envs, dof) to ``goal``, (7,) or (envs, 7): bools (envs,).
 
     The joints have to stay within their limits, which the law does not know, on the whole way. The model has no
     contact and no friction.
@@ -176,7 +176,7 @@ def default_goal(robot: Robot, control: OperationalSpace, start: Float64, poses:
     Raises
     ------
     InvalidArgumentError
-        There is no such pose.
+        No pose is reached from all starts.
     """
     goals: Float64 = ts.link_poses(control.tree, poses, [control.link], point=control.point)[:, 0]
     for goal in goals:

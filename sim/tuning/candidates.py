@@ -3,8 +3,8 @@ r"""Candidates of a search for gains of joints: from points in log space to para
 :mod:`batchpid.sim.tuning.cost` has the terms of the cost, of which the mean over joints is taken. Steps alone do not
 show how closely a moving setpoint is followed, and the gains that decide it, above all ki, are not those that decide
 the approach of a step, where the setpoint weight acts too. So some moves are also made as smooth motions of the
-setpoint, with its rate: the half whose motions are the shortest, because these have the largest accelerations. The mean
-over them plus the worst is added of::
+setpoint, with its rate: the half whose motions are the shortest, because these have the largest accelerations. Their
+cost, also the mean over moves plus the cost of the worst one, is added::
 
     w_following log(1 + F / (10 b))
 
@@ -82,7 +82,7 @@ _DRAWS = 100
 
 
 class Candidates:
-    """Candidates of a search as points in log space, of which 0 are the designed gains, on ``moves``.
+    """Candidates of a search on ``moves``, as points in log space. The point 0 has the designed gains.
 
     Each move has the robot's actuators, or its row of ``motors``; the rows are counted from the first, or with ``step``
     -1 from the last. ``varied`` says that the robots of the moves are drawn: the cost is twice the mean over moves,

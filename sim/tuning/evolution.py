@@ -1,6 +1,6 @@
 """Search for gains by simulation: CMA-ES from known gains, in log space, and a final round.
 
-One search finds the gains of joints (:func:`batchpid.sim.tuning.search.tune`) and those of a tool
+The same search finds gains of joints (:func:`batchpid.sim.tuning.search.tune`) and gains of a tool
 (:func:`batchpid.sim.tuning.tool_search.tune_tool`). Each env runs one move of one candidate, so a generation is one
 rollout. The moves are free of contact, so the robots have no collision shapes in the search. A share of the effort
 limits is a reserve for harder moves. :mod:`batchpid.sim.tuning.cost` defines the cost. The search itself is the package
@@ -46,10 +46,10 @@ SEARCH_PHYSICS = {"collisions": False, "physics": "free"}
 
 
 class GainCandidates(Protocol):
-    """Candidates of a search as points in log space, and the moves that each of them runs, one per env."""
+    """Candidates of a search: points in log space. Each candidate runs the same moves, one per env."""
 
     start: str
-    """Name of the gains of the point 0, from which the search starts."""
+    """Name of the gains at the point 0, where the search starts."""
     dimension: int
 
     @property
@@ -68,14 +68,14 @@ Round = tuple[GainCandidates, Document]
 
 
 class Found(NamedTuple):
-    """Best candidate of a search; the gains at the start if they were better."""
+    """Result of a search: the best candidate, or the gains at the start if they were better."""
 
     point: Float64
     """Point in log space (dimension,)."""
     cost: float
     """Cost in the search."""
     costs: tuple[tuple[float, ...], ...]
-    """Costs of every candidate of every generation."""
+    """Costs of the candidates, by generation."""
     rejected: str | None
     final: Trial | None
     """Final round: the gains at the start, then the candidates."""
@@ -113,13 +113,13 @@ class Search:
         self.seconds = number("seconds", self.seconds, 0.05, 600.0, "seconds")
 
     def refuse(self, names: Sequence[str], remedy: str) -> None:
-        """Raise InvalidArgumentError for options ``names`` of the runner, which the search chooses itself."""
+        """Raise InvalidArgumentError if the caller gave an option among ``names``, which the search chooses itself."""
         for name in names:
             if name in self.runner_options:
                 raise InvalidArgumentError(name, "is chosen by the search, which is for explicit gains", remedy=remedy)
 
     def settings(self, moves: Any, /, **own: Any) -> Document:
-        """Return all inputs that the costs of this search depend on, the ``own`` of its kind among them."""
+        """Return all inputs on which the costs of this search depend, with the inputs ``own`` of its kind."""
         actuators = self.robot.actuators
         return {
             **self.robot.describe(),
@@ -135,7 +135,7 @@ class Search:
         }
 
     def run(self, settings: Document, first: Round, final: Round | None, designs: Float64 | None = None) -> Found:
-        """Run the generations, and the ``final`` round of those candidates that beat the gains at the start.
+        """Run the generations, then the ``final`` round of the candidates that beat the gains at the start.
 
         With ``designs`` (n, dimension) these are candidates of the first generation too, and CMA-ES starts again from
         the best of it.
@@ -165,7 +165,7 @@ class Search:
     def _evolve(
         self, candidates: GainCandidates, runner: Runner, record: HistoryFile, designs: Float64 | None
     ) -> tuple[Float64, tuple[tuple[float, ...], ...]]:
-        """Return all points (n, dimension) and the costs of each generation, which are kept in ``record``."""
+        """Return all points (n, dimension) and the costs of each generation; ``record`` keeps the costs."""
         from cmaes import CMA
 
         def optimizer_at(mean: Float64) -> CMA:
@@ -177,7 +177,7 @@ class Search:
         began = time.monotonic()
         bar = (self.progress or (lambda items: items))(range(self.generations))
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MissedContactWarning)  # a bad candidate may leave the line of its move
+            warnings.simplefilter("ignore", MissedContactWarning)  # bad gains may leave the way of a move
             for generation in bar:
                 points += [optimizer.ask() for _ in range(self.population)]
                 if generation == 0:

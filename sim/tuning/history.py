@@ -42,7 +42,7 @@ class HistoryFile:
                 raise self._error(problem)
 
     def state(self, parse: Callable[[Any], Value]) -> Value | None:
-        """Return the state that the file had, as ``parse`` makes it from plain values; None if there was no file.
+        """Return the state in the file, as ``parse`` converts it from plain values; None without a file.
 
         Raises InvalidArgumentError if ``parse`` raises an error: the state is impossible under these settings.
         """

@@ -148,7 +148,7 @@ def tool_metrics(rollout: Rollout, goal: Float64, start: Float64) -> StepMetrics
 
 
 class ToolCandidates:
-    """Candidates of a search as points in log space, of which 0 are the default gains, on ``moves``."""
+    """Candidates of a search on ``moves``, as points in log space. The point 0 has the default gains."""
 
     start, dimension = "default", len(GAINS)
 

@@ -98,7 +98,7 @@ class _Camera(NamedTuple):
 
 
 class PaintedScene:
-    """Picture of ``count`` robots on a floor in given poses, as RenderScene has it without shadows and textures."""
+    """Picture of ``count`` robots on a floor in given poses, like that of RenderScene without shadows and textures."""
 
     def __init__(self, robot: Robot, count: int, ground: bool) -> None:
         layout = arrange_robots(robot, 1, count, ground)
@@ -280,7 +280,7 @@ def show_window(rollout: Rollout, *, robot: Robot | None = None, seconds: float 
     Raises
     ------
     RenderError
-        There is no display, or SAPIEN cannot render on this machine.
+        This machine has no display, or SAPIEN cannot render on it.
     """
     check_renderer()
     from sapien.utils import Viewer

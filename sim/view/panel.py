@@ -1,7 +1,7 @@
-"""Control panel of the page: motion, the watched joint, setpoints, gains, disturbances, and the requests of controls.
+"""Control panel of the page: motion, the watched joint, setpoints, gains, disturbances, and queued requests.
 
-viser calls back from a separate thread, with unchecked data of a page. A control keeps its last valid value; requests
-are queued and carried out between two frames.
+viser calls back from a separate thread, with unchecked data from a page. A control keeps its last valid value. Requests
+of controls are queued and executed between two frames.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ PATIENCE = 2.0
 
 
 def cause(data: ViewData, robot: int) -> str:
-    """Return a sentence on why a robot, numbered over all groups, has not settled since its setpoint last changed.
+    """Return a sentence with the reason why a robot, numbered over all groups, has not settled since its last setpoint.
 
     Empty if it has, or within :data:`PATIENCE`.
     """

@@ -1,7 +1,7 @@
-"""What a worker and its caller exchange: messages over a stream socket, and arrays in memory that both have.
+"""Exchange between a worker and its caller: messages over a stream socket, and arrays in shared memory.
 
-The memory is an anonymous file (memfd), handed to the worker by file descriptor. The kernel frees it with its last
-user, however that one ends: nothing can be left behind in /dev/shm.
+The memory is an anonymous file (memfd), passed to the worker by file descriptor. The kernel frees it when the last
+process that uses it ends, even by a crash, so nothing is left behind in /dev/shm.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ALIGN = 64  # a cache line, so that two workers never write to the same one
 class Channel:
     """One end of a connected stream socket.
 
-    ``on_wait`` is called every 0.1 s while the other side does not take, or does not send, the rest of a message; an
+    ``on_wait`` is called every 0.1 s during a wait for the other side to receive or send the rest of a message. An
     exception that it raises ends the wait.
     """
 
@@ -54,7 +54,7 @@ class Channel:
                 self._wait(select.POLLOUT)
 
     def receive(self, begun: bytes = b"") -> bytes:
-        """Wait for the next message and return it; ``begun`` was received before.
+        """Wait for the next message and return it; ``begun`` are bytes of it that were already received.
 
         Raises
         ------
@@ -107,7 +107,7 @@ class Channel:
 
 
 class SharedArrays(SingleOwner):
-    """Named arrays of given ``layout`` in one block of shared memory: a new one, or with ``fd`` an existing one."""
+    """Named arrays in one block of shared memory: a new one, or the existing one with file descriptor ``fd``."""
 
     def __init__(self, layout: Layout, fd: int | None = None) -> None:
         self.layout = layout
@@ -129,7 +129,7 @@ class SharedArrays(SingleOwner):
             self._file = None
         self.fd = fd
         with standard_streams_occupied():
-            memory = mmap.mmap(fd, max(size, 1))  # it holds a copy of the descriptor
+            memory = mmap.mmap(fd, max(size, 1))  # duplicates the descriptor
         self.arrays: dict[str, Rows] = {
             name: np.ndarray(shape, dtype, buffer=memory, offset=offsets[name])
             for name, (shape, dtype) in layout.items()
@@ -150,4 +150,4 @@ class MemoryFile(io.FileIO):
             super().__init__(os.memfd_create(name, os.MFD_CLOEXEC), "r+")
 
     def __del__(self) -> None:
-        self.close()  # without the ResourceWarning of its base
+        self.close()  # the base class would issue a ResourceWarning

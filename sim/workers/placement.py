@@ -46,7 +46,7 @@ def estimate_memory(options: RunnerOptions, num_envs: int) -> int:
 
 
 def check_memory(options: RunnerOptions, num_envs: int, workers: int, is_local: bool) -> None:
-    """Check that the memory of this machine, and the limits of this process, leave room for ``num_envs`` of the envs.
+    """Check that ``num_envs`` of the envs fit into the memory of this machine and the limits of this process.
 
     Raises InvalidArgumentError if not.
     """
@@ -69,7 +69,7 @@ def check_memory(options: RunnerOptions, num_envs: int, workers: int, is_local: 
 
 
 def _fitting(options: RunnerOptions, num_envs: int, available: int) -> int:
-    """Return a round number of envs that take half of ``available`` bytes or less."""
+    """Return a round number of envs that need at most half of ``available`` bytes."""
     count = max(1, num_envs * max(available, 0) // (2 * estimate_memory(options, num_envs)))
     digits = 10 ** (len(str(count)) - 1)
     return count // digits * digits
@@ -83,7 +83,7 @@ def _free_memory() -> int:
 
 
 def _cgroup_memory() -> Iterator[int]:
-    """Yield the bytes that are left of each limit of the control groups that this process is in, as in a container."""
+    """Yield the bytes left under each memory limit of this process's control groups, such as those of a container."""
     for line in Path("/proc/self/cgroup").read_text().splitlines():
         _, controllers, path = line.split(":", 2)
         names = ("limit_in_bytes", "usage_in_bytes") if controllers else ("max", "current")

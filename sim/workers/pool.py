@@ -5,8 +5,8 @@ last checkpoint and all later requests. At a checkpoint all workers rebuild thei
 (:mod:`batchpid.sim.loop.snapshot`), so the replayed envs are bit-identical. Each worker has its own queue of requests,
 so that one can catch up while the others continue.
 
-A request is completed once it was begun: an exception other than WorkerLost, such as one of a signal handler, leaves
-the pool in no valid state, so that its owner must close it.
+A request that has begun must be completed. An exception other than WorkerLost, such as one from a signal handler,
+leaves the pool in an invalid state, and its owner must close it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class RecoveryWarning(UserWarning):
 
 
 class Outcome(NamedTuple):
-    """What the workers did for a request."""
+    """Outcome of a request in all workers."""
 
     results: list[Any]
     """Result of each worker; None of one that failed."""
@@ -188,7 +188,7 @@ class WorkerPool(SingleOwner):
                 self._replace(slot, error)
 
     def finish(self) -> Outcome:
-        """Wait until every worker has executed its queue, and return what they did. Raises as :meth:`run`."""
+        """Wait until every worker has executed its queue, and return the outcome. Raises as :meth:`run`."""
         self._next_check = time.monotonic() + _POLL_INTERVAL
         while not self.closed and (busy := list(filter(_QUEUE, self._slots))):
             try:

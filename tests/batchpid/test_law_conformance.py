@@ -1,6 +1,6 @@
-"""Every executor of the law gives the efforts of the law on plain numbers, for params of any combination of options.
+"""Every executor of the law agrees with a scalar controller (scalar_pid.py), for params of any combination of options.
 
-The native extension and the exported C give the bytes of NumPy.
+The native extension and the exported C are bit-identical to NumPy.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ GIVEN = [(), RATES, ("measurement_rate",), ("setpoint_rate",), ("measurement_rat
 
 
 def by_steps(params, inputs, step=bp.step, array=read_only):
-    """Return the efforts (steps, envs, joints) of the pure functions on arrays of ``array``, read-only for NumPy."""
+    """Return the efforts (steps, envs, joints) of ``step``; ``array`` makes its arrays, by default read-only ones."""
     params = bp.PIDParams(*(array(x, params.dtype) if isinstance(x, np.ndarray) else x for x in params))
     rows = [[None if x is None else array(x[t], params.dtype) for x in inputs] for t in range(len(inputs.setpoint))]
     state, efforts = bp.init(params, rows[0][1]), []
@@ -59,19 +59,19 @@ def by_native_code(params, inputs):
 
 
 def by_jaxs_controller(params, inputs):
-    """By JAX with its optimisations."""
+    """Return the efforts of BatchPID with backend "jax", which has all of JAX's optimisations."""
     return by_controller(params, inputs, "jax")
 
 
 class Executor(NamedTuple):
-    """A way to run the law."""
+    """Function that returns the efforts (steps, envs, joints) of params under inputs, and its properties."""
 
     run: Any
     dtype: Any = np.float64
     seeds: int = 12
-    """Number of generated params that it gets."""
+    """Number of generated params to test."""
     bits: bool = False
-    """Whether it gives the bytes of NumPy."""
+    """Whether results are bit-identical to NumPy's."""
 
 
 EXECUTORS = {
@@ -88,7 +88,7 @@ CASES = [(name, seed) for name, executor in EXECUTORS.items() for seed in range(
 
 
 def oracle(params, inputs):
-    """Return the efforts of a scalar controller for each env and joint, and the sums of their terms' magnitudes."""
+    """Return the efforts of scalar controllers, one per env and joint, and the sum of the magnitudes of their terms."""
     efforts, sizes = np.zeros((2, *inputs.setpoint.shape))
     for (env, joint), pid in np.ndenumerate(np.array(scalar_pids(params, inputs.setpoint.shape[1]), object)):
         pid.start(inputs.measurement[0, env, joint])
@@ -134,7 +134,7 @@ def test_efforts_with_each_option_alone_on_any_inputs(options, given, inputs):
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("seed", range(4))
 def test_exported_c_has_the_bytes_of_numpy(seed, dtype, tmp_path):
-    """For a robot; the other settings of an export: test_c_header.py."""
+    """Test one env; test_c_header.py tests the other settings of an export."""
     params = bp.make_params(JOINTS, **generated_options(seed, envs=1), dtype=dtype)
     given = GIVEN[seed]
     inputs = made_up_inputs(envs=1)
@@ -163,7 +163,7 @@ def test_terms_add_up_and_say_what_saturates(options, inputs):
 
 
 def test_an_option_with_a_neutral_value_is_off():
-    """Neutral values are off: the same structure as leaving the option out."""
+    """Params with neutral values have the same structure as params without these options."""
     gains = {"kp": 3.0, "ki": 1.0, "kd": 0.2}
     limits = dict.fromkeys(("effort_limit", "effort_rate_limit", "integral_limit"), np.inf)
     zeros = dict.fromkeys(("derivative_filter_time", "setpoint_weight_derivative", "deadband"), 0.0)
@@ -172,7 +172,7 @@ def test_an_option_with_a_neutral_value_is_off():
 
 
 def test_every_option_that_is_on_changes_the_efforts(options, inputs):
-    """Every case of the table changes the efforts of a plain PID, so that no test of it is empty."""
+    """Every case of the table changes the efforts of a plain PID: no case is without effect."""
     if set(options) <= {"kp", "ki", "kd"}:
         pytest.skip("a plain PID")
     inputs = Inputs(inputs.setpoint, inputs.measurement)

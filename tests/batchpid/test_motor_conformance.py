@@ -1,6 +1,6 @@
-"""Guard, friction, motors and sensors by every executor against plain numbers, for any combination of options.
+"""Every executor of guard, friction, motors and sensors agrees with scalar_motors.py, for any combination of options.
 
-Executors are NumPy on read-only arrays, JAX, and programs of the native extension, which give the bytes of NumPy.
+Executors are NumPy on read-only arrays, JAX, and native programs, which are bit-identical to NumPy.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Misuse of the public functions: each wrong value is refused by an error that names its argument and a remedy.
 
-Wrong values of the options of joints come from the declared fields, those of other arguments from a table by name.
+Wrong values for options of joints come from the declared fields. Other wrong values come from a table, by argument.
 """
 
 from __future__ import annotations
@@ -274,7 +274,7 @@ def needed(function, more=(), module=None):
 STEPS = {"dt", "timestep"}
 CORE = {"batchpid.motors", "batchpid.motors.guard", "batchpid.motors.friction"}
 HOT = {"advance", "discretise", "drive_target", "osc", "init", "reset", "track", "dumps_params"}
-"""Functions of the loop, which check their time steps alone, besides those of the law."""
+"""Functions of a control loop besides the law's, which check only their time steps."""
 
 
 def checked(module, name, function):

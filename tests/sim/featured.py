@@ -15,7 +15,7 @@ from batchpid.sim import Robot
 AXES = ("0 0 1", "0 1 0", "1 0 0", "0 1 0", "0 0 1", "1 0 0", "0 1 0", "0 0 1", "0 1 0")
 WIDE = '<limit lower="-9" upper="9" effort="80" velocity="9"/>'
 TURNED = 6.1
-"""Start of continuous joints: a move of 0.3 rad passes the end of SAPIEN's positions, 2 pi."""
+"""Start position of continuous joints, from which a move of 0.3 rad passes 2 pi, where SAPIEN's positions wrap."""
 
 FEATURES: dict[str, dict] = {
     "mimic": {"mimics": {3: (1, -0.5, 0.1)}},

@@ -16,7 +16,7 @@ from batchpid.sim import MujocoSolver, Physics, Randomization, Robot, RunnerKeyw
 
 
 def label(value):
-    """Name of a case that is the same in every process: without addresses and temporary folders."""
+    """Return a name of a case without addresses and temporary folders, so that it is the same in every process."""
     return re.sub(r" at 0x[0-9a-f]+|path='[^']*'", "", str(value))
 
 
@@ -94,7 +94,7 @@ DECLARED = {name: hint.__metadata__[-1] for name, hint in get_type_hints(RunnerK
 
 
 def option_values(name):
-    """Return the values of an option to try: those that its type lists, and those of the table."""
+    """Return the values of an option to try: the values that its type lists, and its row of VALUES."""
     return [*listed(TYPES.get(name)), *VALUES.get(name, [])]
 
 

@@ -1,7 +1,8 @@
-"""Every feature, in each engine, gives the results of the plain NumPy loop, however it is run.
+"""Every feature, in each engine, gives the same results on every path: native code, NumPy, XLA, workers, snapshots, ...
 
-A case is a feature: options of a Runner. Its program is a rollout in which one env fails, a reset of some envs, a
-snapshot, and another rollout. Each path of :data:`PATHS` runs this program in another way.
+A case is a feature (options of a Runner, in :data:`FEATURES`) in an engine. Its program is a rollout in which one env
+fails, a reset of some envs, a snapshot, and another rollout. Each path of :data:`PATHS` runs this program in another
+way, and compares the results with :func:`reference`: native code in this process.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Damped:
 
 
 class Feature(NamedTuple):
-    """Options of a Runner, and what is known of its results."""
+    """Options of a Runner, and properties of its results."""
 
     options: Any = MappingProxyType({})
     params: Any = None
@@ -58,11 +59,11 @@ class Feature(NamedTuple):
     engines: tuple[str, ...] = ENGINES
     accelerations: bool = False
     repeats: bool = True
-    """Whether an episode can be repeated: not with noise, nor where checkpoints have another phase in it."""
+    """Whether a second episode is bit-identical: not with noise, nor with checkpoints at other ticks of the episode."""
     exact: bool = False
-    """Whether results are bit-identical without native code, which rounds nothing differently for this feature."""
+    """Whether results are bit-identical with and without native code, instead of close."""
     alike: bool = True
-    """Whether the engines agree on the motion: not in contact, nor under drives or efforts that are large for them."""
+    """Whether the engines agree on the motion: not in contact, nor under large efforts or drives at their limits."""
 
 
 EFFORTS = {"kp": 20.0, "ki": 5.0, "kd": 2.0}
@@ -164,7 +165,7 @@ FEATURES |= {f"random options {seed}": random_feature(seed) for seed in range(9)
 
 @functools.cache
 def robot_of(name: str) -> Robot:
-    """Return a robot of the table of features: by default an arm of two joints, whose links have shapes."""
+    """Return a robot by its name in the features; "arm" has two joints, and links with shapes."""
     if name == "arm":
         return ARM
     if name == "worn":
@@ -193,7 +194,7 @@ def make(case: tuple[str, str], num_envs: int = N, **more: Any) -> Runner:
 
 
 def commands(case: tuple[str, str], runner: Runner) -> dict[str, np.ndarray]:
-    """Return the commands of a rollout (TICKS, envs, ...); those of an env do not depend on the others."""
+    """Return the commands of a rollout (TICKS, envs, ...), which are the same for an env in any number of envs."""
     rng, robot, envs = np.random.default_rng(0), runner.robot, runner.num_envs
     start = runner.observe()
     noise, slope, extra = rng.uniform(-1, 1, (3, TICKS, N, robot.dof))[:, :, :envs]
@@ -233,7 +234,7 @@ class Result(NamedTuple):
     faults: Any
     missed: Any
     poses: Any
-    """Of the user's content."""
+    """Poses of the user's content."""
 
 
 def second_half(runner: Runner, given: dict[str, np.ndarray], rollout: Any) -> tuple[Any, ...]:
@@ -266,7 +267,7 @@ def reference(case: tuple[str, str], backend: str = "numpy") -> Result:
 
 
 def leaves(value: Any, path: str = "") -> Any:
-    """Yield the arrays and numbers of a result with their names, without those that no promise is about."""
+    """Yield the arrays and numbers of a result with their paths in it; of a snapshot, states, params and steps."""
     if value is None or isinstance(value, str | bool | int | float | np.ndarray):
         yield path, value
     elif isinstance(value, Snapshot):
@@ -313,7 +314,7 @@ def in_python(case: tuple[str, str]) -> None:
 
 
 def in_numpy(case: tuple[str, str]) -> None:
-    """NumPy, with mass matrices and passive forces of the extension."""
+    """The NumPy executor, with mass matrices and passive forces from native code: bit-identical."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("batchpid.sim.loop.env_group.NativeExecutor", NumPyExecutor)
         with make(case) as runner:
@@ -321,7 +322,7 @@ def in_numpy(case: tuple[str, str]) -> None:
 
 
 def tick_by_tick(case: tuple[str, str]) -> None:
-    """A rollout is its ticks, by step or by send and recv."""
+    """Single ticks, by step and by send and recv in turn, are bit-identical to a rollout."""
 
     def rollout(runner: Runner, given: dict[str, np.ndarray]) -> Any:
         seen = []
@@ -339,7 +340,7 @@ def tick_by_tick(case: tuple[str, str]) -> None:
 
 
 def alone(case: tuple[str, str]) -> None:
-    """An env does not depend on the other envs."""
+    """A runner of one env is bit-identical to the first env of several."""
     with make(case, num_envs=1) as runner:
         result = program(runner, case)
     for name in ("first", "second"):
@@ -347,7 +348,7 @@ def alone(case: tuple[str, str]) -> None:
 
 
 def restored(case: tuple[str, str]) -> None:
-    """Another runner goes on from the file of a snapshot."""
+    """Another runner continues from the file of a snapshot, bit-identically."""
     expected = reference(case)
     with make(case) as runner, tempfile.TemporaryDirectory() as folder:
         expected.snapshot.save(path := f"{folder}/half.npz")
@@ -359,7 +360,7 @@ def restored(case: tuple[str, str]) -> None:
 
 
 def again(case: tuple[str, str]) -> None:
-    """An episode does not depend on the episodes before it."""
+    """A second episode is bit-identical to the first."""
     with make(case) as runner:
         given = commands(case, runner)
         seed = {} if runner.options.randomization is None else {"seed": 0}
@@ -379,20 +380,20 @@ def in_workers(case: tuple[str, str]) -> None:
 
 
 def in_xla(case: tuple[str, str]) -> None:
-    """The law in XLA; again bit-identical in a worker."""
+    """The law in XLA is close to NumPy, and bit-identical in a worker."""
     check_close(reference(case, "jax"), reference(case), 1e-5)
     with make(case, workers=1, backend="jax") as runner:
         check_equal(program(runner, case), reference(case, "jax"))
 
 
 def in_the_other_engine(case: tuple[str, str]) -> None:
-    """The engines agree where nothing touches."""
+    """The engines agree within 1e-3 rad, without contact."""
     check_close(reference(case), reference((case[0], "sapien")), 1e-3)
 
 
 PATHS = (in_python, in_numpy, tick_by_tick, alone, restored, again, in_workers, in_xla, in_the_other_engine)
 QUICK = {in_workers: 5, in_xla: 50}
-"""Every so many rows of a path are quick; of the other paths every feature in one of the engines."""
+"""Interval of the quick cases of a path; the others are slow. Other paths have every feature, in one engine, quick."""
 
 
 def rows() -> Iterator[Any]:
@@ -417,7 +418,7 @@ def test_every_feature_is_the_same_on_every_path(path: Any, case: tuple[str, str
 
 
 def test_every_option_has_a_row() -> None:
-    """A new option needs a row in FEATURES, unless it says how a program is run."""
+    """A new option needs a row in FEATURES, unless paths or programs use it."""
     of_paths = {"first_env", "workers", "cluster", "recover", "timeout", "engine", "backend", "dtype", "params"}
     of_programs = {"timestep", "substeps", "on_invalid_input"}
     options = {name for feature in FEATURES.values() for name in feature.options}

@@ -1,8 +1,8 @@
-"""Files of every kind with damaged content: read as what they hold, or refused by an error that names the file.
+"""Damaged files of every kind: read with their present content, or refused by an error that names the file.
 
-Bytes, keys, values and lengths are changed at random. A file with the content of the original has the value of the
-original, and a file with other content has another value or is refused: nothing that it says is ignored. Keys that are
-left out have their defaults.
+Bytes, keys, values and lengths are changed at random. A file with the same content as the original gives the same
+value. A file with other content gives another value or is refused, so that no part of a file is ignored. A missing key
+has its default.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from batchpid.sim.identification import read_logs
 from batchpid.sim.identification.setpoint_files import read_setpoints
 from batchpid.sim.tuning import load_randomization, random_moves, tune
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # of odd values
+pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of unusual values
 JOINTS = list(ARM.joint_names)
 PARAMS = ARM.params(kp=[[40.0, 20.0], [30.0, 10.0]], ki=5.0, kd=2.0, effort_limit=87.0, anti_windup="conditional")
 OSC = {"stiffness": [400.0, 300.0, 200.0, 90.0, 80.0, 70.0], "damping_ratio": 1.0, "posture_stiffness": 20.0}
@@ -39,12 +39,12 @@ SHORT = {"workers": 0, "engine": "mujoco", "substeps": 4}
 
 
 class Kind(NamedTuple):
-    """Kind of file."""
+    """Kind of file, with a function that writes a good one and a function that reads one."""
 
     write: Callable[[Path], object]
-    """Write a good file."""
+    """Function that writes a good file."""
     read: Callable[[Path], object]
-    """Return its value."""
+    """Function that returns the value of a file."""
 
 
 def write_table(path: Path, quantity: str = "qpos") -> None:
@@ -57,7 +57,7 @@ def write_table(path: Path, quantity: str = "qpos") -> None:
 
 
 def write_runs(path: Path) -> None:
-    """Write a list of logs, and its log."""
+    """Write a YAML file that lists logs, and the log."""
     write_table(path.with_name("log.csv"))
     entries = [{"log": "log.csv", "payload": 0.5, "sign": {JOINTS[0]: -1}}, {"log": "log.csv", "held_out": True}]
     path.write_text(yaml.safe_dump({"gains": "designed", "logs": entries}))
@@ -74,7 +74,7 @@ def write_run(path: Path) -> None:
 
 
 def search(path: Path) -> object:
-    """Return the result of a search with a history."""
+    """Return the result of a search with the history ``path``, which it reads or writes."""
     found = tune(ARM, moves=MOVES, generations=1, population=4, seconds=0.05, workers=0, engine="mujoco", history=path)
     return found.history, found.params
 
@@ -110,7 +110,7 @@ NUMBERS = [np.nan, np.inf, -np.inf, 0.0, 0.123, 1e38, -1.0, 2.0**31 - 1]
 
 
 def plain(value: Any) -> Any:
-    """Return a value as lists and texts of all its parts, with all digits."""
+    """Return a value as nested dicts and lists of texts, with all digits of its numbers."""
     if isinstance(value, np.ndarray):
         return repr((str(value.dtype), value.shape, value.tolist()))
     if isinstance(value, Robot):
@@ -144,7 +144,7 @@ def _number(cell: str) -> float | str:
 
 
 def encoded(suffix: str, tree: Any) -> bytes:
-    """Return the content of a file with a tree."""
+    """Return the content of a file that holds ``tree``: the inverse of :func:`decoded`."""
     if suffix == ".npz":
         np.savez(file := io.BytesIO(), **tree)
         return file.getvalue()
@@ -155,7 +155,7 @@ def encoded(suffix: str, tree: Any) -> bytes:
 
 @st.composite
 def changed_bytes(draw: st.DrawFn, content: bytes) -> bytes:
-    """Draw the content with a flipped bit, a replaced part, a repeated part or a cut."""
+    """Draw a copy of the content with a flipped bit, or a part replaced, repeated, removed or cut off."""
     start, length = draw(st.integers(0, len(content) - 1)), draw(st.integers(0, 30))
     before, part, after = content[:start], content[start : start + length], content[start + length :]
     match draw(st.sampled_from(["flip", "replace", "repeat", "remove", "cut"])):
@@ -177,7 +177,7 @@ def cast(value: Any, dtype: Any) -> Any:
 
 
 def holds(part: Any, whole: Any) -> bool:
-    """Return whether a content is another one without some of its keys."""
+    """Return whether ``part`` equals ``whole`` except for missing keys."""
     if isinstance(part, dict) and isinstance(whole, dict):
         return part.keys() <= whole.keys() and all(holds(each, whole[key]) for key, each in part.items())
     if isinstance(part, list) and isinstance(whole, list):
@@ -187,7 +187,7 @@ def holds(part: Any, whole: Any) -> bool:
 
 @st.composite
 def changed_tree(draw: st.DrawFn, tree: Any, leaves: list) -> Any:
-    """Draw the tree with another key, value or length somewhere."""
+    """Draw a copy of the tree with a changed key, value or length somewhere."""
     if isinstance(tree, np.ndarray) and tree.size:
         match draw(st.sampled_from(["entry", "dtype", "shorter", "longer"])):
             case "entry":
@@ -221,7 +221,7 @@ def changed_tree(draw: st.DrawFn, tree: Any, leaves: list) -> Any:
 
 @pytest.fixture
 def good(request, tmp_path, monkeypatch):
-    """A good file of a kind, and its content and value."""
+    """Kind, path, content and value of a good file."""
     kind, path = KINDS[request.param], tmp_path / request.param
     monkeypatch.setattr("batchpid.sim.recording.recording_files.CHUNK_BYTES", 256)
     kind.write(path)
@@ -229,21 +229,21 @@ def good(request, tmp_path, monkeypatch):
 
 
 def check(good, content: bytes) -> None:
-    """Read a file with ``content``: it is refused by its name, or has the value of that content."""
+    """Check that a file with ``content`` is refused with its name in the error, or read with the right value."""
     kind, path, original, value = good
     is_binary = path.suffix in (".npz", ".h5")
     path.write_bytes(content)
     try:
         here, there = (plain(decoded(path.suffix, each)) for each in (content, original))
         same, may_be = here == there, holds(here, there)
-    except Exception:  # not readable, so that it may not be read as something else
+    except Exception:  # no tree: a text file must be refused, and a binary file may have the original's value
         same, may_be = is_binary, is_binary
     try:
         found = plain(kind.read(path))
     except BatchPIDError as error:
         assert path.name in str(error)  # noqa: PT017
     except FileNotFoundError as error:
-        assert error.filename not in (None, str(path))  # noqa: PT017  # another file, which this one names
+        assert error.filename not in (None, str(path))  # noqa: PT017  # of another file, whose name is in this one
     else:
         assert same or found != value or may_be
         assert found == value or not same
@@ -252,7 +252,7 @@ def check(good, content: bytes) -> None:
 
 
 def kinds(*unnamed: str) -> pytest.MarkDecorator:
-    """Return the parameters of a test: files of all kinds. Errors of those ``unnamed`` do not all name the file yet."""
+    """Parametrize a test by all kinds of files; errors of the kinds ``unnamed`` do not always name the file yet."""
     marks = {name: pytest.mark.xfail(reason="names the field alone", strict=True) for name in unnamed}
     names = [name for name in KINDS if name != "recording.h5"]
     return pytest.mark.parametrize(
@@ -279,13 +279,13 @@ def test_bytes(good, data):
 @settings(max_examples=6, **EXAMPLES)
 @given(st.data())
 def test_bytes_of_hdf5(good, data):
-    """Each file is read by a process of its own."""
+    """Few examples: each file is read in a new process."""
     check(good, data.draw(changed_bytes(good[2])))
 
 
 @st.composite
 def encoded_changes(draw: st.DrawFn, suffix: str, content: bytes) -> bytes:
-    """Draw the file of a content with another key, value or length."""
+    """Draw the content of a file with a changed key, value or length."""
     leaves = CELLS if suffix == ".csv" else LEAVES
     return encoded(suffix, draw(changed_tree(decoded(suffix, content), leaves)))
 

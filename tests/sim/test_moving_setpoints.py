@@ -1,4 +1,4 @@
-"""Trajectories under the default gains: with rates robots follow them, and without they are told."""
+"""Trajectories under the default gains: robots follow them with rates, and a warning names rates that are missing."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def test_every_option_is_documented_where_it_is_declared():
 
 
 def test_commands_and_recordings_take_switches_from_their_declaration():
-    """Adding one touches the record, and the place where it acts."""
+    """A new switch changes its declaration and the code where it acts, and no other module."""
     switches = [each.name for each in fields(RunnerKeywords) if isinstance(each.default, bool)]
     assert {"collisions", "recover"} <= {*switches}
     root = Path(inspect.getfile(RunnerKeywords)).parent

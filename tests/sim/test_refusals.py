@@ -1,4 +1,4 @@
-"""Table of calls that are refused: each error names the argument, and changes nothing."""
+"""Tables of wrong calls: each raises an error that names the argument, and changes nothing."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SAPIENS_OWN = dataclasses.replace(ARM, dissipation="sapien")
 
 
 class Hold:
-    """Controller that compensates the passive force; ``more`` are its attributes."""
+    """Controller that only compensates the passive force; ``more`` are further attributes, such as ``command``."""
 
     def __init__(self, **more: Any) -> None:
         vars(self).update(more)
@@ -49,7 +49,7 @@ class Hold:
 
 
 def named(call: Callable[[], Any]) -> str:
-    """Return the argument that the error of a call names."""
+    """Return the name of the argument in the InvalidArgumentError of ``call``."""
     with pytest.raises(InvalidArgumentError) as caught:
         call()
     assert len(str(caught.value)) > 20
@@ -74,7 +74,7 @@ def test_values_of_no_use_are_refused_for_every_option(name: str) -> None:
     assert set(refused) <= {name, "link"} if name == "tool" else {*refused} == {name}
 
 
-# -- options that do not go together -----------------------------------------------------------------------------------
+# -- options that exclude each other -----------------------------------------------------------------------------------
 
 MOTORS = bp.make_actuators(DOF, strength=0.9)
 PUSHES = {"push": Uniform(0, 1), "push_interval": Uniform(1, 2)}
@@ -177,7 +177,7 @@ def runner() -> Any:
 
 
 def call(runner: Runner, name: str, arguments: dict[str, Any]) -> str:
-    """Return the argument that the error of a refused call names, after which nothing has changed."""
+    """Make a wrong call; check that it changes nothing, and return the name of the argument in its error."""
     before, time = runner.observe(), runner.time
     act = (lambda: setattr(runner, name, arguments["value"])) if "value" in arguments else None
     argument = named(act or (lambda: getattr(runner, name)(**arguments)))

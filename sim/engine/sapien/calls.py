@@ -1,8 +1,8 @@
 """Calls into SAPIEN for all robots of a pack: reads, efforts, and steps of their systems.
 
 Native calls are one call of the extension for all robots. The extension calls functions that SAPIEN's shared library
-exports, so that it needs nothing of SAPIEN to be compiled. It depends on the layout of two of SAPIEN's types, which no
-header promises: see :data:`batchpid.sim.engine.native.library.TESTED`.
+exports, so that it compiles without SAPIEN. It depends on the layout of two of SAPIEN's types, which SAPIEN does not
+guarantee: see :data:`batchpid.sim.engine.native.library.TESTED`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class PythonCalls:
             step()
 
     def close(self) -> None:
-        """Release robots and systems, so that they can be freed."""
+        """Drop the references to robots and systems, so that they can be freed."""
         self._get_qpos, self._get_qvel, self._passive_force, self._set_qf, self._steps = [], [], [], [], []
 
 

@@ -306,7 +306,7 @@ class Pack(ModelPack):
                 shape.set_physical_material(material)
 
     def _change_masses(self, robot: Any, row: int) -> None:
-        """Set the masses of a robot. They move the frames of its joints by rounding, so that these are set again."""
+        """Set the masses of a robot, and restore the frames of its joints, which this moves by rounding."""
         if not self._masses.added:
             return
         if not self._frames:  # of a robot as it is built

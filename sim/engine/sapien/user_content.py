@@ -1,6 +1,6 @@
 """Scenes that need no render device, and the content that the user's ``build`` function adds to them.
 
-Mirrored collision meshes get builders of their own. A URDF mirrors a mesh by a negative scale. PhysX requires positive
+Mirrored collision meshes have separate builders. A URDF mirrors a mesh by a negative scale. PhysX requires positive
 scales of convex meshes, SAPIEN passes on any scale, and the process ends with a segmentation fault once two such shapes
 touch. The mirrored vertices make a sound mesh.
 """
@@ -31,7 +31,7 @@ from batchpid.sim.engine.scene_spec import Build, SceneSpec
 
 
 class MirroringBuilder(ArticulationBuilder):
-    """Articulation builder whose links build meshes of negative scale from mirrored vertices."""
+    """Articulation builder that builds meshes of negative scale from mirrored vertices."""
 
     def create_link_builder(self, parent: LinkBuilder | None = None) -> LinkBuilder:
         """Return a builder of a link below ``parent``."""

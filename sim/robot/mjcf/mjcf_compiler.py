@@ -188,7 +188,7 @@ def _refusal(path: Path, problem: str) -> str:
 
 
 ALONE = "engine 'mujoco' alone simulates"
-"""Beginning of what findings say of elements that have no equivalent in a URDF."""
+"""First words of the findings for elements without equivalent in a URDF."""
 MOVING = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 """Types of joints with one degree of freedom."""
 
@@ -227,7 +227,7 @@ class Names:
         self.joints = {joint: name for joint, name in self.joints.items() if self.is_of_robot(self._bodies[joint])}
 
     def is_of_robot(self, body: Any) -> bool:
-        """Return whether a body, the world included, is none of those that were left out, nor below one."""
+        """Return whether a body, or the world, was kept: neither left out nor below a body that was left out."""
         return int(self._roots[body]) not in self._left_out
 
     def new_link(self, name: str) -> str:

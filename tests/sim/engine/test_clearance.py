@@ -1,4 +1,4 @@
-"""Proofs in MuJoCo that no shapes touch leave out no contact that matters: the motion is the same without them."""
+"""MuJoCo's contacts with and without proofs of clearance: proofs skip no contact, so the motion is the same."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ CASES = [
 @pytest.mark.skipif(os.environ.get("BATCHPID_NATIVE") == "0", reason="there are no native calls")
 @pytest.mark.parametrize(("name", "fixed_base", "ground"), CASES)
 def test_a_motion_is_the_same_without_proofs(name, fixed_base, ground, tmp_path, monkeypatch):
-    """Python's calls, which know no proofs, let MuJoCo look for contacts in every step."""
+    """Without native code MuJoCo looks for contacts in every step."""
     of = load_bundled(name) if isinstance(name, str) else shaped_tree(name, tmp_path, fixed_base=fixed_base)
     ours, theirs = (motion(of, monkeypatch, proofs, ground=ground) for proofs in (True, False))
     for one, other in zip(ours, theirs, strict=True):

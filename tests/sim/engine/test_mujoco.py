@@ -1,4 +1,4 @@
-"""MuJoCo as an engine: the same motion as in SAPIEN, and what is its own."""
+"""MuJoCo as an engine: the same motion as in SAPIEN, and features of MuJoCo alone."""
 
 import sys
 

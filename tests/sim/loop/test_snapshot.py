@@ -1,4 +1,4 @@
-"""Snapshots: what they hold, and files of them that are damaged, of another format, or made to do harm.
+"""Snapshots: their content, and files that are damaged, of another format, or malicious.
 
 test_conformance.py shows that a run goes on from a snapshot bit by bit, test_state_belongs.py which runners refuse it.
 """
@@ -45,7 +45,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-# -- what it holds -----------------------------------------------------------------------------------------------------
+# -- content -----------------------------------------------------------------------------------------------------
 
 
 def test_a_new_process_and_a_copy_go_on_from_it(jaco2: Robot, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A history of a search matches its inputs, or an error says so."""
+"""A search resumes from a history with the same inputs; with other inputs an error names them."""
 
 from __future__ import annotations
 
