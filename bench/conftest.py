@@ -74,7 +74,7 @@ def most(pytestconfig: pytest.Config) -> Size:
 
 @pytest.fixture(scope="module")
 def quick_smoke() -> Iterator[None]:
-    """Let JAX compile with few optimisations."""
+    """Make JAX compile with few optimisations."""
     jax = pytest.importorskip("jax")
     jax.config.update("jax_disable_most_optimizations", True)
     yield

@@ -1,4 +1,4 @@
-"""Controller of one's own, for the benchmark: a policy network that is evaluated at every sim step."""
+"""User-defined controller for the benchmark: a policy network, evaluated at every sim step."""
 
 from __future__ import annotations
 

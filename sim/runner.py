@@ -593,7 +593,7 @@ class Runner(SingleOwner):
             self._call.end()
 
     def _execute(self, command: RunnerCommand) -> Outcome:
-        """Execute a command, or complete the one that was sent; then warn of what was found.
+        """Execute a command, or complete the one that was sent; then issue warnings.
 
         Ctrl-C does not interrupt it between the request and the new state. The runner is closed if the workers cannot
         complete the request, or if a second Ctrl-C ends it.

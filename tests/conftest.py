@@ -25,7 +25,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def quick_compilation() -> Iterator[None]:
-    """Let JAX compile with few optimisations."""
+    """Make JAX compile with few optimisations."""
     jax = pytest.importorskip("jax")
     jax.config.update("jax_disable_most_optimizations", True)
     yield

@@ -1,4 +1,4 @@
-"""The examples of docs/own-simulator.md: short, complete, and each does what it says."""
+"""The examples of docs/own-simulator.md are short and complete, and do what the page says."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def advance_with_mass_matrix(
 
 
 def given_acceleration(k: Coefficients, setpoint_acceleration: Array) -> Array:
-    """Return what a given acceleration of the setpoint adds to the law's output; None for nothing."""
+    """Return the term of a given setpoint acceleration in the law's output; None without one."""
     if setpoint_acceleration is None or k.acceleration_share is None:
         return setpoint_acceleration
     return k.acceleration_share * setpoint_acceleration

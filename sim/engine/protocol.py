@@ -78,7 +78,7 @@ class EnginePack(Protocol):
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N].
 
         They come from the model of ``spec`` at the present state, without the pack's variation. On a floating base they
-        are those of the joints alone, as if the base were held where it is: no effort of a joint carries the base.
+        are computed as if the base were fixed: no effort of a joint carries the base.
         """
 
     def joint_mass_matrix(self, qpos: Rows) -> Float64:
@@ -115,7 +115,7 @@ class EnginePack(Protocol):
         """Add ``twists`` (len(rows), 6) [m/s, rad/s] to those of floating bases, as :meth:`read_base` has them."""
 
     def take_sensed(self) -> dict[str, Float64]:
-        """Return what the sensors of links summed up in all sim steps since the last call, and begin again.
+        """Return the sums of the link sensors over all sim steps since the last call, and reset them.
 
         ``contact_force`` (M, links, 3), ``touching`` (M, links), 0 without a contact, and ``wrench`` (M, links, 6), as
         :class:`batchpid.sim.Observation` describes them; of robots that were placed meanwhile, since then.

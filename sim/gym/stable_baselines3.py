@@ -88,7 +88,7 @@ class TaskVecEnv(VecEnv):
         return [getattr(self.envs, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
-        """Set an attribute of the task. Envs have no attributes of their own: ``indices`` must be None."""
+        """Set an attribute of the task. Single envs have no attributes: ``indices`` must be None."""
         if indices is not None:
             raise InvalidArgumentError("indices", "cannot be chosen: all envs are one task", remedy="leave it out")
         setattr(self.envs, attr_name, value)

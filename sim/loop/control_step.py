@@ -56,7 +56,7 @@ def control_step(
 def sim_step(
     layout: Layout, constants: Constants, values: Values, engine: Mapping[str, Callable[[Values], Values]]
 ) -> Values:
-    """Run the stages of a sim step in the order of the table; ``engine`` has those of the executor, by name."""
+    """Run the stages of a sim step in the order of the table; ``engine`` has the executor's own stages, by name."""
     for stage in STAGES:
         if stage.function is not None:
             values = stage.function(layout, constants, values)

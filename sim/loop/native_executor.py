@@ -1,7 +1,7 @@
 """Ticks in native code: one call of the extension runs them until an event needs Python.
 
-With a controller in Python, or too many joints, the stages run in NumPy, and one native call applies efforts, steps and
-reads.
+With a controller in Python, or more than MOST_SUMMED joints, the stages run in NumPy. One native call then applies
+efforts, does the engine's step and reads the state.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class NativeExecutor(NumPyExecutor):
     ) -> Ran:
         """Run sim steps until an event needs Python: an env may have failed, or a command is not finite.
 
-        With ``table``, commands and observations are those of its ticks; otherwise one tick runs under ``command``.
+        With ``table``, its ticks run: commands are read from it, and observations are written to it. Otherwise one tick
+        runs under ``command``.
         """
         if not self._compiles:
             return super().run(state, measured, command, span)

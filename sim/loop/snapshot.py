@@ -176,7 +176,7 @@ class Snapshot:
     targets: NDArray[np.float64] | None = None
     """Last joint setpoints (envs, dof) of a runner whose setpoints are poses; else None."""
     motion: NDArray[np.float64] | None = None
-    """Last joint setpoints and their rates (2, envs, dof); None where setpoints are not those of joints."""
+    """Last joint setpoints and their rates (2, envs, dof); None where setpoints are not for joints."""
 
     def check(self, about: Mapping[str, Any]) -> None:
         """Check that a runner with options ``about`` can restore it.

@@ -291,7 +291,7 @@ class _Run:
 
     @cached_property
     def unsettled(self) -> Bool:
-        """Joints that end outside their band (envs, dof); those of failed envs do not count."""
+        """Joints that end outside their band (envs, dof); failed envs do not count."""
         shape = self.rollout.qpos.shape[1:]
         outside: Any
         if self.is_pose and self.rollout.tool_pose is not None and self.robot.fixed_base:
@@ -609,7 +609,7 @@ class _Run:
         return effort + np.clip(drive, low, high), (drive <= low) | (drive >= high)
 
     def _is_at_rest(self, env: int, joint: int) -> bool:
-        """Return whether a joint hardly moves at the end, or swings about a position beside the setpoint."""
+        """Return whether a joint hardly moves at the end, or swings about a position away from the setpoint."""
         error = self.error[self.tail, env, joint]
         drift = abs(error[: len(error) // 2].mean() - error[len(error) // 2 :].mean())
         speed = abs(self.rollout.qvel[self.tail, env, joint].mean())  # within a second, if the run is shorter

@@ -137,7 +137,7 @@ class Run(Request):
     substeps: int = field()
     command: Command = Command(None)  # noqa: RUF009  (immutable)
     given: tuple[bool, ...] | None = None
-    """Which arrays of the command are used; None: those of ``command``, which a worker process does not have."""
+    """Which arrays of the command are used. None in the calling process, where ``command`` shows it; see ``encode``."""
     counts_ticks = True
     idle_limit = 0.7  # it only computes
 

@@ -32,7 +32,7 @@ def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> s
 
 @pytest.fixture
 def small_groups(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let runners in this process have several groups of envs."""
+    """Give runners in this process several groups of envs."""
     for name in ("sapien", "mujoco"):
         monkeypatch.setattr(type(load_engine(name)), "group_size", 3)
 

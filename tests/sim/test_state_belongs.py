@@ -54,7 +54,7 @@ def quick(name):
 
 
 def go_on(runner):
-    """Return what follows: every observation, and where the boxes end."""
+    """Return the next observations, and the final poses of the boxes."""
     pose = runner.options.command.size > 2 or runner.options.setpoint_space == "tool"
     start = runner.observe()
     seen = []

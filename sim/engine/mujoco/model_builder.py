@@ -64,7 +64,7 @@ class RobotMj:
     bodies: dict[str, int]
     """Number of the body of each simulated link."""
     own: Any = (0.0, 0.0)
-    """Armature and damping (2, dof) of the joints besides those of the description and of motors."""
+    """Armature and damping (2, dof) of the joints in addition to the description and the motors."""
     frames: Mapping[str, BodyFrame] = field(default_factory=dict)
     """Frames of simulated links in their bodies; of other links the frames are the same."""
     base: tuple[int, int] | None = None

@@ -75,7 +75,7 @@ def home(model: MjModel) -> int | None:
 
 
 def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> MjcfFile:
-    """Return what the engine MuJoCo needs to know of the file."""
+    """Return the data of the file that the engine MuJoCo needs."""
     model, loops = compiled.model, []
     for equality in np.flatnonzero(model.eq_active0):
         at = [model.eq_obj1id[equality], model.eq_obj2id[equality]]

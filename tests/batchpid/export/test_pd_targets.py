@@ -1,4 +1,4 @@
-"""Configurations of Isaac Lab and ManiSkill: Python that parses, with the figures of the law, and what it loses."""
+"""Configurations of Isaac Lab and ManiSkill: Python that parses, the figures of the law, and differences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parameters of ros2_control: the target's law beside the law, and a round trip that loses only what it lists."""
+"""Parameters of ros2_control: the target's law against this one, and a round trip that loses only listed parts."""
 
 from __future__ import annotations
 

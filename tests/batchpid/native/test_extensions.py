@@ -79,7 +79,7 @@ def test_the_files_are_all_that_are_included_and_the_tables(name):
 
 
 def other_file(monkeypatch, changed):
-    """Let the digests of the files that end with ``changed`` be other ones."""
+    """Change the digests of the files that end with ``changed``."""
     real = extensions.Extension.digests
     monkeypatch.setattr(
         extensions.Extension,

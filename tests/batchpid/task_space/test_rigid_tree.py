@@ -1,4 +1,4 @@
-"""Kinematic trees: against MuJoCo, against differences of their own, and the errors of their arguments."""
+"""Kinematic trees: against MuJoCo, against finite differences, and errors of arguments."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from batchpid.sim.cli import main
 
 @pytest.fixture(autouse=True)
 def working_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let each test run in an empty folder: files of the checkout, as in its out/, do not matter, and none is added."""
+    """Run each test in an empty folder, so that it neither uses nor adds files of the checkout, such as out/."""
     monkeypatch.chdir(tmp_path_factory.mktemp("working"))
 
 

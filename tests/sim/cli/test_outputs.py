@@ -52,7 +52,7 @@ def files(tmp_path_factory):
 
 @pytest.fixture
 def empty_pictures(monkeypatch):
-    """Let commands write empty files in place of pictures: their names are of interest."""
+    """Make commands write empty files in place of pictures: only their names matter."""
     for name in ("step_responses", "efforts", "comparison"):
         monkeypatch.setattr(f"batchpid.sim.plots.{name}", lambda *_, **__: None)
     monkeypatch.setattr(

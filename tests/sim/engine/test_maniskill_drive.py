@@ -1,4 +1,4 @@
-"""ManiSkill's controller on PhysX: its drives, set from an exported configuration, beside their equation."""
+"""ManiSkill's controller on PhysX: its drives, set from an exported configuration, against their equation."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def rollout(panda, workers=0, runners=1, engine="sapien"):
 
 
 def make_stale(monkeypatch, module):
-    """Let the extension ``module`` be built from other sources."""
+    """Pretend that the extension ``module`` was built from other sources."""
     real = extensions.Extension.digests
     monkeypatch.setattr(
         extensions.Extension,

@@ -71,7 +71,7 @@ def test_it_is_the_rollout_of_one_runner(name, tmp_path):
 
 
 def content_of_env(scene, env):
-    """Build a box beside the robot, farther for each env."""
+    """Build a box next to the robot, farther away for each env."""
     return box(0.05, scene, env)
 
 

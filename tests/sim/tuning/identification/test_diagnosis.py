@@ -1,4 +1,4 @@
-"""Diagnosis beside a fit: a link that is heavier than described, weak motors, and a push."""
+"""Diagnosis of a fit: a link that is heavier than described, weak motors, and a push."""
 
 from __future__ import annotations
 

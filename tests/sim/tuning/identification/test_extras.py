@@ -1,4 +1,4 @@
-"""Effects beside those of every fit, found in logs of a Runner, and kept where they lower the held-out error."""
+"""Optional effects of a fit, found in logs of a Runner, and kept where they lower the held-out error."""
 
 import numpy as np
 import pytest
