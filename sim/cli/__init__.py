@@ -22,6 +22,7 @@ import tyro
 
 import batchpid
 from batchpid.errors import BatchPIDError
+from batchpid.sim.cli import flags
 from batchpid.sim.cli.compare import CompareCommand, ParityCommand
 from batchpid.sim.cli.demo import DemoCommand
 from batchpid.sim.cli.excite import ExciteCommand
@@ -92,6 +93,7 @@ def _run(arguments: list[str]) -> int:
             command = parse(arguments)
         except SystemExit as end:  # after --help, or a message about unknown flags
             return int(end.code or 0)
+        flags.check(command)
         for name in command.imports:
             importlib.import_module(name)
         if signal.getsignal(signal.SIGINT) is exit_at_once:
