@@ -198,9 +198,9 @@ def read_distribution(name: str, value: Any) -> Distribution:
     if not isinstance(arguments, list | tuple) or len(arguments) != len(numbers):
         problem, remedy = f"{kind} needs a list of numbers", f"write {kind}: [{', '.join(numbers)}]"
         raise InvalidArgumentError(name, f"is not a distribution: {problem}", value=value, remedy=remedy)
+    for option in options:
+        choice(name, option, known)
     try:
-        for option in options:
-            choice("option", option, known)
         return KINDS[kind](*arguments, **options)
     except InvalidArgumentError as error:
         problem = f"{error.argument} {error.problem}"
