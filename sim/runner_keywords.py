@@ -211,8 +211,9 @@ class RunnerKeywords:
     :meth:`batchpid.sim.Runner.poses` reports. A reset returns the content to the poses that ``build`` gave it."""
     on_fault: Annotated[FaultAction, option("snapshot")] = "hold"
     """Action when an env fails: ``"hold"`` (default) keeps it at rest in its last valid state, with ``ok`` False until
-    it is reset; ``"reset"`` returns it to its last start, with ``ok`` False for that tick. An env fails when its state
-    is not finite, when a position is beyond 1e6 rad or m, or by ``speed_limit``. The other envs are not affected."""
+    it is reset; ``"reset"`` returns it to its last start, with ``ok`` False for that tick. An env fails when its state,
+    or the effort of a :class:`Controller`, is not finite, when a position is beyond 1e6 rad or m, or by
+    ``speed_limit``. The other envs are not affected."""
     speed_limit: Annotated[ArrayLike | None, option("snapshot")] = None
     """Joint speed at which an env fails, scalar or (dof,) [rad/s or m/s]; default none."""
     actuators: Annotated[bp.Actuators | None, option(role="restored")] = None

@@ -52,7 +52,7 @@ def refuse(command: Any, names: Iterable[str], problem: str) -> None:
 
 
 def variation(command: Any) -> tuple[float, float] | None:
-    """Return the payload and the friction of ``--variation``; None without it, where both must be left out."""
+    """Return the payload and the friction of ``--variation``; None without this flag, which both of them need."""
     if not command.variation:
         refuse(command, ("payload", "friction"), "has no effect without --variation")
         return None

@@ -1,4 +1,4 @@
-"""Output of the commands: files, with default names and checks of every one before the run, and bars of progress.
+"""Output of the commands: files, with default names and checks before the run, and progress bars.
 
 A run may take hours, so every possible check is made before it. No file is replaced without ``--force``.
 """

@@ -72,8 +72,8 @@ def _read(path: Path, every: int) -> Rollout:
 class RenderCommand:
     """Film a recorded run in real time, all envs side by side.
 
-    SAPIEN's renderer draws it, with a Vulkan device, which may be a software one. Without one, Matplotlib draws it,
-    plainer. ``batchpid view --play`` shows the same in a browser.
+    SAPIEN's renderer draws it on a Vulkan device, which may be a software one. Without a device, Matplotlib draws it,
+    in less detail. ``batchpid view --play`` shows the same in a browser.
     """
 
     recording: tyro.conf.Positional[Path]
