@@ -24,7 +24,7 @@ from tabulate import tabulate
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.workers.cluster import NODE_STEPS
-from batchpid.sim.workers.node_worker import SILENCE_LIMIT
+from batchpid.sim.workers.node import SILENCE_LIMIT
 
 NODES, CORES, ENVS = (2, 10, 100, 1000), 16, 64
 """Nodes of a cluster, cores of a node, envs of a core."""

@@ -49,8 +49,8 @@ from batchpid.sim.runner_commands import (
 )
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE, KINDS, OPTIONS, arguments_of, checked_option
 from batchpid.sim.runner_state import RunnerState
+from batchpid.sim.workers.cluster import NodeInfo
 from batchpid.sim.workers.contact_log import MissedContact
-from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, WorkerPool
 from batchpid.sim.workers.requests import ReadPoses, ReadStateSizes, Restore

@@ -20,11 +20,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
+from batchpid.checks.validate import choice
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.sim.identification.log import Sensor
 from batchpid.sim.recording.hdf5 import LOG_QUANTITIES as QUANTITIES
 from batchpid.sim.recording.hdf5 import read_hdf5
 from batchpid.sim.recording.recording_files import RecordingError, load_h5py
+from batchpid.sim.robot.robot import Robot
 
 MAX_BYTES = 1 << 30
 """Most that the columns of an HDF5 file may take."""
@@ -126,6 +128,26 @@ def time_column(source: str, columns: dict[str, Float64], unit: TimeUnit | None)
     if unit is not None and found[name] not in (None, unit):
         raise error(source, f"has the column {name!r}, not in {unit}", "leave out the unit of the times", unit)
     return SECONDS[unit or found[name] or "s"] * columns[name]
+
+
+def columns_by_joint(
+    robot: Robot, source: str, columns: dict[str, Float64], quantities: Sequence[str], prefix: str = ""
+) -> dict[str, dict[str, Float64]]:
+    """Return the columns of ``quantities`` by quantity and by the robot's name of their joint; others are left out.
+
+    Raises InvalidArgumentError for an unknown joint, or for two columns that differ in blanks alone.
+    """
+    by: dict[str, dict[str, Float64]] = {quantity: {} for quantity in quantities}
+    for name, values in columns.items():
+        quantity, colon, joint = name.partition(":")
+        quantity, joint = quantity.strip(), joint.strip().removeprefix(prefix)
+        if not colon or quantity not in by:
+            continue
+        choice(f"{source}: column {name!r}: joint", joint, robot.joint_names)
+        if joint in by[quantity]:
+            raise error(source, f"has the column '{quantity}:{joint}' twice, apart from blanks", "keep one of them")
+        by[quantity][joint] = values
+    return by
 
 
 def _unquoted(path: Path, number: int, line: str, delimiter: str) -> list[str]:

@@ -235,8 +235,5 @@ def _chirp(
     edge = np.clip(np.minimum(time, total - time) / (_WINDOW * total), 0.0, 1.0)[:, None]
     window = edge**3 * (10 - 15 * edge + 6 * edge**2)
     position = robot.coupled(center + window * amplitude * np.sin(angle))
-    return Trajectory(time, position, np.gradient(position, dt, axis=0), _second(position, dt))
-
-
-def _second(position: Float64, dt: float) -> Float64:
-    return np.gradient(np.gradient(position, dt, axis=0), dt, axis=0)
+    velocity = np.gradient(position, dt, axis=0)
+    return Trajectory(time, position, velocity, np.gradient(velocity, dt, axis=0))

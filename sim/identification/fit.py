@@ -79,31 +79,31 @@ def fit(problem: Problem, begin: FitStep, report: Callable[[FitStep, float], Non
     scale, spread = problem.unknowns.scale, problem.unknowns.spread
     bounds = problem.unknowns.low / scale, problem.unknowns.high / scale
     x, last, cost = _inside(begin.theta / scale, bounds), begin.last / scale, begin.cost
-    if not np.isfinite(factors.at(x * scale)).all():
+    if not np.isfinite(factors.at(x * scale)[0]).all():
         remedy = "check the params that drove the robot, --timestep and the units of the logs"
         raise InvalidArgumentError(
             "logs", "move otherwise than any robot that was simulated: all diverge", remedy=remedy
         )
     while True:
         factors.keep(x * scale)
-        sizes = factors.sizes(x * scale)
-        determinants = np.concatenate([window.determinant for window in factors.windows(x * scale)])
+        factor, sizes, windows = factors.at(x * scale)
+        determinants = np.concatenate([window.determinant for window in windows])
         before, cost = cost, float(problem.costs(sizes, determinants).mean())
         report(FitStep(x * scale, factors.left, last * scale, before), cost)
         gain = before - cost
-        weighed = factors.at(x * scale) / sizes[..., None, None]
+        weighed = factor / sizes[..., None, None]
         moved = np.max(np.abs(x - last) / _deviations(weighed, scale / spread))
         promised = _promised(weighed, (bounds[0] - x, bounds[1] - x)) / problem.count
         done = gain < LEAST_GAIN or (gain < GAIN and moved < STEP) or promised < LEAST_GAIN
         if done or factors.left <= 0:
-            return Solution(x * scale, cost, sizes, factors.windows(x * scale), promised)
+            return Solution(x * scale, cost, sizes, windows, promised)
 
         def residuals(x: Float64, sizes: Float64 = sizes) -> Float64:
-            found = factors.at(x * scale)[..., -1] / sizes[..., None]
+            found = factors.at(x * scale)[0][..., -1] / sizes[..., None]
             return np.append(found.ravel(), (x * scale - problem.unknowns.prior) / spread)
 
         def jacobian(x: Float64, sizes: Float64 = sizes) -> Float64:
-            found = -factors.at(x * scale)[..., :-1] / sizes[..., None, None]
+            found = -factors.at(x * scale)[0][..., :-1] / sizes[..., None, None]
             return np.vstack([found.reshape(-1, len(x)), np.diag(scale / spread)])
 
         # One evaluation is of x itself, whose value is known.
@@ -148,23 +148,15 @@ class _Factors:
         self._problem = problem
         self._known: dict[bytes, tuple[Float64, Float64, list[FitEvaluation]]] = {}
 
-    def at(self, theta: Float64) -> Float64:
-        """Return the factors (stretches, joints, rows, unknowns + 1); inf if the simulation diverges."""
-        return self._all(theta)[0]
-
-    def sizes(self, theta: Float64) -> Float64:
-        """Return the sizes of the residuals (stretches, joints)."""
-        return self._all(theta)[1]
-
     def keep(self, theta: Float64) -> None:
         """Discard all points except ``theta``."""
-        self._known = {theta.tobytes(): self._all(theta)}
+        self._known = {theta.tobytes(): self.at(theta)}
 
-    def windows(self, theta: Float64) -> list[FitEvaluation]:
-        """Return residuals and Jacobian of all windows."""
-        return self._all(theta)[2]
+    def at(self, theta: Float64) -> tuple[Float64, Float64, list[FitEvaluation]]:
+        """Return the factors, the sizes of the residuals, and residuals and Jacobian of all windows.
 
-    def _all(self, theta: Float64) -> tuple[Float64, Float64, list[FitEvaluation]]:
+        Factors are (stretches, joints, rows, unknowns + 1), inf if the simulation diverges; sizes (stretches, joints).
+        """
         key = theta.tobytes()
         if key not in self._known:
             # The one at the start does not count, so that a fit may resume there. A point that is moved off a bound

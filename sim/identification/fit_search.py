@@ -116,7 +116,7 @@ def variants(drive: LoggedDrive, motions: list[Motion]) -> list[LoggedDrive]:
     return [*([replace(quiet, noisy=True)] if seen else []), quiet, *([drive] if drive.measured_rate else [])]
 
 
-def best_drive(
+def likely_drives(
     robot: Robot,
     joints: tuple[int, ...],
     drive: LoggedDrive,
@@ -124,17 +124,17 @@ def best_drive(
     motions: list[Motion],
     payload: bool,
     gains_known: bool = True,
-) -> tuple[LoggedDrive, Regression]:
-    """Return the drive that explains the logs best, with its regression."""
-    ways = hypotheses(drive, payload)
+) -> list[tuple[LoggedDrive, Regression]]:
+    """Return the possible drives with their regressions; the one that explains the logs best is the first."""
     found = [
-        (Regression(plants_of(robot, joints, each, logs), logs, motions, payload, gains_known), each) for each in ways
+        (each, Regression(plants_of(robot, joints, each, logs), logs, motions, payload, gains_known))
+        for each in hypotheses(drive, payload)
     ]
-    best, chosen = found[0]
-    for other, way in found[1:]:
-        if explains_better(other.best, best.best):
-            best, chosen = other, way
-    return chosen, best
+    best = 0
+    for number, (_, regression) in enumerate(found):
+        if explains_better(regression.best, found[best][1].best):
+            best = number
+    return [found[best], *found[:best], *found[best + 1 :]]
 
 
 def begin(problem: Problem, regression: Regression, ideal: Motors, seed: int) -> Float64:

@@ -29,9 +29,8 @@ from batchpid.sim.identification.fit_search import (
     Progress,
     State,
     begin,
-    best_drive,
     extended,
-    hypotheses,
+    likely_drives,
     search,
     variants,
 )
@@ -39,7 +38,7 @@ from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.logged_control import LoggedDrive
-from batchpid.sim.identification.plant import Plant, plants_of
+from batchpid.sim.identification.plant import Plant
 from batchpid.sim.identification.problem import Problem
 from batchpid.sim.identification.regression import Motion, Regression, smooth
 from batchpid.sim.identification.result import Fit, Identification, actuators_at
@@ -157,8 +156,8 @@ def identify(
     motions = [smooth(log, timestep) for log in found]
     fitted = [log for log in found if not log.settings.held_out]
     fitted_motions = [each for each, log in zip(motions, found, strict=True) if not log.settings.held_out]
-    drive, regression = best_drive(resting, joints, assumed, fitted, fitted_motions, payload, gains_known)
-    unknowns = _unknowns(resting, joints, drive, regression, motions, payload)
+    drives = likely_drives(resting, joints, assumed, fitted, fitted_motions, payload, gains_known)
+    unknowns = _unknowns(resting, joints, *drives[0], motions, payload)
     if not gains_known:
         unknowns = unknowns.plus(["gain"], range(len(joints)), {})
     ratios = None if found[0].measured is None else effort_ratios(inputs)
@@ -179,15 +178,10 @@ def identify(
             state = known or State(FitStep.first(begin(problems[0], regression, ideal, seed), evaluations))
             return search(problems, state, evaluations, record, Progress(len(problems), evaluations, progress))
 
-        fits_of_ways, regressions = [fit_under(drive, regression, record)], {drive.compensation: regression}
-        if misfits(*fits_of_ways[0]).max() > LARGEST_MISFIT:  # the compensation may be wrong
-            for way in hypotheses(assumed, payload):
-                if way.compensation != drive.compensation:
-                    plants = plants_of(resting, joints, way, fitted)
-                    regression = Regression(plants, fitted, fitted_motions, payload, gains_known)
-                    regressions[way.compensation] = regression
-                    fits_of_ways.append(fit_under(way, regression, HistoryFile(None, "fit", settings)))
-        problem, best = min(fits_of_ways, key=lambda each: each[1].cost)
+        fits_of_drives = [fit_under(*drives[0], record)]
+        if misfits(*fits_of_drives[0]).max() > LARGEST_MISFIT:  # the compensation may be wrong
+            fits_of_drives += [fit_under(*each, HistoryFile(None, "fit", settings)) for each in drives[1:]]
+        problem, best = min(fits_of_drives, key=lambda each: each[1].cost)
         for name in extras:
             if name in EXTRAS:
                 problem, best = extended(problem, best, EXTRAS[name])
@@ -205,6 +199,7 @@ def identify(
     errors_of_fit = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
     noise = np.sqrt((errors_of_fit**2).mean(0))
     names = [robot.joint_names[joint] for joint in joints]
+    regressions = {each.compensation: regression for each, regression in drives}
     diagnosis = diagnose(regressions[problem.drive.compensation], fitted, names)
     estimate = best.theta
     if ratios is not None:

@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
-from batchpid.checks.validate import choice, file_path
+from batchpid.checks.validate import file_path
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification import log_lists
@@ -37,6 +37,7 @@ from batchpid.sim.identification.columns import (
     BAGS,
     QUANTITIES,
     Reading,
+    columns_by_joint,
     error,
     is_bag,
     read_bag,
@@ -49,8 +50,6 @@ from batchpid.sim.identification.log_checks import SPEEDING, checked, commands_o
 from batchpid.sim.observation import Rollout
 from batchpid.sim.recording.recording_files import HDF5, read_recording
 from batchpid.sim.robot.robot import Robot
-
-__all__ = ["CommandKind", "Log", "LogWarning", "logs_of_rollout", "read_logs"]
 
 SUFFIXES = (".csv", ".txt", ".npz", *HDF5, *BAGS)
 
@@ -192,7 +191,9 @@ def _build(
     """Return the logs that the columns of a file hold; ``commands`` are those that have times of their own."""
     time = time_column(source, columns, reading.time_unit)
     command_time = time if commands is None else commands["time"]
-    by = _by_quantity(robot, source, columns if commands is None else columns | commands, reading)
+    everything = columns if commands is None else columns | commands
+    by = columns_by_joint(robot, source, everything, QUANTITIES, reading.prefix)
+    _in_si_units(robot, by, reading)
     if not by["qpos"]:
         raise error(
             source, "has no column qpos:JOINT", "measured positions are needed, e.g. qpos:" + robot.joint_names[0]
@@ -263,22 +264,12 @@ def _choose(
     return found, sensor if found == "effort" else None
 
 
-def _by_quantity(
-    robot: Robot, source: str, columns: dict[str, Float64], reading: Reading
-) -> dict[str, dict[str, Float64]]:
-    """Return the columns by quantity and by the robot's name of their joint, in SI units."""
-    by: dict[str, dict[str, Float64]] = {quantity: {} for quantity in QUANTITIES}
-    for name, values in columns.items():
-        quantity, colon, joint = name.partition(":")
-        quantity, joint = quantity.strip(), joint.strip().removeprefix(reading.prefix)
-        if not colon or quantity not in by:
-            continue
-        choice(f"{source}: column {name!r}: joint", joint, robot.joint_names)
-        if joint in by[quantity]:
-            raise error(source, f"has the column '{quantity}:{joint}' twice, apart from blanks", "keep one of them")
-        angle = robot.units[robot.joint_names.index(joint)] == "rad" and quantity in ("qpos", "qvel", "setpoint")
-        factor = (reading.sign or {}).get(joint, 1.0)
-        if quantity in ("effort", "measured_effort", "feedforward"):
-            factor *= (reading.scale or {}).get(joint, 1.0)
-        by[quantity][joint] = factor * (np.radians(values) if reading.degrees and angle else values)
-    return by
+def _in_si_units(robot: Robot, by: dict[str, dict[str, Float64]], reading: Reading) -> None:
+    """Change the columns by quantity and joint to SI units, and to the robot's signs."""
+    for quantity, columns in by.items():
+        for joint, values in columns.items():
+            angle = robot.units[robot.joint_names.index(joint)] == "rad" and quantity in ("qpos", "qvel", "setpoint")
+            factor = (reading.sign or {}).get(joint, 1.0)
+            if quantity in ("effort", "measured_effort", "feedforward"):
+                factor *= (reading.scale or {}).get(joint, 1.0)
+            columns[joint] = factor * (np.radians(values) if reading.degrees and angle else values)

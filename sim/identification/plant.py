@@ -97,7 +97,8 @@ class Plant:
         frame = whole.bodies.link_frames[tool]
         tree = _with_payload(tree, whole.link_bodies[tool], frame[:, :3] @ whole.center[tool] + frame[:, 3])
         fixed = tree.fixed_at(coupling.positions(robot.start), moves)
-        self._tree = replace(fixed, coupling=Coupling.of(fixed.dof, followers))
+        self.tree = replace(fixed, coupling=Coupling.of(fixed.dof, followers))
+        """Rigid tree of the logged joints, with a link without mass for the payload."""
         self._own = None if np.array_equal(number[own], np.arange(fixed.dof)) else number[own]
         free = robot.continuous[own]
         self.low, self.high = (
@@ -109,15 +110,10 @@ class Plant:
         """Return the mass matrices (n, joints, joints) of the logged joints at ``qpos`` (n, joints)."""
         return self.at(qpos, np.zeros_like(qpos), payload).matrix
 
-    @property
-    def tree(self) -> RigidTree:
-        """Rigid tree of the logged joints, with a link without mass for the payload."""
-        return self._tree
-
     def with_tree(self, tree: RigidTree) -> Plant:
         """Return this plant with other masses, those of ``tree``."""
         other = copy(self)
-        other._tree = tree
+        other.tree = tree
         return other
 
     def compensation(self, qpos: Float64, qvel: Float64, payload: Float64) -> Float64 | None:
@@ -130,7 +126,7 @@ class Plant:
 
     def _dynamics(self, qpos: Float64, qvel: Float64, payload: Float64) -> Callable[[], Passive]:
         """Return :meth:`at` of what the arrays then hold; each result takes the place of the one before."""
-        tree, own, index = self._tree, self._own, len(self._tree.links) - 1
+        tree, own, index = self.tree, self._own, len(self.tree.links) - 1
         wanted = _LOADED if payload.any() else _EMPTY
         q, v = (np.ascontiguousarray(each) if own is None else np.zeros((len(qpos), tree.dof)) for each in (qpos, qvel))
         native = native_rows.bound(tree, wanted, q, v, index)

@@ -208,10 +208,6 @@ class Problem:
             found.append(FitEvaluation(residual, *whiten(wander, stretches, residual, jacobian), expected))
         return found
 
-    def lags(self, seconds: float) -> list[int]:
-        """Return how many rows of each log are ``seconds`` long."""
-        return [round(seconds / float(np.median(np.diff(log.time)))) for log in self.logs]
-
     def _simulate(self, points: Float64, draws: NDArray[np.intp], states: Float64) -> list[tuple[Float64, Float64]]:
         """Return for each window the positions (points, rows, joints), and the effect of its initial state.
 

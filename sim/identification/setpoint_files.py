@@ -18,8 +18,8 @@ import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import TURN, wrap
-from batchpid.checks.validate import choice, file_path
-from batchpid.sim.identification.columns import error, read_csv
+from batchpid.checks.validate import file_path
+from batchpid.sim.identification.columns import columns_by_joint, error, read_csv
 from batchpid.sim.robot.description import LIMIT_TOLERANCE
 from batchpid.sim.robot.robot import Robot
 from batchpid.trajectories import Trajectory
@@ -113,20 +113,15 @@ def _tables(robot: Robot, source: str, columns: dict[str, Float64], lines: list[
     if "time" not in columns:
         problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
         raise error(source, problem, f"begin the header with time, in seconds; columns are {known}")
-    found = dict[str, dict[str, Float64]]()
     for name, values in columns.items():
-        quantity, colon, joint = (part.strip() for part in name.partition(":"))
-        if name != "time" and not (colon and quantity in QUANTITIES):
+        quantity, colon, _ = name.partition(":")
+        if name != "time" and not (colon and quantity.strip() in QUANTITIES):
             raise error(source, f"has the unknown column {name!r}", f"remove it; columns are {known}")
         if not np.isfinite(values).all():
             line = lines[int(np.argmin(np.isfinite(values)))]
             raise error(source, f"line {line}, column {name!r} is empty or not finite", "give the number")
-        if name == "time":
-            continue
-        choice(f"{source}: column {name!r}: joint", joint, robot.joint_names)
-        if joint in found.setdefault(quantity, {}):
-            raise error(source, f"has the column '{quantity}:{joint}' twice, apart from blanks", "keep one of them")
-        found[quantity][joint] = values
+    by = columns_by_joint(robot, source, columns, QUANTITIES)
+    found = {quantity: of_joints for quantity, of_joints in by.items() if of_joints}
     needed = ("setpoint", *(["setpoint_rate"] if "setpoint_acceleration" in found else []))
     leaders = [name for name, free in zip(robot.joint_names, robot.independent, strict=True) if free]
     tables = {}

@@ -76,8 +76,8 @@ def uncertainty(problem: Problem, point: Solution) -> Uncertainty:
     unknowns = problem.unknowns
     count = len(unknowns.scale)
     normal, spread = np.zeros((count, count)), np.zeros((count, count))
-    covariances = _autocovariances(problem, point, max(problem.lags(MEMORY)))
     weights = _sizes_of_rows(problem, point)
+    covariances = _autocovariances(problem, point, weights)
     for evaluation, window, sigma in zip(point.windows, problem.windows, weights, strict=True):
         jacobian = evaluation.jacobian
         for joint in range(jacobian.shape[1]):
@@ -158,9 +158,9 @@ def _motion(problem: Problem) -> Float64:
     return np.concatenate([window.measured[window.fitted] for window in problem.windows]).std(0)
 
 
-def _autocovariances(problem: Problem, point: Solution, lags: int) -> Float64:
-    """Return the tapered autocovariances of the weighted residuals of each joint (lags, joints)."""
-    weights = _sizes_of_rows(problem, point)
+def _autocovariances(problem: Problem, point: Solution, weights: list[Float64]) -> Float64:
+    """Return the tapered autocovariances of the residuals over ``weights`` of each joint (lags, joints)."""
+    lags = max(round(MEMORY / float(np.median(np.diff(log.time)))) for log in problem.logs)
     parts = [e.white[w.fitted] / s for e, w, s in zip(point.windows, problem.windows, weights, strict=True)]
     parts = [part for part in parts if len(part)]
     lags = max(2, min(lags, max(map(len, parts)) // 2))  # a short stretch must not reduce the lags

@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from itertools import combinations
-from typing import NamedTuple
 
 from batchpid.sim.robot.merging import fixed_edges, place_links
 from batchpid.sim.robot.parts import Joint
@@ -31,19 +30,13 @@ _OTHERS = 1 << 31  # bit of words 0 and 1 of the bodies outside the vertex cover
 _MAX_CLIQUES, _MAX_STARS = 32, 30
 
 
-class CollisionGroups(NamedTuple):
-    """Words of each body, and the pairs that should be ignored but that no words were left for."""
-
-    words: dict[str, Words]
-    left_over: frozenset[Pair]
-
-
 def collision_groups(
     bodies: Sequence[str], ignored: Collection[Pair], free: Collection[Pair] = frozenset()
-) -> CollisionGroups:
-    """Return filter words: PhysX then ignores the pairs ``ignored``, perhaps some of ``free``, and no others.
+) -> tuple[dict[str, Words], frozenset[Pair]]:
+    """Return filter words, and the pairs that should be ignored but that no words were left for.
 
-    The ground and the user's content, with the default words 1, 1, 0, 0, touch every body.
+    With the words, PhysX ignores the other pairs of ``ignored``, perhaps some of ``free``, and no others. The ground
+    and the user's content, with the default words 1, 1, 0, 0, touch every body.
     """
     cliques = _cliques(bodies, ignored, free)
     cliques = sorted(cliques, key=lambda clique: -len(_within(clique, ignored)))[:_MAX_CLIQUES]
@@ -67,13 +60,13 @@ def collision_groups(
                 zero, one = zero | _OTHERS, one | _OTHERS
         two = sum(1 << number for number, clique in enumerate(cliques) if body in clique)
         words[body] = (zero, one, two, _ROBOT)
-    return CollisionGroups(words, frozenset(left))
+    return words, frozenset(left)
 
 
 def link_groups(
     urdf: str, merge_fixed: bool, fixed_base: bool, joints: Sequence[Joint], ignored: Collection[Pair]
-) -> CollisionGroups:
-    """Return the words by which PhysX ignores the pairs ``ignored``, for each link of the URDF that has shapes.
+) -> tuple[dict[str, Words], frozenset[Pair]]:
+    """Return :func:`collision_groups` of the links of the URDF that have shapes, to ignore the pairs ``ignored``.
 
     Links of one rigid body are ignored, too: they cannot move apart, and the solver would shake them. PhysX ignores
     contacts within a simulated link, and with its parent, unless that is the root of a fixed base.

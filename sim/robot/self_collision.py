@@ -134,7 +134,7 @@ def self_contact(robot: Any) -> SelfContact:
     listed = {pair.links: pair for pair in (*computed, *robot.srdf.disabled)}
     pairs = [pair for links, pair in listed.items() if links not in robot.srdf.enabled and links <= set(solid)]
     ignored = [pair.links for pair in pairs]
-    left_over = link_groups(robot.urdf, robot.merge_fixed, robot.fixed_base, robot.joints, ignored).left_over
+    _, left_over = link_groups(robot.urdf, robot.merge_fixed, robot.fixed_base, robot.joints, ignored)
     return SelfContact(
         pairs=tuple(pair for pair in pairs if pair.links not in left_over),
         left_over=tuple(pair for pair in pairs if pair.links in left_over),

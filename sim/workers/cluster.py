@@ -19,7 +19,6 @@ from batchpid.errors import InvalidArgumentError, MissingDependencyError, Worker
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.processes.background import BACKGROUND
 from batchpid.sim.ray_options import ClusterWarning, Ray
-from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.placement import split_in_shares
 
 NODE_STEPS = 25_000
@@ -40,6 +39,23 @@ class Machine(NamedTuple):
     address: str
     port: int
     workers: int
+
+
+class NodeInfo(NamedTuple):
+    """Machine of a cluster, and the processes that run some of a runner's envs there."""
+
+    address: str
+    """Address of the machine."""
+    envs: slice
+    """Envs of the runner."""
+    pid: int
+    """Process that holds the pool of workers."""
+    pids: tuple[int, ...]
+    """Worker processes."""
+    processor: str
+    """Model of the processor."""
+    digest: str
+    """Digest of the canonical episode (:func:`batchpid.sim.workers.requests.canonical_digest`)."""
 
 
 class Cluster:

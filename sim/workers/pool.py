@@ -25,10 +25,9 @@ from batchpid.errors import ClosedError
 from batchpid.sim.loop.arrays import Arrays, Ticks
 from batchpid.sim.loop.failure import Failure, order
 from batchpid.sim.options import RunnerOptions
-from batchpid.sim.workers.cluster import NODE_STEPS, Cluster
+from batchpid.sim.workers.cluster import NODE_STEPS, Cluster, NodeInfo
 from batchpid.sim.workers.exchange import SharedArrays
-from batchpid.sim.workers.node import NodeInfo
-from batchpid.sim.workers.node_worker import NodeWorker
+from batchpid.sim.workers.node import NodeWorker
 from batchpid.sim.workers.placement import check_memory, pinned_cores, split_envs
 from batchpid.sim.workers.requests import Request, Start
 from batchpid.sim.workers.worker import LocalWorker, ProcessWorker, Worker, WorkerLost

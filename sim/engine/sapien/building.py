@@ -183,8 +183,8 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
             remedy = "repair the file, or remove that <collision>"
             raise RobotError(f"link {link.name!r}: SAPIEN cannot build a collision shape from {files}; {remedy}")
     ignored = {frozenset(pair) for pair in spec.ignored}
-    groups = link_groups(spec.urdf, spec.merge_fixed, spec.fixed_base, spec.joints, ignored)
-    words, owners = groups.words, shape_owners(spec)
+    words, _ = link_groups(spec.urdf, spec.merge_fixed, spec.fixed_base, spec.joints, ignored)
+    owners = shape_owners(spec)
     for link in robot.links:
         for shape, owner in zip(link.collision_shapes, owners[link.name], strict=True):
             shape.set_collision_groups(words[owner])

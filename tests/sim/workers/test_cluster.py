@@ -141,7 +141,7 @@ def test_the_envs_of_a_killed_machine_go_to_another(machines, undisturbed):
 
 @pytest.mark.slow
 def test_a_process_that_does_not_answer_is_replaced(machines, undisturbed, monkeypatch):
-    monkeypatch.setattr("batchpid.sim.workers.node_worker.SILENCE_LIMIT", 3.0)
+    monkeypatch.setattr("batchpid.sim.workers.node.SILENCE_LIMIT", 3.0)
     with make_runner(cluster=machines.ensure(2).options(2)) as runner:
         pids = pids_of(runner)
         stop = lambda: os.kill(runner.nodes[0].pid, signal.SIGSTOP)  # noqa: E731

@@ -11,7 +11,7 @@ import batchpid as bp
 from batchpid.sim import Robot, Runner, write_recording
 from batchpid.sim.identification import excite, identify
 from batchpid.sim.identification.diagnosis import diagnose
-from batchpid.sim.identification.fit_search import best_drive
+from batchpid.sim.identification.fit_search import likely_drives
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.regression import smooth
 from batchpid.sim.robot.urdf_export import to_urdf
@@ -69,7 +69,7 @@ def diagnosed(arms, folder, real, *, push=0.0, **motors):
         write_recording(runner.rollout(motion.position, feedforwards=pushes), path, overwrite=True)
     inputs = read_inputs(robot, [path], gains, "none", 1 / 2000, 1, False)
     motions = [smooth(log, inputs.drive.timestep) for log in inputs.logs]
-    regression = best_drive(inputs.robot, inputs.joints, inputs.drive, inputs.logs, motions, False)[1]
+    _, regression = likely_drives(inputs.robot, inputs.joints, inputs.drive, inputs.logs, motions, False)[0]
     return diagnose(regression, inputs.logs, list(robot.joint_names)), gains, path
 
 
