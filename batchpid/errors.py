@@ -21,7 +21,7 @@ class InvalidArgumentError(BatchPIDError, ValueError):
     """An argument has a wrong type, shape, dtype, range or a non-finite entry.
 
     Raised before anything is changed. ``argument``, ``joint``, ``entry``, ``env``, ``value`` and ``remedy`` hold the
-    facts of the message, for programs; ``entry`` is the name in a command whose entries are not joints.
+    facts of the message, for programs; ``entry`` is the name in an array whose columns are not joints.
     """
 
     def __init__(

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_o
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Kind
-from batchpid.checks.validate import at_least, choice, entries, flag, integer, is_traced, number
+from batchpid.checks.validate import AxisKind, at_least, choice, entries, flag, integer, is_traced, number
 from batchpid.errors import InvalidArgumentError
 
 T = TypeVar("T")
@@ -38,7 +38,15 @@ class Field(NamedTuple):
     group: str = ""
     """Name of the fields that it belongs to."""
 
-    def checked(self, name: str, values: Array, joint_names: Sequence[str] | None, *, infinite: bool = False) -> Any:
+    def checked(
+        self,
+        name: str,
+        values: Array,
+        joint_names: Sequence[str] | None,
+        *,
+        infinite: bool = False,
+        kind: AxisKind = "joint",
+    ) -> Any:
         """Return ``values`` (..., envs, joints), unless they are traced, if all are within the bounds.
 
         Raises InvalidArgumentError if an entry is out of bounds, or infinite where neither ``infinite`` nor ``neutral``
@@ -46,9 +54,9 @@ class Field(NamedTuple):
         """
         if not is_traced(values):
             infinite = infinite or math.isinf(self.neutral)
-            at_least(name, values, self.low, joint_names, above=self.above, infinite=infinite)
+            at_least(name, values, self.low, joint_names, above=self.above, infinite=infinite, kind=kind)
             remedy = f"use a number from {self.low:g} to {self.high:g} ({self.unit})"
-            entries(name, values, values <= self.high, "out of range", joint_names, remedy=remedy)
+            entries(name, values, values <= self.high, "out of range", joint_names, kind=kind, remedy=remedy)
         return values
 
 

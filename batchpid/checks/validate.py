@@ -68,10 +68,10 @@ def time_step(argument: str, value: Any) -> float:
 
 
 def check_time_step(argument: str, value: Any) -> None:
-    """Check a time step that is a plain number; the values of arrays are not read."""
+    """Check a time step that is not an array; the values of arrays are not read."""
     if isinstance(value, float) and 0.0 < value <= LONGEST_STEP:  # at every sim step: without the checks' cost
         return
-    if isinstance(value, int | float | np.number):
+    if isinstance(value, np.generic) or not hasattr(value, "__array_namespace__"):
         time_step(argument, value)
 
 
@@ -251,11 +251,12 @@ def at_least(
     *,
     above: bool = False,
     infinite: bool = False,
+    kind: AxisKind = "joint",
 ) -> NDArray[Any]:
     """Return ``values`` (..., envs, joints) if every entry is >= ``low``, or > it, and finite unless ``infinite``."""
     good = ((values > low) if above else (values >= low)) & (infinite | np.isfinite(values))
     bounds = ["finite"] * (not infinite) + [f"{'>' if above else '>='} {low:g}"] * math.isfinite(low)
-    entries(argument, values, good, f"must be {' and '.join(bounds) or 'a number'}", joint_names)
+    entries(argument, values, good, f"must be {' and '.join(bounds) or 'a number'}", joint_names, kind=kind)
     return values
 
 

@@ -6,7 +6,8 @@ import json
 import math
 import os
 import reprlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -76,11 +77,18 @@ def build(source: str, document: Any, schema: Schema, joints: Document, make: Ca
     Errors name the document and the key. ``options`` are further arguments.
     """
     given = columns(source, joints, schema) | {name: document[name] for name in schema.head if name in document}
-    try:
+    with named(source):
         return make(len(joints), **given, **options, joint_names=list(joints))
+
+
+@contextmanager
+def named(source: str) -> Iterator[None]:
+    """Begin the messages of InvalidArgumentErrors from the block with ``source``, a file or a place in it."""
+    try:
+        yield
     except InvalidArgumentError as error:
-        where = {"joint": error.joint, "env": error.env, "value": error.value, "remedy": error.remedy}
-        raise InvalidArgumentError(f"{source}: {error.argument}", error.problem, **where) from None
+        facts = {name: getattr(error, name) for name in ("joint", "entry", "env", "value", "remedy")}
+        raise InvalidArgumentError(f"{source}: {error.argument}", error.problem, **facts) from None
 
 
 def parse_text(text: str) -> Any:

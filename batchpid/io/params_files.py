@@ -21,7 +21,7 @@ from typing import Any
 
 from batchpid.arrays.array_types import Document
 from batchpid.arrays.choices import CHOICES
-from batchpid.checks.validate import names
+from batchpid.checks.validate import instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.law.params import FIELDS, PIDParams, make_params
@@ -46,8 +46,9 @@ def dumps_params(
     Raises
     ------
     InvalidArgumentError
-        Names that do not fit the params, or an unknown format.
+        Params of another type, names that do not fit them, or an unknown format.
     """
+    instance("params", params, PIDParams, "build them with make_params")
     joints = names("joint_names", joint_names, params.num_joints)
     return documents.render(documents.document(SCHEMA, params.options(), joints, about), format)
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN, namespace, tiny_of
+from batchpid.checks.validate import instance
 from batchpid.law.implicit import as_explicit, implicit_gains
 from batchpid.law.input_checks import checked_dt
 from batchpid.law.params import PIDParams
@@ -62,10 +63,10 @@ class Coefficients(NamedTuple):
 def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coefficients:
     """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.advance`.
 
-    With ``num_envs`` they have the shape of :func:`spread`. Raises InvalidArgumentError unless dt is positive and
-    finite; an array of JAX is not checked.
+    With ``num_envs`` they have the shape of :func:`spread`. Raises InvalidArgumentError for params of another type, and
+    unless dt is positive and finite; an array of JAX is not checked.
     """
-    dt = checked_dt(dt, params.dtype)
+    dt = checked_dt(dt, instance("params", params, PIDParams, "build them with make_params").dtype)
     c, c_given, share, implicit = params.setpoint_weight_derivative, None, None, params.discretization is not None
     if implicit:
         c, c_given, share = implicit_gains(params, dt)[-3:]

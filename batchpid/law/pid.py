@@ -116,9 +116,17 @@ def _step(
     params: PIDParams, state: PIDState, setpoint: Array, measurement: Array, dt: Array, **inputs: Any
 ) -> tuple[PIDState, Terms]:
     """Check the arguments of a step and advance the law."""
+    r, y, inputs = _checked(params, state, setpoint, measurement, inputs)
+    return advance(discretise(params, dt), state, r, y, **inputs)
+
+
+def _checked(
+    params: PIDParams, state: PIDState, setpoint: Array, measurement: Array, inputs: dict[str, Array]
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Return setpoint, measurement and inputs of a step as arrays that fit the params and the state."""
     y, r, *rest = checked_inputs(params, state, measurement, setpoint=setpoint, **inputs)
-    state = checked_state(state, needs(params))
-    return advance(discretise(params, dt), state, r, y, **dict(zip(inputs, rest, strict=True)))
+    checked_state(state, needs(params))
+    return r, y, dict(zip(inputs, rest, strict=True))
 
 
 def advance(
@@ -273,9 +281,19 @@ def drive_target(
     Raises InvalidArgumentError as :func:`batchpid.step`, and for options that a drive does not have: setpoint weights,
     a filter of the derivative, a dead zone, a limit of the effort's rate, and a policy for non-finite inputs.
     """
+    r, y, inputs = _checked(params, state, setpoint, measurement, inputs)
     check_drive(params)
-    k = discretise(params, dt)
+    return advance_drive(discretise(params, dt), state, r, y, **inputs)
+
+
+def advance_drive(
+    k: Coefficients, state: PIDState, setpoint: Array, measurement: Array, **inputs: Any
+) -> tuple[PIDState, Any]:
+    """Return ``(state, target)`` with given coefficients, for loops with constant params; else as :func:`drive_target`.
+
+    It takes the arguments of :func:`advance`.
+    """
     state, terms = advance(k, state, setpoint, measurement, **inputs)
-    xp = namespace(*params, terms.i, setpoint)
-    driven, target = params.kp > 0, nearest_turn(setpoint, measurement, k.turns, xp)
-    return state, target + xp.where(driven, terms.filled().i, 0) / xp.where(driven, params.kp, 1)
+    xp = namespace(*k, terms.i, setpoint)
+    driven, target = k.kp > 0, nearest_turn(setpoint, measurement, k.turns, xp)
+    return state, target + xp.where(driven, terms.filled().i, 0) / xp.where(driven, k.kp, 1)

@@ -23,7 +23,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.field_tables import Field
-from batchpid.checks.validate import names
+from batchpid.checks.validate import instance, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.motors.actuators import FIELDS, Actuators, make_actuators
@@ -39,9 +39,10 @@ def dumps_actuators(
     """Return ``actuators`` as text in ``format``, "yaml" or "json", with one name per joint.
 
     ``about`` is kept with them, e.g. where they come from: plain numbers, strings, lists, mappings. Raises
-    InvalidArgumentError for names that do not fit, an unknown format, or a limit by position that differs from env to
-    env.
+    InvalidArgumentError for actuators of another type, names that do not fit, an unknown format, or a limit by position
+    that differs from env to env.
     """
+    instance("actuators", actuators, Actuators, "build them with make_actuators")
     joints, options = names("joint_names", joint_names, actuators.num_joints), actuators.options()
     table = options.pop(_TABLE, None)
     document = documents.document(_SCHEMA, options, joints, about)

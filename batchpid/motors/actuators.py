@@ -299,10 +299,13 @@ def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Array, Ar
         raise InvalidArgumentError("position_limit", problem, remedy=remedy)
     shape = (1, build.joints, rows[0].shape[-1])
     positions, efforts = (np.broadcast_to(each, np.broadcast_shapes(each.shape, shape)) for each in rows)
-    rising = np.isfinite(positions).all(2) & (np.diff(positions) >= 0).all(2)
-    entries("position_limit", positions[..., 0], rising, "has positions that do not ascend", build.names)
-    good = (efforts >= 0).all(2) & (np.isfinite(efforts).all(2) | np.isinf(efforts).all(2))
-    entries("position_limit", efforts[..., 0], good, "has an effort < 0 or not finite", build.names)
+    rising = np.isfinite(positions)
+    rising[..., 1:] &= positions[..., 1:] >= positions[..., :-1]
+    good = (efforts >= 0) & (np.isfinite(efforts) | np.isinf(efforts).all(2, keepdims=True))
+    problems = "has positions that do not ascend", "has an effort < 0 or not finite"
+    for each, right, problem in zip((positions, efforts), (rising, good), problems, strict=True):
+        first = np.take_along_axis(each, right.argmin(2, keepdims=True), 2)[..., 0]
+        entries("position_limit", first, right.all(2), problem, build.names)
     return (None, None) if np.isinf(efforts).all() else (build.freeze(positions), build.freeze(efforts))
 
 

@@ -25,14 +25,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Array, Float64
 from batchpid.arrays.display import array_summary
-from batchpid.checks.validate import array, broadcast, choice, entries, integer, positive
+from batchpid.checks.validate import array, choice, entries, instance, integer, positive
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import pose_error, pose_of
-from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
 from batchpid.task_space.symmetric import gram, product, quiet, whitened
-from batchpid.task_space.tree_kinematics import jacobian_at, motions_of, rate_at, tool_frame, velocities_of
+from batchpid.task_space.tree_kinematics import jacobian_at, motions_of, rate_at, read_point, tool_frame, velocities_of
 
 ON_FAILURE = ("warn", "raise", "return")
 _DAMPING, _DAMPING_PER_ERROR = 1e-8, 0.1
@@ -108,13 +108,13 @@ def inverse_kinematics(
         An argument has a wrong shape or range, a quaternion is not of unit length, or, with "raise", a pose was not
         reached.
     """
-    index, how = tree.index(link), choice("on_failure", on_failure, ON_FAILURE)
+    index, how = instance("tree", tree, RigidTree, MAKE_TREE).index(link), choice("on_failure", on_failure, ON_FAILURE)
     integer("starts", starts, 1, 10_000)
     integer("iterations", iterations, 1, 100_000)
     tolerances = {"position_tolerance": (position_tolerance, "m"), "rotation_tolerance": (rotation_tolerance, "rad")}
     tolerance = np.array([positive(name, *value) for name, value in tolerances.items()])
     goal, rows = _goals_and_starts(tree, pose, start)
-    at = None if point is None else broadcast("point", point, (3,), "give x, y, z in the link's frame [m]")
+    at = None if point is None else array("point", read_point(goal[0], point), (3,), "xyz", kind="entry")
     search = _Search(tree, index, at, tolerance, iterations)
     integer("seed", seed, 0, 2**63)
     with quiet():
@@ -253,7 +253,8 @@ def _goals_and_starts(tree: RigidTree, pose: ArrayLike, start: ArrayLike) -> tup
     rows = array("start", start, (envs, tree.dof), tree.joint_names)
     length = np.linalg.norm(goal[:, 3:], axis=1, keepdims=True)
     unit = np.abs(length - 1) < 1e-3
-    entries("pose", length, unit, "has a quaternion that is not of unit length", ["qw"], remedy="normalise w, x, y, z")
+    problem, remedy = "has a quaternion that is not of unit length", "normalise w, x, y, z"
+    entries("pose", length, unit, problem, ["qw"], kind="entry", remedy=remedy)
     goal[:, 3:] /= length
     return goal, tree.positions(np.clip(rows, tree.lower, tree.upper))
 

@@ -50,11 +50,12 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import clip, namespace, wrap
+from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_law
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
-from batchpid.task_space.osc_params import NoDecoupling, OSCParams, PartialDecoupling
+from batchpid.task_space.osc_params import MAKE_PARAMS, NoDecoupling, OSCParams, PartialDecoupling
 from batchpid.task_space.osc_state import (
     OSCInputs,
     OSCState,
@@ -69,7 +70,11 @@ from batchpid.task_space.symmetric import product, quiet, solve
 
 
 def init(params: OSCParams, qpos: Array) -> OSCState:
-    """Return the state before the first step: the posture is ``qpos`` (envs, dof) [rad or m], the integral 0."""
+    """Return the state before the first step: the posture is ``qpos`` (envs, dof) [rad or m], the integral 0.
+
+    Raises InvalidArgumentError for params of another type.
+    """
+    instance("params", params, OSCParams, MAKE_PARAMS)
     xp = namespace(*params, qpos)
     posture = xp.zeros_like(qpos, dtype=xp.result_type(params.stiffness, qpos)) + qpos
     integral = None if params.integral_gain is None else xp.zeros((len(posture), 6), posture.dtype)
@@ -260,15 +265,15 @@ def track(
     Raises
     ------
     InvalidArgumentError
-        The params have no integral, or partial decoupling.
+        The params are of another type, or have no integral, or partial decoupling.
     """
+    k, mass, bias = discretise(params, dt), dynamics.mass_matrix, dynamics.bias
     if params.integral_gain is None:
         problem = "is off, so no integral can carry the effort over"
         raise InvalidArgumentError("params.integral_gain", problem, remedy="give integral_gain; 0 is allowed")
     if isinstance(params.decoupling, PartialDecoupling):
         problem = "'partial' has an inertia that does not move the tool by its acceleration"
         raise InvalidArgumentError("params.decoupling", problem, remedy="use 'full' or 'none'")
-    k, mass, bias = discretise(params, dt), dynamics.mass_matrix, dynamics.bias
     inputs = OSCInputs(setpoint, qpos, qvel, twist, acceleration)
     xp = namespace(*k, *dynamics, *inputs, effort)
     with quiet():

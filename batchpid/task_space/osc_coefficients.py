@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import namespace
-from batchpid.checks.validate import check_time_step
-from batchpid.task_space.osc_params import OSCParams
+from batchpid.checks.validate import check_time_step, instance
+from batchpid.task_space.osc_params import MAKE_PARAMS, OSCParams
 
 
 class OSCCoefficients(NamedTuple):
@@ -69,8 +69,9 @@ def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
     Raises
     ------
     InvalidArgumentError
-        dt is a number that is not positive, or above 1 s.
+        The params are of another type, or dt is not positive, or above 1 s.
     """
+    instance("params", params, OSCParams, MAKE_PARAMS)
     check_time_step("dt", dt)
     xp = namespace(*params, dt)
     kp, kd, ki = params.stiffness, params.damping, params.integral_gain

@@ -14,13 +14,15 @@ from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.arrays.leaves import checked_ends
-from batchpid.checks.validate import array, choice, entries, instance, known_keywords, read_array
+from batchpid.checks.validate import AxisKind, array, choice, entries, instance, known_keywords, read_array
 from batchpid.errors import InvalidArgumentError
-from batchpid.task_space.rigid_tree import RigidTree
+from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
 from batchpid.task_space.tree_dynamics import check_masses
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Names of the axes of a task."""
+MAKE_PARAMS = "build them with make_osc_params"
+"""Remedy for params of another type."""
 
 
 class PartialDecoupling(NamedChoice):
@@ -107,16 +109,16 @@ def make_osc_params(
     integral_limit: Annotated[ArrayLike, Field("m/s^2 or rad/s^2", math.inf)] = math.inf,
     axes: Annotated[ArrayLike | None, Field(neutral=True)] = None,
     force_axes: Annotated[ArrayLike | None, Field(neutral=False)] = None,
-    posture_stiffness: Annotated[ArrayLike, Field("1/s^2")] = 10.0,
-    posture_damping_ratio: Annotated[ArrayLike, Field("1", 1.0)] = 1.0,
-    limit_margin: Annotated[ArrayLike | None, Field("rad or m")] = None,
-    limit_stiffness: Annotated[ArrayLike, Field("1/s^2")] = 400.0,
+    posture_stiffness: Annotated[ArrayLike, Field("1/s^2", group="joint")] = 10.0,
+    posture_damping_ratio: Annotated[ArrayLike, Field("1", 1.0, group="joint")] = 1.0,
+    limit_margin: Annotated[ArrayLike | None, Field("rad or m", group="joint")] = None,
+    limit_stiffness: Annotated[ArrayLike, Field("1/s^2", group="joint")] = 400.0,
     position_error_limit: Annotated[ArrayLike, Field("m", math.inf, above=True)] = 0.1,
     rotation_error_limit: Annotated[ArrayLike, Field("rad", math.inf, above=True)] = 0.5,
     smallest_eigenvalue: Annotated[ArrayLike, Field("1/kg or 1/(kg m^2)", above=True)] = 0.02,
-    effort_limit: Annotated[ArrayLike | None, Field("N m or N", math.inf)] = None,
-    effort_min: Annotated[ArrayLike | None, Field("N m or N", -math.inf, low=-math.inf)] = None,
-    effort_max: Annotated[ArrayLike | None, Field("N m or N", math.inf, low=-math.inf)] = None,
+    effort_limit: Annotated[ArrayLike | None, Field("N m or N", math.inf, group="joint")] = None,
+    effort_min: Annotated[ArrayLike | None, Field("N m or N", -math.inf, low=-math.inf, group="joint")] = None,
+    effort_max: Annotated[ArrayLike | None, Field("N m or N", math.inf, low=-math.inf, group="joint")] = None,
     decoupling: str = "full",
     frame: str = "world",
     discretization: str = "explicit",
@@ -164,7 +166,7 @@ def make_osc_params(
     InvalidArgumentError
         Naming the option, axis or joint, env and value.
     """
-    check_masses(instance("tree", tree, RigidTree, "pass robot.kinematic_tree()"))
+    check_masses(instance("tree", tree, RigidTree, MAKE_TREE))
     joints = tree.joint_names
     # An option without effect is an error: it is nearly always a misunderstanding.
     _check_unused("damping_ratio", damping_ratio, 1.0, damping is not None, "damping is given, too")
@@ -230,8 +232,9 @@ def _rows(name: str, value: ArrayLike, columns: tuple[str, ...]) -> NDArray[np.f
     if len(columns) == 1 and given.ndim == 1:  # one number per env
         given = given[:, None]
         shape = given.shape
-    rows = array(name, given, shape, columns, finite=False, kind="entry").copy()
-    FIELDS[name].checked(name, rows, columns)
+    kind: AxisKind = "joint" if FIELDS[name].group == "joint" else "entry"
+    rows = array(name, given, shape, columns, finite=False, kind=kind).copy()
+    FIELDS[name].checked(name, rows, columns, kind=kind)
     rows.setflags(write=False)
     return rows
 

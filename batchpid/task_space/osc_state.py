@@ -121,8 +121,8 @@ def task_dynamics(
     InvalidArgumentError
         The link is unknown, or a shape is wrong.
     """
-    index = tree.index(link)
     (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
+    index = tree.index(link)
     chain = xp.asarray(tree.chains[tree.link_bodies[index]], dtype=q.dtype)
     wanted = "pose", "jacobian", "jacobian_rate", "mass_matrix", *(("bias",) if bias is None else ())
     found = native_rows.kinematics(tree, wanted, q, v, index, read_point(q, point))

@@ -31,6 +31,8 @@ from batchpid.task_space.spatial_inertia import SpatialInertia, inertia_rows, mo
 JOINT_TYPES = ("fixed", "revolute", "prismatic")
 GRAVITY = (0.0, 0.0, -9.81)
 """Gravity of a tree, and in the engines, unless another one is given [m/s^2]."""
+MAKE_TREE = "pass robot.kinematic_tree()"
+"""Remedy for a tree of another type."""
 
 
 class Bodies(NamedTuple):
@@ -138,12 +140,13 @@ class RigidTree:
             finite = np.isfinite(table).reshape(len(table), -1).all(1) | (name in ("lower", "upper"))
             of = {count: links, len(moving): moving}.get(len(table)) if name != "gravity" else "xyz"
             entries(name, np.where(finite, 0.0, np.nan), finite, "is not finite", of, kind="entry")
-        for name in ("mass", "armature"):
-            entries(name, tables[name], tables[name] >= 0, "must be >= 0", (links, moving)[name == "armature"])
+        entries("mass", tables["mass"], tables["mass"] >= 0, "must be >= 0", links, kind="entry")
+        entries("armature", tables["armature"], tables["armature"] >= 0, "must be >= 0", moving)
         lengths = {name: np.linalg.norm(tables[name], axis=1) for name in ("wxyz", "axis")}
-        entries("wxyz", lengths["wxyz"], np.abs(lengths["wxyz"] - 1) < 1e-6, "is not a unit quaternion", links)
+        unit = np.abs(lengths["wxyz"] - 1) < 1e-6
+        entries("wxyz", lengths["wxyz"], unit, "is not a unit quaternion", links, kind="entry")
         pointing = (lengths["axis"] > 0) | (np.array(types) == "fixed")
-        entries("axis", lengths["axis"], pointing, "has no direction", links)
+        entries("axis", lengths["axis"], pointing, "has no direction", links, kind="entry")
         tables["wxyz"] /= lengths["wxyz"][:, None]
         tables["axis"] /= np.where(lengths["axis"] > 0, lengths["axis"], 1.0)[:, None]
         coupling = Coupling.of(len(moving)) if self.coupling is None else self.coupling

@@ -118,8 +118,8 @@ def forward_dynamics(tree: RigidTree, qpos: Array, qvel: Array, effort: Array) -
     InvalidArgumentError
         A shape is wrong, or a joint moves no mass and has no armature.
     """
-    check_masses(tree)
     (q, v, u), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel, effort=effort)
+    check_masses(tree)
     u = tree.efforts(u)
     if (found := native_rows.kinematics(tree, ("mass_matrix", "bias"), q, v)) is not None:
         with quiet():

@@ -24,11 +24,11 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace
-from batchpid.checks.validate import choice, is_traced, read_array
+from batchpid.checks.validate import choice, instance, is_traced, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_rows
 from batchpid.task_space.frames import cross, in_axes, matrix_of, pose_of, rotate, turned
-from batchpid.task_space.rigid_tree import Bodies, RigidTree
+from batchpid.task_space.rigid_tree import MAKE_TREE, Bodies, RigidTree
 from batchpid.task_space.symmetric import quiet
 
 FRAMES = ("world", "tool")
@@ -65,11 +65,10 @@ def link_poses(tree: RigidTree, qpos: Array, links: Sequence[str] | None = None,
     InvalidArgumentError
         A link is unknown, or the shape is wrong.
     """
-    chosen = tree.links if links is None else tuple(links)
     if isinstance(links, str):
         raise InvalidArgumentError("links", "must be a list of names", value=links, remedy=f"pass [{links!r}]")
-    indices = [tree.index(link) for link in chosen]
     (q,), bodies, xp = prepared(tree, qpos=qpos)
+    indices = [tree.index(link) for link in (tree.links if links is None else links)]
     at = read_point(q, point)
     found = [native_rows.kinematics(tree, ("pose",), q, None, index, at) for index in indices]
     poses = [each[0] for each in found if each is not None]
@@ -95,8 +94,8 @@ def jacobian(tree: RigidTree, qpos: Array, link: str, *, point: Array = None, fr
     InvalidArgumentError
         The link or the frame is unknown, or a shape is wrong.
     """
-    index, _ = tree.index(link), choice("frame", frame, FRAMES)
     (q,), bodies, xp = prepared(tree, qpos=qpos)
+    index, _ = tree.index(link), choice("frame", frame, FRAMES)
     found = native_rows.kinematics(tree, ("pose", "jacobian"), q, None, index, read_point(q, point))
     if found is not None:
         pose, matrix = found
@@ -116,8 +115,8 @@ def jacobian_rate(
     ``qpos`` and ``qvel`` are (..., dof). With frame "tool" the same vectors are given in the axes of the link. Other
     arguments and errors as in :func:`jacobian`.
     """
-    index, _ = tree.index(link), choice("frame", frame, FRAMES)
     (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
+    index, _ = tree.index(link), choice("frame", frame, FRAMES)
     found = native_rows.kinematics(tree, ("pose", "jacobian_rate"), q, v, index, read_point(q, point))
     if found is not None:
         pose, rate = found
@@ -131,6 +130,7 @@ def jacobian_rate(
 
 def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Any], Bodies, Any]:
     """Return checked arrays (..., dof) in one dtype, the tree's bodies in it, and their namespace."""
+    instance("tree", tree, RigidTree, MAKE_TREE)
     xp = namespace(*arrays.values())
     checked, shape = [], None
     for name, value in arrays.items():
@@ -221,8 +221,9 @@ def read_point(like: Any, point: Array) -> Array:
         return None
     xp = namespace(like, point)
     at = read_array("point", point).astype(np.float64, copy=False) if xp is np else xp.asarray(point, like.dtype)
-    if at.shape not in ((3,), (*like.shape[:-1], 3)):
-        problem = f"has shape {at.shape}, not (3,) or {(*like.shape[:-1], 3)}"
+    shapes = dict.fromkeys([(3,), (*like.shape[:-1], 3)])
+    if at.shape not in shapes:
+        problem = f"has shape {at.shape}, not {' or '.join(map(str, shapes))}"
         raise InvalidArgumentError("point", problem, remedy="give x, y, z in the link's frame [m]")
     return at
 

@@ -1,6 +1,7 @@
 """The command line: each command is a frozen dataclass whose fields are its flags.
 
-To add a command, write a module with such a dataclass and list it in :data:`COMMANDS`. Its ``run()`` returns the exit
+To add a command, write a module with such a dataclass and list it in :data:`COMMANDS`. The range of a number is a
+:class:`batchpid.arrays.field_tables.Field` beside its type, and is checked before ``run()``, which returns the exit
 status (None: 0). Modules that load SAPIEN or Matplotlib are named in ``imports`` and imported after the flags are
 parsed, so that ``--help`` answers at once, and before ``run()``: Ctrl-C ends the program at once until then, because
 some packages suppress a KeyboardInterrupt while they are imported.
@@ -22,6 +23,7 @@ import tyro
 
 import batchpid
 from batchpid.errors import BatchPIDError
+from batchpid.sim.cli import flags
 from batchpid.sim.cli.compare import CompareCommand, ParityCommand
 from batchpid.sim.cli.demo import DemoCommand
 from batchpid.sim.cli.excite import ExciteCommand
@@ -92,6 +94,7 @@ def _run(arguments: list[str]) -> int:
             command = parse(arguments)
         except SystemExit as end:  # after --help, or a message about unknown flags
             return int(end.code or 0)
+        flags.check(command)
         for name in command.imports:
             importlib.import_module(name)
         if signal.getsignal(signal.SIGINT) is exit_at_once:

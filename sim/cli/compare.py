@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
+from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
@@ -26,9 +27,9 @@ class CompareCommand:
 
     robot: flags.RobotName = "panda"
     gains: flags.GainSets = ()
-    moves: int = 20
+    moves: Annotated[int, Field(high=100_000)] = 20
     """Number of random moves, the tutorial's aside."""
-    seed: int = 0
+    seed: flags.Seed = 0
     """Seed of the moves; no search of `batchpid tune` with the same seed sees them."""
     seconds: flags.Seconds = 2.0
     randomize: flags.Randomize = None
@@ -62,8 +63,10 @@ class CompareCommand:
             raise InvalidArgumentError("engine", "is missing", remedy="name sapien, mujoco or both")
         if picture is not None and len(sets) * len(set(self.engine)) < 2:
             raise InvalidArgumentError("gains", "names a single set", remedy="name two, or two engines, for a picture")
-        variation = (self.payload, self.friction) if self.variation else None
-        robot, randomization = read_variation(robot, self.randomize, variation)
+        if not self.moves and robot.settings is None:
+            remedy = "use 1 or more: the robot has no move of a tutorial"
+            raise InvalidArgumentError("moves", "leaves none", value=self.moves, remedy=remedy)
+        robot, randomization = read_variation(robot, self.randomize, flags.variation(self))
         options = flags.chosen(self, "moves seed seconds") | self.runner.options()
         evaluations = evaluate_sets(robot, sets, randomization=randomization, engines=self.engine, **options)
         print(f"{robot.name}: {len(evaluations[0].moves.start)} moves, seed {self.seed}, {self.seconds:g} s each\n")
@@ -83,9 +86,9 @@ class ParityCommand:
 
     robot: flags.RobotName = "panda"
     gains: flags.Gains = None
-    moves: int = 8
+    moves: Annotated[int, Field(low=1, high=100_000)] = 8
     """Number of random moves under the gains."""
-    seed: int = 0
+    seed: flags.Seed = 0
     """Seed of states, efforts and moves."""
     seconds: flags.Seconds = 2.0
     workers: flags.Workers = None

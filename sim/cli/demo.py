@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 from batchpid.arrays.array_types import Document
-from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
@@ -29,7 +28,7 @@ class DemoCommand:
     num_envs: flags.NumEnvs = 64
     gains: flags.Gains = None
     seconds: flags.Seconds = 2.0
-    seed: int = 0
+    seed: flags.Seed = 0
     """Seed of the start poses."""
     spread: flags.Spread = 0.3
     runner: Annotated[flags.RunnerFlags, flags.group(RUNNER)] = field(default_factory=RUNNER)
@@ -64,7 +63,6 @@ class DemoCommand:
         outputs = OutputFiles(force=self.force)
         picture = outputs.path("picture", picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
-        seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
         start = start_poses(robot, self.num_envs, self.spread, self.seed)
         gains = gain_set(robot, self.gains)
         title = f"{robot.name}: {self.num_envs} robots, {gains.control} at {settings.rate_hz:g} Hz, gains {gains.name}"
@@ -73,7 +71,7 @@ class DemoCommand:
             made = Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options)
         with made as runner:
             print(f"{title}, {robot.dof} joints, {len(runner.pids) or 1} processes, {runner.backend}", flush=True)
-            rollout, report = hold_setpoint(runner, start, settings.target, seconds)
+            rollout, report = hold_setpoint(runner, start, settings.target, self.seconds)
         print(report)
         for note in settings.notes:
             print(f"Note: {note}")

@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles
@@ -24,15 +25,15 @@ class ExciteCommand:
     """
 
     robot: flags.RobotName = "panda"
-    seconds: Annotated[float, tyro.conf.arg(aliases=("--duration",))] = 10.0
+    seconds: Annotated[float, Field("s", low=1.0, high=3600.0), tyro.conf.arg(aliases=("--duration",))] = 10.0
     """Duration of the motion [s]."""
-    rate: float = 500.0
+    rate: Annotated[float, Field("Hz", low=20.0, high=10_000.0)] = 500.0
     """Rows per second [Hz]."""
-    lowest: float = 0.15
+    lowest: Annotated[float, Field("Hz", low=0.01, high=50.0)] = 0.15
     """Lowest frequency of the chirp [Hz]."""
-    highest: float = 3.0
+    highest: Annotated[float, Field("Hz", low=0.01, high=1000.0)] = 3.0
     """Highest frequency [Hz]."""
-    seed: int = 0
+    seed: flags.Seed = 0
     """Seed of the phases."""
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None

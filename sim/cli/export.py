@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
 from batchpid.arrays.array_types import Document
+from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles
@@ -63,7 +64,7 @@ class ExportCommand:
     actuators: flags.Actuators = None
     controller: Literal["joint_trajectory_controller", "pid_controller"] = "joint_trajectory_controller"
     """Controller of ros2_control."""
-    timestep: float = 1 / 1000
+    timestep: Annotated[float, Field("seconds, not a rate: 1/1000", low=1e-6, high=1.0)] = 1 / 1000
     """Time step of the control on the robot, or of the physics [s]."""
     limits: flags.Switch = False
     """Limit setpoints to the robot's joint limits and speeds before they reach the law."""

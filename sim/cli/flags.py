@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
 from batchpid.arrays.array_types import Document, Kind
+from batchpid.arrays.field_tables import Field, declared, plain
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.runner_keywords import KINDS, OPTIONS, Compensation, EngineName, PhysicsPreset, RunnerKeywords
 
@@ -22,6 +23,19 @@ def _flag(help: str | None = None, **options: Any) -> Any:
         return "" if default in ("None", "False", "True", "") else f"(default: {default})"
 
     return tyro.conf.arg(help=help, help_behavior_hint=hint, **options)
+
+
+def check(command: Any) -> None:
+    """Check the flags of a command, and of its groups of flags, by their types and the Field in their annotations.
+
+    Raises InvalidArgumentError for the first value that is out of range.
+    """
+    for name, kind in get_type_hints(type(command), include_extras=True).items():
+        value = getattr(command, name)
+        if is_dataclass(value):
+            check(value)
+        else:
+            plain(name, kind, value)
 
 
 def chosen(command: Any, names: str) -> Document:
@@ -37,10 +51,20 @@ def refuse(command: Any, names: Iterable[str], problem: str) -> None:
             raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
 
 
+def variation(command: Any) -> tuple[float, float] | None:
+    """Return the payload and the friction of ``--variation``; None without it, where both must be left out."""
+    if not command.variation:
+        refuse(command, ("payload", "friction"), "has no effect without --variation")
+        return None
+    return command.payload, command.friction
+
+
 FLAGS = {each.name: each.default for each in fields(RunnerKeywords) if OPTIONS[each.name].flag}
 """Options that have a flag, with their defaults."""
 SCENE_FLAGS = tuple(name for name in FLAGS if "scene" in OPTIONS[name].kept and name != "engine")
 """Options that change the scenes in an engine."""
+BOUNDS = declared(RunnerKeywords, Field)
+"""Ranges of the options that are numbers."""
 _PLAIN = (NoneType, bool, int, float, str)
 _SWITCHES = [name for name, kind in KINDS.items() if get_args(kind)[0] == bool | None]
 """Options that are on, off, or chosen by the Runner."""
@@ -81,7 +105,8 @@ class RunnerFlags:
 def runner_flags(*names: str) -> type[RunnerFlags]:
     """Return the flags of a Runner's options, by default of all that have one."""
     chosen = names or FLAGS
-    made = [(name, Annotated[_kind(name), of_option(name)], field(default=FLAGS[name])) for name in chosen]
+    kinds = {name: Annotated[_kind(name), BOUNDS.get(name), of_option(name)] for name in chosen}
+    made = [(name, kind, field(default=FLAGS[name])) for name, kind in kinds.items()]
     return make_dataclass("ChosenFlags", made, bases=(RunnerFlags,), frozen=True)
 
 
@@ -122,8 +147,8 @@ class MeshOptions:
 
 
 Meshes = Annotated[MeshOptions, tyro.conf.arg(name="")]
-NumEnvs = Annotated[int, _flag("Number of robots, one in each scene.")]
-Workers = Annotated[int | None, of_option("workers")]
+NumEnvs = Annotated[int, BOUNDS["num_envs"], _flag("Number of robots, one in each scene.")]
+Workers = Annotated[int | None, BOUNDS["workers"], of_option("workers")]
 Cluster = Annotated[Literal["ray"] | None, of_option("cluster")]
 Gains = Annotated[
     str | None,
@@ -157,11 +182,15 @@ Engine = Annotated[EngineName, of_option("engine")]
 Engines = Annotated[tuple[EngineName, ...], _flag("Physics engines, one or both.")]
 Physics = Annotated[PhysicsPreset, of_option("physics")]
 Compensate = Annotated[Compensation, of_option("compensate")]
-Seconds = Annotated[float, _flag("Simulated time [s].")]
-Spread = Annotated[float, _flag("Largest distance of a start pose from that of env 0 [rad or m].")]
+Seed = Annotated[int, Field(high=2**31 - 1)]
+Seconds = Annotated[float, Field("simulated time, s", low=1e-6, high=1e6), _flag("Simulated time [s].")]
+MoveSeconds = Annotated[float, Field("simulated time, s", low=0.05, high=600.0)]
+Distance = Annotated[float, Field("rad or m", high=10.0)]
+Spread = Annotated[Distance, _flag("Largest distance of a start pose from that of env 0 [rad or m].")]
 Json = Annotated[Path | None, _flag("Figures to write: .json.", metavar="FILE")]
-Fps = Annotated[float, _flag("Frames per second.")]
-TimeLimit = Annotated[float | None, _flag("Stop after this wall-clock time [s]. Default: none.")]
+ShownEnvs = Annotated[int, Field(low=1, high=64)]
+Fps = Annotated[float, Field("frames per second", low=1.0, high=120.0), _flag("Frames per second.")]
+TimeLimit = Annotated[float | None, Field("s"), _flag("Stop after this wall-clock time [s]. Default: none.")]
 Randomize = Annotated[
     str | None,
     _flag(
@@ -171,5 +200,9 @@ Randomize = Annotated[
     ),
 ]
 Variation = Annotated[bool, _flag("Draw payload, joint friction, sensor resolution and effort delay for each move.")]
-Payload = Annotated[float, _flag("With --variation: largest payload [kg]; less where the robot cannot carry it.")]
-Friction = Annotated[float, _flag("With --variation: largest Coulomb friction added to the joints [N m or N].")]
+Payload = Annotated[
+    float, Field("kg"), _flag("With --variation: largest payload [kg]; less where the robot cannot carry it.")
+]
+Friction = Annotated[
+    float, Field("N m or N"), _flag("With --variation: largest Coulomb friction added to the joints [N m or N].")
+]

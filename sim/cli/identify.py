@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
@@ -45,9 +46,9 @@ class IdentifyCommand:
     compensate: Annotated[flags.Compensate | None, tyro.conf.arg(metavar="FORCES")] = None
     """Forces that the robot compensates: gravity+coriolis+friction, gravity+coriolis, gravity or none. Default: as the
     recordings say, else gravity+coriolis+friction."""
-    timestep: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    timestep: Annotated[float | None, Field("s", low=1e-5, high=0.01), tyro.conf.arg(metavar="FLOAT")] = None
     """Time step of the control that drove the robot [s]. Default: as the recordings say, else 1/2000."""
-    sim_steps: int = 1
+    sim_steps: Annotated[int, Field(low=1, high=100)] = 1
     """Sim steps in each control step: about 4 for a robot under control at 500 Hz, or its hold counts as delay."""
     hold: flags.Switch = False
     """Commands hold from row to row of a log; otherwise they are interpolated. Recordings are always held."""
@@ -60,7 +61,7 @@ class IdentifyCommand:
     """Positions, setpoints and velocities of revolute joints are in degrees."""
     topic: str = "/joint_states"
     """Topic of the measurements in a ROS bag (sensor_msgs/JointState), whose efforts count as measured."""
-    command_topic: flags.OptionalName = None
+    command_topic: Annotated[flags.OptionalName, tyro.conf.arg(metavar="TOPIC")] = None
     """Topic of the commands in a ROS bag: positions are setpoints, efforts are efforts. Default: measured efforts."""
     prefix: str = ""
     """Prefix of the joints' names in the logs."""
@@ -69,7 +70,7 @@ class IdentifyCommand:
     extras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = ()
     """Effects to try, each kept where the error on the held-out part falls: load_friction, stribeck, offset; with
     --gains also gain (a factor of gains that are not known), kd, saturation and slew (the limit of the goal's rate)."""
-    evaluations: int = 25
+    evaluations: Annotated[int, Field(high=1000)] = 25
     """Largest number of evaluations of the fit; each simulates the robot along the logs and, for each unknown,
     a perturbed one, so that a minute of logs takes six times as long as ten seconds. 0: no fit; with --actuators their
     error is printed, and without them strength, delay and lag are found from efforts that are commanded and measured,
@@ -77,7 +78,7 @@ class IdentifyCommand:
     actuators: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """With --evaluations 0: an actuators file whose error on the held-out part is printed. Nothing is fitted or
     written."""
-    seed: int = 0
+    seed: flags.Seed = 0
     """Seed of CMA-ES, which finds the start of the fit. The result does not depend on the number of workers."""
     workers: flags.Workers = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
@@ -125,7 +126,6 @@ class IdentifyCommand:
         logs = self._logs(robot)
         if self.evaluations == 0:
             return self._compare_efforts(robot, logs, out, details)
-        out.parent.mkdir(parents=True, exist_ok=True)
         note = "first a search for the start of the fit, then the fit; both take longer the longer the logs are"
         print(f"{robot.name}: {note}", flush=True)
         found = identify(

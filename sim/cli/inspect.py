@@ -55,12 +55,14 @@ class InspectCommand:
         robot = Robot.load(self.robot, **vars(self.meshes))
         mass = sum(link.mass for link in robot.link_masses.values())
         size = f"{robot.dof} degrees of freedom, {len(robot.links)} links, {mass:.4g} kg"
-        print(f"{robot.name}: {size}, {robot.path}\n")
         setpoint = None if robot.settings is None else robot.settings.target
         findings = robot.check(setpoint=setpoint, control="drive")  # without gains
+        asked = self.gains is not None or robot.has_tuned  # designed gains keep the stability bound
+        gains = gain_set(robot, self.gains) if asked else None
+        calls = _calls(self.engine) if self.engine else None
+        print(f"{robot.name}: {size}, {robot.path}\n")
         print(sentences(findings) or "Nothing odd about it.")
-        if self.gains is not None or robot.has_tuned:  # designed gains keep the stability bound
-            gains = gain_set(robot, self.gains)
+        if gains is not None:
             with_gains = robot.check(params=gains.params, setpoint=setpoint, control=gains.control)
             of_gains = [finding for finding in with_gains if finding not in findings]
             print(f"\nUnder gains {gains.name}:")
@@ -69,12 +71,8 @@ class InspectCommand:
         print("\n" + joint_table(robot, fixed_too=self.all))
         print("\n" + mass_table(robot, light_too=self.all))
         print("\n" + contact_lines(robot, pairs_too=self.all))
-        if self.engine:
-            from batchpid.sim.engine.native import describe_calls
-            from batchpid.sim.engine.protocol import load_engine
-
-            engine, version = load_engine(self.engine), package_versions([self.engine])[self.engine]
-            print(f"\nEngine: {describe_calls(f'{engine.title} {version}', engine.native_obstacle())}.")
+        if calls is not None:
+            print(f"\nEngine: {calls}.")
         if json is not None:
             names = ("type", "unit", "lower", "upper", "effort_limit", "velocity_limit", "damping", "friction")
             figures = {
@@ -85,6 +83,15 @@ class InspectCommand:
             write_figures(json, figures)
             print(f"\nfigures: {json}")
         return int(self.strict and any(finding.severity != "note" for finding in findings))
+
+
+def _calls(name: str) -> str:
+    """Return the kind of the calls into a physics engine."""
+    from batchpid.sim.engine.native import describe_calls
+    from batchpid.sim.engine.protocol import load_engine
+
+    engine, version = load_engine(name), package_versions([name])[name]
+    return describe_calls(f"{engine.title} {version}", engine.native_obstacle())
 
 
 def joint_table(robot: Robot, *, fixed_too: bool) -> str:

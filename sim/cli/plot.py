@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from batchpid.checks.validate import integer
+from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Rollout, read_recording
 from batchpid.sim.cli import flags
@@ -31,7 +31,7 @@ class PlotCommand:
     """Step responses, or efforts against their limits, of one recording."""
     joints: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]", help_behavior_hint="")] = ()
     """Names of joints to draw. Default: all."""
-    every: int = 1
+    every: Annotated[int, Field(low=1, high=1e9)] = 1
     """Draw only every n-th tick, for long recordings."""
     picture: flags.OptionalPath = None
     """Picture to draw: .png or .svg. Default: next to the recording NAME.npz, NAME-responses.png, NAME-efforts.png, or
@@ -44,16 +44,15 @@ class PlotCommand:
         """Run the command."""
         from batchpid.sim import plots
 
-        every = integer("every", self.every, 1, 10**9)
         if not self.recording.is_file():  # before a picture is named after it
             read_recording(self.recording)
         shown = self.kind if self.versus is None else f"versus-{stem(self.versus)}"
         outputs = OutputFiles(force=self.force, inputs=(self.recording, self.versus))
         picture = outputs.path("picture", self.picture or beside(self.recording, shown), plots.FORMATS)
-        rollout = _read(self.recording, every)
+        rollout = _read(self.recording, self.every)
         if self.versus is not None:
             labels = (self.recording.name, self.versus.name)
-            figure = plots.comparison(rollout, _read(self.versus, every), labels=labels, joints=self.joints)
+            figure = plots.comparison(rollout, _read(self.versus, self.every), labels=labels, joints=self.joints)
         else:
             draw: Any = plots.step_responses if self.kind == "responses" else plots.efforts
             figure = draw(rollout, joints=self.joints)
@@ -80,12 +79,12 @@ class RenderCommand:
     recording: tyro.conf.Positional[Path]
     """File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote: .npz or .h5."""
     robot: flags.RecordedRobot = None
-    num_envs: int = 16
+    num_envs: flags.ShownEnvs = 16
     """Number of envs to show, the first ones; 64 at most."""
     fps: flags.Fps = 30.0
-    width: int = 960
+    width: Annotated[int, Field(low=16, high=8192)] = 960
     """Width of the film [pixels]."""
-    height: int = 540
+    height: Annotated[int, Field(low=16, high=8192)] = 540
     """Height of the film [pixels]."""
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
@@ -98,14 +97,13 @@ class RenderCommand:
         """Run the command."""
         from batchpid.sim.cli.run import read_run
         from batchpid.sim.view.film import FORMATS, write_film
-        from batchpid.sim.view.layout import MAX_ROBOTS
         from batchpid.sim.view.renderer import REMEDY, render_problem
 
         outputs = OutputFiles(force=self.force, inputs=(self.recording,))
         out = outputs.path("out", self.out or beside(self.recording, "film", ".mp4"), FORMATS)
         usage = f"batchpid render {shlex.quote(str(self.recording))} PATH/TO/ROBOT.urdf"
         rollout, robot = read_run(self.recording, self.robot, self.meshes, usage)
-        rollout = rollout.for_envs(slice(0, integer("num_envs", self.num_envs, 1, MAX_ROBOTS)))
+        rollout = rollout.for_envs(slice(0, self.num_envs))
         progress = bar("filming", unit="frame")
         path = write_film(
             rollout, out, robot=robot, fps=self.fps, width=self.width, height=self.height, progress=progress

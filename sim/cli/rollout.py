@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from batchpid.arrays.array_types import Array
-from batchpid.checks.validate import array, file_path, number
+from batchpid.checks.validate import array, file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Recorder, Robot, write_recording
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, waiting, write_figures
 from batchpid.sim.recording.recording_files import HDF5
-from batchpid.sim.runner_keywords import checked_option
 from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tool_space.tool_setpoints import default_goal
 from batchpid.sim.tuning.gain_sets import gain_set
@@ -55,13 +54,13 @@ class RolloutCommand:
     rates: bool = True
     """With --no-rates the setpoints of the trajectory have none, as in a recording that `batchpid identify` reads."""
     seconds: flags.Seconds = 2.0
-    timestep: float = 1 / 2000
+    timestep: Annotated[float, flags.BOUNDS["timestep"]] = 1 / 2000
     """Time step of simulation and control [s]."""
-    substeps: int = 20
+    substeps: Annotated[int, flags.BOUNDS["substeps"]] = 20
     """Sim steps of a tick, from one sample to the next; with --trajectory as the times of its rows say."""
-    seed: int = 0
+    seed: flags.Seed = 0
     """Seed of the start poses."""
-    spread: float = 0.3
+    spread: flags.Distance = 0.3
     """Largest distance of a start pose from the robot's own, with --control osc from the bundled robot's target, with
     --trajectory from its first row at time 0 [rad or m]; env 0 starts at that itself."""
     runner: Annotated[flags.RunnerFlags, flags.group(RUNNER)] = field(default_factory=RUNNER)
@@ -107,7 +106,6 @@ class RolloutCommand:
         json = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes))
         robot, randomization = read_variation(robot, self.randomize)
-        seconds = number("seconds", self.seconds, 1e-6, 1e6, "simulated time")
         target = robot.start if robot.settings is None else robot.settings.target
         setpoints = None if self.trajectory is None else self._read(robot, self.trajectory)
         params: Any = None
@@ -150,7 +148,7 @@ class RolloutCommand:
             if setpoints is not None:
                 rollout, report = follow(runner, start, setpoints, self.rates)
             else:
-                rollout, report = (hold_pose if osc else hold_setpoint)(runner, start, setpoint, seconds)
+                rollout, report = (hold_pose if osc else hold_setpoint)(runner, start, setpoint, self.seconds)
         if out is not None and stream is None and not self.resume:
             write_recording(rollout, out, seed=self.seed, overwrite=True)
         print(report)
@@ -177,7 +175,7 @@ class RolloutCommand:
             if is_given:
                 remedy = "leave one of them out; a trajectory has joint setpoints, and lasts as long as its file"
                 raise InvalidArgumentError("trajectory", f"excludes {name}", remedy=remedy)
-        setpoints = read_setpoints(robot, path, checked_option("timestep", self.timestep))
+        setpoints = read_setpoints(robot, path, self.timestep)
         if self.substeps not in (RolloutCommand.substeps, setpoints.substeps):
             problem, remedy = f"differs from the ticks of {path}", f"leave it out, or use {setpoints.substeps}"
             raise InvalidArgumentError("substeps", problem, value=self.substeps, remedy=remedy)

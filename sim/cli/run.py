@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Document, Rows
-from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, Runner, read_recording
 from batchpid.sim.cli.flags import MeshOptions
@@ -24,7 +23,7 @@ from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.identification.setpoint_files import Setpoints
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE, checked_option
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.evaluation import (
     Evaluation,
     evaluate_gains,
@@ -77,9 +76,7 @@ def start_poses(
     The center is by default the robot's start pose. Uniform within ``spread`` [rad or m], and within a quarter of the
     joint's range where that is less. Row k is the same for any ``num_envs``.
     """
-    num_envs = checked_option("num_envs", num_envs)
-    spread = number("spread", spread, 0.0, 10.0, "rad or m")
-    random = np.random.default_rng(integer("seed", seed, 0, 2**63 - 1))
+    random = np.random.default_rng(seed)
     reach = np.minimum(spread, (robot.upper - robot.lower) / 4)
     center = robot.start if center is None else center
     poses = center + reach * random.uniform(-1.0, 1.0, (num_envs, robot.dof))

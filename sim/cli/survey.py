@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from batchpid.arrays.field_tables import Field
 from batchpid.io.files import write_atomically
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, bar, write_figures
@@ -34,16 +35,17 @@ class SurveyCommand:
     ]
     """URDF and MJCF files, and folders that are searched for both: *.urdf, and *.xml or *.mjcf with a <mujoco> that no
     other file includes."""
-    moves: int = 8
+    moves: Annotated[int, Field(low=1, high=1000)] = 8
     """Number of moves of each robot."""
-    seed: int = 0
+    seed: flags.Seed = 0
     """Seed of the moves."""
-    seconds: flags.Seconds = 2.0
-    bandwidth: float = 2.0
+    seconds: flags.MoveSeconds = 2.0
+    """Simulated time of each move [s]."""
+    bandwidth: Annotated[float, Field("Hz", low=1e-3, high=100.0)] = 2.0
     """Bandwidth of the designed gains [Hz]."""
     engine: flags.Engine = DEFAULT_ENGINE
     physics: flags.Physics = "accurate"
-    time_limit: float = 300.0
+    time_limit: Annotated[float, Field("s", low=1.0, high=1e6)] = 300.0
     """Wall-clock time for each robot [s]."""
     workers: flags.Workers = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)

@@ -12,6 +12,7 @@ import tyro
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document
+from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
@@ -50,13 +51,13 @@ class TuneCommand:
     """Gains of the joints, or of operational-space control of a tool: bandwidths and damping ratios."""
     tool: Annotated[str | None, tyro.conf.arg(metavar="LINK", help_behavior_hint="")] = None
     """With --control osc: link to move. Default: the last one of the longest chain."""
-    generations: int | None = None
+    generations: Annotated[int | None, Field(low=1, high=100_000)] = None
     """Number of populations that the search evaluates. Default: 10; 4 with --within."""
-    population: int = 8
+    population: Annotated[int, Field(low=4, high=1000)] = 8
     """Candidates of a population, evaluated at once."""
-    seed: int = 0
+    seed: flags.Seed = 0
     """Seed of the search and its moves. The result does not depend on the number of workers."""
-    seconds: Annotated[float, tyro.conf.arg(aliases=("--search-seconds",))] = 1.5
+    seconds: Annotated[flags.MoveSeconds, tyro.conf.arg(aliases=("--search-seconds",))] = 1.5
     """Simulated time of each move of the search [s]."""
     gain_units: Literal["mass_matrix", "inertia", "effort"] = "mass_matrix"
     """Gains per mass matrix (all joints respond equally fast), per joint inertia, or as efforts (for any
@@ -116,9 +117,7 @@ class TuneCommand:
         out = outputs.path("out", self.out or named.with_suffix(".tuned.yaml"), SUFFIXES)
         picture = outputs.path("picture", self.picture or beside(named, "tune"), plots.FORMATS)
         history = outputs.history(out.with_suffix(".search.json"), resume=self.resume)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        variation = (self.payload, self.friction) if self.variation else None
-        robot, randomization = read_variation(robot, self.randomize, variation)
+        robot, randomization = read_variation(robot, self.randomize, flags.variation(self))
         found = tune(
             robot,
             seconds=self.seconds,
@@ -239,7 +238,6 @@ class TuneCommand:
         flags.refuse(self, others, "is not available with --control osc")
         out = outputs.path("out", self.out or named.with_suffix(".osc.yaml"), SUFFIXES)
         history = outputs.history(out.with_suffix(".search.json"), resume=self.resume)
-        out.parent.mkdir(parents=True, exist_ok=True)
         found = tune_tool(
             robot,
             self.tool,

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from batchpid.checks.validate import integer, number
+from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
@@ -32,7 +32,7 @@ class ViewCommand:
     """
 
     robot: flags.RecordedRobot = None
-    num_envs: int = 16
+    num_envs: flags.ShownEnvs = 16
     """Number of robots in each group; 64 in all at most."""
     control: tuple[Literal["pid", "drive", "osc"], ...] = ("pid",)
     """Batch PID, PhysX's internal drive, or both side by side; or operational-space control, to drag a tool."""
@@ -48,7 +48,7 @@ class ViewCommand:
     fps: flags.Fps = 30.0
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 for all of this machine. Everyone who sees the printed address can use it."""
-    port: int = 8080
+    port: Annotated[int, Field(low=1, high=65535)] = 8080
     """Port, or the next free one if it is taken."""
     time_limit: flags.TimeLimit = None
 
@@ -59,16 +59,14 @@ class ViewCommand:
         from batchpid.sim.view import View
         from batchpid.sim.view.address import resolve
 
-        port = integer("port", self.port, 1, 65535)
-        number("fps", self.fps, 1.0, 120.0, "frames per second")
         resolve(self.host)  # before the robots are loaded
         source = self._live() if self.play is None else self._recorded(self.play)
-        with closing(source), View(source, host=self.host, port=port) as view:
+        with closing(source), View(source, host=self.host, port=self.port) as view:
             if self.host not in LOOPBACK:
                 warning = f"listening on {self.host}, unencrypted: everyone who sees the address can move the robots"
                 print(f"batchpid: warning: {warning}", file=sys.stderr)
-            if view.port != port:
-                print(f"port {port} is in use; the page is at {view.port}")
+            if view.port != self.port:
+                print(f"port {self.port} is in use; the page is at {view.port}")
             for finding in view.findings:
                 print(f"batchpid: {finding}", file=sys.stderr)
             print(f"Open in a browser: {view.url}  (Ctrl-C ends it)", flush=True)

@@ -110,6 +110,7 @@ def read_region(path: str | os.PathLike[str], robot: Robot) -> Region:
     right = estimate.shape == deviation.shape == (len(names),) and bool(np.isfinite([*estimate, *deviation]).all())
     right = right and bool((deviation >= 0).all() and (np.abs(correlation) <= 1).all()) and len(names) > 0
     right = right and np.allclose(np.diagonal(correlation), 1.0)
+    right = right and len({*names}) == len(names) and all(len(each) <= 2 for each in known["unknowns"])
     if not right or any(kind not in KINDS | ADDED for kind, _ in names):
         raise InvalidArgumentError(source, "has wrong shapes, numbers or unknowns", remedy=remedy)
     if strangers := sorted({joint for _, joint in names if joint} - set(robot.joint_names)):

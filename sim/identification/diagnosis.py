@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.plant import Plant
-from batchpid.sim.identification.regression import LEAST_ROWS, STRENGTHS, Motion, Regression
+from batchpid.sim.identification.regression import LEAST_ROWS, STRENGTHS, Motion, Regression, required_efforts
 from batchpid.task_space.rigid_tree import RigidTree
 
 SPREAD, MOMENT_SPREAD = 0.5, 0.05
@@ -168,13 +168,13 @@ class _System:
         found = []
         for (rows, motion, plant), described in zip(self._of_logs(), self._described, strict=True):
             changed = plant.with_tree(_changed(plant.tree, link, more, further))
-            found.append(_required(changed, motion, rows) - described)
+            found.append(required_efforts(changed, motion, rows, 0.0) - described)
         return np.concatenate(found)[..., None]
 
     @cached_property
     def _described(self) -> list[Float64]:
         """Required efforts (rows, joints) of each log with the links as described."""
-        return [_required(plant, motion, rows) for rows, motion, plant in self._of_logs()]
+        return [required_efforts(plant, motion, rows, 0.0) for rows, motion, plant in self._of_logs()]
 
     def solve(self, further: Float64, spread: Float64 | float = SPREAD) -> _Solved:
         """Return the solution with ``further`` columns (rows, joints, n), which all joints share."""
@@ -259,13 +259,6 @@ def _heavier(system: _System, scaled: dict[str, Float64], described: _Solved) ->
         chosen, best = [*chosen, name], tried[name]
     factors = {name: float(1 + value) for name, value in zip(chosen, best.values, strict=True)}
     return {name: each for name, each in factors.items() if abs(each - 1) > LEAST_CHANGE and each > 0}, best
-
-
-def _required(plant: Plant, motion: Motion, rows: NDArray[np.intp]) -> Float64:
-    """Return the efforts (rows, joints) that a motion requires, without payload and compensation."""
-    q, v, a = (table[rows] for table in (motion.qpos, motion.qvel, motion.qacc))
-    passive = plant.at(q, v, np.zeros((len(q), 1)))
-    return (passive.matrix @ a[..., None])[..., 0] + passive.force
 
 
 def _changed(tree: RigidTree, link: str, more: float, further: Float64 | float) -> RigidTree:

@@ -22,8 +22,8 @@ import batchpid as bp
 from batchpid.arrays.array_types import Float64
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.identification.inputs import Inputs, read_inputs
-from batchpid.sim.identification.log import Log
-from batchpid.sim.identification.regression import CUTOFF, DELAYS, EDGE, smooth
+from batchpid.sim.identification.log import Log, interpolated
+from batchpid.sim.identification.regression import CUTOFF, DELAYS, EDGE, lowpass, smooth
 from batchpid.sim.identification.result import actuators_at
 from batchpid.sim.identification.statistics import INTERVAL, LEAST_DEVIATION, PARTS, jackknife_variance
 from batchpid.sim.identification.unknowns import KINDS, Motors, Unknowns
@@ -109,7 +109,7 @@ class _Tables:
             # A row holds the effort of the step that ends there.
             self._index.append(np.ceil((time - log.time[0]) / self._dt - 1e-6).astype(int) - 1)
             assert log.measured is not None
-            measured = np.stack([np.interp(grid, log.time, column) for column in log.measured.T], axis=1)
+            measured = interpolated(grid, log.time, log.measured)
             sign = self._filtered(np.clip(motion.qvel / (0.01 * np.abs(motion.qvel).max(0) + 1e-9), -1, 1))
             own = [-motion.qacc, -motion.qvel, -sign] if self._links else []
             fitted = time <= log.time[0] + share_fitted(log) * log.seconds
@@ -119,9 +119,7 @@ class _Tables:
 
     def _filtered(self, table: Float64) -> Float64:
         """Return ``table`` filtered as the motion is, if the sensor is at the link; otherwise unchanged."""
-        from scipy.signal import butter, sosfiltfilt
-
-        return sosfiltfilt(butter(4, CUTOFF, fs=1 / self._dt, output="sos"), table, axis=0) if self._links else table
+        return lowpass(table, CUTOFF, self._dt) if self._links else table
 
     def _columns(self, delay: float, lag: float, joint: int) -> Float64:
         """Return the columns of the linear unknowns of a joint (rows, unknowns)."""

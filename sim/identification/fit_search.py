@@ -1,4 +1,9 @@
-"""Fits of all variants of the drive, and of other delays; the one with the highest likelihood is the result.
+"""Search for the likeliest fit: assumptions about the drive, start, fits of all variants, other delays, more effects.
+
+Filtered efforts hardly show a short delay, but the simulated motion does. For the start of a fit, the motion is
+simulated for a grid of delays, and then for the candidates of a search over the unknowns that all joints share, by
+CMA-ES (N. Hansen, "The CMA evolution strategy: a tutorial", arXiv:1604.00772). Each candidate has the motors that the
+regression gives for its delay, payload and stopping time.
 
 Efforts that jump from step to step are smoothed by a delay of a fractional number of steps, but not by a whole number.
 So the likelihood may have a maximum between any two steps, and a fit finds the nearest. It is repeated one step earlier
@@ -18,12 +23,20 @@ import numpy as np
 
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.sim.identification.fit import LEAST_GAIN, FitStep, Solution, fit
+from batchpid.sim.identification.log import Log
+from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.plant import plants_of
 from batchpid.sim.identification.problem import Problem
-from batchpid.sim.identification.regression import Regression
-from batchpid.sim.identification.unknowns import LAW
+from batchpid.sim.identification.regression import DELAYS, STRONG, WEAK, Motion, Regression, explains_better
+from batchpid.sim.identification.unknowns import KINDS, LAW, Motors
+from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tuning.history import HistoryFile
 
+GRID = DELAYS[::4]
+"""Delays that are tried first [s]."""
+GENERATIONS, POPULATION = 4, 8
+SPREAD = np.array([5e-4, 0.3, 0.05])
+"""Standard deviations of the first candidates: delay [s], logarithm of the stopping time, payload [kg]."""
 NEIGHBOURS, NEIGHBOUR_EVALUATIONS = 6, 8
 """Most fits at other delays, and most evaluations of each."""
 EXTRA_EVALUATIONS = 25
@@ -76,6 +89,92 @@ class Progress:
             self._shown += 1
         if hasattr(self._bar, "set_postfix"):
             self._bar.set_postfix(error=f"{np.exp(cost):.3g}")
+
+
+def hypotheses(drive: LoggedDrive, payload: bool) -> list[LoggedDrive]:
+    """Return the possible compensations: outside the motors, with the payload or without, or through the motors.
+
+    The logged efforts may also include the compensation.
+    """
+    if drive.compensate == "none":
+        return [drive]
+    ways = [drive, replace(drive, through=True)]
+    if payload:
+        ways.append(replace(drive, knows_payload=True))
+    return ways if drive.params is not None else [*ways, replace(drive, compensate="none")]
+
+
+def variants(drive: LoggedDrive, motions: list[Motion]) -> list[LoggedDrive]:
+    """Return the possible measurements of the law: with or without sensor noise, rates or differences of positions.
+
+    Without noise, the law gets the simulated positions and rates.
+    """
+    if drive.params is None:
+        return [drive]
+    quiet = replace(drive, measured_rate=False)
+    seen = any(motion.sensor.size.any() for motion in motions)
+    return [*([replace(quiet, noisy=True)] if seen else []), quiet, *([drive] if drive.measured_rate else [])]
+
+
+def best_drive(
+    robot: Robot,
+    joints: tuple[int, ...],
+    drive: LoggedDrive,
+    logs: list[Log],
+    motions: list[Motion],
+    payload: bool,
+    gains_known: bool = True,
+) -> tuple[LoggedDrive, Regression]:
+    """Return the drive that explains the logs best, with its regression."""
+    ways = hypotheses(drive, payload)
+    found = [
+        (Regression(plants_of(robot, joints, each, logs), logs, motions, payload, gains_known), each) for each in ways
+    ]
+    best, chosen = found[0]
+    for other, way in found[1:]:
+        if explains_better(other.best, best.best):
+            best, chosen = other, way
+    return chosen, best
+
+
+def begin(problem: Problem, regression: Regression, ideal: Motors, seed: int) -> Float64:
+    """Return the point (unknowns,) at which a fit begins: the candidate with the highest likelihood."""
+    from cmaes import CMA
+
+    unknowns = problem.unknowns
+
+    def costs(candidates: list[Motors]) -> Float64:
+        points = np.array([unknowns.clip(unknowns.point(motors)) for motors in candidates])
+        return problem.costs(problem.sizes(problem.residuals(points)))
+
+    # Each joint has its prior: the strong one where the log hardly shows the strength.
+    kg, priors = regression.best.motors["payload"][0, 0], np.array([WEAK, STRONG])
+    grid = costs([regression.at(delay, kg, prior).motors for prior in priors for delay in GRID])
+    both = grid.reshape(len(priors), len(GRID), -1)
+    late = both.min(0).sum(1).argmin()
+    prior = priors[both[:, late].argmin(0)]
+
+    yields = KINDS["stopping"]
+
+    def candidate(x: Float64) -> Motors:
+        delay, stopping, kg = x * SPREAD
+        stopping = np.clip(np.exp(stopping), yields.low, yields.high)
+        return regression.at(delay, kg, prior).motors | {"stopping": np.array([[stopping]])}
+
+    first = regression.at(GRID[late], kg, prior).motors
+    mean = np.array([GRID[late], np.log(yields.start), kg]) / SPREAD
+    bounds = np.array([[0.0, DELAYS[-1]], np.log([yields.low, yields.high]), [0.0, np.inf]]) / SPREAD[:, None]
+    bounds = bounds if ("payload", None) in unknowns.names else bounds[:2]
+    optimizer = CMA(mean[: len(bounds)], 1.0, bounds=bounds, seed=seed, population_size=POPULATION)
+    tried = [first, ideal]
+    lowest = [*costs(tried).sum(1)]
+    for _ in range(GENERATIONS):
+        asked = [optimizer.ask() for _ in range(POPULATION)]
+        candidates = [candidate(np.append(x, mean[len(x) :])) for x in asked]
+        found = costs(candidates).sum(1)
+        optimizer.tell(list(zip(asked, found, strict=True)))
+        tried, lowest = [*tried, *candidates], [*lowest, *found]
+    return unknowns.clip(unknowns.point(tried[int(np.argmin(lowest))]))
 
 
 def search(

@@ -14,10 +14,11 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.motors.actuators import FIELDS
+from batchpid.sim.identification.fit_search import hypotheses, variants
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.problem import Problem
-from batchpid.sim.identification.regression import hypotheses, smooth, variants
+from batchpid.sim.identification.regression import smooth
 from batchpid.sim.identification.unknowns import ADDED, DESCRIBED, KINDS, Motors, Unknowns
 from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.robot import Robot

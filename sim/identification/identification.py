@@ -24,16 +24,25 @@ from batchpid.native.availability import obstacle
 from batchpid.sim.identification.diagnosis import diagnose
 from batchpid.sim.identification.effort_ratios import EffortRatios, effort_ratios
 from batchpid.sim.identification.fit import FitStep, Solution
-from batchpid.sim.identification.fit_search import NEIGHBOUR_EVALUATIONS, Progress, State, extended, search
+from batchpid.sim.identification.fit_search import (
+    NEIGHBOUR_EVALUATIONS,
+    Progress,
+    State,
+    begin,
+    best_drive,
+    extended,
+    hypotheses,
+    search,
+    variants,
+)
 from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_of, residuals_of_ideal
 from batchpid.sim.identification.inputs import read_inputs
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.plant import Plant, plants_of
 from batchpid.sim.identification.problem import Problem
-from batchpid.sim.identification.regression import Motion, Regression, best_drive, hypotheses, smooth, variants
+from batchpid.sim.identification.regression import Motion, Regression, smooth
 from batchpid.sim.identification.result import Fit, Identification, actuators_at
-from batchpid.sim.identification.start import begin
 from batchpid.sim.identification.statistics import LARGEST_MISFIT, misfits, uncertainty
 from batchpid.sim.identification.unknowns import EXTRAS, KINDS, LAW, Motors, Unknowns
 from batchpid.sim.identification.windows import rows_of

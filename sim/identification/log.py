@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.sim.robot.robot import Robot
 
 CommandKind = Literal["setpoint", "effort"]
@@ -104,4 +104,9 @@ class Log:
         if self.held:
             index = np.searchsorted(self.command_time, time + 1e-9, side="right") - 1
             return table[np.clip(index, 0, len(table) - 1)]
-        return np.stack([np.interp(time, self.command_time, column) for column in table.T], axis=1)
+        return interpolated(time, self.command_time, table)
+
+
+def interpolated(time: Float64, known: Rows, table: Rows) -> Float64:
+    """Return the rows (n, columns) at ``time`` (n,) of a table whose rows are for the times ``known``."""
+    return np.stack([np.interp(time, known, column) for column in table.T], axis=1)

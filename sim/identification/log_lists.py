@@ -22,6 +22,7 @@ relative to the folder of the list.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -68,7 +69,8 @@ def read_log_list(
             choice(f"{where}: key", key, (*OWN, *Reading._fields))
         if not isinstance(entry.get("log"), str) or Path(entry["log"]).suffix.lower() in SUFFIXES:
             raise error(where, "names no log", "add 'log: FILE', of another kind than this list")
-        found += _read(where, path.parent, robot, read, kind, entry)
+        with documents.named(where):
+            found += _read(path.parent, robot, read, kind, entry)
     if any(log.settings.held_out for log in found):
         whole = [log.settings._replace(held_out=bool(log.settings.held_out)) for log in found]
         found = [replace(log, settings=each) for log, each in zip(found, whole, strict=True)]
@@ -78,7 +80,7 @@ def read_log_list(
 def gains_of(robot: Robot, name: str) -> bp.PIDParams:
     """Return the gains of a name or file, for all joints of ``robot``; a params file may have only some joints."""
     path, known = Path(name), [each for each in NAMES if each != "drive"]
-    if name not in known and not path.is_file():
+    if name not in known and not os.path.isfile(path):  # False for any text that is no path, too
         remedy = f"use a file or {', '.join(known)}"
         raise InvalidArgumentError("gains", "is neither a name nor a file of gains", value=name, remedy=remedy)
     kind = path.suffix.lower()
@@ -92,7 +94,6 @@ def gains_of(robot: Robot, name: str) -> bp.PIDParams:
 
 
 def _read(
-    where: str,
     folder: Path,
     robot: Robot,
     read: Callable[..., list[Log]],
@@ -102,43 +103,43 @@ def _read(
     """Return the parts of one log of a list, divided where its times jump, with its settings."""
     own, params = robot, None
     if (urdf := entry.get("urdf")) is not None:
-        own = Robot.load(folder / urdf)
+        own = Robot.load(folder / instance("urdf", urdf, str, "name a file"))
         if own.joint_names != robot.joint_names:
             remedy = f"use one with {', '.join(robot.joint_names)}"
-            raise error(f"{where}: urdf", f"has the joints {', '.join(own.joint_names)}", remedy)
+            raise error("urdf", f"has the joints {', '.join(own.joint_names)}", remedy)
     if (gains := entry.get("gains")) is not None:
-        gains = str(gains)
-        params = gains_of(own, str(folder / gains) if (folder / gains).is_file() else gains)
-    payload = number(f"{where}: payload", entry.get("payload", 0.0), 0.0, MOST_PAYLOAD, "kg")
+        gains = instance("gains", gains, str, "name a file, or gains of the robot")
+        params = gains_of(own, str(folder / gains) if os.path.isfile(folder / gains) else gains)
+    payload = number("payload", entry.get("payload", 0.0), 0.0, MOST_PAYLOAD, "kg")
     held_out = entry.get("held_out")
     if held_out is not None:
-        flag(f"{where}: held_out", held_out)
+        flag("held_out", held_out)
     settings = LogSettings(None if own is robot else own, params, payload, held_out)
     wanted: CommandKind | None = kind if params is None else "setpoint"
-    hold, reading = flag(f"{where}: hold", entry["hold"]), _reading(where, robot, entry)
+    hold, reading = flag("hold", entry["hold"]), _reading(robot, entry)
     found = read(own, [folder / entry["log"]], wanted, hold=hold, reading=reading)
     return [replace(log, settings=settings) for log in found]
 
 
-def _reading(where: str, robot: Robot, entry: Document) -> Reading:
+def _reading(robot: Robot, entry: Document) -> Reading:
     """Return the options of an entry that are fields of :class:`Reading`."""
     reading = Reading(**{key: entry[key] for key in Reading._fields})
     if reading.time_unit is not None:
-        choice(f"{where}: time_unit", reading.time_unit, get_args(TimeUnit))
+        choice("time_unit", reading.time_unit, get_args(TimeUnit))
     if reading.measured is not None:
-        choice(f"{where}: measured", reading.measured, get_args(Sensor))
-    flag(f"{where}: degrees", reading.degrees)
+        choice("measured", reading.measured, get_args(Sensor))
+    flag("degrees", reading.degrees)
     for key in ("topic", "prefix", *(["command_topic"] if reading.command_topic is not None else [])):
-        instance(f"{where}: {key}", getattr(reading, key), str, "write a text")
+        instance(key, getattr(reading, key), str, "write a text")
     for key in ("sign", "scale"):
-        factors = instance(f"{where}: {key}", getattr(reading, key) or {}, dict, "write {JOINT: NUMBER}")
+        factors = instance(key, getattr(reading, key) or {}, dict, "write {JOINT: NUMBER}")
         for joint, factor in factors.items():
-            choice(f"{where}: {key}", joint, robot.joint_names)
-            size = abs(number(f"{where}: {key}: {joint}", factor, -math.inf, math.inf, "1"))
+            choice(key, joint, robot.joint_names)
+            size = abs(number(f"{key}: {joint}", factor, -math.inf, math.inf, "1"))
             if size == 0 or (key == "sign" and size != 1):
                 wanted = "1 or -1" if key == "sign" else "another number than 0"
-                raise error(f"{where}: {key}: {joint}", "is no such factor", f"write {wanted}", factor)
+                raise error(f"{key}: {joint}", "is no such factor", f"write {wanted}", factor)
     for key in ("start", "end"):
         if not documents.is_number(getattr(reading, key)):
-            raise error(f"{where}: {key}", "is not a number", "write a time in seconds", getattr(reading, key))
+            raise error(key, "is not a number", "write a time in seconds", getattr(reading, key))
     return reading

@@ -9,12 +9,11 @@ An HDF5 file has one dataset per column, of the same names. A row holds the posi
 command computed from it, which acts from then on. A feedforward is an effort that is added to the law's. Columns may
 have any order, joints may be missing, and times need not be equidistant. Columns of other quantities are ignored, such
 as the rates of setpoints that ``batchpid excite`` writes. :class:`batchpid.sim.identification.columns.Reading` has
-other units and names; :mod:`batchpid.sim.identification.bags` reads ROS bags, and
-:mod:`batchpid.sim.identification.log_lists` lists of logs with settings of their own (.yaml).
+other units and names, and the topics of ROS bags; :mod:`batchpid.sim.identification.log_lists` reads lists of logs with
+settings of their own (.yaml).
 
-Where the times have a gap, such as between two recordings, each stretch without gap is a log
-(:mod:`batchpid.sim.identification.gaps`). Positions and setpoints that wrap at +-pi or at 0 and 2 pi are unwrapped
-(:mod:`batchpid.sim.identification.turns`).
+Where the times have a gap, such as between two recordings, each stretch without gap is a log. Positions and setpoints
+that wrap at +-pi or at 0 and 2 pi are unwrapped (:mod:`batchpid.sim.identification.log_checks`).
 
 In a recording (:func:`batchpid.sim.write_recording`) the command of a row acted in the tick that ends at its time, and
 each env is a log.
@@ -33,18 +32,27 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice, file_path
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.identification import bags, log_lists
-from batchpid.sim.identification.columns import QUANTITIES, Reading, error, read_csv, read_hdf5_columns, time_column
-from batchpid.sim.identification.gaps import commands_of
+from batchpid.sim.identification import log_lists
+from batchpid.sim.identification.columns import (
+    BAGS,
+    QUANTITIES,
+    Reading,
+    error,
+    is_bag,
+    read_bag,
+    read_csv,
+    read_hdf5_columns,
+    time_column,
+)
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning, Sensor
-from batchpid.sim.identification.log_checks import SPEEDING, checked, too_fast
+from batchpid.sim.identification.log_checks import SPEEDING, checked, commands_of, too_fast
 from batchpid.sim.observation import Rollout
 from batchpid.sim.recording.recording_files import HDF5, read_recording
 from batchpid.sim.robot.robot import Robot
 
 __all__ = ["CommandKind", "Log", "LogWarning", "logs_of_rollout", "read_logs"]
 
-SUFFIXES = (".csv", ".txt", ".npz", *HDF5, *bags.SUFFIXES)
+SUFFIXES = (".csv", ".txt", ".npz", *HDF5, *BAGS)
 
 
 def read_logs(
@@ -90,14 +98,14 @@ def read_logs(
 
 
 def _read(robot: Robot, path: Path, kind: CommandKind | None, hold: bool, reading: Reading) -> list[Log]:
-    if not bags.is_bag(path):
+    if not is_bag(path):
         file_path("log", path, (*SUFFIXES, *log_lists.SUFFIXES))
     if not path.exists():
         raise FileNotFoundError(2, "there is no such file", str(path))
     if path.suffix.lower() in log_lists.SUFFIXES:
         return log_lists.read_log_list(path, robot, read_logs, kind, hold, reading)
-    if bags.is_bag(path):
-        states, *commands = [_named(robot, str(path), each, reading) for each in bags.read_bag(path, reading)]
+    if is_bag(path):
+        states, *commands = [_named(robot, str(path), each, reading) for each in read_bag(path, reading)]
         return _build(robot, str(path), states, None, kind, hold, reading, *commands)
     columns, lines = None, None
     if path.suffix.lower() in (".csv", ".txt"):

@@ -10,8 +10,17 @@ s_bj is the root mean square of r_j in b, and f twice the noise of the sensor. T
 exact, and a stretch in which the robot hardly moves would have all the weight. Where the model fails, for example where
 a joint slips a little sooner or later in the simulation, the size is large and the stretch has less weight.
 
-Motion by unknown disturbances, such as sensor noise between the rows, is removed from residuals and Jacobian
-(:mod:`batchpid.sim.identification.wander`); the simulated motion is the mean over several draws of them.
+Wander is motion by unlogged disturbances. The law reacts to the noise n of the sensors and thereby moves the robot.
+Between the rows of a log that noise is unknown, so it is drawn several times; the simulated motion is the mean over the
+draws. The deviations of the simulated motions from their mean, over the root of their number less 1, are columns of W.
+A further column is the motion due to one standard deviation of an unknown initial velocity. Residuals r of white noise
+of size sigma and of wander have the covariance::
+
+    C = sigma^2 (I + W W^T / n^2),     r_white = (I + W W^T / n^2)^(-1/2) r
+
+r_white and its Jacobian replace r and J; half the logarithm of det(I + W W^T / n^2) is added to the negative logarithm
+of the likelihood (generalized least squares; L. Ljung, System Identification, 2nd edition, Prentice Hall, 1999, section
+7.2).
 
 Column i of the Jacobian is a finite difference: the change of the simulated motion over a small change of unknown i.
 
@@ -36,7 +45,6 @@ from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.logged_control import LoggedDrive
 from batchpid.sim.identification.regression import Motion
 from batchpid.sim.identification.unknowns import Unknowns, take
-from batchpid.sim.identification.wander import spread, whiten
 from batchpid.sim.identification.windows import Subject, Window, cut, project, rows_of, simulate, whole
 from batchpid.sim.robot.robot import Robot
 
@@ -242,3 +250,40 @@ class Problem:
         """Return what windows have in common that are simulated together."""
         subject, payload = self._subjects[window.log]
         return window.segment.command.shape, window.past, subject.key, payload
+
+
+def spread(draws: Float64) -> Float64:
+    """Return the columns (rows, joints, draws) of W for positions of several draws (draws, rows, joints)."""
+    return (draws - draws.mean(0)).transpose(1, 2, 0) / np.sqrt(max(len(draws) - 1, 1))
+
+
+def whiten(
+    wander: Float64, stretches: list[NDArray[np.intp]], residual: Float64, jacobian: Float64
+) -> tuple[Float64, Float64, Float64]:
+    """Return residuals and Jacobian without wander in the rows of ``stretches``, and half log-determinants.
+
+    Parameters
+    ----------
+    wander
+        W over the noise n (rows, joints, columns).
+    residual, jacobian
+        (rows, joints) and (rows, joints, unknowns).
+
+    Returns
+    -------
+    residual, jacobian, determinants
+        The last one over the number of rows (stretches, joints).
+    """
+    determinants = np.zeros((len(stretches), residual.shape[1]))
+    if not np.isfinite(wander).all():
+        return residual, jacobian, determinants
+    white, jacobian = residual.copy(), jacobian.copy()
+    for number, rows in enumerate(stretches):
+        for joint in range(residual.shape[1]):
+            directions, sizes, _ = np.linalg.svd(wander[rows, joint], full_matrices=False)
+            shrink = (1 - 1 / np.sqrt(1 + sizes**2))[:, None]
+            table = np.column_stack([white[rows, joint], jacobian[rows, joint]])
+            table -= directions @ (shrink * (directions.T @ table))
+            white[rows, joint], jacobian[rows, joint] = table[:, 0], table[:, 1:]
+            determinants[number, joint] = 0.5 * np.log1p(sizes**2).sum() / len(rows)
+    return white, jacobian, determinants

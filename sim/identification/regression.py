@@ -1,4 +1,4 @@
-r"""Start of the fit: inverse-dynamics regression, linear in all unknowns at a given delay.
+r"""Start of the fit: smoothed motions, and an inverse-dynamics regression, linear in all unknowns at a given delay.
 
 With the measured motion filtered without phase lag, and the effort u filtered in the same way, each joint obeys::
 
@@ -9,26 +9,32 @@ stick (J. Swevers, W. Verdonck and J. De Schutter, "Dynamic model identification
 Systems Magazine 27(5), 2007; M. Gautier, "Dynamic identification of robots with power model", ICRA 1997). Under the PID
 law u is computed from the filtered positions. A weak prior at strength 1 determines the parameters that the log does
 not show.
+
+The noise of a log's columns is found by its frequency: roughly known at the rows, unknown between them.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.actuators import Actuators
-from batchpid.sim.identification.log import Log
-from batchpid.sim.identification.log_noise import Noise, split
-from batchpid.sim.identification.logged_control import LoggedDrive
-from batchpid.sim.identification.plant import Plant, plants_of
+from batchpid.sim.identification.log import Log, interpolated
+from batchpid.sim.identification.plant import Plant
 from batchpid.sim.identification.unknowns import Motors
 
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
+NOISE_CUTOFF = 60.0
+"""Frequency [Hz] above which a measured signal counts as noise."""
+DRAWS = 16
+"""Number of draws of the unknown noise."""
+_MOST_NOISE = 4.0
+"""Largest noise, over its standard deviation; larger deviations count as motion."""
 DELAY_STEP = 5e-4
 DELAYS = np.arange(0.0, 0.03, DELAY_STEP)
 """Delays that are tried [s]."""
@@ -50,10 +56,19 @@ LEAST_SHARE = 0.05
 it an error of the model of a twentieth of the effort hides the links, and only ratios to the strength are known."""
 NO_PRIOR, WEAK, STRONG = 1e-3, 0.1, 3.0
 """Weights of the prior at strength 1; the strong one is safe where the log hardly shows the strengths."""
-
-
 FOUND = ("armature", "damping", "friction", "strength", "bias", "delay", "payload")
 """Kinds of unknowns that a regression gives."""
+
+
+class Noise(NamedTuple):
+    """White noise of a table (steps, columns) on the grid of the sim steps."""
+
+    values: Float64
+    """Noise at the log's rows, 0 between them (steps, columns)."""
+    errors: Float64
+    """Draws of the true noise less ``values`` (draws, steps, columns)."""
+    size: Float64
+    """Standard deviations (columns,), 0 if the rows are too far apart to determine them."""
 
 
 class Motion(NamedTuple):
@@ -71,24 +86,12 @@ class Motion(NamedTuple):
     """Efforts that are added to the efforts of the law."""
 
 
-class FirstGuess(NamedTuple):
-    """Result of the regression."""
-
-    motors: Motors
-    cost: float
-    """Sum of the logarithms of the joints' mean squares of the efforts' residuals."""
-
-
 def smooth(log: Log, timestep: float) -> Motion:
     """Return the motion of ``log`` on the grid, filtered without phase lag."""
-    from scipy.signal import butter, sosfiltfilt
-
     time = log.time[0] + timestep * np.arange(int(log.seconds / timestep) + 1)
-    raw = np.stack([np.interp(time, log.time, column) for column in log.qpos.T], axis=1)
+    raw = interpolated(time, log.time, log.qpos)
     period = float(np.median(np.diff(log.time)))
-    sections = butter(4, min(CUTOFF, 0.2 / period), fs=1 / timestep, output="sos")
-    pad = min(len(raw) - 1, round(0.5 / timestep))
-    qpos = sosfiltfilt(sections, raw, axis=0, padlen=pad)
+    qpos = lowpass(raw, min(CUTOFF, 0.2 / period), timestep, min(len(raw) - 1, round(0.5 / timestep)))
     qvel = np.gradient(qpos, timestep, axis=0)
     command, jitter = log.commands_at(time), None
     if log.kind == "effort" and not log.held:
@@ -97,6 +100,62 @@ def smooth(log: Log, timestep: float) -> Motion:
     sensor = split(log.time, log.qpos, time)[1]
     forward = None if log.feedforward is None else log.commands_at(time, log.feedforward)
     return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), command, sensor, jitter, forward)
+
+
+def split(time: Float64, table: Float64, grid: Float64, given: bool = False) -> tuple[Float64, Noise]:
+    """Return the columns of a table without noise, filtered without phase lag, and their noise.
+
+    Parameters
+    ----------
+    time
+        Times of the rows (rows,) [s].
+    table
+        (rows, columns).
+    grid
+        Times at which both are returned (steps,) [s], equidistant.
+    given
+        True if the errors are errors of the sum of both, which is exact at the rows; False if they are errors of the
+        noise, whose part below the cutoff counts as motion.
+    """
+    from scipy.interpolate import make_interp_spline
+
+    timestep, period, columns = grid[1] - grid[0], float(np.median(np.diff(time))), table.shape[1]
+    step = np.clip(np.rint((time - grid[0]) / timestep).astype(int), 0, len(grid) - 1)
+    values = np.zeros((len(grid), columns))
+    if (share := 1 - 2 * NOISE_CUTOFF * period) < 0.5:
+        return interpolated(grid, time, table), Noise(values, np.zeros((0, *values.shape)), np.zeros(columns))
+    pad = min(len(grid) - 1, 1000)
+    slow = lowpass(make_interp_spline(time, table)(grid), NOISE_CUTOFF, timestep, pad)
+    found = table - slow[step]
+    size = 1.4826 * np.median(np.abs(found), axis=0) / np.sqrt(share)  # jerks of the joint do not affect the median
+    values[step] = np.clip(found, -_MOST_NOISE * size, _MOST_NOISE * size)
+    jerks = interpolated(grid, time, found - values[step])
+    draws = size * np.random.default_rng(0).standard_normal((DRAWS, *values.shape))
+    rows, at_rows = np.unique(step), np.zeros(len(grid), bool)
+    at_rows[rows] = True
+    of_rows = (make_interp_spline(grid[rows], draw[rows])(grid) for draw in draws)
+    taken = np.stack([lowpass(each, NOISE_CUTOFF, timestep, pad) for each in of_rows])
+    known = at_rows[:, None]
+    errors = np.where(known, 0.0, draws - taken) if given else np.where(known, taken, draws)
+    return slow + jerks, Noise(values, errors if errors.any() else errors[:0], size)
+
+
+def lowpass(table: Float64, cutoff: float, timestep: float, pad: int | None = None) -> Float64:
+    """Return the columns of a table (steps, columns) without frequencies above ``cutoff`` [Hz], without phase lag.
+
+    For the filter, the table is extended by ``pad`` steps at both ends; default as in ``scipy.signal.sosfiltfilt``.
+    """
+    from scipy.signal import butter, sosfiltfilt
+
+    return sosfiltfilt(butter(4, cutoff, fs=1 / timestep, output="sos"), table, axis=0, padlen=pad)
+
+
+class FirstGuess(NamedTuple):
+    """Result of the regression."""
+
+    motors: Motors
+    cost: float
+    """Sum of the logarithms of the joints' mean squares of the efforts' residuals."""
 
 
 class Regression:
@@ -112,11 +171,8 @@ class Regression:
         law: Motors | None = None,
     ) -> None:
         """Take ``motions`` of ``logs``; ``law`` are values (1, joints) of the law's unknowns, by kind."""
-        from scipy.signal import butter, sosfiltfilt
-
         drive, dt = plants[0].drive, plants[0].drive.timestep
-        period = max(float(np.median(np.diff(log.time))) for log in logs)
-        sections = butter(4, min(CUTOFF, 0.2 / period), fs=1 / dt, output="sos")
+        cutoff = min(CUTOFF, 0.2 / max(float(np.median(np.diff(log.time))) for log in logs))
         blocks: list[tuple[Float64, ...]] = []
         late: list[Float64] = []
         self.plants, self.motions, self.rows = plants, motions, list[Any]()
@@ -126,20 +182,18 @@ class Regression:
             self.rows.append(rows)
             v, a = motion.qvel[rows], motion.qacc[rows]
             known = log.settings.payload
-            empty = _required(plant, motion, rows, known)
-            per_kg = _required(plant, motion, rows, known + 1.0) - empty if payload else np.zeros_like(empty)
+            empty = _motor_efforts(plant, motion, rows, known)
+            per_kg = _motor_efforts(plant, motion, rows, known + 1.0) - empty if payload else np.zeros_like(empty)
             effort = motion.command if drive.params is None else _law_efforts(plant, motion, law or {})
             unloaded = np.full((len(motion.qpos), 1), known)
             if drive.through and (held := plant.compensation(motion.qpos, motion.qvel, unloaded)) is not None:
                 effort = effort + held
             if drive.params is None:  # the law's efforts are computed from filtered positions
-                effort = sosfiltfilt(sections, effort, axis=0)
+                effort = lowpass(effort, cutoff, dt)
             time = np.arange(len(effort)) * dt
-            late.append(
-                np.array([np.stack([np.interp(time[rows] - d, time, u) for u in effort.T], axis=1) for d in DELAYS])
-            )
+            late.append(np.array([interpolated(time[rows] - d, time, effort) for d in DELAYS]))
             still = 0.01 * np.abs(v).max(0) + 1e-9
-            sign = sosfiltfilt(sections, np.clip(motion.qvel / still, -1, 1), axis=0)[rows]
+            sign = lowpass(np.clip(motion.qvel / still, -1, 1), cutoff, dt)[rows]
             blocks.append((empty, per_kg, a, v, sign))
         self._efforts = np.concatenate(late, axis=1)
         self._columns = [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
@@ -208,13 +262,19 @@ def _law_efforts(plant: Plant, motion: Motion, law: Motors) -> Float64:
     return efforts if motion.feedforward is None else efforts + motion.feedforward
 
 
-def _required(plant: Plant, motion: Motion, rows: Any, payload: float) -> Float64:
-    """Return the efforts that a motion requires, less the compensation that does not pass through the motors."""
+def required_efforts(plant: Plant, motion: Motion, rows: NDArray[np.intp], payload: float) -> Float64:
+    """Return the efforts (rows, joints) that a motion with a ``payload`` [kg] requires, without compensation."""
     q, v, a = (table[rows] for table in motion[:3])
-    kg = np.full((len(q), 1), payload)
-    passive = plant.at(q, v, kg)
-    effort = (passive.matrix @ a[..., None])[..., 0] + (passive.force + passive.payload_force)
-    held = None if plant.drive.through else plant.compensation(q, v, kg)
+    passive = plant.at(q, v, np.full((len(q), 1), payload))
+    return (passive.matrix @ a[..., None])[..., 0] + (passive.force + passive.payload_force)
+
+
+def _motor_efforts(plant: Plant, motion: Motion, rows: NDArray[np.intp], payload: float) -> Float64:
+    """Return the required efforts, less the compensation that does not pass through the motors."""
+    effort = required_efforts(plant, motion, rows, payload)
+    if plant.drive.through:
+        return effort
+    held = plant.compensation(motion.qpos[rows], motion.qvel[rows], np.full((len(rows), 1), payload))
     return effort if held is None else effort - held
 
 
@@ -240,49 +300,3 @@ def _solve_joint(
     high = np.array([np.inf, np.inf, np.inf, bounds[1], np.inf]) * size
     found = lsq_linear(root.T, np.linalg.solve(root, target), (low, high)).x
     return float(((matrix @ found + required) ** 2).mean()), found / size
-
-
-def hypotheses(drive: LoggedDrive, payload: bool) -> list[LoggedDrive]:
-    """Return the possible compensations: outside the motors, with the payload or without, or through the motors.
-
-    The logged efforts may also include the compensation.
-    """
-    if drive.compensate == "none":
-        return [drive]
-    ways = [drive, replace(drive, through=True)]
-    if payload:
-        ways.append(replace(drive, knows_payload=True))
-    return ways if drive.params is not None else [*ways, replace(drive, compensate="none")]
-
-
-def variants(drive: LoggedDrive, motions: list[Motion]) -> list[LoggedDrive]:
-    """Return the possible measurements of the law: with or without sensor noise, rates or differences of positions.
-
-    Without noise, the law gets the simulated positions and rates.
-    """
-    if drive.params is None:
-        return [drive]
-    quiet = replace(drive, measured_rate=False)
-    seen = any(motion.sensor.size.any() for motion in motions)
-    return [*([replace(quiet, noisy=True)] if seen else []), quiet, *([drive] if drive.measured_rate else [])]
-
-
-def best_drive(
-    robot: Any,
-    joints: tuple[int, ...],
-    drive: LoggedDrive,
-    logs: list[Log],
-    motions: list[Motion],
-    payload: bool,
-    gains_known: bool = True,
-) -> tuple[LoggedDrive, Regression]:
-    """Return the drive that explains the logs best, with its regression."""
-    ways = hypotheses(drive, payload)
-    found = [
-        (Regression(plants_of(robot, joints, each, logs), logs, motions, payload, gains_known), each) for each in ways
-    ]
-    best, chosen = found[0]
-    for other, way in found[1:]:
-        if explains_better(other.best, best.best):
-            best, chosen = other, way
-    return chosen, best

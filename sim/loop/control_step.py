@@ -28,9 +28,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import batchpid as bp
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, nearest_turn, replace_envs, wrap
+from batchpid.law.pid import advance_drive
 from batchpid.motors import advance_effort, advance_measurement
 from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
@@ -242,7 +242,7 @@ def _drive(layout: Layout, constants: Constants, values: Values, limits: tuple[A
     target = nearest_turn(target, seen.qpos, constants.turns, xp)
     if constants.driven is not None:
         rates = {"setpoint_rate": rate, "feedforward": seen.passive}
-        law, target = bp.drive_target(constants.driven, state.law, target, seen.qpos, constants.timestep, **rates)
+        law, target = advance_drive(constants.driven, state.law, target, seen.qpos, **rates)
         state = state._replace(law=law)
     effort = xp.zeros_like(seen.qpos) if seen.passive is None else seen.passive
     outputs = values.outputs._replace(qf=effort, target=target, target_rate=rate)

@@ -33,7 +33,7 @@ class Pushes:
     def due(self, suspended: Bool, episodes: Int64) -> tuple[list[int], Float64]:
         """Return the envs that are pushed now, and the changes of their twists (n, 6)."""
         rows = np.flatnonzero((self.counts["steps"] >= self.counts["due"]) & ~suspended)
-        twists = self._draw(rows, episodes)[1] if rows.size else np.zeros((0, 6))
+        twists = self._draw("push", rows, episodes) if rows.size else np.zeros((0, 6))
         self.counts["number"][rows] += 1
         self._take(rows, episodes)
         return rows.tolist(), twists
@@ -45,11 +45,11 @@ class Pushes:
     def _take(self, rows: NDArray[np.intp], episodes: Int64) -> None:
         """Set the time of the next push of envs ``rows``."""
         if rows.size:
-            intervals, _ = self._draw(rows, episodes)
+            intervals = self._draw("push_interval", rows, episodes)[:, 0]
             steps = np.ceil(np.minimum(intervals / self._options.timestep, 2.0**53))
             self.counts["due"][rows] += steps.astype(np.int64)
 
-    def _draw(self, rows: NDArray[np.intp], episodes: Int64) -> tuple[Float64, Float64]:
+    def _draw(self, name: str, rows: NDArray[np.intp], episodes: Int64) -> Float64:
         randomization = self._options.randomization
         assert randomization is not None
-        return randomization.next_push(self._options.robot, episodes[rows], self.counts["number"][rows])
+        return randomization.next_push(name, self._options.robot, episodes[rows], self.counts["number"][rows])

@@ -75,7 +75,7 @@ def make_constants(
     if options.control == "drive":
         kd = np.zeros_like(acting.kp) if acting.kd is None else acting.kd
         integrates = params.ki is not None and bool(np.any(params.ki > 0))
-        driven = acting._replace(measurement_rate=None) if integrates else None
+        driven = bp.discretise(acting._replace(measurement_rate=None), scene.timestep) if integrates else None
         return constants._replace(drive=(kd, acting.kp), driven=driven, turns=_turns(pack))
     return constants
 

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import batchpid as bp
 from batchpid.arrays.array_types import Array
 from batchpid.law.coefficients import Coefficients
 from batchpid.motors import STAGES, ActuatorState, Stages
@@ -122,8 +121,8 @@ class Constants(NamedTuple):
     """:class:`batchpid.Guard`"""
     motors: Any = None
     """:class:`batchpid.motors.MotorCoefficients` of motors and sensors."""
-    driven: bp.PIDParams | None = None
-    """Params of the integral that moves the targets of drives."""
+    driven: Coefficients | None = None
+    """Coefficients of the integral that moves the targets of drives."""
     turns: Array = None
     """1 / (2 pi) on continuous joints with drives, 0 elsewhere; None without such joints."""
 

@@ -194,13 +194,14 @@ def read_distribution(name: str, value: Any) -> Distribution:
     (kind,) = kinds
     options = {key: option for key, option in value.items() if key != kind}
     arguments = [value[kind]] if kind == Choice.kind else value[kind]
+    numbers, known = ([each.name for each in fields(KINDS[kind]) if each.kw_only is only] for only in (False, True))
+    if not isinstance(arguments, list | tuple) or len(arguments) != len(numbers):
+        problem, remedy = f"{kind} needs a list of numbers", f"write {kind}: [{', '.join(numbers)}]"
+        raise InvalidArgumentError(name, f"is not a distribution: {problem}", value=value, remedy=remedy)
+    for option in options:
+        choice(name, option, known)
     try:
-        if not isinstance(arguments, list | tuple):
-            raise TypeError(f"{kind} needs a list of numbers")
         return KINDS[kind](*arguments, **options)
-    except TypeError as error:
-        remedy = f"the options are {', '.join(each.name for each in fields(KINDS[kind]) if each.kw_only)}"
-        raise InvalidArgumentError(name, f"is not a distribution: {error}", value=value, remedy=remedy) from None
     except InvalidArgumentError as error:
         problem = f"{error.argument} {error.problem}"
         raise InvalidArgumentError(name, problem, value=error.value, remedy=error.remedy) from None

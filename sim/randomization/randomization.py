@@ -152,16 +152,12 @@ class Randomization:
                 row[chosen] = distribution.sample(generator, size)
         return rows
 
-    def next_push(
-        self, robot: Robot, episodes: NDArray[np.int64], number: NDArray[np.int64]
-    ) -> tuple[Float64, Float64]:
-        """Return the time (n,) [s] from push ``number`` (n,) of these episodes (n, 2) to the next, and the twist (n, 6)
-        that the next one adds. Number 0 is the reset.
+    def next_push(self, name: str, robot: Robot, episodes: NDArray[np.int64], number: NDArray[np.int64]) -> Float64:
+        """Return one field of the push after push ``number`` (n,) of these episodes (n, 2); number 0 is the reset.
+
+        Its ``name`` is "push_interval", the time between the two (n, 1) [s], or "push", the added twist (n, 6).
         """
-        assert self.push is not None
-        assert self.push_interval is not None
-        drawn = {name: self._draw(name, each, robot, episodes, number) for name, each in self.events.items()}
-        return drawn["push_interval"][:, 0], np.nan_to_num(drawn["push"])
+        return np.nan_to_num(self._draw(name, self.events[name], robot, episodes, number))
 
     def first(self, robot: Robot, num_envs: int, first_env: int = 0) -> Draws:
         """Return the draws for the first episode of each env, of the stream of its number, from ``first_env`` on."""

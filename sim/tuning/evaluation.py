@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.arrays.elementwise import TURN
+from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.observation import Rollout
@@ -178,8 +179,9 @@ def run_moves(
     randomization, by default one for each move, so that the draws are the same at every call.
 
     A move is a step of the setpoint, or, where ``durations`` (moves,) [s] are above 0, a minimum-jerk motion of that
-    duration, or its beginning, with setpoint rates.
+    duration, or its beginning, with setpoint rates. Raises InvalidArgumentError if ``seconds`` are out of range.
     """
+    seconds = number("seconds", seconds, 1e-6, 1e6, "simulated time, s")
     tick = runner.timestep * runner.substeps
     ticks = max(2, round(seconds / tick))
     with warnings.catch_warnings():

@@ -70,7 +70,8 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     if path.suffix.lower() == ".xml":
         found = _of_mjcf(path, own)
     elif path.suffix.lower() != ".json" and is_ros2_control(documents.read(path)):
-        found = from_ros2_control(path.read_text(), own, continuous=robot.continuous[robot.independent])
+        with documents.named(name):
+            found = from_ros2_control(path.read_text(), own, continuous=robot.continuous[robot.independent])
     else:
         return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])
     for each in found.differences:

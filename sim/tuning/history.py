@@ -49,9 +49,10 @@ class HistoryFile:
         return None if self._found is None else self._checked(lambda: parse(self._found))
 
     def write(self, state: Any) -> None:
-        """Write the file with a ``state`` of plain values."""
+        """Write the file with a ``state`` of plain values; its folder is made if there is none."""
         if self._path is not None:
             state = json.loads(json.dumps(state))
+            self._path.parent.mkdir(parents=True, exist_ok=True)
             document = {"settings": self._settings, "state": state, "digest": digest(self._settings, state)}
             write_atomically(self._path, json.dumps(document))
 

@@ -115,11 +115,11 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
     Raises
     ------
     InvalidArgumentError
-        ``count`` or ``size`` is out of range, or there are no such moves: the robot touches itself, or is too weak, in
-        nearly every pose.
+        ``count``, ``seed`` or ``size`` is out of range, or there are no such moves: the robot touches itself, or is too
+        weak, in nearly every pose.
     """
     count, size = integer("count", count, 0, 100_000), number("size", size, 1e-3, 10.0, "rad or m")
-    dynamics, rng = robot.dynamics(ground), np.random.default_rng(seed)
+    dynamics, rng = robot.dynamics(ground), np.random.default_rng(integer("seed", seed, 0, 2**63 - 1))
     poses = robot.sample(1000, seed=0)
     reach = np.ptp(poses, axis=0)
     low, high = robot.lower + _EDGE * reach, robot.upper - _EDGE * reach

@@ -58,9 +58,9 @@ def load_randomization(name: str | Path, robot: Robot, seed: int = 0) -> Randomi
             remedy=f"use a .yaml or .json file, or {' or '.join(PRESETS)}",
         )
     known = documents.read(path)
-    known = {"seed": seed, **known} if isinstance(known, dict) else known
-    randomization = Randomization.from_dict(known)
-    check_robot(randomization, robot)
+    with documents.named(str(path)):
+        randomization = Randomization.from_dict({"seed": seed, **known} if isinstance(known, dict) else known)
+        check_robot(randomization, robot)
     return randomization
 
 

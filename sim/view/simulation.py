@@ -88,6 +88,7 @@ class LiveSimulation(SingleOwner):
         substeps = max(1, round(number("period", period, timestep, 1.0, "seconds between frames") / timestep))
         self.period = substeps * timestep
         self._random = np.random.default_rng(seed)
+        spread = number("spread", spread, 0.0, 10.0, "rad or m")
         offsets = self._random.uniform(-spread, spread, (self.per_group, robot.dof))
         osc = self._operational_space(tool)
         home = robot.start if osc is None else self._home()

@@ -1,5 +1,6 @@
 """Values of every option of a Runner, to try the promises that hold for all of them."""
 
+import re
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,11 @@ from tiny_urdf import INERTIAL, joint, link, robot, write
 
 import batchpid as bp
 from batchpid.sim import MujocoSolver, Physics, Randomization, Robot, RunnerKeywords, Uniform
+
+
+def label(value):
+    """Name of a case that is the same in every process: without addresses and temporary folders."""
+    return re.sub(r" at 0x[0-9a-f]+|path='[^']*'", "", str(value))
 
 
 def arm(mass, **options):

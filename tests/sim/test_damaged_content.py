@@ -251,15 +251,7 @@ def check(good, content: bytes) -> None:
         path.write_bytes(original)
 
 
-def kinds(*unnamed: str) -> pytest.MarkDecorator:
-    """Return the parameters of a test: files of all kinds. Errors of those ``unnamed`` do not all name the file yet."""
-    marks = {name: pytest.mark.xfail(reason="names the field alone", strict=True) for name in unnamed}
-    names = [name for name in KINDS if name != "recording.h5"]
-    return pytest.mark.parametrize(
-        "good", [pytest.param(name, marks=marks.get(name, ())) for name in names], indirect=True
-    )
-
-
+of_all_kinds = pytest.mark.parametrize("good", [name for name in KINDS if name != "recording.h5"], indirect=True)
 EXAMPLES = {
     "derandomize": True,
     "phases": [Phase.generate],
@@ -268,7 +260,7 @@ EXAMPLES = {
 }
 
 
-@kinds("drawn.yaml")
+@of_all_kinds
 @settings(max_examples=25, **EXAMPLES)
 @given(st.data())
 def test_bytes(good, data):
@@ -290,7 +282,7 @@ def encoded_changes(draw: st.DrawFn, suffix: str, content: bytes) -> bytes:
     return encoded(suffix, draw(changed_tree(decoded(suffix, content), leaves)))
 
 
-@kinds("drawn.yaml", "runs.yaml")
+@of_all_kinds
 @settings(max_examples=30, **EXAMPLES)
 @given(st.data())
 def test_keys_values_and_lengths(good, data):
@@ -298,7 +290,7 @@ def test_keys_values_and_lengths(good, data):
 
 
 @pytest.mark.slow
-@kinds("drawn.yaml", "runs.yaml")
+@of_all_kinds
 @settings(max_examples=int(os.environ.get("BATCHPID_SOAK_EXAMPLES", "500")), **EXAMPLES)
 @given(st.data())
 def test_many_changes(good, data):

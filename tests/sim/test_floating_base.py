@@ -100,15 +100,27 @@ def test_an_env_that_fails_is_placed_where_it_began(quadruped, engine):
     assert np.isfinite(seen.base_twist).all()
 
 
+class Counted(Uniform):
+    """Uniform distribution that counts its draws."""
+
+    draws = 0
+
+    def sample(self, generator, size):
+        Counted.draws += 1
+        return super().sample(generator, size)
+
+
 def test_a_push_changes_the_twist_of_the_base_at_a_tick(quadruped, engine):
     push = {"vx": Uniform(0.5, 1.0), "vy": Uniform(-1, 1), "wx": Uniform(2, 3), "wz": Uniform(-2, 2)}
-    randomization = Randomization(push=push, push_interval=Uniform(0.055, 0.055))
+    randomization = Randomization(push=push, push_interval=Counted(0.055, 0.055))
     options = {"control": "effort", "compensate": "none", "workers": 0, "ground": False, "engine": engine}
     with Runner(quadruped, 2, randomization=randomization, **options) as runner:
         runner.reset(base_pose=[0, 0, 0, 0.9, 0.1, 0.3, 0.2])
         still = runner.rollout(np.zeros((6, 4)))
         assert np.abs(still.base_twist[..., [0, 1, 3, 4, 5]]).max() < 1e-4
+        Counted.draws = 0
         before, after = still.base_twist[-1], runner.step(np.zeros(4), substeps=1).base_twist
+        assert Counted.draws == 2, "the next interval of each env, drawn once"
         assert (after[:, 0] - before[:, 0] > 0.49).all()
         assert (after[:, 3] > 1.9).all()
         assert np.ptp(after[:, 0]) > 1e-3

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from featured import robot_with
 from identical import assert_identical
-from option_values import ARM, box
+from option_values import ARM, box, label
 from robots import load_bundled
 
 import batchpid as bp
@@ -128,7 +128,7 @@ RUNNERS: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("options", "argument"), RUNNERS, ids=str)
+@pytest.mark.parametrize(("options", "argument"), RUNNERS, ids=label)
 def test_options_that_do_not_go_together_are_refused_by_name(options: dict[str, Any], argument: str) -> None:
     options = {"robot": ARM, "num_envs": N, **options}
     options.setdefault("workers", None if "cluster" in options else 0)
@@ -187,7 +187,7 @@ def call(runner: Runner, name: str, arguments: dict[str, Any]) -> str:
     return argument
 
 
-@pytest.mark.parametrize(("name", "arguments", "argument"), CALLS, ids=str)
+@pytest.mark.parametrize(("name", "arguments", "argument"), CALLS, ids=label)
 def test_a_refused_call_names_its_argument(runner: Runner, name: str, arguments: dict[str, Any], argument: str) -> None:
     assert argument.removesuffix("s") in call(runner, name, arguments)
 

@@ -186,7 +186,7 @@ def test_the_dynamics_are_those_of_the_engine():
 def test_a_tree_that_is_none_is_refused():
     for change, message in (
         ({"parent": [-1, 0, 2, 2]}, "entry 'link2'.*does not come before"),
-        ({"mass": [0, 1, -1, 0]}, "mass, joint 'link2'"),
+        ({"mass": [0, 1, -1, 0]}, "mass, entry 'link2'"),
         ({"wxyz": np.ones((4, 4))}, "unit quaternion"),
         ({"axis": np.zeros((4, 3))}, "no direction"),
         ({"joint_names": ("a",)}, "has 1 names, needs 2"),

@@ -87,8 +87,17 @@ def test_an_output_without_a_folder_is_refused_before_the_run(command, flag, fil
     assert not path.parent.exists()
 
 
-BAD = {"INT": "-1", "FLOAT": "nan", "FILE": "nothing.xyz", "PATH": "nothing.xyz", "LINK": "nothing", "NAME": "nothing"}
-"""Bad value of a flag, by the kind of value that it takes. Any text is good for the other kinds."""
+BAD = {
+    "INT": ("-1",),
+    "FLOAT": ("nan", "-1"),
+    "FLOAT [FLOAT ...]": ("nan",),
+    "FILE": ("nothing.xyz",),
+    "PATH": ("nothing.xyz",),
+    "LINK": ("nothing",),
+    "NAME": ("nothing",),
+    "NAME|FILE": ("nothing",),
+}
+"""Bad values of a flag, by the kind of value that it takes. Any text is good for the other kinds."""
 SHORT = {
     "demo": ("demo", "--num-envs", 1, "--workers", 0, "--seconds", 0.02),
     "rollout": ("rollout", "arm.urdf", "--num-envs", 1, "--workers", 0, "--seconds", 0.02),
@@ -97,23 +106,14 @@ SHORT = {
     "render": (*WORDS["render"], "arm.urdf"),
 }
 """Words of commands, where they are other ones than in WORDS."""
-UNCHECKED = {
-    *(("compare", flag) for flag in ("--moves", "--seed", "--seconds", "--payload", "--friction")),
-    *(("parity", flag) for flag in ("--moves", "--seed", "--seconds")),
-    *(("tune", flag) for flag in ("--payload", "--friction", "--time-limit")),
-    *(("view", flag) for flag in ("--spread", "--time-limit", "--workers")),
-    *(("export", "--timestep"), ("survey", "--workers"), ("identify", "--command-topic")),
-}
-"""Flags whose bad values are not refused yet, or under another name."""
 
 
 def bad_values(command: str) -> list[tuple[str, str, str]]:
     """Return each flag of a command with a bad value; the command names the flag."""
     found = []
     for flag, kind in flags(command).items():
-        bad = "other" if flag in choices(command) else next((BAD[each] for each in BAD if each in kind), None)
-        if bad is not None and (command, flag) not in UNCHECKED:
-            found.append((command, flag, bad))
+        kind = kind.replace("{None}|", "").partition(" [NAME|FILE")[0]
+        found += [(command, flag, bad) for bad in (("other",) if flag in choices(command) else BAD.get(kind, ()))]
     return found
 
 
@@ -129,8 +129,8 @@ def test_a_bad_value_is_answered_by_the_name_of_its_flag(command, flag, bad, fil
 
 
 def written(folder: Path) -> set[Path]:
-    """Return the files below a folder."""
-    return {path for path in folder.rglob("*") if path.is_file()}
+    """Return the files and folders below a folder."""
+    return {*folder.rglob("*")}
 
 
 @pytest.mark.parametrize(
@@ -162,6 +162,11 @@ def written(folder: Path) -> set[Path]:
         ("identify arm.urdf run.npz --evaluations 0 --actuators a.yaml --extras slew", "extras: is for"),
         ("export panda --gains drive", "gains: are a drive's"),
         ("inspect panda2", "'panda2'"),
+        ("inspect --gains nothing", "gains: is neither"),
+        ("compare arm.urdf --moves 0", "moves: leaves none"),
+        ("compare --payload 1", "payload: has no effect without --variation"),
+        ("tune --friction 1", "friction: has no effect without --variation"),
+        ("tune arm.urdf --variation --randomize model", "variation: excludes --randomize"),
         ("survey .", "hold no file *.urdf"),
         ("plot /dev/null", "/dev/null"),
         ("plot .", "."),
@@ -174,7 +179,9 @@ def written(folder: Path) -> set[Path]:
 def test_flags_that_contradict_each_other_are_answered_in_one_line(words, message, files, batchpid, monkeypatch):  # noqa: F811
     if words != "survey .":
         monkeypatch.chdir(files)
+    before = written(Path())
     status, said, complaint = batchpid(*words.split())
+    assert written(Path()) == before
     assert (status, said, complaint.count("\n")) == (2, "", 1)
     assert complaint.startswith("batchpid: ")
     assert message in complaint

@@ -56,8 +56,8 @@ def test_motors_are_written_for_other_commands(batchpid, tmp_path, monkeypatch, 
     """
     pytest.importorskip("mujoco.batch" if engine == "mujoco" else "sapien")
     if evaluations == 1:
-        monkeypatch.setattr("batchpid.sim.identification.regression.hypotheses", lambda drive, payload: [drive])
-        monkeypatch.setattr("batchpid.sim.identification.start.GENERATIONS", 1)
+        monkeypatch.setattr("batchpid.sim.identification.fit_search.hypotheses", lambda drive, payload: [drive])
+        monkeypatch.setattr("batchpid.sim.identification.fit_search.GENERATIONS", 1)
         monkeypatch.setattr("batchpid.sim.identification.fit_search.NEIGHBOUR_EVALUATIONS", 2)
     bars = []
     monkeypatch.setattr(
@@ -102,7 +102,7 @@ def effort_log(path, wrong=0.0):
 @pytest.fixture
 def short_search(monkeypatch):
     """The search has few steps: one generation, short fits of neighbours."""
-    monkeypatch.setattr("batchpid.sim.identification.start.GENERATIONS", 1)
+    monkeypatch.setattr("batchpid.sim.identification.fit_search.GENERATIONS", 1)
     monkeypatch.setattr("batchpid.sim.identification.fit_search.NEIGHBOUR_EVALUATIONS", 1)
 
 

@@ -9,12 +9,14 @@ import sys
 import time
 import warnings
 from pathlib import Path
+from typing import Annotated
 
 import pytest
 
 import batchpid
 from batchpid import __version__ as version
 from batchpid import startup
+from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import cli
 
@@ -23,7 +25,7 @@ from batchpid.sim import cli
 class Stub:
     """A command for tests."""
 
-    number: int = 0
+    number: Annotated[int, Field(high=255)] = 0
     """Exit status."""
 
     imports = ()

@@ -13,6 +13,8 @@ from robots import load_bundled
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import FaultWarning, Runner
+from batchpid.sim.loop import faults
+from batchpid.sim.loop.step_values import Measured
 
 PANDA = load_bundled("panda")
 N = 6
@@ -257,3 +259,26 @@ def test_a_state_that_is_finite_and_far_away_is_a_fault_at_the_same_step_for_eve
 def test_the_other_63_of_64_envs_are_bit_identical_in_many_cases():
     for case in range(6, CASES):
         check_random_fault(case)
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
+def test_a_fault_in_the_first_sim_step_is_reported():
+    with make(2) as runner:
+        runner.step(np.where([[True], [False]], np.nan, PANDA.start))
+        assert [(fault.env, fault.step) for fault in runner.faults] == [(0, 1)]
+
+
+def test_quick_checks_pass_ordinary_states_and_no_failed_one():
+    beyond = [np.nextafter(faults.FARTHEST, np.inf), 1e8, 1e200, np.inf, -np.inf, np.nan]
+    assert faults.far(np.array([faults.FARTHEST, *beyond])).tolist() == [False] + [True] * len(beyond)
+    rest, limits = Measured(np.ones((2, 3)), np.ones((2, 3)), None), (None, 2.0)
+    assert faults.near(rest.qpos)
+    assert faults.finite(None, rest.qpos, rest.qvel)
+    assert all(faults.sound(rest, limit) for limit in limits)
+    for value in beyond:
+        bad = np.ones((2, 3))
+        bad[1, 2] = value
+        assert not faults.near(bad)
+        assert not any(faults.sound(rest._replace(qpos=bad), limit) for limit in limits)
+        assert not faults.sound(rest._replace(qvel=bad), 2.0)
+        assert faults.finite(rest.qpos, bad) == (value in beyond[:2])

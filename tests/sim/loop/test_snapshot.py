@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from identical import assert_identical
-from option_values import ARM
+from option_values import ARM, label
 from robots import load_bundled
 
 import batchpid as bp
@@ -231,7 +231,7 @@ class Counts:
         {"actuators": bp.make_actuators(ARM.dof, sensor_delay=np.full((3, ARM.dof), 2e-3))},
         {"contacts": ["hand"], "guard": True},
     ],
-    ids=str,
+    ids=label,
 )
 def test_a_file_holds_the_state_of_every_part(options: Any, tmp_path: Path) -> None:
     setpoint = np.outer([1, 2, 3], np.full(ARM.dof, 0.1))

@@ -103,12 +103,15 @@ def test_operations(operation, expected):
             lambda: read({"gamma": [1, 2]}),
             "qpos: is not a distribution.*uniform, log_uniform",
         ),
-        (lambda: read({"uniform": [1, 2, 3]}), "qpos: is not a distribution"),
+        (
+            lambda: read({"uniform": [1, 2, 3]}),
+            r"qpos: .*uniform needs a list of numbers.*write uniform: \[low, high\]",
+        ),
         (
             lambda: read({"uniform": 1}),
             "qpos: is not a distribution: uniform needs a list",
         ),
-        (lambda: read({"uniform": [0, 1], "mode": "add"}), "qpos: .*operation, shared"),
+        (lambda: read({"uniform": [0, 1], "mode": "add"}), "qpos: unknown option .*'operation', 'shared'"),
         (lambda: read({"uniform": [2, 1]}), "qpos: high is less than low"),
     ],
 )

@@ -67,6 +67,7 @@ def test_all_draws_are_within_the_ellipsoid():
         (lambda known: known | {"estimate": [1.0]}, "wrong shapes, numbers"),
         (lambda known: known | {"unknowns": [["strength", "knee"], *known["unknowns"][1:]]}, "of other joints: knee"),
         (lambda known: known | {"unknowns": [["colour"], *known["unknowns"][1:]]}, "wrong shapes, numbers or unknowns"),
+        (lambda known: known | {"unknowns": [[*known["unknowns"][0], "elbow"], *known["unknowns"][1:]]}, "or unknowns"),
         (lambda known: {"unknowns": known["unknowns"]}, "cannot be read"),
     ],
 )

@@ -11,8 +11,9 @@ import batchpid as bp
 from batchpid.sim import Robot, Runner, write_recording
 from batchpid.sim.identification import excite, identify
 from batchpid.sim.identification.diagnosis import diagnose
+from batchpid.sim.identification.fit_search import best_drive
 from batchpid.sim.identification.inputs import read_inputs
-from batchpid.sim.identification.regression import best_drive, smooth
+from batchpid.sim.identification.regression import smooth
 from batchpid.sim.robot.urdf_export import to_urdf
 from tests.sim.tuning.identification.test_identify import ARM
 

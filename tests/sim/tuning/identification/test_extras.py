@@ -30,7 +30,7 @@ def pendulum(tmp_path_factory) -> Robot:
 @pytest.fixture
 def short_search(monkeypatch):
     """The search has one generation, and short fits of neighbours and of effects."""
-    monkeypatch.setattr("batchpid.sim.identification.start.GENERATIONS", 1)
+    monkeypatch.setattr("batchpid.sim.identification.fit_search.GENERATIONS", 1)
     monkeypatch.setattr("batchpid.sim.identification.fit_search.NEIGHBOUR_EVALUATIONS", 2)
 
 

@@ -85,8 +85,8 @@ def runs(arm, mujoco_log):
 @pytest.fixture
 def short_search(monkeypatch):
     """The search has few steps: one hypothesis of the compensation, one generation, short fits of neighbours."""
-    monkeypatch.setattr("batchpid.sim.identification.regression.hypotheses", lambda drive, payload: [drive])
-    monkeypatch.setattr("batchpid.sim.identification.start.GENERATIONS", 1)
+    monkeypatch.setattr("batchpid.sim.identification.fit_search.hypotheses", lambda drive, payload: [drive])
+    monkeypatch.setattr("batchpid.sim.identification.fit_search.GENERATIONS", 1)
     monkeypatch.setattr("batchpid.sim.identification.fit_search.NEIGHBOUR_EVALUATIONS", 2)
 
 

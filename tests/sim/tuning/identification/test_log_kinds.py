@@ -143,7 +143,10 @@ def test_a_list_of_logs_has_settings_for_each(panda, tmp_path):
         ("{log: a.csv, payload: -1}", r"logs\[0\]: payload: out of range"),
         ("{log: a.csv, sign: {panda_joint1: 2}}", r"sign: panda_joint1: is no such factor .*write 1 or -1"),
         ("{log: a.csv, scale: {elbow: 2}}", r"scale: unknown option"),
-        ("{log: a.csv, start: 5}", "has no rows from 5 to inf s"),
+        ("{log: a.csv, start: 5}", r"wrong.yaml: logs\[0\]: .*a.csv.* has no rows from 5 to inf s"),
+        ("{log: a.csv, gains: 3}", r"wrong.yaml: logs\[0\]: gains: must be a str"),
+        ("{log: a.csv, gains: none}", r"wrong.yaml: logs\[0\]: gains: is neither a name nor a file"),
+        ("{log: a.csv, urdf: 3}", r"wrong.yaml: logs\[0\]: urdf: must be a str"),
         ("{log: a.csv, gains: none.yaml}", "is neither a name nor a file of gains"),
     ):
         (tmp_path / "wrong.yaml").write_text(f"logs:\n- {entry}\n")

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 import batchpid as bp
 from batchpid.sim import Robot, Rollout, Runner, read_recording, write_recording
 from batchpid.sim.identification import Log, LogWarning, identify, logs_of_rollout, read_logs
-from batchpid.sim.identification.gaps import divided
+from batchpid.sim.identification.log_checks import divided
 
 ROWS = 60
 

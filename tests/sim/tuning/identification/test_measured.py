@@ -27,7 +27,7 @@ def hinge(folder: Path, mass: float = 0.8) -> Robot:
 
 @pytest.fixture
 def short_search(monkeypatch):
-    monkeypatch.setattr("batchpid.sim.identification.start.GENERATIONS", 1)
+    monkeypatch.setattr("batchpid.sim.identification.fit_search.GENERATIONS", 1)
     monkeypatch.setattr("batchpid.sim.identification.fit_search.NEIGHBOUR_EVALUATIONS", 1)
 
 

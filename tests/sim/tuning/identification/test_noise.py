@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("scipy")
-from batchpid.sim.identification.log_noise import CUTOFF, DRAWS, split
-from batchpid.sim.identification.wander import spread, whiten
+from batchpid.sim.identification.problem import spread, whiten
+from batchpid.sim.identification.regression import DRAWS, NOISE_CUTOFF, split
 
 DT = 5e-4
 
@@ -75,7 +75,7 @@ def test_efforts_are_exact_at_the_rows():
 
 def test_rows_that_are_far_apart_tell_no_noise():
     time = DT * np.arange(4000)
-    rows = time[:: round(0.3 / CUTOFF / DT)]
+    rows = time[:: round(0.3 / NOISE_CUTOFF / DT)]
     slow, noise = split(rows, np.sin(rows)[:, None], time)
     assert not noise.size.any()
     assert not len(noise.errors)

@@ -223,7 +223,7 @@ def test_rows_of_a_simulation_do_not_depend_on_their_company(tmp_path):
 def test_an_effect_of_the_motors_is_identified_by_a_line_in_the_table(monkeypatch, tmp_path):
     """Here the lag: from a log of the Runner, and in the file that is saved."""
     monkeypatch.setitem(KINDS, "lag", Kind("lag", True, 1e-3, 0.1, 5e-3, 20.0, 5e-3))
-    monkeypatch.setattr("batchpid.sim.identification.start.GENERATIONS", 1)
+    monkeypatch.setattr("batchpid.sim.identification.fit_search.GENERATIONS", 1)
     monkeypatch.setattr("batchpid.sim.identification.fit_search.NEIGHBOUR_EVALUATIONS", 2)
     arm, dt = Robot.load(write(tmp_path, ARM)), 1e-3
     truth, params = [0.006, 0.012], arm.designed("effort").replace(setpoint_weight=1.0)
