@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import choice, flag, number
 from batchpid.errors import InvalidArgumentError
+from batchpid.io import documents
 
 Episodes = NDArray[np.int64]
 Operation = Literal["add", "scale", "abs"]
@@ -200,11 +201,8 @@ def read_distribution(name: str, value: Any) -> Distribution:
         raise InvalidArgumentError(name, f"is not a distribution: {problem}", value=value, remedy=remedy)
     for option in options:
         choice(name, option, known)
-    try:
+    with documents.named(name):
         return KINDS[kind](*arguments, **options)
-    except InvalidArgumentError as error:
-        problem = f"{error.argument} {error.problem}"
-        raise InvalidArgumentError(name, problem, value=error.value, remedy=error.remedy) from None
 
 
 def _bound(name: str, value: Any) -> float:

@@ -112,7 +112,7 @@ def test_operations(operation, expected):
             "qpos: is not a distribution: uniform needs a list",
         ),
         (lambda: read({"uniform": [0, 1], "mode": "add"}), "qpos: unknown option .*'operation', 'shared'"),
-        (lambda: read({"uniform": [2, 1]}), "qpos: high is less than low"),
+        (lambda: read({"uniform": [2, 1]}), "qpos: high: is less than low"),
     ],
 )
 def test_what_is_no_distribution_is_refused(make, message):

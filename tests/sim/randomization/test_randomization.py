@@ -236,7 +236,7 @@ def test_damping_that_the_engine_simulates_is_not_drawn():
         ({"load": {"uniform": [0, 1]}}, "randomization: unknown option"),
         ([1], "randomization: is not a mapping"),
         ({"payload": 0.5}, "payload: is not a distribution"),
-        ({"params": {"kp": {"uniform": [2, 1]}}}, "params.kp: high is less than low"),
+        ({"params": {"kp": {"uniform": [2, 1]}}}, "params.kp: high: is less than low"),
         ({"friction": {"panda_joint1": {"normal": [0]}}}, "friction.panda_joint1: is not a distribution"),
     ],
 )
