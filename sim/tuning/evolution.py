@@ -74,6 +74,8 @@ class Found(NamedTuple):
     """Point in log space (dimension,)."""
     cost: float
     """Cost in the search."""
+    ranked: Float64
+    """Points of all candidates (n, dimension), those of the lowest cost in the search first."""
     costs: tuple[tuple[float, ...], ...]
     """Costs of the candidates, by generation."""
     rejected: str | None
@@ -146,7 +148,8 @@ class Search:
         with Runner(self.robot, self.population * candidates.envs, **options) as runner:
             points, costs = self._evolve(candidates, runner, record, designs)
         every, start = np.concatenate([np.ravel(row) for row in costs]), candidates.start
-        ranking = [int(index) for index in np.argsort(every, kind="stable")[:FINALISTS]]
+        ranked = np.argsort(every, kind="stable")
+        ranking = [int(index) for index in ranked[:FINALISTS]]
         better = ranking[: ranking.index(0)] if 0 in ranking else ranking
         finalists, place, trial, rejected = [0, *better], min(1, len(better)), None, None
         if not better:
@@ -160,7 +163,7 @@ class Search:
             if better and not place:
                 rejected = f"cost in the final: best candidate {min(trial.costs[1:]):.4f}, {start} {trial.costs[0]:.4f}"
         best = finalists[place]
-        return Found(points[best], float(every[best]), costs, rejected, trial, place)
+        return Found(points[best], float(every[best]), points[ranked], costs, rejected, trial, place)
 
     def _evolve(
         self, candidates: GainCandidates, runner: Runner, record: HistoryFile, designs: Float64 | None

@@ -49,6 +49,8 @@ class Tuning(NamedTuple):
     start_cost: float
     history: tuple[tuple[float, ...], ...]
     """Costs of every candidate of every generation."""
+    ranked_params: bp.PIDParams
+    """Gains of all candidates, a row each, those of the lowest cost in the search first."""
     settings: Document
     """Seed, moves, options and versions, for the record."""
     rejected: str | None = None
@@ -170,6 +172,7 @@ def tune(
         start_params=start,
         start_cost=found.costs[0][0],
         history=found.costs,
+        ranked_params=searched.params(found.ranked),
         settings={**settings, "generations": len(found.costs)},
         rejected=found.rejected,
     )

@@ -17,6 +17,7 @@ from batchpid.sim.cli import parse
 from batchpid.sim.identification import Region
 from batchpid.sim.tuning import Weights, random_moves, tune
 from batchpid.sim.tuning.cost import Trial
+from batchpid.sim.tuning.evaluation import within
 
 pytest.importorskip("cmaes")
 
@@ -90,6 +91,32 @@ def test_tune_within_prints_what_holds_for_all_drawn_motors(batchpid, tmp_path, 
         status, _, complaint = batchpid("tune", urdf, *SHORT, "--within", *arguments, "--out", tmp_path / "other.yaml")
         assert status == 2
         assert problem in complaint
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_worst_draw_chooses_among_the_candidates_of_the_search(batchpid, tmp_path, monkeypatch):
+    """Here the candidate with the largest kp, which is not the one with the lowest cost."""
+    tried = []
+
+    def ranked_by_kp(robot, params, motors, moves, **_):
+        tried.append((motors.num_envs, float(params.kp.max())))
+        found = within(robot, params, motors, moves, seconds=0.1)
+        return found._replace(settling=np.ones(motors.num_envs), excess=np.full(motors.num_envs, 1 / params.kp.max()))
+
+    monkeypatch.setattr("batchpid.sim.cli.tune.DRAWS", 5)
+    monkeypatch.setattr("batchpid.sim.tuning.evaluation.within", ranked_by_kp)
+    urdf, motors, out = write(tmp_path, one_joint()), tmp_path / "motors.yaml", tmp_path / "tuned.yaml"
+    known = Region((("delay", None),), np.array([3e-3]), np.array([5e-4]), np.eye(1)).to_dict()
+    bp.save_actuators(
+        motors, bp.make_actuators(1, command_delay=3e-3), Robot.load(urdf).joint_names, {"confidence_region": known}
+    )
+    status, _, complaint = batchpid("tune", urdf, *SHORT, "--actuators", motors, "--within", "--out", out)
+    assert status == 0, complaint
+    candidates, (draws, kp) = tried[:4], tried[4]
+    assert {count for count, _ in candidates} == {2}
+    assert (draws, kp) == (5, max(candidates)[1])
+    assert kp > candidates[0][1]
+    assert bp.load_params(out)[0].kp.max() == pytest.approx(kp)
 
 
 @pytest.mark.slow
