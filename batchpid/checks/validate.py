@@ -95,7 +95,8 @@ def flag(argument: str, value: Any) -> bool:
 def instance(argument: str, value: Any, kind: type[T], remedy: str) -> T:
     """Return ``value`` if it is a ``kind``."""
     if not isinstance(value, kind):
-        raise InvalidArgumentError(argument, f"must be a {kind.__name__}", value=value, remedy=remedy)
+        article = "an" if kind.__name__[0] in "AEIO" else "a"
+        raise InvalidArgumentError(argument, f"must be {article} {kind.__name__}", value=value, remedy=remedy)
     return value
 
 

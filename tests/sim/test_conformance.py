@@ -419,7 +419,18 @@ def test_every_feature_is_the_same_on_every_path(path: Any, case: tuple[str, str
 
 def test_every_option_has_a_row() -> None:
     """A new option needs a row in FEATURES, unless paths or programs use it."""
-    of_paths = {"first_env", "workers", "cluster", "recover", "timeout", "engine", "backend", "dtype", "params"}
+    of_paths = {
+        "num_envs",
+        "first_env",
+        "workers",
+        "cluster",
+        "recover",
+        "timeout",
+        "engine",
+        "backend",
+        "dtype",
+        "params",
+    }
     of_programs = {"timestep", "substeps", "on_invalid_input"}
     options = {name for feature in FEATURES.values() for name in feature.options}
     assert options >= RunnerKeywords.__annotations__.keys() - of_paths - of_programs
