@@ -435,9 +435,13 @@ def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
         problem = f"{given} needs a fixed base, which {robot.name!r} does not have"
         remedy = "load the robot with fixed_base=True, or control its joints"
         raise InvalidArgumentError(argument, problem, remedy=remedy)
-    if name == "osc":
+    if name != "osc":
+        return value
+    try:
         return OperationalSpace(robot, default_tool(robot) if tool is None else tool)
-    return value
+    except InvalidArgumentError as error:
+        named = "tool" if error.argument == "link" else error.argument
+        raise InvalidArgumentError(named, error.problem, value=error.value, remedy=error.remedy) from None
 
 
 def _plain(value: object) -> object:

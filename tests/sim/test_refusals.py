@@ -71,7 +71,7 @@ def test_values_of_no_use_are_refused_for_every_option(name: str) -> None:
         except InvalidArgumentError as error:
             refused.append(error.argument)
     assert len(refused) >= len(JUNK) - 1  # a number may be a name of a Ray cluster
-    assert set(refused) <= {name, "link"} if name == "tool" else {*refused} == {name}
+    assert {*refused} == {name}
 
 
 # -- options that exclude each other -----------------------------------------------------------------------------------
