@@ -108,10 +108,13 @@ def _run(arguments: list[str]) -> int:
 
 def _interrupt_again(unraisable: Any) -> None:
     """Repeat a Ctrl-C that came in a destructor, where Python prints its KeyboardInterrupt and goes on."""
-    if unraisable.exc_type is KeyboardInterrupt:
-        Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
-    else:
+    if unraisable.exc_type is not KeyboardInterrupt:
         sys.__unraisablehook__(unraisable)
+        return
+    try:
+        Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
+    except KeyboardInterrupt:  # on a busy machine it comes before start() has returned
+        _interrupt_again(unraisable)
 
 
 def parse(arguments: Sequence[str]) -> Any:
