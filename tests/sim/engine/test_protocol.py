@@ -50,7 +50,8 @@ def test_an_engine_has_the_members_of_each_protocol(name):
     pack = engine.make_pack(spec, 1)
     for protocol in (EnginePack, DrivenPack, CompiledPack):
         check_members(protocol, pack)
-    check_members(CompiledStep, pack.compiled_step(True, True, True, None))
+    if pack.steps_natively:
+        check_members(CompiledStep, pack.compiled_step(True, True, True, None))
     pack.close()
 
 
