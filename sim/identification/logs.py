@@ -22,7 +22,7 @@ each env is a log.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -112,12 +112,17 @@ def _read(robot: Robot, path: Path, kind: CommandKind | None, hold: bool, readin
     elif path.suffix.lower() in HDF5:
         columns = read_hdf5_columns(path)
     if columns is not None:
+        _refuse(reading, ("topic", "command_topic"), f"{path}, which is no ROS bag")
         return _build(robot, str(path), columns, lines, kind, hold, reading)
-    if reading != Reading():
-        given = ", ".join(name for name, a, b in zip(Reading._fields, reading, Reading(), strict=True) if a != b)
-        remedy = "leave it out"
-        raise InvalidArgumentError(given, f"is not for {path}, a recording, which has SI units", remedy=remedy)
+    _refuse(reading, Reading._fields, f"{path}, a recording, which has SI units")
     return logs_of_rollout(robot, read_recording(path), kind, source=str(path))
+
+
+def _refuse(reading: Reading, names: Sequence[str], file: str) -> None:
+    """Refuse the options ``names`` of ``reading``, for which a file has no use."""
+    given = [name for name in names if getattr(reading, name) != getattr(Reading(), name)]
+    if given:
+        raise InvalidArgumentError(", ".join(given), f"is not for {file}", remedy="leave it out")
 
 
 def _named(robot: Robot, source: str, columns: dict[str, Float64], reading: Reading) -> dict[str, Float64]:

@@ -113,6 +113,13 @@ def test_a_bag_is_read_as_the_csv_file(panda, tmp_path, name, version, storage):
     np.testing.assert_allclose(alone.command, plain.measured)
 
 
+def test_topics_are_refused_where_there_are_none(panda, tmp_path):
+    path = write(tmp_path / "log.csv", table(panda))
+    for reading in (Reading(topic="/states"), Reading(command_topic="/commands")):
+        with pytest.raises(bp.InvalidArgumentError, match=r"topic: is not for .*log.csv, which is no ROS bag"):
+            read_logs(panda, [path], reading=reading)
+
+
 def test_a_damaged_bag_is_refused(panda, tmp_path):
     pytest.importorskip("rosbags")
     for name in ("a.bag", "a.mcap", "a.db3"):
