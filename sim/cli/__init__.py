@@ -1,8 +1,8 @@
 """The command line: each command is a frozen dataclass whose fields are its flags.
 
 To add a command, write a module with such a dataclass and list it in :data:`COMMANDS`. The range of a number is a
-:class:`batchpid.arrays.field_tables.Field` beside its type, and is checked before ``run()``, which returns the exit
-status (None: 0). Modules that load SAPIEN or Matplotlib are named in ``imports`` and imported after the flags are
+:class:`batchpid.arrays.field_tables.Field` in its annotation, and is checked before ``run()`` starts, which returns the
+exit status (None: 0). Modules that load SAPIEN or Matplotlib are named in ``imports`` and imported after the flags are
 parsed, so that ``--help`` answers at once, and before ``run()``: Ctrl-C ends the program at once until then, because
 some packages suppress a KeyboardInterrupt while they are imported.
 """

@@ -187,7 +187,7 @@ class IdentifyCommand:
         names = "time_unit degrees measured topic command_topic prefix"
         kind: Literal["setpoint", "effort"] | None = "effort" if self.gains is None else "setpoint"
         if self.evaluations == 0 and self.actuators is None:
-            kind = None  # what the logs hold is seen in _compare_efforts
+            kind = None  # _compare_efforts checks the kind of the logs
         return read_logs(robot, self.logs, kind, hold=self.hold, reading=Reading(**flags.chosen(self, names)))
 
     def _compare_efforts(self, robot: Robot, logs: list[Log], out: Path, details: Path | None) -> None:

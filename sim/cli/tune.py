@@ -210,7 +210,7 @@ class TuneCommand:
     def _judge_within(
         self, robot: Robot, sets: tuple[GainSet, GainSet], drawn: DrawnMotors, rejected: str | None
     ) -> tuple[str | None, Within]:
-        """Print what holds for all drawn motors; return why the designed gains are better, if so, and the figures.
+        """Print figures that hold for all drawn motors; return them, after a reason if the designed gains are better.
 
         The designed gains are tried too where the search ``rejected`` the tuned ones, or these do not hold for all.
         """

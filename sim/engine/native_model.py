@@ -140,8 +140,8 @@ class NativeRefresh:
 class NativeStep:
     """Sim step of ``robots`` with ``dof`` joints as one native call, from Python or from an XLA program.
 
-    ``arrays`` and ``fields`` are those of :class:`.interface.Group`; ``speed_limit`` (dof,) is the joint speed beyond
-    which the status says so. Implements :class:`batchpid.sim.engine.protocol.CompiledStep`.
+    ``arrays`` and ``fields`` fill a :class:`.interface.Group`; a joint speed beyond ``speed_limit`` (dof,) shows in the
+    status. Implements :class:`batchpid.sim.engine.protocol.CompiledStep`.
     """
 
     def __init__(

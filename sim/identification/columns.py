@@ -1,6 +1,6 @@
 """Columns of a log by name, from CSV and HDF5 files and ROS bags.
 
-Bags are those of ROS 1, of ROS 2, and MCAP files, with messages ``sensor_msgs/JointState``. These hold positions,
+A bag is a bag of ROS 1 or ROS 2 or an MCAP file, with messages ``sensor_msgs/JointState``. These hold positions,
 velocities and efforts of joints by name, in any order. In the topic of measurements, efforts are measured efforts.
 Positions in the topic of commands are setpoints, and its efforts are commanded efforts.
 """

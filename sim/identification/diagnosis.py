@@ -72,7 +72,7 @@ class Diagnosis(NamedTuple):
     links: dict[str, float]
     """Factors of the mass of links that seem lighter or heavier than described."""
     strengths: Float64 | None
-    """Strengths (joints,) that explain the efforts as well as ``links`` do; None if there are none."""
+    """Strengths (joints,) that explain the efforts as well as ``links`` do, or None."""
     disturbance: Disturbance | None
 
     def to_dict(self) -> Document:

@@ -80,7 +80,7 @@ def read_log_list(
 def gains_of(robot: Robot, name: str) -> bp.PIDParams:
     """Return the gains of a name or file, for all joints of ``robot``; a params file may have only some joints."""
     path, known = Path(name), [each for each in NAMES if each != "drive"]
-    if name not in known and not os.path.isfile(path):  # False for any text that is no path, too
+    if name not in known and not os.path.isfile(path):  # False, too, for text that cannot be a path
         remedy = f"use a file or {', '.join(known)}"
         raise InvalidArgumentError("gains", "is neither a name nor a file of gains", value=name, remedy=remedy)
     kind = path.suffix.lower()

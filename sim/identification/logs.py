@@ -9,8 +9,8 @@ An HDF5 file has one dataset per column, of the same names. A row holds the posi
 command computed from it, which acts from then on. A feedforward is an effort that is added to the law's. Columns may
 have any order, joints may be missing, and times need not be equidistant. Columns of other quantities are ignored, such
 as the rates of setpoints that ``batchpid excite`` writes. :class:`batchpid.sim.identification.columns.Reading` has
-other units and names, and the topics of ROS bags; :mod:`batchpid.sim.identification.log_lists` reads lists of logs with
-settings of their own (.yaml).
+other units and names, and the topics of ROS bags; :mod:`batchpid.sim.identification.log_lists` reads lists of logs
+(.yaml), each with its settings.
 
 Where the times have a gap, such as between two recordings, each stretch without gap is a log. Positions and setpoints
 that wrap at +-pi or at 0 and 2 pi are unwrapped (:mod:`batchpid.sim.identification.log_checks`).

@@ -309,7 +309,7 @@ class Pack(ModelPack):
         """Set the masses of a robot, and restore the frames of its joints, which this moves by rounding."""
         if not self._masses.added:
             return
-        if not self._frames:  # of a robot as it is built
+        if not self._frames:  # as built, before a mass has moved them
             moves = [joint.parent_link is not None for joint in robot.joints]
             pairs = zip(robot.joints, moves, strict=True)
             self._frames = [(joint.pose_in_parent, joint.pose_in_child) if move else None for joint, move in pairs]
