@@ -52,7 +52,7 @@ class CompareCommand:
         from batchpid.sim.cli.report import draw_first_move, evaluation_table, motion_difference
         from batchpid.sim.cli.run import evaluate_sets, read_variation
 
-        outputs = OutputFiles(force=self.force)
+        outputs = OutputFiles(self)
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))

@@ -60,7 +60,7 @@ class DemoCommand:
                 "robot", "has no tutorial setpoint", value=self.robot, remedy=f"run: batchpid rollout {self.robot}"
             )
         picture = self.picture or beside(Path("out") / robot.path.name, "demo")
-        outputs = OutputFiles(force=self.force)
+        outputs = OutputFiles(self)
         picture = outputs.path("picture", picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
         start = start_poses(robot, self.num_envs, self.spread, self.seed)

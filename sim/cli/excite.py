@@ -50,7 +50,7 @@ class ExciteCommand:
 
         robot = Robot.load(self.robot, **vars(self.meshes))
         out = self.out or Path(f"out/{robot.path.stem}.excite.csv")
-        out = OutputFiles(force=self.force).path("out", out, (".csv",))
+        out = OutputFiles(self).path("out", out, (".csv",))
         motion = excite(robot, self.seconds, rate=self.rate, lowest=self.lowest, highest=self.highest, seed=self.seed)
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, setpoint_csv(robot, motion))

@@ -98,7 +98,7 @@ class ExportCommand:
         flags.refuse(self, unused, f"has no effect with --to {self.to}")
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
-        outputs = OutputFiles(force=self.force)
+        outputs = OutputFiles(self)
         out = outputs.path("out", out, (Path(FILES[self.to]).suffix,))
         others = {name: outputs.path("out", out.with_name(name), ()) for name in PROJECT if self.project}
         if self.to == "urdf":

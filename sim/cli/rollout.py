@@ -95,11 +95,11 @@ class RolloutCommand:
             start_poses,
         )
 
-        outputs = OutputFiles(force=self.force)
+        outputs = OutputFiles(self)
         if self.resume and self.out is None:
             raise InvalidArgumentError("resume", "has no file to continue", remedy="add --out NAME.h5")
         if self.resume and self.out is not None:
-            out: Path | None = outputs.history(file_path("out", self.out, HDF5), resume=True)
+            out: Path | None = file_path("out", self.out, HDF5)
         else:
             out = outputs.path("out", self.out, (".npz", *HDF5))
         picture = outputs.path("picture", self.picture, plots.FORMATS)

@@ -23,13 +23,11 @@ if TYPE_CHECKING:
     from batchpid.sim.tuning.randomization_presets import load_randomization, payload_capacity, usual_variation
     from batchpid.sim.tuning.robot_survey import find_robots, survey
     from batchpid.sim.tuning.search import Tuning, tune
-    from batchpid.sim.tuning.tool_search import ToolTuning, tune_tool
 
 __all__ = [
     "Evaluation",
     "GainSet",
     "Moves",
-    "ToolTuning",
     "Tuning",
     "Weights",
     "arm_joints",
@@ -45,7 +43,6 @@ __all__ = [
     "step_response_metrics",
     "survey",
     "tune",
-    "tune_tool",
     "tutorial_move",
     "usual_variation",
 ]
@@ -65,7 +62,6 @@ _MODULES = {
     "randomization_presets": ("load_randomization", "payload_capacity", "usual_variation"),
     "robot_survey": ("find_robots", "survey"),
     "search": ("Tuning", "tune"),
-    "tool_search": ("ToolTuning", "tune_tool"),
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}
 
