@@ -36,8 +36,8 @@ SAMPLES = 200
 class DisabledPair(NamedTuple):
     """Two links that do not collide.
 
-    ``reason`` is one of MoveIt's: "Adjacent" (neighbours), "Default" (within GAP at the start pose), "Always" (in nearly
-    every sampled pose), "Never" or "User" (in an .srdf).
+    ``reason`` is one of MoveIt's: "Adjacent" (neighbours), "Default" (in contact at the start pose), "Always" (in
+    nearly every sampled pose), "Never" or "User" (in an .srdf).
     """
 
     first: str
