@@ -12,7 +12,7 @@ from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import AT_MOST, OutputFiles, bar, beside, write_figures
+from batchpid.sim.cli.outputs import AT_MOST, FOLDER, OutputFiles, bar, beside, stem, write_figures
 
 if TYPE_CHECKING:
     from batchpid.sim.identification.log import Log
@@ -108,17 +108,17 @@ class IdentifyCommand:
         from batchpid.sim.identification.identification import identify
         from batchpid.sim.identification.log_lists import gains_of
 
-        robot = Robot.load(self.robot, **vars(self.meshes))
         if not self.logs:
             raise InvalidArgumentError("logs", "are missing", remedy="name one file or more after the robot")
-        if self.actuators is not None:
-            return self._judge(robot, self.actuators)
-        out = self.out or Path(f"out/{robot.path.stem}.actuators.yaml")
+        out = self.out or FOLDER / f"{stem(Path(self.robot))}.actuators.yaml"
         outputs = OutputFiles(self)
         out = outputs.path("out", out, (".yaml", ".yml", ".json"))
         details = outputs.path("json", self.json, (".json",))
         corrected = outputs.path("corrected_urdf", self.corrected_urdf, (".urdf",))
         picture = outputs.path("picture", self.picture or beside(out, "fit"), plots.FORMATS)
+        robot = Robot.load(self.robot, **vars(self.meshes))
+        if self.actuators is not None:
+            return self._judge(robot, self.actuators)
         params = None if self.gains is None else gains_of(robot, self.gains)
         logs = self._logs(robot)
         if self.evaluations == 0:

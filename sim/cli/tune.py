@@ -14,7 +14,7 @@ from batchpid.arrays.array_types import Document
 from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, bar, beside
+from batchpid.sim.cli.outputs import FOLDER, OutputFiles, bar, beside, stem
 from batchpid.sim.tuning.cost import Weights
 from batchpid.sim.tuning.gain_sets import GainSet
 
@@ -64,11 +64,10 @@ class TuneCommand:
         from batchpid.sim.tuning.randomization_presets import load_randomization
         from batchpid.sim.tuning.search import tune
 
-        robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
-        outputs = OutputFiles(self)
-        named = self.out or Path("out") / robot.path.name
+        outputs, named = OutputFiles(self), FOLDER / stem(Path(self.robot))
         out = outputs.path("out", self.out or named.with_suffix(".tuned.yaml"), (".yaml", ".yml", ".json"))
-        picture = outputs.path("picture", self.picture or beside(named, "tune"), plots.FORMATS)
+        picture = outputs.path("picture", self.picture or beside(self.out or named, "tune"), plots.FORMATS)
+        robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         randomization = None if self.randomize is None else load_randomization(self.randomize, robot)
         options: Document = {"randomization": randomization, "seed": self.seed} | self.runner.options()
         searched = flags.chosen(self, "generations population seconds gain_units per_joint weights time_limit")

@@ -17,10 +17,11 @@ if TYPE_CHECKING:
         following_error,
         run_moves,
         step_response_metrics,
+        within,
     )
     from batchpid.sim.tuning.gain_sets import GainSet, gain_set
     from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
-    from batchpid.sim.tuning.randomization_presets import load_randomization, payload_capacity, usual_variation
+    from batchpid.sim.tuning.randomization_presets import load_randomization, payload_capacity
     from batchpid.sim.tuning.robot_survey import find_robots, survey
     from batchpid.sim.tuning.search import Tuning, tune
 
@@ -44,7 +45,7 @@ __all__ = [
     "survey",
     "tune",
     "tutorial_move",
-    "usual_variation",
+    "within",
 ]
 
 _MODULES = {
@@ -56,10 +57,11 @@ _MODULES = {
         "following_error",
         "run_moves",
         "step_response_metrics",
+        "within",
     ),
     "gain_sets": ("GainSet", "gain_set"),
     "moves": ("Moves", "random_moves", "search_moves", "tutorial_move"),
-    "randomization_presets": ("load_randomization", "payload_capacity", "usual_variation"),
+    "randomization_presets": ("load_randomization", "payload_capacity"),
     "robot_survey": ("find_robots", "survey"),
     "search": ("Tuning", "tune"),
 }

@@ -196,9 +196,7 @@ class Candidates:
             followed = np.minimum(error, 1e6).reshape(count, -1)[:, self._steps :]
             total += w.following * self._over_moves(np.log1p(followed / 10))
         lasted = rollout.ok.mean(0).reshape(count, -1)
-        total = np.where(
-            lasted.min(1) < 1, DIVERGED_COST * (2 - lasted.mean(1)), np.minimum(total, DIVERGED_COST)
-        )
+        total = np.where(lasted.min(1) < 1, DIVERGED_COST * (2 - lasted.mean(1)), np.minimum(total, DIVERGED_COST))
         return total + self._stability_penalty(params, runner.timestep)
 
     def _over_moves(self, cost: Float64) -> Float64:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document, Float64, Rows
+from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
