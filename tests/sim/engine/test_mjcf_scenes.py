@@ -430,7 +430,8 @@ OPENED = {
       <worldbody><geom type="hfield" hfield="hills" pos="2 0 0"/><include file="arm.xml"/>
       <frame pos="0 3 0"><attach model="other" body="pole" prefix="b"/></frame></worldbody></mujoco>""",
     "arm.xml": """<mujocoinclude><body name="arm"><joint name="j" axis="0 1 0"/>
-      <geom size=".1 .1 .1" type="box"/></body><body name="toy" pos="1 0 1"><freejoint/><geom type="mesh" mesh="block"/></body></mujocoinclude>""",
+      <geom size=".1 .1 .1" type="box"/></body>
+      <body name="toy" pos="1 0 1"><freejoint/><geom type="mesh" mesh="block"/></body></mujocoinclude>""",
     "other.xml": """<mujoco><asset><mesh name="tip" file="tip.obj"/></asset><worldbody>
       <body name="pole"><geom size=".1"/><geom type="mesh" mesh="tip"/></body></worldbody></mujoco>""",
     "parts/block.obj": BLOCK,
