@@ -41,7 +41,7 @@ class OutputFiles:
     def __init__(self, command: Any) -> None:
         self._force: bool = command.force
         self._outputs = list[str]()
-        self._inputs = list[str]()
+        self._inputs = list[str | Path]()
         for name, value in vars(command).items():
             if name not in OUTPUTS:
                 values = value if isinstance(value, tuple) else (value,)

@@ -264,8 +264,7 @@ def within(
     """
     sets, count = motors.num_envs, len(moves.start)
     repeated = motors.for_envs(np.repeat(np.arange(sets), count))
-    options = {"substeps": SUBSTEPS, "params": params, "actuators": repeated} | options
-    with Runner(robot, sets * count, **options) as runner:
+    with Runner(robot, sets * count, params=params, actuators=repeated, **{"substeps": SUBSTEPS, **options}) as runner:
         metrics, timestep = run_moves(runner, moves.take(np.tile(np.arange(count), sets)), seconds)[1], runner.timestep
     settled = np.nan_to_num(metrics.settling_time[:, arm_joints(robot)], nan=0.0, posinf=np.inf)
     poses = np.concatenate([moves.start, moves.target])[:POSES]

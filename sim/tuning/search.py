@@ -53,7 +53,7 @@ FINAL_MOVES, FINALISTS = 24, 3
 """Number of moves of the final round, and the largest number of candidates in it, besides the designed gains."""
 FINAL_SEED = 1_000_003
 """Difference between the seed of the final round and the seed of the search."""
-SEARCH_SCENE = {"collisions": False, "physics": "fast", "ground": None}
+SEARCH_SCENE: Document = {"collisions": False, "physics": "fast", "ground": None}
 """Options of the runner in a search on moves that are free of contact."""
 
 
