@@ -61,7 +61,6 @@ class Controller(Protocol):
 
 
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
-SetpointSpace = Literal["joints", "tool"]
 Backend = Literal["numpy", "jax"]
 Precision = Literal["float64", "float32"]
 EngineName = Literal["sapien", "mujoco"]
@@ -136,13 +135,7 @@ class RunnerKeywords:
     whose setpoints are poses (7,), a :class:`batchpid.sim.OperationalSpace` with its defaults; or a
     :class:`Controller`."""
     tool: Annotated[str | None, option("snapshot", "recording")] = None
-    """Link that control "osc" and ``setpoint_space`` "tool" move; default the last link of the robot's longest
-    chain."""
-    setpoint_space: Annotated[SetpointSpace, option("snapshot")] = "joints"
-    """``"joints"``, the default, or ``"tool"``: under control "pid" or "drive" setpoints are poses (7,) of the link
-    ``tool``, position and quaternion (w, x, y, z), or poses and the positions of the joints outside the chain to it.
-    Inverse kinematics (:class:`batchpid.sim.tool_space.tool_setpoints.ToolSetpoints`) makes joint setpoints of them,
-    which rollouts and recordings hold."""
+    """Link that control "osc" moves; default the last link of the robot's longest chain."""
     backend: Annotated[
         Backend, option("snapshot", flag="Library of the law: NumPy, or JAX, as one program with the steps.")
     ] = "numpy"

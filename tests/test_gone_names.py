@@ -14,6 +14,7 @@ GONE = (
     r"--search-seconds",
     r"--variation",
     r"--within",
+    r"ToolSetpoints",
     r"ToolTuning",
     r"batchpid parity",
     r"batchpid render",
@@ -21,8 +22,10 @@ GONE = (
     r"compare_engines",
     r"engine_differences",
     r"engine_parity",
+    r"setpoint_space",
     r"tool_candidates",
     r"tool_search",
+    r"tool_setpoints",
     r"tune_tool",
     r"usual_variation",
 )
