@@ -10,6 +10,25 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 GONE = (
     # one a line, as a regular expression; sorted
+    r"--project",
+    r"--to (isaac_lab|maniskill|newton)",
+    r"actuator_presets",
+    r"control_toolbox\(",
+    r"decoupling=",
+    r"first_derivative",
+    r"from_ros2_control",
+    r"gain_units=.inertia",
+    r"integrate_first",
+    r"motors\.presets",
+    r"osc_presets",
+    r"per_inertia",
+    r"presets\.simple_pid",
+    r"to_c_project",
+    r"to_isaac_lab",
+    r"to_maniskill",
+    r"to_newton",
+    r"ts\.presets",
+    r"weight_origin",
 )
 FILES = [
     path

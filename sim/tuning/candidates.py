@@ -128,8 +128,6 @@ class Candidates:
             self._mass, self._damping = robot.mass_matrix(robot.sample(50, seed=0)), robot.damping
             coupling = robot.coupling
             self._mass, self._damping = coupling.reduced(self._mass), coupling.reduced_damping(self._damping)
-        inertia = gain_units == "inertia"
-        self._unit = np.diagonal(self._mass, axis1=1, axis2=2) if inertia else np.ones(joints)
 
     @property
     def envs(self) -> int:
@@ -206,9 +204,7 @@ class Candidates:
         """Return the penalty (count,) of candidates near the stability bound, whose moves may look stable."""
         leaves = np.stack(np.broadcast_arrays(params.kp, params.kd, params.derivative_filter_time))
         ratios = [
-            stability_bound(
-                self._mass, kp * self._unit, kd * self._unit, dt, filter_time=tau, damping=self._damping
-            ).ratio.max()
+            stability_bound(self._mass, kp, kd, dt, filter_time=tau, damping=self._damping).ratio.max()
             for kp, kd, tau in zip(*leaves[..., self.robot.independent], strict=True)
         ]
         return 10 * np.maximum(np.array(ratios) - PENALTY_RATIO, 0)

@@ -88,7 +88,7 @@ def tune(
     seconds
         Simulated time of each move [s].
     gain_units
-        "effort", "inertia" or "mass_matrix": :mod:`batchpid.law.computed_torque`.
+        "effort" or "mass_matrix": :mod:`batchpid.law.computed_torque`.
     per_joint
         Search for a factor of each joint's gains too, which needs more generations.
     weights

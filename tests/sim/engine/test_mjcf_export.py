@@ -143,7 +143,7 @@ def test_an_inertia_of_no_body_is_replaced_and_listed(tmp_path):
 
 def test_bad_requests_are_refused():
     loaded = Robot.load("panda")
-    for params in (plain(loaded).replace(gain_units="inertia"), plain(loaded, effort_min=1.0, effort_max=1.0)):
+    for params in (plain(loaded).replace(gain_units="mass_matrix"), plain(loaded, effort_min=1.0, effort_max=1.0)):
         with pytest.raises(InvalidArgumentError):
             to_mjcf(loaded, params, DT)
     with pytest.raises(InvalidArgumentError, match="physics"):

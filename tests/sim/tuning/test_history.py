@@ -27,7 +27,7 @@ INPUTS = {
     "generations": [1, 2],
     "population": [4, 5],
     "seconds": [0.05, 0.1],
-    "gain_units": ["mass_matrix", "inertia", "effort"],
+    "gain_units": ["mass_matrix", "effort"],
     "per_joint": [False, True],
     "weights": [Weights(), Weights(itae=2.0)],
     "moves": [random_moves(ARM, 1, 0), random_moves(ARM, 1, 1), None],
