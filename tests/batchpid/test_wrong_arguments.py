@@ -343,7 +343,7 @@ TEXTS = [
     *((PID % f'"kp": {value}', "kp", "elbow") for value in ("-1.0", '"nan"', '"1e3"', "true", "null", "[[1.0]]", "[]")),
     (PID % f'"kp": 1{"0" * 400}', "kp", "elbow"),
     (PID % '"kp": 1.0, "anti_windup": "magic"', "anti_windup", "elbow"),
-    ('{"format": "batchpid-params-1", "integration": [], "joints": {"a": {"kp": 1.0}}}', "integration", None),
+    ('{"format": "batchpid-params-1", "non_finite": [], "joints": {"a": {"kp": 1.0}}}', "non_finite", None),
     ('{"format": "batchpid-params-1", "dtype": "object", "joints": {"a": {"kp": 1.0}}}', "dtype", None),
     ('{"format": "batchpid-params-1", "about": 3, "joints": {"a": {"kp": 1.0}}}', "about", None),
     ("format: batchpid-params-1\njoints: {elbow: {kp: 1}}", "text", None),

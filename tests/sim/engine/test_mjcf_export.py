@@ -366,7 +366,7 @@ def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
     other = Robot.load(folder / "chain.xml")
     back, listed = other.mjcf_gains(), {each.partition(":")[0] for each in exported.differences}
     scale, tolerance = 1.0 if params.gain_units is None else inertia, 1e-12 if params.dtype == np.float64 else 1e-6
-    limit = np.minimum(-np.array(values(params, "integral_min")), values(params, "integral_max"))
+    limit = scale * np.minimum(-np.array(values(params, "integral_min")), values(params, "integral_max"))
     kept = (np.array(values(params, "ki")) > 0) & (limit > 0)
     for name in ("kp", "ki", "kd"):
         wanted = np.array(values(params, name)) * scale
