@@ -11,7 +11,7 @@ import numpy as np
 from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles
+from batchpid.sim.cli.outputs import FOLDER, OutputFiles, stem
 
 if TYPE_CHECKING:
     import batchpid as bp
@@ -80,12 +80,12 @@ class ExportCommand:
         from batchpid.sim.robot.urdf_export import to_urdf
         from batchpid.sim.tuning.gain_sets import gain_set
 
+        out = self.out or FOLDER / f"{stem(Path(self.robot))}{FILES[self.to]}"
+        out = OutputFiles(self).path("out", out, (Path(FILES[self.to]).suffix,))
         known = {name for names in USED.values() for name in names}
         unused = [each.name for each in fields(self) if each.name in known.difference(USED[self.to])]
         flags.refuse(self, unused, f"has no effect with --to {self.to}")
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
-        out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
-        out = OutputFiles(force=self.force).path("out", out, (Path(FILES[self.to]).suffix,))
         if self.to == "urdf":
             exported = to_urdf(robot, out.absolute().parent)
             content = f"{robot.name}, {robot.dof} joints, without need of repair"
