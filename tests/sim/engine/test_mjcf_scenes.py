@@ -11,6 +11,10 @@ pytest.importorskip("mujoco.batch")
 
 from batchpid.errors import InvalidArgumentError, RobotError  # noqa: E402
 from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, Uniform  # noqa: E402
+from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
+from batchpid.sim.engine.mujoco.mujoco_engine import ENGINE  # noqa: E402
+from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
+from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits")
 
@@ -392,3 +396,61 @@ def test_random_files_in_contact_move_as_in_mujoco(load, monkeypatch, seed):
             seen.append(run(runner, rows)[:, 0])
     np.testing.assert_array_equal(*seen)
     np.testing.assert_allclose(seen[0], in_mujoco(robot, model, rows, 20), rtol=0, atol=1e-6)
+
+
+def test_a_snapshot_holds_the_integration_state(load):
+    """Also what a keyframe places, and what a run may change: mocap bodies, equality constraints, user data."""
+    robot = load(
+        ARM.replace("<worldbody>", '<size nuserdata="2"/><worldbody><body name="target" mocap="true"/>')
+        .replace('<key name="home"', '<key name="home" mpos=".3 0 .35"')
+        .replace("<actuator>", '<equality><weld body1="cube" body2="lid" active="false"/></equality><actuator>')
+    )
+    whole, kept = int(mujoco.mjtState.mjSTATE_INTEGRATION), []
+    spec = SceneSpec(robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf)
+    packs = [ENGINE.make_pack(spec, 2) for _ in range(2)]
+    rng = np.random.default_rng(0)
+    for data in packs[0]._data:
+        assert list(data.mocap_pos[0]) == [0.3, 0, 0.35]
+        row = np.empty(mujoco.mj_stateSize(packs[0].models[0], whole))
+        mujoco.mj_getState(packs[0].models[0], data, row, whole)
+        mujoco.mj_setState(packs[0].models[0], data, row + rng.uniform(0.1, 0.2, len(row)), whole)
+    packs[1].write_state_rows(packs[0].read_state())
+    for pack in packs:
+        kept.append([])
+        for data in pack._data:
+            mujoco.mj_getState(pack.models[0], data, row := np.empty(len(row)), whole)
+            kept[-1].append(row)
+    np.testing.assert_array_equal(*kept)
+
+
+BLOCK = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+OPENED = {
+    "scene.xml": """<mujoco><compiler meshdir="parts"/><asset><mesh name="block" file="block.obj"/>
+      <hfield name="hills" file="hills.bin" size="1 1 .1 .1"/><model name="other" file="other.xml"/></asset>
+      <worldbody><geom type="hfield" hfield="hills" pos="2 0 0"/><include file="arm.xml"/>
+      <frame pos="0 3 0"><attach model="other" body="pole" prefix="b"/></frame></worldbody></mujoco>""",
+    "arm.xml": """<mujocoinclude><body name="arm"><joint name="j" axis="0 1 0"/>
+      <geom size=".1 .1 .1" type="box"/></body>
+      <body name="toy" pos="1 0 1"><freejoint/><geom type="mesh" mesh="block"/></body></mujocoinclude>""",
+    "other.xml": """<mujoco><asset><mesh name="tip" file="tip.obj"/></asset><worldbody>
+      <body name="pole"><geom size=".1"/><geom type="mesh" mesh="tip"/></body></worldbody></mujoco>""",
+    "parts/block.obj": BLOCK,
+    "tip.obj": BLOCK,
+    "parts/hills.bin": np.array([2, 2], np.int32).tobytes() + np.array([0, 0.1, 0.2, 0.3], np.float32).tobytes(),
+}
+
+
+@pytest.mark.parametrize("changed", OPENED)
+def test_every_file_that_a_load_opens_is_part_of_the_identity(tmp_path, changed):
+    (tmp_path / "parts").mkdir()
+    for name, content in OPENED.items():
+        (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    robot = Robot.load(tmp_path / "scene.xml")
+    with Runner(robot, 1, workers=0, engine="mujoco"):
+        pass
+    path = tmp_path / changed
+    path.write_bytes(path.read_bytes().replace(b".1", b".2").replace(*(np.float32(x).tobytes() for x in (0.3, 0.5))))
+    assert Robot.load(tmp_path / "scene.xml").describe() != robot.describe()
+    robot_model.cache_clear()
+    with pytest.raises(RobotError, match="has changed since the robot was loaded"):
+        Runner(robot, 1, workers=0, engine="mujoco")
