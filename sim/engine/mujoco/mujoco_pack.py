@@ -24,7 +24,6 @@ from batchpid.sim.engine.mujoco.model_builder import FLOATING, LARGEST_FORCE, Ro
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel
-from batchpid.sim.engine.protocol import FAILED
 from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_back
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
@@ -144,8 +143,7 @@ class MujocoPack(ModelPack):
         if self.steps_natively:
             if self._own_step is None:
                 self._own_step = self._make_step(False, None)
-            if self._own_step(self.qf, *np.empty((3, *self.qf.shape))) & FAILED:
-                raise RuntimeError(self._own_step.message)
+            self._own_step.may_have_failed(self._own_step(self.qf, *np.empty((3, *self.qf.shape))))
             return
         effort = self.qf
         if self._constraint is not None:

@@ -354,3 +354,41 @@ def test_an_error_of_mujoco_closes_the_runner(load):
         with pytest.raises(Exception, match="memory"):
             runner.rollout(np.full((100, 2, robot.dof), 3.0))
         assert runner.closed
+
+
+def random_file(rng):
+    """Return an MJCF text of an arm with up to three joints a body that falls onto its floor."""
+    flag = rng.choice(["", '<flag contact="disable"/>', '<flag override="enable"/>', '<flag filterparent="disable"/>'])
+    option = OPTION.replace("/>", f' o_margin=".05" o_solref=".02 1" o_solimp=".9 .95 .001 .5 2">{flag}</option>', 1)
+    margin = rng.choice(["", 'margin=".03" gap=".01"'], p=[0.8, 0.2])
+    bodies, count = "", 0
+    for number in range(3):
+        joints = ""
+        for _ in range(rng.integers(number == 0, 4)):
+            axis, slides = " ".join(map(str, rng.normal(size=3).round(2))), rng.random() < 0.4
+            kind = 'type="slide" range="-.1 .1"' if slides else f'type="hinge" pos="{rng.choice([0, -0.2])} 0 0"'
+            ref = rng.choice([0, 0.3, 2])
+            joints += f'<joint name="j{count}" {kind} axis="{axis}" ref="{ref}" damping="{20 if slides else 0.02}"/>'
+            count += 1
+        place = "0 0 .3" if number == 0 else ".25 0 0"
+        bodies += f'<body pos="{place}">{joints}<geom type="capsule" size=".04" fromto="0 0 0 .2 0 0" {margin}/>'
+    world = f"<worldbody><geom type='plane' size='1 1 1'/>{bodies}{3 * '</body>'}</worldbody>"
+    return f"<mujoco>{option}{world}<keyframe><key name='home' qpos='{count * '0 '}'/></keyframe></mujoco>"
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.MissedContactWarning")
+@pytest.mark.parametrize("seed", range(16))
+def test_random_files_in_contact_move_as_in_mujoco(load, monkeypatch, seed):
+    rng = np.random.default_rng(seed)
+    text, collides = random_file(rng), bool(rng.random() < 0.8)
+    robot, model = load(text, self_collision="urdf"), mujoco.MjModel.from_xml_string(text)
+    if not collides:
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    rows, seen = np.zeros((80, robot.dof)), []
+    for native in (1, 0):
+        monkeypatch.setenv("BATCHPID_NATIVE", str(native))
+        options = {"control": "effort", "compensate": "none", "substeps": 20, "collisions": collides}
+        with Runner(robot, 1, workers=0, engine="mujoco", **options) as runner:
+            seen.append(run(runner, rows)[:, 0])
+    np.testing.assert_array_equal(*seen)
+    np.testing.assert_allclose(seen[0], in_mujoco(robot, model, rows, 20), rtol=0, atol=1e-6)
