@@ -12,11 +12,18 @@ GONE = (
     # one a line, as a regular expression; sorted
     r"--duration\b",
     r"--search-seconds",
+    r"ClusterWarning",
+    r"accept_differences",
     r"batchpid parity",
     r"batchpid render",
+    r"bench/cluster",
+    r"checkpoint_steps",
     r"compare_engines",
     r"engine_differences",
     r"engine_parity",
+    r"fork server",
+    r"fork_server",
+    r"placement=",
 )
 FILES = [
     path
