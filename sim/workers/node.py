@@ -218,7 +218,7 @@ class NodeWorker(Worker):
         try:
             result, failure, arrays = self._cluster.ray.get(self._call, timeout=self._limit)
         except exceptions.GetTimeoutError as error:
-            raise self._lost(f"is stuck: no answer within {self._limit:.0f} s") from error
+            raise self._lost("is stuck: no answer in time") from error
         except exceptions.RayError as error:
             raise self._lost(f"died ({type(error).__name__}: {error})") from error
         if failure is not None and isinstance(failure.error, WorkerLost):

@@ -29,6 +29,7 @@ MAX_LOSSES = 5
 """Number of losses of one worker during the same request after which the pool gives up."""
 _MAX_STEPS = 8000
 """Largest number of sim steps times envs of one request to a worker, except for one tick: a fifth of a second."""
+_CLOSED = "this Runner was closed during a call"
 
 
 class RecoveryWarning(UserWarning):
@@ -140,7 +141,8 @@ class WorkerPool(SingleOwner):
 
         A loop in this process executes it at once.
         """
-        self._raise_if_closed(None)
+        if self.closed:
+            raise ClosedError(_CLOSED)
         self._request = request
         try:
             request.write(self.arrays, slice(None))
@@ -158,7 +160,10 @@ class WorkerPool(SingleOwner):
         request, results, failures = self._request, [], []
         try:
             for worker in self.workers:
-                result = self._result(worker)
+                try:
+                    result = worker.receive()
+                except WorkerLost as error:
+                    result = self._replace(worker, error)
                 if isinstance(result, Failure):
                     failures.append(result)
                     result = None
@@ -166,7 +171,8 @@ class WorkerPool(SingleOwner):
         except Exception as error:
             self._raise_if_closed(error)
             raise
-        self._raise_if_closed(None)
+        if self.closed:
+            raise ClosedError(_CLOSED)
         failure, count = None, request.ticks
         if failures:
             failure = min(failures, key=order)
@@ -174,7 +180,8 @@ class WorkerPool(SingleOwner):
         elif request.changes_loop:
             self._replay.append(request)
         if count:
-            self.present = self.ticks[count - 1]
+            views = self.ticks.made
+            self.present = views[count - 1] if count <= len(views) else self.ticks[count - 1]
         return Outcome(results, failure, count, self.ticks)
 
     def start_replay_from(self, request: Request | None) -> None:
@@ -195,16 +202,12 @@ class WorkerPool(SingleOwner):
         if hasattr(self, "workers"):
             self.close()
 
-    def _raise_if_closed(self, error: Exception | None) -> None:
+    def _raise_if_closed(self, error: Exception) -> None:
         if self.closed:
-            raise ClosedError("this Runner was closed during a call") from error
+            raise ClosedError(_CLOSED) from error
 
-    def _result(self, worker: Worker) -> Any:
-        """Return the result of a worker for the present request; replace the worker if it is lost."""
-        try:
-            return worker.receive()
-        except WorkerLost as error:
-            loss = error
+    def _replace(self, worker: Worker, loss: WorkerLost) -> Any:
+        """Replace a lost worker; return the result of the new one for the present request."""
         cause, began = str(loss), time.monotonic()
         for _ in range(1, self.max_losses):
             self._raise_if_closed(loss)

@@ -6,7 +6,8 @@ import pickle
 from abc import ABC, abstractmethod
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
-from operator import itemgetter
+from itertools import repeat
+from operator import is_not, itemgetter
 from typing import Any, Self
 
 import numpy as np
@@ -28,12 +29,12 @@ class Request(ABC):
     """True if the replacement of a lost worker repeats the request, and an error in it closes the pool."""
     ticks = 0
     """Ticks of the arrays that hold observations afterwards; 0: the observation does not change."""
+    substeps = 10
+    """Sim steps of each tick, or those that take about as long as the request."""
+    patience = 0.0
+    """Further time that the request may take [s]."""
     counts_ticks = False
     """True if the ticks that every env completed before an error are kept."""
-
-    def limit(self, num_envs: int) -> float:
-        """Return an upper bound of the request's time for ``num_envs`` envs [s]."""
-        return 1e-2 * num_envs
 
     def for_envs(self, envs: slice) -> Self:
         """Return the part of some envs, of fields that are arrays (envs, ...) or have such a method."""
@@ -89,8 +90,7 @@ class Start:
 class Build(Request):
     """Build the loop; each worker has the :class:`Start` of its loop."""
 
-    def limit(self, num_envs: int) -> float:
-        return 60.0 + super().limit(num_envs)  # mostly imports, from a disk that may be slow
+    patience = 60.0  # mostly imports, from a disk that may be slow
 
     def apply(self, loop: Loop) -> None:
         pass
@@ -120,9 +120,6 @@ class Run(Request):
     command: Command = Command(None)  # noqa: RUF009  (immutable)
     counts_ticks = True
 
-    def limit(self, num_envs: int) -> float:
-        return 1e-3 * self.ticks * self.substeps * num_envs  # a sim step of an env takes about 20 us
-
     def for_envs(self, envs: slice) -> Self:
         return replace(self, command=self.command.map(itemgetter((slice(None), envs))))
 
@@ -132,7 +129,8 @@ class Run(Request):
                 table[: self.ticks, envs] = rows[:, envs]
 
     def encode(self, envs: slice) -> bytes:
-        return pickle.dumps((self.ticks, self.substeps, self.command.given))
+        given = tuple(map(is_not, self.command, repeat(None)))  # Command.given, without one more call in a tick
+        return pickle.dumps((self.ticks, self.substeps, given))
 
     def apply(self, loop: Loop) -> float:
         return loop.run(self.ticks, self.substeps, self.command.given)

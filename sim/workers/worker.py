@@ -16,6 +16,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from abc import ABC, abstractmethod
 from dataclasses import fields
 from pathlib import Path
@@ -83,8 +84,9 @@ class Worker(SingleOwner, ABC):
         return f"{self._start.index} ({process}envs {first + self.envs.start} to {first + self.envs.stop - 1})"
 
     def limit(self, request: Request) -> float:
-        """Return the time after which the worker counts as stuck [s]."""
-        return self._start.options.timeout + request.limit(self.envs.stop - self.envs.start)
+        """Return the time after which the worker counts as stuck [s]; a sim step of an env takes about 20 us."""
+        steps = (request.ticks or 1) * request.substeps * (self.envs.stop - self.envs.start)
+        return self._start.options.timeout + request.patience + 1e-3 * steps
 
 
 class LocalWorker(Worker):
@@ -150,17 +152,20 @@ class ProcessWorker(Worker):
                 os.sched_setaffinity(self.pid, {self._core})
 
     def send(self, request: Request) -> None:
-        self._limit = self.limit(request)
-        self._socket.settimeout(self._limit)
+        limit = self.limit(request)
+        self._deadline = time.monotonic() + limit
+        self._socket.settimeout(limit)
         try:
-            self._socket.sendall(self._message if isinstance(request, Build) else request.encode(self.envs))
-        except OSError:
+            self._socket.sendall(self._message if type(request) is Build else request.encode(self.envs))
+        except OSError as error:
+            self._raise_early(error)
             self._process.kill()  # receive() reports it
 
     def receive(self) -> Any:
         try:
             result = pickle.load(self._answers)
         except (EOFError, OSError, pickle.UnpicklingError) as error:
+            self._raise_early(error)
             raise self._lost(error) from error
         return result.of_worker(f"worker {self.label}") if isinstance(result, Failure) else result
 
@@ -168,8 +173,13 @@ class ProcessWorker(Worker):
         self._end.close()
         vars(self).pop("_answers", None)  # closed later where this is a signal handler in receive()
 
+    def _raise_early(self, error: Exception) -> None:
+        """Raise the error if it is a TimeoutError of a signal handler."""
+        if isinstance(error, TimeoutError) and time.monotonic() < self._deadline:
+            raise error
+
     def _lost(self, error: Exception) -> WorkerLost:
-        cause = f"is stuck: no answer within {self._limit:.0f} s; raise timeout= if that was too short"
+        cause = "is stuck: no answer in time; raise timeout= if that was too short"
         if isinstance(error, TimeoutError):
             self._process.send_signal(signal.SIGABRT)  # it prints its stack, unless it is stopped
         try:

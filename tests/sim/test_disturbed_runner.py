@@ -176,7 +176,7 @@ def test_a_worker_without_an_answer_is_stuck_after_the_timeout(capfd, monkeypatc
     options = {"workers": 1, "control": Acts(work_for_ever), "timeout": 0.5}
     with (
         Runner(ROBOT, N, **options) as runner,
-        pytest.raises(Exception, match=r"is stuck: no answer within .*timeout="),
+        pytest.raises(Exception, match=r"is stuck: no answer in time; raise timeout="),
     ):
         runner.step(MARKED)
     assert "work_for_ever" in capfd.readouterr().err  # its stack
