@@ -18,7 +18,7 @@ from batchpid.arrays.array_types import DType, Float64, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.model_pack import ModelPack
-from batchpid.sim.engine.mujoco.data_pool import DataPool
+from batchpid.sim.engine.mujoco.data_pool import STATE, DataPool, rest
 from batchpid.sim.engine.mujoco.link_sensors import MujocoLinkSensors
 from batchpid.sim.engine.mujoco.model_builder import FLOATING, LARGEST_FORCE, RobotMj, robot_model, set_inertia
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
@@ -27,14 +27,12 @@ from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_back
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.task_space import frames
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.rotations import inverse, multiply
-from batchpid.task_space.spatial_inertia import rotation_matrix
+from batchpid.task_space.rotations import inverse
 
-_STATE = ("qpos", "qvel", "qacc_warmstart")
-"""Fields of ``mujoco.MjData`` that a robot's later motion depends on, besides its efforts."""
+_KEPT = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)
+"""Parts of the state in snapshots: all but the targets of drives, which every tick writes."""
 _JOINTS = ("dof_armature", "dof_damping", "actuator_biasprm", "actuator_forcerange")
 """Fields of ``mujoco.MjModel`` that joints and drives change."""
 
@@ -202,10 +200,8 @@ class MujocoPack(ModelPack):
     # -- changes -----------------------------------------------------------------------------------------------
 
     def read_base(self) -> Float64:
-        rows, turn = self._bases(), self._robot.turn
+        rows = self._bases()
         rows[:, 10:] = turned_back(inverse(rows[:, 3:7]), rows[:, 10:])  # MuJoCo's are in the body's axes
-        if turn[0] != 1.0:
-            rows[:, 3:7] = multiply(rows[:, 3:7], inverse(turn))
         return rows
 
     def _bases(self) -> Float64:
@@ -228,9 +224,8 @@ class MujocoPack(ModelPack):
     def read_base_motion(self) -> Float64 | None:
         if self.spec.fixed_base:
             return None
-        rows, turn = self._bases(), rotation_matrix(self._robot.turn)  # a matrix: it rounds as native code does
-        parts = turned_back(rows[:, 3:7], np.array(self.spec.gravity)), rows[:, 10:]
-        return np.concatenate([frames.rotate(turn, part) for part in parts], axis=1)
+        rows = self._bases()
+        return np.hstack([turned_back(rows[:, 3:7], np.array(self.spec.gravity)), rows[:, 10:]])
 
     def push(self, rows: Sequence[int], twists: Float64) -> None:
         data, turns = self._data, matrix_of(self._bases()[rows, 3:7])
@@ -245,16 +240,11 @@ class MujocoPack(ModelPack):
         everyone, floats = self._data, self._robot.base is not None
         bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else base.copy()
         at, moves = self._robot.base or (0, 0)
-        if self._robot.turn[0] != 1.0:
-            bases[:, 3:7] = multiply(bases[:, 3:7], self._robot.turn)
         bases[:, 10:] = np.einsum("eji,ej->ei", matrix_of(bases[:, 3:7]), bases[:, 10:])
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
             data = everyone[row]
             ctrl = data.ctrl.copy()
-            if self.models[row].nkey:
-                mujoco.mj_resetDataKeyframe(self.models[row], data, 0)
-            else:
-                mujoco.mj_resetData(self.models[row], data)
+            rest(self.models[row], data)
             if floats:
                 data.qpos[at : at + FLOATING + 1], data.qvel[moves : moves + FLOATING] = np.split(root, [FLOATING + 1])
             data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = position, velocity
@@ -369,20 +359,18 @@ class MujocoPack(ModelPack):
 
     def state_sizes(self) -> list[int]:
         """Return the number of values in the state of each robot."""
-        model = self._robot.model
-        return [model.nq + 2 * model.nv] * self.size
+        return [mujoco.mj_stateSize(self._robot.model, _KEPT)] * self.size
 
     def read_state(self) -> Float64:
-        """Return the state of each robot (M, values): MuJoCo's qpos, qvel and warm start of the solver."""
-        return np.array([np.concatenate([getattr(data, name) for name in _STATE]) for data in self._data])
+        """Return the state of each robot (M, values), in MuJoCo's order."""
+        states = np.empty((self.size, self.state_sizes()[0]))
+        for model, data, state in zip(self.models, self._data, states, strict=True):
+            mujoco.mj_getState(model, data, state, _KEPT)
+        return states
 
     def write_state_rows(self, states: Float64) -> None:
-        for data, state in zip(self._data, states, strict=True):
-            begin = 0
-            for name in _STATE:
-                field = getattr(data, name)
-                field[:] = state[begin : begin + len(field)]
-                begin += len(field)
+        for model, data, state in zip(self.models, self._data, states, strict=True):
+            mujoco.mj_setState(model, data, state, _KEPT)
         self._update(range(self.size))
 
     def read_poses(self, names: Sequence[str] | None = None) -> list[Rows]:

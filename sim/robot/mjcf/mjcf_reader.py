@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import mujoco
 import numpy as np
 from lxml import etree
 
-from batchpid.arrays.array_types import MjModel, MjSpec
+from batchpid.arrays.array_types import MjModel
 from batchpid.arrays.digest import digest
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.mjcf.mjcf_compiler import ALONE, Attempt, Names, compile_file, label
@@ -19,11 +20,14 @@ from batchpid.sim.robot.mjcf.mjcf_shapes import PLANE, can_collide, excluded_pai
 from batchpid.sim.robot.mjcf.mjcf_tree import Tree
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.self_collision import DisabledPair
+from batchpid.sim.robot.xml import parse_xml
 from batchpid.task_space.rigid_tree import GRAVITY
 
 _EQ = mujoco.mjtEq
 _KEYFRAME = "home"
 """Keyframe with the start pose."""
+_FOLDERS = ("meshdir", "texturedir", "assetdir")
+"""Attributes of ``<compiler>`` with folders of other files."""
 _OURS = ("GRAVITY", "ACTUATION", "CLAMPCTRL")
 """Parts of MuJoCo's physics that a file cannot disable in either engine."""
 _OTHERS = ("CONTACT", "LIMIT", "EQUALITY", "FRICTIONLOSS", "DAMPER", "CONSTRAINT")
@@ -40,6 +44,8 @@ class Mjcf(NamedTuple):
     motors: Motors
     start: dict[str, float]
     """Start pose by joint [rad or m]: the keyframe "home", else the reference pose."""
+    base: tuple[float, ...] | None
+    """Start pose (7,) of a floating base, from the same."""
     missing_meshes: tuple[str, ...]
     """Collision meshes that the robot is simulated without."""
     findings: tuple[Finding, ...]
@@ -65,8 +71,10 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> M
     findings += [*_in_radians(model, names), *_unused(model, names, key)]
     pose = model.qpos0 if key is None else model.key_qpos[key]
     start = {name: float(pose[model.jnt_qposadr[joint]]) for joint, name in names.joints.items()}
+    at = model.jnt_qposadr[model.body_jntadr[tree.base]] if tree.base and not fixed_base else None
+    base = None if at is None else tuple(pose[at : at + 7].tolist())
     file = _file(path, compiled, names, fixed_base)
-    return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, missing, tuple(findings), file)
+    return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, base, missing, tuple(findings), file)
 
 
 def home(model: MjModel) -> int | None:
@@ -91,7 +99,7 @@ def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> Mjcf
     return MjcfFile(
         path=str(path),
         reading=compiled.reading,
-        content=content_of(compiled.scene),
+        content=content_of(path),
         bodies=tuple(names.bodies.values()),
         falling=tuple(names.bodies[int(body)] for body in free if not names.is_of_robot(body)),
         loops=tuple(loops),
@@ -100,9 +108,24 @@ def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> Mjcf
     )
 
 
-def content_of(scene: MjSpec) -> str:
-    """Return the digest of a compiled ``mujoco.MjSpec``, the same on every machine."""
-    return digest(scene.to_xml())
+def content_of(path: Path) -> str:
+    """Return the digest of an MJCF file and of all files that it names: included models, meshes, height fields, ...
+
+    MuJoCo looks for a file beside the file that names it, or in a folder of its ``<compiler>``. A file without any of
+    these is left out: if MuJoCo needs it, the compilation fails.
+    """
+    names, folders, models = set[str](), set[Path](), [path]
+    for model in models:
+        folders.add(model.parent)
+        for element in parse_xml(model).iter():
+            folders |= {model.parent / folder for key, folder in element.items() if key in _FOLDERS}
+            for key, name in element.items():
+                if (key == "value" or key.startswith("file")) and name not in names:
+                    names |= {name, Path(name).name}
+                    included = [model.parent / name, path.parent / name] if element.tag in ("include", "model") else []
+                    models += [file for file in included if file.is_file() and file not in models]
+    files = {(name, file) for name in names for folder in folders if os.path.isfile(file := folder / name)}
+    return digest(path.read_bytes(), sorted((name, digest(file.read_bytes())) for name, file in files))
 
 
 def _in_radians(model: MjModel, names: Names) -> list[Finding]:

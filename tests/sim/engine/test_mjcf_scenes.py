@@ -11,6 +11,10 @@ pytest.importorskip("mujoco.batch")
 
 from batchpid.errors import InvalidArgumentError, RobotError  # noqa: E402
 from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, Uniform  # noqa: E402
+from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
+from batchpid.sim.engine.mujoco.mujoco_engine import ENGINE  # noqa: E402
+from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
+from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits")
 
@@ -294,7 +298,6 @@ WALKER = """
 def test_a_floating_base_behind_an_object(load):
     """Pose and twist of a base are those of its link, wherever MuJoCo has them, and in both engines the same."""
     robot = load(WALKER, fixed_base=False)
-    turn = np.array([1.0, 1.0, 0.0, 0.0]) / np.sqrt(2)
     pose, twist = [0.1, 0.2, 3.0, 0.8, 0.0, 0.6, 0.0], [0.3, 0.1, 0.2, 1.0, 2.0, 3.0]
     seen = []
     cases = ("mujoco", "none"), ("sapien", "none"), ("mujoco", "gravity+coriolis"), ("rebuilt", "gravity+coriolis")
@@ -306,8 +309,7 @@ def test_a_floating_base_behind_an_object(load):
             np.testing.assert_allclose(obs.base_pose[0], pose, atol=1e-6)
             np.testing.assert_allclose(obs.base_twist[0], twist, atol=1e-5)
             if engine == "mujoco":
-                mujoco.mju_mulQuat(turned := np.zeros(4), np.array(pose[3:]), turn)
-                np.testing.assert_allclose(runner.bodies(["trunk"])[0, 0, 3:], turned)
+                np.testing.assert_allclose(runner.bodies(["trunk"])[0, 0], pose)
             for _ in range(20):
                 obs = runner.step([0.02])
             seen.append(np.concatenate([obs.qpos[0], obs.base_pose[0], obs.base_twist[0]]))
@@ -392,3 +394,97 @@ def test_random_files_in_contact_move_as_in_mujoco(load, monkeypatch, seed):
             seen.append(run(runner, rows)[:, 0])
     np.testing.assert_array_equal(*seen)
     np.testing.assert_allclose(seen[0], in_mujoco(robot, model, rows, 20), rtol=0, atol=1e-6)
+
+
+def test_a_snapshot_holds_the_integration_state(load):
+    """Also what a keyframe places, and what a run may change: mocap bodies, equality constraints, user data."""
+    robot = load(
+        ARM.replace("<worldbody>", '<size nuserdata="2"/><worldbody><body name="target" mocap="true"/>')
+        .replace('<key name="home"', '<key name="home" mpos=".3 0 .35"')
+        .replace("<actuator>", '<equality><weld body1="cube" body2="lid" active="false"/></equality><actuator>')
+    )
+    whole, kept = int(mujoco.mjtState.mjSTATE_INTEGRATION), []
+    spec = SceneSpec(robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf)
+    packs = [ENGINE.make_pack(spec, 2) for _ in range(2)]
+    rng = np.random.default_rng(0)
+    for data in packs[0]._data:
+        assert list(data.mocap_pos[0]) == [0.3, 0, 0.35]
+        row = np.empty(mujoco.mj_stateSize(packs[0].models[0], whole))
+        mujoco.mj_getState(packs[0].models[0], data, row, whole)
+        mujoco.mj_setState(packs[0].models[0], data, row + rng.uniform(0.1, 0.2, len(row)), whole)
+    packs[1].write_state_rows(packs[0].read_state())
+    for pack in packs:
+        kept.append([])
+        for data in pack._data:
+            mujoco.mj_getState(pack.models[0], data, row := np.empty(len(row)), whole)
+            kept[-1].append(row)
+    np.testing.assert_array_equal(*kept)
+
+
+BLOCK = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+OPENED = {
+    "scene.xml": """<mujoco><compiler meshdir="parts"/><asset><mesh name="block" file="block.obj"/>
+      <hfield name="hills" file="hills.bin" size="1 1 .1 .1"/><model name="other" file="other.xml"/></asset>
+      <worldbody><geom type="hfield" hfield="hills" pos="2 0 0"/><include file="arm.xml"/>
+      <frame pos="0 3 0"><attach model="other" body="pole" prefix="b"/></frame></worldbody></mujoco>""",
+    "arm.xml": """<mujocoinclude><body name="arm"><joint name="j" axis="0 1 0"/>
+      <geom size=".1 .1 .1" type="box"/></body>
+      <body name="toy" pos="1 0 1"><freejoint/><geom type="mesh" mesh="block"/></body></mujocoinclude>""",
+    "other.xml": """<mujoco><asset><mesh name="tip" file="tip.obj"/></asset><worldbody>
+      <body name="pole"><geom size=".1"/><geom type="mesh" mesh="tip"/></body></worldbody></mujoco>""",
+    "parts/block.obj": BLOCK,
+    "tip.obj": BLOCK,
+    "parts/hills.bin": np.array([2, 2], np.int32).tobytes() + np.array([0, 0.1, 0.2, 0.3], np.float32).tobytes(),
+}
+
+
+@pytest.mark.parametrize("changed", OPENED)
+def test_every_file_that_a_load_opens_is_part_of_the_identity(tmp_path, changed):
+    (tmp_path / "parts").mkdir()
+    for name, content in OPENED.items():
+        (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    robot = Robot.load(tmp_path / "scene.xml")
+    with Runner(robot, 1, workers=0, engine="mujoco"):
+        pass
+    path = tmp_path / changed
+    path.write_bytes(path.read_bytes().replace(b".1", b".2").replace(*(np.float32(x).tobytes() for x in (0.3, 0.5))))
+    assert Robot.load(tmp_path / "scene.xml").describe() != robot.describe()
+    robot_model.cache_clear()
+    with pytest.raises(RobotError, match="has changed since the robot was loaded"):
+        Runner(robot, 1, workers=0, engine="mujoco")
+
+
+STARTS = {
+    "plane": ('<geom type="plane" size="5 5 1" pos="0 0 .5"/>', "0 0 1 1 0 0 0", 0.55),
+    "low plane": ('<geom type="plane" size="5 5 1" pos="0 0 -1"/>', "0 0 -.5 1 0 0 0", -0.95),
+    "platform": ('<geom type="box" size="1 1 .2" pos="0 0 .2"/>', "0 0 .6 1 0 0 0", 0.45),
+    "turned": ('<geom type="plane" size="5 5 1"/>', "1 2 .3 0 1 0 0", 0.25),
+}
+
+
+@pytest.mark.parametrize("keyed", [True, False])
+@pytest.mark.parametrize("name", STARTS)
+def test_a_floating_robot_starts_where_its_file_places_its_root_body(load, name, keyed):
+    ground, pose, height = STARTS[name]
+    values = pose.split()
+    place = "" if keyed else f'pos="{" ".join(values[:3])}" quat="{" ".join(values[3:])}"'
+    key = f'<keyframe><key name="home" qpos="{pose} 0"/></keyframe>' if keyed else ""
+    body = (
+        f'<body name="t" {place}><freejoint/><geom type="box" size=".2 .2 .05" mass="5"/><body name="l" pos="0 0 .2">'
+    )
+    leg = '<joint name="a" axis="0 1 0" range="-1 1" damping="1"/><geom size=".05" mass=".1"/>'
+    text = f"<mujoco>{OPTION}<worldbody>{ground}{body}{leg}</body></body></worldbody>{key}</mujoco>"
+    robot = load(text, fixed_base=False)
+    assert [*robot.bodies] == ["t", "l"]
+    for engine in ("mujoco", "sapien"):
+        with Runner(robot, 1, workers=0, engine=engine, physics="accurate") as runner:
+            start = runner.observe().base_pose[0]
+            if engine == "mujoco" or name != "low plane":  # SAPIEN's ground is at height 0
+                np.testing.assert_allclose(start, [float(each) for each in values], atol=1e-6)
+            if engine == "mujoco":
+                for _ in range(100):
+                    seen = runner.step(robot.start)
+                np.testing.assert_allclose(seen.base_pose[0, 2], height, atol=2e-3)
+            seen = runner.reset(base_pose=start, base_twist=[0, 0, 0.1, 0, 0.2, 0])
+            np.testing.assert_allclose(seen.base_pose[0], start, atol=1e-6)
+            np.testing.assert_allclose(seen.base_twist[0], [0, 0, 0.1, 0, 0.2, 0], atol=1e-6)
