@@ -135,8 +135,6 @@ def written(folder: Path) -> set[Path]:
         ("rollout --control osc --gains tuned", "gains: are for the control of joints"),
         ("rollout --tool panda_hand", "tool: is for control 'osc'"),
         ("rollout --substeps 0", "substeps: out of range"),
-        ("rollout --resume", "resume: has no file to continue"),
-        ("rollout --resume --out a.npz", "out: unknown file format"),
         ("rollout --gains tunned", "did you mean 'tuned'?"),
         ("tune nobody", "no robot 'nobody'"),
         ("tune arm.urdf --population 1", "population: out of range"),
