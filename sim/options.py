@@ -100,7 +100,7 @@ class RunnerOptions(RunnerKeywords):
             own["speed_limit"] = read_only(limit.copy())
         if self.randomization is not None:
             remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
-            check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
+            check_robot(instance("randomization", self.randomization, Randomization, remedy), robot, self.mjcf)
             self._check_world(self.randomization)
         self._check_tree()
         own["guard"] = fit_guard(given["guard"], robot.joints, self.num_envs, self.control_name, self.sets_positions)
