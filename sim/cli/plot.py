@@ -72,8 +72,7 @@ def _read(path: Path, every: int) -> Rollout:
 class RenderCommand:
     """Film a recorded run in real time, all envs side by side.
 
-    SAPIEN's renderer draws it on a Vulkan device, which may be a software one. Without a device, Matplotlib draws it,
-    in less detail. ``batchpid view --play`` shows the same in a browser.
+    Matplotlib draws it. ``batchpid view --play`` shows the same in a browser.
     """
 
     recording: tyro.conf.Positional[Path]
@@ -97,7 +96,6 @@ class RenderCommand:
         """Run the command."""
         from batchpid.sim.cli.run import read_run
         from batchpid.sim.view.film import FORMATS, write_film
-        from batchpid.sim.view.renderer import REMEDY, render_problem
 
         outputs = OutputFiles(force=self.force, inputs=(self.recording,))
         out = outputs.path("out", self.out or beside(self.recording, "film", ".mp4"), FORMATS)
@@ -109,5 +107,3 @@ class RenderCommand:
             rollout, out, robot=robot, fps=self.fps, width=self.width, height=self.height, progress=progress
         )
         print(f"film: {path}")
-        if (problem := render_problem()) is not None:
-            print(f"Note: drawn by Matplotlib; SAPIEN's renderer does not work on this machine ({problem}): {REMEDY}")

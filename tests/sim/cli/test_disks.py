@@ -16,7 +16,6 @@ from batchpid.sim import Recorder, Runner, Snapshot, plots, write_recording
 from batchpid.sim.cli import outputs
 from batchpid.sim.cli import run as cli_run
 from batchpid.sim.tuning import robot_survey as surveying
-from batchpid.sim.view import film, renderer
 
 SHORT = ("--num-envs", "1", "--workers", "0", "--seconds", "0.02")
 TUNE = ("tune", "--generations", "1", "--population", "4", "--search-seconds", "0.05", "--workers", "0")
@@ -47,25 +46,9 @@ def rollout(panda):
         return runner.rollout(np.tile(panda.start, (4, 1, 1)))
 
 
-class Grey:
-    """Stand-in for the scene of a film on machines that cannot render."""
-
-    def __init__(self, *_):
-        pass
-
-    def add_camera(self, width, height):
-        picture = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
-        return lambda: picture
-
-    def place(self, *_):
-        pass
-
-
 @pytest.fixture
 def command(batchpid, rollout, tmp_path, monkeypatch):
     """Function that runs a command of the table with its output in a folder and returns (exit status, stderr)."""
-    monkeypatch.setattr(renderer, "render_problem", lambda: None)
-    monkeypatch.setattr(film, "RenderScene", Grey)
     run = write_recording(rollout, tmp_path / "run.npz")
     urdf = write(tmp_path, one_joint(), "one_joint.urdf")
 
