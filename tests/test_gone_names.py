@@ -19,6 +19,13 @@ GONE = (
     r"\brender_problem\b",
     r"\bshow_window\b",
     r"view[^\n]* --control",
+    r"--duration\b",
+    r"--search-seconds",
+    r"batchpid parity",
+    r"batchpid render",
+    r"compare_engines",
+    r"engine_differences",
+    r"engine_parity",
 )
 FILES = [
     path

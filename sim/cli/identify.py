@@ -40,7 +40,7 @@ class IdentifyCommand:
 
     robot: flags.RobotName = "panda"
     logs: Logs = ()
-    gains: Annotated[flags.OptionalName, tyro.conf.arg(metavar="NAME|FILE", aliases=("--params",))] = None
+    gains: Annotated[flags.OptionalName, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file as for --gains of
     other commands. Without it the logs' efforts are used."""
     compensate: Annotated[flags.Compensate | None, tyro.conf.arg(metavar="FORCES")] = None

@@ -1,4 +1,4 @@
-"""Every script of bench/ runs, on a tiny workload; bench/scale.py without Ray: test_scale.py."""
+"""Every script of bench/ runs, on a tiny workload."""
 
 import json
 import shutil
@@ -12,7 +12,7 @@ from scripts import ROOT, load_script
 
 from batchpid.sim import Robot, Runner
 
-TESTED = {"accuracy", "circles", "cluster", "draw", "measure", "motions", "newcomer", "scale"}
+TESTED = {"accuracy", "circles", "cluster", "draw", "measure", "motions", "newcomer"}
 TESTED |= {"trajectories"}
 
 
