@@ -86,7 +86,8 @@ class Robot(RobotDescription):
             file of :func:`batchpid.save_actuators`, in which joints are matched by name. None: ideal ones, with the
             armature, torque-speed lines and lags of an MJCF file.
         strict
-            True to refuse a file that needs repairs, which are otherwise made and listed by :meth:`check`.
+            True to refuse a file that needs repairs, which are otherwise made, with a warning, and listed by
+            :meth:`check`.
 
         Raises
         ------
@@ -292,10 +293,10 @@ def _find(name_or_path: str | Path) -> Path:
     path = Path(os.path.expanduser(file_path("name_or_path", name_or_path)))
     if str(name_or_path) in Robot.bundled():
         return _ASSETS / f"{name_or_path}.urdf"
-    if os.path.isfile(path):  # pathlib's methods raise other errors for names that are too long or start with ~
-        return path.absolute()
-    if os.path.isdir(path):
+    if os.path.isdir(path):  # pathlib's methods raise other errors for names that are too long or start with ~
         raise RobotNotFoundError(f"{path} is a folder; pass the path of a URDF or MJCF file in it")
+    if os.path.exists(path):  # also a pipe, such as /dev/stdin
+        return path.absolute()
     raise RobotNotFoundError(
         f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a file; "
         "check the spelling, or pass the path of a URDF or MJCF file"
