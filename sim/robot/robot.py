@@ -200,7 +200,7 @@ class Robot(RobotDescription):
         Parameters
         ----------
         gain_units
-            ``"mass_matrix"``, ``"inertia"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
+            ``"mass_matrix"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
             ``"mass_matrix"``; on a floating base ``"effort"``, for legs that carry the base at the start pose: the mass
             matrix is that of legs in the air, a twentieth.
 

@@ -207,7 +207,7 @@ def test_designed_gains_carry_the_base(tmp_path, engine):
     path = tmp_path / "dog.urdf"
     path.write_text(DOG)
     dog, sinks = Robot.load(path, fixed_base=False), []
-    for params in (None, dog.designed("inertia")):
+    for params in (None, dog.designed("mass_matrix")):
         with Runner(dog, 1, workers=0, engine=engine, params=params) as runner:
             start = runner.observe().base_pose[0]
             stood = runner.rollout(np.tile(dog.start, (60, 1)))

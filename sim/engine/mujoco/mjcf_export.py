@@ -67,8 +67,8 @@ def to_mjcf(
     Raises
     ------
     InvalidArgumentError
-        Params, actuators or guard for several envs, gains per inertia without ``inertia``, a guard without params, or
-        unknown physics.
+        Params, actuators or guard for several envs, gains per mass matrix without ``inertia``, a guard without params,
+        or unknown physics.
     RobotError
         MuJoCo cannot build the robot.
     """
@@ -77,7 +77,7 @@ def to_mjcf(
         check_guard(guard, 1, robot.joint_names)
         if params is None:
             raise InvalidArgumentError("guard", "limits setpoints of a law", remedy="pass params, or leave it out")
-    found = Drive(law, robot.joint_names, dt, inertia, actuators, integrates=True, two_sided=True)
+    found = Drive(law, robot.joint_names, dt, inertia, actuators)
     spec = SceneSpec(
         robot.urdf,
         robot.ignored_pairs,

@@ -145,7 +145,7 @@ class Tick(ctypes.Structure):
         ("noise", 2 * ctypes.c_void_p),
         ("timestep", ctypes.c_double),
         *((name, ctypes.c_int64) for name in ("dof", "stage_count", "transfer_count")),
-        *((name, ctypes.c_int32) for name in ("whole", "matrix_steps")),
+        *((name, ctypes.c_int32) for name in ("matrix_steps",)),
         *((name, ctypes.c_int32) for name in ("gravity", "coriolis", "late", "unused")),
     ]
 

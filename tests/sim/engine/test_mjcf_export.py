@@ -143,7 +143,7 @@ def test_an_inertia_of_no_body_is_replaced_and_listed(tmp_path):
 
 def test_bad_requests_are_refused():
     loaded = Robot.load("panda")
-    for params in (plain(loaded).replace(gain_units="inertia"), plain(loaded, effort_min=1.0, effort_max=1.0)):
+    for params in (plain(loaded).replace(gain_units="mass_matrix"), plain(loaded, effort_min=1.0, effort_max=1.0)):
         with pytest.raises(InvalidArgumentError):
             to_mjcf(loaded, params, DT)
     with pytest.raises(InvalidArgumentError, match="physics"):
@@ -366,7 +366,7 @@ def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
     other = Robot.load(folder / "chain.xml")
     back, listed = other.mjcf_gains(), {each.partition(":")[0] for each in exported.differences}
     scale, tolerance = 1.0 if params.gain_units is None else inertia, 1e-12 if params.dtype == np.float64 else 1e-6
-    limit = np.minimum(-np.array(values(params, "integral_min")), values(params, "integral_max"))
+    limit = scale * np.minimum(-np.array(values(params, "integral_min")), values(params, "integral_max"))
     kept = (np.array(values(params, "ki")) > 0) & (limit > 0)
     for name in ("kp", "ki", "kd"):
         wanted = np.array(values(params, name)) * scale
