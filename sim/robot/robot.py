@@ -115,8 +115,9 @@ class Robot(RobotDescription):
         root, repairs, mjcf = read_source(path, fixed_base is not False, missing_meshes)
         free_joint = free_joint_of(root)
         fixed_base = free_joint is None if fixed_base is None else fixed_base
+        base = None if mjcf is None else mjcf.base
         if free_joint is not None and not fixed_base:
-            free_base(root, free_joint)
+            base = free_base(root, free_joint, repairs)
         urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
         if mjcf is not None:
             urdf = replace(urdf, missing_meshes=(*mjcf.missing_meshes, *urdf.missing_meshes))
@@ -147,6 +148,7 @@ class Robot(RobotDescription):
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
             defaults=None if mjcf is None else _file_defaults(mjcf, joints),
             mjcf=None if mjcf is None else mjcf.file,
+            base_start=base,
         )
         if actuators is None and mjcf is not None:
             actuators = _file_actuators(mjcf, joints)
