@@ -116,7 +116,7 @@ def sweep(
     jax = ("jax",) if checked.backend == "jax" else ()
     inputs = {
         **checked.describe(),
-        **{name: getattr(checked, name) for name in ("substeps", "checkpoint_steps", "on_invalid_input")},
+        **{name: getattr(checked, name) for name in ("substeps", "on_invalid_input")},
         **{name: digest(rows) for name, rows in command.items()},
         **{
             name: digest(rows)

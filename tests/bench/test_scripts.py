@@ -6,13 +6,12 @@ from functools import partial
 
 import numpy as np
 import pytest
-from clusters import FILTERS
 from robots import load_bundled
 from scripts import ROOT, load_script
 
 from batchpid.sim import Robot, Runner
 
-TESTED = {"accuracy", "circles", "cluster", "draw", "measure", "motions", "newcomer"}
+TESTED = {"accuracy", "circles", "draw", "measure", "motions", "newcomer"}
 TESTED |= {"trajectories"}
 
 
@@ -128,20 +127,6 @@ def test_draw(tmp_path):
         assert (tmp_path / name).read_text() == (ROOT / name).read_text(), f"{name}: run bench/draw.py"
     for name in ("performance", "accuracy"):
         assert (docs / "images" / f"{name}.png").stat().st_size > 10_000
-
-
-@pytest.mark.slow
-class TestOnRay:
-    pytestmark = FILTERS
-
-    def test_cluster_and_the_measured_costs_of_the_page_on_large_clusters(self, capsys):
-        pytest.importorskip("ray")
-        cluster = load_script("cluster")
-        bench = cluster.Bench(num_envs=2, workers=1, turns=1, ticks=20, steps=1)
-        with cluster.machines(bench.workers) as address:
-            bench.run(address)
-            assert len(rows(capsys.readouterr().out)) == 3
-            assert "round trip" in load_script("scale").measure(calls=2, address=address, ignore_reinit_error=True)
 
 
 @pytest.mark.parametrize("sines", [False, True])

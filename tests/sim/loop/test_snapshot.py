@@ -70,10 +70,11 @@ def test_a_new_process_and_a_copy_go_on_from_it(jaco2: Robot, tmp_path: Path) ->
     np.testing.assert_array_equal(np.load(tmp_path / "qpos.npy"), went_on.qpos)
 
 
-def test_in_free_motion_the_barrier_changes_the_last_bits_only() -> None:
+def test_in_free_motion_the_barrier_changes_the_last_bits_only(monkeypatch) -> None:
     results = []
-    for checkpoint_steps in (None, 40):
-        with make(checkpoint_steps=checkpoint_steps, ground=False) as runner:
+    for checkpoint_steps in (8000, 40):
+        monkeypatch.setattr("batchpid.sim.runner.CHECKPOINT_STEPS", checkpoint_steps)
+        with make(ground=False) as runner:
             results.append(runner.rollout(np.tile(GOAL, (20, 1))))
     np.testing.assert_allclose(results[0].qpos, results[1].qpos, rtol=0, atol=1e-7)
     assert np.abs(results[0].qpos[-1]).max() > 1e-3
