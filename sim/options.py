@@ -184,7 +184,7 @@ class RunnerOptions(RunnerKeywords):
         if self.engine_name == "sapien" and robot.dissipation == "sapien":
             problem = "need a robot without SAPIEN's link damping, which acts like a contact"
             raise InvalidArgumentError(option, problem, remedy="load the robot with dissipation='urdf'")
-        bodies = place_links(robot.urdf, robot.merge_fixed)
+        bodies = place_links(robot.urdf, links if option == "wrenches" else ())
         root = next(at.link for at in bodies.values())
         for link in links:
             if link not in known:
@@ -193,9 +193,6 @@ class RunnerOptions(RunnerKeywords):
             if bodies[link].link == root and (option == "wrenches" or robot.fixed_base):
                 problem = f"names {link!r}, which no joint moves"
                 raise InvalidArgumentError(option, problem, remedy="name a link further along the robot")
-            if option == "wrenches" and bodies[link].link != link:
-                problem = f"names {link!r}, which is simulated as one with {bodies[link].link!r}"
-                raise InvalidArgumentError(option, problem, remedy="load the robot with merge_fixed=False")
         return links
 
     @cached_property

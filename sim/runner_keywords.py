@@ -203,8 +203,8 @@ class RunnerKeywords:
     """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``; default none. Links that are
     connected by fixed joints count as one. A fixed base is refused. SAPIEN needs ``dissipation="urdf"``."""
     wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
-    """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``; default none. A
-    link on a fixed joint needs a robot with ``merge_fixed=False``, and SAPIEN one with ``dissipation="urdf"``."""
+    """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``; default none.
+    SAPIEN needs ``dissipation="urdf"``."""
     build: Annotated[Callable[[Any, int], Any] | None, option("scene", snapshot="build_digest")] = None
     """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env. Visuals and lights are
     ignored, so code that was written for a screen runs unchanged. It may return the entities that
