@@ -103,7 +103,7 @@ class RobotDescription(Urdf):
     link, by name, in its simulated link: links joined by fixed joints are simulated as one. ``settings`` come from a
     bundled robot, ``defaults`` and ``mjcf`` from an MJCF file, else None.
     ``package_dirs`` are the folders in which meshes are looked up first. ``actuators`` are its motors and sensors, None
-    for ideal ones.
+    for ideal ones. ``base_start`` is the pose (7,) at which the file places a floating base, None if it does not.
     """
 
     path: Path
@@ -118,6 +118,7 @@ class RobotDescription(Urdf):
     actuators: bp.Actuators | None = None
     defaults: FileDefaults | None = None
     mjcf: MjcfFile | None = None
+    base_start: tuple[float, ...] | None = None
 
     def __repr__(self) -> str:
         given = sum(link.mass or 0.0 for link in self.links)
@@ -352,6 +353,7 @@ class RobotDescription(Urdf):
             "settings": digest(self.settings) if self.defaults is None else digest(self.defaults),
             "mjcf": None if self.mjcf is None else digest(replace(self.mjcf, path="")),
             **{name: getattr(self, name) for name in ("self_collision", "dissipation", "fixed_base")},
+            "base_start": self.base_start,
         }
 
     @cached_property

@@ -111,8 +111,9 @@ class Robot(RobotDescription):
         root, repairs, mjcf = read_source(path, fixed_base is not False, missing_meshes)
         free_joint = free_joint_of(root)
         fixed_base = free_joint is None if fixed_base is None else fixed_base
+        base = None if mjcf is None else mjcf.base
         if free_joint is not None and not fixed_base:
-            free_base(root, free_joint)
+            base = free_base(root, free_joint, repairs)
         urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
         if mjcf is not None:
             urdf = replace(urdf, missing_meshes=(*mjcf.missing_meshes, *urdf.missing_meshes))
@@ -142,6 +143,7 @@ class Robot(RobotDescription):
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
             defaults=None if mjcf is None else _file_defaults(mjcf, joints),
             mjcf=None if mjcf is None else mjcf.file,
+            base_start=base,
         )
         if actuators is None and mjcf is not None:
             actuators = _file_actuators(mjcf, joints)
@@ -195,7 +197,7 @@ class Robot(RobotDescription):
         Parameters
         ----------
         gain_units
-            ``"mass_matrix"``, ``"inertia"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
+            ``"mass_matrix"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
             ``"mass_matrix"``; on a floating base ``"effort"``, for legs that carry the base at the start pose: the mass
             matrix is that of legs in the air, a twentieth.
 
