@@ -96,7 +96,7 @@ def build_many(num_envs: int) -> tuple[float, float]:
         runner.reset()  # the model is compiled once
     process = psutil.Process()
     before, began = process.memory_info().rss, time.perf_counter()
-    with Runner(robot, num_envs, engine="mujoco", workers=0, checkpoint_steps=None, substeps=1) as runner:
+    with Runner(robot, num_envs, engine="mujoco", workers=0, substeps=1) as runner:
         seconds = time.perf_counter() - began
         start = runner.reset().qpos
         assert np.abs(runner.step(robot.target).qpos - start).max() > 0
