@@ -61,7 +61,6 @@ class Controller(Protocol):
 
 
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
-SetpointSpace = Literal["joints", "tool"]
 Backend = Literal["numpy", "jax"]
 Precision = Literal["float64", "float32"]
 EngineName = Literal["sapien", "mujoco"]
@@ -135,13 +134,7 @@ class RunnerKeywords:
     whose setpoints are poses (7,), a :class:`batchpid.sim.OperationalSpace` with its defaults; or a
     :class:`Controller`."""
     tool: Annotated[str | None, option("snapshot", "recording")] = None
-    """Link that control "osc" and ``setpoint_space`` "tool" move; default the last link of the robot's longest
-    chain."""
-    setpoint_space: Annotated[SetpointSpace, option("snapshot")] = "joints"
-    """``"joints"``, the default, or ``"tool"``: under control "pid" or "drive" setpoints are poses (7,) of the link
-    ``tool``, position and quaternion (w, x, y, z), or poses and the positions of the joints outside the chain to it.
-    Inverse kinematics (:class:`batchpid.sim.tool_space.tool_setpoints.ToolSetpoints`) makes joint setpoints of them,
-    which rollouts and recordings hold."""
+    """Link that control "osc" moves; default the last link of the robot's longest chain."""
     backend: Annotated[
         Backend, option("snapshot", flag="Library of the law: NumPy, or JAX, as one program with the steps.")
     ] = "numpy"
@@ -202,8 +195,8 @@ class RunnerKeywords:
     """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``; default none. Links that are
     connected by fixed joints count as one. A fixed base is refused. SAPIEN needs ``dissipation="urdf"``."""
     wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
-    """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``; default none. A
-    link on a fixed joint needs a robot with ``merge_fixed=False``, and SAPIEN one with ``dissipation="urdf"``."""
+    """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``; default none.
+    SAPIEN needs ``dissipation="urdf"``."""
     build: Annotated[Callable[[Any, int], Any] | None, option("scene", snapshot="build_digest")] = None
     """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env. Visuals and lights are
     ignored, so code that was written for a screen runs unchanged. It may return the entities that

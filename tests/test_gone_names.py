@@ -54,6 +54,7 @@ GONE = (
     r"placement=",
     r"--variation",
     r"--within",
+    r"ToolSetpoints",
     r"ToolTuning",
     r"batchpid parity",
     r"batchpid render",
@@ -61,8 +62,10 @@ GONE = (
     r"compare_engines",
     r"engine_differences",
     r"engine_parity",
+    r"setpoint_space",
     r"tool_candidates",
     r"tool_search",
+    r"tool_setpoints",
     r"tune_tool",
     r"usual_variation",
 )
