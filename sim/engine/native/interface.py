@@ -79,7 +79,7 @@ class Mujoco(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("models", "data")),
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")),
         *((name, ctypes.c_void_p) for name in ("ctrl", "stiffness", "rate_gain")),
-        *((name, ctypes.c_void_p) for name in ("clearance", "sensors", "sensed", "turn")),
+        *((name, ctypes.c_void_p) for name in ("clearance", "sensors", "sensed")),
         *((name, ctypes.c_int64) for name in ("sensor_size", "base_qpos", "base_qvel")),
     ]
 

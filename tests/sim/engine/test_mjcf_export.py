@@ -394,3 +394,10 @@ def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
     lost = {"effort_rate_limit", "setpoint_weight", "deadband", "continuous", "non_finite", "gain_units"}
     lost |= {"setpoint_weight_derivative", "derivative_filter_time"} if params.kd is not None else set()
     assert {name for name in lost if getattr(params, name) is not None} == listed & lost
+
+
+def test_a_floating_base_starts_as_in_the_runner():
+    robot = Robot.load("quadruped", fixed_base=False)
+    model = mujoco.MjModel.from_xml_string(to_mjcf(robot, None, 1e-3).text)
+    with Runner(robot, 1, workers=0, engine="mujoco") as runner:
+        np.testing.assert_allclose(model.key_qpos[0, :7], runner.observe().base_pose[0], atol=1e-6)
