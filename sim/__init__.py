@@ -33,7 +33,7 @@ from batchpid.sim.observation import Observation, Rollout, RunInfo, register_fin
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.ray_options import ClusterWarning, Ray
+from batchpid.sim.ray_options import Ray
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
 from batchpid.sim.robot.description import Dynamics, RobotDescription, register_dynamics
@@ -55,7 +55,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Choice",
-    "ClusterWarning",
     "CommandSpec",
     "Controller",
     "Fault",

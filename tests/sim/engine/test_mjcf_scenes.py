@@ -224,9 +224,8 @@ def test_an_object_that_diverges_is_a_fault_of_its_env(load):
 def test_a_closed_loop_has_no_tree(load):
     robot = load(FOUR_BAR)
     options = {"num_envs": 1, "workers": 0, "engine": "mujoco"}
-    for given, argument in (({"control": "osc"}, "control"), ({"setpoint_space": "tool"}, "setpoint_space")):
-        with pytest.raises(InvalidArgumentError, match=f"^{argument}.*'loop'"):
-            Runner(robot, **options, **given)
+    with pytest.raises(InvalidArgumentError, match=r"^control.*'loop'"):
+        Runner(robot, **options, control="osc")
     with pytest.raises(InvalidArgumentError, match=r"gain_units.*'loop'"):
         Runner(robot, params=robot.designed(), **options)
     with Runner(robot, **options) as runner:  # its default gains need no tree
@@ -268,21 +267,21 @@ def test_what_a_scene_does_not_have_is_refused(load):
         Runner(robot, 1, workers=0, engine="mujoco")
 
 
-@pytest.mark.parametrize("merge_fixed", [True, False])
-def test_masses_and_damping_vary(load, merge_fixed):
+@pytest.mark.parametrize("wrenches", [None, ["tip"]])
+def test_masses_and_damping_vary(load, wrenches):
     """A randomized robot moves as the file with other numbers, also where several bodies are one link."""
     tip = (
         '<body name="tip" pos=".2 0 0" quat=".9 .1 .3 0"><inertial pos=".01 0 .02" mass="{}" diaginertia="{}"/></body>'
     )
     arm = ARM.replace(f"{LINK}</body>", f"{LINK}{{}}</body>")
-    robot = load(arm.format(tip.format(0.2, "1e-4 2e-4 2.5e-4")), merge_fixed=merge_fixed)
+    robot = load(arm.format(tip.format(0.2, "1e-4 2e-4 2.5e-4")))
     heavy = arm.format(tip.format(0.4, "2e-4 4e-4 5e-4")).replace('damping=".5"', 'damping="1"')
     model = mujoco.MjModel.from_xml_string(heavy.replace('damping=".2"', 'damping=".4"'))
     twice = Uniform(2.0, 2.0, operation="scale")
     varied = Randomization(link_mass={"tip": twice}, damping=twice)
     rows = efforts(robot, 15)  # without contacts, whose softness in MuJoCo depends on how mass is divided among bodies
     options = {"control": "effort", "compensate": "none", "substeps": 10, "randomization": varied}
-    with Runner(robot, 2, workers=0, engine="mujoco", **options) as runner:
+    with Runner(robot, 2, workers=0, engine="mujoco", wrenches=wrenches, **options) as runner:
         ours = run(runner, rows)
     theirs = in_mujoco(robot, model, rows, 10)
     np.testing.assert_allclose(ours, np.broadcast_to(theirs[:, None], ours.shape), rtol=0, atol=1e-8)
