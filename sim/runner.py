@@ -206,14 +206,12 @@ class Runner(SingleOwner):
             (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N]. A follower's
             value (:attr:`batchpid.sim.Robot.coupling`) is replaced by the coupling's value for the leader's setpoint;
             an effort acts on the leader. A :class:`batchpid.sim.Controller` that defines its command takes (size,) or
-            (envs, size): :attr:`command`. With ``setpoint_space="tool"`` it is a pose (7,) or (envs, 7), or
-            :attr:`command`.
+            (envs, size): :attr:`command`.
         setpoint_rate
             Rate of the setpoint [rad/s or m/s], same shapes, with which the setpoint moves within the tick. Both hold
             at the tick's end: the setpoint of a sim step that begins t before it is ``setpoint - t setpoint_rate``. The
             law damps the velocity error instead of the velocity, and follows this motion with full weight. Controls
-            other than "pid" and "drive" ignore it. With ``setpoint_space="tool"`` it is the twist of the tool in the
-            world (6,) or (envs, 6) [m/s, rad/s].
+            other than "pid" and "drive" ignore it.
         setpoint_acceleration
             Acceleration of the setpoint [rad/s^2 or m/s^2], same shapes, besides its rate: a law with gains per unit of
             inertia adds it to the acceleration that it commands. Other gains take ``feedforward``. Default 0. Where the
@@ -465,8 +463,7 @@ class Runner(SingleOwner):
     @property
     def command(self) -> CommandSpec:
         """Names and units of a setpoint's entries: the joints, or as a controller declares them."""
-        tool = self.options.tool_setpoints
-        return self.options.command if tool is None else tool.command
+        return self.options.command
 
     @property
     def faults(self) -> tuple[Fault, ...]:
@@ -492,7 +489,7 @@ class Runner(SingleOwner):
     @property
     def backend(self) -> str:
         """Library of the law, and kind of the calls into the engine, with the reason if they are not native."""
-        return describe(self.options, self.actuators)
+        return describe(self.options)
 
     @property
     def time(self) -> float:

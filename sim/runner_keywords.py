@@ -63,9 +63,7 @@ class Controller(Protocol):
 
 
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
-SetpointSpace = Literal["joints", "tool"]
 Backend = Literal["numpy", "jax"]
-Precision = Literal["float64", "float32"]
 EngineName = Literal["sapien", "mujoco"]
 DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
 """SAPIEN where it is installed, which is on Linux with x86-64; elsewhere MuJoCo."""
@@ -137,21 +135,14 @@ class RunnerKeywords:
     whose setpoints are poses (7,), a :class:`batchpid.sim.OperationalSpace` with its defaults; or a
     :class:`Controller`."""
     tool: Annotated[str | None, option("snapshot", "recording")] = None
-    """Link that control "osc" and ``setpoint_space`` "tool" move; default the last link of the robot's longest
-    chain."""
-    setpoint_space: Annotated[SetpointSpace, option("snapshot")] = "joints"
-    """``"joints"``, the default, or ``"tool"``: under control "pid" or "drive" setpoints are poses (7,) of the link
-    ``tool``, position and quaternion (w, x, y, z), or poses and the positions of the joints outside the chain to it.
-    Inverse kinematics (:class:`batchpid.sim.tool_space.tool_setpoints.ToolSetpoints`) makes joint setpoints of them,
-    which rollouts and recordings hold."""
+    """Link that control "osc" moves; default the last link of the robot's longest chain."""
     backend: Annotated[
         Backend, option("snapshot", flag="Library of the law: NumPy, or JAX, as one program with the steps.")
     ] = "numpy"
     """Library of the law: ``"numpy"``, the default, or ``"jax"``, which compiles law and sim steps of a tick, and a
-    :class:`Controller`, into one XLA program for the CPU (docs/performance.md). The last bits of results differ between
-    the two, and between processors."""
-    dtype: Annotated[Precision, option("snapshot")] = "float64"
-    """Floating-point type of the law under backend ``"jax"``: ``"float64"``, the default, or ``"float32"``."""
+    :class:`Controller`, into one XLA program for the CPU (docs/performance.md). It needs native code, control "pid",
+    "effort" or a :class:`Controller`, and has no coupled joints, actuators, randomization and guard. The last bits of
+    results differ between the two, and between processors."""
     compensate: Annotated[
         Compensation, option("snapshot", "recording", flag="Passive force and known friction, added at every sim step.")
     ] = "gravity+coriolis+friction"
@@ -204,8 +195,8 @@ class RunnerKeywords:
     """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``; default none. Links that are
     connected by fixed joints count as one. A fixed base is refused. SAPIEN needs ``dissipation="urdf"``."""
     wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
-    """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``; default none. A
-    link on a fixed joint needs a robot with ``merge_fixed=False``, and SAPIEN one with ``dissipation="urdf"``."""
+    """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``; default none.
+    SAPIEN needs ``dissipation="urdf"``."""
     build: Annotated[Callable[[Any, int], Any] | None, option("scene", snapshot="versioned_build")] = None
     """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env. Visuals and lights are
     ignored, so code that was written for a screen runs unchanged. It may return the entities that

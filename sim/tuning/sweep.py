@@ -132,7 +132,7 @@ def sweep(
         return whole
     limits = SetpointCheck(robot)
     limits.check("qpos", robot.coupled(start[0]))
-    if checked.sets_positions and checked.guard is None and checked.tool_setpoints is None:
+    if checked.sets_positions and checked.guard is None:
         rows = read_array("setpoints", setpoints)
         rows = array("setpoints", rows, (*rows.shape[:-1], robot.dof), robot.joint_names, finite=is_finite)
         limits.check("setpoint", robot.coupled(rows))

@@ -55,7 +55,7 @@ def quick(name):
 
 def go_on(runner):
     """Return the next observations, and the final poses of the boxes."""
-    pose = runner.options.command.size > 2 or runner.options.setpoint_space == "tool"
+    pose = runner.options.command.size > 2
     start = runner.observe()
     seen = []
     for _ in range(5):

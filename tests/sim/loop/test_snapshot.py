@@ -166,7 +166,6 @@ DAMAGES = {
     "envs as text": about(num_envs="2"),
     "fewer joints": about(joints=["a"]),
     "a randomization without episodes": about(randomization={}),
-    "a tool without targets": about(setpoint_space="tool"),
     "no integral": array("controller.integral", None),
     "no start": array("containment.start_qvel", None),
     "no state": array("engine", None),
@@ -251,10 +250,10 @@ def test_a_file_holds_the_state_of_every_part(options: Any, tmp_path: Path) -> N
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Snapshot of a runner with episodes and targets."""
+    """Snapshot of a runner with episodes."""
     path = tmp_path_factory.mktemp("snapshot") / "drawn.npz"
     randomization = Randomization(payload=Uniform(0, 0.5))
-    with make(setpoint_space="tool", tool="hand", randomization=randomization, params=None) as runner:
+    with make(randomization=randomization) as runner:
         runner.snapshot().save(path)
     return path
 
@@ -267,13 +266,9 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
         array("episodes", lambda rows: rows - 9),
         array("episodes", None),
         about(randomization=None),
-        array("targets", lambda rows: rows[:1]),
-        array("targets", lambda rows: rows * np.nan),
-        array("targets", None),
-        about(setpoint_space="joints"),
     ],
 )
-def test_episodes_and_targets_that_do_not_agree_are_refused(drawn: Path, damage: Any, tmp_path: Path) -> None:
+def test_episodes_that_do_not_agree_are_refused(drawn: Path, damage: Any, tmp_path: Path) -> None:
     parts = read(drawn)
     assert Snapshot.load(write(tmp_path / "rewritten.npz", *parts)).episodes.shape == (N, 2)
     damage(*parts)
