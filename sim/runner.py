@@ -414,9 +414,8 @@ class Runner(SingleOwner):
         - ``workers``, ``cluster`` and ``timeout``, which change no result;
         - ``substeps`` and ``on_invalid_input``, which apply to the commands that follow.
 
-        A controller or ``build`` of the caller's own counts by its code, constants, closure and attributes, and by the
-        globals that it names, as they are when the runner is made. So snapshots of an edited function are refused, and
-        of another version of Python. Make a new controller for each runner if calls change its attributes.
+        A controller of the caller's own counts by its class, ``build`` by its name, and both by their attribute
+        ``version``, if they have one.
 
         Raises
         ------
@@ -490,7 +489,7 @@ class Runner(SingleOwner):
     @property
     def backend(self) -> str:
         """Library of the law, and kind of the calls into the engine, with the reason if they are not native."""
-        return describe(self.options, self.actuators)
+        return describe(self.options)
 
     @property
     def time(self) -> float:
