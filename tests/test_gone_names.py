@@ -11,6 +11,16 @@ ROOT = Path(__file__).resolve().parents[1]
 GONE = (
     # one a line, as a regular expression; sorted
     r"--viewer",
+    r"\bPush-v0\b",
+    r"\bPushEnv\b",
+    r"\bToolReach-v0\b",
+    r"\bToolVectorEnv\b",
+    r"\bWalk-v0\b",
+    r"\bWalkEnv\b",
+    r"batchpid\.sim\.gym\.(push|walk|tool_vector_env|stable_baselines3)",
+    r"batchpid\[sb3\]",
+    r"bench/(accuracy|circles|film|motions|newcomer|trajectories|view)\.py",
+    r"make accuracy",
     r"\bRenderError\b",
     r"\bapply_set\b",
     r"\bcheck_renderer\b",
