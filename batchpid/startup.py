@@ -15,7 +15,7 @@ IMPORTED = """
     msgspec mujoco multiprocessing numbers numpy operator os pathlib pickle PIL platform queue random ray re reprlib
     resource rosbags ruckig sapien scipy secrets select shutil signal socket ssl stable_baselines3 stat statistics
     string struct subprocess tabulate tempfile textwrap threading token tokenize tqdm traceback trimesh types typing
-    tyro urllib uuid viser warnings weakref websockets xarray yaml zipfile zlib
+    tyro urllib uuid viser warnings weakref websockets yaml zipfile zlib
 """.split()  # noqa: SIM905
 """Modules that this project imports, and some that these import."""
 

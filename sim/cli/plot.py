@@ -13,18 +13,18 @@ from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Rollout, read_recording
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, bar, beside, stem
+from batchpid.sim.cli.outputs import OutputFiles, bar, beside
 
 
 @dataclass(frozen=True)
 class PlotCommand:
     """Draw a recorded run, or compare it with another one.
 
-    The recording may be complete, cut short by a kill (``NAME.h5.partial``), or still being written.
+    The recording may be complete, cut short by a kill, or still being written.
     """
 
     recording: tyro.conf.Positional[Path]
-    """File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote: .npz or .h5."""
+    """File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote, .h5."""
     versus: flags.OptionalPath = None
     """Another recording, to compare with."""
     kind: Literal["responses", "efforts"] = "responses"
@@ -34,7 +34,7 @@ class PlotCommand:
     every: Annotated[int, Field(low=1, high=1e9)] = 1
     """Draw only every n-th tick, for long recordings."""
     picture: flags.OptionalPath = None
-    """Picture to draw: .png or .svg. Default: next to the recording NAME.npz, NAME-responses.png, NAME-efforts.png, or
+    """Picture to draw: .png or .svg. Default: next to the recording NAME.h5, NAME-responses.png, NAME-efforts.png, or
     NAME-versus-OTHER.png."""
     force: flags.Force = False
 
@@ -46,7 +46,7 @@ class PlotCommand:
 
         if not self.recording.is_file():  # before a picture is named after it
             read_recording(self.recording)
-        shown = self.kind if self.versus is None else f"versus-{stem(self.versus)}"
+        shown = self.kind if self.versus is None else f"versus-{self.versus.stem}"
         outputs = OutputFiles(force=self.force, inputs=(self.recording, self.versus))
         picture = outputs.path("picture", self.picture or beside(self.recording, shown), plots.FORMATS)
         rollout = _read(self.recording, self.every)
@@ -77,7 +77,7 @@ class RenderCommand:
     """
 
     recording: tyro.conf.Positional[Path]
-    """File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote: .npz or .h5."""
+    """File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote, .h5."""
     robot: flags.RecordedRobot = None
     num_envs: flags.ShownEnvs = 16
     """Number of envs to show, the first ones; 64 at most."""
@@ -88,7 +88,7 @@ class RenderCommand:
     """Height of the film [pixels]."""
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
-    """Film to write: .mp4 or .gif. Default: next to the recording NAME.npz, NAME-film.mp4."""
+    """Film to write: .mp4 or .gif. Default: next to the recording NAME.h5, NAME-film.mp4."""
     force: flags.Force = False
 
     imports = ("batchpid.sim.view.film",)

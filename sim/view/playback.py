@@ -57,7 +57,7 @@ class Playback:
 
     def info_of(self, robot: int) -> RunInfo:
         """Return the options of the run of one robot."""
-        return self._rollout.info.for_envs([robot])
+        return self._rollout.info.for_envs(np.array([robot]))
 
     def effort_limits(self, robot: int, joint: int) -> tuple[float, float]:
         """Return the effort limits in the URDF [N m or N]."""

@@ -71,8 +71,8 @@ def test_film_of_a_recording(tmp_path):
     """Robots with a floating base are drawn where they are: the second picture is of robots that fell."""
     film, path, robot = load_script("film"), tmp_path / "fall.gif", Robot.load("quadruped", fixed_base=False)
     with Runner(robot, 4, params=robot.params(kp=1.0), workers=0, compensate="none") as runner:
-        write_recording(runner.rollout(np.tile(robot.start, (31, 1))), tmp_path / "fall.npz")
-    film.main(film.Options(path, seconds=0.31, interval=0.3, recording=tmp_path / "fall.npz"))
+        write_recording(runner.rollout(np.tile(robot.start, (31, 1))), tmp_path / "fall.h5")
+    film.main(film.Options(path, seconds=0.31, interval=0.3, recording=tmp_path / "fall.h5"))
     with Image.open(path) as pictures:
         heights = []
         for at in range(pictures.n_frames):

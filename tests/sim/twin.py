@@ -164,10 +164,6 @@ class Twin:
             ours, theirs = (self._folder / f"{name}{self._files}.h5" for name in ("ours", "theirs"))
             disturb(lambda: Recorder(ours, self.runner))
             if self.runner.recorder is None:
-                deadline = time.monotonic() + 5.0
-                while ours.with_name(ours.name + ".partial").exists() and time.monotonic() < deadline:
-                    time.sleep(1e-3)
-                assert not ours.exists()
                 Recorder(ours, self.runner)
             Recorder(theirs, self._model)
             self._recorders = self.runner.recorder, self._model.recorder
@@ -180,7 +176,6 @@ class Twin:
             assert ours.info.complete
             assert len(ours.time) == len(theirs.time)
             assert_identical(ours, theirs)
-            assert not recorders[0].partial.exists()
 
     def reopen(self, disturb: Disturbance = undisturbed) -> None:
         """Close the runner, and go on with another one from a snapshot."""

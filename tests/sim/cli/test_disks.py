@@ -12,7 +12,7 @@ from disks import fill, limited_file_size, make_read_only, small_disk
 from tiny_urdf import one_joint, write
 
 import batchpid as bp
-from batchpid.sim import Recorder, Runner, Snapshot, plots, write_recording
+from batchpid.sim import Runner, Snapshot, plots, write_recording
 from batchpid.sim.cli import outputs
 from batchpid.sim.cli import run as cli_run
 from batchpid.sim.tuning import robot_survey as surveying
@@ -22,8 +22,6 @@ SHORT = ("--num-envs", "1", "--workers", "0", "--seconds", "0.02")
 TUNE = ("tune", "--generations", "1", "--population", "4", "--search-seconds", "0.05", "--workers", "0")
 COMMANDS = {
     "demo": (("demo", *SHORT, "--picture"), "a.png"),
-    "rollout npz": (("rollout", *SHORT, "--out"), "a.npz"),
-    "rollout h5": (("rollout", *SHORT, "--out"), "a.h5"),
     "rollout picture": (("rollout", *SHORT, "--picture"), "a.svg"),
     "plot": (("plot", "RUN", "--picture"), "a.png"),
     "render": (("render", "RUN", "--fps", "120", "--width", "64", "--height", "64", "--out"), "a.mp4"),
@@ -37,7 +35,7 @@ COMMANDS = {
 SECOND = ("rollout picture", "survey json", "tune picture")
 """Other outputs of a command that is in the table already."""
 ROWS = [pytest.param(name, marks=pytest.mark.slow if name in SECOND else ()) for name in COMMANDS]
-NEEDS = {"rollout h5": "h5py", "render": "imageio_ffmpeg", "tune": "cmaes", "tune picture": "cmaes"}
+NEEDS = {"render": "imageio_ffmpeg", "tune": "cmaes", "tune picture": "cmaes"}
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +64,7 @@ def command(batchpid, rollout, tmp_path, monkeypatch):
     """Function that runs a command of the table with its output in a folder and returns (exit status, stderr)."""
     monkeypatch.setattr(renderer, "render_problem", lambda: None)
     monkeypatch.setattr(film, "RenderScene", Grey)
-    run = write_recording(rollout, tmp_path / "run.npz")
+    run = write_recording(rollout, tmp_path / "run.h5")
     urdf = write(tmp_path, one_joint(), "one_joint.urdf")
 
     def run_it(name: str, path: Path) -> tuple[int, str]:
@@ -157,11 +155,11 @@ def run_while_filling(command, name: str, disk: Path, free: int, monkeypatch) ->
     else:
         assert path.read_bytes() != b"older"
     left = {each.name for each in disk.iterdir()} - {path.name, "filler"}
-    assert left <= ({"a.h5.partial"} if name.endswith("h5") else {"a.search.json"} if name == "tune" else set())
+    assert left <= ({"a.search.json"} if name == "tune" else set())
     return status
 
 
-@pytest.mark.parametrize("name", ["rollout npz", "rollout h5", pytest.param("plot", marks=pytest.mark.slow), "render"])
+@pytest.mark.parametrize("name", [pytest.param("plot", marks=pytest.mark.slow), "render"])
 def test_a_disk_that_fills_up_during_the_run_keeps_the_older_file(name, command, tmp_path, monkeypatch):
     with small_disk(tmp_path / "disk", 1 << 16) as disk:
         assert run_while_filling(command, name, disk, 0, monkeypatch) == 2
@@ -200,9 +198,7 @@ def test_a_disk_with_any_space_left_keeps_the_older_file_or_holds_the_new_one(na
 WRITERS: dict[str, tuple[str, Callable]] = {
     "params": ("a.yaml", lambda runner, rollout, path: bp.save_params(path, runner.params, runner.robot.joint_names)),
     "snapshot": ("a.npz", lambda runner, rollout, path: runner.snapshot().save(path)),
-    "recording": ("a.npz", lambda runner, rollout, path: write_recording(rollout, path, overwrite=True)),
-    "HDF5": ("a.h5", lambda runner, rollout, path: write_recording(rollout, path, overwrite=True)),
-    "recorder": ("a.h5", lambda runner, rollout, path: Recorder(path, runner, overwrite=True).close()),
+    "recording": ("a.h5", lambda runner, rollout, path: write_recording(rollout, path, overwrite=True)),
     "picture": ("a.png", lambda runner, rollout, path: plots.save(plots.efforts(rollout), path)),
     "drawing": ("a.svg", lambda runner, rollout, path: plots.save(plots.efforts(rollout), path)),
 }
@@ -214,8 +210,6 @@ WRITERS: dict[str, tuple[str, Callable]] = {
 )
 @pytest.mark.parametrize("make", [fill, make_read_only], ids=["full", "read-only"])
 def test_a_call_that_cannot_write_raises_an_error_of_the_system(make, name, panda, rollout, tmp_path):
-    if name in ("HDF5", "recorder"):
-        pytest.importorskip("h5py")
     file, write = WRITERS[name]
     with Runner(panda, 1, workers=0) as runner, small_disk(tmp_path / "disk", 1 << 16) as disk:
         (path := disk / file).write_text("older")
@@ -224,5 +218,4 @@ def test_a_call_that_cannot_write_raises_an_error_of_the_system(make, name, pand
         with pytest.raises(OSError, match=r"No space left|Read-only"):
             write(runner, rollout, path)
         assert contents(disk) == before
-        assert runner.recorder is None
         assert isinstance(runner.snapshot(), Snapshot)

@@ -28,7 +28,7 @@ HAVE = {
     "--picture": {"demo", "rollout", "tune", "compare", "identify", "parity", "plot"},
     "--package-dirs": COMMANDS.keys() - {"plot"},
     "--missing-meshes": COMMANDS.keys() - {"plot"},
-    "--resume": {"rollout", "tune", "identify"},
+    "--resume": {"tune", "identify"},
 }
 """Commands in which a flag has a meaning."""
 SEVERAL = {("compare", "--gains"), ("compare", "--engine")}
@@ -143,8 +143,7 @@ def written(folder: Path) -> set[Path]:
         ("rollout --control osc --gains tuned", "gains: is not a file, and --control osc has no gains by name"),
         ("rollout --tool panda_hand", "tool: is for control 'osc'"),
         ("rollout --substeps 0", "substeps: out of range"),
-        ("rollout --resume", "resume: has no file to continue"),
-        ("rollout --resume --out a.npz", "out: unknown file format"),
+        ("rollout --out a.npz", "out: unknown file format"),
         ("rollout --gains tunned", "did you mean 'tuned'?"),
         ("tune --tool arm", "tool: is for --control osc"),
         ("tune --control osc --per-joint", "per_joint: is not available with --control osc"),
@@ -155,11 +154,11 @@ def written(folder: Path) -> set[Path]:
         ("compare --gains tuned --picture x.png", "gains: names a single set"),
         ("compare --engine", "engine: is missing"),
         ("identify arm.urdf", "logs: are missing"),
-        ("identify arm.urdf run.npz", "fit its setpoints"),
-        ("identify arm.urdf run.npz --evaluations 0", "evaluations: is 0"),
-        ("identify arm.urdf run.npz --actuators a.yaml", "actuators: are not the start of a fit"),
-        ("identify arm.urdf run.npz --evaluations 0 --actuators a.yaml --out b.yaml", "out: is for a fit"),
-        ("identify arm.urdf run.npz --evaluations 0 --actuators a.yaml --extras slew", "extras: is for"),
+        ("identify arm.urdf run.h5", "fit its setpoints"),
+        ("identify arm.urdf run.h5 --evaluations 0", "evaluations: is 0"),
+        ("identify arm.urdf run.h5 --actuators a.yaml", "actuators: are not the start of a fit"),
+        ("identify arm.urdf run.h5 --evaluations 0 --actuators a.yaml --out b.yaml", "out: is for a fit"),
+        ("identify arm.urdf run.h5 --evaluations 0 --actuators a.yaml --extras slew", "extras: is for"),
         ("export panda --gains drive", "gains: are a drive's"),
         ("inspect panda2", "'panda2'"),
         ("inspect --gains nothing", "gains: is neither"),
@@ -173,7 +172,7 @@ def written(folder: Path) -> set[Path]:
         ("view --control", "controls: out of range (got 0)"),
         ("view --port 99999", "port: out of range (got 99999)"),
         ("view --num-envs 65", "num_envs: out of range"),
-        ("view --play nothing.npz", "nothing.npz: there is no such file"),
+        ("view --play nothing.h5", "there is no such file"),
     ],
 )
 def test_flags_that_contradict_each_other_are_answered_in_one_line(words, message, files, batchpid, monkeypatch):  # noqa: F811

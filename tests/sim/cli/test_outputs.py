@@ -22,15 +22,15 @@ WORDS = {
     "parity": ("parity", "arm.urdf"),
     "excite": ("excite", "arm.urdf"),
     "export": ("export", "arm.urdf"),
-    "identify": ("identify", "arm.urdf", "run.npz"),
+    "identify": ("identify", "arm.urdf", "run.h5"),
     "inspect": ("inspect", "arm.urdf"),
     "survey": ("survey", "arm.urdf"),
-    "plot": ("plot", "run.npz"),
-    "render": ("render", "run.npz"),
+    "plot": ("plot", "run.h5"),
+    "render": ("render", "run.h5"),
 }
 """Words of each command that writes, without its outputs."""
 SUFFIXES = {"picture": ".png", "json": ".json", "out": ".yaml"}
-OUT = {"rollout": ".npz", "excite": ".csv", "export": ".h", "survey": ".md", "render": ".mp4"}
+OUT = {"rollout": ".h5", "excite": ".csv", "export": ".h", "survey": ".md", "render": ".mp4"}
 
 
 def output_flags() -> list[tuple[str, str]]:
@@ -46,7 +46,7 @@ def files(tmp_path_factory):
     robot = Robot.load(write(folder, one_joint(), "arm.urdf"))
     with Runner(robot, 1, workers=0, substeps=10) as runner:
         rollout = runner.rollout(np.tile(robot.start, (60, 1, 1)))
-    write_recording(rollout, folder / "run.npz")
+    write_recording(rollout, folder / "run.h5")
     return folder
 
 
@@ -85,15 +85,15 @@ def test_every_command_with_outputs_has_force():
 @pytest.mark.usefixtures("empty_pictures")
 def test_default_names_say_what_they_show(files, batchpid, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "run.npz").write_bytes((files / "run.npz").read_bytes())
+    (tmp_path / "run.h5").write_bytes((files / "run.h5").read_bytes())
     (tmp_path / "run.png").write_text("kept")
-    for words in ((), ("--kind", "efforts"), ("--versus", files / "run.npz")):
-        status, _, complaint = batchpid("plot", "run.npz", *words)
+    for words in ((), ("--kind", "efforts"), ("--versus", files / "run.h5")):
+        status, _, complaint = batchpid("plot", "run.h5", *words)
         assert status == 0, complaint
-        status, _, complaint = batchpid("plot", "run.npz", *words)
+        status, _, complaint = batchpid("plot", "run.h5", *words)
         assert "exists already" in complaint
-        assert batchpid("plot", "run.npz", *words, "--force")[0] == 0
-    names = {"run.npz", "run.png", "run-responses.png", "run-efforts.png", "run-versus-run.png"}
+        assert batchpid("plot", "run.h5", *words, "--force")[0] == 0
+    names = {"run.h5", "run.png", "run-responses.png", "run-efforts.png", "run-versus-run.png"}
     assert {path.name for path in tmp_path.iterdir()} == names
     assert (tmp_path / "run.png").read_text() == "kept"
 
@@ -111,7 +111,7 @@ def test_the_demo_can_be_repeated_for_another_robot_and_with_force(batchpid, tmp
 
 
 def test_inputs_are_never_replaced_and_no_two_outputs_are_one_file(files, batchpid, tmp_path):
-    arm, recording = files / "arm.urdf", files / "run.npz"
+    arm, recording = files / "arm.urdf", files / "run.h5"
     (path := tmp_path / "motors.yaml").write_text("kept")
     (link := tmp_path / "link.yaml").symlink_to(path)
     for each in (path, link, tmp_path / "." / "motors.yaml"):

@@ -24,25 +24,25 @@ BATCHPID = f"{sys.executable} -m batchpid"
 SHORT = "--num-envs 2 --workers 1 --seconds 0.3"
 RUNS = {
     "demo": f"demo {SHORT} --force --picture out/a.png",
-    "rollout": f"rollout {SHORT} --force --out out/a.npz --picture out/b.png",
+    "rollout": f"rollout {SHORT} --force --out out/a.h5 --picture out/b.png",
     "tune": "tune arm.urdf --generations 1 --population 4 --search-seconds 0.05 --workers 1 --force --out out/a.yaml",
     "compare": "compare arm.urdf --moves 1 --workers 1 --seconds 0.3 --force --picture out/a.png",
     "parity": "parity arm.urdf --moves 1 --seconds 0.3 --workers 0 --force --json out/a.json --picture out/a.png",
     "excite": "excite arm.urdf --duration 1 --force --out out/a.csv",
     "export": "export arm.urdf --force --out out/a.h",
-    "identify": "identify arm.urdf log.npz --params gains.yaml --evaluations 1 --no-payload --workers 0 --force "
+    "identify": "identify arm.urdf log.h5 --params gains.yaml --evaluations 1 --no-payload --workers 0 --force "
     "--out out/a.yaml",
     "inspect": "inspect panda --all",
     "survey": "survey arm.urdf --moves 1 --seconds 0.1 --workers 1 --force --json out/a.json --out out/a.md",
-    "plot": "plot run.npz --force",
+    "plot": "plot run.h5 --force",
     "view": "view --num-envs 1 --workers 1 --port 18700 --time-limit 1",
-    "render": "render run.npz --force --out out/a.mp4",
+    "render": "render run.h5 --force --out out/a.mp4",
 }
 """A short run of each command."""
 UNDISTURBED = {name: {0, 2} if name == "render" else {0} for name in RUNS}
 """Exit statuses of these runs; 2 where this machine cannot render."""
-INPUTS = {"arm.urdf", "gains.yaml", "run.npz", "log.npz"}
-WRITTEN = (".yaml", ".search.json", "-tune.png", ".fit.json", "-fit.png", ".png", ".npz", ".json", ".md", ".csv", ".h")
+INPUTS = {"arm.urdf", "gains.yaml", "run.h5", "log.h5"}
+WRITTEN = (".yaml", ".search.json", "-tune.png", ".fit.json", "-fit.png", ".png", ".h5", ".json", ".md", ".csv", ".h")
 MOMENTS = int(os.environ.get("BATCHPID_SOAK_MOMENTS", "4"))
 """Number of interrupts of each command."""
 
@@ -91,8 +91,8 @@ def folder(tmp_path):
     robot = Robot.load(write(tmp_path, one_joint(), "arm.urdf"))
     save_params(tmp_path / "gains.yaml", robot.designed("effort"), robot.joint_names)
     line = f"{BATCHPID} rollout --num-envs 1 --workers 0"
-    log = "arm.urdf --gains gains.yaml --seconds 1 --setpoint 0.3 --out log.npz"
-    for words in ("--seconds 0.05 --out run.npz", log):
+    log = "arm.urdf --gains gains.yaml --seconds 1 --setpoint 0.3 --out log.h5"
+    for words in ("--seconds 0.05 --out run.h5", log):
         assert shell(f"{line} {words}", tmp_path)[0] == 0
     return tmp_path
 

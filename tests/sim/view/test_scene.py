@@ -56,7 +56,7 @@ def test_a_page_shows_the_ground_of_the_runner_and_of_the_recording(options, gro
     assert live.ground is live.frame().info.ground is ground
     with Runner(hanging, 1, workers=0, **options) as runner:
         rollout = runner.rollout(np.zeros((1, 1)))
-    read = read_recording(write_recording(rollout, tmp_path / "run.npz"))
+    read = read_recording(write_recording(rollout, tmp_path / "run.h5"))
     assert Playback(read, hanging).ground is ground
 
 

@@ -38,11 +38,11 @@ class Tape:
     def __init__(self):
         self.ticks = []
 
-    def wait(self):
+    def prepare(self):
         pass
 
-    def append(self, time_, setpoint, observation, has_rates):
-        self.ticks.append((time_, setpoint, observation))
+    def append(self, time_, command, observation):
+        self.ticks.append((time_, command.setpoint, observation))
 
 
 def program(runner, disturb=lambda: None):
