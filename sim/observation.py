@@ -444,8 +444,8 @@ class Rollout:
     def _mapped(self, function: Callable[[Rows], Rows], **others: Any) -> Rollout:
         """Return a rollout with ``function`` applied to each array but the times, and with other fields."""
         feedforward = None if self.feedforward is None else function(self.feedforward)
-        arrays = {"setpoint": function(self.setpoint), "feedforward": feedforward}
-        return replace(self, observation=self.observation.map(function), **arrays, **others)
+        seen = self.observation.map(function)
+        return replace(self, setpoint=function(self.setpoint), observation=seen, feedforward=feedforward, **others)
 
     @staticmethod
     def join(parts: Sequence[Rollout]) -> Rollout:
@@ -460,15 +460,14 @@ class Rollout:
         if not parts:
             raise InvalidArgumentError("parts", "are empty", remedy="give one rollout or more")
         first = parts[0]
-        columns = {"tick": [part.tick for part in parts], "num_envs": [part.num_envs for part in parts]}
+        odd = [name for name in ("tick", "num_envs") if len({getattr(part, name) for part in parts}) > 1]
         joined = {}
         for name, rule in RULES.items():
             values = [getattr(part.info, name) for part in parts]
-            if rule.join is None:
-                columns[name] = values
-            else:
+            if rule.join is not None:
                 joined[name] = rule.join(values)
-        odd = [name for name, (one, *others) in columns.items() if not all(_is_equal(one, other) for other in others)]
+            elif not all(_is_equal(values[0], value) for value in values):
+                odd.append(name)
         if odd:
             raise InvalidArgumentError("parts", f"differ in {', '.join(odd)}", remedy="join parts of one run")
         feedforward = None

@@ -17,6 +17,21 @@ GONE = (
     "sim[.]sweep",
     "to_dataset",
     "xarray",
+    r"--duration\b",
+    r"--search-seconds",
+    r"--variation",
+    r"--within",
+    r"ToolTuning",
+    r"batchpid parity",
+    r"batchpid render",
+    r"batchpid tune --resume",
+    r"compare_engines",
+    r"engine_differences",
+    r"engine_parity",
+    r"tool_candidates",
+    r"tool_search",
+    r"tune_tool",
+    r"usual_variation",
 )
 FILES = [
     path

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles
+from batchpid.sim.cli.outputs import FOLDER, OutputFiles
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class ExciteCommand:
     """
 
     robot: flags.RobotName = "panda"
-    seconds: Annotated[float, Field("s", low=1.0, high=3600.0), tyro.conf.arg(aliases=("--duration",))] = 10.0
+    seconds: Annotated[float, Field("s", low=1.0, high=3600.0)] = 10.0
     """Duration of the motion [s]."""
     rate: Annotated[float, Field("Hz", low=20.0, high=10_000.0)] = 500.0
     """Rows per second [Hz]."""
@@ -49,9 +48,9 @@ class ExciteCommand:
         from batchpid.sim.identification.excitation import excite
         from batchpid.sim.identification.setpoint_files import setpoint_csv
 
+        out = self.out or FOLDER / f"{Path(self.robot).stem}.excite.csv"
+        out = OutputFiles(self).path("out", out, (".csv",))
         robot = Robot.load(self.robot, **vars(self.meshes))
-        out = self.out or Path(f"out/{robot.path.stem}.excite.csv")
-        out = OutputFiles(force=self.force).path("out", out, (".csv",))
         motion = excite(robot, self.seconds, rate=self.rate, lowest=self.lowest, highest=self.highest, seed=self.seed)
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, setpoint_csv(robot, motion))

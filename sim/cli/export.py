@@ -12,7 +12,7 @@ from batchpid.arrays.array_types import Document
 from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles
+from batchpid.sim.cli.outputs import FOLDER, OutputFiles
 
 if TYPE_CHECKING:
     import batchpid as bp
@@ -93,14 +93,14 @@ class ExportCommand:
         from batchpid.sim.robot.urdf_export import to_urdf
         from batchpid.sim.tuning.gain_sets import gain_set
 
+        out = self.out or FOLDER / f"{Path(self.robot).stem}{FILES[self.to]}"
+        outputs = OutputFiles(self)
+        out = outputs.path("out", out, (Path(FILES[self.to]).suffix,))
+        others = {name: outputs.path("out", out.with_name(name), ()) for name in PROJECT if self.project}
         known = {name for names in USED.values() for name in names}
         unused = [each.name for each in fields(self) if each.name in known.difference(USED[self.to])]
         flags.refuse(self, unused, f"has no effect with --to {self.to}")
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
-        out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
-        outputs = OutputFiles(force=self.force)
-        out = outputs.path("out", out, (Path(FILES[self.to]).suffix,))
-        others = {name: outputs.path("out", out.with_name(name), ()) for name in PROJECT if self.project}
         if self.to == "urdf":
             exported = to_urdf(robot, out.absolute().parent)
             content = f"{robot.name}, {robot.dof} joints, without need of repair"

@@ -12,13 +12,13 @@ from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import AT_MOST, OutputFiles, bar, beside, write_figures
+from batchpid.sim.cli.outputs import AT_MOST, FOLDER, OutputFiles, bar, beside, write_figures
 
 if TYPE_CHECKING:
     from batchpid.sim.identification.log import Log
     from batchpid.sim.identification.result import Identification
 
-OF_FIT = ("no_payload", "extras", "seed", "workers", "resume", "corrected_urdf", "picture")
+OF_FIT = ("no_payload", "extras", "seed", "workers", "corrected_urdf", "picture")
 """Options that a fit alone has, besides its files."""
 Logs = Annotated[
     tuple[Path, ...],
@@ -40,7 +40,7 @@ class IdentifyCommand:
 
     robot: flags.RobotName = "panda"
     logs: Logs = ()
-    gains: Annotated[flags.OptionalName, tyro.conf.arg(metavar="NAME|FILE", aliases=("--params",))] = None
+    gains: Annotated[flags.OptionalName, tyro.conf.arg(metavar="NAME|FILE")] = None
     """Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file as for --gains of
     other commands. Without it the logs' efforts are used."""
     compensate: Annotated[flags.Compensate | None, tyro.conf.arg(metavar="FORCES")] = None
@@ -82,8 +82,6 @@ class IdentifyCommand:
     """Seed of CMA-ES, which finds the start of the fit. The result does not depend on the number of workers."""
     workers: flags.Workers = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
-    resume: flags.Switch = False
-    """Continue a fit with the same options that was stopped."""
     out: flags.OptionalPath = None
     """Actuators file to write: .yaml or .json. Default: out/ROBOT.actuators.yaml."""
     json: flags.Json = None
@@ -110,18 +108,17 @@ class IdentifyCommand:
         from batchpid.sim.identification.identification import identify
         from batchpid.sim.identification.log_lists import gains_of
 
-        robot = Robot.load(self.robot, **vars(self.meshes))
         if not self.logs:
             raise InvalidArgumentError("logs", "are missing", remedy="name one file or more after the robot")
-        if self.actuators is not None:
-            return self._judge(robot, self.actuators)
-        out = self.out or Path(f"out/{robot.path.stem}.actuators.yaml")
-        outputs = OutputFiles(force=self.force, inputs=(None if self.gains is None else Path(self.gains), *self.logs))
+        out = self.out or FOLDER / f"{Path(self.robot).stem}.actuators.yaml"
+        outputs = OutputFiles(self)
         out = outputs.path("out", out, (".yaml", ".yml", ".json"))
         details = outputs.path("json", self.json, (".json",))
         corrected = outputs.path("corrected_urdf", self.corrected_urdf, (".urdf",))
         picture = outputs.path("picture", self.picture or beside(out, "fit"), plots.FORMATS)
-        history = outputs.history(out.with_suffix(".fit.json"), resume=self.resume)
+        robot = Robot.load(self.robot, **vars(self.meshes))
+        if self.actuators is not None:
+            return self._judge(robot, self.actuators)
         params = None if self.gains is None else gains_of(robot, self.gains)
         logs = self._logs(robot)
         if self.evaluations == 0:
@@ -134,7 +131,6 @@ class IdentifyCommand:
             params=params,
             payload=not self.no_payload,
             **flags.chosen(self, "compensate timestep sim_steps hold extras evaluations seed workers"),
-            history=history,
             progress=bar("identifying", bar_format=AT_MOST),
         )
         print(report(found))
@@ -160,7 +156,6 @@ class IdentifyCommand:
         errors = [plots.FitErrors(*fit[1:]) for fit in found.fits if fit.log == 0]
         title = f"{robot.name}: position error, shaded where it was not fitted"
         print(f"picture: {plots.save(plots.fit_errors(errors, names, units, title), picture)}")
-        history.unlink(missing_ok=True)
 
     def _judge(self, robot: Robot, actuators: Path) -> None:
         """Print the error of an actuators file."""

@@ -160,6 +160,7 @@ class Recorder(SingleOwner):
         tick = runner.timestep * runner.substeps
         try:
             if self._file is None:
+                assert self._info is not None
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 self._file = h5py.File(self.path, self._mode, libver=files.LIBVER, locking=False)
                 self._datasets = files.create_datasets(self._file, self._info, runner.num_envs, tick)

@@ -161,7 +161,7 @@ def create_datasets(file: h5py.File, info: RunInfo, num_envs: int, tick: float) 
     return datasets
 
 
-def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Mapping[str, Rows | None]) -> None:
+def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Mapping[str, Any]) -> None:
     """Write ``arrays``, ticks first, from row ``first`` on; it can be repeated if it was interrupted."""
     time = datasets["time"]
     end = first + len(arrays["time"])
