@@ -33,11 +33,11 @@ from batchpid.sim.observation import Observation, Rollout, RunInfo, register_fin
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.ray_options import ClusterWarning, Ray
+from batchpid.sim.ray_options import Ray
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
 from batchpid.sim.robot.description import Dynamics, RobotDescription, register_dynamics
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.findings import Finding, RepairWarning
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.run_checks import MovingSetpointWarning, SetpointWarning
@@ -54,7 +54,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Choice",
-    "ClusterWarning",
     "CommandSpec",
     "Controller",
     "Fault",
@@ -74,6 +73,7 @@ __all__ = [
     "Recorder",
     "RecordingError",
     "RecoveryWarning",
+    "RepairWarning",
     "Robot",
     "Rollout",
     "RunInfo",

@@ -198,8 +198,6 @@ class RunInfo:
     """Text of the robot description."""
     dissipation: str | None = None
     """Source of joint friction and damping: "urdf" or "sapien"."""
-    merge_fixed: bool | None = None
-    """True if links that fixed joints connect were simulated as one."""
     fixed_base: bool | None = None
     """False if the base floats."""
     timestep: float | None = None

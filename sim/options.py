@@ -45,7 +45,6 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 from batchpid.sim.runner_keywords import OPTIONS, Controller, ControlMode, Place, RunnerKeywords, checked_option
 from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
-from batchpid.sim.tool_space.tool_setpoints import ToolSetpoints
 
 IDEAL = bp.Actuators()
 """Actuators without any effect."""
@@ -76,13 +75,11 @@ class RunnerOptions(RunnerKeywords):
         super().__post_init__()
         own, given = vars(self), dict(vars(self))
         robot = instance("robot", self.robot, Robot, "load one with Robot.load('panda') or a URDF path")
-        own["control"] = _control(self.control, robot, given["tool"], self.setpoint_space)
+        own["control"] = _control(self.control, robot, given["tool"])
         if given["ground"] is None:
             own["ground"] = self.collisions and self._has_ground
         if isinstance(self.control, OperationalSpace):
             own["control"], own["tool"] = self.control.in_runner(self.timestep, self.compensate), self.control.link
-        if self.tool_setpoints is not None:
-            own["tool"] = self.tool_setpoints.link
         own["workers"], own["cluster"] = _places(self.workers, given["cluster"])
         if self.backend == "numpy" and self.dtype != "float64":
             raise InvalidArgumentError(
@@ -129,11 +126,10 @@ class RunnerOptions(RunnerKeywords):
 
     def _check_tree(self) -> None:
         """Raise InvalidArgumentError for options that need a kinematic tree, if the robot has closed loops."""
-        needs = {"control": isinstance(self.control, OperationalSpace), "setpoint_space": self.setpoint_space == "tool"}
-        for argument in [name for name, given in needs.items() if given and self.loops]:
+        if self.loops and isinstance(self.control, OperationalSpace):
             problem = f"needs a kinematic tree, and {', '.join(self.loops)} of the file closes a loop of links"
             remedy = "control the joints, or remove the equality constraint"
-            raise InvalidArgumentError(argument, problem, value=getattr(self, argument), remedy=remedy)
+            raise InvalidArgumentError("control", problem, value=self.control, remedy=remedy)
 
     @property
     def mjcf(self) -> MjcfFile | None:
@@ -184,7 +180,7 @@ class RunnerOptions(RunnerKeywords):
         if self.engine_name == "sapien" and robot.dissipation == "sapien":
             problem = "need a robot without SAPIEN's link damping, which acts like a contact"
             raise InvalidArgumentError(option, problem, remedy="load the robot with dissipation='urdf'")
-        bodies = place_links(robot.urdf, robot.merge_fixed)
+        bodies = place_links(robot.urdf, links if option == "wrenches" else ())
         root = next(at.link for at in bodies.values())
         for link in links:
             if link not in known:
@@ -193,9 +189,6 @@ class RunnerOptions(RunnerKeywords):
             if bodies[link].link == root and (option == "wrenches" or robot.fixed_base):
                 problem = f"names {link!r}, which no joint moves"
                 raise InvalidArgumentError(option, problem, remedy="name a link further along the robot")
-            if option == "wrenches" and bodies[link].link != link:
-                problem = f"names {link!r}, which is simulated as one with {bodies[link].link!r}"
-                raise InvalidArgumentError(option, problem, remedy="load the robot with merge_fixed=False")
         return links
 
     @cached_property
@@ -265,16 +258,7 @@ class RunnerOptions(RunnerKeywords):
     @property
     def tool_pose(self) -> Callable[[Rows], NDArray[np.float32]] | None:
         """Function from positions (..., dof) to poses of the tool (..., 7); None where setpoints are not poses."""
-        if self.tool_setpoints is not None:
-            return self.tool_setpoints.tool_pose
         return self.control.tool_pose if isinstance(self.control, OperationalSpace) else None
-
-    @cached_property
-    def tool_setpoints(self) -> ToolSetpoints | None:
-        """Inverse kinematics of ``setpoint_space`` "tool"."""
-        if self.setpoint_space == "joints":
-            return None
-        return ToolSetpoints(self.robot, default_tool(self.robot) if self.tool is None else self.tool)
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
@@ -416,7 +400,7 @@ class RunnerOptions(RunnerKeywords):
         return None if self.randomization is None else self.randomization.to_dict()
 
 
-def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
+def _control(value: object, robot: Robot, tool: Any) -> Any:
     """Return a control, checked; "osc" becomes the controller of the link ``tool``."""
     own = callable(value) and callable(getattr(value, "init", None))
     name = None if own else choice("control", value, (*get_args(ControlMode), "osc"))
@@ -424,17 +408,12 @@ def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
         own_command(value)  # raises for an invalid command
     if tool is not None:
         tool = instance("tool", tool, str, "name a link of the robot")
-    if space == "tool" and name not in ("pid", "drive"):
-        problem = "'tool' makes joint setpoints, which this control does not take"
-        raise InvalidArgumentError("setpoint_space", problem, remedy="use control 'pid' or 'drive', or leave it out")
-    if tool is not None and name != "osc" and space == "joints" and tool != getattr(value, "link", None):
-        problem, remedy = "is for control 'osc' or setpoint_space 'tool'", "leave it out"
-        raise InvalidArgumentError("tool", problem, value=tool, remedy=remedy)
-    if not robot.fixed_base and (name == "osc" or space == "tool"):
-        argument, given = ("control", "'osc'") if name == "osc" else ("setpoint_space", "'tool'")
-        problem = f"{given} needs a fixed base, which {robot.name!r} does not have"
+    if tool is not None and name != "osc" and tool != getattr(value, "link", None):
+        raise InvalidArgumentError("tool", "is for control 'osc'", value=tool, remedy="leave it out")
+    if not robot.fixed_base and name == "osc":
+        problem = f"'osc' needs a fixed base, which {robot.name!r} does not have"
         remedy = "load the robot with fixed_base=True, or control its joints"
-        raise InvalidArgumentError(argument, problem, remedy=remedy)
+        raise InvalidArgumentError("control", problem, remedy=remedy)
     if name != "osc":
         return value
     try:

@@ -7,7 +7,6 @@ Longer than 350 lines because the public signatures and their documentation are 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -49,11 +48,14 @@ from batchpid.sim.runner_commands import (
 )
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE, KINDS, OPTIONS, arguments_of, checked_option
 from batchpid.sim.runner_state import RunnerState
-from batchpid.sim.workers.cluster import NodeInfo
 from batchpid.sim.workers.contact_log import MissedContact
+from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, WorkerPool
 from batchpid.sim.workers.requests import ReadPoses, ReadStateSizes, Restore
+
+CHECKPOINT_STEPS = 8000
+"""Sim steps between checkpoints, from the last of which a lost worker is replayed."""
 
 
 class TickRecorder(Protocol):
@@ -101,7 +103,6 @@ class Runner(SingleOwner):
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call, self._warnings = OneCall(), RunWarnings(checked)
         self._tool_pose = checked.tool_pose
-        self._checkpoint_steps = math.inf if checked.checkpoint_steps is None else checked.checkpoint_steps
         self._state = RunnerState.first(checked)
         self._sent: RunTicks | None = None  # and not completed yet
         self._unreceived: Observation | None = None
@@ -205,14 +206,12 @@ class Runner(SingleOwner):
             (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N]. A follower's
             value (:attr:`batchpid.sim.Robot.coupling`) is replaced by the coupling's value for the leader's setpoint;
             an effort acts on the leader. A :class:`batchpid.sim.Controller` that defines its command takes (size,) or
-            (envs, size): :attr:`command`. With ``setpoint_space="tool"`` it is a pose (7,) or (envs, 7), or
-            :attr:`command`.
+            (envs, size): :attr:`command`.
         setpoint_rate
             Rate of the setpoint [rad/s or m/s], same shapes, with which the setpoint moves within the tick. Both hold
             at the tick's end: the setpoint of a sim step that begins t before it is ``setpoint - t setpoint_rate``. The
             law damps the velocity error instead of the velocity, and follows this motion with full weight. Controls
-            other than "pid" and "drive" ignore it. With ``setpoint_space="tool"`` it is the twist of the tool in the
-            world (6,) or (envs, 6) [m/s, rad/s].
+            other than "pid" and "drive" ignore it.
         setpoint_acceleration
             Acceleration of the setpoint [rad/s^2 or m/s^2], same shapes, besides its rate: a law with gains per unit of
             inertia adds it to the acceleration that it commands. Other gains take ``feedforward``. Default 0. Where the
@@ -408,8 +407,7 @@ class Runner(SingleOwner):
 
         The snapshot is from this runner, or from one with the same options, except for:
 
-        - ``workers``, ``cluster``, ``recover`` and ``timeout``, which change no result, and
-          ``checkpoint_steps``, which changes the last bits;
+        - ``workers``, ``cluster`` and ``timeout``, which change no result;
         - ``substeps`` and ``on_invalid_input``, which apply to the commands that follow.
 
         A controller or ``build`` of the caller's own counts by its code, constants, closure and attributes, and by the
@@ -462,8 +460,7 @@ class Runner(SingleOwner):
     @property
     def command(self) -> CommandSpec:
         """Names and units of a setpoint's entries: the joints, or as a controller declares them."""
-        tool = self.options.tool_setpoints
-        return self.options.command if tool is None else tool.command
+        return self.options.command
 
     @property
     def faults(self) -> tuple[Fault, ...]:
@@ -605,7 +602,7 @@ class Runner(SingleOwner):
         """
         call, pool, is_sent = self._call, self._pool, command is self._sent
         ticks = command if isinstance(command, RunTicks) else None
-        is_due = self.recorder is not None or self._state.steps_since_checkpoint >= self._checkpoint_steps
+        is_due = self.recorder is not None or self._state.steps_since_checkpoint >= CHECKPOINT_STEPS
         if is_due and ticks is not None and not is_sent:
             self._prepare_ticks()
         call.begin()
@@ -645,7 +642,7 @@ class Runner(SingleOwner):
 
     def _prepare_ticks(self) -> None:
         """Take a checkpoint if one is due, and let the recorder keep the state before its first tick."""
-        if self._state.steps_since_checkpoint >= self._checkpoint_steps:
+        if self._state.steps_since_checkpoint >= CHECKPOINT_STEPS:
             self._take_snapshot()
         if self.recorder is not None:
             self.recorder.prepare()
@@ -672,11 +669,8 @@ class Runner(SingleOwner):
 
     def _max_ticks(self) -> int:
         """Return the number of ticks that one request may have: none beyond the next checkpoint."""
-        most, every = len(self._pool.ticks), self.options.checkpoint_steps
-        if every is None:
-            return most
-        left = every - self._state.steps_since_checkpoint % every
-        return min(most, -(-left // self.options.substeps))
+        left = CHECKPOINT_STEPS - self._state.steps_since_checkpoint % CHECKPOINT_STEPS
+        return min(len(self._pool.ticks), -(-left // self.options.substeps))
 
 
 _PARAMETERS = signature(RunnerOptions).parameters.items()

@@ -10,15 +10,18 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.checks.validate import array, read_array, within
+from batchpid.checks.validate import array, entries, read_array, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.command import POSE_UNITS, TWIST_UNITS
-from batchpid.sim.engine.robot_model import robot_model
+from batchpid.sim.engine.robot_model import base_start
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FARTHEST, ORIGIN
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.robot.run_checks import SetpointCheck
 from batchpid.sim.runner_state import Motion, RunnerState
+
+_SHORTEST = 1e-9
+"""Smallest length of a quaternion: that of a shorter one has large rounding errors."""
 
 
 def read_command(
@@ -33,8 +36,6 @@ def read_command(
     ``given`` has its arrays by the names of their arguments, in the order of :class:`Command`. Positions of followers
     are computed from their leaders; the loop passes efforts on to the leaders. ``limits`` warns of setpoints.
     """
-    if options.tool_setpoints is not None:
-        given = _joint_setpoints(options, state, given, ticks)
     _, _, acceleration, _ = given.values()
     if acceleration is not None:
         _check_acceleration(state.params, given)
@@ -84,14 +85,14 @@ def count_ticks(options: RunnerOptions, setpoints: ArrayLike) -> int:
     """Return the number of ticks of a rollout, from the shape of its setpoints."""
     rows, num_envs = read_array("setpoints", setpoints), options.num_envs
     size = len(options.command_columns[0][1])
-    if options.tool_setpoints is None and (rows.ndim not in (2, 3) or len(rows) == 0):
+    if rows.ndim not in (2, 3) or len(rows) == 0:
         raise InvalidArgumentError(
             "setpoints",
             f"must have shape (ticks, {num_envs}, {size}) or (ticks, {size})",
             value=rows.shape,
             remedy=f"repeat a constant setpoint with np.broadcast_to(setpoint, (ticks, {size}))",
         )
-    return len(np.atleast_1d(rows))
+    return len(rows)
 
 
 def _check_acceleration(params: bp.PIDParams, given: Mapping[str, ArrayLike | None]) -> None:
@@ -102,22 +103,6 @@ def _check_acceleration(params: bp.PIDParams, given: Mapping[str, ArrayLike | No
         raise InvalidArgumentError(name, "is for gains in accelerations, and these are efforts", remedy=remedy)
     if given_rate is None:
         raise InvalidArgumentError(name, f"is given without {rate}", remedy=f"give {rate}, too")
-
-
-def _joint_setpoints(
-    options: RunnerOptions, state: RunnerState, given: Mapping[str, ArrayLike | None], ticks: int | None
-) -> dict[str, ArrayLike | None]:
-    """Return ``given`` with joint setpoints and their rates for poses of the tool and its twists."""
-    (name, poses), (rate_name, twists), (acceleration_name, acceleration), _ = given.items()
-    if acceleration is not None:
-        problem = "is for joint setpoints, and setpoints are poses"
-        raise InvalidArgumentError(acceleration_name, problem, remedy="leave it out")
-    tool, finite = options.tool_setpoints, options.on_invalid_input == "raise"
-    assert tool is not None
-    assert state.targets is not None
-    qpos = tool.joints(name, poses, state.targets, finite, ticks)
-    rates = None if twists is None else tool.rates(rate_name, twists, qpos, finite)
-    return dict(given) | {name: qpos, rate_name: rates}
 
 
 def joint_rows(options: RunnerOptions, name: str, value: ArrayLike) -> Float64:
@@ -134,7 +119,7 @@ def base_rows(
 ) -> Float64 | None:
     """Return poses and twists (envs, 13) of floating bases to reset to, at joint positions ``qpos``.
 
-    By default a base is at rest, upright, and so high that the robot's lowest point is on the ground.
+    By default a base is at rest at :func:`batchpid.sim.engine.robot_model.base_start`.
     """
     robot, num_envs = options.robot, options.num_envs
     if robot.fixed_base:
@@ -145,19 +130,27 @@ def base_rows(
         return None
     rows = np.tile(ORIGIN, (num_envs, 1))
     if twist is not None:
-        rows[:, 7:] = array("base_twist", twist, (num_envs, 6), tuple(TWIST_UNITS), kind="entry")
+        rows[:, 7:] = _base_entries("base_twist", twist, num_envs, tuple(TWIST_UNITS))
     if pose is not None:
-        rows[:, :7] = array("base_pose", pose, (num_envs, 7), tuple(POSE_UNITS), kind="entry")
+        rows[:, :7] = _base_entries("base_pose", pose, num_envs, tuple(POSE_UNITS))
         length = np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
-        if not length.all():
-            problem = f"env {int(np.flatnonzero(length == 0)[0])} has a quaternion of length 0"
+        if (length < _SHORTEST).any():
+            problem = f"env {int(np.flatnonzero(length < _SHORTEST)[0])} has a quaternion of length 0"
             raise InvalidArgumentError("base_pose", problem, remedy="give (w, x, y, z), (1, 0, 0, 0) upright")
         rows[:, 3:7] /= length
-    elif options.ground:
-        heights: dict[bytes, float] = {}
+    else:
+        starts: dict[bytes, Float64] = {}
+        is_file = options.engine == "mujoco" and robot.mjcf is not None  # which may have a ground at another height
         for env in np.flatnonzero(mask).tolist():
             key = qpos[env].tobytes()
-            if key not in heights:
-                heights[key] = robot_model(robot).height(np.nan_to_num(qpos[env]), base_too=True)
-            rows[env, 2] = -heights[key] if np.isfinite(heights[key]) else 0.0
+            if key not in starts:
+                starts[key] = base_start(robot, qpos[env], options.ground and not is_file)
+            rows[env, :7] = starts[key]
+    return rows
+
+
+def _base_entries(name: str, value: ArrayLike, num_envs: int, columns: tuple[str, ...]) -> Float64:
+    """Return poses or twists (envs, entries), which must be as near as positions and velocities of joints."""
+    rows = array(name, value, (num_envs, len(columns)), columns, kind="entry")
+    entries(name, rows, np.abs(rows) <= FARTHEST, f"is beyond +-{FARTHEST:g}", columns, kind="entry")
     return rows

@@ -146,8 +146,8 @@ Gains = Annotated[
     str | None,
     _flag(
         "Gains: tuned, designed, tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file (.yaml or .json) that "
-        "`batchpid tune` or batchpid.save_params wrote, or gains of ros2_control (.yaml) or MuJoCo "
-        "(.xml). Default: tuned where the robot has them, else designed.",
+        "`batchpid tune` or batchpid.save_params wrote, or an MJCF file (.xml). Default: tuned where the robot has "
+        "them, else designed.",
         metavar="NAME|FILE",
     ),
 ]
@@ -162,10 +162,9 @@ Actuators = Annotated[
 GainSets = Annotated[
     tuple[str, ...],
     _flag(
-        "Sets of gains: tuned, designed, tutorial, mjcf, drive, drive:STIFFNESS,DAMPING, or params files (.yaml or "
-        ".json) that `batchpid tune` or batchpid.save_params wrote, or gains of ros2_control (.yaml) "
-        "or MuJoCo (.xml). Default: tuned, "
-        "tutorial and drive for a bundled robot, else designed and drive.",
+        "Sets of gains: tuned, designed, tutorial, mjcf, drive, drive:STIFFNESS,DAMPING, params files (.yaml or "
+        ".json) that `batchpid tune` or batchpid.save_params wrote, or MJCF files (.xml). Default: tuned, tutorial "
+        "and drive for a bundled robot, else designed and drive.",
         metavar="NAME|FILE [NAME|FILE ...]",
     ),
 ]

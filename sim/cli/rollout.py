@@ -17,7 +17,6 @@ from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, waiting, write_figures
 from batchpid.sim.recording.recording_files import HDF5
 from batchpid.sim.tool_space.osc_controller import default_tool
-from batchpid.sim.tool_space.tool_setpoints import default_goal
 from batchpid.sim.tuning.gain_sets import gain_set
 
 if TYPE_CHECKING:
@@ -44,7 +43,7 @@ class RolloutCommand:
     """With --control osc: link to move. Default: the last one of the longest chain."""
     setpoint: flags.OptionalFloats = None
     """One position per joint [rad or m]; with --control osc x y z qw qx qy qz of the tool. Default: the bundled robot's
-    target, else the start pose; with --control osc a pose near that, which all robots reach within joint limits."""
+    target, else the start pose; with --control osc the pose of the tool there."""
     trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Setpoints to follow instead: a CSV file with the columns time, setpoint:JOINT ..., and, where they are known,
     setpoint_rate:JOINT ... and setpoint_acceleration:JOINT ... A row holds at its time, and rows are equally spaced: by
@@ -102,15 +101,12 @@ class RolloutCommand:
             flags.refuse(self, ("gains",), "are for the control of joints")
             control: Any = OperationalSpace(robot, self.tool or default_tool(robot), posture=target)
             start = start_poses(robot, self.num_envs, self.spread, self.seed, target)
-            if self.setpoint is None:
-                near = start_poses(robot, 8, self.spread, self.seed + 1, target)
-                setpoint = default_goal(robot, control, start, near[1:])
-            else:
-                setpoint = array("setpoint", self.setpoint, (1, 7), control.command.names, kind="entry")[0]
+            goal: Array = control.tool_pose(target) if self.setpoint is None else self.setpoint
+            setpoint = array("setpoint", goal, (1, 7), control.command.names, kind="entry")[0]
         else:
             center = None if setpoints is None else setpoints.start
             start = start_poses(robot, self.num_envs, self.spread, self.seed, center)
-            goal: Array = target if self.setpoint is None else self.setpoint
+            goal = target if self.setpoint is None else self.setpoint
             setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
             gains = gain_set(robot, self.gains or ("drive" if self.control == "drive" else None))
             params, control = gains.params, "drive" if gains.control == "drive" else self.control

@@ -32,7 +32,6 @@ import batchpid as bp
 from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import choice, flag, instance, number
 from batchpid.errors import InvalidArgumentError
-from batchpid.export.ros2_control_reader import is_ros2_control
 from batchpid.io import documents
 from batchpid.sim.identification.columns import Reading, TimeUnit, error
 from batchpid.sim.identification.log import CommandKind, Log, LogSettings, Sensor
@@ -83,8 +82,7 @@ def gains_of(robot: Robot, name: str) -> bp.PIDParams:
     if name not in known and not os.path.isfile(path):  # False, too, for text that cannot be a path
         remedy = f"use a file or {', '.join(known)}"
         raise InvalidArgumentError("gains", "is neither a name nor a file of gains", value=name, remedy=remedy)
-    kind = path.suffix.lower()
-    if name in known or kind in (".py", ".xml") or (kind != ".json" and is_ros2_control(documents.read(path))):
+    if name in known or path.suffix.lower() == ".xml":
         return gain_set(robot, name).params
     names = bp.load_params(path)[1]
     order = [joint for joint in robot.joint_names if joint in names]

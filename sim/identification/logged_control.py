@@ -136,10 +136,10 @@ class LoggedControl:
                 motors = motors._replace(command=np.ascontiguousarray(asked[samples].swapaxes(0, 1)))
             constants = constants._replace(motors=actuator_model.discretise(actuators, motors, dt, len(qpos)))
             state = state._replace(motors=motors)
-        if law is not None and law.needs_matrix:
+        if law is not None and law.uses_mass_matrix:
             self._matrix_steps = law.matrix_steps
-            state = state._replace(matrix=np.zeros((*qpos.shape, qpos.shape[1])[: 3 if law.whole else 2]))
-            constants = constants._replace(damping=damping if law.whole and np.any(damping) else None)
+            state = state._replace(matrix=np.zeros((*qpos.shape, qpos.shape[1])))
+            constants = constants._replace(damping=damping if np.any(damping) else None)
         self._model = Model(model)
         self._constants, self._state = constants, mapped(partial(np.array, order="C"), state)
         self._programs: dict[tuple[bool, bool], Any] = {}

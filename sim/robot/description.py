@@ -97,10 +97,10 @@ class RobotDescription(Urdf):
     """Robot as its URDF describes it; every array is in the order of ``joint_names``.
 
     ``joints`` are the degrees of freedom, the moving joints of ``all_joints``. ``bodies`` is the placement of every
-    link, by name, in its simulated link: links joined by fixed joints are simulated as one, unless ``merge_fixed`` is
-    False. ``settings`` come from a bundled robot, ``defaults`` and ``mjcf`` from an MJCF file, else None.
+    link, by name, in its simulated link: links joined by fixed joints are simulated as one. ``settings`` come from a
+    bundled robot, ``defaults`` and ``mjcf`` from an MJCF file, else None.
     ``package_dirs`` are the folders in which meshes are looked up first. ``actuators`` are its motors and sensors, None
-    for ideal ones.
+    for ideal ones. ``base_start`` is the pose (7,) at which the file places a floating base, None if it does not.
     """
 
     path: Path
@@ -109,13 +109,13 @@ class RobotDescription(Urdf):
     joints: tuple[Joint, ...]
     dissipation: str
     fixed_base: bool
-    merge_fixed: bool
     bodies: Mapping[str, Placement]
     settings: Settings | None
     package_dirs: tuple[Path, ...] = ()
     actuators: bp.Actuators | None = None
     defaults: FileDefaults | None = None
     mjcf: MjcfFile | None = None
+    base_start: tuple[float, ...] | None = None
 
     def __repr__(self) -> str:
         given = sum(link.mass or 0.0 for link in self.links)
@@ -232,6 +232,19 @@ class RobotDescription(Urdf):
             return self.settings.start.copy()
         return self.coupled(np.clip(0.0 if self.defaults is None else self.defaults.start, self.lower, self.upper))
 
+    @property
+    def target(self) -> Float64:
+        """Pose (dof,) [rad or m] for a first move, within the limits.
+
+        It is that of the bundled settings, else a quarter of the way from the start to the farther limit of each joint,
+        at most 0.5 rad or m.
+        """
+        if self.settings is not None:
+            return self.settings.target.copy()
+        above, below = self.upper - self.start, self.lower - self.start
+        way = np.where(above >= -below, above, below)
+        return self.coupled(self.start + np.clip(0.25 * way, -0.5, 0.5))
+
     def params(self, **options: Any) -> bp.PIDParams:
         """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's values filled in.
 
@@ -259,7 +272,7 @@ class RobotDescription(Urdf):
         """Return the info of a run of this robot; ``options`` are further fields of :class:`batchpid.sim.RunInfo`."""
         shared = (
             *("joint_names", "units", "lower", "upper", "effort_limit"),
-            *("urdf", "dissipation", "merge_fixed", "fixed_base"),
+            *("urdf", "dissipation", "fixed_base"),
         )
         known = {name: getattr(self, name) for name in shared}
         return RunInfo(robot=self.name, description=self, **known, **options)
@@ -275,7 +288,7 @@ class RobotDescription(Urdf):
 
         Raises RobotError if a link's mass comes from its shapes, and a mesh cannot be read.
         """
-        inertias = simulated(self.urdf, True).inertias
+        inertias = simulated(self.urdf).inertias
         low, high = np.where(self.continuous, [[-np.inf], [np.inf]], [self.lower, self.upper])
         limits = {"lower": low, "upper": high}
         return rigid_tree(self.urdf, inertias, coupling=self.coupling, fixed_base=self.fixed_base, **limits)
@@ -283,8 +296,7 @@ class RobotDescription(Urdf):
     @cached_property
     def simulated_tree(self) -> RigidTree:
         """Tree of the simulated links, without coupling."""
-        merge = self.merge_fixed
-        return rigid_tree(simulated(self.urdf, merge).urdf, body_inertias(self.urdf, merge), fixed_base=self.fixed_base)
+        return rigid_tree(simulated(self.urdf).urdf, body_inertias(self.urdf), fixed_base=self.fixed_base)
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof), on a fixed base."""
@@ -334,7 +346,8 @@ class RobotDescription(Urdf):
             "srdf": digest(self.srdf.disabled, self.srdf.enabled),
             "settings": digest(self.settings) if self.defaults is None else digest(self.defaults),
             "mjcf": None if self.mjcf is None else digest(replace(self.mjcf, path="")),
-            **{name: getattr(self, name) for name in ("self_collision", "dissipation", "fixed_base", "merge_fixed")},
+            **{name: getattr(self, name) for name in ("self_collision", "dissipation", "fixed_base")},
+            "base_start": self.base_start,
         }
 
     @cached_property

@@ -54,7 +54,6 @@ class Robot(RobotDescription):
         missing_meshes: str = "skip",
         dissipation: str = "urdf",
         fixed_base: bool | None = None,
-        merge_fixed: bool = True,
         self_collision: str = "auto",
         actuators: bp.Actuators | str | Path | None = None,
         strict: bool = False,
@@ -74,9 +73,6 @@ class Robot(RobotDescription):
         fixed_base
             True to fix the root link to the world. Default True, unless the root of a URDF is a link without mass and
             shapes and its only joint is floating or planar: then the base floats, and the root is that joint's child.
-        merge_fixed
-            True to simulate links that are joined by fixed joints as one, with the exact inertia: fewer links, faster
-            steps. False keeps every link, and contacts between links that are joined through other links.
         self_collision
             ``"auto"``: links that are neighbours, or touch or overlap at the start pose or in nearly every sampled pose
             do not collide (:attr:`self_contact`). ``"urdf"``: all links collide. An .srdf next to the URDF, of the same
@@ -86,7 +82,8 @@ class Robot(RobotDescription):
             file of :func:`batchpid.save_actuators`, in which joints are matched by name. None: ideal ones, with the
             armature, torque-speed lines and lags of an MJCF file.
         strict
-            True to refuse a file that needs repairs, which are otherwise made and listed by :meth:`check`.
+            True to refuse a file that needs repairs, which are otherwise made, with a warning, and listed by
+            :meth:`check`.
 
         Raises
         ------
@@ -104,7 +101,7 @@ class Robot(RobotDescription):
         choice("dissipation", dissipation, DISSIPATION)
         choice("self_collision", self_collision, SELF_COLLISION)
         fixed_base = None if fixed_base is None else flag("fixed_base", fixed_base)
-        strict, merge_fixed = flag("strict", strict), flag("merge_fixed", merge_fixed)
+        strict = flag("strict", strict)
         if not isinstance(package_dirs, list | tuple):
             problem = "must be a list of folders"
             raise InvalidArgumentError("package_dirs", problem, value=package_dirs, remedy="pass a list of paths")
@@ -114,18 +111,19 @@ class Robot(RobotDescription):
         root, repairs, mjcf = read_source(path, fixed_base is not False, missing_meshes)
         free_joint = free_joint_of(root)
         fixed_base = free_joint is None if fixed_base is None else fixed_base
+        base = None if mjcf is None else mjcf.base
         if free_joint is not None and not fixed_base:
-            free_base(root, free_joint)
+            base = free_base(root, free_joint, repairs)
         urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
         if mjcf is not None:
             urdf = replace(urdf, missing_meshes=(*mjcf.missing_meshes, *urdf.missing_meshes))
         if not any(joint.moves for joint in urdf.all_joints):
             raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
         # From here on links mean bodies: those that fixed joints hold together are one.
-        bodies = place_links(urdf.urdf, merge_fixed)
+        bodies = place_links(urdf.urdf)
         if (count := len({at.link for at in bodies.values()})) > MAX_LINKS:
             problem = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
-            raise RobotError(f"{path}: {problem}; {'split the robot' if merge_fixed else 'load with merge_fixed=True'}")
+            raise RobotError(f"{path}: {problem}; split the robot")
         joints = couple([joint for joint in urdf.all_joints if joint.moves])
         beside = path.with_suffix(".srdf")
         srdf = read_srdf(beside, [link.name for link in urdf.links]) if os.path.isfile(beside) else Srdf()
@@ -140,12 +138,12 @@ class Robot(RobotDescription):
             joints=joints,
             dissipation=dissipation,
             fixed_base=fixed_base,
-            merge_fixed=merge_fixed,
             package_dirs=folders,
             bodies=bodies,
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
             defaults=None if mjcf is None else _file_defaults(mjcf, joints),
             mjcf=None if mjcf is None else mjcf.file,
+            base_start=base,
         )
         if actuators is None and mjcf is not None:
             actuators = _file_actuators(mjcf, joints)
@@ -199,7 +197,7 @@ class Robot(RobotDescription):
         Parameters
         ----------
         gain_units
-            ``"mass_matrix"``, ``"inertia"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
+            ``"mass_matrix"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
             ``"mass_matrix"``; on a floating base ``"effort"``, for legs that carry the base at the start pose: the mass
             matrix is that of legs in the air, a twentieth.
 
@@ -292,10 +290,10 @@ def _find(name_or_path: str | Path) -> Path:
     path = Path(os.path.expanduser(file_path("name_or_path", name_or_path)))
     if str(name_or_path) in Robot.bundled():
         return _ASSETS / f"{name_or_path}.urdf"
-    if os.path.isfile(path):  # pathlib's methods raise other errors for names that are too long or start with ~
-        return path.absolute()
-    if os.path.isdir(path):
+    if os.path.isdir(path):  # pathlib's methods raise other errors for names that are too long or start with ~
         raise RobotNotFoundError(f"{path} is a folder; pass the path of a URDF or MJCF file in it")
+    if os.path.exists(path):  # also a pipe, such as /dev/stdin
+        return path.absolute()
     raise RobotNotFoundError(
         f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a file; "
         "check the spelling, or pass the path of a URDF or MJCF file"

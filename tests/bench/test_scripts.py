@@ -6,7 +6,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from clusters import FILTERS
 from PIL import Image
 from robots import load_bundled
 from scripts import ROOT, load_script
@@ -14,7 +13,7 @@ from scripts import ROOT, load_script
 from batchpid.sim import Robot, Runner, write_recording
 from batchpid.sim.view import LiveSimulation
 
-TESTED = {"accuracy", "circles", "cluster", "draw", "film", "measure", "motions", "newcomer"}
+TESTED = {"accuracy", "circles", "draw", "film", "measure", "motions", "newcomer"}
 TESTED |= {"trajectories", "view"}
 
 
@@ -188,20 +187,6 @@ def test_view(monkeypatch, capsys):
     view.main(view.Options("panda", num_envs=1, seconds=0.5, loading=0.0, port=18290))
     assert page.url.startswith("http")
     assert "frames/s served" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-class TestOnRay:
-    pytestmark = FILTERS
-
-    def test_cluster_and_the_measured_costs_of_the_page_on_large_clusters(self, capsys):
-        pytest.importorskip("ray")
-        cluster = load_script("cluster")
-        bench = cluster.Bench(num_envs=2, workers=1, turns=1, ticks=20, steps=1)
-        with cluster.machines(bench.workers) as address:
-            bench.run(address)
-            assert len(rows(capsys.readouterr().out)) == 3
-            assert "round trip" in load_script("scale").measure(calls=2, address=address, ignore_reinit_error=True)
 
 
 @pytest.mark.parametrize("sines", [False, True])

@@ -83,7 +83,6 @@ VALUES = {
     "guard": [bp.make_guard(2, rate=0.5), bp.make_guard(2, rate=0.2)],
     "contacts": [["hand"], ["arm", "hand"]],
     "wrenches": [["hand"], ["arm"]],
-    "checkpoint_steps": [100],
     "timeout": [60.0, 30.0],
 }  # fmt: skip
 """Values of options to try, besides those that their types list."""

@@ -59,7 +59,7 @@ class Feature(NamedTuple):
     engines: tuple[str, ...] = ENGINES
     accelerations: bool = False
     repeats: bool = True
-    """Whether a second episode is bit-identical: not with noise, nor with checkpoints at other ticks of the episode."""
+    """Whether a second episode is bit-identical: not with noise."""
     exact: bool = False
     """Whether results are bit-identical with and without native code, instead of close."""
     alike: bool = True
@@ -98,7 +98,6 @@ FEATURES: dict[str, Feature] = {
     "default gains": Feature(),
     "accelerations": Feature(accelerations=True),
     "gains in efforts": Feature(params=EFFORTS, exact=True),
-    "gains per inertia": Feature(params=EFFORTS | {"gain_units": "inertia"}),
     "implicit law": Feature(
         params={"gain_units": "mass_matrix", "discretization": "implicit", "kp": 4e3, "ki": 1e4, "kd": 120.0}
     ),
@@ -107,7 +106,6 @@ FEATURES: dict[str, Feature] = {
     "drive with an integral": Feature({"control": "drive"}, EFFORTS, exact=True),
     "efforts": Feature({"control": "effort"}, exact=True),
     "osc": Feature({"control": "osc"}),
-    "setpoints of a tool": Feature({"setpoint_space": "tool", "tool": "hand"}),
     "own controller": Feature({"control": Damped()}, exact=True),
     "guard": Feature({"guard": GUARD}),
     "guarded drive": Feature({"control": "drive", "guard": GUARD}, exact=True),
@@ -123,7 +121,6 @@ FEATURES: dict[str, Feature] = {
     "compensation of gravity alone": Feature({"compensate": "gravity"}),
     "no compensation": Feature({"compensate": "none", "physics": "fast"}),
     "no collisions": Feature({"collisions": False, "ground": False}),
-    "checkpoints": Feature({"checkpoint_steps": 25}, repeats=False),
     "a reset at a fault": Feature({"on_fault": "reset", "speed_limit": 2.0}),
     "contact sensors": Feature({"contacts": ["hand"], "wrenches": ["arm"]}),
     "user content": Feature({"build": functools.partial(box, 0.05)}, engines=SAPIEN),
@@ -424,7 +421,6 @@ def test_every_option_has_a_row() -> None:
         "first_env",
         "workers",
         "cluster",
-        "recover",
         "timeout",
         "engine",
         "backend",

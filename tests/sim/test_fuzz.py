@@ -143,8 +143,6 @@ GOOD_PARAMS = {
     "tracking_time": 0.1,
     "continuous": np.zeros(DOF, bool),
     "integration": "output_first",
-    "first_derivative": "zero",
-    "weight_origin": "start",
     "measurement_rate": "measured",
     "gain_units": "effort",
     "discretization": "explicit",
@@ -168,8 +166,6 @@ GOOD_RUNNER = {
     "speed_limit": 100.0,
     "randomization": Randomization(payload=Uniform(0, 1)),
     "on_invalid_input": "raise",
-    "recover": True,
-    "checkpoint_steps": 100,
     "timeout": 10.0,
 }
 STEP = {"setpoint": ARRAY, "setpoint_rate": ARRAY, "feedforward": ARRAY}

@@ -122,7 +122,7 @@ def _frames(model: MjModel, robot: dict[int, str], spec: SceneSpec) -> tuple[dic
 
     A body's link has the body's axes, and its origin at the anchor of the body's last hinge.
     """
-    placements, names = place_links(spec.urdf, spec.merge_fixed), dict[str, str]()
+    placements, names = place_links(spec.urdf, spec.separate), dict[str, str]()
     frames: dict[str, BodyFrame] = {}
     for body, name in robot.items():
         if name not in placements:  # the world, if the robot does not include it

@@ -69,8 +69,6 @@ class RobotMj:
     """Frames of simulated links in their bodies; of other links the frames are the same."""
     base: tuple[int, int] | None = None
     """Index of a floating base in MuJoCo's qpos and qvel; None on a fixed one."""
-    turn: NDArray[np.float64] = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
-    """Rotation (4,) of that body's axes in the root link."""
     is_file: bool = False
     """Whether the model is an MJCF file's."""
 
@@ -86,7 +84,7 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     """
     if spec.mjcf is not None:
         return _file_model(spec, spec.mjcf, drives)
-    inertias = body_inertias(spec.urdf, spec.merge_fixed)
+    inertias = body_inertias(spec.urdf, spec.separate)
     scene, names = robot_spec(spec, inertias)
     if drives:
         _add_drives(scene, spec)
@@ -133,12 +131,12 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     model.dof_armature[qvel], model.dof_frictionloss[qvel] = np.maximum(armature, 0.0), 0.0
     model.dof_damping[qvel] = np.maximum(damping + [joint.damping for joint in spec.joints], 0.0)
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    base, turn = None, np.array([1.0, 0.0, 0.0, 0.0])
+    base = None
     if found.root:
         joint = model.joint(model.body(found.root).jntadr[0])
-        base, turn = (int(joint.qposadr[0]), int(joint.dofadr[0])), model.body(found.root).quat.copy()
+        base = int(joint.qposadr[0]), int(joint.dofadr[0])
     bodies = {link: model.body(name).id for link, name in found.names.items()}
-    return RobotMj(model, qpos, qvel, bodies, found.own, found.frames, base, turn, is_file=True)
+    return RobotMj(model, qpos, qvel, bodies, found.own, found.frames, base, is_file=True)
 
 
 def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[Any, dict[str, str]]:
@@ -193,7 +191,7 @@ def _set_options(scene: MjSpec, spec: SceneSpec) -> None:
 
 def _add_links(scene: MjSpec, spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> dict[str, str]:
     """Add the simulated links of ``spec`` as bodies; return the name of the body of each."""
-    root = etree.fromstring(simulated(spec.urdf, spec.merge_fixed).urdf.encode())
+    root = etree.fromstring(simulated(spec.urdf, spec.separate).urdf.encode())
     above = {joint.find("child").get("link"): joint for joint in root.findall("joint")}
     names = {link: _unused("world_link", inertias) if link == "world" else link for link in inertias}
     limits = {joint.name: (joint.lower, joint.upper) for joint in spec.joints}
@@ -246,7 +244,7 @@ def _add_links(scene: MjSpec, spec: SceneSpec, inertias: dict[str, SpatialInerti
 
 def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
     """Add the collision shapes, the pairs of bodies that do not collide, and the ground."""
-    shapes = link_shapes(spec.urdf, spec.merge_fixed)
+    shapes = link_shapes(spec.urdf, spec.separate)
     owners = {link: list(dict.fromkeys(shape.owner for shape in of_link)) for link, of_link in shapes.items()}
     ignored = {frozenset(pair) for pair in spec.ignored}
     solid, split = [link for link in owners if owners[link]], set[str]()

@@ -223,9 +223,8 @@ def test_an_object_that_diverges_is_a_fault_of_its_env(load):
 def test_a_closed_loop_has_no_tree(load):
     robot = load(FOUR_BAR)
     options = {"num_envs": 1, "workers": 0, "engine": "mujoco"}
-    for given, argument in (({"control": "osc"}, "control"), ({"setpoint_space": "tool"}, "setpoint_space")):
-        with pytest.raises(InvalidArgumentError, match=f"^{argument}.*'loop'"):
-            Runner(robot, **options, **given)
+    with pytest.raises(InvalidArgumentError, match=r"^control.*'loop'"):
+        Runner(robot, **options, control="osc")
     with pytest.raises(InvalidArgumentError, match=r"gain_units.*'loop'"):
         Runner(robot, params=robot.designed(), **options)
     with Runner(robot, **options) as runner:  # its default gains need no tree
@@ -267,21 +266,21 @@ def test_what_a_scene_does_not_have_is_refused(load):
         Runner(robot, 1, workers=0, engine="mujoco")
 
 
-@pytest.mark.parametrize("merge_fixed", [True, False])
-def test_masses_and_damping_vary(load, merge_fixed):
+@pytest.mark.parametrize("wrenches", [None, ["tip"]])
+def test_masses_and_damping_vary(load, wrenches):
     """A randomized robot moves as the file with other numbers, also where several bodies are one link."""
     tip = (
         '<body name="tip" pos=".2 0 0" quat=".9 .1 .3 0"><inertial pos=".01 0 .02" mass="{}" diaginertia="{}"/></body>'
     )
     arm = ARM.replace(f"{LINK}</body>", f"{LINK}{{}}</body>")
-    robot = load(arm.format(tip.format(0.2, "1e-4 2e-4 2.5e-4")), merge_fixed=merge_fixed)
+    robot = load(arm.format(tip.format(0.2, "1e-4 2e-4 2.5e-4")))
     heavy = arm.format(tip.format(0.4, "2e-4 4e-4 5e-4")).replace('damping=".5"', 'damping="1"')
     model = mujoco.MjModel.from_xml_string(heavy.replace('damping=".2"', 'damping=".4"'))
     twice = Uniform(2.0, 2.0, operation="scale")
     varied = Randomization(link_mass={"tip": twice}, damping=twice)
     rows = efforts(robot, 15)  # without contacts, whose softness in MuJoCo depends on how mass is divided among bodies
     options = {"control": "effort", "compensate": "none", "substeps": 10, "randomization": varied}
-    with Runner(robot, 2, workers=0, engine="mujoco", **options) as runner:
+    with Runner(robot, 2, workers=0, engine="mujoco", wrenches=wrenches, **options) as runner:
         ours = run(runner, rows)
     theirs = in_mujoco(robot, model, rows, 10)
     np.testing.assert_allclose(ours, np.broadcast_to(theirs[:, None], ours.shape), rtol=0, atol=1e-8)
@@ -298,7 +297,6 @@ WALKER = """
 def test_a_floating_base_behind_an_object(load):
     """Pose and twist of a base are those of its link, wherever MuJoCo has them, and in both engines the same."""
     robot = load(WALKER, fixed_base=False)
-    turn = np.array([1.0, 1.0, 0.0, 0.0]) / np.sqrt(2)
     pose, twist = [0.1, 0.2, 3.0, 0.8, 0.0, 0.6, 0.0], [0.3, 0.1, 0.2, 1.0, 2.0, 3.0]
     seen = []
     cases = ("mujoco", "none"), ("sapien", "none"), ("mujoco", "gravity+coriolis"), ("rebuilt", "gravity+coriolis")
@@ -310,8 +308,7 @@ def test_a_floating_base_behind_an_object(load):
             np.testing.assert_allclose(obs.base_pose[0], pose, atol=1e-6)
             np.testing.assert_allclose(obs.base_twist[0], twist, atol=1e-5)
             if engine == "mujoco":
-                mujoco.mju_mulQuat(turned := np.zeros(4), np.array(pose[3:]), turn)
-                np.testing.assert_allclose(runner.bodies(["trunk"])[0, 0, 3:], turned)
+                np.testing.assert_allclose(runner.bodies(["trunk"])[0, 0], pose)
             for _ in range(20):
                 obs = runner.step([0.02])
             seen.append(np.concatenate([obs.qpos[0], obs.base_pose[0], obs.base_twist[0]]))
@@ -454,3 +451,39 @@ def test_every_file_that_a_load_opens_is_part_of_the_identity(tmp_path, changed)
     robot_model.cache_clear()
     with pytest.raises(RobotError, match="has changed since the robot was loaded"):
         Runner(robot, 1, workers=0, engine="mujoco")
+
+
+STARTS = {
+    "plane": ('<geom type="plane" size="5 5 1" pos="0 0 .5"/>', "0 0 1 1 0 0 0", 0.55),
+    "low plane": ('<geom type="plane" size="5 5 1" pos="0 0 -1"/>', "0 0 -.5 1 0 0 0", -0.95),
+    "platform": ('<geom type="box" size="1 1 .2" pos="0 0 .2"/>', "0 0 .6 1 0 0 0", 0.45),
+    "turned": ('<geom type="plane" size="5 5 1"/>', "1 2 .3 0 1 0 0", 0.25),
+}
+
+
+@pytest.mark.parametrize("keyed", [True, False])
+@pytest.mark.parametrize("name", STARTS)
+def test_a_floating_robot_starts_where_its_file_places_its_root_body(load, name, keyed):
+    ground, pose, height = STARTS[name]
+    values = pose.split()
+    place = "" if keyed else f'pos="{" ".join(values[:3])}" quat="{" ".join(values[3:])}"'
+    key = f'<keyframe><key name="home" qpos="{pose} 0"/></keyframe>' if keyed else ""
+    body = (
+        f'<body name="t" {place}><freejoint/><geom type="box" size=".2 .2 .05" mass="5"/><body name="l" pos="0 0 .2">'
+    )
+    leg = '<joint name="a" axis="0 1 0" range="-1 1" damping="1"/><geom size=".05" mass=".1"/>'
+    text = f"<mujoco>{OPTION}<worldbody>{ground}{body}{leg}</body></body></worldbody>{key}</mujoco>"
+    robot = load(text, fixed_base=False)
+    assert [*robot.bodies] == ["t", "l"]
+    for engine in ("mujoco", "sapien"):
+        with Runner(robot, 1, workers=0, engine=engine, physics="accurate") as runner:
+            start = runner.observe().base_pose[0]
+            if engine == "mujoco" or name != "low plane":  # SAPIEN's ground is at height 0
+                np.testing.assert_allclose(start, [float(each) for each in values], atol=1e-6)
+            if engine == "mujoco":
+                for _ in range(100):
+                    seen = runner.step(robot.start)
+                np.testing.assert_allclose(seen.base_pose[0, 2], height, atol=2e-3)
+            seen = runner.reset(base_pose=start, base_twist=[0, 0, 0.1, 0, 0.2, 0])
+            np.testing.assert_allclose(seen.base_pose[0], start, atol=1e-6)
+            np.testing.assert_allclose(seen.base_twist[0], [0, 0, 0.1, 0, 0.2, 0], atol=1e-6)

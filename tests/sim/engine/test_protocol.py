@@ -134,9 +134,6 @@ class ToyEngine:
     def is_physics(self, settings):
         return False
 
-    def least_memory(self, num_envs, dof):
-        return num_envs * dof
-
     def make_pack(self, spec, size, first_env=0, variation=None, carrier="", links=(), workspace=None):
         return DoubleIntegrators(spec, size, first_env)
 

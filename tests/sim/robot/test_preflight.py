@@ -81,15 +81,13 @@ def test_each_oddity_of_a_urdf_has_its_finding(text, code, severity, message, tm
     assert findings[code].remedy
 
 
-def test_links_without_mass_cost_time_only_where_they_are_not_merged(tmp_path):
+def test_links_without_mass_are_reported_where_they_are_bodies(tmp_path):
     parts = link("a", ""), link("tip", ""), joint("h", "b", "a"), joint("f", "a", "tip", "fixed")
     light = write(tmp_path, robot(link("b"), *parts), "light.urdf")
     assert [finding.link for finding in Robot.load(light).check() if finding.code == "no-inertia"] == ["a"]
     heavy = write(tmp_path, light.read_text().replace(link("tip", ""), link("tip")), "heavy.urdf")
     assert Robot.load(heavy).check() == []
-    found = {finding.link: str(finding) for finding in Robot.load(light, merge_fixed=False).check()}
-    assert "costs time" in found["tip"]
-    assert "without load" in found["a"]
+    assert "without load" in str(Robot.load(light).check())
 
 
 def test_a_sound_robot_has_no_findings(tmp_path, panda):
@@ -204,7 +202,7 @@ def test_gains_that_ring_are_found_with_frequency_and_damping(panda):
     assert error[peaks[1]] / error[peaks[0]] == pytest.approx(0.65, abs=0.05)
 
 
-@pytest.mark.parametrize("units", ["effort", "inertia", "mass_matrix"])
+@pytest.mark.parametrize("units", ["effort", "mass_matrix"])
 def test_designed_and_tuned_gains_neither_ring_nor_pass_the_bound(panda, jaco2, units):
     for each in (panda, jaco2):
         for params in (each.designed(units), each.tuned()):
@@ -213,7 +211,7 @@ def test_designed_and_tuned_gains_neither_ring_nor_pass_the_bound(panda, jaco2, 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning", "ignore::batchpid.sim.StabilityWarning")
 @pytest.mark.parametrize("filter_time", [0.0, 1e-3])
-@pytest.mark.parametrize("units", ["effort", pytest.param("inertia", marks=pytest.mark.slow), "mass_matrix"])
+@pytest.mark.parametrize("units", ["effort", "mass_matrix"])
 @pytest.mark.parametrize(("factor", "stays"), [(0.9, True), (1.1, False)])
 def test_the_simulation_becomes_unstable_at_the_reported_bound(units, filter_time, factor, stays, panda):
     options = {"ki": None, "effort_limit": None, "derivative_filter_time": filter_time, "gain_units": units}
