@@ -486,7 +486,7 @@ class Runner(SingleOwner):
     @property
     def backend(self) -> str:
         """Library of the law, and kind of the calls into the engine, with the reason if they are not native."""
-        return describe(self.options, self.actuators)
+        return describe(self.options)
 
     @property
     def time(self) -> float:

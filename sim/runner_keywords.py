@@ -62,7 +62,6 @@ class Controller(Protocol):
 
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
 Backend = Literal["numpy", "jax"]
-Precision = Literal["float64", "float32"]
 EngineName = Literal["sapien", "mujoco"]
 DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
 """SAPIEN where it is installed, which is on Linux with x86-64; elsewhere MuJoCo."""
@@ -139,10 +138,9 @@ class RunnerKeywords:
         Backend, option("snapshot", flag="Library of the law: NumPy, or JAX, as one program with the steps.")
     ] = "numpy"
     """Library of the law: ``"numpy"``, the default, or ``"jax"``, which compiles law and sim steps of a tick, and a
-    :class:`Controller`, into one XLA program for the CPU (docs/performance.md). The last bits of results differ between
-    the two, and between processors."""
-    dtype: Annotated[Precision, option("snapshot")] = "float64"
-    """Floating-point type of the law under backend ``"jax"``: ``"float64"``, the default, or ``"float32"``."""
+    :class:`Controller`, into one XLA program for the CPU (docs/performance.md). It needs native code, control "pid",
+    "effort" or a :class:`Controller`, and has no coupled joints, actuators, randomization and guard. The last bits of
+    results differ between the two, and between processors."""
     compensate: Annotated[
         Compensation, option("snapshot", "recording", flag="Passive force and known friction, added at every sim step.")
     ] = "gravity+coriolis+friction"

@@ -119,7 +119,7 @@ def parse(arguments: Sequence[str]) -> Any:
     """Return the command with its flags; for --help or unknown flags print help and raise SystemExit."""
     options = (
         tyro.conf.DisallowNone,  # a flag is left out, not given None
-        tyro.conf.FlagCreatePairsOff,  # --viewer without --no-viewer
+        tyro.conf.FlagCreatePairsOff,  # --force without --no-force
         tyro.conf.PositionalMetavarFromFieldName,
         # Without a help of the choice itself, tyro looks for one in the source of `typing`, which takes 0.05 s.
         tyro.conf.arg(help="`batchpid COMMAND --help` lists the flags of a command."),

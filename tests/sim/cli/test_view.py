@@ -43,7 +43,7 @@ def test_tuned_gains_and_files_of_gains(batchpid, tmp_path):
     for gains in ("tuned", "tutorial", tmp_path / "plain.yaml"):
         status, _, err = batchpid("view", *SHORT, "--gains", gains, "--time-limit", 0.1)
         assert (status, err) == (0, "")
-    assert "--control drive" in batchpid("view", *SHORT, "--gains", "drive:20,5")[2]
+    assert "must be PID gains" in batchpid("view", *SHORT, "--gains", "drive:20,5")[2]
 
 
 def test_the_first_64_of_many_recorded_robots_are_shown(batchpid, tmp_path):
@@ -53,10 +53,8 @@ def test_the_first_64_of_many_recorded_robots_are_shown(batchpid, tmp_path):
     assert "the first 64 of 70" in said
 
 
-def test_a_mesh_that_cannot_be_read_is_named_on_the_page_and_in_the_terminal(batchpid, tmp_path, monkeypatch):
-    """And a robot without ground, drawn by the real server, over a grid."""
-    texts = []
-    monkeypatch.setattr("viser.GuiApi.add_html", lambda self, content, **_: texts.append(content))
+def test_a_mesh_that_cannot_be_read_is_named(batchpid, tmp_path):
+    """And a robot without ground is drawn, over a grid."""
     (tmp_path / "<b>.stl").write_text("version https://git-lfs.github.com/spec/v1")
     seen = [f'<visual><geometry><mesh filename="{name}"/></geometry></visual>' for name in ("no.stl", "&lt;b>.stl")]
     box = '<collision><geometry><box size="1 1 1"/></geometry></collision>'
@@ -75,9 +73,6 @@ def test_a_mesh_that_cannot_be_read_is_named_on_the_page_and_in_the_terminal(bat
         "batchpid: warning: link 'arm' ('<b>.stl'): mesh cannot be read (a git-lfs pointer instead of the mesh: run "
         "git lfs pull): collision shapes are drawn instead; repair the file",
     ]
-    first, second = filter(None, texts)
-    assert "mesh not found" in first
-    assert "&lt;b&gt;.stl" in second
 
 
 def test_a_port_in_use_is_named_with_the_next(batchpid):
