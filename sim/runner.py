@@ -410,9 +410,8 @@ class Runner(SingleOwner):
         - ``workers``, ``cluster`` and ``timeout``, which change no result;
         - ``substeps`` and ``on_invalid_input``, which apply to the commands that follow.
 
-        A controller or ``build`` of the caller's own counts by its code, constants, closure and attributes, and by the
-        globals that it names, as they are when the runner is made. So snapshots of an edited function are refused, and
-        of another version of Python. Make a new controller for each runner if calls change its attributes.
+        A controller of the caller's own counts by its class, ``build`` by its name, and both by their attribute
+        ``version``, if they have one.
 
         Raises
         ------
