@@ -12,7 +12,7 @@ import tyro
 from batchpid.arrays.array_types import Array, Document
 from batchpid.checks.validate import array
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import OperationalSpace, Recorder, Robot, write_recording
+from batchpid.sim import OperationalSpace, Recorder, Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, waiting, write_figures
 from batchpid.sim.recording.recording_files import HDF5
@@ -67,7 +67,7 @@ class RolloutCommand:
     actuators: flags.Actuators = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
-    """Recording to write: .npz at the end, or .h5 tick by tick (extra `record`). For plot and view."""
+    """Recording to write, .h5: tick by tick, for plot and view."""
     picture: flags.OptionalPath = None
     """Step responses to draw: .png or .svg."""
     json: flags.Json = None
@@ -83,7 +83,7 @@ class RolloutCommand:
         from batchpid.sim.tuning.randomization_presets import load_randomization
 
         outputs = OutputFiles(self)
-        out = outputs.path("out", self.out, (".npz", *HDF5))
+        out = outputs.path("out", self.out, HDF5)
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes))
@@ -122,15 +122,14 @@ class RolloutCommand:
 
         with waiting(f"building {self.num_envs} robots"):
             made = Runner(robot, self.num_envs, **options)
-        is_streamed = out is not None and out.suffix.lower() != ".npz"
-        recorder = Recorder(out, made, seed=self.seed, overwrite=self.force) if out and is_streamed else nullcontext()
-        with made as runner, recorder:
+        with (
+            made as runner,
+            nullcontext() if out is None else Recorder(out, runner, seed=self.seed, overwrite=self.force),
+        ):
             start = start_poses(robot, self.num_envs, self.spread, self.seed, center)
             rollout, report = simulate(runner, start, setpoints, **rates)
         print(report)
         if out is not None:
-            if not is_streamed:
-                write_recording(rollout, out, seed=self.seed, overwrite=True)
             print(f"written: {out}")
         if json is not None:
             write_figures(json, run_figures(robot, rollout))

@@ -14,7 +14,7 @@ from batchpid.trajectories import Trajectory, minimum_jerk
 from tests.sim.tiny_urdf import LIMIT, joint, link, one_joint, robot, write
 
 SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
-FILE = "run.npz"
+FILE = "run.h5"
 
 
 @pytest.fixture
