@@ -85,7 +85,7 @@ def test_every_command_is_a_frozen_dataclass_with_help(name, batchpid):
 
 @pytest.mark.parametrize("name", [name for name in cli.COMMANDS if "robot" in fields_of(name)])
 def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
-    recording = ["run.npz"] if "recording" in fields_of(name) else []
+    recording = ["run.h5"] if "recording" in fields_of(name) else []
     parsed = cli.parse([name, *recording, "jaco2", "--missing-meshes", "error", "--package-dirs", "a", "b"])
     assert parsed.robot == "jaco2"
     assert vars(parsed.meshes) == {"missing_meshes": "error", "package_dirs": (Path("a"), Path("b"))}
