@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.choices import PerMassMatrix
-from batchpid.arrays.digest import digest, object_digest
+from batchpid.arrays.digest import digest
 from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
@@ -92,7 +92,7 @@ class RunnerOptions(RunnerKeywords):
             own["speed_limit"] = read_only(limit.copy())
         if self.randomization is not None:
             remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
-            check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
+            check_robot(instance("randomization", self.randomization, Randomization, remedy), robot, self.mjcf)
             self._check_world(self.randomization)
         self._check_tree()
         own["guard"] = fit_guard(given["guard"], robot.joints, self.num_envs, self.control_name, self.sets_positions)
@@ -104,8 +104,6 @@ class RunnerOptions(RunnerKeywords):
         own["params"] = self.check_params(params)
         for name in ("contacts", "wrenches"):
             own[name] = self._sensed_links(name, given[name])
-        for name in ("controller_digest", "build_digest"):  # of the objects as they are now
-            getattr(self, name)
 
     def _check_engine(self) -> None:
         """Raise InvalidArgumentError for options that the physics engine does not have."""
@@ -377,7 +375,7 @@ class RunnerOptions(RunnerKeywords):
             **{name: _plain(value) for name, value in self.values_for("snapshot").items()},
             "ignored_pairs": digest(robot.ignored_pairs),
             "robot_actuators": digest(known_joints(robot)),
-            "controller": self.controller_digest,
+            "controller": self.versioned_control,
             "command": None if own is None else list(own.names),
         }
 
@@ -401,15 +399,15 @@ class RunnerOptions(RunnerKeywords):
         """Name of the robot."""
         return self.robot.name
 
-    @cached_property
-    def controller_digest(self) -> str | None:
-        """Digest of a :class:`Controller`, which may change itself later; None for the name of a control."""
-        return _code_digest(self.control)
+    @property
+    def versioned_control(self) -> str | None:
+        """Class and ``version`` of a :class:`Controller`; None for the name of a control."""
+        return _versioned_name(self.control)
 
-    @cached_property
-    def build_digest(self) -> str | None:
-        """Digest of ``build``, which may change itself later; None without one."""
-        return _code_digest(self.build)
+    @property
+    def versioned_build(self) -> str | None:
+        """Name and ``version`` of ``build``; None without one."""
+        return _versioned_name(self.build)
 
     @property
     def guard_digest(self) -> str:
@@ -450,9 +448,12 @@ def _plain(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray) else list(value) if isinstance(value, tuple) else value
 
 
-def _code_digest(value: object) -> str | None:
-    """Return the digest of a controller or function of the caller's; None for a name, or without a value."""
-    return None if value is None or isinstance(value, str) else object_digest(value)
+def _versioned_name(value: object) -> str | None:
+    """Return the class of an object, or the name of a function, with its ``version``; None for a text or None."""
+    if value is None or isinstance(value, str):
+        return None
+    name = getattr(value, "__qualname__", type(value).__qualname__)
+    return f"{name} {getattr(value, 'version', '')}"
 
 
 def worker_count(workers: int | None) -> int:

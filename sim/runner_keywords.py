@@ -35,6 +35,8 @@ class Controller(Protocol):
 
     A setpoint has a number for each joint, unless the controller has an attribute ``command``: a
     :class:`batchpid.sim.CommandSpec`, or a sequence of names, such as ``("x", "y")``. Then it is (envs, size).
+
+    A snapshot fits a controller of the same class, whose attribute ``version`` is the same where it has one.
     """
 
     def init(self, robot: Robot, num_envs: int) -> Any:
@@ -195,7 +197,7 @@ class RunnerKeywords:
     wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
     """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``; default none.
     SAPIEN needs ``dissipation="urdf"``."""
-    build: Annotated[Callable[[Any, int], Any] | None, option("scene", snapshot="build_digest")] = None
+    build: Annotated[Callable[[Any, int], Any] | None, option("scene", snapshot="versioned_build")] = None
     """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env. Visuals and lights are
     ignored, so code that was written for a screen runs unchanged. It may return the entities that
     :meth:`batchpid.sim.Runner.poses` reports. A reset returns the content to the poses that ``build`` gave it."""

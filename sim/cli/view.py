@@ -39,7 +39,7 @@ class ViewCommand:
     actuators: flags.Actuators = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     play: flags.OptionalPath = None
-    """Recorded run to show: .npz or .h5."""
+    """Recorded run to show, .h5."""
     fps: flags.Fps = 30.0
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 for all of this machine. Everyone who sees the printed address can use it."""

@@ -47,7 +47,7 @@ def test_tuned_gains_and_files_of_gains(batchpid, tmp_path):
 
 
 def test_the_first_64_of_many_recorded_robots_are_shown(batchpid, tmp_path):
-    run = write(tmp_path / "run.npz", envs=70)
+    run = write(tmp_path / "run.h5", envs=70)
     status, said, _ = batchpid("view", *SHORT, "--play", run, "--time-limit", 0.2)
     assert status == 0
     assert "the first 64 of 70" in said
@@ -84,14 +84,14 @@ def test_a_port_in_use_is_named_with_the_next(batchpid):
 
 
 def test_a_run_of_another_robot_with_the_name_of_a_bundled_one_is_not_shown_as_that(batchpid, tmp_path):
-    run = write(tmp_path / "my run.npz", urdf=load_bundled("panda").urdf.replace("0.333", "0.433"))
+    run = write(tmp_path / "my run.h5", urdf=load_bundled("panda").urdf.replace("0.333", "0.433"))
     said = "robot: 'panda' of the recording is another one than the bundled robot of that name; name its URDF: batchpid"
     assert f"{said} view PATH/TO/ROBOT.urdf --play '{run}'" in batchpid("view", "--play", run)[2]
     assert f"{said} plot '{run}' PATH/TO/ROBOT.urdf --film a.gif" in batchpid("plot", run, "--film", "a.gif")[2]
 
 
 def test_a_run_of_a_robot_that_is_not_bundled_asks_for_its_urdf(batchpid, tmp_path):
-    run = write(tmp_path / "run.npz", robot="arm")
+    run = write(tmp_path / "run.h5", robot="arm")
     assert (
         "robot: 'arm' of the recording is not bundled; name its URDF: batchpid view PATH/TO/ROBOT.urdf --play"
         in batchpid("view", "--play", run)[2]
