@@ -29,7 +29,7 @@ from batchpid.io.versions import package_versions
 from batchpid.sim.command import CommandSpec
 from batchpid.sim.loop.backend import describe
 from batchpid.sim.loop.faults import Fault
-from batchpid.sim.loop.snapshot import Snapshot
+from batchpid.sim.loop.snapshot import EnvStates, Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.run_warnings import RunWarnings
@@ -424,9 +424,9 @@ class Runner(SingleOwner):
             It is of another robot, number of envs, timestep, control, ...; the message names the options.
         """
         self._ready("restore")
-        instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()").check(self.options.describe())
+        instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
         sizes = [size for part in self._execute(Read(ReadStateSizes())).results for size in part]
-        request = restored(self.options, snapshot, sizes)
+        request = restored(self.options, self._state, snapshot, sizes)
         self._execute(GoBack(request))
         self._pool.start_replay_from(request)
         self._warnings.set_gains(self._state.params, self._state.actuators)
@@ -659,7 +659,8 @@ class Runner(SingleOwner):
     def _take_snapshot(self) -> Snapshot:
         """Return a snapshot, from which the runner goes on, and a replacement of a lost worker begins."""
         state = self._state
-        snapshot = snapshot_of(self.options, state, self._execute(MakeSnapshot()).results)
+        states = EnvStates.join(self._execute(MakeSnapshot()).results)
+        snapshot = snapshot_of(self.options, state, states)
         self._pool.start_replay_from(Restore(snapshot, state.draws))
         return snapshot
 
