@@ -5,7 +5,7 @@
 # make docs     the API reference and the guides, as pages in out/site
 # make bench    benchmarks and their baselines, on an idle machine (10 minutes); the last lines compare them
 # make bench-check  ratios of speeds against their floors: 3 minutes, on an idle machine
-# make figures  measure and redraw docs/performance.md, and the README's film (7 to 25 minutes, on an idle machine)
+# make figures  measure and redraw docs/performance.md (7 to 25 minutes, on an idle machine)
 # make soak     the slow tests, each result as it comes (an hour)
 # make wheel    dist/: the sdist, and from it the wheel, tried in a clean environment; needs network and a C++ compiler
 #
@@ -86,7 +86,6 @@ figures: $(VENV)/.dev
 	@$(RUN) -m pytest bench/test_few_robots.py bench/test_scaling.py bench/test_resources.py \
 		--benchmark-json $(MEASURED)/pytest.json
 	@$(RUN) bench/draw.py $(MEASURED)
-	@$(RUN) bench/film.py
 
 # The errors of the physics presets depend on physics and gains, not on the machine's speed.
 accuracy: $(VENV)/.dev

@@ -6,15 +6,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-from PIL import Image
 from robots import load_bundled
 from scripts import ROOT, load_script
 
-from batchpid.sim import Robot, Runner, write_recording
-from batchpid.sim.view import LiveSimulation
+from batchpid.sim import Robot, Runner
 
-TESTED = {"accuracy", "circles", "draw", "film", "measure", "motions", "newcomer"}
-TESTED |= {"trajectories", "view"}
+TESTED = {"accuracy", "circles", "draw", "measure", "motions", "newcomer"}
+TESTED |= {"trajectories"}
 
 
 def rows(text):
@@ -45,40 +43,6 @@ def test_circles(monkeypatch):
     tool, wanted, center = circles.measure(panda, "panda_hand", "sapien", twist=True, acceleration=True)
     assert np.linalg.norm(tool - wanted, axis=1).max() < 0.05
     np.testing.assert_allclose(np.linalg.norm(wanted - center, axis=1), circles.RADIUS)
-
-
-@pytest.mark.slow
-def test_film(tmp_path):
-    """Few and short: the gains by hand overshoot, the designed ones do not, and every picture shows robots."""
-    film, path = load_script("film"), tmp_path / "new" / "film.gif"
-    moves = film.simulate(load_bundled("panda"), 1.0)
-    overshoot = [move.qpos[:, :, film.JOINT].max() - film.GOAL[film.JOINT] for move in moves.values()]
-    assert overshoot[0] < 0.01
-    assert overshoot[1] > 0.3
-    film.main(film.Options(path, seconds=0.2, interval=0.1))
-    with Image.open(path) as pictures:
-        assert pictures.n_frames == 2
-        shown = []
-        for at in range(2):
-            pictures.seek(at)
-            shown.append(np.asarray(pictures.convert("L"))[:, :500])
-    assert all((picture < 200).mean() > 0.02 for picture in shown)
-    assert (shown[0] != shown[1]).any()
-
-
-def test_film_of_a_recording(tmp_path):
-    """Robots with a floating base are drawn where they are: the second picture is of robots that fell."""
-    film, path, robot = load_script("film"), tmp_path / "fall.gif", Robot.load("quadruped", fixed_base=False)
-    with Runner(robot, 4, params=robot.params(kp=1.0), workers=0, compensate="none") as runner:
-        write_recording(runner.rollout(np.tile(robot.start, (31, 1))), tmp_path / "fall.npz")
-    film.main(film.Options(path, seconds=0.31, interval=0.3, recording=tmp_path / "fall.npz"))
-    with Image.open(path) as pictures:
-        heights = []
-        for at in range(pictures.n_frames):
-            pictures.seek(at)
-            heights.append(np.nonzero((np.asarray(pictures.convert("L")) < 100)[50:].any(1))[0].min())
-    assert len(heights) == 2
-    assert heights[1] > heights[0] + 10
 
 
 def test_newcomer(tmp_path, capfd):
@@ -163,30 +127,6 @@ def test_draw(tmp_path):
         assert (tmp_path / name).read_text() == (ROOT / name).read_text(), f"{name}: run bench/draw.py"
     for name in ("performance", "accuracy"):
         assert (docs / "images" / f"{name}.png").stat().st_size > 10_000
-
-
-class Page:
-    """Browser that draws nothing."""
-
-    def get(self, url):
-        self.url = url
-
-    def execute_script(self, script):
-        return 3 if "return" in script else None
-
-    def quit(self):
-        pass
-
-
-def test_view(monkeypatch, capsys):
-    pytest.importorskip("viser")
-    pytest.importorskip("selenium")
-    view, page = load_script("view"), Page()
-    monkeypatch.setattr(view, "open_browser", lambda options, profile: page)
-    monkeypatch.setattr(view, "LiveSimulation", partial(LiveSimulation, workers=0))
-    view.main(view.Options("panda", num_envs=1, seconds=0.5, loading=0.0, port=18290))
-    assert page.url.startswith("http")
-    assert "frames/s served" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("sines", [False, True])

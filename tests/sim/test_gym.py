@@ -15,38 +15,30 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 from batchpid.errors import CallOrderError, InvalidArgumentError  # noqa: E402
 from batchpid.sim import CommandSpec, FaultWarning, Randomization, Robot, Runner, Uniform  # noqa: E402
 from batchpid.sim.gym import PushVectorEnv, ReachEnv, ReachVectorEnv, ToolReachVectorEnv, WalkVectorEnv  # noqa: E402
-from batchpid.sim.view import renderer  # noqa: E402
 from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write  # noqa: E402
 
 ID = "batchpid.sim.gym:batchpid/Reach-v0"
 
 
 def test_gymnasiums_own_checks_pass():
-    env = gymnasium.make(ID)
-    check_env(env.unwrapped, skip_render_check=True)
+    check_env(gymnasium.make(ID).unwrapped)
     env = gymnasium.make(ID, robot="jaco2", actions="increment")
     check_env(env.unwrapped, skip_render_check=True)
 
 
-def test_gymnasiums_own_checks_pass_without_a_render_device(monkeypatch):
-    """All of them: the metadata of an env name the modes that this machine can render."""
-    monkeypatch.setattr(renderer, "render_problem", lambda: "no device")
-    env = gymnasium.make(ID)
-    assert env.unwrapped.metadata["render_modes"] == []
-    check_env(env.unwrapped)
-    assert ReachEnv.metadata["render_modes"] == ["rgb_array"]
-
-
-def test_the_modes_that_a_device_renders_are_tested_at_the_first_look(monkeypatch):
-    looks: list[int] = []
-    monkeypatch.setattr(renderer, "render_problem", lambda: looks.append(1))
-    envs = ReachVectorEnv(1, workers=0)
+def test_pictures_show_each_env(panda):
+    envs = ReachVectorEnv(2, workers=0, render_mode="rgb_array")
+    envs.runner.reset(panda.start)
+    first, second = envs.render()
+    assert (first.shape, first.dtype) == ((480, 640, 3), np.uint8)
+    np.testing.assert_array_equal(first, second)
+    envs.runner.reset([panda.start, panda.settings.target])
+    np.testing.assert_array_equal(envs.render()[0], first)
+    assert (envs.render()[1] != first).any()
     assert envs.metadata["render_fps"] == pytest.approx(50)
-    assert not looks
-    assert envs.metadata.get("render_modes") == ["rgb_array"]
-    assert envs.metadata["render_modes"] == ["rgb_array"]
-    assert len(looks) == 1
     envs.close()
+    with pytest.raises(InvalidArgumentError, match="render_mode: unknown option"):
+        ReachVectorEnv(1, render_mode="human")
 
 
 MODES = [AutoresetMode.NEXT_STEP]

@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 
 from batchpid.errors import InvalidArgumentError  # noqa: E402
 from batchpid.sim import RecoveryWarning, Robot, Runner  # noqa: E402
-from batchpid.sim.gym import PushVectorEnv, RobotEnv, RobotVectorEnv, ToolReachVectorEnv, WalkVectorEnv  # noqa: E402
-from batchpid.sim.view import renderer  # noqa: E402
+from batchpid.sim.gym import PushVectorEnv, RobotEnv, RobotVectorEnv, ToolReachVectorEnv  # noqa: E402
 from tests.sim.tiny_urdf import one_joint, write  # noqa: E402
 
 
@@ -369,64 +368,6 @@ def test_every_goal_of_a_box_can_be_reached():
             break
     assert reached.all()
     envs.close()
-
-
-# -- pictures ----------------------------------------------------------------------------------------------------------
-
-
-class Still:
-    """Stand-in for a scene on machines that cannot render: the picture has the numbers that the scene was given."""
-
-    def __init__(self, robot, count, ground):
-        assert count == 1
-        self.content, self.size = np.zeros(7), None
-
-    def add_camera(self, width, height):
-        self.size = height, width, 3
-        return lambda: np.full(self.size, 100 * (self.qpos[0, 0] + 1) + 10 * self.content[0] + self.height, np.uint8)
-
-    def add_content(self, build, env):
-        self.content = np.full(7, np.nan)
-
-    def place_content(self, poses):
-        self.content = poses[0]
-
-    def place(self, qpos, base_pose):
-        self.qpos, self.height = qpos, 0.0 if base_pose is None else 40 * base_pose[0, 2]
-
-
-def test_pictures_show_each_env(hinge, monkeypatch):
-    monkeypatch.setattr(renderer, "render_problem", lambda: None)
-    monkeypatch.setattr(renderer, "RenderScene", Still)
-    envs = Swing(2, hinge, workers=0, render_mode="rgb_array")
-    envs.reset(seed=0)
-    envs.runner.reset([[0.0], [1.0]])
-    pictures = envs.render()
-    assert [(each.shape, each.dtype, each[0, 0, 0]) for each in pictures] == [
-        ((480, 640, 3), np.uint8, 100),
-        ((480, 640, 3), np.uint8, 200),
-    ]
-    assert envs.metadata["render_fps"] == pytest.approx(50)
-    envs.close()
-    pushes = PushVectorEnv(1, workers=0, render_mode="rgb_array")
-    pushes.reset(seed=0)
-    assert pushes.render()[0][0, 0, 0] == 104  # the box is at x = 0.49 m
-    pushes.close()
-    walkers = WalkVectorEnv(1, workers=0, render_mode="rgb_array")
-    walkers.runner.reset(base_pose=[0, 0, 1.0, 1, 0, 0, 0])
-    assert walkers.render()[0][0, 0, 0] == 140
-    walkers.close()
-
-
-def test_a_render_mode_that_cannot_be_is_refused_before_anything_runs(hinge, monkeypatch):
-    monkeypatch.setattr(renderer, "render_problem", lambda: "RuntimeError: failed to find a rendering device")
-    with pytest.raises(renderer.RenderError, match=r"failed to find a rendering device.*mesa-vulkan-drivers"):
-        Swing(1, hinge, render_mode="rgb_array")
-    with pytest.raises(InvalidArgumentError, match=r"render_mode: is not supported.*'rgb_array'.*batchpid view"):
-        Swing(1, hinge, render_mode="human")
-    monkeypatch.setattr(renderer, "render_problem", lambda: None)
-    with pytest.raises(InvalidArgumentError, match="num_envs"):
-        Swing(65, hinge, render_mode="rgb_array")
 
 
 # -- adapters ----------------------------------------------------------------------------------------------------------

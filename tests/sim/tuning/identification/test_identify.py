@@ -318,7 +318,6 @@ def test_a_history_of_other_inputs_is_refused_by_their_names(arm, runs, tmp_path
     (path := tmp_path / "arm.urdf").write_text(ARM)
     with pytest.raises(KeyboardInterrupt):
         resume(Robot.load(path))  # the same content under another path
-    refused("merge_fixed", Robot.load(path, merge_fixed=False))
     path.write_text(ARM.replace('mass value="1"', 'mass value="1.5"'))
     refused("urdf", Robot.load(path))
     refused("data", log=replace(log, qpos=qpos + 1e-12))
