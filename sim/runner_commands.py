@@ -224,7 +224,7 @@ def restored(options: RunnerOptions, state: RunnerState, snapshot: Snapshot, siz
     snapshot.check_tables(present.tables())
     params = options.check_params(snapshot.params)
     acting = actuators = options.check_actuators(IDEAL if snapshot.actuators is None else snapshot.actuators)
-    if randomization is not None:
+    if randomization is not None and snapshot.episodes is not None:
         draws = randomization.draw(robot, snapshot.episodes)
         acting = randomization.randomized_actuators(actuators, draws, robot)
     fresh = EnvStates.fresh(
