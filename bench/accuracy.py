@@ -39,8 +39,8 @@ from batchpid.sim.loop.control_step import STAGES, control_step
 from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.loop.step_setup import acting_gains, reset_friction
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
-from batchpid.sim.robot.description import Dynamics
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import RobotModel
 from batchpid.sim.tuning.moves import Moves, draw_moves, random_moves
 
 Float64 = NDArray[np.float64]
@@ -67,7 +67,7 @@ class EquationOfMotion:
     It has the methods of a :class:`batchpid.sim.engine.sapien.pack.Pack` that a control step takes.
     """
 
-    def __init__(self, dynamics: Dynamics, damping: Float64, qpos: Float64, timestep: float) -> None:
+    def __init__(self, dynamics: RobotModel, damping: Float64, qpos: Float64, timestep: float) -> None:
         self._dynamics, self._damping, self._h = dynamics, damping, timestep
         self._qpos, self._qvel = qpos.copy(), np.zeros_like(qpos)
         self._effort = np.zeros_like(qpos)

@@ -48,8 +48,8 @@ PHASES = {
     "write": ("#b45f82", "writing"),
     "waiting": ("#d9d9d9", "waiting"),
 }
-PRESETS = ("accurate", "fast", "free")
-"""Presets in the table of their errors; the cost of "free" is that without collision shapes."""
+PRESETS = ("accurate", "fast")
+"""Presets in the table of their errors."""
 MOTIONS = {
     "tutorial": "the tutorial's",
     "start pose held": "holding the start pose, gripper closed",
@@ -212,7 +212,7 @@ def draw_accuracy(rows: list[dict[str, Any]]) -> Figure:
     for row in rows:
         axes, preset = panels[robots.index(row["robot"])], PRESETS.index(row["physics"])
         place = kinds.index((row["motion"], row["reference"])) - 0.22 * (preset - 1)
-        axes.plot(row["max"], place, "o", color=(OURS, FAST, FREE)[preset], ms=8, label=row["physics"])
+        axes.plot(row["max"], place, "o", color=(OURS, FAST)[preset], ms=8, label=row["physics"])
     for robot, axes in zip(robots, panels, strict=True):
         axes.set_xscale("log")
         axes.set_yticks(range(len(kinds)), [f"{motion}, against {reference}" for motion, reference in kinds])
@@ -284,12 +284,9 @@ def presets_table(figures: dict[str, Any]) -> str:
     measured, cases = {(row["robot"], row["physics"]) for row in figures["accuracy"]}, figures["cases"]
     robots = dict.fromkeys(name.split("-")[0] for name in SETUPS)
     for robot, physics in [both for both in product(robots, PRESETS) if both in measured]:
-        free = physics == "free"
-        phases = cases[f"{robot}-fast"].get("free_phases") if free else cases[f"{robot}-{physics}"]["phases"]
-        cost = ""
-        if phases is not None:
-            all_work = sum(spent for phase, spent in phases.items() if phase != "waiting")
-            cost = f"{phases['step']:.1f} / {all_work:.1f}"
+        phases = cases[f"{robot}-{physics}"]["phases"]
+        all_work = sum(spent for phase, spent in phases.items() if phase != "waiting")
+        cost = f"{phases['step']:.1f} / {all_work:.1f}"
         first = [f"{robot}, {physics}", cost]
         for row in figures["accuracy"]:
             if (row["robot"], row["physics"]) == (robot, physics):

@@ -17,7 +17,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 from unittest.mock import patch
@@ -41,17 +41,16 @@ from batchpid.sim.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 
 OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"
-POLICY, FREE = "closed loop, policy network", "closed loop, no shapes, free"
+POLICY, NO_SHAPES = "closed loop, policy network", "closed loop, no shapes"
 LOOPS = {
     # case of the Runner: its options
     PYTHON: {},
     BY_TICKS: {},
     OURS: {},
     POLICY: {},
-    "closed loop, no shapes": {"collisions": False},
-    FREE: {"collisions": False, "physics": "free"},
+    NO_SHAPES: {"collisions": False},
 }
-XLA_LOOPS = {f"{name}, XLA": LOOPS[name] | {"backend": "jax"} for name in (OURS, POLICY, FREE)}
+XLA_LOOPS = {f"{name}, XLA": LOOPS[name] | {"backend": "jax"} for name in (OURS, POLICY, NO_SHAPES)}
 MUJOCO_LOOPS = {"closed loop, MuJoCo": {"engine": "mujoco"}}
 CASES = (*TUTORIALS, *ENGINES, *LOOPS)
 """Cases without JAX, MuJoCo and peers."""
@@ -201,7 +200,7 @@ class Options:
     num_envs: int = 64
     workers: int | None = None
     """Default: one for each available core."""
-    physics: Literal["accurate", "fast", "free"] = "accurate"
+    physics: Literal["accurate", "fast"] = "accurate"
     ticks: int = 100
     rounds: int = 5
     peers: bool = False
@@ -234,7 +233,6 @@ def main(options: Options) -> None:
             case: round(ratios[case] * result.processes / workload.processes, 3) for case, result in results.items()
         },
         "phases": _rounded(measure_phases(workload)),
-        "free_phases": _rounded(measure_phases(replace(workload, physics="free"), collisions=False)),
     }
     calls = native.describe_calls("SAPIEN", load_engine("sapien").native_obstacle())
     print(f"{options.robot}, {options.num_envs} envs, {workload.processes} processes, {calls}\n")
@@ -245,7 +243,7 @@ def main(options: Options) -> None:
     ]
     print(table(rows, ["case", "thousand env-steps/s", f"{OURS} / case", "per process"], "lrrr"))
     print("\nmicroseconds per env step in a worker:")
-    rows = [[name, *map(str, figures[key].values())] for name, key in ((OURS, "phases"), (FREE, "free_phases"))]
+    rows = [[OURS, *map(str, figures["phases"].values())]]
     print(table(rows, ["", *figures["phases"]], "lrrrrrr"))
     if options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)

@@ -33,7 +33,7 @@ HOLD = "start pose held"
 VARIANTS: dict[str, dict[str, Any]] = {
     "accurate": {"physics": "accurate"},
     "fast": {"physics": "fast"},
-    "free, no shapes": {"physics": "free", "collisions": False},
+    "no shapes": {"physics": "fast", "collisions": False},
 }
 """Options of the runner; the moves touch nothing."""
 

@@ -132,7 +132,7 @@ class Runner(SingleOwner):
             self._call.end()
         self._warnings.issue(state.faults, state.contacts, self._pool.messages)
         self._warnings.check_stability(state.params, state.actuators)
-        self._warnings.set_gains(state.params, state.actuators)
+        self._warnings.set_params(state.params)
         self._warnings.check_controller()
 
     def __repr__(self) -> str:
@@ -381,7 +381,7 @@ class Runner(SingleOwner):
         checked = self.options.check_params(params)
         self._execute(ChangeParams(checked))
         self._warnings.check_stability(checked, self._state.actuators)
-        self._warnings.set_gains(checked, self._state.actuators)
+        self._warnings.set_params(checked)
 
     @property
     def actuators(self) -> bp.Actuators | None:
@@ -396,7 +396,6 @@ class Runner(SingleOwner):
         self._ready()
         checked = self.options.check_actuators(actuators)
         self._execute(ChangeActuators(checked))
-        self._warnings.set_gains(self._state.params, checked)
 
     def snapshot(self) -> Snapshot:
         """Return the state of all envs, physics and controller, for :meth:`restore`.
@@ -429,7 +428,7 @@ class Runner(SingleOwner):
         request = restored(self.options, snapshot, sizes)
         self._execute(GoBack(request))
         self._pool.start_replay_from(request)
-        self._warnings.set_gains(self._state.params, self._state.actuators)
+        self._warnings.set_params(self._state.params)
         return self._pool.present.observation.copied(self._tool_pose)
 
     def settle(self) -> None:
@@ -628,8 +627,7 @@ class Runner(SingleOwner):
         if outcome.failure is not None:
             raise outcome.failure.error
         if ticks is not None and self._warnings.is_watching:
-            seconds, seen = ticks.substeps * ticks.timestep, outcome.ticks.arrays.observation
-            self._warnings.see(ticks.command, seen, outcome.num_ticks, seconds)
+            self._warnings.see(ticks.command, outcome.num_ticks, ticks.substeps * ticks.timestep)
         faults, contacts = self._state.faults, self._state.contacts
         if pool.messages or faults.faults or contacts is not None:
             self._warnings.issue(faults, contacts, pool.messages)

@@ -66,7 +66,7 @@ Precision = Literal["float64", "float32"]
 EngineName = Literal["sapien", "mujoco"]
 DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
 """SAPIEN where it is installed, which is on Linux with x86-64; elsewhere MuJoCo."""
-PhysicsPreset = Literal["accurate", "fast", "free"]
+PhysicsPreset = Literal["accurate", "fast"]
 FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]
 Place = Literal["snapshot", "recording", "scene"]

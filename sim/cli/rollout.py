@@ -91,7 +91,7 @@ class RolloutCommand:
             run_figures,
             start_poses,
         )
-        from batchpid.sim.tuning.randomization_presets import load_randomization
+        from batchpid.sim.tuning.randomization_files import load_randomization
 
         outputs = OutputFiles(self)
         if self.resume and self.out is None:

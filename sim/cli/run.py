@@ -32,7 +32,7 @@ from batchpid.sim.tuning.evaluation import (
 )
 from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
-from batchpid.sim.tuning.randomization_presets import at_the_joints, reseeded
+from batchpid.sim.tuning.randomization_files import at_the_joints, reseeded
 from batchpid.sim.tuning.sweep import sweep
 from batchpid.task_space.frames import pose_error
 

@@ -9,7 +9,6 @@ import numpy as np
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.robot.robot import Robot
 
 MAX_ROBOTS = 64
@@ -73,4 +72,4 @@ def arrange_robots(robot: Robot, groups: int, per_group: int, ground: bool) -> R
 def lowest_point(robot: Robot) -> float:
     """Return the height [m] of the lowest collision shape or link frame at the start pose."""
     frames = ts.link_poses(robot.rigid_tree, robot.start)[:, 2].min()
-    return min(float(frames), robot_model(robot).height(robot.start, base_too=True))
+    return min(float(frames), robot.dynamics().height(robot.start, base_too=True))

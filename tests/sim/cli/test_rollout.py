@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,12 +72,13 @@ def default_motion(tmp_path_factory):
         ("--dissipation", "sapien"),
         ("--timestep", "0.001"),
         ("--spread", "0.1"),
-        ("--randomize", "payload"),
+        ("--randomize", "payload.yaml"),
         ("--setpoint", "0", "-0.5", "0", "-1", "0", "1", "0", "0", "0"),
     ],
     ids=lambda flags: flags[0],
 )
 def test_every_flag_changes_the_motion(flags, batchpid, default_motion, tmp_path):
+    Path("payload.yaml").write_text("payload: {uniform: [0, 0.5]}")
     other = saved(batchpid, tmp_path / "b.npz", *flags)
     assert np.abs(default_motion["qpos"][-1] - other["qpos"][-1]).max() > 1e-6
 
@@ -392,9 +394,10 @@ def test_a_trajectory_without_rates_is_a_log(batchpid, panda, tmp_path, motion):
 
 
 @pytest.mark.parametrize(
-    "flags", [("--randomize", "payload"), pytest.param(("--control", "osc"), marks=pytest.mark.slow)], ids=str
+    "flags", [("--randomize", "payload.yaml"), pytest.param(("--control", "osc"), marks=pytest.mark.slow)], ids=str
 )
 def test_a_run_that_resumes_ends_with_the_file_of_one_that_was_not_stopped(flags, batchpid, tmp_path, monkeypatch):
+    Path("payload.yaml").write_text("payload: {uniform: [0, 0.5]}")
     whole, parts = tmp_path / "whole.h5", tmp_path / "parts.h5"
     words = ("rollout", *SHORT, "--engine", "mujoco", *flags)
     assert batchpid(*words, "--out", whole)[0] == 0
