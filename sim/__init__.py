@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from batchpid.sim.engine.physics import MujocoSolver, Physics
     from batchpid.sim.robot.urdf_export import to_urdf
     from batchpid.sim.runner import Runner
-    from batchpid.sim.tuning.sweep import sweep
     from batchpid.sim.workers.pool import RecoveryWarning
 
 __all__ = [
@@ -69,7 +68,6 @@ __all__ = [
     "StabilityWarning",
     "Uniform",
     "read_recording",
-    "sweep",
     "to_mjcf",
     "to_urdf",
     "write_recording",
@@ -80,7 +78,6 @@ _LOADED_LATE = {
     "Physics": "batchpid.sim.engine.physics",
     "Runner": "batchpid.sim.runner",
     "RecoveryWarning": "batchpid.sim.workers.pool",
-    "sweep": "batchpid.sim.tuning.sweep",
     "to_mjcf": "batchpid.sim.engine.mujoco.mjcf_export",
     "to_urdf": "batchpid.sim.robot.urdf_export",
 }

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.choices import PerMassMatrix
-from batchpid.arrays.digest import digest, object_digest
+from batchpid.arrays.digest import digest
 from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
@@ -31,6 +31,7 @@ from batchpid.law.input_checks import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.command import CommandSpec, joint_command, own_command
+from batchpid.sim.engine.native import xla
 from batchpid.sim.engine.physics import MujocoSolver, Physics
 from batchpid.sim.engine.protocol import Capability, Engine, load_engine, require
 from batchpid.sim.engine.scene_spec import added_friction
@@ -81,12 +82,6 @@ class RunnerOptions(RunnerKeywords):
         if isinstance(self.control, OperationalSpace):
             own["control"], own["tool"] = self.control.in_runner(self.timestep, self.compensate), self.control.link
         own["workers"], own["cluster"] = _places(self.workers, given["cluster"])
-        if self.backend == "numpy" and self.dtype != "float64":
-            raise InvalidArgumentError(
-                "dtype", "is that of backend 'jax'; NumPy's law is in float64", value=self.dtype, remedy="leave it out"
-            )
-        if self.backend == "jax":
-            require_jax()
         self._check_engine()
         if self.build is not None and not callable(self.build):
             raise InvalidArgumentError(
@@ -97,18 +92,18 @@ class RunnerOptions(RunnerKeywords):
             own["speed_limit"] = read_only(limit.copy())
         if self.randomization is not None:
             remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
-            check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
+            check_robot(instance("randomization", self.randomization, Randomization, remedy), robot, self.mjcf)
             self._check_world(self.randomization)
         self._check_tree()
         own["guard"] = fit_guard(given["guard"], robot.joints, self.num_envs, self.control_name, self.sets_positions)
+        if self.backend == "jax":
+            self._check_program()
         own["actuators"] = self.check_actuators(given["actuators"])
         self._check_collisions()
         params = default_params(robot, self.control, self.loops) if given["params"] is None else given["params"]
         own["params"] = self.check_params(params)
         for name in ("contacts", "wrenches"):
             own[name] = self._sensed_links(name, given[name])
-        for name in ("controller_digest", "build_digest"):  # of the objects as they are now
-            getattr(self, name)
 
     def _check_engine(self) -> None:
         """Raise InvalidArgumentError for options that the physics engine does not have."""
@@ -123,6 +118,29 @@ class RunnerOptions(RunnerKeywords):
         for capability, (argument, needs) in needed.items():
             if needs:
                 require(engine, capability, argument)
+
+    def _check_program(self) -> None:
+        """Raise InvalidArgumentError for an option that the program of backend "jax" does not have."""
+        require_jax()
+        engine, robot = self.load_engine(), self.robot
+        whole = "coriolis" in self.compensate or "partial_force" in engine.capabilities
+        reads_force = whole and (robot.fixed_base or "base_state" in engine.capabilities)
+        reason = f"{engine.title} has no compiled sim steps"
+        if "compiled_steps" in engine.capabilities:
+            reason = engine.native_obstacle() or xla.obstacle()
+        lacking = (
+            ("backend", reason, f"is 'jax'; {reason}"),
+            ("control", self.control == "drive", "'drive' has no law to compile"),
+            ("robot", not robot.coupling.is_identity, "has coupled joints"),
+            ("robot", not robot.fixed_base and robot.friction.any(), "has a floating base, and joints with friction"),
+            ("compensate", "gravity" in self.compensate and not reads_force, "needs a passive force of NumPy"),
+            ("randomization", self.randomization is not None, "is given"),
+            ("guard", self.guard is not None, "is given"),
+            ("robot", robot.actuators is not None, "has actuators"),
+        )
+        for argument, lacks, problem in lacking:
+            if lacks:
+                raise _not_in_program(argument, problem)
 
     def _check_tree(self) -> None:
         """Raise InvalidArgumentError for options that need a kinematic tree, if the robot has closed loops."""
@@ -325,6 +343,8 @@ class RunnerOptions(RunnerKeywords):
         fitted = None if fitted is None or fitted.is_ideal else fitted
         if self.randomization is not None:
             fitted = prepared_actuators(self.randomization, fitted, self.robot, self.control)
+        if fitted is not None and self.backend == "jax":
+            raise _not_in_program("actuators", "are given")
         return None if fitted is None else frozen(fitted)
 
     def with_values(self, **values: Any) -> RunnerOptions:
@@ -355,7 +375,7 @@ class RunnerOptions(RunnerKeywords):
             **{name: _plain(value) for name, value in self.values_for("snapshot").items()},
             "ignored_pairs": digest(robot.ignored_pairs),
             "robot_actuators": digest(known_joints(robot)),
-            "controller": self.controller_digest,
+            "controller": self.versioned_control,
             "command": None if own is None else list(own.names),
         }
 
@@ -379,15 +399,15 @@ class RunnerOptions(RunnerKeywords):
         """Name of the robot."""
         return self.robot.name
 
-    @cached_property
-    def controller_digest(self) -> str | None:
-        """Digest of a :class:`Controller`, which may change itself later; None for the name of a control."""
-        return _code_digest(self.control)
+    @property
+    def versioned_control(self) -> str | None:
+        """Class and ``version`` of a :class:`Controller`; None for the name of a control."""
+        return _versioned_name(self.control)
 
-    @cached_property
-    def build_digest(self) -> str | None:
-        """Digest of ``build``, which may change itself later; None without one."""
-        return _code_digest(self.build)
+    @property
+    def versioned_build(self) -> str | None:
+        """Name and ``version`` of ``build``; None without one."""
+        return _versioned_name(self.build)
 
     @property
     def guard_digest(self) -> str:
@@ -428,9 +448,12 @@ def _plain(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray) else list(value) if isinstance(value, tuple) else value
 
 
-def _code_digest(value: object) -> str | None:
-    """Return the digest of a controller or function of the caller's; None for a name, or without a value."""
-    return None if value is None or isinstance(value, str) else object_digest(value)
+def _versioned_name(value: object) -> str | None:
+    """Return the class of an object, or the name of a function, with its ``version``; None for a text or None."""
+    if value is None or isinstance(value, str):
+        return None
+    name = getattr(value, "__qualname__", type(value).__qualname__)
+    return f"{name} {getattr(value, 'version', '')}"
 
 
 def worker_count(workers: int | None) -> int:
@@ -473,3 +496,9 @@ def default_params(
             return robot.designed("effort").replace(ki=0.0, setpoint_weight=None, derivative_filter_time=None)
         return robot.params(kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None)
     return robot.tuned() if robot.has_tuned else robot.designed("effort" if loops else None)
+
+
+def _not_in_program(argument: str, problem: str) -> InvalidArgumentError:
+    """Return the error for an option that the program of backend "jax" does not have."""
+    problem = f"{problem}, which the program of backend 'jax' does not have"
+    return InvalidArgumentError(argument, problem, remedy="use backend='numpy'")

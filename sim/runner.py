@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import check_keywords, choice, instance
 from batchpid.checks.warn import warn
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.sim.command import CommandSpec
+from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.backend import describe
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
@@ -63,11 +63,11 @@ class TickRecorder(Protocol):
 
     path: Path
 
-    def wait(self) -> None:
+    def prepare(self) -> None:
         """Return, or raise, before the next tick begins: whether it can be recorded."""
 
-    def append(self, time_: float, setpoint: Rows, observation: Observation, has_rates: bool) -> None:
-        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size), with rates or without.
+    def append(self, time_: float, command: Command, observation: Observation) -> None:
+        """Record the state at ``time_`` [s] after a tick under ``command`` (envs, ...), which may change afterwards.
 
         It must return soon, and without an error: Ctrl-C waits for it.
         """
@@ -230,9 +230,7 @@ class Runner(SingleOwner):
             "setpoint_acceleration": setpoint_acceleration,
             "feedforward": feedforward,
         }
-        command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
-        count = self.substeps if substeps is None else checked_option("substeps", substeps)
-        self._execute(RunTicks(command, count, self.timestep))
+        self._execute(self._tick(given, substeps))
         return self._pool.present.observation.copied(self._tool_pose)
 
     def send(
@@ -262,9 +260,7 @@ class Runner(SingleOwner):
             "setpoint_acceleration": setpoint_acceleration,
             "feedforward": feedforward,
         }
-        command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
-        count = self.substeps if substeps is None else checked_option("substeps", substeps)
-        self._begin(RunTicks(command, count, self.timestep))
+        self._begin(self._tick(given, substeps))
 
     def recv(self) -> Observation:
         """Wait for the end of the tick that :meth:`send` began; return its observation.
@@ -328,7 +324,7 @@ class Runner(SingleOwner):
             seen = seen._replace(tool_pose=options.tool_pose(seen.qpos))
         if (faults := self._state.faults.faults) is not info.faults:
             info = replace(info, faults=faults)
-        return Rollout(times, command.setpoint, seen, tick, info)
+        return Rollout(times, command.setpoint, seen, tick, info, command.feedforward)
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
@@ -413,9 +409,8 @@ class Runner(SingleOwner):
         - ``workers``, ``cluster`` and ``timeout``, which change no result;
         - ``substeps`` and ``on_invalid_input``, which apply to the commands that follow.
 
-        A controller or ``build`` of the caller's own counts by its code, constants, closure and attributes, and by the
-        globals that it names, as they are when the runner is made. So snapshots of an edited function are refused, and
-        of another version of Python. Make a new controller for each runner if calls change its attributes.
+        A controller of the caller's own counts by its class, ``build`` by its name, and both by their attribute
+        ``version``, if they have one.
 
         Raises
         ------
@@ -489,7 +484,7 @@ class Runner(SingleOwner):
     @property
     def backend(self) -> str:
         """Library of the law, and kind of the calls into the engine, with the reason if they are not native."""
-        return describe(self.options, self.actuators)
+        return describe(self.options)
 
     @property
     def time(self) -> float:
@@ -572,6 +567,15 @@ class Runner(SingleOwner):
             self._execute(self._sent)
         return self._state
 
+    def _tick(self, given: dict[str, ArrayLike | None], substeps: int | None) -> RunTicks:
+        """Return the command for the arguments of :meth:`step`, checked."""
+        command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
+        count = self.substeps if substeps is None else checked_option("substeps", substeps)
+        if self.recorder is not None and count != self.substeps:
+            problem, remedy = f"is not the runner's {self.substeps}", "all ticks of a recording have the same length"
+            raise InvalidArgumentError("substeps", problem, value=count, remedy=remedy)
+        return RunTicks(command, count, self.timestep)
+
     def _begin(self, command: RunTicks) -> None:
         """Send the request of ticks, for :meth:`_execute` to complete."""
         self._prepare_ticks()
@@ -634,18 +638,17 @@ class Runner(SingleOwner):
         return outcome
 
     def _prepare_ticks(self) -> None:
-        """Take a checkpoint if one is due, and wait while the recorder lags."""
+        """Take a checkpoint if one is due, and let the recorder keep the state before its first tick."""
         if self._state.steps_since_checkpoint >= CHECKPOINT_STEPS:
             self._take_snapshot()
         if self.recorder is not None:
-            self.recorder.wait()
+            self.recorder.prepare()
 
     def _record(self, recorder: TickRecorder, ticks: RunTicks, before: RunnerState, outcome: Outcome) -> None:
         """Pass completed ticks on to the recorder."""
-        rated = ticks.command.setpoint_rate is not None
-        for number, arrays in enumerate(outcome.completed, start=1):
-            time = (before.steps + number * ticks.substeps) * ticks.timestep
-            recorder.append(time, arrays.command.setpoint.copy(), arrays.observation.copied(self._tool_pose), rated)
+        for number, arrays in enumerate(outcome.completed):
+            time = (before.steps + (number + 1) * ticks.substeps) * ticks.timestep
+            recorder.append(time, ticks.command.map(itemgetter(number)), arrays.observation.copied(self._tool_pose))
 
     def _fail(self, error: BaseException) -> None:
         """End the runner, which cannot complete a command."""

@@ -140,11 +140,11 @@ def base_rows(
         rows[:, 3:7] /= length
     else:
         starts: dict[bytes, Float64] = {}
-        is_file = options.engine == "mujoco" and robot.mjcf is not None  # which may have a ground at another height
+        ground = options.ground and options.mjcf is None  # an MJCF file may have a ground at another height
         for env in np.flatnonzero(mask).tolist():
             key = qpos[env].tobytes()
             if key not in starts:
-                starts[key] = base_start(robot, qpos[env], options.ground and not is_file)
+                starts[key] = base_start(robot, qpos[env], ground)
             rows[env, :7] = starts[key]
     return rows
 

@@ -35,6 +35,8 @@ class Controller(Protocol):
 
     A setpoint has a number for each joint, unless the controller has an attribute ``command``: a
     :class:`batchpid.sim.CommandSpec`, or a sequence of names, such as ``("x", "y")``. Then it is (envs, size).
+
+    A snapshot fits a controller of the same class, whose attribute ``version`` is the same where it has one.
     """
 
     def init(self, robot: Robot, num_envs: int) -> Any:
@@ -62,7 +64,6 @@ class Controller(Protocol):
 
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
 Backend = Literal["numpy", "jax"]
-Precision = Literal["float64", "float32"]
 EngineName = Literal["sapien", "mujoco"]
 DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
 """SAPIEN where it is installed, which is on Linux with x86-64; elsewhere MuJoCo."""
@@ -139,10 +140,9 @@ class RunnerKeywords:
         Backend, option("snapshot", flag="Library of the law: NumPy, or JAX, as one program with the steps.")
     ] = "numpy"
     """Library of the law: ``"numpy"``, the default, or ``"jax"``, which compiles law and sim steps of a tick, and a
-    :class:`Controller`, into one XLA program for the CPU (docs/performance.md). The last bits of results differ between
-    the two, and between processors."""
-    dtype: Annotated[Precision, option("snapshot")] = "float64"
-    """Floating-point type of the law under backend ``"jax"``: ``"float64"``, the default, or ``"float32"``."""
+    :class:`Controller`, into one XLA program for the CPU (docs/performance.md). It needs native code, control "pid",
+    "effort" or a :class:`Controller`, and has no coupled joints, actuators, randomization and guard. The last bits of
+    results differ between the two, and between processors."""
     compensate: Annotated[
         Compensation, option("snapshot", "recording", flag="Passive force and known friction, added at every sim step.")
     ] = "gravity+coriolis+friction"
@@ -197,7 +197,7 @@ class RunnerKeywords:
     wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
     """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``; default none.
     SAPIEN needs ``dissipation="urdf"``."""
-    build: Annotated[Callable[[Any, int], Any] | None, option("scene", snapshot="build_digest")] = None
+    build: Annotated[Callable[[Any, int], Any] | None, option("scene", snapshot="versioned_build")] = None
     """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env. Visuals and lights are
     ignored, so code that was written for a screen runs unchanged. It may return the entities that
     :meth:`batchpid.sim.Runner.poses` reports. A reset returns the content to the poses that ``build`` gave it."""

@@ -179,6 +179,7 @@ def write_files() -> None:
     panda = Robot.load("panda")
     shutil.copy(panda.path, "arm.urdf")
     Path("arm.xml").write_text(MJCF)
+    Path("payload.yaml").write_text("payload: {uniform: [0, 0.5]}")
     bp.save_params("gains.yaml", panda.params(), panda.joint_names)
     bp.save_actuators("motors.yaml", bp.make_actuators(panda.dof, command_delay=0.005), panda.joint_names)
 
@@ -203,7 +204,7 @@ def run(words: list[str]) -> None:
 
 def command(name: str, *flags: str) -> None:
     assert name in COMMANDS
-    if name in ONLY_PARSED or "--viewer" in flags:
+    if name in ONLY_PARSED:
         parse([name, *flags])
         return
     if name == "view" and importlib.util.find_spec("viser") is None:

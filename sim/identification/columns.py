@@ -23,13 +23,13 @@ from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
 from batchpid.sim.identification.log import Sensor
-from batchpid.sim.recording.hdf5 import LOG_QUANTITIES as QUANTITIES
-from batchpid.sim.recording.hdf5 import read_hdf5
-from batchpid.sim.recording.recording_files import RecordingError, load_h5py
+from batchpid.sim.recording.recording_files import RecordingError
 from batchpid.sim.robot.robot import Robot
 
-MAX_BYTES = 1 << 30
-"""Most that the columns of an HDF5 file may take."""
+QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos", "qvel")
+"""Quantities of the columns of a log, QUANTITY:JOINT."""
+TIMES = ("time", "time_s", "time_ms", "time_us", "time_ns")
+"""Names of the column of the times."""
 TimeUnit = Literal["s", "ms", "us", "ns"]
 SECONDS: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -189,10 +189,14 @@ def _remedy(text: str) -> str:
 
 def read_hdf5_columns(path: Path) -> dict[str, Float64] | None:
     """Return the datasets of an HDF5 file by name, None if none is named as a column of a log."""
-    load_h5py()  # raises without the package
+    import h5py
+
     try:
-        arrays, _ = read_hdf5(path, None, 1, MAX_BYTES)
-    except (OSError, ValueError) as bad:
+        with h5py.File(path, "r", locking=False) as file:
+            quantities = {name: name.partition(":")[0].strip() for name in file if ":" in name}
+            names = [name for name in file if quantities.get(name) in QUANTITIES or name.strip() in TIMES]
+            arrays = {name: np.asarray(file[name]) for name in names}
+    except (OSError, ValueError, KeyError, RuntimeError) as bad:
         raise RecordingError(f"{path}: cannot be read as a log: {bad}") from bad
     if not any(name.partition(":")[0].strip() == "qpos" for name in arrays):
         return None
@@ -200,8 +204,8 @@ def read_hdf5_columns(path: Path) -> dict[str, Float64] | None:
     for name, array in arrays.items():
         if name.strip() in columns:
             raise error(str(path), f"has the column {name.strip()!r} twice, apart from blanks", "keep one of them")
-        if array.ndim > 1 or not len(array):
-            problem = f"has {name!r} of shape {array.shape}, which is not a column"
+        if array.ndim != 1 or not len(array) or array.dtype.kind not in "biuf":
+            problem = f"has {name!r} of shape {array.shape} and {array.dtype}, which is not a column of numbers"
             raise error(str(path), problem, "give each dataset one number per row")
         columns[name.strip()] = array.astype(np.float64)
     return columns

@@ -171,9 +171,7 @@ class LoggedControl:
     def _update_matrix(self, qpos: Float64, qvel: Float64) -> None:
         steps, dt = self._matrix_steps, self._drive.timestep * self._drive.substeps
         layout = self._layout._replace(model=self._model)
-        found = mass_matrix(layout, self._constants, half_way(qpos, qvel, steps, dt))
-        whole = self._state.matrix.ndim == 3
-        self._state.matrix[...] = found if whole else np.einsum("ejj->ej", found)
+        self._state.matrix[...] = mass_matrix(layout, self._constants, half_way(qpos, qvel, steps, dt))
 
     def _program(self, inputs: tuple[Any, ...]) -> Any:
         """Return the program, the arrays of its state, of its results, and of the efforts; None for NumPy."""

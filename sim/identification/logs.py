@@ -51,7 +51,7 @@ from batchpid.sim.observation import Rollout
 from batchpid.sim.recording.recording_files import HDF5, read_recording
 from batchpid.sim.robot.robot import Robot
 
-SUFFIXES = (".csv", ".txt", ".npz", *HDF5, *BAGS)
+SUFFIXES = (".csv", ".txt", *HDF5, *BAGS)
 
 
 def read_logs(

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Document, Float64
 from batchpid.arrays.digest import digest
-from batchpid.arrays.display import html_table
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
@@ -24,7 +23,6 @@ from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import (
     DISSIPATION,
-    HEADERS,
     FileDefaults,
     Joint,
     LinkMass,
@@ -32,7 +30,6 @@ from batchpid.sim.robot.parts import (
     Placement,
     Settings,
     Urdf,
-    joint_rows,
 )
 from batchpid.sim.robot.robot_model import RobotModel
 from batchpid.sim.robot.self_collision import SelfContact, Srdf, self_contact
@@ -95,9 +92,6 @@ class RobotDescription(Urdf):
         joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
         head = f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
         return f"{head}\n  joints={joints})"
-
-    def _repr_html_(self) -> str:
-        return html_table(repr(self).partition("\n")[0].rstrip(",") + ")", HEADERS, joint_rows(self.joints))
 
     @property
     def dof(self) -> int:

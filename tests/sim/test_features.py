@@ -174,7 +174,7 @@ def test_every_feature_is_identified_or_refused(feature, tmp_path):
         runner.reset(start)
         run = runner.rollout(robot.coupled(start + swing)[:, None])
     assert run.ok.all()
-    path = write_recording(run, tmp_path / "run.npz")
+    path = write_recording(run, tmp_path / "run.h5")
     try:
         found = identify(robot, [path], params=params, evaluations=6, workers=0)
     except BatchPIDError:

@@ -82,7 +82,7 @@ RUNNERS: list[tuple[dict[str, Any], str]] = [
     ({"worker": 1}, "worker"),
     ({"engine": "bullet"}, "engine"),
     ({"backend": "torch"}, "backend"),
-    ({"dtype": "float32"}, "dtype"),
+    ({"backend": "jax", "guard": True}, "guard"),
     ({"cluster": "ray", "workers": 2}, "workers"),
     ({"cluster": "slurm"}, "cluster"),
     ({"physics": MujocoSolver(), "engine": "sapien"}, "physics"),

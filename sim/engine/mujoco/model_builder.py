@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Document, MjModel, MjSpec
 from batchpid.errors import RobotError
-from batchpid.sim.engine.mujoco.file_scene import BodyFrame, file_scene, set_ground
+from batchpid.sim.engine.mujoco.file_scene import REMOVED, BodyFrame, file_scene, set_ground
 from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
 from batchpid.sim.engine.physics import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -124,8 +124,9 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     try:
         model = scene.compile()
     except ValueError as error:
-        problem = f"MuJoCo cannot compile it without its actuators: {' '.join(str(error).split())}"
-        raise RobotError(f"{file.path}: {problem}; remove what refers to them") from error
+        problem = f"MuJoCo cannot compile the scene: {' '.join(str(error).split())}"
+        remedy = f"correct it; nothing may refer to {', '.join(REMOVED)}, which are left out"
+        raise RobotError(f"{file.path}: {problem}; {remedy}") from error
     qpos, qvel = _places(model, spec)
     armature, damping = found.own
     model.dof_armature[qvel], model.dof_frictionloss[qvel] = np.maximum(armature, 0.0), 0.0

@@ -41,7 +41,7 @@ def make_log(folder, engine="sapien"):
         runner.reset(motion.position[0])
         rollout = runner.rollout(motion.position)
     bp.save_params(folder / "gains.yaml", gains, robot.joint_names)
-    return folder / "pendulum.urdf", write_recording(rollout, folder / "run.npz"), folder / "gains.yaml"
+    return folder / "pendulum.urdf", write_recording(rollout, folder / "run.h5"), folder / "gains.yaml"
 
 
 @pytest.mark.slow

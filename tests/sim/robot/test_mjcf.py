@@ -717,3 +717,10 @@ def test_an_unwritable_cache_is_an_error(load, monkeypatch, tmp_path):
 def test_is_drawn_by_its_shapes(load):
     pytest.importorskip("trimesh")
     assert {surface.link for surface in surfaces(load(ARM))} == {"base", "upper", "fore", "flange", "hand"}
+
+
+def test_a_name_in_another_encoding_is_an_error_with_the_file(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_bytes(ARM.replace('"base"', '"körper"').encode("latin-1"))
+    with pytest.raises(RobotError, match=r"arm\.xml: a name is not UTF-8"):
+        Robot.load(path)

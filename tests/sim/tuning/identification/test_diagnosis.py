@@ -55,7 +55,7 @@ def arms(tmp_path_factory):
 
 def diagnosed(arms, folder, real, *, push=0.0, **motors):
     """Return the diagnosis of a log of the ``real`` robot, with a push at PUSH seconds that it does not hold."""
-    robot, path = arms["described"], folder / "log.npz"
+    robot, path = arms["described"], folder / "log.h5"
     inertia = np.diagonal(robot.mass_matrix(robot.start)[0])
     motors = {"command_delay": 0.003, "coulomb": 0.4, "viscous": 0.3 * inertia} | motors
     motors = bp.make_actuators(robot.dof, **motors)
@@ -122,5 +122,5 @@ def test_a_push_is_pointed_at(arms, tmp_path):
     assert found.disturbance.time == pytest.approx(PUSH + 0.1, abs=0.25)
     assert found.disturbance.joint == "elbow"
     assert found.disturbance.effort == pytest.approx(6.0, rel=0.5)
-    assert found.disturbance.log.endswith("log.npz")
+    assert found.disturbance.log.endswith("log.h5")
     assert any(each.startswith(("at 3.", "at 2.9")) for each in found.sentences())

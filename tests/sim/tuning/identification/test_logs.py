@@ -1,3 +1,4 @@
+import h5py
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -57,7 +58,6 @@ def test_delimiters_comments_blank_lines_and_other_columns_do_not_matter(panda, 
 
 
 def test_hdf5_columns_read_as_those_of_a_csv_file(panda, tmp_path, columns):
-    h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "log.h5", "w") as file:
         for name, values in columns.items():
             file[name] = values
@@ -142,7 +142,7 @@ def test_a_recording_is_a_log_of_each_env(panda, tmp_path):
     with Runner(panda, 2, workers=0, substeps=10) as runner:
         runner.reset(setpoints[0])
         rollout = runner.rollout(np.clip(panda.coupled(setpoints), panda.lower, panda.upper))
-    first, second = read_logs(panda, [write_recording(rollout, tmp_path / "run.npz")])
+    first, second = read_logs(panda, [write_recording(rollout, tmp_path / "run.h5")])
     assert second.source.endswith("env 1")
     assert np.array_equal(first.qpos, rollout.qpos[:, 0, first.joints].astype(float))
     # The setpoint of a row acts during the tick that ends at its time.
@@ -152,19 +152,14 @@ def test_a_recording_is_a_log_of_each_env(panda, tmp_path):
         logs_of_rollout(panda, rollout, "effort")
 
 
-def test_a_damaged_or_linked_hdf5_log_is_refused(panda, tmp_path, columns):
-    h5py = pytest.importorskip("h5py")
-    path, linked = tmp_path / "log.h5", tmp_path / "linked.h5"
+def test_a_damaged_hdf5_log_is_refused(panda, tmp_path, columns):
+    path = tmp_path / "log.h5"
     with h5py.File(path, "w") as file:
         for name, rows in columns.items():
             file[name] = rows
-    with h5py.File(linked, "w") as file:
-        for name in columns:
-            file[name] = h5py.ExternalLink(str(path), name)
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    for each in (path, linked):
-        with pytest.raises(bp.BatchPIDError, match="cannot be read as a log"):
-            read_logs(panda, [each])
+    with pytest.raises(bp.BatchPIDError, match="cannot be read as a log"):
+        read_logs(panda, [path])
 
 
 def test_a_joint_at_its_limit_is_told(panda):
@@ -268,11 +263,10 @@ def test_columns_that_differ_by_blanks_are_one_twice(panda, tmp_path, columns):
     [
         ("qpos:panda_joint6", lambda rows: np.stack([rows, rows], 1), r"'qpos:panda_joint6' of shape \(60, 2\)"),
         ("qvel:panda_joint2", lambda rows: rows[:-3], "different lengths"),
-        ("qpos:panda_joint2", lambda rows: np.array([b"x"] * len(rows)), "qpos:panda_joint2 is not an array"),
+        ("qpos:panda_joint2", lambda rows: np.array([b"x"] * len(rows)), "not a column of numbers"),
     ],
 )
 def test_datasets_that_are_no_columns_are_named(panda, tmp_path, columns, name, change, message):
-    h5py = pytest.importorskip("h5py")
     columns = {**columns, "qvel:panda_joint2": columns["time"], "qvel:panda_joint6": columns["time"]}
     with h5py.File(tmp_path / "log.h5", "w") as file:
         for each, rows in columns.items():
@@ -352,13 +346,13 @@ def test_a_recording_says_its_time_step_compensation_and_control(tmp_path):
         options = {"params": gains} if control == "pid" else {}
         with Runner(robot, 1, workers=0, timestep=1 / 500, substeps=1, control=control, **options) as runner:
             runner.reset(setpoints[0])
-            paths[control] = write_recording(runner.rollout(setpoints), tmp_path / f"{control}.npz")
+            paths[control] = write_recording(runner.rollout(setpoints), tmp_path / f"{control}.h5")
     (log,) = read_logs(robot, [paths["pid"]])
     assert (log.timestep, log.compensate) == (1 / 500, "gravity+coriolis+friction")
     with pytest.raises(bp.InvalidArgumentError, match="made under control 'drive'"):
         read_logs(robot, [paths["drive"]])
     for option in ({"timestep": 1 / 2000}, {"compensate": "none"}):
-        with pytest.raises(bp.InvalidArgumentError, match=f"{next(iter(option))}: contradicts .*pid.npz"):
+        with pytest.raises(bp.InvalidArgumentError, match=f"{next(iter(option))}: contradicts .*pid.h5"):
             identify(robot, [paths["pid"]], params=gains, workers=0, **option)
 
 
@@ -369,7 +363,7 @@ def test_a_recording_with_setpoint_rates_is_refused(panda, tmp_path):
         without = runner.rollout(setpoints)
         rated = runner.rollout(setpoints, setpoint_rates=0 * setpoints)
     assert (without.info.rates, rated.info.rates, Rollout.join([without, rated]).info.rates) == (False, True, True)
-    path = write_recording(rated, tmp_path / "run.npz")
+    path = write_recording(rated, tmp_path / "run.h5")
     assert read_recording(path).info.rates
     with pytest.raises(bp.InvalidArgumentError, match=r"was made with setpoint rates.*record one without"):
         read_logs(panda, [path])
