@@ -12,6 +12,7 @@ GONE = (
     # one a line, as a regular expression; sorted
     "_repr_html_",
     "h5[.]partial",
+    "mujoco[.]pid",
     "open_dataset",
     "rollout .*--resume",
     "sim[.]sweep",
