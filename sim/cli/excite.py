@@ -47,7 +47,7 @@ class ExciteCommand:
         from batchpid.io.files import write_atomically
         from batchpid.sim.cli.report import table
         from batchpid.sim.identification.excitation import excite
-        from batchpid.sim.identification.setpoint_files import setpoint_csv
+        from batchpid.sim.setpoint_files import setpoint_csv
 
         robot = Robot.load(self.robot, **vars(self.meshes))
         out = self.out or Path(f"out/{robot.path.stem}.excite.csv")

@@ -23,7 +23,7 @@ from batchpid.sim.tuning.gain_sets import gain_set
 from batchpid.task_space import load_osc_options
 
 if TYPE_CHECKING:
-    from batchpid.sim.identification.setpoint_files import Setpoints
+    from batchpid.sim.setpoint_files import Setpoints
 
 RUNNER = flags.runner_flags()
 
@@ -164,7 +164,7 @@ class RolloutCommand:
 
     def _read(self, robot: Robot, path: Path) -> Setpoints:
         """Return the setpoints in a file, if no flag contradicts them."""
-        from batchpid.sim.identification.setpoint_files import read_setpoints
+        from batchpid.sim.setpoint_files import read_setpoints
 
         others = {
             "--setpoint": self.setpoint is not None,
