@@ -190,7 +190,7 @@ def main() -> None:
     bp.save_actuators(actuators, as_actuators(robot, truth), robot.joint_names, {"truth_of": options.out.name})
     print(table(robot, truth))
     print(f"\nwritten: {options.out}, {gains}, {actuators}")
-    print(f"next: batchpid identify {options.robot} {options.out} --params {gains}")
+    print(f"next: batchpid identify {options.robot} {options.out} --gains {gains}")
 
 
 if __name__ == "__main__":

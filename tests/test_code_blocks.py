@@ -34,7 +34,7 @@ SHORTER = {
     # command: flags that make it short
     "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
     "rollout": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
-    "excite": ["--duration", "1"],
+    "excite": ["--seconds", "1"],
     "compare": ["--moves", "1", "--workers", "0", "--seconds", "0.1", "--engine", "mujoco"],
     "view": ["--num-envs", "2", "--workers", "0", "--time-limit", "0.1", "--port", "8765"],
 }
@@ -58,7 +58,7 @@ RARE = {
     ),
     "sh": ("docs/two-engines.md", "docs/view.md", "docs/deploy.md", "docs/sim-to-real.md"),
 }
-ONLY_PARSED = ("tune", "identify", "render", "survey", "parity")
+ONLY_PARSED = ("tune", "identify", "survey")
 
 
 def name(page: Path) -> str:

@@ -10,6 +10,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 GONE = (
     # one a line, as a regular expression; sorted
+    r"--duration\b",
+    r"--search-seconds",
+    r"batchpid parity",
+    r"batchpid render",
+    r"compare_engines",
+    r"engine_differences",
+    r"engine_parity",
 )
 FILES = [
     path

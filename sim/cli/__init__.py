@@ -24,14 +24,14 @@ import tyro
 import batchpid
 from batchpid.errors import BatchPIDError
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.compare import CompareCommand, ParityCommand
+from batchpid.sim.cli.compare import CompareCommand
 from batchpid.sim.cli.demo import DemoCommand
 from batchpid.sim.cli.excite import ExciteCommand
 from batchpid.sim.cli.export import ExportCommand
 from batchpid.sim.cli.identify import IdentifyCommand
 from batchpid.sim.cli.inspect import InspectCommand
 from batchpid.sim.cli.outputs import close_bars
-from batchpid.sim.cli.plot import PlotCommand, RenderCommand
+from batchpid.sim.cli.plot import PlotCommand
 from batchpid.sim.cli.rollout import RolloutCommand
 from batchpid.sim.cli.survey import SurveyCommand
 from batchpid.sim.cli.tune import TuneCommand
@@ -47,11 +47,9 @@ COMMANDS: dict[str, type[Any]] = {
     "identify": IdentifyCommand,
     "export": ExportCommand,
     "inspect": InspectCommand,
-    "parity": ParityCommand,
     "survey": SurveyCommand,
     "plot": PlotCommand,
     "view": ViewCommand,
-    "render": RenderCommand,
 }
 
 

@@ -1,11 +1,9 @@
-"""``batchpid compare`` and ``batchpid parity``: sets of gains on the same moves, and one robot in both engines."""
+"""``batchpid compare``: sets of gains on the same moves, in one engine or in both."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Annotated
-
-import numpy as np
 
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
@@ -22,7 +20,8 @@ RUNNER = flags.runner_flags(*flags.SCENE_FLAGS, "workers")
 class CompareCommand:
     """Compare sets of gains on the same seeded moves: settling, overshoot, final error and chatter of each.
 
-    With `--engine sapien mujoco` every set runs in both engines, on the same moves.
+    With `--engine sapien mujoco` every set runs in both engines, on the same moves, and the largest difference of their
+    motions is printed.
     """
 
     robot: flags.RobotName = "panda"
@@ -50,7 +49,7 @@ class CompareCommand:
     def run(self) -> None:
         """Run the command."""
         from batchpid.sim import plots
-        from batchpid.sim.cli.report import draw_first_move, evaluation_table
+        from batchpid.sim.cli.report import draw_first_move, evaluation_table, motion_difference
         from batchpid.sim.cli.run import evaluate_sets, read_variation
 
         outputs = OutputFiles(force=self.force)
@@ -71,6 +70,10 @@ class CompareCommand:
         evaluations = evaluate_sets(robot, sets, randomization=randomization, engines=self.engine, **options)
         print(f"{robot.name}: {len(evaluations[0].moves.start)} moves, seed {self.seed}, {self.seconds:g} s each\n")
         print(evaluation_table(robot, evaluations))
+        if len(set(self.engine)) == 2:
+            print("\nLargest difference of a position between the engines:")
+            for first, second in zip(evaluations[::2], evaluations[1::2], strict=True):
+                print(motion_difference(robot, first, second))
         if json is not None:
             arrays = "metrics chatter settling_limit following_error"
             figures = {each.name: {name: getattr(each, name) for name in arrays.split()} for each in evaluations}
@@ -78,69 +81,3 @@ class CompareCommand:
             print(f"\nfigures: {json}")
         if picture is not None:
             print(f"\npicture: {draw_first_move(robot, evaluations, picture)}")
-
-
-@dataclass(frozen=True)
-class ParityCommand:
-    """Compare SAPIEN and MuJoCo on one robot: dynamics, motion under equal efforts and gains, contact."""
-
-    robot: flags.RobotName = "panda"
-    gains: flags.Gains = None
-    moves: Annotated[int, Field(low=1, high=100_000)] = 8
-    """Number of random moves under the gains."""
-    seed: flags.Seed = 0
-    """Seed of states, efforts and moves."""
-    seconds: flags.Seconds = 2.0
-    workers: flags.Workers = None
-    actuators: flags.Actuators = None
-    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
-    picture: flags.OptionalPath = None
-    """Differences over time, to draw: .png or .svg."""
-    json: flags.Json = None
-    force: flags.Force = False
-
-    imports = ("batchpid.sim.plots", "batchpid.sim.runner")
-
-    def run(self) -> None:
-        """Run the command."""
-        from batchpid.sim import plots
-        from batchpid.sim.cli.report import table
-        from batchpid.sim.plots.figures import engine_differences
-        from batchpid.sim.tuning.engine_parity import compare_engines
-
-        outputs = OutputFiles(force=self.force)
-        picture = outputs.path("picture", self.picture, plots.FORMATS)
-        json_path = outputs.path("json", self.json, (".json",))
-        robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
-        gains = gain_set(robot, self.gains)
-        found = compare_engines(
-            robot, gains.params, moves=self.moves, seconds=self.seconds, seed=self.seed, workers=self.workers
-        )
-        worst, settling = float(found.closed_loop.max()), np.median(found.settling, axis=1)
-        rows = [
-            ["gravity and Coriolis efforts, 100 random states", f"{found.bias:.1e}", "relative"],
-            ["velocity after 5 sim steps", f"{found.first_tick:.1e}", "relative"],
-            ["  two starts one bit apart, in SAPIEN", f"{found.first_chaos:.1e}", "relative"],
-            [f"equal efforts for {found.time[-1]:g} s", f"{found.open_loop[-1]:.1e}", "rad or m"],
-            ["  two starts one bit apart, in SAPIEN", f"{found.chaos[-1]:.1e}", "rad or m"],
-            [f"equal gains ({gains.name}), {len(found.closed_loop)} moves", f"{worst:.1e}", "rad or m"],
-            ["  settling time, median", " / ".join(f"{each:.2f}" for each in settling), "s, sapien / mujoco"],
-            ["  moves that settled", " / ".join(map(str, found.settled)), "sapien / mujoco"],
-        ]
-        if found.push is not None:
-            rows.append([f"{len(found.push)} pushes on the ground", f"{found.push.max():.1e}", "rad or m"])
-        print(f"{robot.name}: MuJoCo compared with SAPIEN\n")
-        print(table(rows, ["comparison", "difference", "unit"], "lrl"))
-        print()
-        print("\n".join(found.verdict()))
-        if json_path is not None:
-            names = "bias first_tick first_chaos time open_loop chaos closed_loop settling push"
-            figures = {name: getattr(found, name) for name in names.split()}
-            write_figures(json_path, figures | {"settled": found.settled, "verdict": found.verdict()})
-            print(f"\nfigures: {json_path}")
-        if picture is not None:
-            first, second = (each.rollout for each in found.moves)
-            apart = np.abs(first.qpos - second.qpos).max(2)
-            title = f"{robot.name}: MuJoCo compared with SAPIEN"
-            figure = engine_differences(found.time, found.open_loop, found.chaos, first.time, apart, title)
-            print(f"\npicture: {plots.save(figure, picture)}")

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import tyro
 
 from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot
@@ -25,7 +24,7 @@ class ExciteCommand:
     """
 
     robot: flags.RobotName = "panda"
-    seconds: Annotated[float, Field("s", low=1.0, high=3600.0), tyro.conf.arg(aliases=("--duration",))] = 10.0
+    seconds: Annotated[float, Field("s", low=1.0, high=3600.0)] = 10.0
     """Duration of the motion [s]."""
     rate: Annotated[float, Field("Hz", low=20.0, high=10_000.0)] = 500.0
     """Rows per second [Hz]."""

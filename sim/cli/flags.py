@@ -154,7 +154,7 @@ Gains = Annotated[
     str | None,
     _flag(
         "Gains: tuned, designed, tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file (.yaml or .json) that "
-        "`batchpid tune` or batchpid.save_params wrote, or gains of ros2_control (.yaml), Isaac Lab (.py) or MuJoCo "
+        "`batchpid tune` or batchpid.save_params wrote, or gains of ros2_control (.yaml) or MuJoCo "
         "(.xml). Default: tuned where the robot has them, else designed. With --control osc: a file of `batchpid tune "
         "--control osc`.",
         metavar="NAME|FILE",
@@ -172,7 +172,7 @@ GainSets = Annotated[
     tuple[str, ...],
     _flag(
         "Sets of gains: tuned, designed, tutorial, mjcf, drive, drive:STIFFNESS,DAMPING, or params files (.yaml or "
-        ".json) that `batchpid tune` or batchpid.save_params wrote, or gains of ros2_control (.yaml), Isaac Lab (.py) "
+        ".json) that `batchpid tune` or batchpid.save_params wrote, or gains of ros2_control (.yaml) "
         "or MuJoCo (.xml). Default: tuned, "
         "tutorial and drive for a bundled robot, else designed and drive.",
         metavar="NAME|FILE [NAME|FILE ...]",

@@ -1,4 +1,4 @@
-"""``batchpid plot`` and ``batchpid render``: a picture of a recording, or of two, and a film."""
+"""``batchpid plot``: a picture of a recording or of two, or a film."""
 
 from __future__ import annotations
 
@@ -15,16 +15,20 @@ from batchpid.sim import Rollout, read_recording
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, bar, beside, stem
 
+SHOWN_ENVS = 16
+"""Envs in a film."""
+
 
 @dataclass(frozen=True)
 class PlotCommand:
-    """Draw a recorded run, or compare it with another one.
+    """Draw a recorded run, compare it with another one, or film it.
 
     The recording may be complete, cut short by a kill (``NAME.h5.partial``), or still being written.
     """
 
     recording: tyro.conf.Positional[Path]
     """File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote: .npz or .h5."""
+    robot: flags.RecordedRobot = None
     versus: flags.OptionalPath = None
     """Another recording, to compare with."""
     kind: Literal["responses", "efforts"] = "responses"
@@ -36,6 +40,9 @@ class PlotCommand:
     picture: flags.OptionalPath = None
     """Picture to draw: .png or .svg. Default: next to the recording NAME.npz, NAME-responses.png, NAME-efforts.png, or
     NAME-versus-OTHER.png."""
+    film: flags.OptionalPath = None
+    """Film of the first 16 envs in real time, to write instead of a picture: .mp4 or .gif."""
+    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     force: flags.Force = False
 
     imports = ("batchpid.sim.plots",)
@@ -48,6 +55,8 @@ class PlotCommand:
             read_recording(self.recording)
         shown = self.kind if self.versus is None else f"versus-{stem(self.versus)}"
         outputs = OutputFiles(force=self.force, inputs=(self.recording, self.versus))
+        if self.film is not None:
+            return self._film(outputs)
         picture = outputs.path("picture", self.picture or beside(self.recording, shown), plots.FORMATS)
         rollout = _read(self.recording, self.every)
         if self.versus is not None:
@@ -58,6 +67,18 @@ class PlotCommand:
             figure = draw(rollout, joints=self.joints)
         print(f"picture: {plots.save(figure, picture)}")
 
+    def _film(self, outputs: OutputFiles) -> None:
+        """Film the recording."""
+        from batchpid.sim.cli.run import read_run
+        from batchpid.sim.view.film import FORMATS, write_film
+
+        film = outputs.path("film", self.film, FORMATS)
+        assert film is not None
+        usage = f"batchpid plot {shlex.quote(str(self.recording))} PATH/TO/ROBOT.urdf --film {film}"
+        rollout, robot = read_run(self.recording, self.robot, self.meshes, usage)
+        shown = rollout.for_envs(slice(0, SHOWN_ENVS))
+        print(f"film: {write_film(shown, film, robot=robot, progress=bar('filming', unit='frame'))}")
+
 
 def _read(path: Path, every: int) -> Rollout:
     """Return the run in a file, unless it is empty, and print a line about it."""
@@ -66,48 +87,3 @@ def _read(path: Path, every: int) -> Rollout:
     if not len(rollout.time):
         raise InvalidArgumentError("recording", f"{path} holds no tick", remedy="its run was cut short: run it again")
     return rollout
-
-
-@dataclass(frozen=True)
-class RenderCommand:
-    """Film a recorded run in real time, all envs side by side.
-
-    SAPIEN's renderer draws it on a Vulkan device, which may be a software one. Without a device, Matplotlib draws it,
-    in less detail. ``batchpid view --play`` shows the same in a browser.
-    """
-
-    recording: tyro.conf.Positional[Path]
-    """File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote: .npz or .h5."""
-    robot: flags.RecordedRobot = None
-    num_envs: flags.ShownEnvs = 16
-    """Number of envs to show, the first ones; 64 at most."""
-    fps: flags.Fps = 30.0
-    width: Annotated[int, Field(low=16, high=8192)] = 960
-    """Width of the film [pixels]."""
-    height: Annotated[int, Field(low=16, high=8192)] = 540
-    """Height of the film [pixels]."""
-    meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
-    out: flags.OptionalPath = None
-    """Film to write: .mp4 or .gif. Default: next to the recording NAME.npz, NAME-film.mp4."""
-    force: flags.Force = False
-
-    imports = ("batchpid.sim.view.film",)
-
-    def run(self) -> None:
-        """Run the command."""
-        from batchpid.sim.cli.run import read_run
-        from batchpid.sim.view.film import FORMATS, write_film
-        from batchpid.sim.view.renderer import REMEDY, render_problem
-
-        outputs = OutputFiles(force=self.force, inputs=(self.recording,))
-        out = outputs.path("out", self.out or beside(self.recording, "film", ".mp4"), FORMATS)
-        usage = f"batchpid render {shlex.quote(str(self.recording))} PATH/TO/ROBOT.urdf"
-        rollout, robot = read_run(self.recording, self.robot, self.meshes, usage)
-        rollout = rollout.for_envs(slice(0, self.num_envs))
-        progress = bar("filming", unit="frame")
-        path = write_film(
-            rollout, out, robot=robot, fps=self.fps, width=self.width, height=self.height, progress=progress
-        )
-        print(f"film: {path}")
-        if (problem := render_problem()) is not None:
-            print(f"Note: drawn by Matplotlib; SAPIEN's renderer does not work on this machine ({problem}): {REMEDY}")

@@ -257,6 +257,14 @@ def evaluation_table(robot: Robot, evaluations: Sequence[Evaluation]) -> str:
     return table(rows, headers, "l" + "r" * (len(headers) - 1)) + about + "".join(f"\n{line}" for line in causes)
 
 
+def motion_difference(robot: Robot, first: Evaluation, second: Evaluation) -> str:
+    """Return a line with the largest difference of a position between two evaluations on the same moves."""
+    apart = np.nan_to_num(np.abs(first.rollout.qpos - second.rollout.qpos), nan=np.inf).max(0)
+    move, joint = np.unravel_index(int(apart.argmax()), apart.shape)
+    place = f"joint {robot.joint_names[joint]!r}, move {first.moves.names[move]!r}"
+    return f"  {first.name} / {second.name}: {apart.max():.1e} {robot.units[joint]} ({place})"
+
+
 def draw_first_move(robot: Robot, evaluations: Sequence[Evaluation], path: Path) -> Path:
     """Draw the first two ``evaluations`` on their first move to ``path``, and return it."""
     from batchpid.sim import plots

@@ -70,7 +70,7 @@ class RolloutCommand:
     actuators: flags.Actuators = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
-    """Recording to write: .npz at the end, or .h5 tick by tick (extra `record`). For plot, view and render."""
+    """Recording to write: .npz at the end, or .h5 tick by tick (extra `record`). For plot and view."""
     picture: flags.OptionalPath = None
     """Step responses to draw: .png or .svg."""
     json: flags.Json = None

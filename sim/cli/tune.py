@@ -57,7 +57,7 @@ class TuneCommand:
     """Candidates of a population, evaluated at once."""
     seed: flags.Seed = 0
     """Seed of the search and its moves. The result does not depend on the number of workers."""
-    seconds: Annotated[flags.MoveSeconds, tyro.conf.arg(aliases=("--search-seconds",))] = 1.5
+    seconds: flags.MoveSeconds = 1.5
     """Simulated time of each move of the search [s]."""
     gain_units: Literal["mass_matrix", "inertia", "effort"] = "mass_matrix"
     """Gains per mass matrix (all joints respond equally fast), per joint inertia, or as efforts (for any

@@ -17,7 +17,7 @@ from batchpid.arrays.array_types import Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import SHARE, Friction, FrictionState
 from batchpid.sim.engine import native
-from batchpid.sim.engine.native.interface import BASES, Group, ModelStruct, Refresh
+from batchpid.sim.engine.native.interface import BASES, STATUS, Group, ModelStruct, Refresh
 from batchpid.sim.engine.protocol import CompiledModel
 from batchpid.sim.engine.robot_model import passive_force, scene_tree
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -163,10 +163,11 @@ class NativeStep:
         status: int = self._native.sim_step(self.prepare(), *arrays)
         return status
 
-    @property
-    def message(self) -> str:
-        """Message of the engine's exception, after the status FAILED."""
-        return self._group.message.decode(errors="replace")
+    def may_have_failed(self, status: int) -> bool:
+        """Return whether an env may have failed in a sim step with this status; RuntimeError if the engine has."""
+        if status & 1 << STATUS.index("failed"):
+            raise RuntimeError(self._group.message.decode(errors="replace"))
+        return bool(status)
 
 
 def mass_matrix_of(spec: SceneSpec, natively: bool) -> Callable[[Float64], Float64]:

@@ -22,7 +22,6 @@ from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.motors import Actuators
 from batchpid.motors.friction import Friction
-from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -35,8 +34,6 @@ Capability = Literal["drive", "build", "compiled_steps", "partial_force", "base_
 - ``"base_state"``: compiled steps read state and passive force of robots on a floating base;
 - ``"sapien_dissipation"``: SAPIEN's own friction and damping in place of the URDF's.
 """
-FAILED = 1 << STATUS.index("failed")
-"""Bit of the status of a compiled sim step in which the engine raised an exception."""
 
 
 @runtime_checkable
@@ -189,9 +186,11 @@ class CompiledStep(Protocol):
     def __call__(self, *arrays: Float64) -> int:
         """Do one sim step on the arrays effort, qpos, qvel and passive force (envs, dof); return the status."""
 
-    @property
-    def message(self) -> str:
-        """Message of the engine's exception, after the status FAILED."""
+    def may_have_failed(self, status: int) -> bool:
+        """Return whether an env may have failed in the last sim step, which had this status.
+
+        The sensors of links are read here, where native code does not. RuntimeError if the engine has failed.
+        """
 
 
 class CompiledModel(Protocol):

@@ -16,7 +16,7 @@ from batchpid.arrays.elementwise import clip
 from batchpid.motors import ActuatorState, advance_measurement
 from batchpid.motors.friction import FrictionState
 from batchpid.motors.guard import GuardState
-from batchpid.sim.engine.link_reach import MissedContacts
+from batchpid.sim.engine.missed_contacts import MissedContacts
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.acting_draws import acting_actuators, acting_params, variation
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays, Ticks

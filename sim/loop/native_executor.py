@@ -12,7 +12,7 @@ import numpy as np
 
 from batchpid.arrays.trees import leaves, mapped
 from batchpid.native.operations import MOST_SUMMED
-from batchpid.sim.engine.protocol import FAILED, CompiledModel, CompiledPack, CompiledStep, DrivenPack
+from batchpid.sim.engine.protocol import CompiledModel, CompiledPack, CompiledStep, DrivenPack
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.native_ticks import NativeTicks, Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran, Span
@@ -59,7 +59,7 @@ class NativeExecutor(NumPyExecutor):
             ticks.exchange(table)
         until = span.until if table else span.tick + 1
         tick, done, status = ticks.run(self._prepared(), span.tick, span.begin, until, span.steps, table is not None)
-        failed = self._may_have_failed(status)
+        failed = self._prepared().may_have_failed(status)
         return Ran(ticks.state, ticks.outputs, ticks.measured, ticks.before, tick, done, failed)
 
     def numpy_state(self, state: StepState) -> StepState:
@@ -76,14 +76,8 @@ class NativeExecutor(NumPyExecutor):
             passive = None
         elif not self._steps_read_force:
             passive = self._pack.passive_force(self._gravity, self._coriolis)
-        self._failed = self._may_have_failed(status)
+        self._failed = self._prepared().may_have_failed(status)
         return values._replace(measured=Measured(qpos, qvel, passive))
-
-    def _may_have_failed(self, status: int) -> bool:
-        """Return whether an env may have failed in a sim step; RuntimeError if the engine has."""
-        if status & FAILED:
-            raise RuntimeError(self._prepared().message)
-        return bool(status)
 
     def _prepared(self) -> CompiledStep:
         """Return the compiled sim step of the present robots and systems."""

@@ -17,7 +17,7 @@ from batchpid.arrays.array_types import Array, Rows
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.arrays.trees import mapped
 from batchpid.sim.engine.native import xla
-from batchpid.sim.engine.protocol import FAILED, CompiledPack, CompiledStep
+from batchpid.sim.engine.protocol import CompiledPack, CompiledStep
 from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import sim_step
@@ -102,9 +102,8 @@ class XLAExecutor:
                 program = compiled(self._layout, traced, self._gravity)
                 carry = program(steps, self._constants, self._bodies, self._started(state), measured, command)
             done, status = np.asarray(carry.progress).tolist()
-        if status & FAILED:
-            raise RuntimeError(native.message)
-        return Ran(carry.state, carry.outputs, carry.measured, carry.before, span.tick, done, bool(status))
+        failed = native.may_have_failed(status)
+        return Ran(carry.state, carry.outputs, carry.measured, carry.before, span.tick, done, failed)
 
     def rows(self, array: Array) -> Rows:
         """Return an array of the executor as a new NumPy array."""

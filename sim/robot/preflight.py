@@ -106,6 +106,11 @@ def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Find
     if left_over := robot.self_contact.left_over:
         text = f"{len(left_over)} pairs that should not collide do, since PhysX's filter cannot hold them all"
         yield Finding("note", "pairs-left-over", text, "disable fewer pairs in the .srdf")
+    for pair in robot.self_contact.pairs:
+        if pair.reason == "Default" and pair not in robot.srdf.disabled:
+            text = "links that touch or overlap at the start pose do not collide with each other"
+            remedy = "move their shapes 1 mm apart, or enable the pair in an .srdf"
+            yield Finding("note", "pairs-left-out", text, remedy, link=pair.first, detail=f"with {pair.second!r}")
     if robot.dynamics(ground=robot.fixed_base and robot.has_ground).in_contact(start[None])[0]:
         text = "links overlap each other or the ground at the start pose: SAPIEN pushes them apart"
         remedy = "use another start pose, correct the collision shapes, or load with self_collision='auto'"

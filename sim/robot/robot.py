@@ -78,8 +78,8 @@ class Robot(RobotDescription):
             True to simulate links that are joined by fixed joints as one, with the exact inertia: fewer links, faster
             steps. False keeps every link, and contacts between links that are joined through other links.
         self_collision
-            ``"auto"``: links that are neighbours, overlap at the start pose, or touch in nearly every sampled pose do
-            not collide (:attr:`self_contact`). ``"urdf"``: all links collide. An .srdf next to the URDF, of the same
+            ``"auto"``: links that are neighbours, or touch or overlap at the start pose or in nearly every sampled pose
+            do not collide (:attr:`self_contact`). ``"urdf"``: all links collide. An .srdf next to the URDF, of the same
             name, disables and enables further pairs. ``"none"``: no link collides with another.
         actuators
             Motors and sensors that runners of this robot have by default: :class:`batchpid.Actuators` of one row, or a

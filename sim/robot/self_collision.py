@@ -27,18 +27,17 @@ SELF_COLLISION = ("auto", "urdf", "none")
 ALWAYS = 0.95
 """Share of sampled poses beyond which a pair counts as always in contact; MoveIt's."""
 GAP = 1e-3
-"""Distance [m] that counts as contact there: links built to glide along each other never come apart."""
+"""Distance [m] that counts as contact: links built to glide along each other never come apart, and PhysX pushes links
+apart that just touch at the start."""
 SAMPLES = 200
 """Number of sampled poses; MoveIt's."""
-PENETRATION = 1e-3
-"""Depth [m] from which links at rest overlap: fingers of a closed gripper only touch."""
 
 
 class DisabledPair(NamedTuple):
     """Two links that do not collide.
 
-    ``reason`` is one of MoveIt's: "Adjacent" (neighbours), "Default" (overlap at the start pose), "Always" (in nearly
-    every sampled pose), "Never" or "User" (in an .srdf).
+    ``reason`` is one of MoveIt's: "Adjacent" (neighbours), "Default" (in contact at the start pose), "Always" (in
+    nearly every sampled pose), "Never" or "User" (in an .srdf).
     """
 
     first: str
@@ -99,7 +98,7 @@ def disabled_pairs(
 ) -> tuple[DisabledPair, ...]:
     """Return the pairs that do not collide, each with the first of its reasons, in ``order`` of the links.
 
-    ``adjacent`` are neighbours, ``rest`` the pairs that overlap at rest, ``samples`` those in contact at each pose.
+    ``adjacent`` are neighbours, ``rest`` the pairs in contact at rest, ``samples`` those in contact at each pose.
     """
     touches = Counter(pair for sample in samples for pair in set(sample))
     always = (pair for pair, count in touches.items() if count > ALWAYS * len(samples))
@@ -128,8 +127,7 @@ def self_contact(robot: Any) -> SelfContact:
         computed = tuple(DisabledPair(*pair, "User") for pair in combinations(solid, 2))
     elif robot.self_collision == "auto" and len({bodies[link] for link in solid}) > 1:
         at_rest, *samples = [_distances(contacts, qpos) for qpos in (robot.start, *robot.sample(SAMPLES, seed=0))]
-        rest = [pair for pair, distance in at_rest.items() if distance < -PENETRATION]
-        close = [[pair for pair, distance in sample.items() if distance < GAP] for sample in samples]
+        rest, *close = [[pair for pair, distance in near.items() if distance < GAP] for near in (at_rest, *samples)]
         computed = disabled_pairs(solid, _adjacent_links(robot.all_joints, solid), rest, close)
     listed = {pair.links: pair for pair in (*computed, *robot.srdf.disabled)}
     pairs = [pair for links, pair in listed.items() if links not in robot.srdf.enabled and links <= set(solid)]
@@ -138,7 +136,7 @@ def self_contact(robot: Any) -> SelfContact:
     return SelfContact(
         pairs=tuple(pair for pair in pairs if pair.links not in left_over),
         left_over=tuple(pair for pair in pairs if pair.links in left_over),
-        reaches_ground=robot.fixed_base and contacts.height(robot.start) < PENETRATION,
+        reaches_ground=robot.fixed_base and contacts.height(robot.start) < GAP,
     )
 
 

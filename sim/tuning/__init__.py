@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from batchpid.sim.tuning.cost import Weights
-    from batchpid.sim.tuning.engine_parity import compare_engines
     from batchpid.sim.tuning.evaluation import (
         Evaluation,
         arm_joints,
@@ -34,7 +33,6 @@ __all__ = [
     "Tuning",
     "Weights",
     "arm_joints",
-    "compare_engines",
     "evaluate_gains",
     "find_robots",
     "following_error",
@@ -54,7 +52,6 @@ __all__ = [
 
 _MODULES = {
     "cost": ("Weights",),
-    "engine_parity": ("compare_engines",),
     "evaluation": (
         "Evaluation",
         "arm_joints",

@@ -1,4 +1,4 @@
-"""Every script of bench/ runs, on a tiny workload; bench/scale.py without Ray: test_scale.py."""
+"""Every script of bench/ runs, on a tiny workload."""
 
 import json
 import shutil
@@ -14,7 +14,7 @@ from scripts import ROOT, load_script
 from batchpid.sim import Robot, Runner, write_recording
 from batchpid.sim.view import LiveSimulation
 
-TESTED = {"accuracy", "circles", "cluster", "draw", "film", "measure", "motions", "newcomer", "scale"}
+TESTED = {"accuracy", "circles", "cluster", "draw", "film", "measure", "motions", "newcomer"}
 TESTED |= {"trajectories", "view"}
 
 

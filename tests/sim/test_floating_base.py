@@ -51,6 +51,15 @@ def test_it_starts_on_the_ground_and_stands(quadruped, engine):
     np.testing.assert_allclose(rollout.base_pose[-1, :, 2], 0.35, atol=5e-3)
 
 
+def test_a_fast_base_keeps_its_speed(quadruped, engine):
+    """v = v0 - g t and w = w0, for 2 s; PhysX stops links at 10 m/s and 50 rad/s by default."""
+    with Runner(quadruped, 1, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:
+        runner.reset(base_pose=[0, 0, 60, 1, 0, 0, 0], base_twist=[15, 0, 0, 0, 0, 80])
+        seen = runner.rollout(np.tile(quadruped.start, (200, 1))).base_twist[-1, 0]
+    np.testing.assert_allclose(seen[[2, 5]], [-2 * GRAVITY, 80], rtol=0.05)
+    assert np.hypot(*seen[:2]) > 14
+
+
 def test_a_pose_of_the_legs_sets_the_height(quadruped, engine):
     poses = np.stack([np.full(4, -0.05), np.full(4, 0.08)])
     with Runner(quadruped, 2, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:

@@ -15,7 +15,7 @@ from processes import have_ended
 from twin import ROBOT, SUBSTEPS, CtrlC, N, Twin, nothing_left
 
 from batchpid.errors import ClosedError
-from batchpid.sim import Recorder, Runner, read_recording
+from batchpid.sim import Recorder, Robot, Runner, read_recording
 
 INTERRUPTS = int(os.environ.get("BATCHPID_SOAK_INTERRUPTS", "100"))
 NEAR = 0.9 * ROBOT.start + 0.1 * ROBOT.settings.target
@@ -159,6 +159,30 @@ def test_an_exception_of_another_signal_handler_closes_the_runner():
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "jax"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, TimeoutError, MemoryError])
+def test_an_exception_within_a_sim_step_reaches_the_caller(error, backend, monkeypatch):
+    """Native code returns to Python for sensors, since Python drops exceptions of functions that C calls."""
+    pytest.importorskip("jax" if backend == "jax" else "sapien")
+    from batchpid.sim.engine.sapien.link_sensors import LinkSensors
+
+    robot = Robot.load("quadruped", fixed_base=False)
+    with Runner(robot, 2, engine="sapien", workers=0, backend=backend, contacts=[robot.links[-1].name]) as runner:
+        runner.step(robot.start)
+        steps = []
+
+        def fail(sensors, row):
+            steps.append(len(steps))
+            if len(steps) == 7:
+                raise error
+
+        monkeypatch.setattr(LinkSensors, "_add", fail)
+        with pytest.raises(error):
+            runner.step(robot.start)
+        assert len(steps) == 7
+        assert runner.closed
 
 
 def test_calls_in_another_thread_leave_ctrl_c_to_the_main_thread():

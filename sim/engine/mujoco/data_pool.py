@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.arrays.array_types import MjModel
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import FARTHEST
 
@@ -31,6 +32,14 @@ class User(Protocol):
     rows: NDArray[np.float64]
 
 
+def rest(model: MjModel, data: Any) -> None:
+    """Reset the data of a robot: to the start of its file, or with its joints at 0."""
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    else:
+        mujoco.mj_resetData(model, data)
+
+
 class DataPool:
     """``mujoco.MjData`` of ``robot`` for one pack at a time, and the model of robots without variation.
 
@@ -41,10 +50,12 @@ class DataPool:
         self.robot, self.model, self._data, self._taken = robot, copy.copy(robot.model), list[Any](), list[Any]()
         self._user: User | None = None
         self._initial = np.empty(mujoco.mj_stateSize(robot.model, STATE))
-        mujoco.mj_getState(robot.model, self._new(1)[0], self._initial, STATE)
+        (data,) = self._new(1)
+        rest(robot.model, data)
+        mujoco.mj_getState(robot.model, data, self._initial, STATE)
 
     def initial(self, size: int) -> NDArray[np.float64]:
-        """Return the rows of ``size`` robots at rest, with their joints at 0."""
+        """Return the rows of ``size`` robots at rest."""
         return np.tile(self._initial, (size, 1))
 
     def take(self, user: User) -> list[Any]:

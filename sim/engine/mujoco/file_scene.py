@@ -58,7 +58,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
     """
     compiled = attempt(Path(file.path), spec.fixed_base, file.reading)
     scene, model = compiled.scene, compiled.model
-    if model is None or content_of(scene) != file.content:
+    if model is None or content_of(Path(file.path)) != file.content:
         problem = compiled.problem or "it has another content"
         raise RobotError(f"{file.path}: has changed since the robot was loaded: {problem}; load the robot again")
     names = Names(model)

@@ -71,6 +71,8 @@ class RobotMj:
     """Index of a floating base in MuJoCo's qpos and qvel; None on a fixed one."""
     turn: NDArray[np.float64] = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
     """Rotation (4,) of that body's axes in the root link."""
+    is_file: bool = False
+    """Whether the model is an MJCF file's."""
 
 
 @lru_cache(maxsize=8)
@@ -136,7 +138,7 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
         joint = model.joint(model.body(found.root).jntadr[0])
         base, turn = (int(joint.qposadr[0]), int(joint.dofadr[0])), model.body(found.root).quat.copy()
     bodies = {link: model.body(name).id for link, name in found.names.items()}
-    return RobotMj(model, qpos, qvel, bodies, found.own, found.frames, base, turn)
+    return RobotMj(model, qpos, qvel, bodies, found.own, found.frames, base, turn, is_file=True)
 
 
 def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[Any, dict[str, str]]:

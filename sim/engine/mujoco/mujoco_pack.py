@@ -18,13 +18,12 @@ from batchpid.arrays.array_types import DType, Float64, Rows
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.model_pack import ModelPack
-from batchpid.sim.engine.mujoco.data_pool import DataPool
+from batchpid.sim.engine.mujoco.data_pool import STATE, DataPool, rest
 from batchpid.sim.engine.mujoco.link_sensors import MujocoLinkSensors
 from batchpid.sim.engine.mujoco.model_builder import FLOATING, LARGEST_FORCE, RobotMj, robot_model, set_inertia
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel
-from batchpid.sim.engine.protocol import FAILED
 from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_back
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
@@ -34,8 +33,8 @@ from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.rotations import inverse, multiply
 from batchpid.task_space.spatial_inertia import rotation_matrix
 
-_STATE = ("qpos", "qvel", "qacc_warmstart")
-"""Fields of ``mujoco.MjData`` that a robot's later motion depends on, besides its efforts."""
+_KEPT = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)
+"""Parts of the state in snapshots: all but the targets of drives, which every tick writes."""
 _JOINTS = ("dof_armature", "dof_damping", "actuator_biasprm", "actuator_forcerange")
 """Fields of ``mujoco.MjModel`` that joints and drives change."""
 
@@ -144,8 +143,7 @@ class MujocoPack(ModelPack):
         if self.steps_natively:
             if self._own_step is None:
                 self._own_step = self._make_step(False, None)
-            if self._own_step(self.qf, *np.empty((3, *self.qf.shape))) & FAILED:
-                raise RuntimeError(self._own_step.message)
+            self._own_step.may_have_failed(self._own_step(self.qf, *np.empty((3, *self.qf.shape))))
             return
         effort = self.qf
         if self._constraint is not None:
@@ -253,10 +251,7 @@ class MujocoPack(ModelPack):
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
             data = everyone[row]
             ctrl = data.ctrl.copy()
-            if self.models[row].nkey:
-                mujoco.mj_resetDataKeyframe(self.models[row], data, 0)
-            else:
-                mujoco.mj_resetData(self.models[row], data)
+            rest(self.models[row], data)
             if floats:
                 data.qpos[at : at + FLOATING + 1], data.qvel[moves : moves + FLOATING] = np.split(root, [FLOATING + 1])
             data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = position, velocity
@@ -371,20 +366,18 @@ class MujocoPack(ModelPack):
 
     def state_sizes(self) -> list[int]:
         """Return the number of values in the state of each robot."""
-        model = self._robot.model
-        return [model.nq + 2 * model.nv] * self.size
+        return [mujoco.mj_stateSize(self._robot.model, _KEPT)] * self.size
 
     def read_state(self) -> Float64:
-        """Return the state of each robot (M, values): MuJoCo's qpos, qvel and warm start of the solver."""
-        return np.array([np.concatenate([getattr(data, name) for name in _STATE]) for data in self._data])
+        """Return the state of each robot (M, values), in MuJoCo's order."""
+        states = np.empty((self.size, self.state_sizes()[0]))
+        for model, data, state in zip(self.models, self._data, states, strict=True):
+            mujoco.mj_getState(model, data, state, _KEPT)
+        return states
 
     def write_state_rows(self, states: Float64) -> None:
-        for data, state in zip(self._data, states, strict=True):
-            begin = 0
-            for name in _STATE:
-                field = getattr(data, name)
-                field[:] = state[begin : begin + len(field)]
-                begin += len(field)
+        for model, data, state in zip(self.models, self._data, states, strict=True):
+            mujoco.mj_setState(model, data, state, _KEPT)
         self._update(range(self.size))
 
     def read_poses(self, names: Sequence[str] | None = None) -> list[Rows]:

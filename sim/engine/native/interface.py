@@ -26,7 +26,7 @@ SYMBOLS = (
 """Functions of SAPIEN, in the order of Functions in gateway.h."""
 BASES = ("fixed", "free", "held")
 """Kinds of the base of a :class:`ModelStruct`, as Base in model.h."""
-STATUS = ("not_finite", "too_fast", "failed", "no_noise")
+STATUS = ("not_finite", "too_fast", "failed", "no_noise", "sense")
 """Bits of the status of a sim step: reasons to stop a loop over sim steps, as Status in sim_step.h."""
 STAGES = ("program", "force", "inertia", "mass_matrix", "controller", "targets", "constraint", "engine")
 """Kinds of a :class:`Stage`."""
@@ -41,13 +41,13 @@ class Group(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("gateway", "qf", "skip", "speed_limit")),
-        *((name, ctypes.c_void_p) for name in ("mujoco", "constraint", "joints", "sense")),
+        *((name, ctypes.c_void_p) for name in ("mujoco", "constraint", "joints")),
         ("robots", ctypes.c_int64),
         ("dof", ctypes.c_int64),
         ("gravity", ctypes.c_int32),
         ("coriolis", ctypes.c_int32),
         ("velocities", ctypes.c_int32),
-        ("unused", ctypes.c_int32),
+        ("senses", ctypes.c_int32),
         ("message", ctypes.c_char * 256),
     ]
 

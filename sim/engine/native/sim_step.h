@@ -16,7 +16,7 @@ namespace batchpid {
 constexpr double FARTHEST = 1e6;
 
 // Reasons for which a loop over sim steps has to stop, as bits: STATUS in interface.py.
-enum Status : std::int32_t { NOT_FINITE = 1, TOO_FAST = 2, FAILED = 4, NO_NOISE = 8 };
+enum Status : std::int32_t { NOT_FINITE = 1, TOO_FAST = 2, FAILED = 4, NO_NOISE = 8, SENSE = 16 };
 
 // Group of robots; Python fills in the fields (Group in interface.py) and owns what they point to.
 struct Group {
@@ -27,10 +27,10 @@ struct Group {
   Mujoco const *mujoco;              // robots in MuJoCo, or null; then there is no gateway
   Constraint const *constraint;      // of coupled joints, or null
   Joint *const *joints;              // (robots, dof): in SAPIEN, or null without targets of drives that move
-  void (*sense)(std::int64_t row);   // reads the sensors of a robot's links in SAPIEN after a sim step, or null
   std::int64_t robots, dof;
   std::int32_t gravity, coriolis;    // parts of the passive force; without both it is zero
-  std::int32_t velocities, unused;   // whether to read velocities; otherwise they are zero
+  std::int32_t velocities;           // whether to read velocities; otherwise they are zero
+  std::int32_t senses;               // whether Python reads sensors after each sim step
   char message[256];                 // of an exception of the engine
 };
 
@@ -73,7 +73,6 @@ void step_in_sapien(Group const &group, T const *effort, T *qpos, T *qvel, T *pa
     if (group.constraint != nullptr) constrain_row(group, row, qf);
     if (!group.skip[row]) apply(call, robot, qf, dof);
     call.step(gateway.systems[row]);
-    if (group.sense != nullptr) group.sense(static_cast<std::int64_t>(row));
     copy_row(call.get_qpos(robot), qpos + at, dof);
     if (moves) copy_row(call.get_qvel(robot), qvel + at, dof);
     if (bears) {
@@ -133,7 +132,7 @@ std::int32_t try_sim_step(Group &group, std::int64_t rows, T const *effort, T *q
                                             : succeeds(group.message, in_sapien);
   if (!good) return FAILED;
   std::int64_t const dof = group.dof;
-  std::int32_t status = 0;
+  std::int32_t status = group.senses != 0 ? SENSE : 0;
   for (std::int64_t at = 0; at < group.robots * dof; ++at) {
     if (!(std::fabs(qpos[at]) <= FARTHEST)) status |= NOT_FINITE;
     if (group.speed_limit && !(std::fabs(qvel[at]) <= group.speed_limit[at % dof])) status |= TOO_FAST;

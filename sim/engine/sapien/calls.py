@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import DType, Rows
 from batchpid.sim.engine.native import SWITCH, extension
+from batchpid.sim.engine.native.interface import STATUS
 from batchpid.sim.engine.native.library import functions
 from batchpid.sim.engine.native_model import NativeStep
 
@@ -140,7 +141,7 @@ def pointer(wrapper: Any, kind: str) -> int:
     return _capsule_pointer(capsule, _capsule_name(capsule))
 
 
-_SENSE = ctypes.CFUNCTYPE(None, ctypes.c_int64)
+_SENSE = 1 << STATUS.index("sense")
 
 
 class SapienStep(NativeStep):
@@ -163,7 +164,8 @@ class SapienStep(NativeStep):
     joints
         Joints of all robots, if the targets of their drives move within a tick.
     sense
-        Function that reads the sensors of the links of a robot after its sim step, or None.
+        Function that reads the sensors of the links after a sim step, or None. Native code returns to Python for it
+        after each sim step, since Python drops exceptions of functions that C calls.
     """
 
     def __init__(
@@ -176,10 +178,10 @@ class SapienStep(NativeStep):
         speed_limit: NDArray[np.float64] | None,
         constraint: int | None = None,
         joints: Sequence[Any] | None = None,
-        sense: Callable[[int], None] | None = None,
+        sense: Callable[[], None] | None = None,
     ) -> None:
         assert isinstance(calls, NativeCalls)
-        self._stepped, self._calls, self._sense = stepped, calls, None if sense is None else _SENSE(sense)
+        self._stepped, self._calls, self._sense = stepped, calls, sense
         arrays: dict[str, Rows] = {"qf": calls.qf, "skip": calls.skip}
         if joints is not None:
             arrays["joints"] = np.array([pointer(joint, "joint") for joint in joints], np.uint64)
@@ -194,10 +196,16 @@ class SapienStep(NativeStep):
             coriolis=coriolis,
             velocities=velocities,
             constraint=constraint,
-            sense=None if self._sense is None else ctypes.cast(self._sense, ctypes.c_void_p),
+            senses=sense is not None,
         )
 
     def prepare(self) -> int:
         """Return the address of the group, for a call of the extension or of XLA that does a sim step."""
         self._stepped[...] = True
         return super().prepare()
+
+    def may_have_failed(self, status: int) -> bool:
+        failed = super().may_have_failed(status & ~_SENSE)
+        if self._sense is not None:
+            self._sense()
+        return failed

@@ -56,8 +56,12 @@ class LinkSensors:
         links, *_ = self._parts[row]
         return np.array([links[at].get_linear_velocity() for at in self._contacts], np.float64).reshape(-1, 3)
 
-    def add(self, row: int) -> None:
-        """Add the sensors of robot ``row`` after a sim step."""
+    def add(self) -> None:
+        """Add the sensors of all robots after a sim step."""
+        for row in range(len(self._robots)):
+            self._add(row)
+
+    def _add(self, row: int) -> None:
         links, joints, _, gravity = self._parts[row]
         forces = self._robots[row].get_link_incoming_joint_forces()
         if self._wrenches:

@@ -137,8 +137,7 @@ class Pack(ModelPack):
         self._stepped[...] = True
         self._calls.step()
         if self._sensors is not None:
-            for row in range(self.size):
-                self._sensors.add(row)
+            self._sensors.add()
 
     @property
     def calls(self) -> EngineCalls:
@@ -252,7 +251,7 @@ class Pack(ModelPack):
 
         PhysX gives the velocity of the center of mass c: v_c = v + w x (R c), subtracted with ``sign`` -1.
         """
-        centers = np.array([self.robots[row].links[0].cmass_local_pose.p for row in rows], np.float64)
+        centers = np.array([self.robots[row].links[0].cmass_local_pose.p for row in rows], np.float64).reshape(-1, 3)
         arm = (matrix_of(roots[:, 3:7]) @ centers[..., None])[..., 0]
         velocity = roots[:, 7:10] + sign * np.cross(roots[:, 10:], arm)
         return np.concatenate([roots[:, :7], velocity, roots[:, 10:]], axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import mujoco
 import numpy as np
 from lxml import etree
 
-from batchpid.arrays.array_types import MjModel, MjSpec
+from batchpid.arrays.array_types import MjModel
 from batchpid.arrays.digest import digest
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.mjcf.mjcf_compiler import ALONE, Attempt, Names, compile_file, label
@@ -19,11 +20,14 @@ from batchpid.sim.robot.mjcf.mjcf_shapes import PLANE, can_collide, excluded_pai
 from batchpid.sim.robot.mjcf.mjcf_tree import Tree
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.self_collision import DisabledPair
+from batchpid.sim.robot.xml import parse_xml
 from batchpid.task_space.rigid_tree import GRAVITY
 
 _EQ = mujoco.mjtEq
 _KEYFRAME = "home"
 """Keyframe with the start pose."""
+_FOLDERS = ("meshdir", "texturedir", "assetdir")
+"""Attributes of ``<compiler>`` with folders of other files."""
 _OURS = ("GRAVITY", "ACTUATION", "CLAMPCTRL")
 """Parts of MuJoCo's physics that a file cannot disable in either engine."""
 _OTHERS = ("CONTACT", "LIMIT", "EQUALITY", "FRICTIONLOSS", "DAMPER", "CONSTRAINT")
@@ -91,7 +95,7 @@ def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> Mjcf
     return MjcfFile(
         path=str(path),
         reading=compiled.reading,
-        content=content_of(compiled.scene),
+        content=content_of(path),
         bodies=tuple(names.bodies.values()),
         falling=tuple(names.bodies[int(body)] for body in free if not names.is_of_robot(body)),
         loops=tuple(loops),
@@ -100,9 +104,24 @@ def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> Mjcf
     )
 
 
-def content_of(scene: MjSpec) -> str:
-    """Return the digest of a compiled ``mujoco.MjSpec``, the same on every machine."""
-    return digest(scene.to_xml())
+def content_of(path: Path) -> str:
+    """Return the digest of an MJCF file and of all files that it names: included models, meshes, height fields, ...
+
+    MuJoCo looks for a file beside the file that names it, or in a folder of its ``<compiler>``. A file without any of
+    these is left out: if MuJoCo needs it, the compilation fails.
+    """
+    names, folders, models = set[str](), set[Path](), [path]
+    for model in models:
+        folders.add(model.parent)
+        for element in parse_xml(model).iter():
+            folders |= {model.parent / folder for key, folder in element.items() if key in _FOLDERS}
+            for key, name in element.items():
+                if (key == "value" or key.startswith("file")) and name not in names:
+                    names |= {name, Path(name).name}
+                    included = [model.parent / name, path.parent / name] if element.tag in ("include", "model") else []
+                    models += [file for file in included if file.is_file() and file not in models]
+    files = {(name, file) for name in names for folder in folders if os.path.isfile(file := folder / name)}
+    return digest(path.read_bytes(), sorted((name, digest(file.read_bytes())) for name, file in files))
 
 
 def _in_radians(model: MjModel, names: Names) -> list[Finding]:

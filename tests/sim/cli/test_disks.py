@@ -16,17 +16,15 @@ from batchpid.sim import Recorder, Runner, Snapshot, plots, write_recording
 from batchpid.sim.cli import outputs
 from batchpid.sim.cli import run as cli_run
 from batchpid.sim.tuning import robot_survey as surveying
-from batchpid.sim.view import film, renderer
 
 SHORT = ("--num-envs", "1", "--workers", "0", "--seconds", "0.02")
-TUNE = ("tune", "--generations", "1", "--population", "4", "--search-seconds", "0.05", "--workers", "0")
+TUNE = ("tune", "--generations", "1", "--population", "4", "--seconds", "0.05", "--workers", "0")
 COMMANDS = {
     "demo": (("demo", *SHORT, "--picture"), "a.png"),
     "rollout npz": (("rollout", *SHORT, "--out"), "a.npz"),
     "rollout h5": (("rollout", *SHORT, "--out"), "a.h5"),
     "rollout picture": (("rollout", *SHORT, "--picture"), "a.svg"),
     "plot": (("plot", "RUN", "--picture"), "a.png"),
-    "render": (("render", "RUN", "--fps", "120", "--width", "64", "--height", "64", "--out"), "a.mp4"),
     "compare": (("compare", "--moves", "1", "--workers", "0", "--seconds", "0.02", "--picture"), "a.png"),
     "survey json": (("survey", "URDF", "--workers", "1", "--out", "OTHER.md", "--json"), "a.json"),
     "survey": (("survey", "URDF", "--workers", "1", "--json", "OTHER.json", "--out"), "a.md"),
@@ -37,7 +35,7 @@ COMMANDS = {
 SECOND = ("rollout picture", "survey json", "tune picture")
 """Other outputs of a command that is in the table already."""
 ROWS = [pytest.param(name, marks=pytest.mark.slow if name in SECOND else ()) for name in COMMANDS]
-NEEDS = {"rollout h5": "h5py", "render": "imageio_ffmpeg", "tune": "cmaes", "tune picture": "cmaes"}
+NEEDS = {"rollout h5": "h5py", "tune": "cmaes", "tune picture": "cmaes"}
 
 
 @pytest.fixture(scope="module")
@@ -47,25 +45,9 @@ def rollout(panda):
         return runner.rollout(np.tile(panda.start, (4, 1, 1)))
 
 
-class Grey:
-    """Stand-in for the scene of a film on machines that cannot render."""
-
-    def __init__(self, *_):
-        pass
-
-    def add_camera(self, width, height):
-        picture = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
-        return lambda: picture
-
-    def place(self, *_):
-        pass
-
-
 @pytest.fixture
-def command(batchpid, rollout, tmp_path, monkeypatch):
+def command(batchpid, rollout, tmp_path):
     """Function that runs a command of the table with its output in a folder and returns (exit status, stderr)."""
-    monkeypatch.setattr(renderer, "render_problem", lambda: None)
-    monkeypatch.setattr(film, "RenderScene", Grey)
     run = write_recording(rollout, tmp_path / "run.npz")
     urdf = write(tmp_path, one_joint(), "one_joint.urdf")
 
@@ -161,7 +143,7 @@ def run_while_filling(command, name: str, disk: Path, free: int, monkeypatch) ->
     return status
 
 
-@pytest.mark.parametrize("name", ["rollout npz", "rollout h5", pytest.param("plot", marks=pytest.mark.slow), "render"])
+@pytest.mark.parametrize("name", ["rollout npz", "rollout h5", pytest.param("plot", marks=pytest.mark.slow)])
 def test_a_disk_that_fills_up_during_the_run_keeps_the_older_file(name, command, tmp_path, monkeypatch):
     with small_disk(tmp_path / "disk", 1 << 16) as disk:
         assert run_while_filling(command, name, disk, 0, monkeypatch) == 2

@@ -19,18 +19,16 @@ WORDS = {
     "rollout": ("rollout", *SHORT),
     "tune": ("tune", "arm.urdf"),
     "compare": ("compare", "arm.urdf"),
-    "parity": ("parity", "arm.urdf"),
     "excite": ("excite", "arm.urdf"),
     "export": ("export", "arm.urdf"),
     "identify": ("identify", "arm.urdf", "run.npz"),
     "inspect": ("inspect", "arm.urdf"),
     "survey": ("survey", "arm.urdf"),
     "plot": ("plot", "run.npz"),
-    "render": ("render", "run.npz"),
 }
 """Words of each command that writes, without its outputs."""
 SUFFIXES = {"picture": ".png", "json": ".json", "out": ".yaml"}
-OUT = {"rollout": ".npz", "excite": ".csv", "export": ".h", "survey": ".md", "render": ".mp4"}
+OUT = {"rollout": ".npz", "excite": ".csv", "export": ".h", "survey": ".md"}
 
 
 def output_flags() -> list[tuple[str, str]]:

@@ -278,7 +278,7 @@ def test_files_of_other_programs_read_as_those_of_this_one(batchpid, tmp_path, p
 
 def test_the_motion_of_excite_is_followed(batchpid, tmp_path):
     path = tmp_path / "x.csv"
-    assert batchpid("excite", "panda", "--duration", 2, "--rate", 200, "--out", path)[0] == 0
+    assert batchpid("excite", "panda", "--seconds", 2, "--rate", 200, "--out", path)[0] == 0
     status, said, error = batchpid("rollout", "--trajectory", path, *ONE)
     assert status == 0, error
     assert "real-time" in said

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shlex
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from batchpid.sim.tuning.evaluation import within
 
 pytest.importorskip("cmaes")
 
-SHORT = ("--generations", 1, "--population", 4, "--search-seconds", 0.1, "--workers", 0, "--physics", "fast")
+SHORT = ("--generations", 1, "--population", 4, "--seconds", 0.1, "--workers", 0, "--physics", "fast")
 
 
 @pytest.fixture(autouse=True)
@@ -205,6 +206,8 @@ def test_compare_runs_each_set_in_both_engines(drawn, batchpid, tmp_path, reques
     rows = {line.split("  ")[0]: line.split()[2:7] for line in said.splitlines() if " of 2" in line}
     assert rows.keys() == {"tuned, SAPIEN", "tuned, MuJoCo"}
     assert "following error" in said
+    difference = re.search(r"tuned, SAPIEN / tuned, MuJoCo: (\S+) rad", said)
+    assert 0 < float(difference[1]) < 1e-2
     assert max(map(len, said.splitlines())) <= 120
     assert rows["tuned, SAPIEN"] == rows["tuned, MuJoCo"]  # settling times in hundredths of a second
     assert not drawn or picture.stat().st_size > 10_000

@@ -92,7 +92,7 @@ def test_a_run_of_another_robot_with_the_name_of_a_bundled_one_is_not_shown_as_t
     run = write(tmp_path / "my run.npz", urdf=load_bundled("panda").urdf.replace("0.333", "0.433"))
     said = "robot: 'panda' of the recording is another one than the bundled robot of that name; name its URDF: batchpid"
     assert f"{said} view PATH/TO/ROBOT.urdf --play '{run}'" in batchpid("view", "--play", run)[2]
-    assert f"{said} render '{run}' PATH/TO/ROBOT.urdf" in batchpid("render", run)[2]
+    assert f"{said} plot '{run}' PATH/TO/ROBOT.urdf --film a.gif" in batchpid("plot", run, "--film", "a.gif")[2]
 
 
 def test_a_run_of_a_robot_that_is_not_bundled_asks_for_its_urdf(batchpid, tmp_path):

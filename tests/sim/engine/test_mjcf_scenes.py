@@ -11,6 +11,10 @@ pytest.importorskip("mujoco.batch")
 
 from batchpid.errors import InvalidArgumentError, RobotError  # noqa: E402
 from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, Uniform  # noqa: E402
+from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
+from batchpid.sim.engine.mujoco.mujoco_engine import ENGINE  # noqa: E402
+from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
+from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits")
 
@@ -354,3 +358,99 @@ def test_an_error_of_mujoco_closes_the_runner(load):
         with pytest.raises(Exception, match="memory"):
             runner.rollout(np.full((100, 2, robot.dof), 3.0))
         assert runner.closed
+
+
+def random_file(rng):
+    """Return an MJCF text of an arm with up to three joints a body that falls onto its floor."""
+    flag = rng.choice(["", '<flag contact="disable"/>', '<flag override="enable"/>', '<flag filterparent="disable"/>'])
+    option = OPTION.replace("/>", f' o_margin=".05" o_solref=".02 1" o_solimp=".9 .95 .001 .5 2">{flag}</option>', 1)
+    margin = rng.choice(["", 'margin=".03" gap=".01"'], p=[0.8, 0.2])
+    bodies, count = "", 0
+    for number in range(3):
+        joints = ""
+        for _ in range(rng.integers(number == 0, 4)):
+            axis, slides = " ".join(map(str, rng.normal(size=3).round(2))), rng.random() < 0.4
+            kind = 'type="slide" range="-.1 .1"' if slides else f'type="hinge" pos="{rng.choice([0, -0.2])} 0 0"'
+            ref = rng.choice([0, 0.3, 2])
+            joints += f'<joint name="j{count}" {kind} axis="{axis}" ref="{ref}" damping="{20 if slides else 0.02}"/>'
+            count += 1
+        place = "0 0 .3" if number == 0 else ".25 0 0"
+        bodies += f'<body pos="{place}">{joints}<geom type="capsule" size=".04" fromto="0 0 0 .2 0 0" {margin}/>'
+    world = f"<worldbody><geom type='plane' size='1 1 1'/>{bodies}{3 * '</body>'}</worldbody>"
+    return f"<mujoco>{option}{world}<keyframe><key name='home' qpos='{count * '0 '}'/></keyframe></mujoco>"
+
+
+@pytest.mark.filterwarnings("ignore::batchpid.sim.MissedContactWarning")
+@pytest.mark.parametrize("seed", range(16))
+def test_random_files_in_contact_move_as_in_mujoco(load, monkeypatch, seed):
+    rng = np.random.default_rng(seed)
+    text, collides = random_file(rng), bool(rng.random() < 0.8)
+    robot, model = load(text, self_collision="urdf"), mujoco.MjModel.from_xml_string(text)
+    if not collides:
+        model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    rows, seen = np.zeros((80, robot.dof)), []
+    for native in (1, 0):
+        monkeypatch.setenv("BATCHPID_NATIVE", str(native))
+        options = {"control": "effort", "compensate": "none", "substeps": 20, "collisions": collides}
+        with Runner(robot, 1, workers=0, engine="mujoco", **options) as runner:
+            seen.append(run(runner, rows)[:, 0])
+    np.testing.assert_array_equal(*seen)
+    np.testing.assert_allclose(seen[0], in_mujoco(robot, model, rows, 20), rtol=0, atol=1e-6)
+
+
+def test_a_snapshot_holds_the_integration_state(load):
+    """Also what a keyframe places, and what a run may change: mocap bodies, equality constraints, user data."""
+    robot = load(
+        ARM.replace("<worldbody>", '<size nuserdata="2"/><worldbody><body name="target" mocap="true"/>')
+        .replace('<key name="home"', '<key name="home" mpos=".3 0 .35"')
+        .replace("<actuator>", '<equality><weld body1="cube" body2="lid" active="false"/></equality><actuator>')
+    )
+    whole, kept = int(mujoco.mjtState.mjSTATE_INTEGRATION), []
+    spec = SceneSpec(robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf)
+    packs = [ENGINE.make_pack(spec, 2) for _ in range(2)]
+    rng = np.random.default_rng(0)
+    for data in packs[0]._data:
+        assert list(data.mocap_pos[0]) == [0.3, 0, 0.35]
+        row = np.empty(mujoco.mj_stateSize(packs[0].models[0], whole))
+        mujoco.mj_getState(packs[0].models[0], data, row, whole)
+        mujoco.mj_setState(packs[0].models[0], data, row + rng.uniform(0.1, 0.2, len(row)), whole)
+    packs[1].write_state_rows(packs[0].read_state())
+    for pack in packs:
+        kept.append([])
+        for data in pack._data:
+            mujoco.mj_getState(pack.models[0], data, row := np.empty(len(row)), whole)
+            kept[-1].append(row)
+    np.testing.assert_array_equal(*kept)
+
+
+BLOCK = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+OPENED = {
+    "scene.xml": """<mujoco><compiler meshdir="parts"/><asset><mesh name="block" file="block.obj"/>
+      <hfield name="hills" file="hills.bin" size="1 1 .1 .1"/><model name="other" file="other.xml"/></asset>
+      <worldbody><geom type="hfield" hfield="hills" pos="2 0 0"/><include file="arm.xml"/>
+      <frame pos="0 3 0"><attach model="other" body="pole" prefix="b"/></frame></worldbody></mujoco>""",
+    "arm.xml": """<mujocoinclude><body name="arm"><joint name="j" axis="0 1 0"/>
+      <geom size=".1 .1 .1" type="box"/></body>
+      <body name="toy" pos="1 0 1"><freejoint/><geom type="mesh" mesh="block"/></body></mujocoinclude>""",
+    "other.xml": """<mujoco><asset><mesh name="tip" file="tip.obj"/></asset><worldbody>
+      <body name="pole"><geom size=".1"/><geom type="mesh" mesh="tip"/></body></worldbody></mujoco>""",
+    "parts/block.obj": BLOCK,
+    "tip.obj": BLOCK,
+    "parts/hills.bin": np.array([2, 2], np.int32).tobytes() + np.array([0, 0.1, 0.2, 0.3], np.float32).tobytes(),
+}
+
+
+@pytest.mark.parametrize("changed", OPENED)
+def test_every_file_that_a_load_opens_is_part_of_the_identity(tmp_path, changed):
+    (tmp_path / "parts").mkdir()
+    for name, content in OPENED.items():
+        (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    robot = Robot.load(tmp_path / "scene.xml")
+    with Runner(robot, 1, workers=0, engine="mujoco"):
+        pass
+    path = tmp_path / changed
+    path.write_bytes(path.read_bytes().replace(b".1", b".2").replace(*(np.float32(x).tobytes() for x in (0.3, 0.5))))
+    assert Robot.load(tmp_path / "scene.xml").describe() != robot.describe()
+    robot_model.cache_clear()
+    with pytest.raises(RobotError, match="has changed since the robot was loaded"):
+        Runner(robot, 1, workers=0, engine="mujoco")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from batchpid.sim import Robot, Runner
-from tests.sim.tiny_urdf import write
+from tests.sim.tiny_urdf import one_joint, write
 
 
 def wheel(folder, kind: str = "", multiplier: float = 0.0) -> Robot:
@@ -45,6 +45,18 @@ def test_a_follower_stays_with_its_leader_over_many_turns(kind, multiplier, tmp_
     assert second.ok.all()
     np.testing.assert_allclose(qvel[:, 1], multiplier * qvel[:, 0], rtol=2e-3, atol=0.01)
     np.testing.assert_allclose(qvel[-1, 0], 0.5 / inertia * ticks * 0.01, rtol=3e-3)
+
+
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+@pytest.mark.parametrize("kind", ["continuous", "prismatic"])
+def test_no_speed_is_too_high(kind, engine, tmp_path):
+    """v = F t / m, far beyond PhysX's defaults: 10 m/s and 50 rad/s of links, 100 of joints."""
+    limit = '<limit lower="-9e3" upper="9e3" effort="900" velocity="900"/>'
+    robot = Robot.load(write(tmp_path, one_joint(limit, kind)))
+    options = {"control": "effort", "compensate": "gravity+coriolis", "ground": False, "engine": engine}
+    with Runner(robot, 1, workers=0, **options) as runner:
+        seen = runner.rollout(np.full((200, 1), 20.0 if kind == "continuous" else 200.0))
+    np.testing.assert_allclose(seen.qvel[-1, 0], 2 * 200, rtol=1e-2)
 
 
 @pytest.mark.quick_rows(8)

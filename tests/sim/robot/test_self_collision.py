@@ -51,8 +51,19 @@ def test_links_that_overlap_at_rest_do_not_collide(tmp_path):
         Robot.load(path, self_collision="srdf")
 
 
-def test_links_that_only_touch_at_rest_go_on_colliding(tmp_path):
-    assert reasons(Robot.load(write(tmp_path, sliders(0.0, 0.1995)))) == {}
+@pytest.mark.parametrize("gap", [-1e-2, -1e-5, 0.0, 1e-5, 9e-4])
+def test_links_that_touch_at_the_start_are_not_pushed_apart(gap, tmp_path):
+    """PhysX answers 0.01 mm with a large impulse."""
+    loaded = Robot.load(write(tmp_path, sliders(0.0, 0.2 + gap)))
+    assert reasons(loaded) == {("l0", "l1"): "Default"}
+    (finding,) = [each for each in loaded.check() if each.code == "pairs-left-out"]
+    assert (finding.link, finding.detail) == ("l0", "with 'l1'")
+    with Runner(loaded, 1, engine="sapien", control="effort", workers=0) as runner:
+        assert np.abs(runner.step(np.zeros(2)).qvel).max() < 1e-3
+
+
+def test_links_apart_at_the_start_collide(tmp_path):
+    assert reasons(Robot.load(write(tmp_path, sliders(0.0, 0.2011)))) == {}
 
 
 def test_links_that_touch_in_nearly_every_pose_do_not_collide(tmp_path):
@@ -78,7 +89,7 @@ def test_neighbours_are_those_with_a_chain_of_links_without_shape_between_them(t
 
 
 def test_an_srdf_disables_and_enables_pairs_whatever_their_reason(tmp_path):
-    path = write(tmp_path, sliders(0.0, 0.1, 0.2))
+    path = write(tmp_path, sliders(0.0, 0.1, 0.202))
     assert set(reasons(Robot.load(path))) == {("l0", "l1"), ("l1", "l2")}
     write(
         tmp_path,

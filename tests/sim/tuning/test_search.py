@@ -147,17 +147,15 @@ def test_cost_is_linear_in_the_weight_of_the_following_error():
     assert more - none == pytest.approx(4 * (some - none))
 
 
-COSTS = {"arm": (19.194, 19.037), "panda": (23.522, 23.337), "jaco2": (23.741, 23.565)}
-"""Costs of the designed gains, and of the best ones that a short search finds, by robot."""
-
-
 @pytest.mark.parametrize("engine", ["mujoco", pytest.param("sapien", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", COSTS)
-def test_costs_of_known_robots_are_as_they_were(name, engine):
+@pytest.mark.parametrize("name", ["arm", "panda", "jaco2"])
+def test_a_short_search_is_near_the_best_of_many_candidates(name, engine):
     robot = ARM if name == "arm" else load_bundled(name)
-    options = SMALL | {"seconds": 0.3, "engine": engine}
-    found = tune(robot, moves=random_moves(robot, 2, 0), workers=0, **options)
-    assert (found.start_cost, found.cost) == pytest.approx(COSTS[name], rel=1e-3)
+    options = SMALL | {"seconds": 0.3, "engine": engine, "moves": random_moves(robot, 2, 0), "workers": 0}
+    short = tune(robot, **options)
+    wide = tune(robot, **options | {"generations": 1, "population": 48, "seed": 1})
+    assert short.cost <= short.start_cost
+    assert short.cost <= 1.1 * min(wide.history[0])
 
 
 def test_search_starts_from_the_designed_gains():

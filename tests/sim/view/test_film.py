@@ -31,13 +31,12 @@ def test_without_a_device_the_error_gives_the_remedy(rollout, no_device):
         film.show_window(rollout)
 
 
-def test_without_a_device_a_film_is_painted_and_says_so(tmp_path, monkeypatch, capsys, no_device):
+def test_without_a_device_a_film_is_painted(tmp_path, monkeypatch, no_device):
     pytest.importorskip("imageio_ffmpeg")
     monkeypatch.chdir(tmp_path)
     assert main(["rollout", "--num-envs", "2", "--seconds", "0.2", "--workers", "0", "--out", "run.npz"]) == 0
-    assert main(["render", "run.npz", "--out", "film.mp4", "--width", "320", "--height", "180"]) == 0
-    assert "drawn by Matplotlib; SAPIEN's renderer does not work" in capsys.readouterr().out
-    frames = read_film("film.mp4", 320, 180)
+    assert main(["plot", "run.npz", "--film", "film.mp4"]) == 0
+    frames = read_film("film.mp4", 960, 540)
     assert 6 <= len(frames) <= 7
     assert frames[0].std() > 5  # not empty
     assert np.abs(frames[-1].astype(int) - frames[0]).max() > 40  # the robots move
@@ -94,9 +93,9 @@ def test_a_film_shows_a_recorded_run(tmp_path, monkeypatch):
         pytest.skip("needs a Vulkan device")
     monkeypatch.chdir(tmp_path)
     assert main(["rollout", "--num-envs", "2", "--seconds", "0.3", "--workers", "0", "--out", "run.npz"]) == 0
-    assert main(["render", "run.npz", "--out", "film.mp4", "--width", "320", "--height", "180"]) == 0
-    frames = read_film("film.mp4", 320, 180)
-    assert frames.shape[1:] == (180, 320, 3)
+    assert main(["plot", "run.npz", "--film", "film.mp4"]) == 0
+    frames = read_film("film.mp4", 960, 540)
+    assert frames.shape[1:] == (540, 960, 3)
     assert 8 <= len(frames) <= 10
     assert frames[0].std() > 5  # not empty
     assert np.abs(frames[-1].astype(int) - frames[0]).max() > 40  # the robots move
