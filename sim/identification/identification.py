@@ -22,7 +22,7 @@ from batchpid.sim.identification.fit import MOST_WINDOWS, Problem, windows_of
 from batchpid.sim.identification.intervals import intervals_of
 from batchpid.sim.identification.log import Log, LogWarning, checked
 from batchpid.sim.identification.logs import Reading, read_logs
-from batchpid.sim.identification.regression import Guess, Motion, Regression, smooth
+from batchpid.sim.identification.regression import STRENGTHS, Guess, Motion, Regression, better_reading, smooth
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.identification.simulator import Drive, Plant
 from batchpid.sim.identification.unknowns import BASIC, EXTRAS, LAW, Unknowns
@@ -34,6 +34,8 @@ STILL = {"rad": 1e-3, "m": 1e-4}
 """Standard deviation of the positions up to which a joint did not move."""
 SHARE, SHAKEN = 0.01, 1.5
 """The same as a share of the joint that moved most, and over the noise from row to row."""
+BEYOND = 3.0
+"""Effort over the robot's limit from which it looks like another unit."""
 FOLLOWS = 0.02
 """Standard deviation of the positions, over that of the setpoints, up to which a joint is stuck, and gives a little."""
 
@@ -111,10 +113,15 @@ def identify(
         choice("extras", name, [*EXTRAS])
     data = _read(robot, logs, params, compensate, timestep, reading)
     guess = _guess(data)
+    if _is_odd(data, guess) and (words := _better_reading(data)):
+        raise InvalidArgumentError("logs", f"make sense with {words}", remedy="correct the log or its options")
     unknowns = _unknowns(data, guess, [*extras], flag("payload", payload))
     with _pool(workers) as run:
         problem = Problem(data.plants, data.drives, _windows(data), unknowns, run)
-        return _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
+        found = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
+    if not found.explains and (words := _better_reading(data)):
+        return replace(found, advice=f"the logs make more sense with {words}: correct the log or its options")
+    return found
 
 
 def _read(
@@ -251,6 +258,21 @@ def _guess(data: Data) -> Guess:
         guesses.append((guess.cost - (0.1 if through else 0.0), drives, guess))
     _, data.drives[:], best = min(guesses, key=lambda option: option[0])
     return best
+
+
+def _is_odd(data: Data, guess: Guess) -> bool:
+    """Return whether a strength is at its bound, or efforts are far beyond the limits of the robot."""
+    if data.logs[0].kind == "effort":
+        most = np.quantile(np.abs(np.concatenate([log.command for log in data.logs])), 0.99, axis=0)
+        limits = data.robot.effort_limit[list(data.logs[0].joints)]
+        if (most > BEYOND * np.where(limits > 0, limits, np.inf)).any():
+            return True
+    return bool(np.isin(guess.values["strength"], STRENGTHS).any())
+
+
+def _better_reading(data: Data) -> str:
+    names = [data.robot.joint_names[joint] for joint in data.logs[0].joints]
+    return better_reading(data.plants[0], data.drives[0], data.logs[0], names)
 
 
 def _unknowns(data: Data, guess: Guess, extras: list[str], payload: bool) -> Unknowns:

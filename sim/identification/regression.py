@@ -12,7 +12,9 @@ are taken from a grid.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,10 +33,18 @@ EDGE = 0.15
 """Time left out at both ends of a log, where the filter begins [s]."""
 MOST_ROWS = 4000
 """Most rows of a regression."""
+STRENGTHS = 0.2, 3.0
+"""Bounds of the strength."""
 MOVES = 0.4
 """Speed, over its root mean square, below which a joint may stick."""
 WEIGHT = 0.02
 """Weight of the prior at strength 1, over the effort's size."""
+EVIDENCE = 0.7
+"""Decrease of the mean logarithm of the residual's square that counts for another reading of a log."""
+ALIKE = 0.3
+"""Difference of costs that are as good as equal: the first reading is named."""
+TRIED = 10.0
+"""Length of a log from which other readings are tried [s]."""
 LEAST_SHARE = 0.05
 """Least share of a joint's effort that moves the links, for a strength to be found: the motor's inertia and friction
 take the rest, of which only ratios to the strength are known."""
@@ -66,7 +76,8 @@ def smooth(log: Log, timestep: float) -> Motion:
     qpos = lowpass(interpolated(time, log.time, log.qpos), min(CUTOFF, 0.2 / period), timestep)
     qvel = np.gradient(qpos, timestep, axis=0)
     forward = None if log.feedforward is None else log.commands_at(time, log.feedforward)
-    return Motion(qpos, qvel, np.gradient(qvel, timestep, axis=0), log.commands_at(time), forward)
+    tables = map(np.ascontiguousarray, (qpos, qvel, np.gradient(qvel, timestep, axis=0)))
+    return Motion(*tables, log.commands_at(time), forward)
 
 
 def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
@@ -75,6 +86,52 @@ def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
 
     pad = min(len(table) - 1, round(0.5 / timestep))
     return sosfiltfilt(butter(4, cutoff, fs=1 / timestep, output="sos"), table, axis=0, padlen=pad)
+
+
+def better_reading(plant: Plant, drive: Drive, log: Log, names: Sequence[str]) -> str:
+    """Return the reading of a log that explains its efforts far better than the present one, in words; "" for none.
+
+    Signs, exchanged joints, factors of units and times of the commands are tried. ``names`` are those of the joints.
+    """
+    first = log.part(log.time < log.time[0] + TRIED, log.command_time < log.time[0] + TRIED)
+    present, costs = _cost(plant, drive, first), dict[str, float]()
+    for words, changed in _readings(first, names):
+        costs[words] = _cost(plant, drive, changed)
+    if min(costs.values()) > present - EVIDENCE:
+        return ""
+    return next(words for words, cost in costs.items() if cost < min(costs.values()) + ALIKE)
+
+
+def _cost(plant: Plant, drive: Drive, log: Log) -> float:
+    return Regression([plant], [drive], [log], [smooth(log, drive.timestep)]).best().cost
+
+
+def _readings(log: Log, names: Sequence[str]) -> Iterator[tuple[str, Log]]:
+    """Yield other readings of a log, in words."""
+    columns: dict[str, tuple[bool, bool]] = {log.kind: (False, True), "qpos": (True, False)}
+    columns[f"qpos and {log.kind}"] = True, True
+    joints = len(names)
+
+    def changed(sides: tuple[bool, bool], function: Callable[[Float64], Float64]) -> Log:
+        qpos, command = (function(table) if side else table for table, side in zip((log.qpos, log.command), sides, strict=True))
+        return replace(log, qpos=qpos, command=command)
+
+    for column, sides in columns.items():
+        for joint in range(joints):
+            signs = np.where(np.arange(joints) == joint, -1.0, 1.0)
+            yield f"{column} of {names[joint]} with the other sign", changed(sides, lambda table, s=signs: table * s)
+        for first, second in combinations(range(joints), 2):
+            order = np.arange(joints)
+            order[[first, second]] = second, first
+            words = f"{column} of {names[first]} and {names[second]} exchanged"
+            yield words, changed(sides, lambda table, o=order: table[:, o])
+    yield f"{log.kind} of all joints with the other sign", changed((False, True), np.negative)
+    units = {"thousandths of SI units": 1e-3, "degrees": np.pi / 180} if log.kind == "effort" else {"degrees": np.pi / 180}
+    for words, factor in units.items():
+        yield f"{log.kind} in {words}", changed((False, True), lambda table, f=factor: table * f)
+    for shift in np.arange(0.01, 0.06, 0.01) if log.kind == "setpoint" else ():
+        words = f"setpoints that were logged {1e3 * shift:.0f} ms late"
+        yield words, replace(log, command_time=log.command_time - shift)
 
 
 class Regression:
@@ -158,12 +215,14 @@ def _bounded(matrix: Float64, target: Float64, is_strong: bool) -> tuple[Float64
         free = ~fixed
         rest = moment[free] - gram[np.ix_(free, fixed)] @ values[fixed]
         values[free] = np.linalg.solve(gram[np.ix_(free, free)], rest)
-        low, high = np.array([0, 0, 0, 0.2 * size[3], -np.inf]), np.array([*[np.inf] * 3, 3 * size[3], np.inf])
+        low = np.array([0, 0, 0, STRENGTHS[0] * size[3], -np.inf])
+        high = np.array([np.inf, np.inf, np.inf, STRENGTHS[1] * size[3], np.inf])
         outside = free & ((values < low) | (values > high))
         if not outside.any():
             break
         values, fixed = np.clip(values, low, high), fixed | outside
     values /= size
+    values[3] = np.clip(values[3], *STRENGTHS)  # exactly, after the rounding of the division
     return values, target - matrix @ values
 
 
@@ -176,7 +235,7 @@ def _required(plant: Plant, drive: Drive, motion: Motion, rows: Any) -> tuple[Fl
     if drive.compensate == "none":
         return required, None
     speed = 0.0 if drive.compensate == "gravity" else 1.0
-    held = plant.dynamics([()] * len(motion.qpos), np.ascontiguousarray(motion.qpos), speed * motion.qvel)
+    held = plant.dynamics([()] * len(motion.qpos), motion.qpos, speed * motion.qvel)
     held.update()
     return required, held.force
 

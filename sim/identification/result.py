@@ -30,6 +30,8 @@ KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
 LEAST_GAIN = 0.1
 """Least share of the remaining squared error that a further unknown has to explain to be named."""
+ALIKE = 0.8
+"""Share of the best explanation from which another one is as good."""
 EXPLAINS = 0.5
 """Share of the position error with ideal motors that a file may leave."""
 
@@ -301,33 +303,43 @@ def advice(problem: Problem, solution: Solution) -> str:
             size = float(KINDS[kind].size)
             further += [Unknown(kind, joint, start, size) for joint in range(len(unknowns.joints))]
     entries = (*unknowns.entries, *further)
-    wide = replace(problem, unknowns=replace(unknowns, entries=entries, bodies=plant.bodies()))
+    wide = replace(unknowns, entries=entries, bodies=plant.bodies())
     point = np.concatenate([solution.point, [entry.coordinate(entry.start) for entry in further]])
     steps = np.full(len(point), STEP)
     steps[[at for at, entry in enumerate(entries) if entry.kind == "load_friction"]] = 4.0
-    evaluation = wide.evaluate(point, steps)
-    residual, matrix = wide.system(evaluation, point, solution.size)
-    rows, count = len(residual) - len(point), len(unknowns.entries)
-    weight = (1 + residual[:rows] ** 2 / 4) ** -0.25
-    residual, matrix = weight * residual[:rows], weight[:, None] * matrix[:rows]
-    q, _ = np.linalg.qr(matrix[:, :count])
-    alone = matrix[:, count:] - q @ (q.T @ matrix[:, count:])
-    along, squares = alone.T @ residual, (alone**2).sum(0) + 1e-12 * (matrix[:, count:] ** 2).sum(0) + 1e-300
-    gains = along**2 / squares / (residual @ residual)
-    if not further or gains.max() < LEAST_GAIN:
+    wider = replace(problem, unknowns=wide)
+    residual, matrix = wider.system(wider.evaluate(point, steps), point, solution.size)
+    count = len(unknowns.entries)
+    weight = (1 + residual**2 / 4) ** -0.25
+    weight[-len(further) :] = 0.1 * np.array([entry.spread for entry in further])  # each may change by a factor
+    residual, matrix = weight * residual, weight[:, None] * matrix
+    strengths = [at for at, entry in enumerate(unknowns.entries) if entry.kind == "strength"]
+    gains, changes, distances = list[float](), list[float](), list[float]()
+    for number in range(len(further)):
+        columns = [*range(count), count + number]
+        change, *_ = np.linalg.lstsq(matrix[:, columns], -residual, rcond=1e-10)
+        left = residual + matrix[:, columns] @ change
+        gains.append(1 - float(left @ left) / float(residual @ residual))
+        changes.append(float(change[-1]))
+        distances.append(float((((solution.point + change[:-1]) / unknowns.spread) ** 2)[strengths].sum()))
+    if not further or max(gains) < LEAST_GAIN:
         return "no further effect that was tried would explain a tenth of the remaining error"
-    best = int(gains.argmax())
-    entry, change = further[best], -along[best] / squares[best]
-    share = f"would explain {100 * gains[best]:.0f} % of the remaining squared error"
+    # Explanations that are as good as equal differ in how far they bring the strengths from 1.
+    alike = sorted(np.flatnonzero(np.array(gains) > ALIKE * max(gains)), key=lambda number: distances[number])
+    words = " or ".join(_effect(problem, further[number], changes[number]) for number in alike[:2])
+    text = f"{words} would explain {100 * gains[alike[0]]:.0f} % of the remaining squared error"
+    kinds = {further[number].kind for number in alike[:2]}
+    weigh = "; or the strengths are as found: weigh the link" if "mass" in kinds else ""
+    return f"{text} (extras: {', '.join(sorted(kinds))}){weigh}"
+
+
+def _effect(problem: Problem, entry: Unknown, change: float) -> str:
+    """Return a change of an unknown in words."""
     if entry.link is not None:
-        word = "heavier" if change > 0 else "lighter"
-        strengths = [f"{row:.2g}" for row in unknowns.tables(unknowns.values(solution.point[None]))["strength"][0]]
-        return (
-            f"link {entry.link} about {100 * abs(np.expm1(np.clip(change, -1.5, 1.5))):.0f} % {word} {share} (extras: mass), "
-            f"or the strengths are {', '.join(strengths)} as found: weigh the link"
-        )
-    joint = unknowns.robot.joint_names[unknowns.joints[entry.joint or 0]]
-    return f"{entry.kind} of {joint} {share} (extras: {entry.kind})"
+        percent = 100 * float(np.expm1(np.clip(change, -1.5, 1.5)))
+        return f"link {entry.link} {abs(percent):.0f} % {'heavier' if percent > 0 else 'lighter'}"
+    names = problem.unknowns.robot.joint_names
+    return f"{entry.kind} of {names[problem.unknowns.joints[entry.joint or 0]]}"
 
 
 def draw_motors(path: str | os.PathLike[str], robot: Robot, count: int, seed: int = 0) -> bp.Actuators:
