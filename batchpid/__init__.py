@@ -12,7 +12,7 @@ Params say how to control, a state is carried from step to step, and every array
 - Control: :class:`BatchPID`, or the pure functions :func:`init`, :func:`step`, :func:`reset` and :func:`track`, which
   take and return a :class:`PIDState`; :func:`discretise` and :func:`advance` for loops with constant params;
   :func:`step_terms` returns all terms of the effort, as :func:`advance` does.
-- Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.gains.presets` for other controllers' numerics;
+- Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.gains.presets` for the tutorial's;
   :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`, :func:`load_about`.
 - Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`, :func:`spectral_radius`.
 - A simulator's drive with integral action: :func:`drive_target`.

@@ -54,7 +54,7 @@ class Bench:
     def run(self, address: str) -> None:
         """Print the table, on the cluster at ``address``."""
         robot = Robot.load("panda")
-        setpoints = np.tile(robot.settings.target, (self.ticks, 1))
+        setpoints = np.tile(robot.target, (self.ticks, 1))
         where: dict[str, dict[str, Any]] = {
             f"local, workers: {self.workers}": {"workers": self.workers},
             f"one node, workers: {self.workers}": {"cluster": Ray(address, nodes=1, cpus_per_node=self.workers)},

@@ -99,7 +99,7 @@ def build_many(num_envs: int) -> tuple[float, float]:
     with Runner(robot, num_envs, engine="mujoco", workers=0, checkpoint_steps=None, substeps=1) as runner:
         seconds = time.perf_counter() - began
         start = runner.reset().qpos
-        assert np.abs(runner.step(robot.settings.target).qpos - start).max() > 0
+        assert np.abs(runner.step(robot.target).qpos - start).max() > 0
         return seconds, (process.memory_info().rss - before) / num_envs
 
 

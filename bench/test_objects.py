@@ -70,7 +70,7 @@ def test_panda_with_a_cube(benchmark, report, compare, most, tmp_path):
     benchmark.group = "MuJoCo, in one process"
     robot, num_envs = panda_with_a_cube(tmp_path), min(NUM_ENVS, most.envs)
     ticks, rounds = min(TICKS, most.ticks), min(ROUNDS, most.rounds)
-    target = Robot.load("panda").settings.target
+    target = Robot.load("panda").target
     setpoints = np.broadcast_to(target, (ticks, num_envs, robot.dof))
     _, known = run_scene(robot, setpoints.repeat(SUBSTEPS, axis=0), 1)
 

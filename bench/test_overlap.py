@@ -29,20 +29,20 @@ def compute(seconds: float) -> None:
 def in_turn(runner: Runner, policy, seconds: float, ticks: int) -> None:
     """Step, then let the policy compute for all envs."""
     for _ in range(ticks):
-        runner.step(runner.robot.settings.target)
+        runner.step(runner.robot.target)
         policy(seconds)
 
 
 def at_once(halves: list[Runner], policy, seconds: float, ticks: int) -> None:
     """Compute the policy of one half while the other half steps."""
     for half in halves:
-        half.send(half.robot.settings.target)
+        half.send(half.robot.target)
     for tick in range(ticks):
         for half in halves:
             half.recv()
             policy(seconds / 2)
             if tick < ticks - 1:
-                half.send(half.robot.settings.target)
+                half.send(half.robot.target)
 
 
 def seconds_of(act, *arguments) -> float:

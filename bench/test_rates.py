@@ -21,7 +21,7 @@ def test_rates_cost_little(benchmark, report, compare, most, engine):
         pytest.importorskip("mujoco")
     robot, num_envs = Robot.load("panda"), int(min(64, most.envs))
     ticks, rounds = int(min(50, most.ticks)), int(min(7, most.rounds))
-    setpoints = np.broadcast_to(robot.settings.target, (ticks, num_envs, robot.dof))
+    setpoints = np.broadcast_to(robot.target, (ticks, num_envs, robot.dof))
 
     def seconds_per_env_step(runner, **given):
         runner.reset()

@@ -75,7 +75,7 @@ class Trajectories:
         return rows
 
     def _sines(self, robot: Robot) -> list[list[str]]:
-        middle = robot.start if robot.settings is None else robot.settings.target
+        middle = robot.start if robot.settings is None else robot.target
         room = np.minimum(robot.upper - middle, middle - robot.lower)
         swings = (room > 0.25) & robot.independent & (np.array(robot.units) == "rad")
         time, rows = TICK * np.arange(1, 401), []

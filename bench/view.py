@@ -66,7 +66,7 @@ def main(options: Options) -> None:
     """Serve a page, open it in a browser, and count frames once everything is loaded."""
     robot = Robot.load(options.robot)
     live = LiveSimulation(robot, options.num_envs, controls=options.control, physics=options.physics)
-    target = robot.settings.target if robot.settings is not None else robot.start
+    target = robot.target if robot.settings is not None else robot.start
     live.set_setpoint(target)
     first = live.frame().qpos
     with View(live, port=options.port) as view, tempfile.TemporaryDirectory() as profile:

@@ -36,7 +36,7 @@ class Workload:
     @property
     def target(self) -> np.ndarray:
         """Setpoint of every case (dof,) [rad or m]."""
-        return self.robot.settings.target
+        return self.robot.target
 
     @property
     def start(self) -> np.ndarray:

@@ -48,7 +48,7 @@ def main(options: Options) -> None:
     compensate = options.compensate or ("gravity+coriolis" if driven else "none")
 
     robot = Robot.load(options.robot)
-    target = robot.settings.target
+    target = robot.target
     command = target if driven else np.zeros(robot.dof)  # under "effort" it is the joint effort itself
     params = None  # the drive's stiffness and damping are the robot's
     if control == "pid":

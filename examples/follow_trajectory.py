@@ -34,7 +34,7 @@ def main():
     """Run one robot per profile and print the errors of each."""
     robot = Robot.load("panda")
     velocity = 0.5 * robot.velocity_limit
-    moves = profiles(robot.start, robot.settings.target, velocity, acceleration=4 * velocity)
+    moves = profiles(robot.start, robot.target, velocity, acceleration=4 * velocity)
     ticks = min(move.ticks for move in moves.values())
     position, rate, acceleration = (
         np.stack([getattr(move, name)[:ticks] for move in moves.values()], axis=1)

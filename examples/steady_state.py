@@ -29,8 +29,8 @@ def final_errors(robot: Robot, control: str, compensate: str, seconds: float) ->
     gains = robot.tuned() if control == "pid" else None
     with Runner(robot, 1, control=control, compensate=compensate, workers=0, params=gains) as runner:
         ticks = round(seconds / (runner.substeps * runner.timestep))
-        rollout = runner.rollout(np.broadcast_to(robot.settings.target, (ticks, robot.dof)))
-    return np.abs(rollout.qpos[-1, 0] - robot.settings.target)
+        rollout = runner.rollout(np.broadcast_to(robot.target, (ticks, robot.dof)))
+    return np.abs(rollout.qpos[-1, 0] - robot.target)
 
 
 def draw(errors: dict[str, np.ndarray], names: list[str], title: str) -> Figure:

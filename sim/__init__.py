@@ -37,7 +37,7 @@ from batchpid.sim.ray_options import ClusterWarning, Ray
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
 from batchpid.sim.robot.description import Dynamics, RobotDescription, register_dynamics
-from batchpid.sim.robot.findings import Finding
+from batchpid.sim.robot.findings import Finding, RepairWarning
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.run_checks import MovingSetpointWarning, SetpointWarning
@@ -75,6 +75,7 @@ __all__ = [
     "Recorder",
     "RecordingError",
     "RecoveryWarning",
+    "RepairWarning",
     "Robot",
     "Rollout",
     "RunInfo",

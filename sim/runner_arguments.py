@@ -10,15 +10,18 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.checks.validate import array, read_array, within
+from batchpid.checks.validate import array, entries, read_array, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.command import POSE_UNITS, TWIST_UNITS
-from batchpid.sim.engine.robot_model import robot_model
+from batchpid.sim.engine.robot_model import base_start
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FARTHEST, ORIGIN
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.robot.run_checks import SetpointCheck
 from batchpid.sim.runner_state import Motion, RunnerState
+
+_SHORTEST = 1e-9
+"""Smallest length of a quaternion: that of a shorter one has large rounding errors."""
 
 
 def read_command(
@@ -134,7 +137,7 @@ def base_rows(
 ) -> Float64 | None:
     """Return poses and twists (envs, 13) of floating bases to reset to, at joint positions ``qpos``.
 
-    By default a base is at rest, upright, and so high that the robot's lowest point is on the ground.
+    By default a base is at rest at :func:`batchpid.sim.engine.robot_model.base_start`.
     """
     robot, num_envs = options.robot, options.num_envs
     if robot.fixed_base:
@@ -145,19 +148,27 @@ def base_rows(
         return None
     rows = np.tile(ORIGIN, (num_envs, 1))
     if twist is not None:
-        rows[:, 7:] = array("base_twist", twist, (num_envs, 6), tuple(TWIST_UNITS), kind="entry")
+        rows[:, 7:] = _base_entries("base_twist", twist, num_envs, tuple(TWIST_UNITS))
     if pose is not None:
-        rows[:, :7] = array("base_pose", pose, (num_envs, 7), tuple(POSE_UNITS), kind="entry")
+        rows[:, :7] = _base_entries("base_pose", pose, num_envs, tuple(POSE_UNITS))
         length = np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
-        if not length.all():
-            problem = f"env {int(np.flatnonzero(length == 0)[0])} has a quaternion of length 0"
+        if (length < _SHORTEST).any():
+            problem = f"env {int(np.flatnonzero(length < _SHORTEST)[0])} has a quaternion of length 0"
             raise InvalidArgumentError("base_pose", problem, remedy="give (w, x, y, z), (1, 0, 0, 0) upright")
         rows[:, 3:7] /= length
-    elif options.ground:
-        heights: dict[bytes, float] = {}
+    else:
+        starts: dict[bytes, Float64] = {}
+        is_file = options.engine == "mujoco" and robot.mjcf is not None  # which may have a ground at another height
         for env in np.flatnonzero(mask).tolist():
             key = qpos[env].tobytes()
-            if key not in heights:
-                heights[key] = robot_model(robot).height(np.nan_to_num(qpos[env]), base_too=True)
-            rows[env, 2] = -heights[key] if np.isfinite(heights[key]) else 0.0
+            if key not in starts:
+                starts[key] = base_start(robot, qpos[env], options.ground and not is_file)
+            rows[env, :7] = starts[key]
+    return rows
+
+
+def _base_entries(name: str, value: ArrayLike, num_envs: int, columns: tuple[str, ...]) -> Float64:
+    """Return poses or twists (envs, entries), which must be as near as positions and velocities of joints."""
+    rows = array(name, value, (num_envs, len(columns)), columns, kind="entry")
+    entries(name, rows, np.abs(rows) <= FARTHEST, f"is beyond +-{FARTHEST:g}", columns, kind="entry")
     return rows

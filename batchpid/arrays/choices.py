@@ -27,18 +27,6 @@ class Everywhere(NamedChoice):
     """An option that may be chosen per joint and env is on for all of them, so no mask is needed."""
 
 
-class IntegrateFirst(NamedChoice):
-    """The present error enters the integral before the effort is computed."""
-
-
-class DerivativeKick(NamedChoice):
-    """The error before the first sample counts as 0, so that the first derivative is a kick."""
-
-
-class WeightFromStart(NamedChoice):
-    """Setpoint weighting measures positions from the first measurement instead of from 0."""
-
-
 class ZeroEffort(NamedChoice):
     """A joint with a non-finite input gets effort 0."""
 
@@ -51,10 +39,6 @@ class MeasuredRate(NamedChoice):
     """The derivative takes the measured velocity instead of the difference quotient of positions."""
 
 
-class PerInertia(NamedChoice):
-    """Gains are per unit of the joint's inertia, the diagonal of the mass matrix."""
-
-
 class PerMassMatrix(NamedChoice):
     """Gains are of an acceleration, which the whole mass matrix turns into an effort."""
 
@@ -64,12 +48,9 @@ class ImplicitLaw(NamedChoice):
 
 
 CHOICES: dict[str, Document] = {
-    "integration": {"output_first": None, "integrate_first": IntegrateFirst()},
-    "first_derivative": {"zero": None, "kick": DerivativeKick()},
-    "weight_origin": {"zero": None, "start": WeightFromStart()},
     "non_finite": {"propagate": None, "zero": ZeroEffort(), "hold": HoldEffort()},
     "measurement_rate": {"difference": None, "measured": MeasuredRate()},
-    "gain_units": {"effort": None, "inertia": PerInertia(), "mass_matrix": PerMassMatrix()},
+    "gain_units": {"effort": None, "mass_matrix": PerMassMatrix()},
     "discretization": {"explicit": None, "implicit": ImplicitLaw()},
 }
 """Options chosen by name, and what each name puts into the params; the first is the default."""

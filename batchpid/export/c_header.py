@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Document
-from batchpid.arrays.choices import MeasuredRate, PerInertia, PerMassMatrix
+from batchpid.arrays.choices import MeasuredRate
 from batchpid.checks.validate import choice, instance, names, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.c_rigid_body import rigid_body
@@ -24,7 +24,7 @@ from batchpid.export.c_step import Dialect, Value, helpers, statements
 from batchpid.export.differences import Exported, check_one_env
 from batchpid.law import pid
 from batchpid.law.coefficients import Coefficients, discretise
-from batchpid.law.computed_torque import advance_with_mass_matrix, check_gain_units, per_inertia
+from batchpid.law.computed_torque import advance_with_mass_matrix, check_gain_units
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState
 from batchpid.motors import guard as guard_model
@@ -56,8 +56,7 @@ def to_c(
     Parameters
     ----------
     params
-        Of one env: (1, joints). Gains per "inertia" add an argument ``inertia`` (joints,), gains per "mass_matrix" an
-        argument ``mass_matrix`` (joints, joints), by rows.
+        Of one env: (1, joints). Gains per "mass_matrix" add an argument ``mass_matrix`` (joints, joints), by rows.
     dt
         Time step of the control [s].
     joint_names
@@ -121,10 +120,9 @@ class Header:
                 raise InvalidArgumentError("tree", problem, remedy="pass joint_names=, in the tree's order")
         self.params, self.dt, self.guard, self.tree, self.labels = params, float(dt), guard, tree, labels
         self.names = Dialect(prefix, np.dtype(params.dtype), joints)
-        whole, diagonal = (isinstance(params.gain_units, kind) for kind in (PerMassMatrix, PerInertia))
-        self.matrix = "mass_matrix" if whole else "inertia" if diagonal else None
         rates = [each for each in RATES if each in chosen]
-        self.given = ["setpoint", "measurement", *rates, *([self.matrix] if self.matrix else [])]
+        matrix = [] if params.gain_units is None else ["mass_matrix"]
+        self.given = ["setpoint", "measurement", *rates, *matrix]
         """Inputs of a step, in their order."""
         # init runs on a measurement of NaN: what is NaN afterwards is a copy of the measurement.
         nan = np.full((1, joints), math.nan, params.dtype)
@@ -178,10 +176,9 @@ class Header:
             given["measurement"],
         )
         optional = given.get("measurement_rate"), rate, given.get("feedforward")
-        if self.matrix == "mass_matrix":
+        if "mass_matrix" in given:
             law, terms = advance_with_mass_matrix(k, *arguments, given["mass_matrix"], *optional)
         else:
-            k = k if self.matrix is None else per_inertia(k, given["inertia"])
             law, terms = pid.advance(k, *arguments, *optional)
         return {**law.leaves(), **new}, terms.effort
 
@@ -196,7 +193,6 @@ class Header:
             "setpoint": "r [rad or m]",
             "measurement": "y [rad or m]",
             "mass_matrix": "M at about y [kg m^2 or kg], by rows",
-            "inertia": "diagonal of M at about y [kg m^2 or kg]",
             **RATES,
         }
         arguments = "".join(f",\n    const {t} {name}[{self.extent(name)}] /* {units[name]} */" for name in given)

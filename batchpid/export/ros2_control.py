@@ -19,13 +19,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from batchpid.arrays.array_types import Array, Document
-from batchpid.arrays.choices import MeasuredRate
+from batchpid.arrays.array_types import Bool, Document
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.differences import Differences, Exported, plain, strategies
@@ -36,12 +34,6 @@ TYPES = {
     "joint_trajectory_controller": "joint_trajectory_controller/JointTrajectoryController",
     "pid_controller": "pid_controller/PidController",
 }
-STRATEGIES = {
-    "none": "none",
-    "back_calculation": "back_calculation",
-    "conditional": "conditional_integration",
-}
-"""Anti-windup of make_params, and what control_toolbox calls it."""
 NEUTRAL = {
     "p": 0.0,
     "i": 0.0,
@@ -93,131 +85,116 @@ def to_ros2_control(
     name
         Of the controller. Default: ``controller``.
     inertia
-        Diagonal of the mass matrix (joints,) or (poses, joints) [kg m^2 or kg]: gains per unit of inertia are converted
-        at the first pose, and differences of phase are given at its crossover.
+        Diagonal of the mass matrix (joints,) or (poses, joints) [kg m^2 or kg]: gains per mass matrix are converted
+        at the first pose.
 
     Raises
     ------
     InvalidArgumentError
-        Params for several envs, gains per inertia without ``inertia``, or limits that the target refuses.
+        Params for several envs, gains per mass matrix without ``inertia``, or limits that the target refuses.
     """
     choice("controller", controller, TYPES)
-    found = Differences(params, joint_names, dt, inertia)
-    if params.dtype != np.float64:
-        found.append(f"dtype: the target computes in float64, these params are {params.dtype}")
-    given = found.params
+    law = Differences(params, joint_names, dt, inertia)
     trajectory = controller == "joint_trajectory_controller"
-    two = trajectory or isinstance(given.measurement_rate, MeasuredRate)
-    gains = _gains(found, "ff_velocity_scale" if trajectory else "feedforward_gain", two)
-    if given.continuous is not None and not trajectory:
-        for joint, wraps in zip(found.joints, given.continuous[0] > 0, strict=True):
-            gains[joint]["angle_wraparound"] = bool(wraps)
-    _compare(found, two, trajectory)
-    rate = round(1 / found.dt)
-    if not math.isclose(rate * found.dt, 1.0, rel_tol=1e-9):
-        found.append(f"dt: the update rate is a whole number: {rate} Hz instead of {1 / found.dt:.6g} Hz")
+    two = trajectory or law.params.measurement_rate is not None
+    gains = _gains(law, trajectory, two)
+    rate = round(1 / law.dt)
     if rate < 1:
         raise InvalidArgumentError("dt", "is more than a second", value=dt, remedy="use a rate of at least 1 Hz")
+    law.add("dtype", f"the target computes in float64, these params are {params.dtype}", params.dtype != np.float64)
+    _compare(law, two, trajectory)
+    _compare_anti_windup(law)
+    uneven = not math.isclose(rate * law.dt, 1.0, rel_tol=1e-9)
+    law.add("dt", f"the update rate is a whole number: {rate} Hz instead of {1 / law.dt:.6g} Hz", uneven)
+
     name = name or controller
     interfaces = ["position", "velocity"] if two else ["position"]
     body: Document
     if trajectory:
-        body = {"joints": found.joints, "command_interfaces": ["effort"], "state_interfaces": interfaces}
+        body = {"joints": law.joints, "command_interfaces": ["effort"], "state_interfaces": interfaces}
     else:
-        body = {"dof_names": found.joints, "command_interface": "effort", "reference_and_state_interfaces": interfaces}
+        body = {"dof_names": law.joints, "command_interface": "effort", "reference_and_state_interfaces": interfaces}
     document = {
         "controller_manager": {"ros__parameters": {"update_rate": rate, name: {"type": TYPES[controller]}}},
         name: {"ros__parameters": {**body, "gains": gains}},
     }
-    return Exported(f"{found.opening('PID gains')}{documents.render(document, 'yaml')}", tuple(found))
+    return Exported(f"{law.opening('PID gains')}{documents.render(document, 'yaml')}", tuple(law))
 
 
-def _gains(found: Differences, feedforward: str, two: bool) -> dict[str, Document]:
+def _gains(law: Differences, trajectory: bool, two: bool) -> dict[str, Document]:
     """Return the gains of each joint, by name."""
-    params, gains = found.params, {}
-    for at, (joint, strategy) in enumerate(zip(found.joints, strategies(found.params), strict=True)):
-        own: Document = dict(NEUTRAL)
+    params, gains = law.params, {}
+    for at, (joint, strategy) in enumerate(zip(law.joints, strategies(params), strict=True)):
+        entry: Document = dict(NEUTRAL)
         for key, leaf in LEAVES.items():
             if (values := getattr(params, leaf)) is not None:
-                own[key] = plain(values, at)
-        if own["u_clamp_min"] >= own["u_clamp_max"]:
-            problem, value = "must be below effort_max for control_toolbox", own["u_clamp_min"]
+                entry[key] = plain(values, at)
+        if entry["u_clamp_min"] >= entry["u_clamp_max"]:
+            problem, value = "must be below effort_max for control_toolbox", entry["u_clamp_min"]
             raise InvalidArgumentError("effort_min", problem, joint=joint, value=value, remedy="widen the limits")
-        own["i_clamp_min"], own["i_clamp_max"] = min(own["i_clamp_min"], 0.0), max(own["i_clamp_max"], 0.0)
+        entry["i_clamp_min"], entry["i_clamp_max"] = min(entry["i_clamp_min"], 0.0), max(entry["i_clamp_max"], 0.0)
         if strategy == "back_calculation":
-            own["tracking_time_constant"] = plain(params.tracking_time, at)
-        own["antiwindup_strategy"] = STRATEGIES[strategy]
+            entry["tracking_time_constant"] = plain(params.tracking_time, at)
+        entry["antiwindup_strategy"] = "conditional_integration" if strategy == "conditional" else strategy
         if two:
             weight = params.setpoint_weight_derivative
-            own[feedforward] = 0.0 if weight is None else own["d"] * (plain(weight, at) - 1.0)
-        gains[joint] = own
+            feedforward = "ff_velocity_scale" if trajectory else "feedforward_gain"
+            entry[feedforward] = 0.0 if weight is None else entry["d"] * (plain(weight, at) - 1.0)
+        if params.continuous is not None and not trajectory:
+            entry["angle_wraparound"] = bool(params.continuous[0, at] > 0)
+        gains[joint] = entry
     return gains
 
 
-def _compare(found: Differences, two: bool, trajectory: bool) -> None:
-    """Add the differences between the law and control_toolbox's."""
-    params = found.params
-    low, high = found.value("effort_min", -math.inf), found.value("effort_max", math.inf)
-    limited = np.isfinite(low) | np.isfinite(high)
-    weight = found.value("setpoint_weight_derivative", 1.0 if two else 0.0)  # of the rate given, or of a difference
-    acts = found.value("kd") > 0
-    if limited.any():
-        text = "u_clamp limits the PID alone, not its sum with a feedforward such as gravity compensation"
-        found.append(f"effort_limit: {text}")
-    found.lack("effort_rate_limit", "the change of the effort is not limited", math.inf, "N m/s or N/s")
-    found.lack("setpoint_weight", "P acts on the whole setpoint (b = 1), so steps overshoot more", 1.0)
-    if two and (acts & (weight != 1)).any():
-        text = "written as a feedforward of the desired velocity, which differences of setpoints do not enter"
-        found.append(f"setpoint_weight_derivative: {text}{', added after u_clamp' if limited.any() else ''}")
-    elif not two and (acts & (weight != 1)).any():
-        weights = found.listed(weight, acts)
-        text = f"the derivative acts on the whole error (c = 1), so a step of the setpoint kicks it; here c = {weights}"
-        found.append(f"setpoint_weight_derivative: {text}")
-    if params.derivative_filter_time is not None and acts.any():
-        values = found.value("derivative_filter_time")
-        phase = found.phase(params._replace(derivative_filter_time=None))
-        times = found.listed(values, values > 0)
-        found.append(f"derivative_filter_time: the derivative is not filtered: {times} s{phase}")
-    if two and acts.any() and not isinstance(params.measurement_rate, MeasuredRate):
-        phase = found.phase(params._replace(measurement_rate=MeasuredRate()))
-        found.append(f"measurement_rate: the derivative is the measured velocity, not a difference{phase}")
-    half = found.value("deadband")
-    if (half > 0).any():
-        more = found.listed(found.value("kp") * half, half > 0)
-        found.append(f"deadband: it only stops the integral; P is larger by up to {more} N m or N")
-    if params.integration is not None and found.value("ki").any():
-        phase = found.phase(params._replace(integration=None))
-        found.append(f"integration: the present error enters the integral after the output, a step later{phase}")
-    if params.first_derivative is not None and params.setpoint_weight_derivative is not None:
-        found.append(f"first_derivative: no kick: {'rates are given' if two else 'the first setpoint is the position'}")
-    if params.non_finite is not None:
-        found.append("non_finite: the effort is NaN, or not written, after an input that is not finite")
-    if params.continuous is not None and trajectory:
-        found.append("continuous: taken from the type of the joint in robot_description")
-    elif params.continuous is not None and not two and acts.any():
-        found.append("continuous: where the error wraps, the derivative has a spike of kd 2 pi / dt")
-    _compare_anti_windup(found, low, high, limited)
+def _compare(law: Differences, two: bool, trajectory: bool) -> None:
+    """Add the differences between the law and control_toolbox's, but for anti-windup."""
+    acts, limited = law.value("kd") > 0, _limited(law)
+    problem = "u_clamp limits the PID alone, not its sum with a feedforward such as gravity compensation"
+    law.add("effort_limit", problem, limited)
+    law.lack("effort_rate_limit", "the change of the effort is not limited", math.inf, "N m/s or N/s")
+    law.lack("setpoint_weight", "P acts on the whole setpoint (b = 1), so steps overshoot more", 1.0)
+    # The weight of a given rate, or of a difference of setpoints.
+    weight = law.value("setpoint_weight_derivative", 1.0 if two else 0.0)
+    problem = "the derivative acts on the whole error (c = 1), so a step of the setpoint kicks it"
+    if two:
+        problem = "a feedforward of the desired velocity, after u_clamp, which differences of setpoints do not enter"
+    law.add("setpoint_weight_derivative", problem, acts & (weight != 1), weight)
+    filter_time = law.value("derivative_filter_time")
+    law.add("derivative_filter_time", "no filter", acts & (filter_time > 0), filter_time, "s")
+    differences = two and law.params.measurement_rate is None
+    law.add("measurement_rate", "the derivative is the measured velocity, not a difference", acts & differences)
+    law.lack("deadband", "stops the integral alone, and P acts on the whole error", 0.0, "rad or m")
+    finite = law.params.non_finite is None
+    law.add("non_finite", "the effort is NaN, or not written, after an input that is not finite", not finite)
+    turns = law.value("continuous") > 0
+    if trajectory:
+        law.add("continuous", "taken from the type of the joint in robot_description", turns)
+    elif not two:
+        law.add("continuous", "where the error wraps, the derivative has a spike of kd 2 pi / dt", turns & acts)
 
 
-def _compare_anti_windup(found: Differences, low: Array, high: Array, limited: Any) -> None:
-    params = found.params
-    used = np.array(strategies(params))
-    for key, sign in (("integral_min", 1), ("integral_max", -1)):
-        values = found.value(key, -sign * math.inf)
-        if (beyond := sign * values > 0).any():
-            found.append(f"{key}: the integral's limits include 0: {found.listed(0 * values, beyond)}")
-    if params.ki is None:
+def _compare_anti_windup(law: Differences) -> None:
+    """Add the differences of the integral's limits and of anti-windup."""
+    low, high = law.value("integral_min", -math.inf), law.value("integral_max", math.inf)
+    law.add("integral_min", "0 at most in the target", low > 0, low)
+    law.add("integral_max", "0 at least in the target", high < 0, high)
+    if law.params.ki is None:
         return
-    if (odd := (used == "conditional") & ((low > 0) | (high < 0))).any():
-        text = "conditional integration takes the sign of the whole effort, wrong where the limits exclude 0"
-        found.append(f"anti_windup: {text}: {found.listed(low, odd)}")
-    back, ki = used == "back_calculation", found.value("ki")
-    if (off := back & (ki == 0)).any():
-        found.append(f"anti_windup: without ki the integral does not track: {found.listed(ki, off)}")
-    if (limited & back & (ki > 0)).any():
-        found.append("anti_windup: back-calculation is left out in a step with an error of exactly 0")
-    if (short := back & (found.value("tracking_time", math.inf) < found.dt)).any():
-        times = found.listed(found.value("tracking_time"), short)
-        found.append(f"tracking_time: shorter than dt, the integral over-corrects: {times} s, dt {found.dt:g} s")
-    if params.effort_rate_limit is not None and (used != "none").any():
-        found.append("anti_windup: acts on u_clamp alone, not on a limit of the effort's rate")
+    strategy, integrates, limited = np.array(strategies(law.params)), law.value("ki") > 0, _limited(law)
+    back = strategy == "back_calculation"
+    excluded = (law.value("effort_min", -math.inf) > 0) | (law.value("effort_max", math.inf) < 0)
+    problem = "conditional integration takes the sign of the whole effort, wrong where the limits exclude 0"
+    law.add("anti_windup", problem, (strategy == "conditional") & excluded)
+    law.add("anti_windup", "without ki the integral does not track", back & ~integrates)
+    problem = "back-calculation is left out in a step with an error of exactly 0"
+    law.add("anti_windup", problem, limited & back & integrates)
+    times = law.value("tracking_time", math.inf)
+    law.add("tracking_time", "shorter than dt, the integral over-corrects", back & (times < law.dt), times, "s")
+    rate_limited = np.isfinite(law.value("effort_rate_limit", math.inf))
+    problem = "acts on u_clamp alone, not on a limit of the effort's rate"
+    law.add("anti_windup", problem, rate_limited & (strategy != "none"))
+
+
+def _limited(law: Differences) -> Bool:
+    """Return a mask of the joints with an effort limit."""
+    return np.isfinite(law.value("effort_min", -math.inf)) | np.isfinite(law.value("effort_max", math.inf))

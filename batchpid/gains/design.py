@@ -132,7 +132,7 @@ def design_gains(
         (n, dof) over which the largest inertia is taken and stability is kept; default 200 seeded ones within the
         limits.
     gain_units
-        Unit of the gains: "effort", or per "inertia" or "mass_matrix" (:mod:`batchpid.law.computed_torque`).
+        Unit of the gains: "effort", or per "mass_matrix" (:mod:`batchpid.law.computed_torque`).
     discretization
         "explicit", or "implicit" for gains per "mass_matrix" (:mod:`batchpid.law.implicit`): stable at any ``dt``, so
         that the bandwidth is kept and the derivative is not filtered.
@@ -161,16 +161,15 @@ def design_gains(
     is_explicit = choice("discretization", discretization, CHOICES["discretization"]) == "explicit"
     least = at_least("load", broadcast("load", load, robot.damping.shape), 0.0)
     if gain_units != "effort" and least.any():
-        remedy = "leave it out: these gains are per inertia"
+        remedy = "leave it out: these gains are per mass matrix"
         raise InvalidArgumentError("load", f"has no effect with gain_units {gain_units!r}", remedy=remedy)
     mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
     coupling = getattr(robot, "coupling", Coupling.of(mass.shape[-1]))
     mass, viscous = coupling.reduced(mass), coupling.reduced_damping(robot.damping)
     own = np.diagonal(mass, axis1=1, axis2=2)
     carried = np.maximum(own.max(0), coupling.reduced_damping(least))
-    inertia = {"effort": carried, "inertia": np.ones(own.shape[1]), "mass_matrix": np.ones(own.shape[1])}[gain_units]
-    # The loop with the whole mass matrix compensates the joints' damping.
-    damping = {"effort": viscous, "inertia": viscous / own.max(0), "mass_matrix": 0.0}[gain_units]
+    # The loop with the mass matrix has unit inertias, and compensates the joints' damping.
+    inertia, damping = (carried, viscous) if gain_units == "effort" else (np.ones_like(carried), 0.0)
     while True:
         gains = pid_from_inertia(inertia, bandwidth, damping_ratio, integral_time=integral_time, damping=damping)
         filter_time = _filter_time(mass, gains, dt, viscous, gain_units, margin) if is_explicit else 0.0
@@ -181,7 +180,6 @@ def design_gains(
         **{name: coupling.of_all(gain) for name, gain in gains.items()},
         "setpoint_weight": setpoint_weight if integrates else 1.0,
         "derivative_filter_time": filter_time,
-        "weight_origin": "start",
         "gain_units": gain_units,
         "discretization": discretization,
     }
@@ -198,18 +196,16 @@ def _filter_time(
     joints = mass.shape[1]
     if gain_units == "mass_matrix":  # u = M a: every joint is a unit inertia, coupled to no other
         mass, damping = np.eye(joints)[None], np.zeros(joints)
-    scale = np.diagonal(mass, axis1=1, axis2=2) if gain_units == "inertia" else np.ones((len(mass), joints))
 
     def ratios(filter_time: float) -> Float64:
-        kp, kd = gains["kp"] * scale, gains["kd"] * scale
-        return stability_bound(mass, kp, kd, dt, filter_time=filter_time, damping=damping).ratio
+        return stability_bound(mass, gains["kp"], gains["kd"], dt, filter_time=filter_time, damping=damping).ratio
 
     low = FILTER_STEPS * dt
     at_low = ratios(low)
     if at_low.max() <= margin:
         return low
     worst = np.argsort(at_low)[-10:]  # the critical pose is among these
-    mass, scale = mass[worst], scale[worst]
+    mass = mass[worst]
 
     # The filter passes dt / (dt + 2 tau), so the ratio falls about as 1 / tau down to kp's own share of it.
     high = low

@@ -28,7 +28,7 @@ def track(
 
     Call it at every step under manual control, or once before a change of kp or kd (with the new params and the last
     effort). The derivative is taken as settled. An effort beyond the limits, or an integral beyond its own, cannot be
-    reproduced: the limits hold. ``dt`` is needed where the params integrate first or are implicit.
+    reproduced: the limits hold. ``dt`` is needed where the params are implicit.
 
     Raises
     ------
@@ -52,9 +52,9 @@ def track(
         raise InvalidArgumentError(
             "params.ki", "is off, so no integral can carry the effort over", remedy="give ki; 0 is allowed"
         )
-    if dt is None and (params.integration is not None or params.discretization is not None):
-        which = "integrate first" if params.discretization is None else "have discretization 'implicit'"
-        raise InvalidArgumentError("dt", f"is needed where the params {which}", remedy="give dt in seconds")
+    if dt is None and params.discretization is not None:
+        problem = "is needed where the params have discretization 'implicit'"
+        raise InvalidArgumentError("dt", problem, remedy="give dt in seconds")
     xp = namespace(*params, *state, setpoint, measurement, effort)
     k = discretise(params, 1.0 if dt is None else dt)
     zero = xp.zeros_like(measurement)
@@ -67,11 +67,6 @@ def track(
     integral = effort - proportional(k, error, measurement, origin)
     integral = integral if k.kd is None else integral - k.kd * rate
     integral = integral if feedforward is None else integral - feedforward
-    # The next step adds the error of this step before it uses the integral, so that part is taken off here.
-    if params.integration is not None:
-        integral = integral - k.ki_dt * error
-        if k.ki_dt2 is not None and setpoint_rate is not None:
-            integral = integral + k.ki_dt2 * setpoint_rate
     return PIDState(
         integral=clip(integral, k.integral_min, k.integral_max, xp),
         measurement=None if state.measurement is None else measurement.copy(),

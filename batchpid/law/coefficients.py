@@ -49,8 +49,6 @@ class Coefficients(NamedTuple):
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
     tiny: Array
     """Argument of :func:`batchpid.arrays.elementwise.flush`."""
-    integration: Any
-    weight_origin: Array
     non_finite: Any
     measurement_rate: Array
     gain_units: Any

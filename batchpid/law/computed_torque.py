@@ -1,11 +1,8 @@
 r"""Gains per unit of inertia: the law's output is an acceleration, and the robot's mass matrix M(q) makes it an effort.
 
-With kp = w^2 and kd = 2 zeta w, all joints of all robots respond in the same way, in every pose. There are two ways:
-
-- "inertia": each gain is multiplied by its joint's M_jj(q), as PhysX's drives do in mode "acceleration". The law is
-  otherwise untouched: integral, limits and anti-windup are in effort units.
-- "mass_matrix": u = M(q) a + passive force, computed-torque control (M. W. Spong, S. Hutchinson and M. Vidyasagar,
-  Robot Modeling and Control, 2nd ed., section 9.3). The joints no longer disturb each other.
+With kp = w^2 and kd = 2 zeta w, all joints of all robots respond in the same way, in every pose, and do not disturb
+each other: u = M(q) a + passive force, computed-torque control (M. W. Spong, S. Hutchinson and M. Vidyasagar, Robot
+Modeling and Control, 2nd ed., section 9.3).
 
 Where limits apply, clipping each joint of u alone would change the direction of the acceleration and couple the joints
 again. So a is scaled as a whole::
@@ -24,7 +21,7 @@ A limit of the effort's rate scales the change of the effort as a whole, for the
 with the last effort u'. Both efforts are within the limits, and so is each on the line between them. While z < 1,
 conditional integration does not integrate further into the direction of u - effort.
 
-A setpoint's acceleration r'' is added to the law's: u = M (a + r'') + passive force, and with "inertia" M_jj r''.
+A setpoint's acceleration r'' is added to the law's: u = M (a + r'') + passive force.
 
 The time step limits the gains per mass matrix, unless the law is implicit (:mod:`batchpid.law.implicit`).
 """
@@ -41,17 +38,6 @@ from batchpid.law.coefficients import Coefficients
 from batchpid.law.params import PIDParams
 from batchpid.law.pid import advance
 from batchpid.law.state import PIDState, Terms
-
-
-def per_inertia(k: Coefficients, inertia: Array) -> Coefficients:
-    """Return the coefficients ``k`` of an acceleration law times ``inertia`` (envs, joints), for an effort law."""
-    return k._replace(
-        gain_units=None,
-        kp=k.kp * inertia,
-        ki_dt=None if k.ki_dt is None else k.ki_dt * inertia,
-        kd=None if k.kd is None else k.kd * inertia,
-        acceleration_share=inertia if k.acceleration_share is None else k.acceleration_share * inertia,
-    )
 
 
 def advance_with_mass_matrix(
@@ -103,7 +89,7 @@ def check_gain_units(params: PIDParams) -> None:
     for option, remedy in instead.items():
         if isinstance(params.gain_units, PerMassMatrix) and getattr(params, option) is not None:
             problem = "is not available with gain_units 'mass_matrix'"
-            raise InvalidArgumentError(option, problem, remedy=f"use {remedy}, or gain_units 'inertia'")
+            raise InvalidArgumentError(option, problem, remedy=f"use {remedy}, or gain_units 'effort'")
 
 
 def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matrix: Array) -> PIDState:

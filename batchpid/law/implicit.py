@@ -11,11 +11,10 @@ it, with D = 1 + dt kd + dt^2 kp + dt^3 ki and e = r - y::
     D a = kp (b r - y - dt v) + kd (c r' - v) + I + ki dt (e - dt v) + r''
 
 with the setpoint's acceleration r'', 0 unless given. (b r stands for o + b (r - o); a given rate moves the origin o to
-the end of the step, too.) That is the explicit law with other gains, so a step costs no more (n = 1 where the present
-error is integrated first, 2 where the output is first)::
+the end of the step, too.) That is the explicit law with other gains, so a step costs no more::
 
-    kp* = (kp + n dt ki) / D            b* = (b kp + n dt ki) / (kp + n dt ki)
-    kd* = (kd + dt kp + dt^2 ki) / D    c* = (c kd - (n - 1) dt^2 ki) / (kd + dt kp + dt^2 ki)
+    kp* = (kp + 2 dt ki) / D            b* = (b kp + 2 dt ki) / (kp + 2 dt ki)
+    kd* = (kd + dt kp + dt^2 ki) / D    c* = (c kd - dt^2 ki) / (kd + dt kp + dt^2 ki)
     ki* = ki / D                        and I <- I - ki* dt^2 r' where a rate of the setpoint is given; else r' = 0
 
 A pole s of the loop in continuous time becomes z = 1 / (1 - s dt): the loop is stable at any dt if it is stable in
@@ -23,7 +22,7 @@ continuous time. The explicit law with kp = w^2 and kd = 2 w is stable for w dt 
 
 - Setpoint: r is the position for the end of the step. The explicit law takes it for the beginning, and leads by dt r'.
 - Integral: the state is I / D, the acceleration that it contributes. Its limits, anti-windup and bumpless transfer
-  work as in the explicit law. The part n dt ki of kp* is outside of its limits.
+  work as in the explicit law. The part 2 dt ki of kp* is outside of its limits.
 - Saturation: limits act on u as before. The prediction assumes that a is delivered.
 - Dead zone: P and I see the error less the zone; the predicted motion dt v damps within it, too.
 - Rate: v is the measured rate or the difference of positions, which is the same under semi-implicit Euler. A filter of
@@ -66,8 +65,7 @@ def implicit_gains(params: PIDParams, dt: Array) -> ImplicitGains:
     kp, ki, kd, b, c = params.kp, params.ki, params.kd, params.setpoint_weight, params.setpoint_weight_derivative
     xp = namespace(kp, ki, kd, b, c, dt)
     ki_dt = 0.0 if ki is None else ki * dt
-    again = 0.0 if params.integration is not None else ki_dt
-    stiffness, damping = kp + ki_dt + again, kd + dt * (kp + ki_dt)
+    stiffness, damping = kp + 2 * ki_dt, kd + dt * (kp + ki_dt)
     per_step = 1 / (1 + dt * damping)
     on_rate = kd if c is None else c * kd
 
@@ -79,9 +77,9 @@ def implicit_gains(params: PIDParams, dt: Array) -> ImplicitGains:
         kp=stiffness * per_step,
         ki=None if ki is None else ki * per_step,
         kd=damping * per_step,
-        b=None if b is None else share(b * kp + ki_dt + again, stiffness, b),
+        b=None if b is None else share(b * kp + 2 * ki_dt, stiffness, b),
         c=None if c is None else share(on_rate, damping, 0),
-        c_given=share(on_rate - dt * again, damping, 0),
+        c_given=share(on_rate - dt * ki_dt, damping, 0),
         acceleration_share=per_step,
     )
 

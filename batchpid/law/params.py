@@ -2,7 +2,7 @@
 
 A :class:`PIDParams` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without registration. An option
 that is off is ``None``, which is not a leaf: NumPy skips it and ``jax.jit`` compiles a law without it. Choices without
-a number, such as the integration order, are tuples without fields (:mod:`batchpid.arrays.choices`): part of the tree's
+a number, such as the unit of the gains, are tuples without fields (:mod:`batchpid.arrays.choices`): part of the tree's
 structure, and so static under every JAX transform.
 """
 
@@ -51,18 +51,12 @@ class PIDParams(NamedTuple):
     """Conditional integration: Everywhere(), or 1.0 on the joints that have it, 0.0 on the others."""
     continuous: Array = None
     """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
-    integration: Any = None
-    """IntegrateFirst(); off: the effort is computed first, with the integral of the past errors."""
-    first_derivative: Any = None
-    """DerivativeKick(); off: the derivative of the first sample is 0."""
-    weight_origin: Array = None
-    """WeightFromStart(); off: setpoint weighting measures positions from 0."""
     non_finite: Any = None
     """ZeroEffort() or HoldEffort(); off: non-finite values propagate."""
     measurement_rate: Array = None
     """MeasuredRate(): whoever runs the law on a robot gives it the measured rate; off: differences of measurements."""
     gain_units: Any = None
-    """PerInertia() or PerMassMatrix(): whoever runs the law on a robot converts to efforts; off: efforts."""
+    """PerMassMatrix(): whoever runs the law on a robot converts to efforts; off: efforts."""
     discretization: Any = None
     """ImplicitLaw(): the law acts on the predicted end of the step; off: on its beginning."""
 
@@ -164,9 +158,6 @@ def make_params(
     anti_windup: Annotated[str | Sequence[Any], Field(neutral="none")] = "none",
     tracking_time: Annotated[Array, Field("s", math.inf)] = None,
     continuous: Annotated[Array, Field(neutral=False)] = None,
-    integration: str = "output_first",
-    first_derivative: str = "zero",
-    weight_origin: str = "zero",
     non_finite: str = "propagate",
     measurement_rate: str = "difference",
     gain_units: str = "effort",
@@ -198,7 +189,8 @@ def make_params(
     derivative_filter_time
         Time constant of the derivative's first-order low-pass [s]; 0: unfiltered.
     setpoint_weight, setpoint_weight_derivative
-        b and c: with setpoint r and measurement y, the proportional term acts on b r - y, the derivative on c r - y.
+        b and c: with setpoint r and measurement y, the proportional term acts on b r - y, with positions from the first
+        measurement, the derivative on c r - y.
     deadband
         Half width of the dead zone: within it P and I act on an error of 0, outside on the distance to the zone.
     anti_windup
@@ -210,12 +202,6 @@ def make_params(
         None: sqrt(kd/ki), or kp/ki without kd (K. J. Astrom and T. Hagglund, Advanced PID Control, 2006, sec. 3.5).
     continuous
         Bools: joints whose position is an angle modulo 2 pi [rad]; errors and differences take the short way round.
-    integration
-        "output_first" (control_toolbox) or "integrate_first" (simple-pid, Newton).
-    first_derivative
-        "zero", or "kick": the error before the first sample counts as 0 (for parity with peers).
-    weight_origin
-        "zero", or "start": setpoint weighting measures positions from the first measurement.
     non_finite
         What to do with a joint whose input is NaN or inf: "propagate" it (no check, no cost), or keep the state and
         command "zero" effort, or "hold" the last effort.
@@ -223,9 +209,8 @@ def make_params(
         Rate of the measurement that the derivative uses: "difference" of successive measurements, or "measured": the
         velocity that :class:`batchpid.sim.Runner` reads from the simulator. The pure law refuses a call without it.
     gain_units
-        "effort" per position, ...; or per unit of "inertia", or of the whole "mass_matrix": gains of an acceleration,
-        which :class:`batchpid.sim.Runner` turns into an effort at the robot's pose (see
-        :mod:`batchpid.law.computed_torque`).
+        "effort" per position, ...; or per "mass_matrix": gains of an acceleration, which
+        :class:`batchpid.sim.Runner` turns into an effort at the robot's pose (:mod:`batchpid.law.computed_torque`).
     discretization
         "explicit": P, I and D act on position and velocity at the beginning of the step, which is unstable at large
         gains or time steps; "implicit": on those at its end (:mod:`batchpid.law.implicit`), stable at any time step.

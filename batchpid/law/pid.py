@@ -3,7 +3,7 @@ r"""The control law: pure functions on (envs, joints) arrays, one definition for
 With setpoint r, measurement y and step dt, per env and joint::
 
     e      = dead(wrap(r - y))                                  error
-    P      = kp (b e - (1 - b) (y - o))                         = kp (b r - y) with o = 0; off: b = 1
+    P      = kp (b e - (1 - b) (y - o))                         o: the first y; off: b = 1
     o     <- o + dt dr/dt                                       where a rate of the setpoint is given
     v      = c dr/dt - dy/dt                                    measured rates, else wrapped differences / dt
     d      = (tau d' + dt v) / (tau + dt)                       low-pass, backward Euler: stable for any dt
@@ -14,11 +14,11 @@ With setpoint r, measurement y and step dt, per env and joint::
     I     <- I + ki e dt   unless (u - effort) e > 0            conditional integration
     I     <- min(max(I, integral_min), integral_max)            clamp
 
-A prime is the value of the step before. I is in effort units, so a change of ki is bumpless. ``integration`` says
-whether the effort is computed before or after I includes the present error. Saturation is on the total effort, which
-the motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13;
-conditional integration and the order of the two stages as in ros-controls/control_toolbox, src/pid.cpp. With
-discretization "implicit" the law is this one with other coefficients: :mod:`batchpid.law.implicit`.
+A prime is the value of the step before. I is in effort units, so a change of ki is bumpless. The effort is computed
+before I includes the present error. Saturation is on the total effort, which the motor delivers. After K. J. Astrom and
+T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13; conditional integration and the order of the two
+stages as in ros-controls/control_toolbox, src/pid.cpp. With discretization "implicit" the law is this one with other
+coefficients: :mod:`batchpid.law.implicit`.
 
 The moving origin is our own addition. With r = o + s, P = kp (o + b s - y): o, the motion that a rate describes, is
 followed with full weight, and the rest s, a step, is approached with weight b. Without a rate all motion counts as
@@ -41,24 +41,20 @@ from batchpid.law.state import PIDState, Terms
 def init(params: PIDParams, measurement: Array) -> PIDState:
     """Return the state before the first step.
 
-    The derivative starts from ``measurement`` (envs, joints) [rad or m]: the first step has no derivative kick,
-    unless the params ask for one.
+    Derivative and setpoint weighting start from ``measurement`` (envs, joints) [rad or m]: the first step has no kick.
 
     Raises InvalidArgumentError if the measurement has another number of joints than the params.
     """
     (measurement,) = checked_inputs(params, PIDState(), measurement)
     xp = namespace(*params, measurement)
     y = xp.zeros_like(measurement, dtype=xp.result_type(params.kp, measurement)) + measurement
-    begun = {"measurement": y, "setpoint": y, "setpoint_seen": float(params.first_derivative is not None)}
-    begun |= {"origin": 0.0 if params.weight_origin is None else y}
-
-    def filled(name: str) -> Array:  # no two leaves share a buffer: JAX donates each of them
-        value = begun.get(name, 0.0)
-        return y.copy() if value is y else xp.full_like(y, value)
-
-    state = PIDState(
-        *(filled(name) if has else None for name, has in zip(PIDState._fields, needs(params), strict=True))
-    )
+    # No two leaves share a buffer: JAX donates each of them.
+    leaves = {
+        name: y.copy() if name in ("measurement", "setpoint", "origin") else xp.zeros_like(y)
+        for name, needed in needs(params)._asdict().items()
+        if needed
+    }
+    state = PIDState(**leaves)
     if params.ki is None:
         return state
     return state._replace(integral=clip(state.integral, params.integral_min, params.integral_max, xp))
@@ -143,7 +139,7 @@ def advance(
     It takes the arguments of :func:`step`, as arrays. A term may be an array of the caller: :meth:`Terms.filled`.
 
     Raises InvalidArgumentError if the coefficients are of gain_units other than "effort", or need a measured rate that
-    is not given. Gains per inertia: :mod:`batchpid.law.computed_torque`.
+    is not given. Gains per mass matrix: :mod:`batchpid.law.computed_torque`.
     """
     check_alone(k, measurement_rate)
     xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
@@ -165,9 +161,7 @@ def advance(
         integral = integral + k.ki_dt * error
         if k.ki_dt2 is not None and r_rate is not None:
             integral = integral - k.ki_dt2 * r_rate
-        if k.integration is not None:
-            integral = clip(integral, k.integral_min, k.integral_max, xp)
-        i = state.integral if k.integration is None else integral
+        i = state.integral
         u = u + i
 
     d, derivative = 0.0, None

@@ -11,7 +11,6 @@ See docs/actuators.md.
 """
 
 from batchpid.arrays.elementwise import replace_envs as reset
-from batchpid.motors import actuator_presets as presets
 from batchpid.motors.actuator_dynamics import (
     STAGES,
     MotorCoefficients,
@@ -53,7 +52,6 @@ __all__ = [
     "make_actuators",
     "measure",
     "measurement_noise",
-    "presets",
     "reset",
     "save_actuators",
 ]

@@ -16,8 +16,6 @@
 
 namespace batchpid {
 
-enum Decoupling { FULL, PARTIAL, NONE };
-
 // Arrays of `law`: LAW in task_space_extension.py.
 enum Law {
   TASK_POSE, TASK_JACOBIAN, TASK_RATE, TASK_MASS, TASK_BIAS, CHAIN,
@@ -110,9 +108,8 @@ inline Lanes share_within(std::int64_t dof, Lanes const *effort, Lanes const *at
 // A law on arrays of some robots; `dynamics`, where it is given, has the arrays of the task that are left out.
 class OSCLaw {
  public:
-  OSCLaw(std::int64_t dof, Decoupling decoupling, bool in_tool_axes, Tables const &table,
-         ToolDynamics *dynamics = nullptr)
-      : dof_(dof), decoupling_(decoupling), in_tool_axes_(in_tool_axes), table_(table), given_(table) {
+  OSCLaw(std::int64_t dof, bool in_tool_axes, Tables const &table, ToolDynamics *dynamics = nullptr)
+      : dof_(dof), in_tool_axes_(in_tool_axes), table_(table), given_(table) {
     for (std::int64_t i = 0; i < dof; ++i) (table[CHAIN].data[i] > 0 ? chain_ : others_).push_back(i);
     auto const n = static_cast<std::size_t>(dof), links = chain_.size();
     factor_.resize(links * links);
@@ -235,12 +232,7 @@ class OSCLaw {
     selected_inverse(mobility, axes == nullptr ? nullptr : allowed, s0, null_inertia_, near_, more_of_springs_);
     null_near_ = near_;
     inertia_ = null_inertia_;
-    if (decoupling_ != PARTIAL && !(decoupling_ == FULL && force_too)) return;
-    for (int i = 0; i < AXES && decoupling_ == PARTIAL; ++i) {
-      for (int j = 0; j < AXES; ++j) {
-        if ((i < 3) != (j < 3)) mobility[i * AXES + j] = mobility[i * AXES + j] * 0.0;
-      }
-    }
+    if (!force_too) return;
     Weighted unused;
     selected_inverse(mobility, axes, s0, task_inertia_, near_, unused);
     inertia_ = task_inertia_;
@@ -248,17 +240,15 @@ class OSCLaw {
 
   // Set the efforts of base, task and posture.
   void set_efforts() {
-    Lanes const *jacobian = given_[TASK_JACOBIAN], *mass = given_[TASK_MASS], *axes = given_[SELECTED];
+    Lanes const *jacobian = given_[TASK_JACOBIAN], *mass = given_[TASK_MASS];
     Lanes moved[AXES], pulled[AXES];
     for (int axis = 0; axis < AXES; ++axis) {
-      moved[axis] = decoupling_ == NONE ? a_[axis] : a_[axis] - given_[TASK_RATE][axis];
+      moved[axis] = a_[axis] - given_[TASK_RATE][axis];
     }
     add_moved(a_n_.data(), pulled);
     Lanes drop[AXES];
     for (int axis = 0; axis < AXES; ++axis) {
-      force_[axis] = decoupling_ != NONE ? along(inertia_ + axis * AXES, moved, AXES)
-                     : axes != nullptr   ? axes[axis] * moved[axis]
-                                         : moved[axis];
+      force_[axis] = along(inertia_ + axis * AXES, moved, AXES);
       if (given_[WRENCH] != nullptr) force_[axis] += given_[WRENCH][axis];
       drop[axis] = along(null_inertia_ + axis * AXES, pulled, AXES);
     }
@@ -339,7 +329,6 @@ class OSCLaw {
   }
 
   std::int64_t dof_;
-  Decoupling decoupling_;
   bool in_tool_axes_;
   Tables const &table_;
   Given given_;

@@ -121,29 +121,27 @@ class JointFriction {
 struct Step : Call {
   Tree tree{};
   std::int64_t body, rows, dof;
-  Decoupling decoupling;
   bool in_tool_axes;
   Tables law, tool, friction;
 
-  // Arguments: rows, dof, decoupling, in_tool_axes, tree, body and tool (None, any and None without them), *arrays of Law.
+  // Arguments: rows, dof, in_tool_axes, tree, body and tool (None, any and None without them), *arrays of Law.
   bool open(PyObject *const *arguments) {
     rows = PyLong_AsLong(arguments[0]);
     dof = PyLong_AsLong(arguments[1]);
-    decoupling = static_cast<Decoupling>(PyLong_AsLong(arguments[2]));
-    in_tool_axes = PyLong_AsLong(arguments[3]) != 0;
-    body = PyLong_AsLong(arguments[5]);
-    if (!PyErr_Occurred() && arguments[4] != Py_None) {
-      if (Tree const *given = held<Tree>(arguments[4])) tree = *given;
+    in_tool_axes = PyLong_AsLong(arguments[2]) != 0;
+    body = PyLong_AsLong(arguments[4]);
+    if (!PyErr_Occurred() && arguments[3] != Py_None) {
+      if (Tree const *given = held<Tree>(arguments[3])) tree = *given;
     }
-    if (PyErr_Occurred() || !tool.open(arguments[6], FRAME, rows, false)) return false;
+    if (PyErr_Occurred() || !tool.open(arguments[5], FRAME, rows, false)) return false;
     for (int i = 0; i < LAW; ++i) {
-      if (!law.open(arguments[7 + i], law_columns(i, dof), i == CHAIN ? 1 : rows, i >= EFFORT)) return false;
+      if (!law.open(arguments[6 + i], law_columns(i, dof), i == CHAIN ? 1 : rows, i >= EFFORT)) return false;
     }
     return true;
   }
   // Arguments: those of `open`, and damping, Coulomb friction and band of the joints.
   bool open_with_friction(PyObject *const *arguments) {
-    return open(arguments) && friction.open_all(arguments + 7 + LAW, {dof, dof, dof}, rows, 3);
+    return open(arguments) && friction.open_all(arguments + 6 + LAW, {dof, dof, dof}, rows, 3);
   }
 };
 
@@ -151,7 +149,7 @@ struct Step : Call {
 struct StepRoom {
   explicit StepRoom(Step const &step)
       : dynamics(step.tree, step.body),
-        law(step.dof, step.decoupling, step.in_tool_axes, step.law, step.tool[0] ? &dynamics : nullptr),
+        law(step.dof, step.in_tool_axes, step.law, step.tool[0] ? &dynamics : nullptr),
         friction(step.friction, step.dof) {
     if (step.friction[1]) law.given().set(FEEDFORWARD, friction.out.data());
   }

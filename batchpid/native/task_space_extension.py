@@ -31,8 +31,6 @@ MOVE = (
     *("limit", "keep", "creep", "low", "high"),
 )
 """Arrays of ``move``; the first three are changed."""
-DECOUPLING = ("full", "partial", "none")
-"""Kinds of decoupling, as Decoupling in task_space.cpp."""
 
 RIGID_BODIES = ("batchpid/native/lanes.h", "batchpid/native/rigid_body.h", "batchpid/native/task_space_extension.py")
 _NAMES = ("task_space.cpp", "extension.h", "mobility.h", "osc_law.h", "pose_search.h", "tables.h", "tool.h")

@@ -4,7 +4,6 @@ Arrays are (envs, dof), or have any other leading axes; poses are (..., 7): a po
 twists, wrenches and Jacobians have linear parts first. NumPy computes in float64; JAX's arrays keep their dtype.
 """
 
-from batchpid.task_space import osc_presets as presets
 from batchpid.task_space.inverse_kinematics import IKResult, InverseKinematicsWarning, inverse_kinematics
 from batchpid.task_space.operational_space import init, osc, reset, track
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
@@ -40,7 +39,6 @@ __all__ = [
     "make_osc_params",
     "mass_matrix",
     "osc",
-    "presets",
     "reset",
     "save_osc_options",
     "task_dynamics",

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Array, Document, Float64
-from batchpid.native.task_space_extension import DECOUPLING, LAW
+from batchpid.native.task_space_extension import LAW
 from batchpid.task_space import native_rows
 from batchpid.task_space.osc_coefficients import OSCCoefficients
-from batchpid.task_space.osc_params import NoDecoupling, PartialDecoupling
 from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDynamics, Tool
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_kinematics import prepared, read_point
@@ -42,13 +41,13 @@ def law(
         tool = dynamics
         (qpos, qvel), *_ = prepared(tool.tree, qpos=inputs.qpos, qvel=inputs.qvel)
         inputs, given = inputs._replace(qpos=qpos, qvel=qvel), (read_point(qpos, tool.point),)
-    arrays = (*inputs, None, None, *state, *k[:-2])
+    arrays = (*inputs, None, None, *state, *k[:-1])
     if (native := native_rows.for_rows(inputs.qpos, *given, *arrays)) is None:
         return None
     rows, dof = inputs.qpos.shape
     wanted = wanted if state.integral is None else (*wanted, "integral")
     results = [np.empty((rows, size or dof)) if name in wanted else None for name, size in _RESULTS.items()]
-    fixed: tuple[Any, ...] = (*_kind(k), *_WITHOUT_TREE)
+    fixed: tuple[Any, ...] = (k.frame is not None, *_WITHOUT_TREE)
     if tool is not None:
         fixed, chain = _of_tree(native, tool.tree, tool.link, given[0], k)
         given = (*[None] * 5, chain)
@@ -69,7 +68,7 @@ def friction(arrays: Mapping[str, Any], coulomb: Array, band: Array) -> Float64 
         return None
     found = np.empty(qpos.shape)
     given = map({**arrays, "effort": found}.get, LAW)
-    native_rows.call(native.friction, *qpos.shape, 0, False, *_WITHOUT_TREE, *given, None, coulomb, band)
+    native_rows.call(native.friction, *qpos.shape, False, *_WITHOUT_TREE, *given, None, coulomb, band)
     return found
 
 
@@ -79,14 +78,8 @@ def _of_tree(
     """Return the arguments of ``law`` and ``bind`` between sizes and arrays, and the chain to the tool (dof,)."""
     own, index = native_rows.native_tree(native, tree), tree.index(link)
     body = tree.link_bodies[index]
-    fixed = *_kind(k), own.tree, body, native_rows.tool(own, index, point)
+    fixed = k.frame is not None, own.tree, body, native_rows.tool(own, index, point)
     return fixed, np.array(tree.chains[body], np.float64)
-
-
-def _kind(k: OSCCoefficients) -> tuple[int, bool]:
-    """Return the index in DECOUPLING, and whether the coefficients are in the axes of the tool."""
-    kind = {NoDecoupling: "none", PartialDecoupling: "partial"}.get(type(k.decoupling), "full")
-    return DECOUPLING.index(kind), k.frame is not None
 
 
 class BoundOSC:
@@ -127,7 +120,7 @@ class BoundOSC:
         self.effort, self.limited = np.zeros((2, *qpos.shape))
         fixed, chain = _of_tree(native, tool.tree, tool.link, tool.point, k)
         integral = self.state.get("integral")
-        known: Document = dict(zip(k._fields[:-2], k[:-2], strict=True)) | self._given
+        known: Document = dict(zip(k._fields[:-1], k[:-1], strict=True)) | self._given
         known |= {"qpos": qpos, "qvel": qvel, "bias": bias, "chain": chain, "posture": self._posture}
         known |= {"integral": integral, "next_integral": integral, "effort": self.effort, "limited": self.limited}
         if damping is not None:

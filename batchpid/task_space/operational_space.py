@@ -8,7 +8,7 @@ kd_n of the posture::
     a     = kp e + kd (V - J q') + V' + I                       acceleration of the task
     A     = J M_cc^-1 J^T
     L     = (S A S^T)^-1, bounded                               its inertia, in the selected axes S
-    F     = L (a - J' q') + wrench                              decoupling "full"; F = a + wrench with "none"
+    F     = L (a - J' q') + wrench
     a_n   = a_s - a_d                                           acceleration of the posture: springs and damping
     a_s   = kp_n (posture - q) + kp_l x
     a_d   = kd_n q' + 2 sqrt(kp_l) q' |x| / margin
@@ -22,10 +22,9 @@ These are the gains of the explicit law; :mod:`batchpid.task_space.osc_coefficie
 stiffness kp_l push joints of the chain away from their limits; x is the depth of q in the margin.
 
 The other joints, such as fingers, are controlled by computed torque: in the task they would move with the hand. L_n is
-the inertia over the axes of motion and force, with full decoupling. With "partial" the blocks of A between positions
-and rotations are left out of L. A bounded inverse turns an eigenvalue s into 1/s, or s/s0^2 below s0: near a
-singularity the direction in which the tool cannot move loses its stiffness to the posture, continuously, and the motion
-returns from it.
+the inertia over the axes of motion and force. A bounded inverse turns an eigenvalue s into 1/s, or s/s0^2 below s0:
+near a singularity the direction in which the tool cannot move loses its stiffness to the posture, continuously, and the
+motion returns from it.
 
 Below its bound an inertia lets the posture into the task. The damping has to enter below s0, where the task loses its
 own. The springs would pull the tool off poses that it reaches: at rest its error would be (s0^2/s^2 - 1) (v J a_s) / kp
@@ -55,7 +54,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_law
 from batchpid.task_space.frames import in_axes, matrix_of, pose_error
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
-from batchpid.task_space.osc_params import MAKE_PARAMS, NoDecoupling, OSCParams, PartialDecoupling
+from batchpid.task_space.osc_params import MAKE_PARAMS, OSCParams
 from batchpid.task_space.osc_state import (
     OSCInputs,
     OSCState,
@@ -148,7 +147,7 @@ def _check_shapes(k: OSCCoefficients, inputs: OSCInputs) -> None:
         if value is not None and np.shape(value) not in ((envs, size), (1, size)):
             problem = f"has shape {np.shape(value)}, not ({envs}, {size})"
             raise InvalidArgumentError(name, problem, remedy="give one row for each env")
-    for name, leaf in zip(k._fields, k[:-2], strict=False):
+    for name, leaf in zip(k._fields, k[:-1], strict=False):
         if leaf is not None and leaf.shape[0] not in (1, envs):
             problem = f"has rows for {leaf.shape[0]} envs, but qpos for {envs}"
             raise InvalidArgumentError(f"k.{name}", problem, remedy="make params for these envs")
@@ -265,15 +264,12 @@ def track(
     Raises
     ------
     InvalidArgumentError
-        The params are of another type, or have no integral, or partial decoupling.
+        The params are of another type, or have no integral.
     """
     k, mass, bias = discretise(params, dt), dynamics.mass_matrix, dynamics.bias
     if params.integral_gain is None:
         problem = "is off, so no integral can carry the effort over"
         raise InvalidArgumentError("params.integral_gain", problem, remedy="give integral_gain; 0 is allowed")
-    if isinstance(params.decoupling, PartialDecoupling):
-        problem = "'partial' has an inertia that does not move the tool by its acceleration"
-        raise InvalidArgumentError("params.decoupling", problem, remedy="use 'full' or 'none'")
     inputs = OSCInputs(setpoint, qpos, qvel, twist, acceleration)
     xp = namespace(*k, *dynamics, *inputs, effort)
     with quiet():
@@ -284,7 +280,5 @@ def track(
         posture = qpos + xp.where(stiff, rest / xp.where(stiff, k.posture_kp, 1.0), 0.0)
         task = in_frame(k, dynamics, inputs)
         wanted = product(task.dynamics.jacobian, qacc) + task.dynamics.jacobian_rate
-        if isinstance(k.decoupling, NoDecoupling):
-            wanted = projections(k._replace(decoupling=None), task.dynamics, wanted, 0 * qpos).force
         integral = wanted - task_acceleration(k, task)
         return OSCState(posture, clip(integral, -k.integral_limit, k.integral_limit, xp))

@@ -56,7 +56,6 @@ class OSCCoefficients(NamedTuple):
     effort_min: Array
     effort_max: Array
     turns: Array
-    decoupling: Any
     frame: Any
 
     def __repr__(self) -> str:

@@ -25,20 +25,11 @@ MAKE_PARAMS = "build them with make_osc_params"
 """Remedy for params of another type."""
 
 
-class PartialDecoupling(NamedChoice):
-    """The inertias of positions and of rotations, without the coupling between the two."""
-
-
-class NoDecoupling(NamedChoice):
-    """Gains are forces and moments: stiffness in N/m and N m/rad."""
-
-
 class ToolFrame(NamedChoice):
     """Gains, selected axes and wrenches are in the axes of the tool."""
 
 
 TASK_CHOICES: dict[str, Document] = {
-    "decoupling": {"full": None, "partial": PartialDecoupling(), "none": NoDecoupling()},
     "frame": {"world": None, "tool": ToolFrame()},
     "discretization": CHOICES["discretization"],
 }
@@ -53,9 +44,9 @@ class OSCParams(NamedTuple):
     """
 
     stiffness: Array
-    """kp (1 | envs, 6) [1/s^2]; with decoupling "none" [N/m, N m/rad]."""
+    """kp (1 | envs, 6) [1/s^2]."""
     damping: Array
-    """kd (1 | envs, 6) [1/s]; with decoupling "none" [N s/m, N m s/rad]."""
+    """kd (1 | envs, 6) [1/s]."""
     posture_stiffness: Array
     """(1 | envs, dof) [1/s^2]."""
     posture_damping: Array
@@ -73,14 +64,12 @@ class OSCParams(NamedTuple):
     effort_min: Array = None
     """(1 | envs, dof) [N m or N]."""
     effort_max: Array = None
-    decoupling: Any = None
-    """None for "full", or a choice without fields."""
     frame: Any = None
     """None for "world", or a choice without fields."""
     integral_gain: Array = None
-    """ki (1 | envs, 6) [1/s^3]; with decoupling "none" [N/(m s), N m/(rad s)]."""
+    """ki (1 | envs, 6) [1/s^3]."""
     integral_limit: Array = None
-    """(1 | envs, 6) [m/s^2, rad/s^2]; with decoupling "none" [N, N m]."""
+    """(1 | envs, 6) [m/s^2, rad/s^2]."""
     limit_stiffness: Array = None
     """(1 | envs, dof) [1/s^2]."""
     limit_margin: Array = None
@@ -119,7 +108,6 @@ def make_osc_params(
     effort_limit: Annotated[ArrayLike | None, Field("N m or N", math.inf, group="joint")] = None,
     effort_min: Annotated[ArrayLike | None, Field("N m or N", -math.inf, low=-math.inf, group="joint")] = None,
     effort_max: Annotated[ArrayLike | None, Field("N m or N", math.inf, low=-math.inf, group="joint")] = None,
-    decoupling: str = "full",
     frame: str = "world",
     discretization: str = "explicit",
 ) -> OSCParams:
@@ -130,8 +118,7 @@ def make_osc_params(
     Parameters
     ----------
     stiffness, damping_ratio, damping
-        kp >= 0 [1/s^2] and kd = 2 zeta sqrt(kp), or kd itself [1/s], of the axes x, y, z, rx, ry, rz. With decoupling
-        "none" they are forces and moments, and ``damping`` is required.
+        kp >= 0 [1/s^2] and kd = 2 zeta sqrt(kp), or kd itself [1/s], of the axes x, y, z, rx, ry, rz.
     integral_gain, integral_limit
         ki [1/s^3], which learns loads that the model does not know, and the largest size of the integral of each axis
         [m/s^2, rad/s^2]. A loop with kp and kd is stable for ki < kp kd. None: no integral.
@@ -152,14 +139,10 @@ def make_osc_params(
         a singularity lose stiffness; below s0/5 the posture pulls the tool there [1/kg, 1/(kg m^2)].
     effort_limit, effort_min, effort_max
         Limits of the total effort of the joints [N m or N]: ``effort_limit=x`` is ``effort_min=-x, effort_max=x``.
-    decoupling
-        "full": accelerations of all axes are independent; "partial": positions and rotations are decoupled within
-        themselves only, as in robosuite by default; "none": gains are forces.
     frame
         "world" or "tool": the axes of gains, selections and wrenches. Setpoints are in the world.
     discretization
-        "explicit", or "implicit": stable at any time step (:mod:`batchpid.task_space.osc_coefficients`); not with
-        decoupling "none".
+        "explicit", or "implicit": stable at any time step (:mod:`batchpid.task_space.osc_coefficients`).
 
     Raises
     ------
@@ -173,12 +156,6 @@ def make_osc_params(
     _check_unused("integral_limit", integral_limit, math.inf, integral_gain is None, "integral_gain is not given")
     _check_unused("limit_stiffness", limit_stiffness, 400.0, limit_margin is None, "limit_margin is not given")
     kp = _rows("stiffness", stiffness, AXES)
-    if choice("decoupling", decoupling, TASK_CHOICES["decoupling"]) == "none" and damping is None:
-        problem = "is missing: with decoupling 'none' no mass relates it to the stiffness"
-        raise InvalidArgumentError("damping", problem, remedy="give forces per velocity [N s/m, N m s/rad]")
-    if choice("discretization", discretization, TASK_CHOICES["discretization"]) == "implicit" and decoupling == "none":
-        problem = "'implicit' needs gains of accelerations, which decoupling 'none' has not"
-        raise InvalidArgumentError("discretization", problem, remedy="use 'explicit', or decoupling 'full'")
     kd = 2 * _rows("damping_ratio", damping_ratio, AXES) * np.sqrt(kp)
     posture = _rows("posture_stiffness", posture_stiffness, joints) * tree.independent
     motion, force = (_mask(name, value) for name, value in (("axes", axes), ("force_axes", force_axes)))
@@ -206,7 +183,6 @@ def make_osc_params(
         force_axes=force,
         effort_min=low,
         effort_max=high,
-        decoupling=TASK_CHOICES["decoupling"][decoupling],
         frame=TASK_CHOICES["frame"][choice("frame", frame, TASK_CHOICES["frame"])],
         integral_gain=integral,
         integral_limit=None if integral is None else _rows("integral_limit", integral_limit, AXES),
@@ -215,14 +191,16 @@ def make_osc_params(
         lower=None if margin is None else limits[:1],
         upper=None if margin is None else limits[1:],
         turns=(endless / TURN)[None] if endless.any() else None,
-        discretization=TASK_CHOICES["discretization"][discretization],
+        discretization=TASK_CHOICES["discretization"][
+            choice("discretization", discretization, TASK_CHOICES["discretization"])
+        ],
     )
     _check_rows(params)
     return params
 
 
 FIELDS = declared(make_osc_params, Field)
-"""Options that are numbers; units are those with full decoupling."""
+"""Options that are numbers."""
 
 
 def _rows(name: str, value: ArrayLike, columns: tuple[str, ...]) -> NDArray[np.float64]:

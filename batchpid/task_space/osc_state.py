@@ -76,7 +76,7 @@ class OSCState(NamedTuple):
     posture: Array
     """Positions (envs, dof) that the joints are drawn to, by the posture gains [rad or m]."""
     integral: Array = None
-    """I (envs, 6): acceleration of the task [m/s^2, rad/s^2]; with decoupling "none" a wrench [N, N m]. None without
+    """I (envs, 6): acceleration of the task [m/s^2, rad/s^2]. None without
     ``integral_gain``."""
 
     def __repr__(self) -> str:

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.elementwise import namespace
 from batchpid.task_space.osc_coefficients import OSCCoefficients
-from batchpid.task_space.osc_params import NoDecoupling, PartialDecoupling
 from batchpid.task_space.osc_state import TaskDynamics
 from batchpid.task_space.symmetric import bounded_inverse, gram, product, whitened
 
@@ -56,7 +55,7 @@ def projections(
     m_cc = xp.where((chain[:, None] * chain) > 0, m, eye)  # the other joints apart, with unit inertia
     y = whitened(m_cc, xp.concatenate([xp.swapaxes(j, -1, -2), eye + xp.zeros_like(m)], axis=-1))
     task_inertia, null_inertia, spring_inertia, singular = _inertias(k, gram(y[..., :6], y[..., :6]), xp)
-    f = product(task_inertia, a - d.jacobian_rate) if task_inertia is not None else _selected(k.axes, a)
+    f = product(task_inertia, a - d.jacobian_rate)
     f = f if wrench is None else f + wrench
     task = gram(j, f[..., None])[..., 0]
 
@@ -78,20 +77,13 @@ def projections(
 
 
 def _inertias(k: OSCCoefficients, mobility: Array, xp: ArrayModule) -> tuple[Array, Array, Array, Array]:
-    """Return L, None with decoupling "none", L_n and L_s of the mobility A (envs, 6, 6), and where any is bounded."""
-    s0 = k.smallest_eigenvalue[..., 0]
-    allowed = k.axes
-    if k.force_axes is not None and k.axes is not None:
-        allowed = xp.maximum(k.axes, k.force_axes)
-    null, springs, near = _selected_inverse(mobility, allowed, xp, s0, SPRING_BOUND * s0)
-    if isinstance(k.decoupling, NoDecoupling):
-        return None, null, springs, near
-    partial = isinstance(k.decoupling, PartialDecoupling)
-    if allowed is k.axes and not partial:
+    """Return L, L_n and L_s of the mobility A (envs, 6, 6), and where any is bounded."""
+    s0, both = k.smallest_eigenvalue[..., 0], k.axes
+    if k.axes is not None and k.force_axes is not None:
+        both = xp.maximum(k.axes, k.force_axes)
+    null, springs, near = _selected_inverse(mobility, both, xp, s0, SPRING_BOUND * s0)
+    if both is k.axes:
         return null, null, springs, near
-    if partial:
-        half = xp.asarray([1.0] * 3 + [0.0] * 3, dtype=mobility.dtype)
-        mobility = mobility * (half[:, None] * half + (1 - half)[:, None] * (1 - half))
     task, bounded = _selected_inverse(mobility, k.axes, xp, s0)
     return task, null, springs, near | bounded
 
@@ -108,7 +100,3 @@ def _selected_inverse(
     alone = free * xp.maximum(smallest, 1.0)[..., None, None]
     *inverses, near = bounded_inverse(xp.where(both, mobility, alone), smallest, *smooth)
     return *[xp.where(both, inverse, xp.zeros_like(inverse)) for inverse in inverses], near
-
-
-def _selected(axes: Any, vector: Array) -> Array:
-    return vector if axes is None else axes * vector

@@ -32,9 +32,6 @@ class CompareCommand:
     """Seed of the moves; no search of `batchpid tune` with the same seed sees them."""
     seconds: flags.Seconds = 2.0
     randomize: flags.Randomize = None
-    variation: flags.Variation = False
-    payload: flags.Payload = 2.0
-    friction: flags.Friction = 0.1
     engine: flags.Engines = (DEFAULT_ENGINE,)
     runner: Annotated[flags.RunnerFlags, flags.group(RUNNER)] = field(default_factory=RUNNER)
     actuators: flags.Actuators = None
@@ -50,9 +47,10 @@ class CompareCommand:
         """Run the command."""
         from batchpid.sim import plots
         from batchpid.sim.cli.report import draw_first_move, evaluation_table, motion_difference
-        from batchpid.sim.cli.run import evaluate_sets, read_variation
+        from batchpid.sim.cli.run import evaluate_sets
+        from batchpid.sim.tuning.randomization_presets import load_randomization
 
-        outputs = OutputFiles(force=self.force)
+        outputs = OutputFiles(self)
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
@@ -65,7 +63,7 @@ class CompareCommand:
         if not self.moves and robot.settings is None:
             remedy = "use 1 or more: the robot has no move of a tutorial"
             raise InvalidArgumentError("moves", "leaves none", value=self.moves, remedy=remedy)
-        robot, randomization = read_variation(robot, self.randomize, flags.variation(self))
+        randomization = None if self.randomize is None else load_randomization(self.randomize, robot)
         options = flags.chosen(self, "moves seed seconds") | self.runner.options()
         evaluations = evaluate_sets(robot, sets, randomization=randomization, engines=self.engine, **options)
         print(f"{robot.name}: {len(evaluations[0].moves.start)} moves, seed {self.seed}, {self.seconds:g} s each\n")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated
 
 from batchpid.arrays.array_types import Document
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, beside, waiting, write_figures
+from batchpid.sim.cli.outputs import FOLDER, OutputFiles, beside, waiting, write_figures
 from batchpid.sim.tuning.gain_sets import gain_set
 
 RUNNER = flags.runner_flags("ground", "workers", "engine", "backend")
@@ -48,6 +47,9 @@ class DemoCommand:
         from batchpid.sim.cli.report import exit_status
         from batchpid.sim.cli.run import hold_setpoint, run_figures, start_poses
 
+        outputs, picture = OutputFiles(self), self.picture or beside(FOLDER / self.robot, "demo")
+        picture = outputs.path("picture", picture, plots.FORMATS)
+        json = outputs.path("json", self.json, (".json",))
         if self.viewer:
             from batchpid.sim.view.film import show_window
             from batchpid.sim.view.renderer import check_renderer
@@ -59,10 +61,6 @@ class DemoCommand:
             raise InvalidArgumentError(
                 "robot", "has no tutorial setpoint", value=self.robot, remedy=f"run: batchpid rollout {self.robot}"
             )
-        picture = self.picture or beside(Path("out") / robot.path.name, "demo")
-        outputs = OutputFiles(force=self.force)
-        picture = outputs.path("picture", picture, plots.FORMATS)
-        json = outputs.path("json", self.json, (".json",))
         start = start_poses(robot, self.num_envs, self.spread, self.seed)
         gains = gain_set(robot, self.gains)
         title = f"{robot.name}: {self.num_envs} robots, {gains.control} at {settings.rate_hz:g} Hz, gains {gains.name}"

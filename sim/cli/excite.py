@@ -11,7 +11,7 @@ import numpy as np
 from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles
+from batchpid.sim.cli.outputs import FOLDER, OutputFiles, stem
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class ExciteCommand:
         from batchpid.sim.identification.excitation import excite
         from batchpid.sim.setpoint_files import setpoint_csv
 
+        out = self.out or FOLDER / f"{stem(Path(self.robot))}.excite.csv"
+        out = OutputFiles(self).path("out", out, (".csv",))
         robot = Robot.load(self.robot, **vars(self.meshes))
-        out = self.out or Path(f"out/{robot.path.stem}.excite.csv")
-        out = OutputFiles(force=self.force).path("out", out, (".csv",))
         motion = excite(robot, self.seconds, rate=self.rate, lowest=self.lowest, highest=self.highest, seed=self.seed)
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, setpoint_csv(robot, motion))

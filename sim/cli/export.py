@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
-from batchpid.arrays.array_types import Document
 from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles
+from batchpid.sim.cli.outputs import FOLDER, OutputFiles, stem
 
 if TYPE_CHECKING:
     import batchpid as bp
@@ -21,19 +20,13 @@ if TYPE_CHECKING:
 FILES = {
     "c": "-pid.h",
     "ros2_control": "-controllers.yaml",
-    "isaac_lab": "-actuators.py",
-    "maniskill": "-controller.py",
-    "newton": "-actuators.py",
     "mjcf": "-pid.xml",
     "urdf": "-repaired.urdf",
 }
 """End of the default file name of each target."""
 USED = {
-    "c": ("gains", "timestep", "limits", "prefix", "dynamics", "project"),
+    "c": ("gains", "timestep", "limits", "prefix", "dynamics"),
     "ros2_control": ("gains", "timestep", "limits", "prefix", "controller"),
-    "isaac_lab": ("gains", "timestep", "limits", "actuators"),
-    "maniskill": ("gains", "timestep", "limits", "actuators"),
-    "newton": ("gains", "timestep", "limits", "actuators"),
     "mjcf": ("gains", "timestep", "limits", "actuators", "motors"),
     "urdf": (),
 }
@@ -41,8 +34,6 @@ USED = {
 COMMENTS = {"c": "/* {} */", "mjcf": "<!-- {} -->", "urdf": "<!-- {} -->"}
 """Comment of a target's language; of the others "# {}"."""
 UNLIMITED = "guard: setpoints are not limited in the target"
-PROJECT = ("CMakeLists.txt", "example.c")
-"""Files of ``--project``, besides the header."""
 POSES = 64
 """Sampled poses, for the range of the inertia."""
 
@@ -52,14 +43,13 @@ class ExportCommand:
     """Write a robot's gains, or the robot itself, as a file for another program.
 
     Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to batchpid's. "ros2_control"
-    is the YAML of a controller, "isaac_lab", "maniskill" and "newton" are gains in Python. "mjcf" is the robot with the
-    law in MuJoCo's own actuators, "urdf" the robot with its repairs. Differences between the file and batchpid's law or
-    the robot's file are printed, one line each.
+    is the YAML of a controller. "mjcf" is the robot with the law in MuJoCo's own actuators, "urdf" the robot with its
+    repairs. Differences between the file and batchpid's law or the robot's file are printed, one line each.
     """
 
     robot: flags.RobotName = "panda"
     gains: flags.Gains = None
-    to: Literal["c", "ros2_control", "isaac_lab", "maniskill", "newton", "mjcf", "urdf"] = "c"
+    to: Literal["c", "ros2_control", "mjcf", "urdf"] = "c"
     """Target."""
     actuators: flags.Actuators = None
     controller: Literal["joint_trajectory_controller", "pid_controller"] = "joint_trajectory_controller"
@@ -74,8 +64,6 @@ class ExportCommand:
     """In C, add the robot's mass matrix, gravity and bias as functions."""
     motors: flags.Switch = False
     """In MJCF, write the motors without the law: their inputs are the efforts asked for."""
-    project: flags.Switch = False
-    """In C, write a CMakeLists.txt and an example loop next to the header."""
     strict: flags.Switch = False
     """End with an error if the target's law differs."""
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
@@ -88,19 +76,16 @@ class ExportCommand:
     def run(self) -> None:
         """Run the command."""
         from batchpid.errors import InvalidArgumentError
-        from batchpid.export import to_c_project
         from batchpid.io.files import write_atomically
         from batchpid.sim.robot.urdf_export import to_urdf
         from batchpid.sim.tuning.gain_sets import gain_set
 
+        out = self.out or FOLDER / f"{stem(Path(self.robot))}{FILES[self.to]}"
+        out = OutputFiles(self).path("out", out, (Path(FILES[self.to]).suffix,))
         known = {name for names in USED.values() for name in names}
         unused = [each.name for each in fields(self) if each.name in known.difference(USED[self.to])]
         flags.refuse(self, unused, f"has no effect with --to {self.to}")
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
-        out = self.out or Path(f"out/{robot.path.stem}{FILES[self.to]}")
-        outputs = OutputFiles(force=self.force)
-        out = outputs.path("out", out, (Path(FILES[self.to]).suffix,))
-        others = {name: outputs.path("out", out.with_name(name), ()) for name in PROJECT if self.project}
         if self.to == "urdf":
             exported = to_urdf(robot, out.absolute().parent)
             content = f"{robot.name}, {robot.dof} joints, without need of repair"
@@ -122,10 +107,6 @@ class ExportCommand:
         if self.strict and differences:
             raise InvalidArgumentError("to", "; ".join(differences), value=self.to, remedy="leave out --strict")
         out.parent.mkdir(parents=True, exist_ok=True)
-        if self.project:
-            files = to_c_project(chosen.params, self.timestep, header=out.name, **self._c_options(robot))
-            for name, path in others.items():
-                write_atomically(path, files[name])
         write_atomically(out, _with_differences(exported, COMMENTS.get(self.to, "# {}")))
         for each in differences:
             print(f"differs: {each}")
@@ -133,35 +114,34 @@ class ExportCommand:
 
     def _exported(self, robot: Robot, params: bp.PIDParams) -> Exported:
         """Return the file of a target for gains."""
-        from batchpid.export import to_c, to_isaac_lab, to_maniskill, to_newton, to_ros2_control
+        from batchpid.export import to_c, to_ros2_control
 
         if self.to == "mjcf":
             return _mjcf(robot, params, self.timestep, self.limits)
-        own, dt = robot.independent, self.timestep
-        joints, followers = ([robot.joint_names[at] for at in np.flatnonzero(mask)] for mask in (own, ~own))
-        place = "joints of their own in the file; ignore their efforts" if self.to == "c" else "not in the file"
-        notes = [f"{', '.join(followers)}: followers are {place}"] if followers else []
+        joints, followers = (
+            [robot.joint_names[at] for at in np.flatnonzero(mask)] for mask in (robot.independent, ~robot.independent)
+        )
+        notes = list[str]()
+        if followers:
+            place = "joints of their own in the file; ignore their efforts" if self.to == "c" else "not in the file"
+            notes.append(f"{', '.join(followers)}: followers are {place}")
         if self.to == "c":
-            exported = to_c(params, dt, **self._c_options(robot))
-            return exported._replace(differences=(*exported.differences, *notes))
-        notes += [UNLIMITED] if self.limits else []
-        params, inertia = params.for_joints(own), _inertia(robot)[:, own]
-        if self.to == "ros2_control":
-            names = {"controller": self.controller, "name": self.prefix}
-            exported = to_ros2_control(params, joints, dt, inertia=inertia, **names)
+            guard = robot.guard() if self.limits else None
+            tree = robot.kinematic_tree() if self.dynamics else None
+            exported = to_c(
+                params, self.timestep, joint_names=robot.joint_names, guard=guard, prefix=self.prefix, tree=tree
+            )
         else:
-            to = {"isaac_lab": to_isaac_lab, "maniskill": to_maniskill, "newton": to_newton}[self.to]
-            exported = to(params, joints, dt, actuators=_motors(robot), inertia=inertia)
+            notes += [UNLIMITED] if self.limits else []
+            exported = to_ros2_control(
+                params.for_joints(robot.independent),
+                joints,
+                self.timestep,
+                controller=self.controller,
+                name=self.prefix,
+                inertia=_inertia(robot)[:, robot.independent],
+            )
         return exported._replace(differences=(*exported.differences, *notes))
-
-    def _c_options(self, robot: Robot) -> Document:
-        """Return the options of the C header."""
-        return {
-            "joint_names": robot.joint_names,
-            "guard": robot.guard() if self.limits else None,
-            "prefix": self.prefix,
-            "tree": robot.kinematic_tree() if self.dynamics else None,
-        }
 
 
 def _with_differences(exported: Exported, comment: str) -> str:
@@ -181,20 +161,6 @@ def _mjcf(robot: Robot, params: bp.PIDParams | None, dt: float, limits: bool) ->
 
     guard = robot.guard() if limits else None
     return to_mjcf(robot, params, dt, actuators=robot.actuators, guard=guard, inertia=_inertia(robot))
-
-
-def _motors(robot: Robot) -> bp.Actuators:
-    """Return the motors of the independent joints, with the friction and damping of the robot's description added."""
-    import batchpid as bp
-
-    own = np.flatnonzero(robot.independent)
-    motors = bp.make_actuators(robot.dof) if robot.actuators is None else robot.actuators
-    friction = {"coulomb": robot.friction, "static": robot.friction, "viscous": robot.damping}
-    if motors.static is None:
-        del friction["static"]
-    given = {name: getattr(motors, name) for name in friction}
-    total = {name: friction[name] + (0.0 if leaf is None else leaf) for name, leaf in given.items()}
-    return motors.replace(joints=robot.dof, **total).for_joints(own)
 
 
 def _inertia(robot: Robot) -> np.ndarray:

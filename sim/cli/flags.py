@@ -51,14 +51,6 @@ def refuse(command: Any, names: Iterable[str], problem: str) -> None:
             raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
 
 
-def variation(command: Any) -> tuple[float, float] | None:
-    """Return the payload and the friction of ``--variation``; None without this flag, which both of them need."""
-    if not command.variation:
-        refuse(command, ("payload", "friction"), "has no effect without --variation")
-        return None
-    return command.payload, command.friction
-
-
 FLAGS = {each.name: each.default for each in fields(RunnerKeywords) if OPTIONS[each.name].flag}
 """Options that have a flag, with their defaults."""
 SCENE_FLAGS = tuple(name for name in FLAGS if "scene" in OPTIONS[name].kept and name != "engine")
@@ -154,9 +146,8 @@ Gains = Annotated[
     str | None,
     _flag(
         "Gains: tuned, designed, tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file (.yaml or .json) that "
-        "`batchpid tune` or batchpid.save_params wrote, or gains of ros2_control (.yaml) or MuJoCo "
-        "(.xml). Default: tuned where the robot has them, else designed. With --control osc: a file of `batchpid tune "
-        "--control osc`.",
+        "`batchpid tune` or batchpid.save_params wrote, or an MJCF file (.xml). Default: tuned where the robot has "
+        "them, else designed.",
         metavar="NAME|FILE",
     ),
 ]
@@ -171,10 +162,9 @@ Actuators = Annotated[
 GainSets = Annotated[
     tuple[str, ...],
     _flag(
-        "Sets of gains: tuned, designed, tutorial, mjcf, drive, drive:STIFFNESS,DAMPING, or params files (.yaml or "
-        ".json) that `batchpid tune` or batchpid.save_params wrote, or gains of ros2_control (.yaml) "
-        "or MuJoCo (.xml). Default: tuned, "
-        "tutorial and drive for a bundled robot, else designed and drive.",
+        "Sets of gains: tuned, designed, tutorial, mjcf, drive, drive:STIFFNESS,DAMPING, params files (.yaml or "
+        ".json) that `batchpid tune` or batchpid.save_params wrote, or MJCF files (.xml). Default: tuned, tutorial "
+        "and drive for a bundled robot, else designed and drive.",
         metavar="NAME|FILE [NAME|FILE ...]",
     ),
 ]
@@ -198,11 +188,4 @@ Randomize = Annotated[
         "`payload: {uniform: [0, 0.5]}`.",
         metavar="NAME|FILE",
     ),
-]
-Variation = Annotated[bool, _flag("Draw payload, joint friction, sensor resolution and effort delay for each move.")]
-Payload = Annotated[
-    float, Field("kg"), _flag("With --variation: largest payload [kg]; less where the robot cannot carry it.")
-]
-Friction = Annotated[
-    float, Field("N m or N"), _flag("With --variation: largest Coulomb friction added to the joints [N m or N].")
 ]

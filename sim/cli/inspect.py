@@ -51,7 +51,7 @@ class InspectCommand:
 
     def run(self) -> int:
         """Run the command and return its exit status."""
-        json = OutputFiles(force=self.force).path("json", self.json, (".json",))
+        json = OutputFiles(self).path("json", self.json, (".json",))
         robot = Robot.load(self.robot, **vars(self.meshes))
         mass = sum(link.mass for link in robot.link_masses.values())
         size = f"{robot.dof} degrees of freedom, {len(robot.links)} links, {mass:.4g} kg"

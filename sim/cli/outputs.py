@@ -1,6 +1,6 @@
 """Output of the commands: files, with default names and checks before the run, and progress bars.
 
-A run may take hours, so every possible check is made before it. No file is replaced without ``--force``.
+A run may take hours, so files are checked before it. No file is replaced without ``--force``.
 """
 
 from __future__ import annotations
@@ -20,71 +20,57 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
-from batchpid.io.files import try_writing, write_atomically
+from batchpid.io.files import write_atomically
 
 if TYPE_CHECKING:
     from tqdm import tqdm
 
 FOLDER = Path("out")
 """Folder of default outputs, which is made when a file is written; other folders have to exist."""
+OUTPUTS = ("out", "picture", "json", "film", "corrected_urdf")
+"""Flags that name output files."""
 P = TypeVar("P", bound=Path | None)
 
 
 class OutputFiles:
-    """Output files of one run of a command.
+    """Output files of one run of a ``command``. With ``--force`` they replace files, but none that the command reads.
 
-    Parameters
-    ----------
-    force
-        Whether existing files are replaced.
-    inputs
-        Files that the command reads, which are never replaced. None entries are ignored.
+    Every other flag whose value is the name of a file is one that the command reads.
     """
 
-    def __init__(self, *, force: bool, inputs: Iterable[Path | None] = ()) -> None:
-        self._force = force
-        self._taken = {os.path.realpath(path): "is a file to read" for path in inputs if path is not None}
+    def __init__(self, command: Any) -> None:
+        self._force: bool = command.force
+        self._outputs = list[str]()
+        self._inputs = list[str | Path]()
+        for name, value in vars(command).items():
+            if name not in OUTPUTS:
+                values = value if isinstance(value, tuple) else (value,)
+                self._inputs += [each for each in values if isinstance(each, str | Path) and os.path.isfile(each)]
 
     def path(self, argument: str, path: P, suffixes: Collection[str]) -> P:
-        """Return ``path`` after a check that a file can be written there; None is returned as None.
+        """Return ``path`` after a check that a file may be written there; None is returned as None.
 
-        The check leaves nothing behind. Raises InvalidArgumentError if its suffix is not one of ``suffixes``, its
-        folder neither exists nor is :data:`FOLDER`, it cannot be written, the command reads it or writes it as another
-        output, or it exists and may not be replaced.
+        Raises InvalidArgumentError if its suffix is not one of ``suffixes``, its folder neither exists nor is
+        :data:`FOLDER`, the command reads it or writes it as another output, or it exists and may not be replaced.
         """
-        if path is not None:
-            file_path(argument, path, suffixes)
-            self._check(argument, path, None if self._force else "add --force to replace it, or choose another name")
-        return path
-
-    def history(self, path: Path, *, resume: bool) -> Path:
-        """Return the ``path`` of the state of a search or fit after a check; with ``resume`` the file may exist.
-
-        Without ``resume``, but with ``--force``, the state of a stopped run is removed. Raises InvalidArgumentError as
-        for :meth:`path`.
-        """
-        remedy = "add --resume to continue the stopped run, --force to begin anew, or choose another --out"
-        self._check("out", path, None if self._force or resume else remedy)
-        if not resume:
-            path.unlink(missing_ok=True)
-        return path
-
-    def _check(self, argument: str, path: Path, keep: str | None) -> None:
-        """Check that a file can be written; ``keep`` is the remedy if an existing one may not be replaced."""
-        target = os.path.realpath(path)
-        problem, remedy = self._taken.get(target), "choose another file"
-        try:
-            try_writing(path)
-        except OSError as error:
-            problem = f"cannot be written: {error.strerror}"
-        folder = path.parent
-        if problem is None and not folder.exists() and folder != FOLDER:
-            problem, remedy = f"has no folder {str(folder)!r}", f"make it: mkdir -p {shlex.quote(str(folder))}"
-        if problem is None and keep is not None and os.path.lexists(path):
-            problem, remedy = "exists already", keep
+        if path is None:
+            return path
+        file_path(argument, path, suffixes)
+        problem, remedy = None, "choose another file"
+        exists = os.path.lexists(path)
+        if os.path.exists(path) and any(os.path.samefile(path, each) for each in self._inputs):
+            problem = "is a file to read"
+        elif os.path.realpath(path) in self._outputs:
+            problem = "is another output of this run"
+        elif not path.parent.exists() and path.parent != FOLDER:
+            folder = str(path.parent)
+            problem, remedy = f"has no folder {folder!r}", f"make it: mkdir -p {shlex.quote(folder)}"
+        elif exists and not self._force:
+            problem, remedy = "exists already", "add --force to replace it, or choose another name"
         if problem is not None:
             raise InvalidArgumentError(argument, problem, value=str(path), remedy=remedy)
-        self._taken[target] = "is another output of this run"
+        self._outputs.append(os.path.realpath(path))
+        return path
 
 
 def write_figures(path: Path, figures: Any) -> None:

@@ -54,7 +54,7 @@ class PlotCommand:
         if not self.recording.is_file():  # before a picture is named after it
             read_recording(self.recording)
         shown = self.kind if self.versus is None else f"versus-{stem(self.versus)}"
-        outputs = OutputFiles(force=self.force, inputs=(self.recording, self.versus))
+        outputs = OutputFiles(self)
         if self.film is not None:
             return self._film(outputs)
         picture = outputs.path("picture", self.picture or beside(self.recording, shown), plots.FORMATS)

@@ -104,24 +104,6 @@ def trajectory_report(runner: Runner, rollout: Rollout, setpoints: Setpoints | N
     return "\n".join(lines)
 
 
-def gains_table(names: Sequence[str], metrics: Sequence[StepMetrics]) -> str:
-    """Return a table with the ``metrics`` (moves, 6) of the axes of a tool under gains of these ``names``."""
-    rows = []
-    for name, m in zip(names, metrics, strict=True):
-        settled, overshoot = m.settling_time.max(1), np.nan_to_num(m.overshoot, nan=0.0, posinf=np.inf).max(1)
-        ends = [1e3 * m.steady_state_error[:, part].max() for part in (slice(0, 3), slice(3, 6))]
-        rows.append(
-            [
-                name,
-                f"{np.median(settled):.2f} / {settled.max():.2f} s",
-                f"{np.median(overshoot):.1%} / {overshoot.max():.1%}",
-                f"{ends[0]:.2g} mm, {ends[1]:.2g} mrad",
-            ]
-        )
-    headers = ["gains", "settling, median / worst", "overshoot", "worst final error"]
-    return table(rows, headers, "lrrr")
-
-
 def speed_line(num_envs: int, simulated: float, timestep: float, wall: float) -> str:
     """Return the speed of a run: ``simulated`` seconds of ``num_envs`` robots in ``wall`` seconds."""
     factor = simulated / wall

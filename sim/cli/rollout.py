@@ -20,7 +20,6 @@ from batchpid.sim.recording.recording_files import HDF5
 from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tool_space.tool_setpoints import default_goal
 from batchpid.sim.tuning.gain_sets import gain_set
-from batchpid.task_space import load_osc_options
 
 if TYPE_CHECKING:
     from batchpid.sim.setpoint_files import Setpoints
@@ -90,28 +89,28 @@ class RolloutCommand:
             follow,
             hold_pose,
             hold_setpoint,
-            read_variation,
             run_figures,
             start_poses,
         )
+        from batchpid.sim.tuning.randomization_presets import load_randomization
 
-        outputs = OutputFiles(force=self.force)
+        outputs = OutputFiles(self)
         if self.resume and self.out is None:
             raise InvalidArgumentError("resume", "has no file to continue", remedy="add --out NAME.h5")
         if self.resume and self.out is not None:
-            out: Path | None = outputs.history(file_path("out", self.out, HDF5), resume=True)
+            out: Path | None = file_path("out", self.out, HDF5)
         else:
             out = outputs.path("out", self.out, (".npz", *HDF5))
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes))
-        robot, randomization = read_variation(robot, self.randomize)
+        randomization = None if self.randomize is None else load_randomization(self.randomize, robot)
         target = robot.start if robot.settings is None else robot.settings.target
         setpoints = None if self.trajectory is None else self._read(robot, self.trajectory)
         params: Any = None
         if osc := self.control == "osc":
-            options = {} if self.gains is None else load_osc_options(self._osc_file(self.gains))
-            control: Any = OperationalSpace(robot, self.tool or default_tool(robot), posture=target, **options)
+            flags.refuse(self, ("gains",), "are for the control of joints")
+            control: Any = OperationalSpace(robot, self.tool or default_tool(robot), posture=target)
             start = start_poses(robot, self.num_envs, self.spread, self.seed, target)
             if self.setpoint is None:
                 near = start_poses(robot, 8, self.spread, self.seed + 1, target)
@@ -180,14 +179,6 @@ class RolloutCommand:
             problem, remedy = f"differs from the ticks of {path}", f"leave it out, or use {setpoints.substeps}"
             raise InvalidArgumentError("substeps", problem, value=self.substeps, remedy=remedy)
         return setpoints
-
-    def _osc_file(self, name: str) -> Path:
-        """Return the path of the gains for ``--control osc``."""
-        if not (path := Path(name)).is_file():
-            problem = "is not a file, and --control osc has no gains by name"
-            remedy = "give a file of batchpid tune --control osc, or leave it out"
-            raise InvalidArgumentError("gains", problem, value=name, remedy=remedy)
-        return path
 
 
 def _check_accelerations(path: Path | None, are_taken: bool) -> None:

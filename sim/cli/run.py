@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -33,7 +32,7 @@ from batchpid.sim.tuning.evaluation import (
 )
 from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
-from batchpid.sim.tuning.randomization_presets import at_the_joints, load_randomization, reseeded, usual_variation
+from batchpid.sim.tuning.randomization_presets import at_the_joints, reseeded
 from batchpid.sim.tuning.sweep import sweep
 from batchpid.task_space.frames import pose_error
 
@@ -164,23 +163,6 @@ def evaluate_sets(
         return evaluate_gains(robot, each.params, unseen, **known)
 
     return [evaluate(*each) for each in bar("comparing", unit="set")(list(product(sets, titles)))]
-
-
-def read_variation(
-    robot: Robot, randomize: str | None, variation: tuple[float, float] | None = None
-) -> tuple[Robot, Randomization | None]:
-    """Return the robot and the randomization that flags of these names ask for; ``variation``: payload and friction.
-
-    Raises InvalidArgumentError if the file does not fit, or there is ``--variation`` with ``--randomize`` or
-    ``--actuators``.
-    """
-    if variation is None:
-        return robot, None if randomize is None else load_randomization(randomize, robot)
-    if randomize is not None or robot.actuators is not None:
-        remedy = "leave it out, and write what it stands for into these files"
-        raise InvalidArgumentError("variation", "excludes --randomize and --actuators", remedy=remedy)
-    randomization, actuators = usual_variation(robot, *variation)
-    return replace(robot, actuators=actuators), randomization
 
 
 def read_run(path: Path, robot: str | None, meshes: MeshOptions, usage: str) -> tuple[Rollout, Robot]:

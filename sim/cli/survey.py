@@ -62,7 +62,7 @@ class SurveyCommand:
         from batchpid.sim.options import worker_count
         from batchpid.sim.tuning.robot_survey import find_robots, survey
 
-        outputs = OutputFiles(force=self.force)
+        outputs = OutputFiles(self)
         json_path = outputs.path("json", self.json, (".json",))
         out = outputs.path("out", self.out, (".md",))
         urdfs = find_robots(self.paths)

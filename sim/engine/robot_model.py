@@ -176,6 +176,25 @@ def scene_model(spec: SceneSpec) -> RobotModel:
     return RobotModel(spec)
 
 
+def base_start(robot: RobotDescription, qpos: Float64, ground: bool) -> Float64:
+    """Return the pose (7,) from which a floating base starts with its joints at ``qpos`` (dof,).
+
+    It is the file's, with the lowest point of the robot as high as at the start pose of the joints. If the file does
+    not place the base, it is upright at the origin. On a ``ground`` at height 0 the lowest point is then on the ground,
+    and otherwise not below.
+    """
+    pose, model = np.array(robot.base_start or (0, 0, 0, 1, 0, 0, 0), np.float64), robot_model(robot)
+    height = model.height(np.nan_to_num(qpos), base_too=True)
+    if not np.isfinite(height):
+        return pose
+    if robot.base_start is not None:
+        lowest = pose[2] + model.height(robot.start, base_too=True)
+        pose[2] = (max(lowest, 0.0) if ground else lowest) - height
+    elif ground:
+        pose[2] = -height
+    return pose
+
+
 def robot_model(robot: RobotDescription, ground: bool | None = None) -> RobotModel:
     """Return the model of ``robot`` on a fixed base; ``ground`` at height 0, by default ``robot.has_ground``."""
     has_ground = robot.has_ground if ground is None else ground

@@ -109,7 +109,7 @@ class ToolVectorEnv(RobotVectorEnv, ABC):
         robot, posture = self.robot, self._posture
         if posture is None:
             if robot.name != "panda":
-                remedy = "give joint positions in which the tool is where it works, such as robot.settings.target"
+                remedy = "give joint positions in which the tool is where it works, such as robot.target"
                 raise InvalidArgumentError("posture", f"is needed for the robot {robot.name!r}", remedy=remedy)
             posture = self.panda_posture
         self.posture = robot.coupled(array("posture", posture, (1, robot.dof), robot.joint_names)[0])

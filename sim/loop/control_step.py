@@ -146,16 +146,15 @@ def _inertia(layout: Layout, constants: Constants, values: Values) -> Values:
 
 
 def _mass_matrix(layout: Layout, constants: Constants, values: Values) -> Values:
-    """The mass matrix of the law, or its diagonal, which is kept for ``law.matrix_steps``."""
+    """The mass matrix of the law, which is kept for ``law.matrix_steps``."""
     (qpos, qvel, _), step, law = values.seen, values.step, layout.law
-    if law is None or not law.needs_matrix:
+    if law is None or not law.uses_mass_matrix:
         return values
 
     def fresh() -> Any:
         xp = namespace(qpos)
         steps = xp.minimum(law.matrix_steps, step.end - step.index).astype(qpos.dtype)
-        found = mass_matrix(layout, constants, half_way(qpos, qvel, steps, constants.timestep))
-        return found if law.whole else xp.einsum("ejj->ej", found).copy()
+        return mass_matrix(layout, constants, half_way(qpos, qvel, steps, constants.timestep))
 
     matrix = layout.model.when(step.index % law.matrix_steps == 0, fresh, values.state.matrix)
     return values._replace(state=values.state._replace(matrix=matrix))

@@ -130,7 +130,7 @@ class EnvGroup:
         state, before, constants = self._take_state(), self._acting_params, self._constants
         self._params, self._acting_params = params, acting_params(self._options, params, self.draws)
         self._prepare()
-        if not PIDLaw.of(before).whole:
+        if not PIDLaw.of(before).uses_mass_matrix:
             constants = self._constants
         qpos = self.pack.read_qpos()
         self._state = with_params(self._layout, constants, state, before, self._acting_params, qpos)

@@ -81,8 +81,8 @@ class NativeTicks:
         shape, law = (pack.size, pack.dof), layout.law
         self._shape = shape
         matrix = None
-        if law is not None and law.needs_matrix:
-            matrix = np.zeros((*shape, pack.dof) if law.whole else shape)
+        if law is not None and law.uses_mass_matrix:
+            matrix = np.zeros((*shape, pack.dof))
         self.state = mapped(partial(np.array, order="C"), state._replace(matrix=matrix))
         self._reading = Measured(*np.zeros((3, *shape)))
         self.measured = self._reading if compensated[0] else self._reading._replace(passive=None)
@@ -97,7 +97,6 @@ class NativeTicks:
             timestep=constants.timestep,
             dof=pack.dof,
             late=layout.late,
-            whole=law is not None and law.whole,
             matrix_steps=1 if law is None else law.matrix_steps,
             **dict(zip(("gravity", "coriolis"), compensated, strict=True)),
         )

@@ -6,10 +6,9 @@ from typing import Any, NamedTuple
 
 import batchpid as bp
 from batchpid.arrays.array_types import Array
-from batchpid.arrays.choices import PerInertia, PerMassMatrix
 from batchpid.arrays.elementwise import clip, namespace
 from batchpid.law.coefficients import Coefficients
-from batchpid.law.computed_torque import advance_with_mass_matrix, given_acceleration, per_inertia
+from batchpid.law.computed_torque import advance_with_mass_matrix, given_acceleration
 
 MASS_MATRIX_STEPS = 4
 """Sim steps for which a mass matrix is kept within a tick.
@@ -22,10 +21,8 @@ at w dt = 3 with one kept for 2.
 class PIDLaw(NamedTuple):
     """Variants of the law that the params select."""
 
-    whole: bool
+    uses_mass_matrix: bool
     """Gains per mass matrix: u = M a."""
-    per_inertia: bool
-    """Gains per unit of each joint's inertia."""
     measures_rate: bool
     """The derivative term takes the measured velocity."""
     implicit: bool
@@ -34,18 +31,13 @@ class PIDLaw(NamedTuple):
     @classmethod
     def of(cls, params: bp.PIDParams) -> PIDLaw:
         """Return the law that ``params`` select."""
-        whole, inertia = (isinstance(params.gain_units, kind) for kind in (PerMassMatrix, PerInertia))
-        return cls(whole, inertia, params.measurement_rate is not None, params.discretization is not None)
+        choices = params.gain_units, params.measurement_rate, params.discretization
+        return cls(*(choice is not None for choice in choices))
 
     @property
     def matrix_steps(self) -> int:
         """Sim steps for which a mass matrix is kept within a tick."""
         return 1 if self.implicit else MASS_MATRIX_STEPS
-
-    @property
-    def needs_matrix(self) -> bool:
-        """Whether the law takes the mass matrix, or its diagonal."""
-        return self.whole or self.per_inertia
 
     def advance(
         self,
@@ -67,7 +59,7 @@ class PIDLaw(NamedTuple):
         command
             Setpoint, and its rate and acceleration, which may be None.
         matrix
-            M + dt B (envs, dof, dof) for gains per mass matrix; its diagonal (envs, dof) for gains per inertia.
+            M + dt B (envs, dof, dof) for gains per mass matrix.
         viscous
             B q', where the whole matrix is used: the engine integrates it implicitly, (M + dt B) (v+ - v) =
             dt (u - B v), so that u = (M + dt B) a + B v gives exactly v+ = v + dt a.
@@ -75,8 +67,6 @@ class PIDLaw(NamedTuple):
             Least and largest effort of the motors (envs, dof); None for no limit. Saturation and anti-windup use them
             after clipping to the limits of the params.
         """
-        if self.per_inertia:
-            k = per_inertia(k, matrix)
         if low is not None:
             xp = namespace(low, high)
             low, high = (clip(end, k.effort_min, k.effort_max, xp) for end in (low, high))
@@ -85,7 +75,7 @@ class PIDLaw(NamedTuple):
             feedforward = viscous if feedforward is None else feedforward + viscous
         setpoint, setpoint_rate, acceleration = command
         rates = qvel if self.measures_rate else None, setpoint_rate
-        if self.whole:
+        if self.uses_mass_matrix:
             inputs = setpoint, qpos, matrix, *rates, acceleration, feedforward
             new, terms = advance_with_mass_matrix(k, state, *inputs)
         else:

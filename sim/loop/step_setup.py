@@ -70,7 +70,7 @@ def make_constants(
         return constants._replace(
             k=bp.discretise(acting, scene.timestep),
             armature=None if known is None else known.armature,
-            damping=damping if law.whole and damping.any() else None,
+            damping=damping if law.uses_mass_matrix and damping.any() else None,
         )
     if options.control == "drive":
         kd = np.zeros_like(acting.kp) if acting.kd is None else acting.kd
@@ -106,7 +106,7 @@ def _turns(pack: EnginePack) -> Array:
 def needs_qvel(layout: Layout, constants: Constants, speed_limit: Array) -> bool:
     """Return whether the joint velocities are needed at each sim step."""
     law = layout.law
-    takes = law is not None and (law.measures_rate or law.needs_matrix)
+    takes = law is not None and (law.measures_rate or law.uses_mass_matrix)
     rubs = any(leaf is not None for leaf in constants.friction)
     return takes or rubs or constants.motors is not None or layout.control == "custom" or speed_limit is not None
 
@@ -142,7 +142,7 @@ def with_params(
     if layout.control == "custom":
         return state
     law = state.law
-    if layout.control == "pid" and PIDLaw.of(old).whole != PIDLaw.of(new).whole:
+    if layout.control == "pid" and old.gain_units != new.gain_units:
         law = convert_integral(law, old, new, mass_matrix(layout, constants, qpos))
     return state._replace(law=law.matched_to(bp.init(new, qpos)), matrix=None)
 

@@ -29,7 +29,7 @@ class StepState(NamedTuple):
     """Motors and sensors; None for ideal ones."""
     guard: GuardState | None = None
     matrix: Array = None
-    """Mass matrix of the law (M, dof, dof), or its diagonal (M, dof). Each tick begins with a new one."""
+    """Mass matrix of the law (M, dof, dof). Each tick begins with a new one."""
 
 
 class Measured(NamedTuple):

@@ -64,7 +64,7 @@ class XLAExecutor:
         self._bound: Any = None
         self._no_matrix: Any = None
         law = layout.law
-        needs_bodies = (law is not None and law.needs_matrix) or constants.friction.coulomb is not None
+        needs_bodies = (law is not None and law.uses_mass_matrix) or constants.friction.coulomb is not None
         tables = scene_tree(pack.spec).tables if needs_bodies else None
 
         def spread(part: Any) -> Array:
@@ -129,10 +129,9 @@ class XLAExecutor:
         if any(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(state)):
             age = None if state.age is None else state.age.astype(np.int32)
             state = put(jax.tree.map(padded, state._replace(age=age)))
-        if state.matrix is None and law is not None and law.needs_matrix:
+        if state.matrix is None and law is not None and law.uses_mass_matrix:
             if self._no_matrix is None:
-                shape = (pack.size, pack.dof, pack.dof) if law.whole else (pack.size, pack.dof)
-                self._no_matrix = put(padded(np.zeros(shape)))
+                self._no_matrix = put(padded(np.zeros((pack.size, pack.dof, pack.dof))))
             state = state._replace(matrix=self._no_matrix)
         return state
 

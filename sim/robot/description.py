@@ -103,7 +103,7 @@ class RobotDescription(Urdf):
     link, by name, in its simulated link: links joined by fixed joints are simulated as one, unless ``merge_fixed`` is
     False. ``settings`` come from a bundled robot, ``defaults`` and ``mjcf`` from an MJCF file, else None.
     ``package_dirs`` are the folders in which meshes are looked up first. ``actuators`` are its motors and sensors, None
-    for ideal ones.
+    for ideal ones. ``base_start`` is the pose (7,) at which the file places a floating base, None if it does not.
     """
 
     path: Path
@@ -119,6 +119,7 @@ class RobotDescription(Urdf):
     actuators: bp.Actuators | None = None
     defaults: FileDefaults | None = None
     mjcf: MjcfFile | None = None
+    base_start: tuple[float, ...] | None = None
 
     def __repr__(self) -> str:
         given = sum(link.mass or 0.0 for link in self.links)
@@ -238,6 +239,19 @@ class RobotDescription(Urdf):
             return self.settings.start.copy()
         return self.coupled(np.clip(0.0 if self.defaults is None else self.defaults.start, self.lower, self.upper))
 
+    @property
+    def target(self) -> Float64:
+        """Pose (dof,) [rad or m] for a first move, within the limits.
+
+        It is that of the bundled settings, else a quarter of the way from the start to the farther limit of each joint,
+        at most 0.5 rad or m.
+        """
+        if self.settings is not None:
+            return self.settings.target.copy()
+        above, below = self.upper - self.start, self.lower - self.start
+        way = np.where(above >= -below, above, below)
+        return self.coupled(self.start + np.clip(0.25 * way, -0.5, 0.5))
+
     def params(self, **options: Any) -> bp.PIDParams:
         """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's values filled in.
 
@@ -341,6 +355,7 @@ class RobotDescription(Urdf):
             "settings": digest(self.settings) if self.defaults is None else digest(self.defaults),
             "mjcf": None if self.mjcf is None else digest(replace(self.mjcf, path="")),
             **{name: getattr(self, name) for name in ("self_collision", "dissipation", "fixed_base", "merge_fixed")},
+            "base_start": self.base_start,
         }
 
     @cached_property

@@ -10,6 +10,7 @@ from pathlib import Path
 from lxml import etree
 
 from batchpid.arrays.display import html_table
+from batchpid.checks.warn import warn
 from batchpid.errors import RobotError
 
 MOST_LISTED = 50  # repairs in an error
@@ -100,11 +101,19 @@ def finding_of(element: etree._Element, severity: str, code: str, text: str, rem
     return Finding(severity, code, text, remedy, joint, link, detail)
 
 
-def refuse(path: Path, repairs: Sequence[Finding]) -> None:
-    """Raise a RobotError that lists the ``repairs`` of the URDF at ``path``, if there are any."""
-    if repairs:
-        sentences = [sentence.partition(": ")[2] for sentence in summary(repairs)]
-        listed = "".join(f"\n  {sentence}" for sentence in sentences[:MOST_LISTED])
-        listed += "\n  ..." if len(sentences) > MOST_LISTED else ""
-        count = "1 repair" if len(repairs) == 1 else f"{len(repairs)} repairs"
-        raise RobotError(f"{path}: needs {count}, which strict=True refuses:{listed}")
+class RepairWarning(UserWarning):
+    """A robot's file was read with repairs."""
+
+
+def report(path: Path, repairs: Sequence[Finding], strict: bool) -> None:
+    """Warn of the ``repairs`` of the file at ``path``; if ``strict``, raise a RobotError that lists them."""
+    if not repairs:
+        return
+    count = "1 repair" if len(repairs) == 1 else f"{len(repairs)} repairs"
+    if not strict:
+        warn(f"{path}: {count}; robot.check() and batchpid inspect list them", RepairWarning)
+        return
+    sentences = [sentence.partition(": ")[2] for sentence in summary(repairs)]
+    listed = "".join(f"\n  {sentence}" for sentence in sentences[:MOST_LISTED])
+    listed += "\n  ..." if len(sentences) > MOST_LISTED else ""
+    raise RobotError(f"{path}: needs {count}, which strict=True refuses:{listed}")

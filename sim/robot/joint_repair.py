@@ -9,7 +9,8 @@ from lxml import etree
 
 from batchpid.sim.robot.findings import Finding, finding_of
 from batchpid.sim.robot.parts import MOVING_TYPES
-from batchpid.sim.robot.xml import readable
+from batchpid.sim.robot.xml import numbers, readable
+from batchpid.task_space.rotations import from_rpy
 
 FREE_TYPES = ("floating", "planar")
 """Types of a joint at the root that make a floating base."""
@@ -51,11 +52,21 @@ def free_joint_of(root: etree._Element) -> etree._Element | None:
     return None if link.find("inertial") is not None or link.find("collision") is not None else at_root[0]
 
 
-def free_base(root: etree._Element, joint: etree._Element) -> None:
-    """Remove the joint of :func:`free_joint_of`, and the link at the root, from the robot."""
-    parent = ends_of(joint)[0]
+def free_base(root: etree._Element, joint: etree._Element, findings: list[Finding]) -> tuple[float, ...] | None:
+    """Remove the joint of :func:`free_joint_of`, and the link at the root, from the robot.
+
+    Return the pose (7,) at which the joint places the base, None without one.
+    """
+    if joint.get("type") == "planar":
+        text, remedy = "the base is free to move in all six directions", "expect it to leave its plane"
+        findings.append(finding_of(joint, "note", "joint-type", text, remedy))
+    parent, origin = ends_of(joint)[0], joint.find("origin")
     for element in (joint, *(link for link in root.findall("link") if link.get("name") == parent)):
         root.remove(element)
+    if origin is None:
+        return None
+    name = f"joint {joint.get('name')!r}"
+    return *numbers(origin, "xyz", "0 0 0", name), *from_rpy(numbers(origin, "rpy", "0 0 0", name)).tolist()
 
 
 def _type(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:

@@ -21,7 +21,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Array, Document, Float64
-from batchpid.arrays.choices import PerInertia, PerMassMatrix
+from batchpid.arrays.choices import PerMassMatrix
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.gains.stability import Oscillation, oscillation
@@ -117,8 +117,6 @@ def gains_at(
         return Gains(np.eye(joints)[None], np.zeros((1, joints)), kp, ki, kd, tau, late, lag, None)
     matrix, damping = _matrix(robot, qpos, armature), robot.damping + column(motors.viscous)
     damping = np.stack([robot.coupling.reduced_damping(row) for row in damping])
-    if isinstance(params.gain_units, PerInertia):
-        strength = strength * np.diagonal(_matrix(robot, qpos, known_joints(robot).armature[None])[0])
     if not of_mass:
         return Gains(matrix, damping, strength * kp, strength * ki, strength * kd, tau, late, lag, None)
     # The law knows the damping, too, as part of its matrix.

@@ -201,7 +201,7 @@ def _stability(
     effect = diverges if unstable else "it may diverge in other poses"
     text = f"the sampled PID loop is at {report.robot_ratio:.3g} times its stability bound at the start pose: {effect}"
     other = "" if report.late else implicit_remedy(params)
-    remedy = f"{report.remedy}, a derivative_filter_time, {other}or gain_units='inertia'"
+    remedy = f"{report.remedy}, a derivative_filter_time, {other}or gain_units='mass_matrix'"
     yield Finding(severity, code, text, remedy)
     for index in np.flatnonzero(robot.independent & (report.joint_ratio >= NEAR_BOUND)):
         joint, ratio = robot.joints[index], report.joint_ratio[index]

@@ -40,10 +40,13 @@ _DECIMAL_COMMA = re.compile(r"[+-]?(\d+,?\d*|,\d+)([eE][+-]?\d+)?")
 def repair(root: etree._Element, path: Path) -> list[Finding]:
     """Repair the ``<robot>`` read from ``path`` in place and return the findings.
 
-    Raises RobotError if the file is a xacro that was not expanded.
+    Raises RobotError if the file is a xacro that was not expanded, or has no joint.
     """
     found = [*_elements(root), *_attributes(root)]
     _refuse_xacro(root, path)
+    if root.find("joint") is None:
+        remedy = "a xacro has to be expanded first: xacro FILE.xacro > FILE.urdf"
+        raise RobotError(f"{path}: a robot without joints cannot be controlled; {remedy}")
     if root.get("name") is None:
         root.set("name", path.stem)
         text = f"<robot> has no name: called {path.stem!r}, after the file"

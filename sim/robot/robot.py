@@ -86,7 +86,8 @@ class Robot(RobotDescription):
             file of :func:`batchpid.save_actuators`, in which joints are matched by name. None: ideal ones, with the
             armature, torque-speed lines and lags of an MJCF file.
         strict
-            True to refuse a file that needs repairs, which are otherwise made and listed by :meth:`check`.
+            True to refuse a file that needs repairs, which are otherwise made, with a warning, and listed by
+            :meth:`check`.
 
         Raises
         ------
@@ -114,8 +115,9 @@ class Robot(RobotDescription):
         root, repairs, mjcf = read_source(path, fixed_base is not False, missing_meshes)
         free_joint = free_joint_of(root)
         fixed_base = free_joint is None if fixed_base is None else fixed_base
+        base = None if mjcf is None else mjcf.base
         if free_joint is not None and not fixed_base:
-            free_base(root, free_joint)
+            base = free_base(root, free_joint, repairs)
         urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
         if mjcf is not None:
             urdf = replace(urdf, missing_meshes=(*mjcf.missing_meshes, *urdf.missing_meshes))
@@ -146,6 +148,7 @@ class Robot(RobotDescription):
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,
             defaults=None if mjcf is None else _file_defaults(mjcf, joints),
             mjcf=None if mjcf is None else mjcf.file,
+            base_start=base,
         )
         if actuators is None and mjcf is not None:
             actuators = _file_actuators(mjcf, joints)
@@ -199,7 +202,7 @@ class Robot(RobotDescription):
         Parameters
         ----------
         gain_units
-            ``"mass_matrix"``, ``"inertia"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
+            ``"mass_matrix"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
             ``"mass_matrix"``; on a floating base ``"effort"``, for legs that carry the base at the start pose: the mass
             matrix is that of legs in the air, a twentieth.
 
@@ -292,10 +295,10 @@ def _find(name_or_path: str | Path) -> Path:
     path = Path(os.path.expanduser(file_path("name_or_path", name_or_path)))
     if str(name_or_path) in Robot.bundled():
         return _ASSETS / f"{name_or_path}.urdf"
-    if os.path.isfile(path):  # pathlib's methods raise other errors for names that are too long or start with ~
-        return path.absolute()
-    if os.path.isdir(path):
+    if os.path.isdir(path):  # pathlib's methods raise other errors for names that are too long or start with ~
         raise RobotNotFoundError(f"{path} is a folder; pass the path of a URDF or MJCF file in it")
+    if os.path.exists(path):  # also a pipe, such as /dev/stdin
+        return path.absolute()
     raise RobotNotFoundError(
         f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a file; "
         "check the spelling, or pass the path of a URDF or MJCF file"

@@ -26,7 +26,7 @@ from functools import cache
 
 from batchpid.arrays.array_types import Document
 from batchpid.errors import RobotError
-from batchpid.sim.robot.findings import refuse
+from batchpid.sim.robot.findings import report
 from batchpid.sim.robot.joint_repair import ends_of
 from batchpid.sim.robot.link_repair import MOMENTS, from_entries, triangle_excess
 from batchpid.sim.robot.meshes import check_unchanged, find_mesh, mesh_problem
@@ -58,6 +58,8 @@ def read_source(path: Path, fixed_base: bool, missing_meshes: str) -> tuple[etre
     root = parse_xml(path, findings)
     if not is_mjcf(root):
         return root, findings, None
+    if not path.is_file():
+        raise RobotError(f"{path}: an MJCF file is read several times, also by workers; save it as a file first")
     try:
         import mujoco  # noqa: F401
     except ImportError as error:
@@ -99,8 +101,7 @@ def read_urdf(
     for element, joint in zip(root.findall("joint"), joints, strict=True):
         if joint.mimic is not None:
             element.remove(element.find("mimic"))  # batchpid.sim.engine.coupled_joints simulates it
-    if strict:
-        refuse(path, repairs)
+    report(path, repairs, strict)
     text = etree.tostring(root, encoding="unicode")
     return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(missing), tuple(repairs))
 

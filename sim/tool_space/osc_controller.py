@@ -26,7 +26,7 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.task_space import native_law, native_rows
 from batchpid.task_space.frames import pose_error
 from batchpid.task_space.native_law import BoundOSC
-from batchpid.task_space.osc_params import AXES, NoDecoupling
+from batchpid.task_space.osc_params import AXES
 from batchpid.task_space.symmetric import gram, solve
 
 OPTIONAL = {
@@ -71,7 +71,7 @@ class OperationalSpace:
     tree
         Kinematic tree; default ``robot.kinematic_tree()``.
     params
-        Params of one row, such as those of :mod:`batchpid.task_space.osc_presets`, in place of ``options``.
+        Params of one row, in place of ``options``.
     options
         Options of :func:`batchpid.task_space.make_osc_params`, one row for all envs; ``effort_limit`` is by default
         the robot's.
@@ -256,7 +256,7 @@ class OperationalSpace:
     def check_stability(self) -> None:
         """Warn if explicit gains are unstable at the time step: kp dt^2 + 2 kd dt > 4."""
         p, dt = self._params, self._timestep
-        if p.discretization is not None or isinstance(p.decoupling, NoDecoupling):
+        if p.discretization is not None:
             return
         for name, kp, kd, columns in (
             ("stiffness", p.stiffness, p.damping, AXES),

@@ -15,7 +15,7 @@ from batchpid.sim.command import POSE_UNITS, CommandSpec
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.tool_space.osc_controller import OPTIONAL, OperationalSpace, tool_pose
 from batchpid.task_space.frames import pose_error
-from batchpid.task_space.osc_params import TASK_CHOICES, NoDecoupling
+from batchpid.task_space.osc_params import TASK_CHOICES
 
 DAMPING = 1e-4
 """Damping of the inverse Jacobian of a tool's twist."""
@@ -152,9 +152,8 @@ def reaches(robot: Robot, control: OperationalSpace, start: Float64, goal: Float
     The joints have to stay within their limits, which the law does not know, on the whole way. The model has no
     contact and no friction.
     """
-    tree, params = control.tree, control.params
-    if not isinstance(params.decoupling, NoDecoupling):
-        params = params._replace(discretization=TASK_CHOICES["discretization"]["implicit"])
+    tree = control.tree
+    params = control.params._replace(discretization=TASK_CHOICES["discretization"]["implicit"])
     k, state = ts.discretise(params, TIMESTEP), control.init(robot, len(start))
     tool = ts.Tool(tree, control.link, control.point)
     goal = np.broadcast_to(goal, (len(start), 7)).astype(np.float64)

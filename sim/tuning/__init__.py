@@ -17,19 +17,18 @@ if TYPE_CHECKING:
         following_error,
         run_moves,
         step_response_metrics,
+        within,
     )
     from batchpid.sim.tuning.gain_sets import GainSet, gain_set
     from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
-    from batchpid.sim.tuning.randomization_presets import load_randomization, payload_capacity, usual_variation
+    from batchpid.sim.tuning.randomization_presets import load_randomization, payload_capacity
     from batchpid.sim.tuning.robot_survey import find_robots, survey
     from batchpid.sim.tuning.search import Tuning, tune
-    from batchpid.sim.tuning.tool_search import ToolTuning, tune_tool
 
 __all__ = [
     "Evaluation",
     "GainSet",
     "Moves",
-    "ToolTuning",
     "Tuning",
     "Weights",
     "arm_joints",
@@ -45,9 +44,8 @@ __all__ = [
     "step_response_metrics",
     "survey",
     "tune",
-    "tune_tool",
     "tutorial_move",
-    "usual_variation",
+    "within",
 ]
 
 _MODULES = {
@@ -59,13 +57,13 @@ _MODULES = {
         "following_error",
         "run_moves",
         "step_response_metrics",
+        "within",
     ),
     "gain_sets": ("GainSet", "gain_set"),
     "moves": ("Moves", "random_moves", "search_moves", "tutorial_move"),
-    "randomization_presets": ("load_randomization", "payload_capacity", "usual_variation"),
+    "randomization_presets": ("load_randomization", "payload_capacity"),
     "robot_survey": ("find_robots", "survey"),
     "search": ("Tuning", "tune"),
-    "tool_search": ("ToolTuning", "tune_tool"),
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -1,6 +1,17 @@
-r"""Candidates of a search for gains of joints: from points in log space to params, and to costs by simulation.
+r"""Candidates of a search for gains: from points in log space to params, and to costs by simulation.
 
-:mod:`batchpid.sim.tuning.cost` has the terms of the cost, of which the mean over joints is taken. Steps alone do not
+The cost of a move is the mean over its joints of the following sum. The cost of a candidate is the mean over its moves,
+plus the cost of its worst move::
+
+    w_itae log(1 + ITAE / (A 1 s^2)) + w_settling Ts / 1 s + w_overshoot log(1 + O / 5 %) + w_final log(1 + E / b)
+        + w_chatter log(1 + max(TV / TV_smooth - 1, 0)) + w_saturation S
+
+plus the mean over moves of w_late log(1 + max(Ts / Tmax - 1, 0) / 5 %) for the joint that settles last.
+
+Ts is limited to 1.5 times the run; Tmax is the settling time asked for. A is the move, or the smallest move that
+counts; O the overshoot as a fraction of A; E the final error, and b the least half width of the settling band; TV the
+total variation of the effort, and TV_smooth its variation in the smooth motion that takes a second; S the share of time
+in saturation. The logarithms prevent a single move or joint from deciding. Steps alone do not
 show how closely a moving setpoint is followed, and the gains that decide it, above all ki, are not those that decide
 the approach of a step, where the setpoint weight acts too. So some moves are also made as smooth motions of the
 setpoint, with its rate: the half whose motions are the shortest, because these have the largest accelerations. Their
@@ -45,18 +56,7 @@ from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.unsettled import absolute_band
 from batchpid.sim.runner import Runner
-from batchpid.sim.tuning.cost import (
-    HEADROOM,
-    PENALTY_RATIO,
-    Trial,
-    Weights,
-    bounded,
-    chatter,
-    late,
-    over_moves,
-    response_cost,
-    with_divergence,
-)
+from batchpid.sim.tuning.cost import Weights
 from batchpid.sim.tuning.evaluation import SETTLE_SECONDS, arm_joints, following_error, run_moves, settling_limits
 from batchpid.sim.tuning.moves import Moves, smooth_durations, smooth_variation
 
@@ -72,6 +72,10 @@ FACTORS = {
 
 A bandwidth factor c scales all poles: kp c^2, ki c^3, kd c. Stiffness multiplies kp alone, damping kd alone.
 """
+DIVERGED_COST = 1e3
+"""Cost of a candidate that diverges; up to twice as much if it diverges early."""
+PENALTY_RATIO = 0.8
+"""Stability ratio (:func:`batchpid.stability_bound`) beyond which a candidate is penalised."""
 PHASE_MARGIN = np.pi / 4
 """Least phase margin of the first candidates [rad]."""
 SPEEDS, SHARES = (7.0, 5.5), (0.65, 1.0, 0.4)
@@ -84,12 +88,9 @@ _DRAWS = 100
 class Candidates:
     """Candidates of a search on ``moves``, as points in log space. The point 0 has the designed gains.
 
-    Each move has the robot's actuators, or its row of ``motors``; the rows are counted from the first, or with ``step``
-    -1 from the last. ``varied`` says that the robots of the moves are drawn: the cost is twice the mean over moves,
-    without the worst.
+    Each env runs one move of one candidate: all moves as steps, then the half whose smooth motions are the shortest.
+    Row k of ``motors`` is for move k, modulo their number.
     """
-
-    start = "designed"
 
     def __init__(
         self,
@@ -100,48 +101,38 @@ class Candidates:
         seconds: float,
         weights: Weights,
         *,
-        headroom: float = HEADROOM,
-        varied: bool = False,
+        headroom: float,
+        varied: bool,
         motors: bp.Actuators | None = None,
-        step: int = 1,
     ) -> None:
-        self.robot, self.moves, self.seconds, self.weights, self.headroom = robot, moves, seconds, weights, headroom
-        self._varied, self._motors, self._step = varied, motors, step
+        self.robot, self.seconds, self.weights, self.headroom = robot, seconds, weights, headroom
+        self._varied = varied
         self.designed = robot.designed(gain_units)
         joints = int(robot.independent.sum())
         self.dimension = len(FACTORS) + (joints if per_joint else 0)
         self._band = absolute_band(robot)
         self._smooth = smooth_variation(robot, moves, 1.0)
         self._limit = settling_limits(robot, moves)
-        # Envs of a candidate: each move as a step, then the followed ones. The same move has the same drawn robot.
-        durations = smooth_durations(robot, moves)
-        followed = max(1, len(durations) // 2) if weights.following else 0
-        shortest = np.argsort(durations, kind="stable")[:followed]
-        steps = np.arange(len(durations))
-        self._moves = np.concatenate([steps, shortest])
-        self._durations = np.concatenate([np.zeros(len(steps)), durations[shortest]]) if followed else None
         self._size = np.maximum(np.abs(moves.target - moves.start), self._band / 0.02)
-        # The plant that the gains see: mass matrices, the gains' unit per joint, and viscous damping.
-        if gain_units == "mass_matrix":
-            self._mass, self._damping = np.eye(joints)[None], np.zeros(joints)
-        else:
-            self._mass, self._damping = robot.mass_matrix(robot.sample(50, seed=0)), robot.damping
-            coupling = robot.coupling
-            self._mass, self._damping = coupling.reduced(self._mass), coupling.reduced_damping(self._damping)
-        inertia = gain_units == "inertia"
-        self._unit = np.diagonal(self._mass, axis1=1, axis2=2) if inertia else np.ones(joints)
+        durations = smooth_durations(robot, moves)
+        shortest = np.argsort(durations, kind="stable")[: max(1, len(durations) // 2) if weights.following else 0]
+        self._steps = len(durations)
+        self._rows = np.concatenate([np.arange(self._steps), shortest])  # a move has the same drawn robot both times
+        self._moves = moves.take(self._rows)
+        self._durations = np.concatenate([np.zeros(self._steps), durations[shortest]]) if len(shortest) else None
+        self._motors = None if motors is None else motors.for_envs(self._rows % motors.num_envs)
+        # The plant that the gains see: mass matrices and viscous damping.
+        self._mass, self._damping = np.eye(joints)[None], np.zeros(joints)
+        if gain_units != "mass_matrix":
+            mass = robot.mass_matrix(robot.sample(50, seed=0))
+            self._mass, self._damping = robot.coupling.reduced(mass), robot.coupling.reduced_damping(robot.damping)
 
-    @property
-    def envs(self) -> int:
-        """Number of envs of a candidate."""
-        return len(self._moves)
-
-    def options(self, count: int) -> Document:
-        """Return the options of a runner for ``count`` candidates: the actuators of each move."""
-        if self._motors is None:
-            return {}
-        rows = (self._step * (1 + self._moves)) % self._motors.num_envs
-        return {"actuators": self._motors.for_envs(np.tile(rows, count))}
+    def runner(self, count: int, options: Document) -> Runner:
+        """Return a runner for ``count`` candidates."""
+        envs = count * len(self._rows)
+        if self._motors is not None:
+            options = options | {"actuators": self._motors.for_envs(np.arange(envs) % len(self._rows))}
+        return Runner(self.robot, envs, **options)
 
     def points(self, gains: Sequence[Float64]) -> Float64:
         """Return the points (n, dimension) of ``gains``: (ki, kp, kd) each, per unit of inertia.
@@ -149,8 +140,8 @@ class Candidates:
         The designed gains per mass matrix are such gains; in other units the same factors are taken.
         """
         designed = self.robot.designed()
-        known = [np.median(leaf[..., self.robot.independent]) for leaf in (designed.ki, designed.kp, designed.kd)]
-        ki, kp, kd = (np.array(gains) / known).T
+        medians = [np.median(leaf[..., self.robot.independent]) for leaf in (designed.ki, designed.kp, designed.kd)]
+        ki, kp, kd = (np.array(gains) / medians).T
         bandwidth = np.cbrt(ki)
         points = np.zeros((len(gains), self.dimension))
         points[:, :3] = np.log(np.stack([bandwidth, kp / bandwidth**2, kd / bandwidth], 1))
@@ -172,43 +163,52 @@ class Candidates:
             derivative_filter_time=d.derivative_filter_time * filter_time,
         )
 
-    def trial(self, runner: Runner, points: Float64) -> Trial:
-        """Run each of ``points`` on ``runner``, which has :attr:`envs` for each."""
-        count, moves, params = len(points), self.moves, self.params(points)
+    def costs(self, runner: Runner, points: Float64) -> Float64:
+        """Run each of ``points`` (n, dimension) on its :meth:`runner`, and return the costs (n,)."""
+        count, w, params = len(points), self.weights, self.params(points)
         limits = {name: getattr(params, name) for name in ("effort_min", "effort_max")}
         limited = params.replace(**{name: self.headroom * limit for name, limit in limits.items() if limit is not None})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", StabilityWarning)  # a candidate beyond the bound gets a penalty
-            runner.params = limited.for_envs(np.repeat(np.arange(count), self.envs))
-        each = np.tile(self._moves, count)
-        durations = None if self._durations is None else np.tile(self._durations, count)
-        rollout, metrics = run_moves(runner, moves.take(each), self.seconds, streams=each, durations=durations)
-        steps, w = slice(len(moves.start)), self.weights
-        metrics = StepMetrics(*(figure.reshape(count, self.envs, -1)[:, steps] for figure in metrics))
+            runner.params = limited.for_envs(np.repeat(np.arange(count), len(self._rows)))
+        envs = np.tile(np.arange(len(self._rows)), count)
+        durations = None if self._durations is None else self._durations[envs]
+        moves, streams = self._moves.take(envs), self._rows[envs]
+        rollout, metrics = run_moves(runner, moves, self.seconds, streams=streams, durations=durations)
 
-        m = StepMetrics(*map(bounded, metrics))
+        # Simulations may diverge: figures are limited. (candidates, moves, joints)
+        figures = (np.minimum(figure, 1e6).reshape(count, len(self._rows), -1) for figure in metrics)
+        m = StepMetrics(*(figure[:, : self._steps] for figure in figures))
         settling = np.minimum(m.settling_time, 1.5 * self.seconds)
         cost = (
-            response_cost(w, m._replace(settling_time=settling), self._size, self._band)
-            + w.chatter * chatter(m.effort_variation, self._smooth)
+            w.itae * np.log1p(m.itae / self._size)
+            + w.settling * settling
+            + w.overshoot * np.log1p(m.peak_deviation / self._size / 0.05)
+            + w.final * np.log1p(m.steady_state_error / self._band)
+            + w.chatter * np.log1p(np.maximum(m.effort_variation / self._smooth - 1, 0))
             + w.saturation * m.saturation_share
         )[..., self.robot.independent].mean(2)
         last = settling[..., arm_joints(self.robot)].max(2)
-        total = over_moves(cost, not self._varied) + w.late * late(last, self._limit)
-        if self.envs > len(moves.start):
+        late = np.log1p(np.maximum(last / self._limit - 1, 0) / 0.05).mean(1)
+        total = self._over_moves(cost) + w.late * late
+        if durations is not None:
             error = (following_error(self.robot, rollout) / self._band)[:, arm_joints(self.robot)].max(1)
-            followed = bounded(error).reshape(count, self.envs)[:, len(moves.start) :]
-            total = total + w.following * over_moves(np.log1p(followed / 10), not self._varied)
-        total = with_divergence(total, rollout.ok) + self._stability_penalty(params, runner.timestep)
-        return Trial(tuple(total.tolist()), metrics, rollout)
+            followed = np.minimum(error, 1e6).reshape(count, -1)[:, self._steps :]
+            total += w.following * self._over_moves(np.log1p(followed / 10))
+        lasted = rollout.ok.mean(0).reshape(count, -1)
+        total = np.where(lasted.min(1) < 1, DIVERGED_COST * (2 - lasted.mean(1)), np.minimum(total, DIVERGED_COST))
+        return total + self._stability_penalty(params, runner.timestep)
+
+    def _over_moves(self, cost: Float64) -> Float64:
+        """Return the mean of ``cost`` (count, moves) over moves plus its largest, or twice the mean: (count,)."""
+        total: Float64 = cost.mean(1) + (cost.mean(1) if self._varied else cost.max(1))
+        return total
 
     def _stability_penalty(self, params: bp.PIDParams, dt: float) -> Float64:
         """Return the penalty (count,) of candidates near the stability bound, whose moves may look stable."""
         leaves = np.stack(np.broadcast_arrays(params.kp, params.kd, params.derivative_filter_time))
         ratios = [
-            stability_bound(
-                self._mass, kp * self._unit, kd * self._unit, dt, filter_time=tau, damping=self._damping
-            ).ratio.max()
+            stability_bound(self._mass, kp, kd, dt, filter_time=tau, damping=self._damping).ratio.max()
             for kp, kd, tau in zip(*leaves[..., self.robot.independent], strict=True)
         ]
         return 10 * np.maximum(np.array(ratios) - PENALTY_RATIO, 0)

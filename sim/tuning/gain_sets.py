@@ -11,9 +11,6 @@ import numpy as np
 import batchpid as bp
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
-from batchpid.export.differences import Imported
-from batchpid.export.ros2_control_reader import from_ros2_control, is_ros2_control
-from batchpid.io import documents
 from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import ControlMode
@@ -37,8 +34,8 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
 
     "tuned" gains ship with the robot, "designed" is :meth:`batchpid.sim.Robot.designed`, "tutorial" are the gains in
     SAPIEN's tutorial, for a bundled robot, "mjcf" is :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or
-    "drive:STIFFNESS,DAMPING" is the engine's internal drive. Other names are params files, or gains of other programs:
-    YAML of ros2_control, MJCF (.xml); their differences are warnings.
+    "drive:STIFFNESS,DAMPING" is the engine's internal drive. Other names are params files, or an MJCF file (.xml),
+    whose differences are warnings.
 
     Raises
     ------
@@ -63,31 +60,23 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
         near = difflib.get_close_matches(name, NAMES, 1)
         remedy = f"did you mean {near[0]!r}?" if near else f"use a file or {', '.join(NAMES)}"
         raise InvalidArgumentError("gains", "is neither a name nor a file", value=name, remedy=remedy)
-    own = [joint for joint, independent in zip(robot.joint_names, robot.independent, strict=True) if independent]
-    if path.suffix.lower() == ".py":
-        remedy = "give a params file (.yaml, .json), YAML of ros2_control, or MJCF (.xml)"
-        raise InvalidArgumentError("gains", "is Python, which is not read", value=name, remedy=remedy)
     if path.suffix.lower() == ".xml":
-        found = _of_mjcf(path, own)
-    elif path.suffix.lower() != ".json" and is_ros2_control(documents.read(path)):
-        with documents.named(name):
-            found = from_ros2_control(path.read_text(), own, continuous=robot.continuous[robot.independent])
-    else:
-        return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])
-    for each in found.differences:
-        warn(f"{path}: {each}", UserWarning)
-    return GainSet(path.name, found.params.for_joints(robot.coupling.of_all(np.arange(len(own)))))
+        return GainSet(path.name, _of_mjcf(path, robot))
+    return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])
 
 
-def _of_mjcf(path: Path, joints: list[str]) -> Imported:
-    """Return the gains of the servos in an MJCF file of a robot with the same joints."""
+def _of_mjcf(path: Path, robot: Robot) -> bp.PIDParams:
+    """Return the gains of the servos in an MJCF file of a robot with the same joints; differences are warnings."""
+    joints = [robot.joint_names[joint] for joint in np.flatnonzero(robot.independent)]
     other = Robot.load(path)
     if missing := sorted(set(joints) - set(other.joint_names)):
         raise InvalidArgumentError("gains", f"{path.name} lacks joints", value=", ".join(missing), remedy="rename them")
     gains = other.mjcf_gains().for_joints([other.joint_names.index(joint) for joint in joints])
-    sentences = summary(each for each in other.repairs if each.code in _OF_GAINS)
-    found = [each.partition(": ")[2] for each in sentences]
+    sentences = summary(finding for finding in other.repairs if finding.code in _OF_GAINS)
+    differences = [sentence.partition(": ")[2] for sentence in sentences]
     if gains.continuous is not None:
         turning = ", ".join(joint for joint, yes in zip(joints, gains.continuous[0], strict=True) if yes)
-        found.append(f"continuous: errors are taken the short way round, which MuJoCo does not: {turning}")
-    return Imported(gains, joints, tuple(found))
+        differences.append(f"continuous: errors are taken the short way round, which MuJoCo does not: {turning}")
+    for difference in differences:
+        warn(f"{path}: {difference}", UserWarning)
+    return gains.for_joints(robot.coupling.of_all(np.arange(len(joints))))

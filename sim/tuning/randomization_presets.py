@@ -7,22 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Document
-from batchpid.checks.validate import file_path, number
+from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.motors import DRIVEN
-from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.checks import check_robot
 from batchpid.sim.randomization.distributions import Uniform
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 
 GRAVITY = 9.81
-ENCODER = 2 * np.pi / 2**18
-"""Resolution of an 18-bit encoder [rad]."""
 PAYLOAD_SHARE = 0.5
 """Share that a payload may take of the effort that the robot's own weight leaves."""
 PAYLOAD = 0.5
@@ -62,21 +58,6 @@ def load_randomization(name: str | Path, robot: Robot, seed: int = 0) -> Randomi
         randomization = Randomization.from_dict({"seed": seed, **known} if isinstance(known, dict) else known)
         check_robot(randomization, robot)
     return randomization
-
-
-def usual_variation(
-    robot: Robot, payload: float = 2.0, friction: float = 0.1, timestep: float = RunnerOptions.timestep
-) -> tuple[Randomization, bp.Actuators]:
-    """Return the robots of ``--variation``: payload and friction drawn uniformly, 18-bit sensors, efforts a step late.
-
-    Payloads are drawn from 0 to ``payload`` [kg], or to :func:`payload_capacity` if that is less; friction from 0 to
-    ``friction`` [N m or N], the same for all joints. Raises InvalidArgumentError for a number out of range.
-    """
-    payload, friction = number("payload", payload, 0, np.inf, "kg"), number("friction", friction, 0, np.inf, "N m or N")
-    drawn = Randomization(
-        payload=Uniform(0, min(payload, payload_capacity(robot))), friction=Uniform(0, friction, shared=True)
-    )
-    return drawn, bp.make_actuators(robot.dof, command_delay=timestep, position_resolution=ENCODER)
 
 
 def reseeded(randomization: Randomization | None, seed: int) -> Randomization | None:

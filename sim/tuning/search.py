@@ -1,7 +1,13 @@
-"""Search for gains of joints by CMA-ES from the designed gains (:mod:`batchpid.sim.tuning.evolution`).
+"""Search for gains of joints by CMA-ES from the designed gains, in log space, and a final round.
 
-Each env runs one move of one candidate, as a step or as a smooth motion of the setpoint, so the gains found are good at
-both.
+Each env runs one move of one candidate, as a step or as a smooth motion of the setpoint, so a generation is one
+rollout. The moves are free of contact, so the robots have no collision shapes in the search. A share of the effort
+limits is a reserve for harder moves. The search itself is the package ``cmaes`` (N. Hansen, "The CMA evolution
+strategy: a tutorial", arXiv:1604.00772).
+
+Gains that are best on the few moves of the search need not be best on others. So the candidates that beat the designed
+gains run a final round with these on more moves, with collisions, with the caller's solver, at the full effort limits.
+The gains with the lowest cost there are the result.
 
 Good gains for robots that differ from the model, by actuators or a randomization, are farther from the designed ones.
 For such robots the first generation consists of designs for the loop's delay (:mod:`batchpid.sim.tuning.candidates`),
@@ -10,32 +16,45 @@ and CMA-ES starts from the best of them.
 
 from __future__ import annotations
 
+import time
+import warnings
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import asdict
+from importlib.util import find_spec
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document
-from batchpid.arrays.digest import digest
-from batchpid.errors import InvalidArgumentError
+from batchpid.arrays.array_types import Document, Float64
+from batchpid.checks.validate import integer, number
+from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.io.versions import package_versions
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
-from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.runner import Runner
+from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.candidates import Candidates, first_gains, loop_delay
-from batchpid.sim.tuning.cost import HEADROOM, Weights
+from batchpid.sim.tuning.cost import Weights
 from batchpid.sim.tuning.evaluation import SUBSTEPS
-from batchpid.sim.tuning.evolution import FINAL_SEED, SEARCH_PHYSICS, Search
 from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
 from batchpid.sim.tuning.randomization_presets import reseeded
+from batchpid.sim.workers.contact_log import MissedContactWarning
 
+INITIAL_SPREAD = 0.12
+"""First standard deviation of the search, in log space."""
+HEADROOM = 0.9
+"""Share of the effort limits that candidates may use."""
 VARIED_MOVES, DRAWN_MOVES = 20, 8
 """Number of random moves in the search for robots that differ from the model, and with drawn motors."""
-FINAL_MOVES = 24
-"""Number of moves of the final round."""
+FINAL_MOVES, FINALISTS = 24, 3
+"""Number of moves of the final round, and the largest number of candidates in it, besides the designed gains."""
+FINAL_SEED = 1_000_003
+"""Difference between the seed of the final round and the seed of the search."""
+SEARCH_SCENE: Document = {"collisions": False, "physics": "fast", "ground": None}
+"""Options of the runner in a search on moves that are free of contact."""
 
 
 class Tuning(NamedTuple):
@@ -49,11 +68,9 @@ class Tuning(NamedTuple):
     start_cost: float
     history: tuple[tuple[float, ...], ...]
     """Costs of every candidate of every generation."""
-    ranked_params: bp.PIDParams
-    """Gains of all candidates, a row each, those of the lowest cost in the search first."""
     settings: Document
     """Seed, moves, options and versions, for the record."""
-    rejected: str | None = None
+    rejected: str | None
     """Criterion by which the designed gains beat all candidates, with both figures; None if a candidate was best."""
 
 
@@ -73,11 +90,10 @@ def tune(
     workers: int | None = None,
     cluster: Literal["ray"] | Ray | None = None,
     time_limit: float | None = None,
-    history: Path | str | None = None,
     progress: Callable[[Any], Any] | None = None,
     **runner_options: Any,
 ) -> Tuning:
-    """Search for gains of ``robot``.
+    """Search for gains of ``robot``. The result depends on the seed and not on the number of workers.
 
     Parameters
     ----------
@@ -88,7 +104,7 @@ def tune(
     seconds
         Simulated time of each move [s].
     gain_units
-        "effort", "inertia" or "mass_matrix": :mod:`batchpid.law.computed_torque`.
+        "effort" or "mass_matrix": :mod:`batchpid.law.computed_torque`.
     per_joint
         Search for a factor of each joint's gains too, which needs more generations.
     weights
@@ -97,82 +113,146 @@ def tune(
     moves
         Default: :func:`batchpid.sim.tuning.moves.search_moves`, and FINAL_MOVES random ones in the final round. For
         robots with actuators or a randomization, the search uses the tutorial's move and VARIED_MOVES random ones
-        (with drawn ``motors`` DRAWN_MOVES),
-        because the hardest moves within the effort limits of the model are too hard for such robots. Given moves
-        replace them, with contacts, since they may touch something. There is then no final round.
+        (with drawn ``motors`` DRAWN_MOVES), because the hardest moves within the effort limits of the model are too
+        hard for such robots. Given moves replace them, with contacts, since they may touch something. There is then
+        no final round.
     randomization
         The robot of each move is drawn from it, the same for all candidates. None: the robot as described.
     motors
-        Actuators of which one is the true one, a row each: every move is made with another row, the same for all
+        Actuators of which one is the true one, a row each, such as the draws of
+        :func:`batchpid.sim.identification.draw_motors`: every move is made with another row, the same for all
         candidates, and the worst move counts as much as the mean. The controller knows the robot's own actuators.
     workers, cluster
-        Number of processes, or a cluster: as for :class:`batchpid.sim.Runner`. The result does not depend on them.
+        Number of processes, or a cluster: as for :class:`batchpid.sim.Runner`.
     time_limit
         Stop after the generation in which this many seconds have passed; None: run all generations.
-    history
-        JSON file, written after each generation. If it exists the search resumes from it.
     progress
         Wraps the range of generations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
     runner_options
-        More options of :class:`batchpid.sim.Runner`, e.g. ``physics="fast"``, for the final round. They also apply to
-        the search if there is a ``build`` or a floating base, or if the solver computes drives or SAPIEN's friction.
+        More options of :class:`batchpid.sim.Runner`, e.g. ``physics="fast"``, for the final round. In the search,
+        robots with a fixed base and without a ``build`` have no collision shapes and "fast" physics.
 
     Raises
     ------
     InvalidArgumentError
-        An option is out of range or chosen by the search, such as ``params``, or the history is of another search.
+        An option is out of range or chosen by the search, such as ``params``.
     MissingDependencyError
         The package ``cmaes`` is missing.
     """
+    if find_spec("cmaes") is None:
+        raise MissingDependencyError("cmaes", "tuning", "tune")
+    seed = integer("seed", seed, 0, 2**31 - 1)
+    generations = integer("generations", generations, 1, 100_000)
+    population = integer("population", population, 4, 1000)
+    seconds = number("seconds", seconds, 0.05, 600.0, "seconds")
+    for name in {"params", "discretization"} & runner_options.keys():
+        problem, remedy = "is chosen by the search, which is for explicit gains", "bp.design_gains makes implicit gains"
+        raise InvalidArgumentError(name, problem, remedy=remedy)
     if motors is not None and runner_options.get("actuators") is not None:
         remedy = "leave it out; the control knows the actuators of the robot: Robot.load(..., actuators=...)"
         raise InvalidArgumentError("actuators", "is given with motors", remedy=remedy)
     weights = Weights() if weights is None else weights
-    search = Search(
-        robot, runner_options, seed, generations, population, seconds, weights, time_limit, history, progress
-    )
-    search.refuse(("params", "discretization"), "leave it out; bp.design_gains makes implicit gains")
-    unseen = random_moves(robot, FINAL_MOVES, search.seed + FINAL_SEED) if moves is None else None
+    options: Document = {"substeps": SUBSTEPS, "workers": workers, "cluster": cluster} | runner_options
+
     is_varied = randomization is not None or robot.actuators is not None or motors is not None
-    if moves is None and is_varied:
-        moves = tutorial_move(robot) + random_moves(robot, VARIED_MOVES if motors is None else DRAWN_MOVES, search.seed)
-    moves = search_moves(robot, search.seed) if moves is None else moves
-    own = unseen is not None and robot.fixed_base and runner_options.get("build") is None
-    # Physics "free", with one iteration, is enough if the loop computes friction, and not the solver.
-    is_free = own and DISSIPATION[robot.dissipation].modelled and runner_options.get("control", "pid") != "drive"
-    settings = search.settings(
-        moves,
-        gain_units=gain_units,
-        per_joint=per_joint,
-        moves=list(moves.names),
-        randomization=None if randomization is None else randomization.to_dict(),
-        search_physics=SEARCH_PHYSICS if is_free else None,
-        **({} if motors is None else {"motors": digest(motors)}),
-    )
+    unseen, scene = None, Document()
+    if moves is None:
+        unseen = random_moves(robot, FINAL_MOVES, seed + FINAL_SEED)
+        count = VARIED_MOVES if motors is None else DRAWN_MOVES
+        moves = tutorial_move(robot) + random_moves(robot, count, seed) if is_varied else search_moves(robot, seed)
+        if robot.fixed_base and runner_options.get("build") is None:
+            scene = SEARCH_SCENE
 
-    def candidates(moves: Moves, headroom: float, step: int) -> Candidates:
-        varied = is_varied and motors is None
-        known: Document = {"headroom": headroom, "varied": varied, "motors": motors, "step": step}
-        return Candidates(robot, gain_units, per_joint, moves, search.seconds, weights, **known)
+    def candidates(moves: Moves, headroom: float) -> Candidates:
+        known: Document = {"headroom": headroom, "varied": is_varied and motors is None, "motors": motors}
+        return Candidates(robot, gain_units, per_joint, moves, seconds, weights, **known)
 
-    searched = candidates(moves, 1.0 if is_varied else HEADROOM, 1)
-    start, designs = searched.params(np.zeros((1, searched.dimension))), None
+    searched = candidates(moves, 1.0 if is_varied else HEADROOM)
+    start = searched.params(np.zeros((1, searched.dimension)))
+    designs = None
     if is_varied:
         dt = float(runner_options.get("timestep", RunnerOptions.timestep))
         delay = loop_delay(robot, randomization, dt + float(np.max(start.derivative_filter_time)), motors)
         designs = searched.points(first_gains(delay))
-    options: Document = {"params": start, "substeps": SUBSTEPS, "workers": workers, "cluster": cluster} | runner_options
-    drawn, others = (reseeded(randomization, each) for each in (search.seed, search.seed + FINAL_SEED))
-    first = (searched, options | {"randomization": drawn} | ({"ground": None, **SEARCH_PHYSICS} if is_free else {}))
-    final = None if unseen is None else (candidates(unseen, 1.0, -1), options | {"randomization": others})
-    found = search.run(settings, first, final, designs)
-    return Tuning(
-        params=searched.params(found.point[None]),
-        cost=found.cost,
-        start_params=start,
-        start_cost=found.costs[0][0],
-        history=found.costs,
-        ranked_params=searched.params(found.ranked),
-        settings={**settings, "generations": len(found.costs)},
-        rejected=found.rejected,
-    )
+    options = options | {"params": start}
+    with searched.runner(population, options | {"randomization": reseeded(randomization, seed)} | scene) as runner:
+        points, history = _evolve(searched, runner, seed, generations, population, designs, time_limit, progress)
+
+    # Final round: the designed gains against the candidates that beat them.
+    costs = np.concatenate(history)
+    ranking = np.argsort(costs, kind="stable")[:FINALISTS].tolist()
+    finalists = ranking[: ranking.index(0)] if 0 in ranking else ranking
+    best, rejected = (finalists or [0])[0], None
+    if not finalists:
+        rejected = f"cost in the search: best candidate {costs[1:].min():.4f}, designed {costs[0]:.4f}"
+    elif unseen is not None:
+        final = candidates(unseen, 1.0)
+        options = options | {"randomization": reseeded(randomization, seed + FINAL_SEED)}
+        with final.runner(1 + len(finalists), options) as runner:
+            judged = final.costs(runner, points[[0, *finalists]])
+        best = [0, *finalists][int(np.argmin(judged))]
+        if not best:
+            rejected = f"cost in the final: best candidate {min(judged[1:]):.4f}, designed {judged[0]:.4f}"
+
+    settings: Document = {
+        **robot.describe(),
+        **{"seed": seed, "generations": len(history), "population": population, "seconds": seconds},
+        **{"gain_units": gain_units, "per_joint": per_joint, "weights": asdict(weights), "moves": list(moves.names)},
+        "randomization": None if randomization is None else randomization.to_dict(),
+        **{name: _plain(value) for name, value in runner_options.items()},
+        "versions": package_versions(("batchpid", runner_options.get("engine", DEFAULT_ENGINE), "numpy", "cmaes")),
+    }
+    params = searched.params(points[[best]])
+    return Tuning(params, float(costs[best]), start, history[0][0], history, settings, rejected)
+
+
+def _evolve(
+    candidates: Candidates,
+    runner: Runner,
+    seed: int,
+    generations: int,
+    population: int,
+    designs: Float64 | None,
+    time_limit: float | None,
+    progress: Callable[[Any], Any] | None,
+) -> tuple[Float64, tuple[tuple[float, ...], ...]]:
+    """Return all points (n, dimension), the first of which is 0, and their costs by generation.
+
+    ``designs`` (n, dimension) are candidates of the first generation too, and CMA-ES starts from the best of it.
+    """
+    from cmaes import CMA
+
+    def optimizer_at(mean: Float64) -> CMA:
+        return CMA(mean=mean, sigma=INITIAL_SPREAD, seed=seed, population_size=population)
+
+    start = np.zeros(candidates.dimension)
+    firsts = np.array([start] if designs is None else [start, *designs])[:population]
+    optimizer, points, history = optimizer_at(start), list[Float64](), list[tuple[float, ...]]()
+    began = time.monotonic()
+    bar = (progress or (lambda items: items))(range(generations))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MissedContactWarning)  # bad gains may leave the way of a move
+        for generation in bar:
+            asked = np.array([optimizer.ask() for _ in range(population)])
+            if generation == 0:
+                asked[: len(firsts)] = firsts
+            costs = candidates.costs(runner, asked)
+            if generation == 0 and designs is not None:
+                optimizer = optimizer_at(asked[int(np.argmin(costs))])
+            else:
+                optimizer.tell(list(zip(asked, costs.tolist(), strict=True)))
+            points.append(asked)
+            history.append(tuple(costs.tolist()))
+            if hasattr(bar, "set_postfix"):
+                bar.set_postfix(cost=f"{np.min(history):.4f}", start=f"{history[0][0]:.4f}")
+            if time_limit is not None and time.monotonic() - began > time_limit:
+                break
+    return np.concatenate(points), tuple(history)
+
+
+def _plain(value: Any) -> Any:
+    """Return an option of the runner as a plain value, or as text."""
+    value = value.item() if isinstance(value, np.generic) else value
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    return getattr(value, "__qualname__", None) or repr(value)

@@ -85,9 +85,7 @@ class GroupGains:
 
     def _adjustable(self, params: bp.PIDParams) -> bp.PIDParams:
         """Return ``params`` with every option on that a slider sets."""
-        weightless = params.setpoint_weight is None  # then the origin has no effect until the weight is changed
-        params = self._replaced(params, _values(params))
-        return params.replace(weight_origin="start") if weightless else params
+        return self._replaced(params, _values(params))
 
     def _replaced(self, params: bp.PIDParams, values: dict[str, Float64]) -> bp.PIDParams:
         return params.replace(**{name: value for name, value in values.items() if name not in self._lacks})

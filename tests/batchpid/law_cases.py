@@ -21,9 +21,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "integral limit": GAINS | {"integral_limit": 0.2},
     "filter": GAINS | {"derivative_filter_time": [0.0, 0.02, 0.005]},
     "setpoint weight": GAINS | {"setpoint_weight": [0.0, 0.7, 1.0]},
-    "weight from start": GAINS | {"setpoint_weight": 0.4, "weight_origin": "start"},
     "derivative weight": GAINS | {"setpoint_weight_derivative": [1.0, 0.3, 0.0], "derivative_filter_time": 0.02},
-    "kick": GAINS | {"setpoint_weight_derivative": 1.0, "first_derivative": "kick"},
     "deadband": GAINS | {"deadband": [0.0, 0.3, 1.0]},
     "clamp": LIMITED | {"anti_windup": "clamp"},
     "conditional": LIMITED | {"anti_windup": "conditional"},
@@ -32,7 +30,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "mixed per env": LIMITED
     | {"anti_windup": [["none", "conditional", "clamp"], *[["back_calculation", "conditional", "none"]] * (ENVS - 1)]},
     "continuous": GAINS | {"continuous": [True, False, True]},
-    "integrate first": LIMITED | {"integration": "integrate_first", "anti_windup": "conditional"},
     "zero effort": LIMITED | {"non_finite": "zero"},
     "hold effort": LIMITED | {"non_finite": "hold"},
     "everything": LIMITED
@@ -45,8 +42,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "deadband": 0.05,
         "anti_windup": ["back_calculation", "conditional", "clamp"],
         "continuous": [True, False, True],
-        "integration": "integrate_first",
-        "weight_origin": "start",
         "non_finite": "hold",
     },
 }
@@ -66,9 +61,6 @@ NUMBERS = {
 }
 """Options that are numbers: the value that is off, and one that has an effect."""
 NAMES = {
-    "integration": ("output_first", "integrate_first"),
-    "first_derivative": ("zero", "kick"),
-    "weight_origin": ("zero", "start"),
     "non_finite": ("propagate", "zero", "hold"),
 }
 

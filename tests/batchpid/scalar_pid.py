@@ -28,9 +28,6 @@ class ScalarPID:
     anti_windup: str = "none"
     tracking_time: float = math.inf
     continuous: bool = False
-    integration: str = "output_first"
-    first_derivative: str = "zero"
-    weight_origin: str = "zero"
     non_finite: str = "propagate"
 
     def start(self, measurement: float) -> None:
@@ -38,9 +35,9 @@ class ScalarPID:
         self.integral = min(max(0.0, self.integral_min), self.integral_max)
         self.measurement = measurement
         self.derivative = 0.0
-        self.setpoint = measurement if self.first_derivative == "kick" else None
+        self.setpoint: float | None = None
         self.effort = self.size = 0.0
-        self.origin = measurement if self.weight_origin == "start" else 0.0
+        self.origin = measurement
 
     def step(
         self,
@@ -79,15 +76,9 @@ class ScalarPID:
 
         before = self.integral
         self.integral += self.ki * error * dt
-        if self.integration == "integrate_first":
-            self.integral = min(max(self.integral, self.integral_min), self.integral_max)
-            used = self.integral
-        else:
-            used = before
-
-        terms = proportional, used, self.kd * self.derivative, feedforward or 0.0
+        terms = proportional, before, self.kd * self.derivative, feedforward or 0.0
         self.size = sum(map(abs, terms))
-        self.unsaturated = proportional + used + self.kd * self.derivative + (feedforward or 0.0)
+        self.unsaturated = proportional + before + self.kd * self.derivative + (feedforward or 0.0)
         change = self.effort_rate_limit * dt
         effort = min(max(self.unsaturated, self.effort - change), self.effort + change)
         effort = min(max(effort, self.effort_min), self.effort_max)

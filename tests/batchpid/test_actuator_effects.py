@@ -84,49 +84,9 @@ def test_the_envelope_is_that_of_isaac_lab_and_of_newton(seed):
     np.testing.assert_allclose(ours[within], newton[within], rtol=1e-12, atol=1e-12 * stall.max())
 
 
-def test_presets_are_named_as_their_models():
-    line = {"saturation_effort": 10.0, "no_load_speed": 5.0, "effort_limit": 8.0}
-    motor = bp.make_actuators(2, **line, armature=0.1)
-    table = [[-1.0, 9.0, 4.0], [1.0, 8.0, 6.0]]
-    same = [
-        (actuators.presets.dc_motor(2, 10.0, 5.0, 8.0, armature=0.1), motor),
-        (
-            actuators.presets.newton(
-                2, saturation_effort=10.0, velocity_limit=5.0, max_motor_effort=8.0, max_effort=9.0, armature=0.1
-            ),
-            motor,
-        ),
-        (
-            actuators.presets.remotized(2, table),
-            actuators.presets.newton(2, lookup_positions=[-1.0, 1.0], lookup_efforts=[4.0, 6.0]),
-        ),
-        (
-            actuators.presets.mujoco_joint(2, armature=0.1, frictionloss=0.2, damping=0.3, forcerange=4.0),
-            bp.make_actuators(2, armature=0.1, coulomb=0.2, viscous=0.3, effort_limit=4.0),
-        ),
-        (
-            actuators.presets.isaac_joint(
-                2, armature=0.1, friction=0.3, dynamic_friction=0.2, viscous_friction=0.4, lag=0.1
-            ),
-            bp.make_actuators(2, armature=0.1, static=0.3, coulomb=0.2, viscous=0.4, lag=0.1),
-        ),
-        (
-            actuators.presets.delayed_pd(2, DT, 2, 6, effort_limit=5.0),
-            bp.make_actuators(2, command_delay=2 * DT, max_delay=6 * DT, effort_limit=5.0),
-        ),
-        (
-            actuators.presets.newton(2, delay_steps=[1, 3], timestep=DT),
-            bp.make_actuators(2, command_delay=[DT, 3 * DT]),
-        ),
-    ]
-    for ours, expected in same:
-        for mine, other in zip(ours, expected, strict=True):
-            np.testing.assert_array_equal(mine, other)
-
-
 def test_the_lag_is_mujocos_exact_filter():
     """Its activation, stated again, with the control clipped before and after (its ctrlrange and forcerange)."""
-    chosen, activation, expected = actuators.presets.mujoco_joint(1, dynprm=0.01, forcerange=2.0), 0.0, []
+    chosen, activation, expected = bp.make_actuators(1, lag=0.01, effort_limit=2.0), 0.0, []
     asked = np.random.default_rng(0).uniform(-2, 2, 50)
     for control in asked:
         activation += (control - activation) / 0.01 * 0.01 * (1 - np.exp(-DT / 0.01))

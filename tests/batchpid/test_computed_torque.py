@@ -14,7 +14,6 @@ from batchpid.law import (
     advance_with_mass_matrix,
     check_gain_units,
     convert_integral,
-    per_inertia,
 )
 
 DT = 1e-3
@@ -80,7 +79,7 @@ def test_every_joint_of_a_coupled_robot_responds_alike_and_on_a_straight_line():
     matrix = mass(rng, envs, joints)
     inverse = np.linalg.inv(matrix)
     for limit in (None, 5.0):
-        p = params(joints, effort_limit=limit, setpoint_weight=0.2, weight_origin="start")
+        p = params(joints, effort_limit=limit, setpoint_weight=0.2)
         k = bp.discretise(p, DT)
         start, goal = rng.normal(size=(2, envs, joints))
         q, v = start.copy(), np.zeros_like(start)
@@ -95,17 +94,6 @@ def test_every_joint_of_a_coupled_robot_responds_alike_and_on_a_straight_line():
             np.testing.assert_allclose(progress, np.broadcast_to(progress[:, :1], progress.shape), atol=1e-7)
         assert saturated == (limit is not None)
         assert (progress > 0.02).all()
-
-
-def test_per_inertia_scales_every_gain_and_nothing_else():
-    p = bp.make_params(2, 10.0, 5.0, 2.0, effort_limit=3.0, derivative_filter_time=1e-3)
-    k = bp.discretise(p, DT)
-    inertia = np.array([[0.5, 2.0], [1.0, 4.0]])
-    scaled = per_inertia(k, inertia)
-    by_hand = bp.discretise(p.replace(kp=10.0 * inertia, ki=5.0 * inertia, kd=2.0 * inertia), DT)
-    by_hand = by_hand._replace(acceleration_share=inertia)  # of a setpoint's acceleration
-    for name in k._fields:
-        np.testing.assert_array_equal(getattr(scaled, name), getattr(by_hand, name), err_msg=name)
 
 
 @settings(deadline=None, max_examples=25)
@@ -169,15 +157,14 @@ def test_options_without_meaning_for_accelerations_are_refused():
     ):
         with pytest.raises(InvalidArgumentError, match="mass_matrix"):
             check_gain_units(bp.make_params(1, 1.0, 1.0, 1.0, gain_units="mass_matrix", **options))
-        check_gain_units(bp.make_params(1, 1.0, 1.0, 1.0, gain_units="inertia", **options))
+        check_gain_units(bp.make_params(1, 1.0, 1.0, 1.0, **options))
 
 
-@pytest.mark.parametrize("unit", ["effort", "inertia"])
-def test_a_change_of_gain_units_keeps_the_effort_of_the_integral(unit):
+def test_a_change_of_gain_units_keeps_the_effort_of_the_integral():
     """Both ways, in the middle of a run; a change that keeps the integral's unit keeps the state."""
     rng = np.random.default_rng(5)
     matrix, y = mass(rng, 3, 4), rng.normal(size=(3, 4))
-    whole, other = params(4), params(4).replace(gain_units=unit)
+    whole, other = params(4), params(4).replace(gain_units="effort")
     state = bp.init(other, y)._replace(integral=rng.normal(size=(3, 4)))
     there = convert_integral(state, other, whole, matrix)
     _, terms = advance_with_mass_matrix(bp.discretise(whole, DT), there, y, y, matrix)

@@ -135,14 +135,14 @@ def test_track_makes_the_next_step_reproduce_the_effort(case, run, share, rates)
     np.testing.assert_allclose(again, effort, rtol=1e-6, atol=1e-6)
 
 
-def test_track_needs_an_integral_and_a_time_step_to_integrate_first():
+def test_track_needs_an_integral_and_the_implicit_law_a_time_step():
     y = np.zeros((1, 2))
     params = bp.make_params(2, 1.0)
     with pytest.raises(bp.InvalidArgumentError, match=r"ki.*no integral can carry"):
         bp.track(params, bp.init(params, y), y, y, y)
-    params = bp.make_params(2, 1.0, 1.0, integration="integrate_first")
-    with pytest.raises(bp.InvalidArgumentError, match=r"dt.*integrate first"):
-        bp.track(params, bp.init(params, y), y, y, y)
+    params = bp.make_params(2, 1.0, 1.0, gain_units="mass_matrix", discretization="implicit")
+    with pytest.raises(bp.InvalidArgumentError, match=r"dt.*implicit"):
+        bp.track(params._replace(gain_units=None), bp.init(params, y), y, y, y)
 
 
 @given(runs, st.floats(0, 100))

@@ -17,7 +17,7 @@ WEIGHTS = st.floats(0.0, 1.0)
 
 def follow(b, rates=True, steps=2000, **options):
     """Return the errors (steps, envs) of joints of inertia 1 on the way of a sine, with setpoint weights b (envs,)."""
-    params = bp.make_params(1, **GAINS, setpoint_weight=np.array(b)[:, None], weight_origin="start", **options)
+    params = bp.make_params(1, **GAINS, setpoint_weight=np.array(b)[:, None], **options)
     late = params.discretization is not None
     k = bp.discretise(params, DT)._replace(gain_units=None)
     y, v, errors = np.zeros((len(b), 1)), np.zeros((len(b), 1)), []
@@ -65,8 +65,7 @@ def test_a_continuous_joint_follows_through_its_turns(options):
     rng, shape = np.random.default_rng(0), (30, 2)
     weights = rng.uniform(0, 1, shape)
     wound, wrapped = (
-        bp.make_params(2, **GAINS, setpoint_weight=weights, weight_origin="start", continuous=turns, **options)
-        for turns in (False, True)
+        bp.make_params(2, **GAINS, setpoint_weight=weights, continuous=turns, **options) for turns in (False, True)
     )
     speed, start = rng.uniform(-40, 40, shape), rng.uniform(-3, 3, shape)
     behind = rng.normal(scale=0.05, size=(300, *shape))
@@ -82,10 +81,9 @@ def test_a_continuous_joint_follows_through_its_turns(options):
         np.testing.assert_allclose(rows[1], rows[0], rtol=1e-9, atol=1e-6)
 
 
-@pytest.mark.parametrize("order", ["output_first", "integrate_first"])
-def test_manual_control_hands_over_to_a_moving_setpoint(order):
+def test_manual_control_hands_over_to_a_moving_setpoint():
     """The next step after ``track`` on these inputs gives the effort, also with a rate."""
-    params = bp.make_params(2, **GAINS, setpoint_weight=0.2, integration=order)
+    params = bp.make_params(2, **GAINS, setpoint_weight=0.2)
     y, r, rate, effort = np.random.default_rng(0).normal(size=(4, 3, 2))
     state = bp.track(params, bp.init(params, y), r, y, effort, dt=DT, setpoint_rate=rate)
     _, got = bp.step(params, state, r, y, DT, setpoint_rate=rate, measurement_rate=0 * y)

@@ -97,7 +97,7 @@ COMBINATIONS = [
     (bp.make_params, "anti_windup", {"anti_windup": ["none", "wind"]}),
     (bp.make_params, "anti_windup", {"anti_windup": "clamp"}),
     (bp.make_params, "tracking_time", {"tracking_time": 1.0}),
-    (bp.make_params, "discretization", {"discretization": "implicit", "gain_units": "inertia"}),
+    (bp.make_params, "gain_units", {"gain_units": "inertia"}),
     (
         bp.make_params,
         "derivative_filter_time",
@@ -121,7 +121,6 @@ COMBINATIONS = [
     (ts.make_osc_params, "effort_min", {"effort_min": 1.0, "effort_max": 0.0}),
     (ts.make_osc_params, "effort_limit", {"effort_limit": 1.0, "effort_max": 2.0}),
     (ts.make_osc_params, "position_error_limit", {"position_error_limit": -1.0}),
-    (ts.make_osc_params, "damping", {"decoupling": "none"}),
     (ts.make_osc_params, "effort_min", {"stiffness": np.ones((3, 6)), "effort_limit": np.ones((2, 2))}),
     (ts.make_osc_params, "integral_gain", {"integral_gain": -1.0}),
     (ts.make_osc_params, "integral_limit", {"integral_gain": 1.0, "integral_limit": math.nan}),
@@ -129,10 +128,7 @@ COMBINATIONS = [
     (ts.make_osc_params, "limit_margin", {"limit_margin": -0.1}),
     (ts.make_osc_params, "limit_stiffness", {"limit_stiffness": [10.0, 20.0]}),
     (ts.make_osc_params, "damping_ratio", {"damping": 9.0, "damping_ratio": 0.7}),
-    (ts.make_osc_params, "discretization", {"discretization": "implicit", "decoupling": "none", "damping": 1.0}),
     *((ts.make_osc_params, name, {name: "other"}) for name in osc_params.TASK_CHOICES),
-    (motors.presets.delayed_pd, "max_delay", {"min_delay": 3, "max_delay": 2, "timestep": 0.01}),
-    (motors.presets.newton, "timestep", {"delay_steps": 1}),
     (motors.dumps_actuators, "actuators", {"actuators": {}}),
     (bp.drive_target, "state", {"state": 3}),
     (bp.drive_target, "measurement_rate", {"measurement_rate": np.ones((1, 3))}),
@@ -142,13 +138,7 @@ COMBINATIONS = [
     (batchpid.export.to_c, "inputs", {"inputs": ("velocity",)}),
     (batchpid.export.to_c, "prefix", {"prefix": "a-b"}),
     (batchpid.export.to_c, "tree", {"tree": planar((1.0,))}),
-    (batchpid.export.to_c_project, "header", {"header": "pid.c"}),
-    (batchpid.export.to_isaac_lab, "model", {"model": "dc_motor"}),
-    (batchpid.export.to_isaac_lab, "model", {"model": "net"}),
-    (batchpid.export.to_isaac_lab, "name", {"name": "a b"}),
-    (batchpid.export.to_maniskill, "name", {"name": "1"}),
-    (batchpid.export.to_newton, "name", {"name": "a b"}),
-    (batchpid.export.to_ros2_control, "inertia", {"params": bp.make_params(2, 1.0, gain_units="inertia")}),
+    (batchpid.export.to_ros2_control, "inertia", {"params": bp.make_params(2, 1.0, gain_units="mass_matrix")}),
     (batchpid.export.to_ros2_control, "inertia", {"inertia": [0.0, 1.0]}),
     (batchpid.export.to_ros2_control, "effort_min", {"params": bp.make_params(2, 1.0, effort_min=2, effort_max=2)}),
     (trajectories.minimum_jerk, "duration", {"duration": None}),
@@ -166,7 +156,7 @@ COMBINATIONS = [
     (bp.design_gains, "margin", {"margin": 1.5}),
     (bp.design_gains, "gain_units", {"gain_units": "torque"}),
     (bp.design_gains, "load", {"load": -1.0}),
-    (bp.design_gains, "load", {"load": 1.0, "gain_units": "inertia"}),
+    (bp.design_gains, "load", {"load": 1.0, "gain_units": "mass_matrix"}),
     (bp.design_gains, "discretization", {"discretization": "implicit", "gain_units": "effort"}),
     (bp.stability_bound, "mass_matrix", {"mass_matrix": -np.eye(2)}),
     (bp.stability_bound, "mass_matrix", {"mass_matrix": np.full((2, 2), math.nan)}),
@@ -212,9 +202,9 @@ def test_options_that_do_not_go_together(function, argument, changes):
 
 # -- Other arguments, by their names ---------------------------------------------------------------------------------
 
-MODULES = (bp, batchpid.export, ts, motors, motors.presets, friction, guard, metrics, trajectories)
+MODULES = (bp, batchpid.export, ts, motors, friction, guard, metrics, trajectories)
 Y, TREE = np.zeros((1, 2)), planar()
-PARAMS = bp.make_params(2, 4.0, 1.0, 1.0, integration="integrate_first")
+PARAMS = bp.make_params(2, 4.0, 1.0, 1.0)
 OSC = ts.make_osc_params(TREE, integral_gain=1.0)
 POSE = ts.link_poses(TREE, Y, ["tip"])[:, 0]
 MOTORS, GUARD = bp.make_actuators(2, lag=0.1), bp.make_guard(2, rate=1.0)
@@ -332,7 +322,7 @@ def test_arguments_of_every_public_function(module, function, argument):
 
 def test_an_unknown_option_is_answered_with_the_nearest():
     params, actuators = bp.make_params(2, 1.0), bp.make_actuators(2, lag=0.01)
-    for function in (bp.make_params, bp.make_actuators, motors.presets.remotized):
+    for function in (bp.make_params, bp.make_actuators):
         assert "'effort_limit'" in refused("efort_limit", function, **needed(function), efort_limit=3.0).remedy
     for function in (params.replace, actuators.replace, lambda **options: bp.presets.tutorial(2, **options)):
         assert "'effort_limit'" in refused("efort_limit", function, efort_limit=3.0).remedy
@@ -353,7 +343,7 @@ TEXTS = [
     *((PID % f'"kp": {value}', "kp", "elbow") for value in ("-1.0", '"nan"', '"1e3"', "true", "null", "[[1.0]]", "[]")),
     (PID % f'"kp": 1{"0" * 400}', "kp", "elbow"),
     (PID % '"kp": 1.0, "anti_windup": "magic"', "anti_windup", "elbow"),
-    ('{"format": "batchpid-params-1", "integration": [], "joints": {"a": {"kp": 1.0}}}', "integration", None),
+    ('{"format": "batchpid-params-1", "non_finite": [], "joints": {"a": {"kp": 1.0}}}', "non_finite", None),
     ('{"format": "batchpid-params-1", "dtype": "object", "joints": {"a": {"kp": 1.0}}}', "dtype", None),
     ('{"format": "batchpid-params-1", "about": 3, "joints": {"a": {"kp": 1.0}}}', "about", None),
     ("format: batchpid-params-1\njoints: {elbow: {kp: 1}}", "text", None),

@@ -3,10 +3,24 @@
 import numpy as np
 from tutorial import TutorialLoop
 
-import batchpid as bp
 from batchpid.sim import Robot, Runner
 
 ARM = slice(0, 7)
+
+
+class SimplePIDs:
+    """SimplePID of the tutorial on arrays, and the passive force."""
+
+    def init(self, robot, num_envs):
+        self.gains = robot.settings
+        return tuple(np.zeros((2, num_envs, robot.dof)))
+
+    def __call__(self, state, setpoint, qpos, qvel, passive):
+        (integral, last), gains, dt = state, self.gains, 1 / self.gains.rate_hz
+        error = setpoint - qpos
+        integral = integral + error * dt
+        effort = gains.kp * error + gains.ki * integral + gains.kd * (error - last) / dt
+        return (integral, error), effort + passive
 
 
 def test_runner_follows_the_tutorials_loop():
@@ -17,8 +31,8 @@ def test_runner_follows_the_tutorials_loop():
     loop = TutorialLoop(robot, settings.target)
     recorded = [loop.run(1) for _ in range(2000)]
 
-    params = bp.presets.tutorial(robot.dof, settings.kp, settings.ki, settings.kd)
-    with Runner(robot, 2, params=params, workers=0, substeps=1) as runner:
+    unlimited = robot.params(effort_limit=None)
+    with Runner(robot, 2, control=SimplePIDs(), params=unlimited, workers=0, substeps=1) as runner:
         rollout = runner.rollout(np.broadcast_to(settings.target, (2000, robot.dof)))
 
     moved = np.abs(rollout.qpos[-1, 0] - settings.start)[ARM]

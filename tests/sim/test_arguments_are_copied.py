@@ -152,7 +152,6 @@ LAWS = {
         "setpoint_weight": 0.5,
         "setpoint_weight_derivative": 0.5,
         "effort_rate_limit": 1e3,
-        "weight_origin": "start",
         "continuous": True,
         "non_finite": "hold",
     },

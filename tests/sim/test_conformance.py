@@ -98,7 +98,6 @@ FEATURES: dict[str, Feature] = {
     "default gains": Feature(),
     "accelerations": Feature(accelerations=True),
     "gains in efforts": Feature(params=EFFORTS, exact=True),
-    "gains per inertia": Feature(params=EFFORTS | {"gain_units": "inertia"}),
     "implicit law": Feature(
         params={"gain_units": "mass_matrix", "discretization": "implicit", "kp": 4e3, "ki": 1e4, "kd": 120.0}
     ),

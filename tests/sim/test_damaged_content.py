@@ -28,7 +28,7 @@ from batchpid.errors import BatchPIDError
 from batchpid.sim import Robot, Runner, Snapshot, read_recording, write_recording
 from batchpid.sim.identification import read_logs
 from batchpid.sim.identification.setpoint_files import read_setpoints
-from batchpid.sim.tuning import load_randomization, random_moves, tune
+from batchpid.sim.tuning import load_randomization, random_moves
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of unusual values
 JOINTS = list(ARM.joint_names)
@@ -73,12 +73,6 @@ def write_run(path: Path) -> None:
             runner.snapshot().save(path)
 
 
-def search(path: Path) -> object:
-    """Return the result of a search with the history ``path``, which it reads or writes."""
-    found = tune(ARM, moves=MOVES, generations=1, population=4, seconds=0.05, workers=0, engine="mujoco", history=path)
-    return found.history, found.params
-
-
 MOVES = random_moves(ARM, 1, 0)
 KINDS = {
     "params.yaml": Kind(lambda path: bp.save_params(path, PARAMS, JOINTS), lambda path: bp.load_params(path, JOINTS)),
@@ -95,7 +89,6 @@ KINDS = {
     "motion.csv": Kind(
         lambda path: write_table(path, "setpoint_rate"), lambda path: read_setpoints(ARM, path, timestep=1e-3)
     ),
-    "search.json": Kind(search, search),
     "snapshot.npz": Kind(write_run, Snapshot.load),
     "recording.npz": Kind(write_run, read_recording),
     "recording.h5": Kind(write_run, read_recording),

@@ -143,8 +143,6 @@ GOOD_PARAMS = {
     "tracking_time": 0.1,
     "continuous": np.zeros(DOF, bool),
     "integration": "output_first",
-    "first_derivative": "zero",
-    "weight_origin": "start",
     "measurement_rate": "measured",
     "gain_units": "effort",
     "discretization": "explicit",

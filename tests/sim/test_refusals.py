@@ -112,7 +112,7 @@ RUNNERS: list[tuple[dict[str, Any], str]] = [
     ({"control": "effort", "setpoint_space": "tool"}, "setpoint_space"),
     ({"params": load_bundled("panda").params()}, "params"),
     ({"params": ARM.params(kp=np.ones((3, DOF)))}, "params"),
-    ({"params": ARM.params(kp=1.0, gain_units="inertia"), "control": "drive"}, "gain_units"),
+    ({"params": ARM.params(kp=1.0, gain_units="mass_matrix"), "control": "drive"}, "gain_units"),
     ({"actuators": bp.make_actuators(3, strength=0.9)}, "actuators"),
     ({"actuators": bp.make_actuators(DOF, strength=np.full((3, DOF), 0.9))}, "actuators"),
     ({"actuators": MOTORS, "control": "drive"}, "actuators"),

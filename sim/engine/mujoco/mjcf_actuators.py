@@ -136,8 +136,11 @@ class MjcfActuators:
         found, own = self._found, self._own
         has = {"armature", "viscous", "coulomb", "command_delay", "saturation_effort", "lag"}
         if self.controls:
-            found.compare_integral(first=False, clamps=self.is_dcmotor)
-            found.delays_setpoint("; until the first input is due, all are 0, or as mj_initCtrlHistory sets them")
+            found.compare_integral(self.is_dcmotor)
+            late = found.motor("command_delay") > 0
+            found.add(
+                "command_delay", "of the inputs, which are 0 at first, not of the effort: the law is not late", late
+            )
         else:
             has |= {"strength", "bias"}
             if (lost := own & self.is_dcmotor & (found.motor("bias") != 0)).any():

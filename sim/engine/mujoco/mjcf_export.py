@@ -25,6 +25,7 @@ from batchpid.motors.guard import Guard, check_guard
 from batchpid.sim.engine.mujoco.mjcf_actuators import FAR, MjcfActuators
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
 from batchpid.sim.engine.physics import SOLVERS
+from batchpid.sim.engine.robot_model import base_start
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_friction
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.link_repair import nearest_physical
@@ -67,8 +68,8 @@ def to_mjcf(
     Raises
     ------
     InvalidArgumentError
-        Params, actuators or guard for several envs, gains per inertia without ``inertia``, a guard without params, or
-        unknown physics.
+        Params, actuators or guard for several envs, gains per mass matrix without ``inertia``, a guard without params,
+        or unknown physics.
     RobotError
         MuJoCo cannot build the robot.
     """
@@ -77,7 +78,7 @@ def to_mjcf(
         check_guard(guard, 1, robot.joint_names)
         if params is None:
             raise InvalidArgumentError("guard", "limits setpoints of a law", remedy="pass params, or leave it out")
-    found = Drive(law, robot.joint_names, dt, inertia, actuators, integrates=True, two_sided=True)
+    found = Drive(law, robot.joint_names, dt, inertia, actuators)
     spec = SceneSpec(
         robot.urdf,
         robot.ignored_pairs,
@@ -160,6 +161,8 @@ def _add_actuators(root: Any, motors: MjcfActuators) -> None:
 def _add_keyframe(root: Any, model: MjModel, robot: RobotDescription, motors: MjcfActuators) -> None:
     """Add the keyframe "home": the start pose as positions and setpoints, and lags at the holding efforts."""
     data = mujoco.MjData(model)
+    if not robot.fixed_base:
+        data.qpos[:7] = base_start(robot, robot.start, robot.has_ground)
     for at, name in enumerate(robot.joint_names):
         data.qpos[model.joint(name).qposadr] = robot.start[at]
     mujoco.mj_forward(model, data)

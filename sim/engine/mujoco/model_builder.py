@@ -69,8 +69,6 @@ class RobotMj:
     """Frames of simulated links in their bodies; of other links the frames are the same."""
     base: tuple[int, int] | None = None
     """Index of a floating base in MuJoCo's qpos and qvel; None on a fixed one."""
-    turn: NDArray[np.float64] = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
-    """Rotation (4,) of that body's axes in the root link."""
     is_file: bool = False
     """Whether the model is an MJCF file's."""
 
@@ -133,12 +131,12 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     model.dof_armature[qvel], model.dof_frictionloss[qvel] = np.maximum(armature, 0.0), 0.0
     model.dof_damping[qvel] = np.maximum(damping + [joint.damping for joint in spec.joints], 0.0)
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    base, turn = None, np.array([1.0, 0.0, 0.0, 0.0])
+    base = None
     if found.root:
         joint = model.joint(model.body(found.root).jntadr[0])
-        base, turn = (int(joint.qposadr[0]), int(joint.dofadr[0])), model.body(found.root).quat.copy()
+        base = int(joint.qposadr[0]), int(joint.dofadr[0])
     bodies = {link: model.body(name).id for link, name in found.names.items()}
-    return RobotMj(model, qpos, qvel, bodies, found.own, found.frames, base, turn, is_file=True)
+    return RobotMj(model, qpos, qvel, bodies, found.own, found.frames, base, is_file=True)
 
 
 def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[Any, dict[str, str]]:

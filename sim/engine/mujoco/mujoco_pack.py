@@ -27,11 +27,9 @@ from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_back
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
-from batchpid.task_space import frames
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.rotations import inverse, multiply
-from batchpid.task_space.spatial_inertia import rotation_matrix
+from batchpid.task_space.rotations import inverse
 
 _KEPT = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)
 """Parts of the state in snapshots: all but the targets of drives, which every tick writes."""
@@ -202,10 +200,8 @@ class MujocoPack(ModelPack):
     # -- changes -----------------------------------------------------------------------------------------------
 
     def read_base(self) -> Float64:
-        rows, turn = self._bases(), self._robot.turn
+        rows = self._bases()
         rows[:, 10:] = turned_back(inverse(rows[:, 3:7]), rows[:, 10:])  # MuJoCo's are in the body's axes
-        if turn[0] != 1.0:
-            rows[:, 3:7] = multiply(rows[:, 3:7], inverse(turn))
         return rows
 
     def _bases(self) -> Float64:
@@ -228,9 +224,8 @@ class MujocoPack(ModelPack):
     def read_base_motion(self) -> Float64 | None:
         if self.spec.fixed_base:
             return None
-        rows, turn = self._bases(), rotation_matrix(self._robot.turn)  # a matrix: it rounds as native code does
-        parts = turned_back(rows[:, 3:7], np.array(self.spec.gravity)), rows[:, 10:]
-        return np.concatenate([frames.rotate(turn, part) for part in parts], axis=1)
+        rows = self._bases()
+        return np.hstack([turned_back(rows[:, 3:7], np.array(self.spec.gravity)), rows[:, 10:]])
 
     def push(self, rows: Sequence[int], twists: Float64) -> None:
         data, turns = self._data, matrix_of(self._bases()[rows, 3:7])
@@ -245,8 +240,6 @@ class MujocoPack(ModelPack):
         everyone, floats = self._data, self._robot.base is not None
         bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else base.copy()
         at, moves = self._robot.base or (0, 0)
-        if self._robot.turn[0] != 1.0:
-            bases[:, 3:7] = multiply(bases[:, 3:7], self._robot.turn)
         bases[:, 10:] = np.einsum("eji,ej->ei", matrix_of(bases[:, 3:7]), bases[:, 10:])
         for row, root, position, velocity in zip(rows, bases, qpos, qvel, strict=True):
             data = everyone[row]

@@ -24,7 +24,6 @@ from batchpid.sim.engine.mujoco.clearance import GroupClearance, shape_tables
 from batchpid.sim.engine.mujoco.model_builder import RobotMj
 from batchpid.sim.engine.native.interface import Mujoco
 from batchpid.sim.engine.native_model import NativeStep
-from batchpid.task_space.spatial_inertia import rotation_matrix
 
 FUNCTIONS = {
     "step1": "mj_step1",
@@ -118,7 +117,7 @@ class MujocoStep(NativeStep):
         }
         arrays: dict[str, Rows] = {name: np.array(rows, np.uint64) for name, rows in tables.items()}
         arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64), "qf": qf}
-        arrays |= {"turn": np.ascontiguousarray(rotation_matrix(robot.turn)), "sensed": sensed}
+        arrays["sensed"] = sensed
         if drives is not None:
             arrays |= zip(("stiffness", "rate_gain"), drives, strict=True)
         robots = Mujoco(**addresses, **{name: array.ctypes.data for name, array in arrays.items()})

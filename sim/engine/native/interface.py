@@ -79,7 +79,7 @@ class Mujoco(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("models", "data")),
         *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")),
         *((name, ctypes.c_void_p) for name in ("ctrl", "stiffness", "rate_gain")),
-        *((name, ctypes.c_void_p) for name in ("clearance", "sensors", "sensed", "turn")),
+        *((name, ctypes.c_void_p) for name in ("clearance", "sensors", "sensed")),
         *((name, ctypes.c_int64) for name in ("sensor_size", "base_qpos", "base_qvel")),
     ]
 
@@ -145,7 +145,7 @@ class Tick(ctypes.Structure):
         ("noise", 2 * ctypes.c_void_p),
         ("timestep", ctypes.c_double),
         *((name, ctypes.c_int64) for name in ("dof", "stage_count", "transfer_count")),
-        *((name, ctypes.c_int32) for name in ("whole", "matrix_steps")),
+        *((name, ctypes.c_int32) for name in ("matrix_steps",)),
         *((name, ctypes.c_int32) for name in ("gravity", "coriolis", "late", "unused")),
     ]
 

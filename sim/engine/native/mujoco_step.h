@@ -40,7 +40,6 @@ struct Mujoco {
   Clearance const *clearance;               // or null: collision detection of all shapes in every sim step
   double const *const *sensors;             // (robots,): arrays of their mjData, (sensor_size,) each
   double *sensed;                           // (robots, sensor_size): sums of the sensors over sim steps
-  double const *turn;                       // (3, 3): axes of the body of a floating base in its link
   std::int64_t sensor_size;
   std::int64_t base_qpos, base_qvel;        // indices of that base
 };

@@ -200,16 +200,8 @@ inline void write_bases(Group const &group, double const *gravity, double *out) 
       double const world[3] = {rate.x, rate.y, rate.z};
       turn_back(q, world, turning);
     }
-    double own[3];
-    turn_back(q, gravity, own);
-    double const *const turn = group.mujoco == nullptr ? nullptr : group.mujoco->turn;
-    for (int i = 0; i < 3; ++i) {
-      auto const in_link = [&](double const *v) {
-        return turn == nullptr ? v[i] : turn[3 * i] * v[0] + turn[3 * i + 1] * v[1] + turn[3 * i + 2] * v[2];
-      };
-      out[i] = in_link(own);
-      out[3 + i] = in_link(turning);
-    }
+    turn_back(q, gravity, out);
+    std::copy_n(turning, 3, out + 3);
   }
 }
 

@@ -38,7 +38,6 @@ struct Transfer {
   std::int64_t stride;  // of the table's ticks [bytes]; 0: each tick overwrites the one before
   std::int64_t size;    // numbers, or bytes
   TransferKind kind;
-  std::int32_t unused;
 };
 
 // Arrays (robots, dof) of double, which Python owns: Tick in interface.py.
@@ -54,7 +53,7 @@ struct Tick {
   double const *armature;         // (dof,), or null
   double const *damping;          // (dof,), or null
   Coupling coupling;
-  double *matrix;                 // (robots, dof, dof), or its diagonal, or null
+  double *matrix;                 // (robots, dof, dof), or null
   Call const *control;            // native controller, whose effort is an input of a program, or null
   Model const *measured_force;    // of the passive force at the measured state, or null
   Model const *read_force;        // of the passive force at the reading after a sim step, or null
@@ -67,11 +66,9 @@ struct Tick {
   double const *noise[2];         // (steps, robots, dof): noise of the sensors in the next steps, or null
   double timestep;
   std::int64_t dof, stage_count, transfer_count;
-  std::int32_t whole;             // the law takes the whole matrix
   std::int32_t matrix_steps;
   std::int32_t gravity, coriolis;  // parts of the passive force
   std::int32_t late;              // the law takes its setpoint at the end of a sim step
-  std::int32_t unused;
 };
 
 // Place in ticks: a tick, and the sim steps of it that are done.
@@ -90,10 +87,8 @@ struct BoundProgram {
 
 // Write M + armature + dt B of each robot, at the pose half way through the next `steps` sim steps.
 inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t steps) {
-  auto const n = static_cast<std::size_t>(tick.dof), all = static_cast<std::size_t>(robots) * n * n;
-  thread_local std::vector<double> whole;
-  if (!tick.whole) whole.resize(all);
-  double *found = tick.whole ? tick.matrix : whole.data();
+  auto const n = static_cast<std::size_t>(tick.dof);
+  double *found = tick.matrix;
   double const ahead = 0.5 * static_cast<double>(steps - 1) * tick.timestep;
   write_mass_matrices({tick.dof, tick.tree, tick.bodies}, robots, tick.pose, tick.rate, ahead, found);
   for (std::int64_t row = 0; row < robots; ++row, found += n * n) {
@@ -103,8 +98,6 @@ inline void write_matrices(Tick const &tick, std::int64_t robots, std::int64_t s
       if (tick.damping != nullptr) entry += tick.timestep * tick.damping[j];
     }
     tick.coupling.fold(n, found);
-    if (tick.whole) continue;
-    for (std::size_t j = 0; j < n; ++j) tick.matrix[static_cast<std::size_t>(row) * n + j] = found[j * n + j];
   }
 }
 

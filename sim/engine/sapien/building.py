@@ -56,8 +56,9 @@ def imported_lazily(name: str) -> Iterator[None]:
             del sys.modules[name]
 
 
-FASTEST = 1e6
-"""Largest speed of links and joints [m/s or rad/s]. PhysX's defaults stop links at 10 m/s and 50 rad/s."""
+FASTEST = 1000.0
+"""Largest speed of links and joints [m/s or rad/s]. PhysX's defaults stop links at 10 m/s and 50 rad/s, and joints at
+100 rad/s. Without a limit, a robot that starts deep in a contact diverges."""
 RESTITUTION = 0.1
 """Coefficient of restitution of SAPIEN's default material."""
 _building = RLock()

@@ -44,6 +44,8 @@ class Mjcf(NamedTuple):
     motors: Motors
     start: dict[str, float]
     """Start pose by joint [rad or m]: the keyframe "home", else the reference pose."""
+    base: tuple[float, ...] | None
+    """Start pose (7,) of a floating base, from the same."""
     missing_meshes: tuple[str, ...]
     """Collision meshes that the robot is simulated without."""
     findings: tuple[Finding, ...]
@@ -69,8 +71,10 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> M
     findings += [*_in_radians(model, names), *_unused(model, names, key)]
     pose = model.qpos0 if key is None else model.key_qpos[key]
     start = {name: float(pose[model.jnt_qposadr[joint]]) for joint, name in names.joints.items()}
+    at = model.jnt_qposadr[model.body_jntadr[tree.base]] if tree.base and not fixed_base else None
+    base = None if at is None else tuple(pose[at : at + 7].tolist())
     file = _file(path, compiled, names, fixed_base)
-    return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, missing, tuple(findings), file)
+    return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, base, missing, tuple(findings), file)
 
 
 def home(model: MjModel) -> int | None:

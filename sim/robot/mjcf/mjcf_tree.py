@@ -37,8 +37,9 @@ _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 class Tree:
     """Links and joints of the robot in ``model``, as elements of ``root``.
 
-    ``solid`` is the name of the link of each body that has shapes. The joints of other objects are removed from
-    ``names``. Raises RobotError if there is a ball joint, or more than one robot.
+    ``base`` is the body of the root, 0 for the world. ``solid`` is the name of the link of each body that has shapes.
+    The joints of other objects are removed from ``names``. Raises RobotError if there is a ball joint, or more than one
+    robot.
     """
 
     def __init__(self, model: MjModel, names: Names, path: Path, fixed_base: bool, findings: list[Finding]) -> None:
@@ -47,19 +48,20 @@ class Tree:
         self._anchors = {0: np.zeros(3)}  # origin of each body's link, in the frame of the body
         self.root = etree.Element("robot")
         self.solid: dict[int, str] = {}
-        self._base, self._left_out = self._find_base(fixed_base)
+        self.base, self._left_out = self._find_base(fixed_base)
+        self._is_held = fixed_base  # also a base on a free joint
         names.leave_out(self._left_out)
 
     def write(self, motors: Motors, couplings: Couplings) -> None:
         """Write the robot."""
-        base, left_out = self._base, self._left_out
+        base, left_out = self.base, self._left_out
         name = self._names.bodies[base]
         parent = None
         if base == 0:
             self._write_content(0, name, self._link(name))
         else:
             self._shapes.leave_out(0)
-        if base != 0 and self._model.body_quat[base][0] != 1:
+        if base != 0 and self._is_held and self._model.body_quat[base][0] != 1:
             parent = self._names.new_link(f"{name}_frame")
             self._link(parent)
         parents = {base: name}

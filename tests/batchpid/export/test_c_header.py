@@ -15,8 +15,8 @@ from law_cases import OPTIONS
 from trees import planar, states, tree_of
 
 import batchpid as bp
-from batchpid.export import to_c, to_c_project
-from batchpid.law import advance_with_mass_matrix, per_inertia
+from batchpid.export import to_c
+from batchpid.law import advance_with_mass_matrix
 from batchpid.motors import guard as guards
 from batchpid.task_space import bias, gravity, mass_matrix
 from tests.c_programs import COMPILERS, STRICT, TABLE, compiled, efforts_in_c
@@ -53,8 +53,7 @@ def efforts_in_numpy(params, columns, guard=None):
         if "mass_matrix" in now:
             state, terms = advance_with_mass_matrix(k, state, r, y, now["mass_matrix"], *optional)
         else:
-            scaled = per_inertia(k, now["inertia"]) if "inertia" in now else k
-            state, terms = bp.advance(scaled, state, r, y, *optional)
+            state, terms = bp.advance(k, state, r, y, *optional)
         efforts.append(terms.effort[0])
     return np.array(efforts)
 
@@ -64,8 +63,6 @@ def motion(seed: int, joints: int, dtype, names, steps: int = 100) -> dict[str, 
     rng = np.random.default_rng(seed)
     columns = {name: rng.normal(0, 2, (steps, joints)) for name in ("setpoint", "measurement", *names)}
     columns["measurement"] = np.cumsum(columns["measurement"], axis=0) * 0.05
-    if "inertia" in names:
-        columns["inertia"] = rng.uniform(0.01, 2, (steps, joints))
     if "mass_matrix" in names:
         root = rng.normal(0, 1, (steps, joints, joints))
         columns["mass_matrix"] = root @ root.transpose(0, 2, 1)
@@ -88,13 +85,9 @@ def settings_of_a_law(draw) -> tuple[bp.PIDParams, dict, list[str]]:
     for name, unit in (("effort_rate_limit", 100.0), ("integral_limit", 0.1)):
         if draw(st.booleans()):
             options[name] = (np.array(draw(row)) + 0.1) * unit
-    if "setpoint_weight_derivative" in options:
-        options["first_derivative"] = draw(st.sampled_from(["zero", "kick"]))
-    options["weight_origin"] = draw(st.sampled_from(["zero", "start"]))
     options["non_finite"] = draw(st.sampled_from(["propagate", "zero", "hold"]))
-    options["integration"] = draw(st.sampled_from(["output_first", "integrate_first"]))
     options["continuous"] = draw(st.lists(st.booleans(), min_size=joints, max_size=joints))
-    units = draw(st.sampled_from(["effort", "effort", "inertia", "mass_matrix"]))
+    units = draw(st.sampled_from(["effort", "effort", "mass_matrix"]))
     if units == "mass_matrix":  # its law lacks these
         for name in ("non_finite", "tracking_time"):
             options.pop(name, None)
@@ -202,26 +195,3 @@ def test_the_dynamics_of_the_robot(name, dtype, tmp_path):
     for at, expected in zip(np.split(found, [n * n, n * n + n], axis=1), parts, strict=True):
         size = max(np.abs(expected).max(), 1.0)
         np.testing.assert_allclose(at, expected, rtol=0, atol=(1e-12 if dtype == np.float64 else 1e-5) * size)
-
-
-def test_the_project_is_a_program_with_the_laws_efforts(tmp_path):
-    tree = planar(gravity=(0.0, -9.81, 0.0))
-    params = bp.make_params(2, [40.0, 20.0], 5.0, 2.0, measurement_rate="measured", gain_units="mass_matrix")
-    options = {"joint_names": tree.joint_names, "tree": tree}
-    files = to_c_project(params, DT, header="two-joints.h", **options)
-    assert files["two-joints.h"] == to_c(params, DT, **options).text
-    for name, text in files.items():
-        (tmp_path / name).write_text(text)
-    q, v, r = np.random.default_rng(0).normal(size=(3, 20, 1, 2))
-    if shutil.which("cmake"):
-        for words in (("-B", "build"), ("--build", "build")):
-            subprocess.run(["cmake", *words], cwd=tmp_path, check=True, capture_output=True)
-        binary = tmp_path / "build/example"
-    else:
-        binary = compiled(tmp_path, files["example.c"], "-std=c99")
-    words = "\n".join(" ".join(map(repr, row)) for row in np.concatenate([r, q, v], axis=2)[:, 0].tolist())
-    ran = subprocess.run([binary], input=words, capture_output=True, text=True, check=True)
-    found = np.array([line.split() for line in ran.stdout.splitlines()], float)
-    columns = {"setpoint": r, "measurement": q, "measurement_rate": v, "feedforward": bias(tree, q, v)}
-    columns = {name: column[:, 0] for name, column in columns.items()} | {"mass_matrix": mass_matrix(tree, q)[:, 0]}
-    np.testing.assert_allclose(found, efforts_in_numpy(params, columns), rtol=1e-12, atol=1e-12)

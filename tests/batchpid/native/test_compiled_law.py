@@ -26,11 +26,8 @@ CHOICES = {
     "derivative_filter_time": st.just(0.01),
     "setpoint_weight": st.just(0.7),
     "setpoint_weight_derivative": st.just(0.3),
-    "weight_origin": st.just("start"),
-    "first_derivative": st.just("kick"),
     "deadband": st.just(0.3),
     "anti_windup": st.sampled_from(["none", "clamp", "conditional", "back_calculation"]),
-    "integration": st.just("integrate_first"),
     "non_finite": st.sampled_from(["zero", "hold"]),
     "continuous": st.just(True),
 }

@@ -76,7 +76,6 @@ def test_kinematics_and_dynamics(name, rows, seed, pointed):
     seed=st.integers(0, 2**31),
     axes=st.none() | MASKS,
     forces=st.none() | MASKS,
-    kind=st.sampled_from(["full", "partial", "none"]),
     frame=st.sampled_from(["world", "tool"]),
     smallest=st.sampled_from([0.02, 0.5, 10.0]),
     extras=st.integers(0, 15),
@@ -84,16 +83,16 @@ def test_kinematics_and_dynamics(name, rows, seed, pointed):
     learns=st.booleans(),
     avoids=st.booleans(),
 )
-def test_the_law(name, rows, seed, axes, forces, kind, frame, smallest, extras, limit, learns, avoids):
+def test_the_law(name, rows, seed, axes, forces, frame, smallest, extras, limit, learns, avoids):
     tree, tool = tree_of(name), tool_of(name)
     qpos, qvel = states(tree, rows, seed)
     goal = ts.link_poses(tree, states(tree, rows, seed + 1)[0], [tool])[:, 0]
     rng = np.random.default_rng(seed)
     forces = None if forces is None else np.array(forces) & ~np.array(axes or [True] * 6)
-    options = {"axes": axes, "force_axes": forces, "decoupling": kind, "frame": frame, "effort_limit": limit}
+    options = {"axes": axes, "force_axes": forces, "frame": frame, "effort_limit": limit}
     options |= {"integral_gain": 50.0, "integral_limit": 1.0} if learns else {}
     options |= {"limit_margin": 0.5} if avoids else {}
-    options |= {"discretization": "implicit"} if seed % 2 and kind != "none" else {}
+    options |= {"discretization": "implicit"} if seed % 2 else {}
     stiffness = rng.uniform(50, 200, (1 if seed % 3 else rows, 6))
     params = ts.make_osc_params(tree, stiffness=stiffness, damping=20.0, smallest_eigenvalue=smallest, **options)
     names = "twist", "acceleration", "wrench", "feedforward"

@@ -76,14 +76,12 @@ def test_the_posture_does_not_move_the_tool():
     for axes in (None, [True] * 3 + [False] * 3, [False, True, True, True, False, True]):
         params = ts.make_osc_params(tree, axes=axes, smallest_eigenvalue=1e-9)
         d = ts.task_dynamics(tree, qpos, qvel, HAND)
-        for decoupling in ("full", "partial", "none"):
-            chosen = params._replace(decoupling=ts.osc_params.TASK_CHOICES["decoupling"][decoupling])
-            state, goal = ts.init(params, qpos + 0.3), goals(tree, HAND)(50)
-            terms = terms_of(chosen, state, goal, qpos, qvel, d)
-            moved = moved_by(d, tree.chain(HAND), terms.posture)
-            moved = moved if axes is None else moved[:, axes]
-            assert np.abs(moved).max() < 1e-9 * np.abs(terms.posture).max()
-            assert np.abs(terms.posture).max() > 1
+        state, goal = ts.init(params, qpos + 0.3), goals(tree, HAND)(50)
+        terms = terms_of(params, state, goal, qpos, qvel, d)
+        moved = moved_by(d, tree.chain(HAND), terms.posture)
+        moved = moved if axes is None else moved[:, axes]
+        assert np.abs(moved).max() < 1e-9 * np.abs(terms.posture).max()
+        assert np.abs(terms.posture).max() > 1
 
 
 @settings(max_examples=30)
@@ -120,7 +118,7 @@ def test_a_row_does_not_depend_on_the_others_and_nan_stays_alone():
     qpos[2], qvel[3] = np.nan, np.inf
     goal, state = goals(tree, HAND)(rows), ts.OSCState(qpos + 0.1)
     goal[5, 0] = np.nan
-    for options in ({}, {"decoupling": "partial", "frame": "tool"}, {"axes": [True] * 3 + [False] * 3}):
+    for options in ({}, {"frame": "tool"}, {"axes": [True] * 3 + [False] * 3}):
         params = ts.make_osc_params(tree, effort_limit=60.0, smallest_eigenvalue=0.05, **options)
 
         def terms_for(chosen, params=params):
@@ -156,19 +154,6 @@ def test_a_selected_force_is_that_of_the_wrench():
         tool = tool if frame == "world" else frames.in_axes(turn, tool[..., None])[..., 0]
         assert np.abs(tool[~terms.near_singular, :5]).max() < 1e-9
         assert np.abs(tool[:, 5]).max() > 0.1
-
-
-def test_without_decoupling_gains_are_forces():
-    tree = tree_of("panda")
-    qpos, qvel = states(tree, 5)
-    params = ts.make_osc_params(tree, decoupling="none", stiffness=400.0, damping=30.0, posture_stiffness=0.0)
-    d = ts.task_dynamics(tree, qpos, qvel, HAND)
-    goal = d.pose.copy()
-    goal[:, 0] += 0.05
-    effort = terms_of(params, ts.init(params, qpos), goal, qpos, 0 * qvel, ts.Tool(tree, HAND)).effort
-    chain = tree.chain(HAND)
-    wanted = ts.gravity(tree, qpos)[:, chain] + 20.0 * d.jacobian[:, 0, chain]
-    np.testing.assert_allclose(effort[:, chain], wanted, atol=1e-9)
 
 
 def test_the_state_is_the_posture_and_rows_of_it_reset():

@@ -16,7 +16,7 @@ OPTIONS = {
     "damping_ratio": 0.7,
     "position_error_limit": math.inf,
     "axes": [True, True, True, False, False, False],
-    "decoupling": "partial",
+    "frame": "tool",
 }
 
 

@@ -139,7 +139,7 @@ def run_while_filling(command, name: str, disk: Path, free: int, monkeypatch) ->
     else:
         assert path.read_bytes() != b"older"
     left = {each.name for each in disk.iterdir()} - {path.name, "filler"}
-    assert left <= ({"a.h5.partial"} if name.endswith("h5") else {"a.search.json"} if name == "tune" else set())
+    assert left <= ({"a.h5.partial"} if name.endswith("h5") else set())
     return status
 
 

@@ -91,7 +91,7 @@ def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
     assert vars(parsed.meshes) == {"missing_meshes": "error", "package_dirs": (Path("a"), Path("b"))}
 
 
-@pytest.mark.parametrize("name", ["meshes", "seed", "variation", "randomize"])
+@pytest.mark.parametrize("name", ["meshes", "seed", "randomize"])
 def test_a_flag_has_the_same_type_and_default_in_every_command(name):
     fields = [fields_of(command)[name] for command in cli.COMMANDS if name in fields_of(command)]
     assert len(fields) >= 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import re
+import os
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ WORDS = {
 }
 """Words of each command that writes, without its outputs."""
 SUFFIXES = {"picture": ".png", "json": ".json", "out": ".yaml"}
+MJCF = "<mujoco><worldbody><body><joint name='a'/><geom size='.1'/></body></worldbody></mujoco>"
 OUT = {"rollout": ".npz", "excite": ".csv", "export": ".h", "survey": ".md"}
 
 
@@ -108,28 +109,40 @@ def test_the_demo_can_be_repeated_for_another_robot_and_with_force(batchpid, tmp
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"panda-demo.png", "jaco2-demo.png"}
 
 
-def test_inputs_are_never_replaced_and_no_two_outputs_are_one_file(files, batchpid, tmp_path):
-    arm, recording = files / "arm.urdf", files / "run.npz"
-    (path := tmp_path / "motors.yaml").write_text("kept")
-    (link := tmp_path / "link.yaml").symlink_to(path)
-    for each in (path, link, tmp_path / "." / "motors.yaml"):
-        _, _, complaint = batchpid("identify", arm, path, "--out", each, "--force")
-        assert "out: is a file to read" in complaint
-    _, _, complaint = batchpid("survey", arm, "--json", tmp_path / "a.json", "--out", tmp_path / "a.json", "--force")
-    assert "out: unknown file format" in complaint
-    _, _, complaint = batchpid("identify", arm, recording, "--out", tmp_path / "a.json", "--json", tmp_path / "a.json")
+INPUTS = {"gains": "a.yaml", "actuators": "a.yaml", "randomize": "a.yaml", "trajectory": "m.csv", "versus": "run.npz"}
+"""Flags of files to read, besides those in WORDS."""
+
+
+@pytest.mark.parametrize("make", [os.symlink, os.link])
+@pytest.mark.parametrize(("name", "flag"), output_flags())
+def test_a_file_that_a_command_reads_is_never_replaced(name, flag, make, files, batchpid, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {field.name for field in dataclasses.fields(COMMANDS[name])}
+    words = [*WORDS[name], *(word for each, file in INPUTS.items() if each in names for word in (f"--{each}", file))]
+    read = {file for file in words if str(file).endswith((".urdf", ".yaml", ".csv", ".npz"))}
+    for file in read:
+        (tmp_path / file).write_text("kept")
+    for file in read:
+        path = tmp_path / f"output{OUT.get(name, SUFFIXES[flag]) if flag == 'out' else SUFFIXES[flag]}"
+        make(tmp_path / file, path)
+        status, said, complaint = batchpid(*words, f"--{flag}", path, "--force")
+        assert (status, said, f"batchpid: {flag}: is a file to read" in complaint) == (2, "", True), complaint
+        assert (tmp_path / file).read_text() == "kept"
+        path.unlink()
+
+
+@pytest.mark.parametrize(("target", "file"), [("urdf", "arm.urdf"), ("mjcf", "arm.xml")])
+def test_an_export_does_not_replace_its_robot(target, file, batchpid, tmp_path):
+    text = MJCF if file.endswith("xml") else one_joint()
+    (path := tmp_path / file).write_text(text)
+    status, _, complaint = batchpid("export", path, "--to", target, "--out", path, "--force")
+    assert (status, "out: is a file to read" in complaint, path.read_text()) == (2, True, text)
+
+
+def test_no_two_outputs_are_one_file(files, batchpid, tmp_path):
+    same = tmp_path / "a.json"
+    _, _, complaint = batchpid("identify", files / "arm.urdf", files / "run.npz", "--out", same, "--json", same)
     assert "json: is another output of this run" in complaint
-    assert {each.name for each in tmp_path.iterdir()} == {"motors.yaml", "link.yaml"}
-    assert path.read_text() == "kept"
-
-
-def test_a_stopped_search_is_neither_lost_nor_continued_unasked(files, batchpid, tmp_path):
-    arm, history = files / "arm.urdf", tmp_path / "a.search.json"
-    history.write_text("costs")
-    status, _, complaint = batchpid("tune", arm, "--out", tmp_path / "a.yaml")
-    assert status == 2
-    assert re.search(r"exists already.*--resume to continue.*--force to begin anew", complaint)
-    assert history.read_text() == "costs"
 
 
 def test_make_can_repeat_its_runs():

@@ -38,7 +38,7 @@ RUNS = {
 }
 """A short run of each command."""
 INPUTS = {"arm.urdf", "gains.yaml", "run.npz", "log.npz"}
-WRITTEN = (".yaml", ".search.json", "-tune.png", ".fit.json", "-fit.png", ".png", ".npz", ".json", ".md", ".csv", ".h")
+WRITTEN = (".yaml", "-tune.png", "-fit.png", ".png", ".npz", ".json", ".md", ".csv", ".h")
 MOMENTS = int(os.environ.get("BATCHPID_SOAK_MOMENTS", "4"))
 """Number of interrupts of each command."""
 

@@ -25,7 +25,7 @@ def test_prints_a_table_and_writes_the_reports(batchpid, tmp_path):
     assert (arm["dof"], arm["loads"], arm["moves"], arm["settled"], arm["error"]) == (1, True, 1, 1, None)
     assert 0 <= arm["worst_error"] < 1e-3
     assert (scenery["dof"], scenery["loads"], scenery["moves"]) == (0, False, 0)
-    assert scenery["error"].startswith("reading the description: a robot without moving joints")
+    assert scenery["error"].startswith("reading the description: a robot without joints")
     assert scenery["error"] in out
     assert page.read_text().startswith("| file ")
     assert "| arm.urdf " in page.read_text()

@@ -143,7 +143,7 @@ def test_an_inertia_of_no_body_is_replaced_and_listed(tmp_path):
 
 def test_bad_requests_are_refused():
     loaded = Robot.load("panda")
-    for params in (plain(loaded).replace(gain_units="inertia"), plain(loaded, effort_min=1.0, effort_max=1.0)):
+    for params in (plain(loaded).replace(gain_units="mass_matrix"), plain(loaded, effort_min=1.0, effort_max=1.0)):
         with pytest.raises(InvalidArgumentError):
             to_mjcf(loaded, params, DT)
     with pytest.raises(InvalidArgumentError, match="physics"):
@@ -366,7 +366,7 @@ def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
     other = Robot.load(folder / "chain.xml")
     back, listed = other.mjcf_gains(), {each.partition(":")[0] for each in exported.differences}
     scale, tolerance = 1.0 if params.gain_units is None else inertia, 1e-12 if params.dtype == np.float64 else 1e-6
-    limit = np.minimum(-np.array(values(params, "integral_min")), values(params, "integral_max"))
+    limit = scale * np.minimum(-np.array(values(params, "integral_min")), values(params, "integral_max"))
     kept = (np.array(values(params, "ki")) > 0) & (limit > 0)
     for name in ("kp", "ki", "kd"):
         wanted = np.array(values(params, name)) * scale
@@ -394,3 +394,10 @@ def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
     lost = {"effort_rate_limit", "setpoint_weight", "deadband", "continuous", "non_finite", "gain_units"}
     lost |= {"setpoint_weight_derivative", "derivative_filter_time"} if params.kd is not None else set()
     assert {name for name in lost if getattr(params, name) is not None} == listed & lost
+
+
+def test_a_floating_base_starts_as_in_the_runner():
+    robot = Robot.load("quadruped", fixed_base=False)
+    model = mujoco.MjModel.from_xml_string(to_mjcf(robot, None, 1e-3).text)
+    with Runner(robot, 1, workers=0, engine="mujoco") as runner:
+        np.testing.assert_allclose(model.key_qpos[0, :7], runner.observe().base_pose[0], atol=1e-6)

@@ -298,7 +298,6 @@ WALKER = """
 def test_a_floating_base_behind_an_object(load):
     """Pose and twist of a base are those of its link, wherever MuJoCo has them, and in both engines the same."""
     robot = load(WALKER, fixed_base=False)
-    turn = np.array([1.0, 1.0, 0.0, 0.0]) / np.sqrt(2)
     pose, twist = [0.1, 0.2, 3.0, 0.8, 0.0, 0.6, 0.0], [0.3, 0.1, 0.2, 1.0, 2.0, 3.0]
     seen = []
     cases = ("mujoco", "none"), ("sapien", "none"), ("mujoco", "gravity+coriolis"), ("rebuilt", "gravity+coriolis")
@@ -310,8 +309,7 @@ def test_a_floating_base_behind_an_object(load):
             np.testing.assert_allclose(obs.base_pose[0], pose, atol=1e-6)
             np.testing.assert_allclose(obs.base_twist[0], twist, atol=1e-5)
             if engine == "mujoco":
-                mujoco.mju_mulQuat(turned := np.zeros(4), np.array(pose[3:]), turn)
-                np.testing.assert_allclose(runner.bodies(["trunk"])[0, 0, 3:], turned)
+                np.testing.assert_allclose(runner.bodies(["trunk"])[0, 0], pose)
             for _ in range(20):
                 obs = runner.step([0.02])
             seen.append(np.concatenate([obs.qpos[0], obs.base_pose[0], obs.base_twist[0]]))
@@ -454,3 +452,39 @@ def test_every_file_that_a_load_opens_is_part_of_the_identity(tmp_path, changed)
     robot_model.cache_clear()
     with pytest.raises(RobotError, match="has changed since the robot was loaded"):
         Runner(robot, 1, workers=0, engine="mujoco")
+
+
+STARTS = {
+    "plane": ('<geom type="plane" size="5 5 1" pos="0 0 .5"/>', "0 0 1 1 0 0 0", 0.55),
+    "low plane": ('<geom type="plane" size="5 5 1" pos="0 0 -1"/>', "0 0 -.5 1 0 0 0", -0.95),
+    "platform": ('<geom type="box" size="1 1 .2" pos="0 0 .2"/>', "0 0 .6 1 0 0 0", 0.45),
+    "turned": ('<geom type="plane" size="5 5 1"/>', "1 2 .3 0 1 0 0", 0.25),
+}
+
+
+@pytest.mark.parametrize("keyed", [True, False])
+@pytest.mark.parametrize("name", STARTS)
+def test_a_floating_robot_starts_where_its_file_places_its_root_body(load, name, keyed):
+    ground, pose, height = STARTS[name]
+    values = pose.split()
+    place = "" if keyed else f'pos="{" ".join(values[:3])}" quat="{" ".join(values[3:])}"'
+    key = f'<keyframe><key name="home" qpos="{pose} 0"/></keyframe>' if keyed else ""
+    body = (
+        f'<body name="t" {place}><freejoint/><geom type="box" size=".2 .2 .05" mass="5"/><body name="l" pos="0 0 .2">'
+    )
+    leg = '<joint name="a" axis="0 1 0" range="-1 1" damping="1"/><geom size=".05" mass=".1"/>'
+    text = f"<mujoco>{OPTION}<worldbody>{ground}{body}{leg}</body></body></worldbody>{key}</mujoco>"
+    robot = load(text, fixed_base=False)
+    assert [*robot.bodies] == ["t", "l"]
+    for engine in ("mujoco", "sapien"):
+        with Runner(robot, 1, workers=0, engine=engine, physics="accurate") as runner:
+            start = runner.observe().base_pose[0]
+            if engine == "mujoco" or name != "low plane":  # SAPIEN's ground is at height 0
+                np.testing.assert_allclose(start, [float(each) for each in values], atol=1e-6)
+            if engine == "mujoco":
+                for _ in range(100):
+                    seen = runner.step(robot.start)
+                np.testing.assert_allclose(seen.base_pose[0, 2], height, atol=2e-3)
+            seen = runner.reset(base_pose=start, base_twist=[0, 0, 0.1, 0, 0.2, 0])
+            np.testing.assert_allclose(seen.base_pose[0], start, atol=1e-6)
+            np.testing.assert_allclose(seen.base_twist[0], [0, 0, 0.1, 0, 0.2, 0], atol=1e-6)

@@ -49,7 +49,7 @@ def test_a_follower_stays_with_its_leader_over_many_turns(kind, multiplier, tmp_
 
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 @pytest.mark.parametrize("kind", ["continuous", "prismatic"])
-def test_no_speed_is_too_high(kind, engine, tmp_path):
+def test_speeds_are_those_of_fast_motors(kind, engine, tmp_path):
     """v = F t / m, far beyond PhysX's defaults: 10 m/s and 50 rad/s of links, 100 of joints."""
     limit = '<limit lower="-9e3" upper="9e3" effort="900" velocity="900"/>'
     robot = Robot.load(write(tmp_path, one_joint(limit, kind)))

@@ -10,7 +10,6 @@ from robots import load_bundled
 
 from batchpid import make_actuators
 from batchpid.errors import InvalidArgumentError
-from batchpid.motors import actuator_presets as presets
 from batchpid.motors import friction
 from batchpid.sim import Choice, LogUniform, Normal, Randomization, Robot, Uniform
 from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
@@ -148,7 +147,7 @@ def test_centers_of_mass_are_drawn_along_three_axes():
 def test_delays_are_drawn_as_by_a_delayed_pd_actuator():
     """Whole steps between both ends, one for all joints of an env, drawn again for each episode."""
     least, most, step = 2, 5, 1 / 2000
-    chosen = presets.delayed_pd(PANDA.dof, step, least, most)
+    chosen = make_actuators(PANDA.dof, command_delay=least * step, max_delay=most * step)
     more = Choice(step * np.arange(most - least + 1), shared=True)
     randomization = Randomization(actuators={"command_delay": more})
     prepared = prepared_actuators(randomization, chosen, PANDA)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 
 from batchpid.errors import RobotError
-from batchpid.sim import Robot
+from batchpid.sim import RepairWarning, Robot
 from batchpid.sim.robot.link_repair import ball, nearest_physical, triangle_excess
 
 BASE, ARM, TIP = link("base"), link("arm"), link("tip")
@@ -163,7 +164,9 @@ REPAIRED = {  # the URDF, the code of its finding, and what that says
 def test_a_repair_is_told_and_the_robot_runs_or_strict_refuses(case, tmp_path):
     text, code, message = REPAIRED[case]
     path = write(tmp_path, text)
-    repaired = Robot.load(path)
+    with pytest.warns(RepairWarning, match=r"repairs?; robot.check\(\) and batchpid inspect list them") as warned:
+        repaired = Robot.load(path)
+    assert [f": {len(repaired.repairs)} repair" in str(each.message) for each in warned] == [True]
     told = [str(finding) for finding in repaired.repairs if finding.code == code]
     assert any(re.search(message, each) for each in told), repaired.repairs
     engine, pose = repaired.dynamics(ground=False), repaired.start[None]
@@ -200,7 +203,9 @@ def test_latin_1_that_claims_to_be_utf_8_is_read(tmp_path):
 def test_what_urdfs_hold_for_others_is_no_repair(tmp_path):
     unused = "<visual/>", "<material/>", "<transmission/>", "<gazebo/>", "<sensor/>"
     text = robot(link("base", "<visual/>" + INERTIAL), ARM, HINGE, *unused[1:])
-    assert Robot.load(write(tmp_path, text), strict=True).repairs == ()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert Robot.load(write(tmp_path, text)).repairs == ()
 
 
 # -- Inertia -------------------------------------------------------------------------------------------------------

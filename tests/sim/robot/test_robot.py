@@ -1,14 +1,53 @@
-"""Designed gains of a robot, and its repr."""
+"""A robot's designed gains, target and repr, and robots from pipes."""
+
+import sys
+import warnings
+from pathlib import Path
+from subprocess import run
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from tiny_urdf import one_joint, write
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from robots import load_bundled
+from tiny_urdf import one_joint, random_tree, write
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Runner
 
 
-@pytest.mark.parametrize("units", ["mass_matrix", "inertia", "effort"])
+@given(st.integers(0, 2**32), st.floats(-4, 4), st.floats(0, 9))
+@settings(max_examples=20, deadline=None)
+def test_every_robot_has_a_target_within_its_limits(seed, low, width):
+    parts = "".join(random_tree(np.random.default_rng(seed), 6))
+    text = parts.replace('lower="-9" upper="9"', f'lower="{low}" upper="{low + width}"')
+    with TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        loaded = Robot.load(write(Path(folder), f'<robot name="x">{text}</robot>'))
+    assert not loaded.limit_violations(loaded.target)
+    moves = np.abs(loaded.target - loaded.start)
+    np.testing.assert_allclose(
+        moves, np.minimum(0.25 * np.maximum(loaded.upper - loaded.start, loaded.start - loaded.lower), 0.5)
+    )
+    assert (load_bundled("panda").target == load_bundled("panda").settings.target).all()
+
+
+def test_a_robot_from_a_pipe():
+    program = "import sys; from batchpid.sim import Robot; print(Robot.load('/dev/stdin').joint_names)"
+    done = run([sys.executable, "-c", program], input=one_joint(), capture_output=True, text=True, check=True)
+    assert done.stdout == "('hinge',)\n"
+    shown = run(
+        ["bash", "-c", f"'{sys.executable}' -m batchpid inspect <(cat)"],
+        input=one_joint(),
+        capture_output=True,
+        text=True,
+    )
+    assert shown.returncode == 0, shown.stderr
+    assert "hinge" in shown.stdout
+
+
+@pytest.mark.parametrize("units", ["mass_matrix", "effort"])
 def test_designed_gains_move_any_urdf_to_its_setpoint(units, tmp_path):
     robot = Robot.load(write(tmp_path, one_joint()))
     params = robot.designed(gain_units=units)

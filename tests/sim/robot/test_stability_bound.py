@@ -67,7 +67,6 @@ LATE = {
         ("effort", "a short delay and a sensor", "panda"),
         ("mass_matrix", "armature", "panda"),
         ("effort", "a lag", "panda"),
-        ("inertia", "armature", "panda"),
         ("effort", "a delay", "jaco2"),
     ],
 )

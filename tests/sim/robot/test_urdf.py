@@ -50,7 +50,11 @@ BAD = {
         "has 256 links that move; PhysX holds at most 255.*split",
     ),
     "no parent": (one_joint().replace('<parent link="base"/>', ""), "joint 'hinge'.*needs <parent"),
-    "no joint": (robot(BASE), "without moving joints"),
+    "no joint": (robot(BASE), "without joints.*xacro has to be expanded"),
+    "library of xacro": (
+        robot('<xacro:macro xmlns:xacro="http://wiki.ros.org/xacro" name="arm">', BASE, ARM, HINGE, "</xacro:macro>"),
+        "xacro has to be expanded",
+    ),
     "fixed joints only": (one_joint("", "fixed"), "without moving joints"),
     "no link": (robot(), "exactly one root|without"),
 }

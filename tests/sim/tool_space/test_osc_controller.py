@@ -288,7 +288,7 @@ LOOPS = {
     "default": {},
     "with parts": {"twist": True, "acceleration": True, "wrench": True, "joints": ["panda_finger_joint1"]},
     "integral": {"integral_gain": 20.0, "integral_limit": 5.0, "limit_margin": 0.2, "frame": "tool"},
-    "implicit": {"discretization": "implicit", "decoupling": "partial", "point": [0.0, 0.0, 0.1]},
+    "implicit": {"discretization": "implicit", "point": [0.0, 0.0, 0.1]},
 }
 MORE = [
     {"compensate": "gravity"},

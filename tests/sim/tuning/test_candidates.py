@@ -1,4 +1,4 @@
-"""Candidates of searches: first ones, by their poles, phase margin and delay, and gains of a tool."""
+"""Candidates of searches: first ones, by their poles, phase margin and delay."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import batchpid.task_space as ts
 from batchpid import make_actuators
-from batchpid.sim import OperationalSpace, Randomization, Uniform
+from batchpid.sim import Randomization, Uniform
 from batchpid.sim.tuning import Weights, random_moves, tune
 from batchpid.sim.tuning.candidates import (
     FASTEST,
@@ -22,9 +21,7 @@ from batchpid.sim.tuning.candidates import (
     loop_delay,
     phase_margin,
 )
-from batchpid.sim.tuning.tool_candidates import GAINS, SearchedSpace, osc_options, stability_penalty
 
-HAND = "panda_hand"
 SPEED = st.floats(0.5, 50.0)
 DELAY = st.floats(0.0, 0.2)
 
@@ -68,7 +65,8 @@ def test_candidates_are_slower_the_later_the_motors(panda):
 
 
 def test_points_stand_for_their_gains_per_mass_matrix(panda):
-    search = Candidates(panda, "mass_matrix", False, random_moves(panda, 1, 0), 0.2, Weights())
+    options = {"headroom": 1.0, "varied": False}
+    search = Candidates(panda, "mass_matrix", False, random_moves(panda, 1, 0), 0.2, Weights(), **options)
     gains = first_gains(0.005)
     params = search.params(search.points(gains))
     for leaf, expected in zip((params.ki, params.kp, params.kd), np.array(gains).T, strict=True):
@@ -94,25 +92,3 @@ def test_first_generation_of_robots_that_differ_are_designs_for_their_delay(pand
     designs = [*first_gains(0.003 + own)[:3]]
     gains = np.array([leaf[0, 0] for leaf in (found.params.ki, found.params.kp, found.params.kd)])
     assert min(np.abs(gains / design - 1).max() for design in designs) < 1e-9 or found.cost == found.start_cost
-
-
-def test_gains_of_a_setpoint_are_those_of_the_options(panda):
-    """Each env has the effort of a controller that is made with its gains; the defaults are the library's."""
-    rng, searched = np.random.default_rng(0), SearchedSpace(panda, HAND)
-    gains = rng.uniform(0.5, 2, (3, 5)) * [value for _, value in GAINS.values()]
-    gains[0] = [value for _, value in GAINS.values()]
-    qpos, qvel = panda.settings.target + 0.1 * rng.normal(size=(2, 3, 9))
-    pose = ts.link_poses(searched.tree, qpos + 0.05, [HAND])[:, 0]
-    inputs = searched.init(panda, 3), np.concatenate([pose, gains], axis=1), qpos, qvel, np.zeros((3, 9))
-    efforts = searched(*inputs)[1]
-    for row, own in enumerate(gains):
-        alone = OperationalSpace(panda, HAND, **osc_options(own) if row else {})
-        state, *rest = inputs
-        part = ts.OSCState(state.posture[row : row + 1]), pose[row : row + 1], *(x[row : row + 1] for x in rest[1:])
-        np.testing.assert_allclose(efforts[row], alone(*part)[1][0], rtol=1e-12, atol=1e-9)
-
-
-def test_gains_near_the_stability_bound_have_a_penalty():
-    """With ratio 1 the explicit law is stable for w dt < 0.828."""
-    gains = np.array([[0.828, 0.1, 0.1, 1, 1], [0.1, 0.828, 0.1, 1, 1], [0.1, 0.1, 0.828, 1, 1], [0.3, 0.3, 0.3, 1, 1]])
-    np.testing.assert_allclose(stability_penalty(gains * [1e3, 1e3, 1e3, 1, 1], 1e-3), [2, 2, 2, 0], atol=0.01)

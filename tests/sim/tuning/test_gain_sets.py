@@ -60,20 +60,6 @@ def test_tuned_gains_of_a_robot_without_are_refused(panda):
         gain_set(dataclasses.replace(panda, settings=None), "tuned")
 
 
-def test_python_is_refused_with_what_is_read(panda, tmp_path):
-    (path := tmp_path / "arm.py").write_text("ARM = ImplicitActuatorCfg(stiffness=1.0)")
-    with pytest.raises(InvalidArgumentError, match=r"is not read.*arm.py.*ros2_control.*MJCF"):
-        gain_set(panda, str(path))
-
-
-def test_errors_of_a_ros2_control_file_name_it(panda, tmp_path):
-    (path := tmp_path / "arm.yaml").write_text("arm: {ros__parameters: {joints: [elbow], gains: {elbow: {p: 1.0}}}}")
-    with pytest.raises(
-        InvalidArgumentError, match=r"arm.yaml: text: has no gains of these joints: panda_finger_joint1"
-    ):
-        gain_set(panda, str(path))
-
-
 def test_gains_of_an_mjcf_file_are_those_of_its_servos(panda, tmp_path):
     pytest.importorskip("mujoco", "3.17")
     params = bp.make_params(

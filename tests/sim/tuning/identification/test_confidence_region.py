@@ -88,10 +88,8 @@ def test_what_holds_for_all_draws(robot, tmp_path):
     found = within(robot, good, drawn.actuators, moves, **options)
     assert found.holds
     assert found.settling.shape == (6,)
-    assert found.settling[found.binding] <= found.settling.max()
     assert "delay" in drawn.describe(found.stability.env, "shoulder")
     with pytest.warns(UserWarning, match="stability bound"):
         bad = within(robot, good.replace(kp=good.kp * 400, kd=good.kd * 20), drawn.actuators, moves, **options)
     assert not bad.holds
-    assert bad.rank > found.rank
     assert bad.stability.robot_ratio > 1
