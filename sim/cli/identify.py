@@ -12,7 +12,7 @@ from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import AT_MOST, OutputFiles, bar, beside, write_figures
+from batchpid.sim.cli.outputs import AT_MOST, FOLDER, OutputFiles, bar, beside, stem, write_figures
 
 if TYPE_CHECKING:
     import batchpid as bp
@@ -83,14 +83,13 @@ class IdentifyCommand:
         from batchpid.sim.identification.identification import identify
         from batchpid.sim.identification.logs import Reading
 
-        robot = Robot.load(self.robot, **vars(self.meshes))
-        out = self.out or Path(f"out/{robot.path.stem}.actuators.yaml")
-        inputs = (robot.path, None if self.gains is None else Path(self.gains), *self.logs)
-        outputs = OutputFiles(force=self.force, inputs=inputs)
+        out = self.out or FOLDER / f"{stem(Path(self.robot))}.actuators.yaml"
+        outputs = OutputFiles(self)
         out = outputs.path("out", out, (".yaml", ".yml", ".json"))
         details = outputs.path("json", self.json, (".json",))
         corrected = outputs.path("corrected_urdf", self.corrected_urdf, (".urdf",))
         picture = outputs.path("picture", self.picture or beside(out, "fit"), plots.FORMATS)
+        robot = Robot.load(self.robot, **vars(self.meshes))
         evaluations = iter(bar("identifying", bar_format=AT_MOST)(range(45)))
         found = identify(
             robot,

@@ -169,7 +169,7 @@ class Problem:
         return Solution(found.x, evaluation, self.size(evaluation), found.status > 0)
 
     def system(self, evaluation: Evaluation, point: Float64, size: Float64) -> tuple[Float64, Float64]:
-        """Return the fitted residuals over their ``size`` (joints,) and the prior's (n,), and derivatives (n, unknowns)."""
+        """Return residuals and derivatives (n, unknowns) of the fitted rows over their ``size``, then of the prior."""
         rows = sum(int(window.fitted.sum()) for window in self.windows)
         every = 1 + rows * len(size) * len(point) // MOST_NUMBERS
         residuals, slopes = list[Float64](), list[Float64]()
@@ -239,8 +239,8 @@ def _window(
     past = 0 if settle else min(first, round(0.1 / dt))
     commands = slice(first - past, last)
     forward = None if motion.feedforward is None else motion.feedforward[commands]
-    start = (motion.qpos[first], motion.qvel[first]) if first else _start(log)
-    stretch = Stretch(*start, motion.command[commands], past, forward, step - first - 1, before)
+    qpos, qvel = (motion.qpos[first], motion.qvel[first]) if first else _start(log)
+    stretch = Stretch(qpos, qvel, motion.command[commands], past, forward, step - first - 1, before)
     fitted = log.time[rows] <= log.time[0] + share * log.seconds
     return Window(number, stretch, log.qpos[rows], log.time[rows], fitted)
 

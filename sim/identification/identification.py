@@ -191,8 +191,10 @@ def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | 
     if known is None or law is None:
         return known if law is None else law
     for name in ("kp", "ki", "kd"):
-        both = [np.zeros(1) if getattr(law, name) is None else getattr(law, name) for law in (known, law)]
-        if not np.allclose(*both, rtol=1e-6):
+        recorded, present = (
+            np.zeros(1) if gain is None else gain for gain in (getattr(known, name), getattr(law, name))
+        )
+        if not np.allclose(recorded, present, rtol=1e-6):
             problem = f"contradict {log.source}, which was recorded with another {name}"
             raise InvalidArgumentError("params", problem, remedy="leave them out: a recording has its own")
     return law
@@ -339,8 +341,7 @@ def _fitted(data: Data, problem: Problem, evaluations: int, progress: Callable[[
     fitted = replace(problem, windows=[window for window in problem.windows if window.fitted.any()])
     rough = fitted.solve(problem.unknowns.start, evaluations // 2, progress=progress)
     shown = intervals_of(fitted, rough).shown
-    unknowns = problem.unknowns.only(shown)
-    hidden = problem.unknowns.only(~shown)
+    unknowns, hidden = problem.unknowns.only(shown), problem.unknowns.only(~shown)
     fitted = replace(fitted, unknowns=unknowns)
     solution = fitted.solve(rough.point[shown], evaluations, rough.size, progress)
     intervals, problem = intervals_of(fitted, solution), replace(problem, unknowns=unknowns)

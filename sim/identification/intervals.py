@@ -6,8 +6,9 @@ part g of the rows is, to first order::
     x_g = x + (H - J_g^T J_g)^-1 J_g^T r_g
 
 (B. Efron, "The jackknife, the bootstrap and other resampling plans", SIAM 1982). The parts are the logs where there are
-five or more, else ten stretches of equal length, so residuals that are correlated in time and errors of the model count. The
-variance is that of the jackknife, or s^2 H^-1 with the mean square s^2 of the residuals, whichever is larger.
+five or more, else ten stretches of equal length, so that residuals that are correlated in time and errors of the model
+count. The variance is that of the jackknife, or s^2 H^-1 with the mean square s^2 of the residuals, whichever is
+larger.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.sim.identification.fit import OUTLIER, Problem, Solution
+from batchpid.sim.identification.fit import OUTLIER, Evaluation, Problem, Solution
 from batchpid.sim.identification.unknowns import KINDS
 
 PARTS, LEAST_LOGS = 10, 5
@@ -69,7 +70,7 @@ def intervals_of(problem: Problem, solution: Solution) -> Intervals:
     return Intervals(np.sqrt(variance) * sizes, inverse / scale[:, None] / scale, shown)
 
 
-def _blocks(problem: Problem, evaluation: object, size: Float64, factors: Float64) -> list[tuple[Float64, Float64]]:
+def _blocks(problem: Problem, evaluation: Evaluation, size: Float64, factors: Float64) -> list[tuple[Float64, Float64]]:
     """Return derivatives (rows, unknowns) and residuals (rows,) of each part, weighted as by the loss."""
     tables = list[tuple[Float64, Float64, int]]()
     for window, residual, slope in zip(problem.windows, *evaluation, strict=True):

@@ -50,6 +50,10 @@ class LogSettings(NamedTuple):
     """True to hold out the whole log, False to fit it all; None: its last quarter is held out."""
 
 
+ALIKE = LogSettings()
+"""Settings of a log that has none of its own."""
+
+
 @dataclass(frozen=True, eq=False)
 class Log:
     """Commands and measured positions of some joints of one robot."""
@@ -79,7 +83,7 @@ class Log:
     """True if the efforts of ``command`` were measured and not commanded: they have no delay."""
     params: bp.PIDParams | None = None
     """Params that drove the robot, where the log says it."""
-    settings: LogSettings = LogSettings()
+    settings: LogSettings = ALIKE
     is_checked: bool = False
     """True for the result of :func:`checked`."""
 
@@ -152,12 +156,12 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
     gap = max(GAP, PERIODS * period)
     ends = [0, *(np.flatnonzero(np.diff(log.time) > gap) + 1).tolist(), len(log.time)]
     parts, short = list[Log](), list[str]()
-    for first, stop in pairwise(ends):
-        if stop - first < MIN_ROWS or log.time[stop - 1] - log.time[first] < MIN_SECONDS:
-            short.append(f"{places[first]} to {places[stop - 1]}")
+    for begin, end in pairwise(ends):
+        if end - begin < MIN_ROWS or log.time[end - 1] - log.time[begin] < MIN_SECONDS:
+            short.append(f"{places[begin]} to {places[end - 1]}")
             continue
-        part = log if len(ends) == 2 else _between(log, slice(first, stop), places)
-        parts.append(replace(_unwrapped(robot, part, places[first:stop]), is_checked=True))
+        part = log if len(ends) == 2 else _between(log, slice(begin, end), places)
+        parts.append(replace(_unwrapped(robot, part, places[begin:end]), is_checked=True))
     if not parts:
         raise error(log.source, f"has gaps of more than {gap:.3g} s in time", f"a stretch between gaps needs {need}")
     if short:
@@ -198,12 +202,13 @@ def _unwrapped(robot: Robot, log: Log, places: list[str]) -> Log:
             if (turns != 0).any() and unclear.any():
                 at = int(np.argmax(unclear))
                 problem = f"{places[at + 1]}: joint {name!r} jumps by {steps[at]:.3g} rad"
-                raise error(log.source, problem, "give positions in rad, log more rows per second, or remove wrong rows")
+                remedy = "give positions in rad, log more rows per second, or remove wrong rows"
+                raise error(log.source, problem, remedy)
             column[1:] -= TURN * np.cumsum(turns)
         if turns.any():
             wrapped.append(name)
-        elif not robot.continuous[joint]:
-            _check_range(robot, log, joint, column, places)
+        else:
+            _check_unit(robot, log, joint, column, places)
         if log.kind == "setpoint" and (turns.any() or robot.continuous[joint]):
             measured = np.interp(log.command_time, log.time, column)
             command[:, number] -= TURN * np.rint((command[:, number] - measured) / TURN)
@@ -214,12 +219,12 @@ def _unwrapped(robot: Robot, log: Log, places: list[str]) -> Log:
     return replace(log, qpos=qpos, command=command)
 
 
-def _check_range(robot: Robot, log: Log, joint: int, column: Float64, places: list[str]) -> None:
+def _check_unit(robot: Robot, log: Log, joint: int, column: Float64, places: list[str]) -> None:
     """Raise InvalidArgumentError for positions that are not in the joint's unit, or far beyond its limits."""
     name, unit, (low, high) = robot.joint_names[joint], robot.units[joint], (robot.lower[joint], robot.upper[joint])
     remedy = f"positions are in {unit}; degrees need the option degrees (--degrees)"
     beyond = (column < low - BEYOND[unit]) | (column > high + BEYOND[unit])
-    if beyond.any():
+    if beyond.any() and not robot.continuous[joint]:
         index = int(np.argmax(beyond))
         problem = f"{places[index]}, column 'qpos:{name}' is far beyond the joint's limits, {low:g} to {high:g}"
         raise error(log.source, problem, f"{remedy}; a joint that turns freely is of type continuous", column[index])

@@ -162,9 +162,7 @@ def logs_of_rollout(
     return logs
 
 
-def _build(
-    robot: Robot, source: str, columns: dict[str, Float64], kind: CommandKind | None, reading: Reading
-) -> Log:
+def _build(robot: Robot, source: str, columns: dict[str, Float64], kind: CommandKind | None, reading: Reading) -> Log:
     """Return the log that the columns of a file hold."""
     times = {name: match[1] for name in columns if (match := _TIME.fullmatch(name))}
     if not times:

@@ -12,7 +12,7 @@ are taken from a grid.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -76,8 +76,8 @@ def smooth(log: Log, timestep: float) -> Motion:
     qpos = lowpass(interpolated(time, log.time, log.qpos), min(CUTOFF, 0.2 / period), timestep)
     qvel = np.gradient(qpos, timestep, axis=0)
     forward = None if log.feedforward is None else log.commands_at(time, log.feedforward)
-    tables = map(np.ascontiguousarray, (qpos, qvel, np.gradient(qvel, timestep, axis=0)))
-    return Motion(*tables, log.commands_at(time), forward)
+    q, v, a = map(np.ascontiguousarray, (qpos, qvel, np.gradient(qvel, timestep, axis=0)))
+    return Motion(q, v, a, log.commands_at(time), forward)
 
 
 def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
@@ -112,23 +112,22 @@ def _readings(log: Log, names: Sequence[str]) -> Iterator[tuple[str, Log]]:
     columns[f"qpos and {log.kind}"] = True, True
     joints = len(names)
 
-    def changed(sides: tuple[bool, bool], function: Callable[[Float64], Float64]) -> Log:
-        qpos, command = (function(table) if side else table for table, side in zip((log.qpos, log.command), sides, strict=True))
-        return replace(log, qpos=qpos, command=command)
+    def changed(sides: tuple[bool, bool], matrix: Float64) -> Log:
+        qpos, command = log.qpos, log.command
+        return replace(log, qpos=qpos @ matrix if sides[0] else qpos, command=command @ matrix if sides[1] else command)
 
+    eye = np.eye(joints)
     for column, sides in columns.items():
         for joint in range(joints):
-            signs = np.where(np.arange(joints) == joint, -1.0, 1.0)
-            yield f"{column} of {names[joint]} with the other sign", changed(sides, lambda table, s=signs: table * s)
+            words = f"{column} of {names[joint]} with the other sign"
+            yield words, changed(sides, eye - 2 * np.outer(eye[joint], eye[joint]))
         for first, second in combinations(range(joints), 2):
             order = np.arange(joints)
             order[[first, second]] = second, first
-            words = f"{column} of {names[first]} and {names[second]} exchanged"
-            yield words, changed(sides, lambda table, o=order: table[:, o])
-    yield f"{log.kind} of all joints with the other sign", changed((False, True), np.negative)
-    units = {"thousandths of SI units": 1e-3, "degrees": np.pi / 180} if log.kind == "effort" else {"degrees": np.pi / 180}
-    for words, factor in units.items():
-        yield f"{log.kind} in {words}", changed((False, True), lambda table, f=factor: table * f)
+            yield f"{column} of {names[first]} and {names[second]} exchanged", changed(sides, eye[order])
+    yield f"{log.kind} of all joints with the other sign", changed((False, True), -eye)
+    for words, factor in {"thousandths of SI units": 1e-3, "degrees": np.pi / 180}.items():
+        yield f"{log.kind} in {words}", changed((False, True), factor * eye)
     for shift in np.arange(0.01, 0.06, 0.01) if log.kind == "setpoint" else ():
         words = f"setpoints that were logged {1e3 * shift:.0f} ms late"
         yield words, replace(log, command_time=log.command_time - shift)
@@ -137,7 +136,9 @@ def _readings(log: Log, names: Sequence[str]) -> Iterator[tuple[str, Log]]:
 class Regression:
     """Efforts that motions of logs require, and efforts of the motors so far, for regressions at any delay."""
 
-    def __init__(self, plants: Sequence[Plant], drives: Sequence[Drive], logs: Sequence[Log], motions: Sequence[Motion]):
+    def __init__(
+        self, plants: Sequence[Plant], drives: Sequence[Drive], logs: Sequence[Log], motions: Sequence[Motion]
+    ) -> None:
         dt = drives[0].timestep
         self._setpoints = drives[0].params is not None
         share = sum(len(motion.qpos) for motion in motions) / MOST_ROWS
@@ -168,18 +169,13 @@ class Regression:
         fast = speed > MOVES * np.sqrt((speed**2).mean(0))
         self._moves = fast | (fast.sum(0) < 50)
 
-    def best(self, most_setpoint_delay: float = np.inf) -> Guess:
+    def best(self) -> Guess:
         """Return the guess with the least cost over all delays."""
-        guesses = [
-            self._at(first, second)
-            for first in range(len(self.efforts))
-            for second in range(len(DELAYS))
-            if SETPOINT_DELAYS[first] <= most_setpoint_delay
-        ]
-        return min(guesses, key=lambda guess: guess.cost)
+        places = np.ndindex(self.efforts.shape[:2])
+        return min((self._at(*place) for place in places), key=lambda guess: guess.cost)
 
     def _at(self, first: int, second: int) -> Guess:
-        effort, rows = self.efforts[first, second], []
+        effort, rows = self.efforts[first, second], list[Float64]()
         cost = 0.0
         for joint, moves in enumerate(self._moves.T):
             columns = [-self._acceleration, -self._velocity, -self._sign, effort, np.ones_like(effort)]
@@ -191,9 +187,9 @@ class Regression:
             cost += np.log((residual**2).mean() / size**2 + 1e-12) / len(self._moves.T)
             rows.append(values)
         names = ("armature", "damping", "friction", "strength", "bias")
-        values = dict(zip(names, np.array(rows).T, strict=True))
-        values |= {"delay": DELAYS[[second]], "setpoint_delay": SETPOINT_DELAYS[[first]]}
-        return Guess(values, cost)
+        motors = dict(zip(names, np.array(rows).T, strict=True))
+        delays = {"delay": DELAYS[[second]], "setpoint_delay": SETPOINT_DELAYS[[first]]}
+        return Guess(motors | delays, cost)
 
 
 def _bounded(matrix: Float64, target: Float64, is_strong: bool) -> tuple[Float64, Float64]:

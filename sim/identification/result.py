@@ -233,7 +233,7 @@ class Identification:
         return changed_params(self.drive.params, law)
 
     def figure(self) -> Figure:
-        """Return a picture of the position errors along the first log, before and after; the held-out part is shaded."""
+        """Return a picture of the position errors along the first log, before and after."""
         from batchpid.sim import plots
 
         windows = [window for window in self.problem.windows if window.log == 0]
@@ -271,7 +271,8 @@ class Identification:
         )
         if self.drive.params is None:
             lines.append(f"with the initial state of each 0.3 s fitted: {free:.3g}")
-        lines.append("by joint: " + ", ".join(f"{name} {error:.2g}" for name, error in zip(names, self.errors[1], strict=True)))
+        joints = [f"{name} {error:.2g}" for name, error in zip(names, self.errors[1], strict=True)]
+        lines.append(f"by joint: {', '.join(joints)}")
         if self.hidden.entries:
             lines.append(f"not shown by these logs, hence as ideal: {', '.join(self.not_identified)}")
         if not self.converged:

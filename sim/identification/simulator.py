@@ -297,10 +297,8 @@ def simulate(
     many, count, dt = len(stretches), len(states), drive.timestep
     offset = candidates.actuators.position_offset
     rows = candidates.repeated(many)
-    q, v = (
-        (np.array([getattr(stretch, name) for stretch in stretches]) + states[:, None, side]).reshape(-1, plant.low.size)
-        for side, name in enumerate(("qpos", "qvel"))
-    )
+    starts = np.array([[stretch.qpos, stretch.qvel] for stretch in stretches])
+    q, v = (np.concatenate(starts[:, side] + states[:, None, side]) for side in (0, 1))
     q -= 0.0 if offset is None else np.repeat(offset, many, axis=0) if len(offset) > 1 else offset
     dynamics = plant.dynamics(rows.masses, q, v)
     dynamics.update()
@@ -345,7 +343,7 @@ def simulate(
                 control.refresh(dynamics.matrix + armature[:, :, None] * eye)
             passive, force = compensation.now(), dynamics.force
             if passive is not None and not drive.through:
-                passive, force = None, force - passive
+                force, passive = force - passive, None
             if forwards is not None:
                 forward = np.tile(forwards[step], (count, 1))
                 passive = forward if passive is None else passive + forward
@@ -354,7 +352,8 @@ def simulate(
             if native is not None:
                 native.move(*q.shape, dt, 1, *arrays)
             else:
-                v += dt * np.linalg.solve(dynamics.matrix + added[:, :, None] * eye, (effort - force)[..., None])[..., 0]
+                inertia = dynamics.matrix + added[:, :, None] * eye
+                v += dt * np.linalg.solve(inertia, (effort - force)[..., None])[..., 0]
                 q += dt * v
                 v[...] = np.where((q < plant.low) | (q > plant.high), 0.0, v)
                 np.clip(q, plant.low, plant.high, out=q)
@@ -468,6 +467,6 @@ def _with_payload(tree: RigidTree, named: RigidTree) -> RigidTree:
     frame = tree.bodies.link_frames[carrier]
     more: Document = {"position": frame[:, :3].T @ (place - frame[:, 3]), "wxyz": [1, 0, 0, 0], "axis": [1, 0, 0]}
     more |= {"parent": carrier, "mass": 0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}
-    tables = {name: np.concatenate([getattr(tree, name), np.array([row])]) for name, row in more.items()}
+    tables: Document = {name: np.concatenate([getattr(tree, name), np.array([row])]) for name, row in more.items()}
     links, types = (*tree.links, PAYLOAD), (*tree.joint_types, "fixed")
     return replace(tree, links=links, joint_types=types, **tables)

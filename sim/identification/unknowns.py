@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Float64
+from batchpid.arrays.array_types import Bool, Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.sim.identification.simulator import PAYLOAD, Candidates
 from batchpid.sim.robot.robot import Robot
@@ -216,7 +216,7 @@ class Unknowns:
         law = {name: table for name, table in tables.items() if KINDS[name].target == "law"}
         return Candidates(Actuators(**fields, max_delay=longest), law, delay, tuple(masses))
 
-    def only(self, mask: Sequence[bool]) -> Unknowns:
+    def only(self, mask: Bool) -> Unknowns:
         """Return the unknowns of a mask (unknowns,); the others have their neutral value."""
         entries = tuple(entry for entry, stays in zip(self.entries, mask, strict=True) if stays)
         return Unknowns(self.robot, self.joints, entries, self.bodies)
