@@ -274,12 +274,10 @@ def _read_bag(path: Path, reading: Reading) -> dict[str, Float64]:
             remedy = f"use one of its topics of {JOINT_STATE}: {', '.join(present) or 'there are none'}"
             raise error(str(path), f"has no values in the topic {topic!r} of {JOINT_STATE}", remedy)
     longest = max((rows for name, rows in samples[reading.topic].items() if name.startswith("qpos")), key=len)
-    stamps = np.unique([stamp for stamp, _ in longest])
-    time = (stamps - stamps[0]) / 1e9
-    merged = {"time": time}
+    first = min(stamp for stamp, _ in longest)
+    merged = {"time": np.unique([stamp - first for stamp, _ in longest]) / 1e9}
     for columns in samples.values():
         for name, rows in columns.items():
-            table = np.array(sorted(rows))
-            known = (table[:, 0] - stamps[0]) / 1e9
-            merged[name] = interpolated(time, known, table[:, 1:])[:, 0]
+            table = np.array(sorted((stamp - first, value) for stamp, value in rows))
+            merged[name] = interpolated(merged["time"], table[:, 0] / 1e9, table[:, 1:])[:, 0]
     return merged

@@ -41,7 +41,7 @@ WEIGHT = 0.02
 """Weight of the prior at strength 1, over the effort's size."""
 EVIDENCE = 0.7
 """Decrease of the mean logarithm of the residual's square that counts for another reading of a log."""
-ALIKE = 0.3
+ALIKE = 0.5
 """Difference of costs that are as good as equal: the first reading is named."""
 TRIED = 10.0
 """Length of a log from which other readings are tried [s]."""

@@ -30,7 +30,7 @@ KEY = "confidence_region"
 """Key of an actuators file, under "about"."""
 LEAST_GAIN = 0.1
 """Least share of the remaining squared error that a further unknown has to explain to be named."""
-ALIKE = 0.8
+ALIKE = 0.6
 """Share of the best explanation from which another one is as good."""
 EXPLAINS = 0.5
 """Share of the position error with ideal motors that a file may leave."""

@@ -229,7 +229,8 @@ class Control:
             params = mapped(lambda leaf: np.tile(leaf, (times, 1)) if leaf.ndim == 2 else leaf, drive.params)
             params = changed_params(params, candidates.law)
             params = params._replace(measurement_rate=None)  # the law of the layout decides, not the params
-            k, state = bp.discretise(params, dt, count), StepState(bp.init(params, qpos))
+            offset = 0.0 if actuators.position_offset is None else actuators.position_offset
+            k, state = bp.discretise(params, dt, count), StepState(bp.init(params, qpos + offset))
         guard = None
         if "slew" in candidates.law:
             guard = Guard(rate=candidates.law["slew"], turns=turns)
@@ -295,14 +296,14 @@ def simulate(
     ends at inf.
     """
     many, count, dt = len(stretches), len(states), drive.timestep
-    offset = candidates.actuators.position_offset
-    rows = candidates.repeated(many)
+    rows, offset = candidates.repeated(many), candidates.actuators.position_offset
     starts = np.array([[stretch.qpos, stretch.qvel] for stretch in stretches])
     q, v = (np.concatenate(starts[:, side] + states[:, None, side]) for side in (0, 1))
-    q -= 0.0 if offset is None else np.repeat(offset, many, axis=0) if len(offset) > 1 else offset
+    if rows.actuators.position_offset is not None:
+        q -= rows.actuators.position_offset
     dynamics = plant.dynamics(rows.masses, q, v)
     dynamics.update()
-    compensation = _Compensation(plant, drive, dynamics, q, v)
+    compensation = _Compensation(plant, drive, dynamics, q, v, rows.actuators.position_offset)
     asked = None
     past = min(stretch.past for stretch in stretches)
     if drive.params is None and past:
@@ -368,21 +369,27 @@ def simulate(
 
 
 class _Compensation:
-    """Forces that the robot compensates by its description, at the present poses."""
+    """Forces that the robot compensates by its description, at the present measured poses."""
 
-    def __init__(self, plant: Plant, drive: Drive, dynamics: Dynamics, qpos: Float64, qvel: Float64) -> None:
+    def __init__(
+        self, plant: Plant, drive: Drive, dynamics: Dynamics, qpos: Float64, qvel: Float64, offset: Float64 | None
+    ) -> None:
         self._dynamics: Dynamics | None = None
-        self._updates = True
-        if drive.compensate == "gravity+coriolis" and not any(dynamics.masses):
-            self._dynamics, self._updates = dynamics, False
-        elif drive.compensate != "none":
-            speed = np.zeros_like(qvel) if drive.compensate == "gravity" else qvel
-            self._dynamics = plant.dynamics([()] * len(qpos), qpos, speed)
+        self._qpos, self._measured, self._offset = qpos, qpos, offset
+        self._updates = offset is not None or drive.compensate != "gravity+coriolis" or any(dynamics.masses)
+        if drive.compensate == "none":
+            return
+        if offset is not None:
+            self._measured = qpos + offset
+        speed = np.zeros_like(qvel) if drive.compensate == "gravity" else qvel
+        self._dynamics = plant.dynamics([()] * len(qpos), self._measured, speed) if self._updates else dynamics
 
     def now(self) -> Float64 | None:
         """Return the forces (n, joints); None without compensation."""
         if self._dynamics is None:
             return None
+        if self._offset is not None:
+            self._measured[...] = self._qpos + self._offset
         if self._updates:
             self._dynamics.update()
         return self._dynamics.force
