@@ -25,13 +25,6 @@ Params say how to control, a state is carried from step to step, and every array
 Requires NumPy alone; JAX, PyYAML and ruckig are imported on first use.
 """
 
-from batchpid import startup
-
-startup.prepare()
-
-__version__ = "0.1.0"
-"""Version of the package; pyproject.toml reads it here."""
-
 from batchpid import motors
 from batchpid.controller import BatchPID
 from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
@@ -46,6 +39,9 @@ from batchpid.law.pid import advance, drive_target, init, reset, step, step_term
 from batchpid.law.state import PIDState, Terms
 from batchpid.motors import Actuators, load_actuators, make_actuators, save_actuators
 from batchpid.motors.guard import Guard, make_guard
+
+__version__ = "0.1.0"
+"""Version of the package; pyproject.toml reads it here."""
 
 __all__ = [
     "Actuators",

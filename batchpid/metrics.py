@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.arrays.display import array_summary, html_table, span
+from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks.validate import broadcast, number, read_array, time_step
 from batchpid.errors import InvalidArgumentError
@@ -62,14 +62,6 @@ class StepMetrics(NamedTuple):
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")
-
-    def _repr_html_(self) -> str:
-        """Return a table for notebooks: a row for each figure, a column for each joint with its range over envs."""
-        joints = range(self.rise_time.shape[-1])
-        rows = (
-            [name.replace("_", " "), *(span(figure[..., j]) for j in joints)] for name, figure in self._asdict().items()
-        )
-        return html_table("Step metrics of each joint, least to largest over envs", ["", *map(str, joints)], rows)
 
     def over_envs(self, statistic: Callable[[Float64], Any]) -> StepMetrics:
         """Return each figure reduced over envs to (joints,) by ``statistic``, a function of one joint's figures.

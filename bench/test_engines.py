@@ -41,7 +41,7 @@ def seconds_per_env_step(runner: Runner, workload: Workload, ticks: int) -> floa
 
 def bare_engine(robot: Robot, num_envs: int, ticks: int) -> float:
     """Return the processor time of an env step of ``mujoco.batch`` alone, of the same robots under fixed efforts."""
-    options: dict[str, Any] = {"ground": robot.has_ground, "merge_fixed": robot.merge_fixed, "engine": "mujoco"}
+    options: dict[str, Any] = {"ground": robot.has_ground, "engine": "mujoco"}
     spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options)
     built = robot_model(spec)
     batch = mujoco_batch.Batch(built.model, num_envs, nthread=1, persistent=True)
@@ -96,7 +96,7 @@ def build_many(num_envs: int) -> tuple[float, float]:
         runner.reset()  # the model is compiled once
     process = psutil.Process()
     before, began = process.memory_info().rss, time.perf_counter()
-    with Runner(robot, num_envs, engine="mujoco", workers=0, checkpoint_steps=None, substeps=1) as runner:
+    with Runner(robot, num_envs, engine="mujoco", workers=0, substeps=1) as runner:
         seconds = time.perf_counter() - began
         start = runner.reset().qpos
         assert np.abs(runner.step(robot.target).qpos - start).max() > 0

@@ -95,7 +95,7 @@ def efforts_of(robot: Robot, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 def bare_engine(robot: Robot, num_envs: int, start: np.ndarray, efforts: np.ndarray) -> tuple[float, np.ndarray]:
     """Return what :func:`closed_loop` returns, of ``mujoco.batch`` under ``efforts`` (steps, dof)."""
-    options = {"merge_fixed": robot.merge_fixed, "fixed_base": False, "engine": "mujoco"}
+    options = {"fixed_base": False, "engine": "mujoco"}
     built = robot_model(SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options))
     batch = mujoco_batch.Batch(built.model, num_envs, nthread=1, persistent=True)
     qpos, applied = batch.bind("qpos"), batch.bind("qfrc_applied")

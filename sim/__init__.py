@@ -33,7 +33,7 @@ from batchpid.sim.observation import Observation, Rollout, RunInfo, register_fin
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.ray_options import ClusterWarning, Ray
+from batchpid.sim.ray_options import Ray
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
 from batchpid.sim.robot.description import Dynamics, RobotDescription, register_dynamics
@@ -50,12 +50,10 @@ if TYPE_CHECKING:
     from batchpid.sim.engine.physics import MujocoSolver, Physics
     from batchpid.sim.robot.urdf_export import to_urdf
     from batchpid.sim.runner import Runner
-    from batchpid.sim.tuning.sweep import sweep
     from batchpid.sim.workers.pool import RecoveryWarning
 
 __all__ = [
     "Choice",
-    "ClusterWarning",
     "CommandSpec",
     "Controller",
     "Fault",
@@ -87,7 +85,6 @@ __all__ = [
     "StabilityWarning",
     "Uniform",
     "read_recording",
-    "sweep",
     "to_mjcf",
     "to_urdf",
     "write_recording",
@@ -98,7 +95,6 @@ _LOADED_LATE = {
     "Physics": "batchpid.sim.engine.physics",
     "Runner": "batchpid.sim.runner",
     "RecoveryWarning": "batchpid.sim.workers.pool",
-    "sweep": "batchpid.sim.tuning.sweep",
     "to_mjcf": "batchpid.sim.engine.mujoco.mjcf_export",
     "to_urdf": "batchpid.sim.robot.urdf_export",
 }

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Bool, DType, Float32, Float64, Rows
-from batchpid.arrays.display import html_table, span
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
@@ -136,7 +135,10 @@ OBSERVED: dict[str, Quantity] = {name: quantity for name, quantity in _SEEN.item
 """Quantity of each other field."""
 BASE: dict[str, Quantity] = {name: _SEEN[name] for name in ("base_pose", "base_twist")}
 """Quantities of a floating base."""
-RECORDED = {"setpoint": Quantity(np.float64, "setpoint", "rad|m")} | _SEEN
+RECORDED = {
+    "setpoint": Quantity(np.float64, "setpoint", "rad|m"),
+    "feedforward": Quantity(np.float64, "effort added before saturation", "N m|N"),
+} | _SEEN
 """Quantity of each array of a :class:`Rollout`, ``time`` aside."""
 
 
@@ -196,8 +198,6 @@ class RunInfo:
     """Text of the robot description."""
     dissipation: str | None = None
     """Source of joint friction and damping: "urdf" or "sapien"."""
-    merge_fixed: bool | None = None
-    """True if links that fixed joints connect were simulated as one."""
     fixed_base: bool | None = None
     """False if the base floats."""
     timestep: float | None = None
@@ -252,8 +252,6 @@ class RunInfo:
     """Episodes that began after that."""
     description: Any = field(default=None, repr=False)
     """Robot (:class:`batchpid.sim.Robot`) of the run, for :meth:`Rollout.findings`; not recorded."""
-    sweep: Mapping[str, Any] | None = None
-    """Inputs of a :func:`batchpid.sim.sweep`, as plain values or digests."""
     options: Mapping[str, Any] | None = None
     """Further options of the runner that recordings keep, by name."""
 
@@ -272,7 +270,7 @@ class RunInfo:
     def recorded(self) -> dict[str, Quantity]:
         """Quantities of :data:`RECORDED` that this run has."""
         seen = observed_by_loop(self.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
-        present = {"setpoint", *seen, *(() if self.tool is None else ("tool_pose",))}
+        present = {"setpoint", "feedforward", *seen, *(() if self.tool is None else ("tool_pose",))}
         return {name: each for name, each in (RECORDED | seen).items() if name in present}
 
     def units_of(self, name: str) -> tuple[str, ...]:
@@ -289,27 +287,101 @@ class RunInfo:
         """
         return self.recorded[name].shape((num_envs, len(self.units_of(name))))
 
-    def for_envs(self, envs: slice | Any) -> RunInfo:
-        """Return the info of some envs (a slice or an index array)."""
-        rows = () if self.episodes is None else np.arange(len(self.episodes))[envs].tolist()
-        return replace(
-            self,
-            params=None if self.params is None else self.params.for_envs(envs),
-            actuators=None if self.actuators is None else self.actuators.for_envs(envs),
-            start=None if self.start is None else self.start[envs],
-            draws=None if self.draws is None else {name: values[envs] for name, values in self.draws.items()},
-            episodes=None if self.episodes is None else self.episodes[envs],
-            redraws=tuple(each._replace(env=rows.index(each.env)) for each in self.redraws if each.env in rows),
-        )
+    def for_envs(self, envs: NDArray[np.int64]) -> RunInfo:
+        """Return the info of the envs with these numbers."""
+        return self._followed(lambda rule, value: rule.for_envs(value, envs))
+
+    def for_ticks(self, start: Rows | None, begin: float, end: float) -> RunInfo:
+        """Return the info of the ticks between two times [s], where the first begins at the positions ``start``."""
+        span = Span(start, begin, end, tuple([each for each in self.redraws if each.time <= begin]))
+        return self._followed(lambda rule, value: rule.for_ticks(value, span))
+
+    def _followed(self, follow: Callable[[Rule, Any], Any]) -> RunInfo:
+        values = {name: value for name, value in vars(self).items() if value is not None}
+        return replace(self, **{name: follow(RULES[name], value) for name, value in values.items()})
 
     def __repr__(self) -> str:
         control = f", control {self.control!r}" if self.control else ""
         return f"RunInfo({self.robot}, {len(self.joint_names)} joints{control})"
 
 
-OWN_OF_PARTS = {"params", "actuators", "start", "seed", "versions", "begun", "draws", "episodes"}
-OWN_OF_PARTS |= {"complete", "faults", "rates", "redraws", "description"}
-"""Fields of :class:`RunInfo` in which parts of a run may differ: state and origin at their start, and events."""
+class Span(NamedTuple):
+    """Ticks of a run between two times [s]."""
+
+    start: Rows | None
+    """Positions before the first tick (envs, dof); None where unknown."""
+    begin: float
+    end: float
+    earlier: tuple[Redraw, ...]
+    """Redraws before these ticks."""
+
+
+class Rule(NamedTuple):
+    """Effect of :meth:`Rollout.for_envs`, :meth:`Rollout.for_ticks` and :meth:`Rollout.join` on a field.
+
+    The first two leave None as it is.
+    ``join`` takes the values of all parts; without it the parts have to agree.
+    """
+
+    for_envs: Callable[[Any, NDArray[np.int64]], Any] = lambda value, envs: value
+    for_ticks: Callable[[Any, Span], Any] = lambda value, span: value
+    join: Callable[[Sequence[Any]], Any] | None = None
+
+
+def _events_of(events: tuple[Any, ...], envs: NDArray[np.int64]) -> tuple[Any, ...]:
+    """Return the events of some envs, under their new numbers."""
+    renumbered = []
+    for event in events:
+        renumbered += [event._replace(env=number) for number in np.flatnonzero(envs == event.env).tolist()]
+    return tuple(renumbered)
+
+
+def _episodes_at(episodes: NDArray[np.int64], span: Span) -> NDArray[np.int64]:
+    """Return stream and episode of each env at the start of ``span``."""
+    episodes = episodes.copy()
+    for redraw in span.earlier:
+        episodes[redraw.env] = redraw.stream, redraw.episode
+    return episodes
+
+
+def _joined_rates(values: Sequence[bool | None]) -> bool | None:
+    """Return True if a part had rates, None if that is unknown of one."""
+    return True if True in values else None if None in values else False
+
+
+_FIRST = itemgetter(0)
+RULES: dict[str, Rule] = dict.fromkeys(
+    (
+        *("robot", "joint_names", "units", "lower", "upper", "effort_limit", "urdf", "dissipation", "merge_fixed"),
+        *("fixed_base", "timestep", "substeps", "control", "tool", "own_command", "compensate", "engine", "physics"),
+        *("collisions", "ground", "contacts", "wrenches", "randomization", "options"),
+    ),
+    Rule(),
+)
+RULES |= dict.fromkeys(("seed", "versions", "begun", "description"), Rule(join=_FIRST))
+RULES |= dict.fromkeys(("params", "actuators"), Rule(lambda value, envs: value.for_envs(envs), join=_FIRST))
+RULES |= {
+    "start": Rule(lambda start, envs: start[envs], lambda start, span: span.start, _FIRST),
+    "draws": Rule(
+        lambda draws, envs: {name: rows[envs] for name, rows in draws.items()},
+        lambda draws, span: None if span.earlier else draws,
+        _FIRST,
+    ),
+    "episodes": Rule(lambda episodes, envs: episodes[envs], _episodes_at, _FIRST),
+    "complete": Rule(join=all),
+    "rates": Rule(join=_joined_rates),
+    "faults": Rule(
+        _events_of,
+        lambda faults, span: tuple([fault for fault in faults if fault.time <= span.end]),
+        itemgetter(-1),  # faults of a runner include the earlier ones
+    ),
+    "redraws": Rule(
+        _events_of,
+        lambda redraws, span: tuple([redraw for redraw in redraws if span.begin < redraw.time <= span.end]),
+        lambda parts: tuple(dict.fromkeys([redraw for part in parts for redraw in part])),
+    ),
+}
+"""Rule of each field of :class:`RunInfo`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,7 +393,7 @@ class Rollout:
     """
 
     time: Float64
-    """End of each tick (ticks,) [s]."""
+    """End of each tick (ticks,) [s], since the start of the runner; a reset does not set it back."""
     setpoint: Float64
     """(ticks, envs, dof) [rad or m]; under control "effort" the effort asked for [N m or N]. For a control that
     defines its command (ticks, envs, size), in the order of ``info.command.names``."""
@@ -331,6 +403,8 @@ class Rollout:
     """Time from one row to the next [s]."""
     info: RunInfo
     """Robot, options and origin of the run."""
+    feedforward: Float64 | None = None
+    """Joint efforts added before saturation (ticks, envs, dof) [N m or N]; None if none were given."""
 
     def __getattr__(self, name: str) -> Rows:
         if name not in _SEEN:
@@ -344,26 +418,39 @@ class Rollout:
         return int(self.qpos.shape[1])
 
     def arrays(self) -> dict[str, Rows]:
-        """Return time, setpoint and every quantity that was observed, by name."""
+        """Return time, setpoint, feedforward if one was given, and every quantity that was observed, by name."""
         seen = {name: array for name, array in self.observation._asdict().items() if array is not None}
+        if self.feedforward is not None:
+            seen["feedforward"] = self.feedforward
         return {"time": self.time, "setpoint": self.setpoint, **seen}
 
     def for_envs(self, envs: slice | Sequence[int] | Any) -> Rollout:
         """Return the rollout of some envs (a slice or an index array)."""
-        part = self.observation.map(lambda array: array[:, envs])
-        return Rollout(self.time, self.setpoint[:, envs], part, self.tick, self.info.for_envs(envs))
+        numbers = np.arange(self.num_envs)[envs]
+        return self._mapped(lambda array: array[:, numbers], info=self.info.for_envs(numbers))
 
     def for_ticks(self, ticks: slice) -> Rollout:
         """Return the rollout of some ticks."""
-        part = self.observation.for_envs(ticks)
-        return Rollout(self.time[ticks], self.setpoint[ticks], part, self.tick * (ticks.step or 1), self.info)
+        numbers = np.arange(len(self.time))[ticks]
+        time, info = self.time[ticks], self.info
+        if len(numbers):
+            first = numbers[0]
+            start, begin = (self.qpos[first - 1], self.time[first - 1]) if first else (info.start, -np.inf)
+            info = info.for_ticks(start, float(begin), float(time[-1]))
+        return self._mapped(itemgetter(ticks), time=time, tick=self.tick * (ticks.step or 1), info=info)
+
+    def _mapped(self, function: Callable[[Rows], Rows], **others: Any) -> Rollout:
+        """Return a rollout with ``function`` applied to each array but the times, and with other fields."""
+        feedforward = None if self.feedforward is None else function(self.feedforward)
+        seen = self.observation.map(function)
+        return replace(self, setpoint=function(self.setpoint), observation=seen, feedforward=feedforward, **others)
 
     @staticmethod
     def join(parts: Sequence[Rollout]) -> Rollout:
         """Return successive rollouts of one run as one.
 
-        The info is the first part's, with the faults of the last and the redraws of all. It is complete if all are, and
-        has rates if one has; if others are unknown, so is the whole.
+        State and origin are those at the start of the first part, faults those at the end of the last. It is complete
+        if all parts are, and has rates or feedforwards if one has; if rates of others are unknown, so are the whole's.
 
         Raises InvalidArgumentError if ``parts`` are empty, or differ in the robot, an option, the tick or the
         number of envs.
@@ -371,47 +458,33 @@ class Rollout:
         if not parts:
             raise InvalidArgumentError("parts", "are empty", remedy="give one rollout or more")
         first = parts[0]
-        for part in parts[1:]:
-            here, there = ({"tick": each.tick, "num_envs": each.num_envs, **vars(each.info)} for each in (first, part))
-            odd = [name for name in here if name not in OWN_OF_PARTS and not _is_equal(here[name], there[name])]
-            if odd:
-                raise InvalidArgumentError("parts", f"differ in {', '.join(odd)}", remedy="join parts of one run")
-        seen = Observation.join([part.observation for part in parts])
-        time, setpoint = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "setpoint"))
-        redraws = tuple(dict.fromkeys(each for part in parts for each in part.info.redraws))
-        complete = all(part.info.complete for part in parts)
-        each = [part.info.rates for part in parts]
-        rates = True if True in each else None if None in each else False
-        info = replace(first.info, faults=parts[-1].info.faults, redraws=redraws, complete=complete, rates=rates)
-        return Rollout(time, setpoint, seen, first.tick, info)
+        odd = [name for name in ("tick", "num_envs") if len({getattr(part, name) for part in parts}) > 1]
+        joined = {}
+        for name, rule in RULES.items():
+            values = [getattr(part.info, name) for part in parts]
+            if rule.join is not None:
+                joined[name] = rule.join(values)
+            elif not all(_is_equal(values[0], value) for value in values):
+                odd.append(name)
+        if odd:
+            raise InvalidArgumentError("parts", f"differ in {', '.join(odd)}", remedy="join parts of one run")
+        feedforward = None
+        if any(part.feedforward is not None for part in parts):
+            rows = [np.zeros(part.qpos.shape) if part.feedforward is None else part.feedforward for part in parts]
+            feedforward = np.concatenate(rows)
+        return Rollout(
+            np.concatenate([part.time for part in parts]),
+            np.concatenate([part.setpoint for part in parts]),
+            Observation.join([part.observation for part in parts]),
+            first.tick,
+            replace(first.info, **joined),
+            feedforward,
+        )
 
     def __repr__(self) -> str:
         ticks, envs, dof = self.qpos.shape
         end = f"up to {self.time[-1]:g} s" if ticks else "empty"
         return f"Rollout({ticks} ticks {end}, {envs} envs, {dof} joints, {_failed_envs(self.ok)})"
-
-    def _repr_html_(self) -> str:
-        if not self.qpos.size:
-            return html_table(repr(self), (), ())
-        command, joints, units = self.info.command, self.info.joint_names, self.info.units
-        last = [f"{span(self.setpoint[-1, :, j])} {unit}" for j, unit in enumerate(command.units)]
-        per_joint = command.names == joints
-        columns = {
-            "joint": joints,
-            "after the first tick": self._spans(self.qpos[0], units),
-            "after the last tick": self._spans(self.qpos[-1], units),
-            "last setpoint": last if per_joint else [],
-            "absolute effort": self._spans(np.abs(self.effort), self.info.units_of("effort")),
-            "saturated": [f"{share:.0%}" for share in self.saturated.mean((0, 1))],
-        }
-        shown = {header: cells for header, cells in columns.items() if cells}
-        own = "" if per_joint else f"\nlast setpoint: {', '.join(map(' '.join, zip(command.names, last, strict=True)))}"
-        return html_table(f"{self!r}{own}", list(shown), zip(*shown.values(), strict=True))
-
-    @staticmethod
-    def _spans(values: Rows, units: Sequence[str]) -> list[str]:
-        """Return the range of values (..., joints) of each joint, with its unit."""
-        return [f"{span(values[..., joint])} {unit}" for joint, unit in enumerate(units)]
 
     def findings(self, robot: Any = None) -> Any:
         """Return the causes for which joints do not settle, the most likely first; an empty list if all settle.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.choices import PerMassMatrix
-from batchpid.arrays.digest import digest, object_digest
+from batchpid.arrays.digest import digest
 from batchpid.arrays.jax_settings import require_jax
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
@@ -31,6 +31,7 @@ from batchpid.law.input_checks import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
 from batchpid.sim.command import CommandSpec, joint_command, own_command
+from batchpid.sim.engine.native import xla
 from batchpid.sim.engine.physics import MujocoSolver, Physics
 from batchpid.sim.engine.protocol import Capability, Engine, load_engine, require
 from batchpid.sim.engine.scene_spec import added_friction
@@ -45,7 +46,6 @@ from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 from batchpid.sim.runner_keywords import OPTIONS, Controller, ControlMode, Place, RunnerKeywords, checked_option
 from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
-from batchpid.sim.tool_space.tool_setpoints import ToolSetpoints
 
 IDEAL = bp.Actuators()
 """Actuators without any effect."""
@@ -76,20 +76,12 @@ class RunnerOptions(RunnerKeywords):
         super().__post_init__()
         own, given = vars(self), dict(vars(self))
         robot = instance("robot", self.robot, Robot, "load one with Robot.load('panda') or a URDF path")
-        own["control"] = _control(self.control, robot, given["tool"], self.setpoint_space)
+        own["control"] = _control(self.control, robot, given["tool"])
         if given["ground"] is None:
             own["ground"] = self.collisions and self._has_ground
         if isinstance(self.control, OperationalSpace):
             own["control"], own["tool"] = self.control.in_runner(self.timestep, self.compensate), self.control.link
-        if self.tool_setpoints is not None:
-            own["tool"] = self.tool_setpoints.link
         own["workers"], own["cluster"] = _places(self.workers, given["cluster"])
-        if self.backend == "numpy" and self.dtype != "float64":
-            raise InvalidArgumentError(
-                "dtype", "is that of backend 'jax'; NumPy's law is in float64", value=self.dtype, remedy="leave it out"
-            )
-        if self.backend == "jax":
-            require_jax()
         self._check_engine()
         if self.build is not None and not callable(self.build):
             raise InvalidArgumentError(
@@ -100,18 +92,18 @@ class RunnerOptions(RunnerKeywords):
             own["speed_limit"] = read_only(limit.copy())
         if self.randomization is not None:
             remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
-            check_robot(instance("randomization", self.randomization, Randomization, remedy), robot)
+            check_robot(instance("randomization", self.randomization, Randomization, remedy), robot, self.mjcf)
             self._check_world(self.randomization)
         self._check_tree()
         own["guard"] = fit_guard(given["guard"], robot.joints, self.num_envs, self.control_name, self.sets_positions)
+        if self.backend == "jax":
+            self._check_program()
         own["actuators"] = self.check_actuators(given["actuators"])
         self._check_collisions()
         params = default_params(robot, self.control, self.loops) if given["params"] is None else given["params"]
         own["params"] = self.check_params(params)
         for name in ("contacts", "wrenches"):
             own[name] = self._sensed_links(name, given[name])
-        for name in ("controller_digest", "build_digest"):  # of the objects as they are now
-            getattr(self, name)
 
     def _check_engine(self) -> None:
         """Raise InvalidArgumentError for options that the physics engine does not have."""
@@ -127,13 +119,35 @@ class RunnerOptions(RunnerKeywords):
             if needs:
                 require(engine, capability, argument)
 
+    def _check_program(self) -> None:
+        """Raise InvalidArgumentError for an option that the program of backend "jax" does not have."""
+        require_jax()
+        engine, robot = self.load_engine(), self.robot
+        whole = "coriolis" in self.compensate or "partial_force" in engine.capabilities
+        reads_force = whole and (robot.fixed_base or "base_state" in engine.capabilities)
+        reason = f"{engine.title} has no compiled sim steps"
+        if "compiled_steps" in engine.capabilities:
+            reason = engine.native_obstacle() or xla.obstacle()
+        lacking = (
+            ("backend", reason, f"is 'jax'; {reason}"),
+            ("control", self.control == "drive", "'drive' has no law to compile"),
+            ("robot", not robot.coupling.is_identity, "has coupled joints"),
+            ("robot", not robot.fixed_base and robot.friction.any(), "has a floating base, and joints with friction"),
+            ("compensate", "gravity" in self.compensate and not reads_force, "needs a passive force of NumPy"),
+            ("randomization", self.randomization is not None, "is given"),
+            ("guard", self.guard is not None, "is given"),
+            ("robot", robot.actuators is not None, "has actuators"),
+        )
+        for argument, lacks, problem in lacking:
+            if lacks:
+                raise _not_in_program(argument, problem)
+
     def _check_tree(self) -> None:
         """Raise InvalidArgumentError for options that need a kinematic tree, if the robot has closed loops."""
-        needs = {"control": isinstance(self.control, OperationalSpace), "setpoint_space": self.setpoint_space == "tool"}
-        for argument in [name for name, given in needs.items() if given and self.loops]:
+        if self.loops and isinstance(self.control, OperationalSpace):
             problem = f"needs a kinematic tree, and {', '.join(self.loops)} of the file closes a loop of links"
             remedy = "control the joints, or remove the equality constraint"
-            raise InvalidArgumentError(argument, problem, value=getattr(self, argument), remedy=remedy)
+            raise InvalidArgumentError("control", problem, value=self.control, remedy=remedy)
 
     @property
     def mjcf(self) -> MjcfFile | None:
@@ -184,7 +198,7 @@ class RunnerOptions(RunnerKeywords):
         if self.engine_name == "sapien" and robot.dissipation == "sapien":
             problem = "need a robot without SAPIEN's link damping, which acts like a contact"
             raise InvalidArgumentError(option, problem, remedy="load the robot with dissipation='urdf'")
-        bodies = place_links(robot.urdf, robot.merge_fixed)
+        bodies = place_links(robot.urdf, links if option == "wrenches" else ())
         root = next(at.link for at in bodies.values())
         for link in links:
             if link not in known:
@@ -193,9 +207,6 @@ class RunnerOptions(RunnerKeywords):
             if bodies[link].link == root and (option == "wrenches" or robot.fixed_base):
                 problem = f"names {link!r}, which no joint moves"
                 raise InvalidArgumentError(option, problem, remedy="name a link further along the robot")
-            if option == "wrenches" and bodies[link].link != link:
-                problem = f"names {link!r}, which is simulated as one with {bodies[link].link!r}"
-                raise InvalidArgumentError(option, problem, remedy="load the robot with merge_fixed=False")
         return links
 
     @cached_property
@@ -265,16 +276,7 @@ class RunnerOptions(RunnerKeywords):
     @property
     def tool_pose(self) -> Callable[[Rows], NDArray[np.float32]] | None:
         """Function from positions (..., dof) to poses of the tool (..., 7); None where setpoints are not poses."""
-        if self.tool_setpoints is not None:
-            return self.tool_setpoints.tool_pose
         return self.control.tool_pose if isinstance(self.control, OperationalSpace) else None
-
-    @cached_property
-    def tool_setpoints(self) -> ToolSetpoints | None:
-        """Inverse kinematics of ``setpoint_space`` "tool"."""
-        if self.setpoint_space == "joints":
-            return None
-        return ToolSetpoints(self.robot, default_tool(self.robot) if self.tool is None else self.tool)
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
@@ -341,6 +343,8 @@ class RunnerOptions(RunnerKeywords):
         fitted = None if fitted is None or fitted.is_ideal else fitted
         if self.randomization is not None:
             fitted = prepared_actuators(self.randomization, fitted, self.robot, self.control)
+        if fitted is not None and self.backend == "jax":
+            raise _not_in_program("actuators", "are given")
         return None if fitted is None else frozen(fitted)
 
     def with_values(self, **values: Any) -> RunnerOptions:
@@ -371,7 +375,7 @@ class RunnerOptions(RunnerKeywords):
             **{name: _plain(value) for name, value in self.values_for("snapshot").items()},
             "ignored_pairs": digest(robot.ignored_pairs),
             "robot_actuators": digest(known_joints(robot)),
-            "controller": self.controller_digest,
+            "controller": self.versioned_control,
             "command": None if own is None else list(own.names),
         }
 
@@ -395,15 +399,15 @@ class RunnerOptions(RunnerKeywords):
         """Name of the robot."""
         return self.robot.name
 
-    @cached_property
-    def controller_digest(self) -> str | None:
-        """Digest of a :class:`Controller`, which may change itself later; None for the name of a control."""
-        return _code_digest(self.control)
+    @property
+    def versioned_control(self) -> str | None:
+        """Class and ``version`` of a :class:`Controller`; None for the name of a control."""
+        return _versioned_name(self.control)
 
-    @cached_property
-    def build_digest(self) -> str | None:
-        """Digest of ``build``, which may change itself later; None without one."""
-        return _code_digest(self.build)
+    @property
+    def versioned_build(self) -> str | None:
+        """Name and ``version`` of ``build``; None without one."""
+        return _versioned_name(self.build)
 
     @property
     def guard_digest(self) -> str:
@@ -416,7 +420,7 @@ class RunnerOptions(RunnerKeywords):
         return None if self.randomization is None else self.randomization.to_dict()
 
 
-def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
+def _control(value: object, robot: Robot, tool: Any) -> Any:
     """Return a control, checked; "osc" becomes the controller of the link ``tool``."""
     own = callable(value) and callable(getattr(value, "init", None))
     name = None if own else choice("control", value, (*get_args(ControlMode), "osc"))
@@ -424,17 +428,12 @@ def _control(value: object, robot: Robot, tool: Any, space: str) -> Any:
         own_command(value)  # raises for an invalid command
     if tool is not None:
         tool = instance("tool", tool, str, "name a link of the robot")
-    if space == "tool" and name not in ("pid", "drive"):
-        problem = "'tool' makes joint setpoints, which this control does not take"
-        raise InvalidArgumentError("setpoint_space", problem, remedy="use control 'pid' or 'drive', or leave it out")
-    if tool is not None and name != "osc" and space == "joints" and tool != getattr(value, "link", None):
-        problem, remedy = "is for control 'osc' or setpoint_space 'tool'", "leave it out"
-        raise InvalidArgumentError("tool", problem, value=tool, remedy=remedy)
-    if not robot.fixed_base and (name == "osc" or space == "tool"):
-        argument, given = ("control", "'osc'") if name == "osc" else ("setpoint_space", "'tool'")
-        problem = f"{given} needs a fixed base, which {robot.name!r} does not have"
+    if tool is not None and name != "osc" and tool != getattr(value, "link", None):
+        raise InvalidArgumentError("tool", "is for control 'osc'", value=tool, remedy="leave it out")
+    if not robot.fixed_base and name == "osc":
+        problem = f"'osc' needs a fixed base, which {robot.name!r} does not have"
         remedy = "load the robot with fixed_base=True, or control its joints"
-        raise InvalidArgumentError(argument, problem, remedy=remedy)
+        raise InvalidArgumentError("control", problem, remedy=remedy)
     if name != "osc":
         return value
     try:
@@ -449,9 +448,12 @@ def _plain(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray) else list(value) if isinstance(value, tuple) else value
 
 
-def _code_digest(value: object) -> str | None:
-    """Return the digest of a controller or function of the caller's; None for a name, or without a value."""
-    return None if value is None or isinstance(value, str) else object_digest(value)
+def _versioned_name(value: object) -> str | None:
+    """Return the class of an object, or the name of a function, with its ``version``; None for a text or None."""
+    if value is None or isinstance(value, str):
+        return None
+    name = getattr(value, "__qualname__", type(value).__qualname__)
+    return f"{name} {getattr(value, 'version', '')}"
 
 
 def worker_count(workers: int | None) -> int:
@@ -494,3 +496,9 @@ def default_params(
             return robot.designed("effort").replace(ki=0.0, setpoint_weight=None, derivative_filter_time=None)
         return robot.params(kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None)
     return robot.tuned() if robot.has_tuned else robot.designed("effort" if loops else None)
+
+
+def _not_in_program(argument: str, problem: str) -> InvalidArgumentError:
+    """Return the error for an option that the program of backend "jax" does not have."""
+    problem = f"{problem}, which the program of backend 'jax' does not have"
+    return InvalidArgumentError(argument, problem, remedy="use backend='numpy'")

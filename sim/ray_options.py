@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
-from typing import Literal, get_args
 
 from batchpid.arrays.array_types import Document
-from batchpid.checks.validate import choice, flag, instance, integer
+from batchpid.checks.validate import instance, integer
 from batchpid.errors import InvalidArgumentError
-
-Placement = Literal["SPREAD", "PACK"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +29,6 @@ class Ray:
     cpus_per_node: int | None = None
     """Workers on each machine, each on one CPU of Ray's count. Machines with fewer CPUs are not used. Default: all
     CPUs that Ray counts."""
-    placement: Placement = "SPREAD"
-    """``"SPREAD"`` the envs over all machines, in proportion to their workers; ``"PACK"`` them on the fewest machines
-    that have a worker for every env."""
-    accept_differences: bool = False
-    """Accept machines whose processors or libraries round differently, with a warning. Results then depend on the
-    machine that runs an env."""
     runtime_env: Document | None = None
     """Ray's ``runtime_env`` of the processes on the machines, such as ``{"working_dir": "."}``."""
 
@@ -52,11 +43,5 @@ class Ray:
         for name in ("nodes", "cpus_per_node"):
             if getattr(self, name) is not None:
                 integer(name, getattr(self, name), 1, 100_000)
-        choice("placement", self.placement, get_args(Placement))
-        flag("accept_differences", self.accept_differences)
         if self.runtime_env is not None:
             instance("runtime_env", self.runtime_env, dict, "pass a dict as for ray.init")
-
-
-class ClusterWarning(UserWarning):
-    """A cluster is slow, or its machines may compute different results."""

@@ -7,7 +7,6 @@ Longer than 350 lines because the public signatures and their documentation are 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -21,13 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import check_keywords, choice, instance
 from batchpid.checks.warn import warn
 from batchpid.errors import CallOrderError, ClosedError, InvalidArgumentError
 from batchpid.io.versions import package_versions
 from batchpid.sim.command import CommandSpec
+from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.backend import describe
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
@@ -49,11 +48,14 @@ from batchpid.sim.runner_commands import (
 )
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE, KINDS, OPTIONS, arguments_of, checked_option
 from batchpid.sim.runner_state import RunnerState
-from batchpid.sim.workers.cluster import NodeInfo
 from batchpid.sim.workers.contact_log import MissedContact
+from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, WorkerPool
 from batchpid.sim.workers.requests import ReadPoses, ReadStateSizes, Restore
+
+CHECKPOINT_STEPS = 8000
+"""Sim steps between checkpoints, from the last of which a lost worker is replayed."""
 
 
 class TickRecorder(Protocol):
@@ -61,11 +63,11 @@ class TickRecorder(Protocol):
 
     path: Path
 
-    def wait(self) -> None:
+    def prepare(self) -> None:
         """Return, or raise, before the next tick begins: whether it can be recorded."""
 
-    def append(self, time_: float, setpoint: Rows, observation: Observation, has_rates: bool) -> None:
-        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size), with rates or without.
+    def append(self, time_: float, command: Command, observation: Observation) -> None:
+        """Record the state at ``time_`` [s] after a tick under ``command`` (envs, ...), which may change afterwards.
 
         It must return soon, and without an error: Ctrl-C waits for it.
         """
@@ -101,7 +103,6 @@ class Runner(SingleOwner):
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call, self._warnings = OneCall(), RunWarnings(checked)
         self._tool_pose = checked.tool_pose
-        self._checkpoint_steps = math.inf if checked.checkpoint_steps is None else checked.checkpoint_steps
         self._state = RunnerState.first(checked)
         self._sent: RunTicks | None = None  # and not completed yet
         self._unreceived: Observation | None = None
@@ -205,14 +206,12 @@ class Runner(SingleOwner):
             (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N]. A follower's
             value (:attr:`batchpid.sim.Robot.coupling`) is replaced by the coupling's value for the leader's setpoint;
             an effort acts on the leader. A :class:`batchpid.sim.Controller` that defines its command takes (size,) or
-            (envs, size): :attr:`command`. With ``setpoint_space="tool"`` it is a pose (7,) or (envs, 7), or
-            :attr:`command`.
+            (envs, size): :attr:`command`.
         setpoint_rate
             Rate of the setpoint [rad/s or m/s], same shapes, with which the setpoint moves within the tick. Both hold
             at the tick's end: the setpoint of a sim step that begins t before it is ``setpoint - t setpoint_rate``. The
             law damps the velocity error instead of the velocity, and follows this motion with full weight. Controls
-            other than "pid" and "drive" ignore it. With ``setpoint_space="tool"`` it is the twist of the tool in the
-            world (6,) or (envs, 6) [m/s, rad/s].
+            other than "pid" and "drive" ignore it.
         setpoint_acceleration
             Acceleration of the setpoint [rad/s^2 or m/s^2], same shapes, besides its rate: a law with gains per unit of
             inertia adds it to the acceleration that it commands. Other gains take ``feedforward``. Default 0. Where the
@@ -231,9 +230,7 @@ class Runner(SingleOwner):
             "setpoint_acceleration": setpoint_acceleration,
             "feedforward": feedforward,
         }
-        command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
-        count = self.substeps if substeps is None else checked_option("substeps", substeps)
-        self._execute(RunTicks(command, count, self.timestep))
+        self._execute(self._tick(given, substeps))
         return self._pool.present.observation.copied(self._tool_pose)
 
     def send(
@@ -263,9 +260,7 @@ class Runner(SingleOwner):
             "setpoint_acceleration": setpoint_acceleration,
             "feedforward": feedforward,
         }
-        command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
-        count = self.substeps if substeps is None else checked_option("substeps", substeps)
-        self._begin(RunTicks(command, count, self.timestep))
+        self._begin(self._tick(given, substeps))
 
     def recv(self) -> Observation:
         """Wait for the end of the tick that :meth:`send` began; return its observation.
@@ -329,7 +324,7 @@ class Runner(SingleOwner):
             seen = seen._replace(tool_pose=options.tool_pose(seen.qpos))
         if (faults := self._state.faults.faults) is not info.faults:
             info = replace(info, faults=faults)
-        return Rollout(times, command.setpoint, seen, tick, info)
+        return Rollout(times, command.setpoint, seen, tick, info, command.feedforward)
 
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
@@ -412,13 +407,11 @@ class Runner(SingleOwner):
 
         The snapshot is from this runner, or from one with the same options, except for:
 
-        - ``workers``, ``cluster``, ``recover`` and ``timeout``, which change no result, and
-          ``checkpoint_steps``, which changes the last bits;
+        - ``workers``, ``cluster`` and ``timeout``, which change no result;
         - ``substeps`` and ``on_invalid_input``, which apply to the commands that follow.
 
-        A controller or ``build`` of the caller's own counts by its code, constants, closure and attributes, and by the
-        globals that it names, as they are when the runner is made. So snapshots of an edited function are refused, and
-        of another version of Python. Make a new controller for each runner if calls change its attributes.
+        A controller of the caller's own counts by its class, ``build`` by its name, and both by their attribute
+        ``version``, if they have one.
 
         Raises
         ------
@@ -466,8 +459,7 @@ class Runner(SingleOwner):
     @property
     def command(self) -> CommandSpec:
         """Names and units of a setpoint's entries: the joints, or as a controller declares them."""
-        tool = self.options.tool_setpoints
-        return self.options.command if tool is None else tool.command
+        return self.options.command
 
     @property
     def faults(self) -> tuple[Fault, ...]:
@@ -493,7 +485,7 @@ class Runner(SingleOwner):
     @property
     def backend(self) -> str:
         """Library of the law, and kind of the calls into the engine, with the reason if they are not native."""
-        return describe(self.options, self.actuators)
+        return describe(self.options)
 
     @property
     def time(self) -> float:
@@ -576,6 +568,15 @@ class Runner(SingleOwner):
             self._execute(self._sent)
         return self._state
 
+    def _tick(self, given: dict[str, ArrayLike | None], substeps: int | None) -> RunTicks:
+        """Return the command for the arguments of :meth:`step`, checked."""
+        command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
+        count = self.substeps if substeps is None else checked_option("substeps", substeps)
+        if self.recorder is not None and count != self.substeps:
+            problem, remedy = f"is not the runner's {self.substeps}", "all ticks of a recording have the same length"
+            raise InvalidArgumentError("substeps", problem, value=count, remedy=remedy)
+        return RunTicks(command, count, self.timestep)
+
     def _begin(self, command: RunTicks) -> None:
         """Send the request of ticks, for :meth:`_execute` to complete."""
         self._prepare_ticks()
@@ -600,7 +601,7 @@ class Runner(SingleOwner):
         """
         call, pool, is_sent = self._call, self._pool, command is self._sent
         ticks = command if isinstance(command, RunTicks) else None
-        is_due = self.recorder is not None or self._state.steps_since_checkpoint >= self._checkpoint_steps
+        is_due = self.recorder is not None or self._state.steps_since_checkpoint >= CHECKPOINT_STEPS
         if is_due and ticks is not None and not is_sent:
             self._prepare_ticks()
         call.begin()
@@ -639,18 +640,17 @@ class Runner(SingleOwner):
         return outcome
 
     def _prepare_ticks(self) -> None:
-        """Take a checkpoint if one is due, and wait while the recorder lags."""
-        if self._state.steps_since_checkpoint >= self._checkpoint_steps:
+        """Take a checkpoint if one is due, and let the recorder keep the state before its first tick."""
+        if self._state.steps_since_checkpoint >= CHECKPOINT_STEPS:
             self._take_snapshot()
         if self.recorder is not None:
-            self.recorder.wait()
+            self.recorder.prepare()
 
     def _record(self, recorder: TickRecorder, ticks: RunTicks, before: RunnerState, outcome: Outcome) -> None:
         """Pass completed ticks on to the recorder."""
-        rated = ticks.command.setpoint_rate is not None
-        for number, arrays in enumerate(outcome.completed, start=1):
-            time = (before.steps + number * ticks.substeps) * ticks.timestep
-            recorder.append(time, arrays.command.setpoint.copy(), arrays.observation.copied(self._tool_pose), rated)
+        for number, arrays in enumerate(outcome.completed):
+            time = (before.steps + (number + 1) * ticks.substeps) * ticks.timestep
+            recorder.append(time, ticks.command.map(itemgetter(number)), arrays.observation.copied(self._tool_pose))
 
     def _fail(self, error: BaseException) -> None:
         """End the runner, which cannot complete a command."""
@@ -668,11 +668,8 @@ class Runner(SingleOwner):
 
     def _max_ticks(self) -> int:
         """Return the number of ticks that one request may have: none beyond the next checkpoint."""
-        most, every = len(self._pool.ticks), self.options.checkpoint_steps
-        if every is None:
-            return most
-        left = every - self._state.steps_since_checkpoint % every
-        return min(most, -(-left // self.options.substeps))
+        left = CHECKPOINT_STEPS - self._state.steps_since_checkpoint % CHECKPOINT_STEPS
+        return min(len(self._pool.ticks), -(-left // self.options.substeps))
 
 
 _PARAMETERS = signature(RunnerOptions).parameters.items()

@@ -36,8 +36,6 @@ def read_command(
     ``given`` has its arrays by the names of their arguments, in the order of :class:`Command`. Positions of followers
     are computed from their leaders; the loop passes efforts on to the leaders. ``limits`` warns of setpoints.
     """
-    if options.tool_setpoints is not None:
-        given = _joint_setpoints(options, state, given, ticks)
     _, _, acceleration, _ = given.values()
     if acceleration is not None:
         _check_acceleration(state.params, given)
@@ -87,14 +85,14 @@ def count_ticks(options: RunnerOptions, setpoints: ArrayLike) -> int:
     """Return the number of ticks of a rollout, from the shape of its setpoints."""
     rows, num_envs = read_array("setpoints", setpoints), options.num_envs
     size = len(options.command_columns[0][1])
-    if options.tool_setpoints is None and (rows.ndim not in (2, 3) or len(rows) == 0):
+    if rows.ndim not in (2, 3) or len(rows) == 0:
         raise InvalidArgumentError(
             "setpoints",
             f"must have shape (ticks, {num_envs}, {size}) or (ticks, {size})",
             value=rows.shape,
             remedy=f"repeat a constant setpoint with np.broadcast_to(setpoint, (ticks, {size}))",
         )
-    return len(np.atleast_1d(rows))
+    return len(rows)
 
 
 def _check_acceleration(params: bp.PIDParams, given: Mapping[str, ArrayLike | None]) -> None:
@@ -105,22 +103,6 @@ def _check_acceleration(params: bp.PIDParams, given: Mapping[str, ArrayLike | No
         raise InvalidArgumentError(name, "is for gains in accelerations, and these are efforts", remedy=remedy)
     if given_rate is None:
         raise InvalidArgumentError(name, f"is given without {rate}", remedy=f"give {rate}, too")
-
-
-def _joint_setpoints(
-    options: RunnerOptions, state: RunnerState, given: Mapping[str, ArrayLike | None], ticks: int | None
-) -> dict[str, ArrayLike | None]:
-    """Return ``given`` with joint setpoints and their rates for poses of the tool and its twists."""
-    (name, poses), (rate_name, twists), (acceleration_name, acceleration), _ = given.items()
-    if acceleration is not None:
-        problem = "is for joint setpoints, and setpoints are poses"
-        raise InvalidArgumentError(acceleration_name, problem, remedy="leave it out")
-    tool, finite = options.tool_setpoints, options.on_invalid_input == "raise"
-    assert tool is not None
-    assert state.targets is not None
-    qpos = tool.joints(name, poses, state.targets, finite, ticks)
-    rates = None if twists is None else tool.rates(rate_name, twists, qpos, finite)
-    return dict(given) | {name: qpos, rate_name: rates}
 
 
 def joint_rows(options: RunnerOptions, name: str, value: ArrayLike) -> Float64:
@@ -158,11 +140,11 @@ def base_rows(
         rows[:, 3:7] /= length
     else:
         starts: dict[bytes, Float64] = {}
-        is_file = options.engine == "mujoco" and robot.mjcf is not None  # which may have a ground at another height
+        ground = options.ground and options.mjcf is None  # an MJCF file may have a ground at another height
         for env in np.flatnonzero(mask).tolist():
             key = qpos[env].tobytes()
             if key not in starts:
-                starts[key] = base_start(robot, qpos[env], options.ground and not is_file)
+                starts[key] = base_start(robot, qpos[env], ground)
             rows[env, :7] = starts[key]
     return rows
 

@@ -95,15 +95,13 @@ class ResetEnvs(RunnerCommand):
         return Reset(self.mask, self.qpos, self.qvel, self.draws, self.base)
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        chosen, targets, motion = self.mask[:, None], state.targets, state.motion
-        if targets is not None:
-            targets = np.where(chosen & np.isfinite(self.qpos), self.qpos, targets)
+        chosen, motion = self.mask[:, None], state.motion
         if motion is not None:
             setpoint, rate = motion
             rate = np.where(chosen, self.qvel, 0.0 if rate is None else rate)
             motion = np.where(chosen, self.qpos, setpoint), rate
         faults = state.faults.without(self.mask).with_faults(outcome.present)
-        return state._replace(faults=faults, draws=self.draws, targets=targets, motion=motion)
+        return state._replace(faults=faults, draws=self.draws, motion=motion)
 
 
 @dataclass(frozen=True)
@@ -122,16 +120,13 @@ class RunTicks(RunnerCommand):
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
         setpoint, rate, *_ = self.command
-        faults, contacts, targets, motion = state.faults, state.contacts, state.targets, state.motion
+        faults, contacts, motion = state.faults, state.contacts, state.motion
         count = outcome.num_ticks
         are_ok = np.logical_and.reduce(outcome.ticks.arrays.observation.ok[:count], axis=None)
         if not are_ok or contacts is not None:
             for arrays in outcome.completed:
                 faults = faults.with_faults(arrays)
                 contacts = None if contacts is None else contacts.with_contacts(arrays)
-        if targets is not None:
-            for rows in setpoint[:count]:
-                targets = np.where(np.isfinite(rows).all(1, keepdims=True), rows, targets)
         if motion is not None and count:
             motion = setpoint[count - 1], None if rate is None else rate[count - 1]
         steps = count * self.substeps
@@ -141,7 +136,6 @@ class RunTicks(RunnerCommand):
             state.draws,
             faults,
             contacts,
-            targets,
             motion,
             state.steps + steps,
             state.steps_since_checkpoint + steps,
@@ -202,7 +196,6 @@ class GoBack(RunnerCommand):
             actuators=snapshot.actuators,
             draws=self.restore.draws,
             faults=state.faults.restored(snapshot.states.containment["step"]),
-            targets=snapshot.targets,
             motion=None if snapshot.motion is None else (snapshot.motion[0], snapshot.motion[1]),
             steps=snapshot.steps,
             steps_since_checkpoint=0,
@@ -216,9 +209,8 @@ def snapshot_of(options: RunnerOptions, state: RunnerState, results: list[EnvSta
         last, rate = state.motion
         motion = np.stack([last, np.zeros_like(last) if rate is None else rate])
     episodes = None if options.randomization is None else state.draws.episodes.copy()
-    targets = None if state.targets is None else state.targets.copy()
     about, states = options.describe(), EnvStates.join(results)
-    return Snapshot(about, state.steps, state.params, states, state.actuators, episodes, targets, motion)
+    return Snapshot(about, state.steps, state.params, states, state.actuators, episodes, motion)
 
 
 def restored(options: RunnerOptions, snapshot: Snapshot, sizes: list[int]) -> Restore:

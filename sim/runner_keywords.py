@@ -35,6 +35,8 @@ class Controller(Protocol):
 
     A setpoint has a number for each joint, unless the controller has an attribute ``command``: a
     :class:`batchpid.sim.CommandSpec`, or a sequence of names, such as ``("x", "y")``. Then it is (envs, size).
+
+    A snapshot fits a controller of the same class, whose attribute ``version`` is the same where it has one.
     """
 
     def init(self, robot: Robot, num_envs: int) -> Any:
@@ -61,9 +63,7 @@ class Controller(Protocol):
 
 
 Compensation = Literal["gravity+coriolis+friction", "gravity+coriolis", "gravity", "none"]
-SetpointSpace = Literal["joints", "tool"]
 Backend = Literal["numpy", "jax"]
-Precision = Literal["float64", "float32"]
 EngineName = Literal["sapien", "mujoco"]
 DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
 """SAPIEN where it is installed, which is on Linux with x86-64; elsewhere MuJoCo."""
@@ -71,12 +71,11 @@ PhysicsPreset = Literal["accurate", "fast", "free"]
 FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]
 Place = Literal["snapshot", "recording", "scene"]
-Role = Literal["restored", "processes", "last bits", "next commands"]
+Role = Literal["restored", "processes", "next commands"]
 """Reason for which a snapshot may be restored in a runner with another value of an option.
 
 - "restored": the snapshot holds the value, and the runner takes it over;
 - "processes": the value decides where and how fast the envs run; results are bit-identical for all values;
-- "last bits": like "processes", except that the last bits of results depend on the value;
 - "next commands": the value is a default of later commands (``substeps``), or decides which of them are refused.
 """
 
@@ -136,21 +135,14 @@ class RunnerKeywords:
     whose setpoints are poses (7,), a :class:`batchpid.sim.OperationalSpace` with its defaults; or a
     :class:`Controller`."""
     tool: Annotated[str | None, option("snapshot", "recording")] = None
-    """Link that control "osc" and ``setpoint_space`` "tool" move; default the last link of the robot's longest
-    chain."""
-    setpoint_space: Annotated[SetpointSpace, option("snapshot")] = "joints"
-    """``"joints"``, the default, or ``"tool"``: under control "pid" or "drive" setpoints are poses (7,) of the link
-    ``tool``, position and quaternion (w, x, y, z), or poses and the positions of the joints outside the chain to it.
-    Inverse kinematics (:class:`batchpid.sim.tool_space.tool_setpoints.ToolSetpoints`) makes joint setpoints of them,
-    which rollouts and recordings hold."""
+    """Link that control "osc" moves; default the last link of the robot's longest chain."""
     backend: Annotated[
         Backend, option("snapshot", flag="Library of the law: NumPy, or JAX, as one program with the steps.")
     ] = "numpy"
     """Library of the law: ``"numpy"``, the default, or ``"jax"``, which compiles law and sim steps of a tick, and a
-    :class:`Controller`, into one XLA program for the CPU (docs/performance.md). The last bits of results differ between
-    the two, and between processors."""
-    dtype: Annotated[Precision, option("snapshot")] = "float64"
-    """Floating-point type of the law under backend ``"jax"``: ``"float64"``, the default, or ``"float32"``."""
+    :class:`Controller`, into one XLA program for the CPU (docs/performance.md). It needs native code, control "pid",
+    "effort" or a :class:`Controller`, and has no coupled joints, actuators, randomization and guard. The last bits of
+    results differ between the two, and between processors."""
     compensate: Annotated[
         Compensation, option("snapshot", "recording", flag="Passive force and known friction, added at every sim step.")
     ] = "gravity+coriolis+friction"
@@ -203,9 +195,9 @@ class RunnerKeywords:
     """Links whose contact forces are observed: ``obs.contact_force`` and ``obs.touching``; default none. Links that are
     connected by fixed joints count as one. A fixed base is refused. SAPIEN needs ``dissipation="urdf"``."""
     wrenches: Annotated[Sequence[str] | None, option("snapshot", "recording", "scene")] = None
-    """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``; default none. A
-    link on a fixed joint needs a robot with ``merge_fixed=False``, and SAPIEN one with ``dissipation="urdf"``."""
-    build: Annotated[Callable[[Any, int], Any] | None, option("scene", snapshot="build_digest")] = None
+    """Links with a sensor of the force and torque that the parent exerts on the link: ``obs.wrench``; default none.
+    SAPIEN needs ``dissipation="urdf"``."""
+    build: Annotated[Callable[[Any, int], Any] | None, option("scene", snapshot="versioned_build")] = None
     """Function ``build(scene, env)`` that adds user content to the ``sapien.Scene`` of each env. Visuals and lights are
     ignored, so code that was written for a screen runs unchanged. It may return the entities that
     :meth:`batchpid.sim.Runner.poses` reports. A reset returns the content to the poses that ``build`` gave it."""
@@ -230,15 +222,9 @@ class RunnerKeywords:
     on_invalid_input: Annotated[InvalidInputAction, option(role="next commands")] = "raise"
     """Response to NaN or infinity in a command or in a pose to reset to: ``"raise"`` (default) raises an error, and
     ``"contain"`` lets only the env concerned fail."""
-    recover: Annotated[bool, option(role="processes")] = True
-    """Replace a worker process that dies or gets stuck, and replay its envs; default True. Results are bit-identical to
-    an undisturbed run. With False :class:`batchpid.errors.WorkerError` is raised."""
-    checkpoint_steps: Annotated[int | None, Field(low=1, high=1e9), option(role="last bits")] = 8000
-    """Sim steps between checkpoints; default 8000. A replay starts from the last checkpoint. With None it starts from
-    the beginning, and all commands are kept. After contacts the last bits of the results depend on this option."""
     timeout: Annotated[float, Field("seconds", low=1e-3, high=1e9), option(role="processes")] = 60.0
-    """Time [s], beyond an upper bound of the work's duration, after which a worker counts as stuck; default 60. A
-    worker that is stopped or asleep within a tick counts as stuck within a second."""
+    """Time [s], beyond an upper bound of the work's duration, after which a worker counts as stuck, and is replaced;
+    default 60."""
     cluster: Annotated[
         Literal["ray"] | Ray | None,
         option(

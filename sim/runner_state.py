@@ -27,8 +27,6 @@ class RunnerState(NamedTuple):
     faults: FaultLog
     contacts: MissedContactLog | None
     """None if contacts are not watched: the robots have collision shapes."""
-    targets: Float64 | None
-    """Last joint setpoints (envs, dof), where searches for poses of the tool start; None without such poses."""
     motion: Motion | None
     """Setpoint of the last tick and its rate, or position and velocity after a reset. None for other setpoints."""
     steps: int = 0
@@ -48,7 +46,5 @@ class RunnerState(NamedTuple):
         if options.misses_contacts:
             nearest = lambda qpos: robot_model(robot).nearest_links(qpos)  # noqa: E731
             contacts = MissedContactLog(count, options.timestep, nearest)
-        start = np.tile(robot.start, (count, 1))
-        targets = None if options.tool_setpoints is None else start
-        motion = (start, None) if options.sets_positions else None
-        return cls(options.params, options.actuators, draws, faults, contacts, targets, motion)
+        motion = (np.tile(robot.start, (count, 1)), None) if options.sets_positions else None
+        return cls(options.params, options.actuators, draws, faults, contacts, motion)

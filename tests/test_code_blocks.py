@@ -203,7 +203,7 @@ def run(words: list[str]) -> None:
 
 def command(name: str, *flags: str) -> None:
     assert name in COMMANDS
-    if name in ONLY_PARSED or "--viewer" in flags:
+    if name in ONLY_PARSED:
         parse([name, *flags])
         return
     if name == "view" and importlib.util.find_spec("viser") is None:

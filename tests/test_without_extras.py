@@ -57,7 +57,7 @@ def modules_of_extras() -> list[str]:
 def test_the_index_lists_every_extra_for_users():
     rows = re.findall(r"^\| (.*) \|.*\|.*[GM]B \|$", INDEX.read_text(), re.MULTILINE)
     assert [row.strip("`") for row in rows if row != "none"][-1] == "all"
-    assert {row.strip("`") for row in rows} == {"none", "all", "sb3"} | FOR_USERS
+    assert {row.strip("`") for row in rows} == {"none", "all"} | FOR_USERS
 
 
 def test_the_base_contains_no_package_of_an_extra():
@@ -71,7 +71,7 @@ def test_each_command_and_program_runs_or_names_its_extra(tmp_path: Path):
     lines = [words[1:] for page in (README, INDEX) for words in shell_lines(page) if words[0] == "batchpid"]
     sizes = [[] if "--trajectory" in words else SIZES.get(words[0], []) for words in lines]
     commands = [[*words, *size] for words, size in zip(lines, sizes, strict=True)]
-    commands.append(["rollout", "panda", "--backend", "jax", "--out", "jax.npz"])
+    commands.append(["rollout", "panda", "--backend", "jax", "--out", "jax.h5"])
     (tmp_path / "robots").mkdir()
     write(tmp_path / "robots", TWO_JOINTS, "two.urdf")
     programs = [match["code"] for page in (README, INDEX) for match in blocks(page, "python")]

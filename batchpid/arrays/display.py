@@ -1,10 +1,9 @@
-"""Short representations of params, states and other tuples of arrays, and HTML tables for notebooks."""
+"""Short representations of params, states and other tuples of arrays."""
 
 from __future__ import annotations
 
-import html
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -37,17 +36,6 @@ def summary(name: str, parts: Iterable[str]) -> str:
     return "\n".join(
         textwrap.wrap(f"{name}({', '.join(parts)})", WIDTH, subsequent_indent="    ", break_on_hyphens=False)
     )
-
-
-def html_table(caption: str, headers: Sequence[str], rows: Iterable[Iterable[str]]) -> str:
-    """Return a table in HTML: a caption above, names of columns, and rows of text. All text is escaped."""
-
-    def row(tag: str, cells: Iterable[str]) -> str:
-        return f"<tr>{''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for cell in cells)}</tr>"
-
-    lines = (row("td", cells) for cells in rows)
-    above = f"<caption style='white-space: pre-wrap; text-align: left'>{html.escape(caption)}</caption>"
-    return f"<table>{above}<thead>{row('th', headers)}</thead><tbody>{''.join(lines)}</tbody></table>"
 
 
 def array_summary(arrays: Any, *axes: str) -> str:

@@ -1,13 +1,11 @@
-"""Files: atomic writes, trials of whether one can be written, .npz files that may be made to do harm, descriptors."""
+"""Files: atomic writes, .npz files that may be made to do harm, descriptors."""
 
 from __future__ import annotations
 
-import errno
 import io
 import math
 import os
 import secrets
-import stat
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -17,9 +15,6 @@ from typing import BinaryIO
 import numpy as np
 
 from batchpid.arrays.array_types import Rows
-
-TRIAL_BYTES = 4096
-"""Size of the file that :func:`try_writing` writes: a block of most file systems [B]."""
 
 
 @contextmanager
@@ -35,12 +30,6 @@ def standard_streams_occupied() -> Iterator[None]:
             number = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
             files.callback(os.close, number)
         yield
-
-
-def read_bytes(path: str) -> bytes:
-    """Return the content of the file at ``path``, in one call of Python; Path.read_bytes takes several."""
-    with open(path, "rb", buffering=0) as file:
-        return file.read()
 
 
 @contextmanager
@@ -90,34 +79,6 @@ def write_atomically(
             content(file)
         else:
             file.write(content.encode() if isinstance(content, str) else content)
-
-
-def try_writing(path: str | os.PathLike[str]) -> None:
-    """Raise OSError unless a file can be written at ``path``, whose folder need not exist; leave nothing behind.
-
-    The trial is a small file in the same folder, or in the nearest folder above that exists. Raises OSError if the
-    folder cannot be written to, the disk is full, or ``path`` is not a regular file or may not be changed.
-    """
-    path = Path(os.path.realpath(path))
-    try:
-        kept = os.stat(path)
-    except FileNotFoundError:
-        pass
-    else:
-        if not stat.S_ISREG(kept.st_mode):
-            number = errno.EISDIR if stat.S_ISDIR(kept.st_mode) else errno.EINVAL
-            raise OSError(number, os.strerror(number), str(path))
-        if not os.access(path, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-    folder = path.parent
-    while not folder.exists():
-        folder = folder.parent
-    trial = _temporary(folder / path.name)
-    try:
-        with trial.open("xb") as file:
-            file.write(bytes(TRIAL_BYTES))
-    finally:
-        trial.unlink(missing_ok=True)
 
 
 def _temporary(path: Path) -> Path:

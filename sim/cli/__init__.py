@@ -3,8 +3,7 @@
 To add a command, write a module with such a dataclass and list it in :data:`COMMANDS`. The range of a number is a
 :class:`batchpid.arrays.field_tables.Field` in its annotation, and is checked before ``run()`` starts, which returns the
 exit status (None: 0). Modules that load SAPIEN or Matplotlib are named in ``imports`` and imported after the flags are
-parsed, so that ``--help`` answers at once, and before ``run()``: Ctrl-C ends the program at once until then, because
-some packages suppress a KeyboardInterrupt while they are imported.
+parsed, so that ``--help`` answers at once.
 """
 
 from __future__ import annotations
@@ -15,8 +14,6 @@ import signal
 import sys
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
-from threading import Timer
 from typing import Any
 
 import tyro
@@ -36,7 +33,6 @@ from batchpid.sim.cli.rollout import RolloutCommand
 from batchpid.sim.cli.survey import SurveyCommand
 from batchpid.sim.cli.tune import TuneCommand
 from batchpid.sim.cli.view import ViewCommand
-from batchpid.startup import exit_at_once
 
 COMMANDS: dict[str, type[Any]] = {
     "demo": DemoCommand,
@@ -69,15 +65,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         status, message = 128 + signal.SIGINT, "interrupted"
     except BrokenPipeError:
         status = 128 + signal.SIGPIPE
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at exit
     except OSError as error:
         status, message = 2, f"{error.filename}: {error.strerror}" if error.filename else error.strerror or str(error)
     if message is not None:
-        _complain(message)
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            stream.flush()
-        except OSError:  # Python flushes it once more at exit
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        close_bars()
+        print("batchpid:", " ".join(message.splitlines()), file=sys.stderr)
     return status
 
 
@@ -95,31 +88,14 @@ def _run(arguments: list[str]) -> int:
         flags.check(command)
         for name in command.imports:
             importlib.import_module(name)
-        if signal.getsignal(signal.SIGINT) is exit_at_once:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        sys.unraisablehook = _interrupt_again
-        try:
-            return command.run() or 0
-        finally:
-            sys.unraisablehook = sys.__unraisablehook__
-
-
-def _interrupt_again(unraisable: Any) -> None:
-    """Repeat a Ctrl-C that came in a destructor, where Python prints its KeyboardInterrupt and goes on."""
-    if unraisable.exc_type is not KeyboardInterrupt:
-        sys.__unraisablehook__(unraisable)
-        return
-    try:
-        Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
-    except KeyboardInterrupt:  # on a busy machine it comes before start() has returned
-        _interrupt_again(unraisable)
+        return command.run() or 0
 
 
 def parse(arguments: Sequence[str]) -> Any:
     """Return the command with its flags; for --help or unknown flags print help and raise SystemExit."""
     options = (
         tyro.conf.DisallowNone,  # a flag is left out, not given None
-        tyro.conf.FlagCreatePairsOff,  # --viewer without --no-viewer
+        tyro.conf.FlagCreatePairsOff,  # --force without --no-force
         tyro.conf.PositionalMetavarFromFieldName,
         # Without a help of the choice itself, tyro looks for one in the source of `typing`, which takes 0.05 s.
         tyro.conf.arg(help="`batchpid COMMAND --help` lists the flags of a command."),
@@ -134,13 +110,5 @@ def parse(arguments: Sequence[str]) -> Any:
     return app.cli(prog="batchpid", description=about, args=arguments, config=options)
 
 
-def _complain(message: str) -> None:
-    """Print ``message`` as one line on stderr, if that can be written."""
-    with suppress(OSError):
-        close_bars()
-        print("batchpid:", " ".join(message.splitlines()), file=sys.stderr)
-
-
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    with suppress(OSError):
-        print(f"batchpid: warning: {message}", file=sys.stderr)
+    print(f"batchpid: warning: {message}", file=sys.stderr)

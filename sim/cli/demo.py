@@ -36,8 +36,6 @@ class DemoCommand:
     """Step responses to draw: .png or .svg. Default: out/ROBOT-demo.png."""
     json: flags.Json = None
     force: flags.Force = False
-    viewer: flags.Switch = False
-    """Replay up to 16 robots in SAPIEN's window at the end. Needs a display and a Vulkan device."""
 
     imports = ("batchpid.sim.plots", "batchpid.sim.runner")
 
@@ -50,11 +48,6 @@ class DemoCommand:
         outputs, picture = OutputFiles(self), self.picture or beside(FOLDER / self.robot, "demo")
         picture = outputs.path("picture", picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
-        if self.viewer:
-            from batchpid.sim.view.film import show_window
-            from batchpid.sim.view.renderer import check_renderer
-
-            check_renderer()
         robot = Robot.load(self.robot, **vars(self.meshes))
         settings = robot.settings
         if settings is None:
@@ -78,6 +71,4 @@ class DemoCommand:
         if json is not None:
             write_figures(json, run_figures(robot, rollout))
             print(f"figures: {json}")
-        if self.viewer:
-            show_window(rollout.for_envs(slice(0, 16)))
         return exit_status(robot, rollout)

@@ -11,7 +11,7 @@ import numpy as np
 from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import FOLDER, OutputFiles, stem
+from batchpid.sim.cli.outputs import FOLDER, OutputFiles
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class ExciteCommand:
         from batchpid.sim.identification.excitation import excite
         from batchpid.sim.setpoint_files import setpoint_csv
 
-        out = self.out or FOLDER / f"{stem(Path(self.robot))}.excite.csv"
+        out = self.out or FOLDER / f"{Path(self.robot).stem}.excite.csv"
         out = OutputFiles(self).path("out", out, (".csv",))
         robot = Robot.load(self.robot, **vars(self.meshes))
         motion = excite(robot, self.seconds, rate=self.rate, lowest=self.lowest, highest=self.highest, seed=self.seed)

@@ -11,7 +11,7 @@ import numpy as np
 from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import FOLDER, OutputFiles, stem
+from batchpid.sim.cli.outputs import FOLDER, OutputFiles
 
 if TYPE_CHECKING:
     import batchpid as bp
@@ -80,7 +80,7 @@ class ExportCommand:
         from batchpid.sim.robot.urdf_export import to_urdf
         from batchpid.sim.tuning.gain_sets import gain_set
 
-        out = self.out or FOLDER / f"{stem(Path(self.robot))}{FILES[self.to]}"
+        out = self.out or FOLDER / f"{Path(self.robot).stem}{FILES[self.to]}"
         out = OutputFiles(self).path("out", out, (Path(FILES[self.to]).suffix,))
         known = {name for names in USED.values() for name in names}
         unused = [each.name for each in fields(self) if each.name in known.difference(USED[self.to])]

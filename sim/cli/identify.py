@@ -12,7 +12,7 @@ from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import AT_MOST, FOLDER, OutputFiles, bar, beside, stem, write_figures
+from batchpid.sim.cli.outputs import AT_MOST, FOLDER, OutputFiles, bar, beside, write_figures
 
 if TYPE_CHECKING:
     import batchpid as bp
@@ -83,7 +83,7 @@ class IdentifyCommand:
         from batchpid.sim.identification.identification import identify
         from batchpid.sim.identification.logs import Reading
 
-        out = self.out or FOLDER / f"{stem(Path(self.robot))}.actuators.yaml"
+        out = self.out or FOLDER / f"{Path(self.robot).stem}.actuators.yaml"
         outputs = OutputFiles(self)
         out = outputs.path("out", out, (".yaml", ".yml", ".json"))
         details = outputs.path("json", self.json, (".json",))

@@ -88,14 +88,9 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def stem(path: Path) -> str:
-    """Return the name of a file without its suffix, and without the ".partial" of an incomplete recording."""
-    return Path(path.name.removesuffix(".partial")).stem
-
-
 def beside(path: Path, shown: str, suffix: str = ".png") -> Path:
     """Return the default path of a picture or film of ``path``, in the same folder: NAME-SHOWN.png."""
-    return path.with_name(f"{stem(path)}-{shown}{suffix}")
+    return path.with_name(f"{path.stem}-{shown}{suffix}")
 
 
 AT_MOST = "{desc}: {n_fmt} of at most {total_fmt} evaluations, {elapsed}, at most {remaining} more{postfix}"

@@ -13,7 +13,7 @@ from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Rollout, read_recording
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, bar, beside, stem
+from batchpid.sim.cli.outputs import OutputFiles, bar, beside
 
 SHOWN_ENVS = 16
 """Envs in a film."""
@@ -23,11 +23,11 @@ SHOWN_ENVS = 16
 class PlotCommand:
     """Draw a recorded run, compare it with another one, or film it.
 
-    The recording may be complete, cut short by a kill (``NAME.h5.partial``), or still being written.
+    The recording may be complete, cut short by a kill, or still being written.
     """
 
     recording: tyro.conf.Positional[Path]
-    """File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote: .npz or .h5."""
+    """File that `batchpid rollout --out` or a batchpid.sim.Recorder wrote, .h5."""
     robot: flags.RecordedRobot = None
     versus: flags.OptionalPath = None
     """Another recording, to compare with."""
@@ -38,7 +38,7 @@ class PlotCommand:
     every: Annotated[int, Field(low=1, high=1e9)] = 1
     """Draw only every n-th tick, for long recordings."""
     picture: flags.OptionalPath = None
-    """Picture to draw: .png or .svg. Default: next to the recording NAME.npz, NAME-responses.png, NAME-efforts.png, or
+    """Picture to draw: .png or .svg. Default: next to the recording NAME.h5, NAME-responses.png, NAME-efforts.png, or
     NAME-versus-OTHER.png."""
     film: flags.OptionalPath = None
     """Film of the first 16 envs in real time, to write instead of a picture: .mp4 or .gif."""
@@ -53,7 +53,7 @@ class PlotCommand:
 
         if not self.recording.is_file():  # before a picture is named after it
             read_recording(self.recording)
-        shown = self.kind if self.versus is None else f"versus-{stem(self.versus)}"
+        shown = self.kind if self.versus is None else f"versus-{self.versus.stem}"
         outputs = OutputFiles(self)
         if self.film is not None:
             return self._film(outputs)

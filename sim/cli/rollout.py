@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from batchpid.arrays.array_types import Array
-from batchpid.checks.validate import array, file_path
+from batchpid.checks.validate import array
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import OperationalSpace, Recorder, Robot, write_recording
+from batchpid.sim import OperationalSpace, Recorder, Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, waiting, write_figures
 from batchpid.sim.recording.recording_files import HDF5
 from batchpid.sim.tool_space.osc_controller import default_tool
-from batchpid.sim.tool_space.tool_setpoints import default_goal
 from batchpid.sim.tuning.gain_sets import gain_set
 
 if TYPE_CHECKING:
@@ -45,7 +43,7 @@ class RolloutCommand:
     """With --control osc: link to move. Default: the last one of the longest chain."""
     setpoint: flags.OptionalFloats = None
     """One position per joint [rad or m]; with --control osc x y z qw qx qy qz of the tool. Default: the bundled robot's
-    target, else the start pose; with --control osc a pose near that, which all robots reach within joint limits."""
+    target, else the start pose; with --control osc the pose of the tool there."""
     trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Setpoints to follow instead: a CSV file with the columns time, setpoint:JOINT ..., and, where they are known,
     setpoint_rate:JOINT ... and setpoint_acceleration:JOINT ... A row holds at its time, and rows are equally spaced: by
@@ -69,14 +67,11 @@ class RolloutCommand:
     actuators: flags.Actuators = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
-    """Recording to write: .npz at the end, or .h5 tick by tick (extra `record`). For plot and view."""
+    """Recording to write, .h5: tick by tick, for plot and view."""
     picture: flags.OptionalPath = None
     """Step responses to draw: .png or .svg."""
     json: flags.Json = None
     force: flags.Force = False
-    resume: flags.Switch = False
-    """Run in parts of 128 robots, and continue after the last part of a run with the same options that was stopped.
-    Needs --out NAME.h5; the parts are in NAME.h5.parts until the end."""
 
     imports = ("batchpid.sim.plots", "batchpid.sim.runner")
 
@@ -85,7 +80,6 @@ class RolloutCommand:
         from batchpid.sim import Runner, plots
         from batchpid.sim.cli.report import exit_status
         from batchpid.sim.cli.run import (
-            Parts,
             follow,
             hold_pose,
             hold_setpoint,
@@ -95,12 +89,7 @@ class RolloutCommand:
         from batchpid.sim.tuning.randomization_presets import load_randomization
 
         outputs = OutputFiles(self)
-        if self.resume and self.out is None:
-            raise InvalidArgumentError("resume", "has no file to continue", remedy="add --out NAME.h5")
-        if self.resume and self.out is not None:
-            out: Path | None = file_path("out", self.out, HDF5)
-        else:
-            out = outputs.path("out", self.out, (".npz", *HDF5))
+        out = outputs.path("out", self.out, HDF5)
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes))
@@ -112,24 +101,19 @@ class RolloutCommand:
             flags.refuse(self, ("gains",), "are for the control of joints")
             control: Any = OperationalSpace(robot, self.tool or default_tool(robot), posture=target)
             start = start_poses(robot, self.num_envs, self.spread, self.seed, target)
-            if self.setpoint is None:
-                near = start_poses(robot, 8, self.spread, self.seed + 1, target)
-                setpoint = default_goal(robot, control, start, near[1:])
-            else:
-                setpoint = array("setpoint", self.setpoint, (1, 7), control.command.names, kind="entry")[0]
+            goal: Array = control.tool_pose(target) if self.setpoint is None else self.setpoint
+            setpoint = array("setpoint", goal, (1, 7), control.command.names, kind="entry")[0]
         else:
             center = None if setpoints is None else setpoints.start
             start = start_poses(robot, self.num_envs, self.spread, self.seed, center)
-            goal: Array = target if self.setpoint is None else self.setpoint
+            goal = target if self.setpoint is None else self.setpoint
             setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
             gains = gain_set(robot, self.gains or ("drive" if self.control == "drive" else None))
             params, control = gains.params, "drive" if gains.control == "drive" else self.control
             if self.rates and setpoints is not None and setpoints.acceleration is not None:
                 _check_accelerations(self.trajectory, control == "pid" and params.gain_units is not None)
-        make: Any = partial(Parts, out) if self.resume and out is not None else Runner
-        stream = None if out is None or self.resume or out.suffix.lower() == ".npz" else out
         with waiting(f"building {self.num_envs} robots"):
-            made = make(
+            made = Runner(
                 robot,
                 self.num_envs,
                 params=params,
@@ -142,14 +126,12 @@ class RolloutCommand:
             )
         with (
             made as runner,
-            Recorder(stream, runner, seed=self.seed, overwrite=self.force) if stream else nullcontext(),
+            Recorder(out, runner, seed=self.seed, overwrite=self.force) if out else nullcontext(),
         ):
             if setpoints is not None:
                 rollout, report = follow(runner, start, setpoints, self.rates)
             else:
                 rollout, report = (hold_pose if osc else hold_setpoint)(runner, start, setpoint, self.seconds)
-        if out is not None and stream is None and not self.resume:
-            write_recording(rollout, out, seed=self.seed, overwrite=True)
         print(report)
         if out is not None:
             print(f"written: {out}")

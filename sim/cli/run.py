@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,9 @@ from batchpid.sim.cli.flags import MeshOptions
 from batchpid.sim.cli.outputs import bar
 from batchpid.sim.cli.report import run_report, tool_report, trajectory_report
 from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.setpoint_files import Setpoints
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
-from batchpid.sim.setpoint_files import Setpoints
 from batchpid.sim.tuning.evaluation import (
     Evaluation,
     evaluate_gains,
@@ -33,38 +31,10 @@ from batchpid.sim.tuning.evaluation import (
 from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
 from batchpid.sim.tuning.randomization_presets import at_the_joints, reseeded
-from batchpid.sim.tuning.sweep import sweep
 from batchpid.task_space.frames import pose_error
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Axes of the error of a pose."""
-PART = 128
-"""Robots in a part of a rollout that can be resumed."""
-
-
-class Parts:
-    """Runner for one rollout of the functions below, recorded to ``path`` as a :func:`batchpid.sim.sweep`."""
-
-    def __init__(self, path: Path, robot: Robot, num_envs: int, *, params: Any, **options: Any) -> None:
-        self.options = known = RunnerOptions(robot, num_envs, **options)
-        self.robot, self.num_envs, self.control = robot, num_envs, known.control
-        self.timestep, self.substeps = known.timestep, known.substeps
-        self._sweep = partial(sweep, robot, num_envs, path=path, params=params, part=PART, **options)
-
-    def __enter__(self) -> Parts:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Nothing is open: each part has a runner of its own."""
-
-    def reset(self, qpos: Rows, *, seed: int | None = None) -> None:
-        """Begin at ``qpos`` (envs, dof)."""
-        self._sweep = partial(self._sweep, qpos=qpos, seed=seed)
-
-    def rollout(self, setpoints: Rows, *, progress: Any = None, **more: Any) -> Rollout:
-        """Return the rollout, from the file as far as it is there."""
-        found: Rollout = self._sweep(setpoints=setpoints, progress=bar("simulating", unit="part"), **more)
-        return found
 
 
 def start_poses(

@@ -14,7 +14,7 @@ from batchpid.arrays.array_types import Document
 from batchpid.arrays.field_tables import Field
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import FOLDER, OutputFiles, bar, beside, stem
+from batchpid.sim.cli.outputs import FOLDER, OutputFiles, bar, beside
 from batchpid.sim.tuning.cost import Weights
 from batchpid.sim.tuning.gain_sets import GainSet
 
@@ -64,7 +64,7 @@ class TuneCommand:
         from batchpid.sim.tuning.randomization_presets import load_randomization
         from batchpid.sim.tuning.search import tune
 
-        outputs, named = OutputFiles(self), FOLDER / stem(Path(self.robot))
+        outputs, named = OutputFiles(self), FOLDER / Path(self.robot).stem
         out = outputs.path("out", self.out or named.with_suffix(".tuned.yaml"), (".yaml", ".yml", ".json"))
         picture = outputs.path("picture", self.picture or beside(self.out or named, "tune"), plots.FORMATS)
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))

@@ -7,7 +7,7 @@ import sys
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
@@ -18,33 +18,28 @@ from batchpid.sim.tuning.gain_sets import gain_set
 if TYPE_CHECKING:
     from batchpid.sim.view import LiveSimulation, Playback
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
+LOOPBACK = ("127.0.0.1", "localhost")
 
 RUNNER = flags.runner_flags("compensate", "engine", "physics", "ground", "workers")
 
 
 @dataclass(frozen=True)
 class ViewCommand:
-    """Show moving robots in the browser: sliders for setpoints and gains, charts, pushes, payloads.
+    """Show moving robots in the browser: sliders for setpoints and gains, and charts.
 
-    The page is served on localhost. With two controls the same robots stand side by side, one group under each. With
-    ``--play`` it shows a recorded run.
+    The page is served on localhost. With ``--play`` it shows a recorded run.
     """
 
     robot: flags.RecordedRobot = None
     num_envs: flags.ShownEnvs = 16
-    """Number of robots in each group; 64 in all at most."""
-    control: tuple[Literal["pid", "drive", "osc"], ...] = ("pid",)
-    """Batch PID, PhysX's internal drive, or both side by side; or operational-space control, to drag a tool."""
-    tool: flags.OptionalName = None
-    """With --control osc: link of the tool. Default: the last link of the robot's longest chain."""
+    """Number of robots; 64 at most."""
     gains: flags.Gains = None
     spread: flags.Spread = 0.2
     runner: Annotated[flags.RunnerFlags, flags.group(RUNNER)] = field(default_factory=RUNNER)
     actuators: flags.Actuators = None
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     play: flags.OptionalPath = None
-    """Recorded run to show: .npz or .h5."""
+    """Recorded run to show, .h5."""
     fps: flags.Fps = 30.0
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 for all of this machine. Everyone who sees the printed address can use it."""
@@ -57,9 +52,7 @@ class ViewCommand:
     def run(self) -> None:
         """Run the command."""
         from batchpid.sim.view import View
-        from batchpid.sim.view.address import resolve
 
-        resolve(self.host)  # before the robots are loaded
         source = self._live() if self.play is None else self._recorded(self.play)
         with closing(source), View(source, host=self.host, port=self.port) as view:
             if self.host not in LOOPBACK:
@@ -80,21 +73,17 @@ class ViewCommand:
 
         robot = Robot.load(self.robot or "panda", actuators=self.actuators, **vars(self.meshes))
         gains = None if self.gains is None else gain_set(robot, self.gains)
-        if gains and "osc" in self.control:
-            raise InvalidArgumentError("gains", "are not for control 'osc'", value=self.gains, remedy="leave it out")
         if gains and gains.control != "pid":
-            raise InvalidArgumentError("gains", "must be PID gains", value=self.gains, remedy="use --control drive")
+            raise InvalidArgumentError("gains", "must be PID gains", value=self.gains, remedy="name others")
         live = LiveSimulation(
             robot,
             self.num_envs,
-            controls=self.control,
-            tool=self.tool,
             period=1 / self.fps,
             spread=self.spread,
             **self.runner.options(),
             params=gains and gains.params,
         )
-        if robot.settings is not None and live.command is None:
+        if robot.settings is not None:
             live.set_setpoint(robot.settings.target)
         return live
 
@@ -102,7 +91,7 @@ class ViewCommand:
         """Return the run in the file; of many envs those that fit on the page."""
         from batchpid.sim.cli.run import read_run
         from batchpid.sim.view import Playback
-        from batchpid.sim.view.layout import MAX_ROBOTS
+        from batchpid.sim.view.scene import MAX_ROBOTS
 
         usage = f"batchpid view PATH/TO/ROBOT.urdf --play {shlex.quote(str(path))}"
         rollout, robot = read_run(path, self.robot, self.meshes, usage)

@@ -265,9 +265,6 @@ class Engine(Protocol):
     def is_physics(self, settings: object) -> bool:
         """Return whether ``settings`` are settings of its solver."""
 
-    def least_memory(self, num_envs: int, dof: int) -> int:
-        """Return a lower estimate of the bytes that ``num_envs`` robots of ``dof`` joints take."""
-
     def make_pack(
         self,
         spec: SceneSpec,

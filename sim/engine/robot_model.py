@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Array, Bool, Document, Float64, Rows
+from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.sim.engine.protocol import load_engine
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_shapes import link_shapes
@@ -154,15 +154,15 @@ def turned_back(wxyz: Float64, vectors: Any) -> Float64:
 @lru_cache(maxsize=16)
 def description_tree(spec: SceneSpec) -> RigidTree:
     """Return the rigid tree of the simulated bodies of ``spec``, not coupled; the same object for equal specs."""
-    text = simulated(spec.urdf, spec.merge_fixed).urdf
-    inertias = body_inertias(spec.urdf, spec.merge_fixed)
+    text = simulated(spec.urdf, spec.separate).urdf
+    inertias = body_inertias(spec.urdf, spec.separate)
     return rigid_tree(text, inertias, gravity=spec.gravity, fixed_base=spec.fixed_base)
 
 
 def contacts_of(spec: SceneSpec, ground: bool) -> Contacts:
     """Return the contacts of the robot of ``spec``, even of one without shapes there; ``ground`` is at height 0."""
     ignored = {frozenset(pair) for pair in spec.ignored}
-    return Contacts(description_tree(spec), link_shapes(spec.urdf, spec.merge_fixed), ignored, ground)
+    return Contacts(description_tree(spec), link_shapes(spec.urdf, spec.separate), ignored, ground)
 
 
 def scene_tree(spec: SceneSpec) -> RigidTree:
@@ -198,5 +198,4 @@ def base_start(robot: RobotDescription, qpos: Float64, ground: bool) -> Float64:
 def robot_model(robot: RobotDescription, ground: bool | None = None) -> RobotModel:
     """Return the model of ``robot`` on a fixed base; ``ground`` at height 0, by default ``robot.has_ground``."""
     has_ground = robot.has_ground if ground is None else ground
-    options: Document = {"merge_fixed": robot.merge_fixed, "ground": has_ground}
-    return scene_model(SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, None, **options))
+    return scene_model(SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, None, ground=has_ground))

@@ -33,9 +33,8 @@ class SceneSpec:
 
     ``urdf`` is sanitised text (see :mod:`batchpid.sim.robot.urdf`); ``ignored`` are pairs of its links that do not
     collide; ``joints`` are the degrees of freedom, in the order of all arrays. ``physics`` are the solver
-    settings of ``engine``, in the engine's type. With ``merge_fixed`` each rigid body is one link
-    (:mod:`batchpid.sim.robot.merging`). Without ``collisions`` scenes have no collision shapes and no ground, but the
-    same masses and inertias. ``mjcf`` is the file that MuJoCo compiles in place of ``urdf``. ``contacts`` and
+    settings of ``engine``, in the engine's type. Without ``collisions`` scenes have no collision shapes and no ground,
+    but the same masses and inertias. ``mjcf`` is the file that MuJoCo compiles in place of ``urdf``. ``contacts`` and
     ``wrenches`` are links with sensors. Specs that differ in ``build`` alone are equal.
     """
 
@@ -47,7 +46,6 @@ class SceneSpec:
     dissipation: str = "urdf"
     ground: bool = True
     fixed_base: bool = True
-    merge_fixed: bool = True
     collisions: bool = True
     build: Build | None = field(default=None, compare=False)
     gravity: tuple[float, float, float] = GRAVITY
@@ -55,6 +53,11 @@ class SceneSpec:
     contacts: tuple[str, ...] | None = None
     wrenches: tuple[str, ...] | None = None
     mjcf: MjcfFile | None = None
+
+    @property
+    def separate(self) -> tuple[str, ...]:
+        """Links that are not merged into their parents, since the wrench between them is measured."""
+        return self.wrenches or ()
 
     @property
     def is_alone(self) -> bool:
@@ -99,7 +102,7 @@ class VariedMasses:
         self._variation, self._bodies = variation, dict[str, Body]()
         varies_links = variation.link_mass is not None or variation.center_of_mass is not None
         if varies_links or variation.payload is not None:
-            self._bodies = varied_bodies(spec.urdf, spec.merge_fixed, carrier, links if varies_links else [])
+            self._bodies = varied_bodies(spec.urdf, spec.separate, carrier, links if varies_links else [])
         self._nominal = {name: total([part.inertia for part in body.parts]) for name, body in self._bodies.items()}
         self.added = {name: np.zeros((size, 6, 6)) for name in self._bodies}
 

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from batchpid.arrays.array_types import Document, Float32
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import check_keywords
-from batchpid.sim.gym.pictures import RENDER_MODES
 from batchpid.sim.gym.robot_vector_env import RobotVectorEnv, arguments_of
 from batchpid.sim.robot.robot import Robot
 
@@ -27,7 +26,7 @@ class RobotEnv(SingleOwner, gymnasium.Env):
     """
 
     instead = RobotVectorEnv.instead
-    metadata: ClassVar[Document] = {"render_modes": RENDER_MODES}  # type: ignore[misc]
+    metadata: ClassVar[Document] = RobotVectorEnv.metadata  # type: ignore[misc]
     task: ClassVar[type[RobotVectorEnv]]
     """Class of the task."""
 

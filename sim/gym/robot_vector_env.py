@@ -20,7 +20,6 @@ from batchpid.arrays.array_types import Bool, Document, DType, Float32, Float64,
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import array, check_keywords, choice, env_mask, flag, integer, number
 from batchpid.errors import CallOrderError, InvalidArgumentError
-from batchpid.sim.gym.pictures import RENDER_MODES, EnvMetadata, EnvPictures, check_render_mode
 from batchpid.sim.observation import Observation
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.randomization import LARGEST
@@ -65,7 +64,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     autoreset_mode
         Of :class:`gymnasium.vector.AutoresetMode`.
     render_mode
-        ``"rgb_array"``: :meth:`render` returns pictures, drawn by SAPIEN's renderer, which needs a Vulkan device.
+        ``"rgb_array"``: :meth:`render` returns pictures.
     options
         Of :class:`batchpid.sim.Runner`: params, workers, timestep, physics, compensate, build, randomization, ...
 
@@ -73,12 +72,10 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     ------
     InvalidArgumentError
         An argument is out of range, is unknown, or is chosen by the task.
-    RenderError
-        ``render_mode`` is "rgb_array", and SAPIEN cannot render on this machine.
     """
 
     instead = "make another env with the same arguments"
-    metadata: ClassVar[Document] = {"render_modes": RENDER_MODES}  # type: ignore[misc]
+    metadata: ClassVar[Document] = {"render_modes": ["rgb_array"]}  # type: ignore[misc]
     picture_size: ClassVar[tuple[int, int]] = (640, 480)
     """Width and height of a picture of :meth:`render` [pixels]."""
 
@@ -131,15 +128,17 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self.action_names = getattr(self, "action_names", tuple(map(str, range(size))))
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.render_mode = check_render_mode(render_mode, self.num_envs)
-        self.metadata = EnvMetadata(  # type: ignore[misc]
-            render_fps=1 / self.step_seconds, autoreset_mode=self.autoreset_mode
-        )
+        self.render_mode = None if render_mode is None else choice("render_mode", render_mode, ("rgb_array",))
+        self.metadata = {  # type: ignore[misc]
+            **type(self).metadata,
+            "render_fps": 1 / self.step_seconds,
+            "autoreset_mode": self.autoreset_mode,
+        }
 
         self.runner = Runner(self.robot, self.num_envs, substeps=substeps, **self._options)
         self._generators = np.random.default_rng().spawn(self.num_envs)
         self._starts = np.tile(self.robot.start, (self.num_envs, 1))
-        self._setpoint, self._rate = (np.zeros((self.num_envs, entries)) for entries in self.setpoint_sizes())
+        self._setpoint = np.zeros((self.num_envs, self.runner.command.size))
         self.action = np.zeros((self.num_envs, size))
         self._observation = np.zeros((self.num_envs, *self.single_observation_space.shape), np.float32)
         self._success = self._diverged = np.zeros(self.num_envs, bool)
@@ -147,7 +146,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._done = np.ones(self.num_envs, bool)
         self._is_stepping = False
         self._received: Observation | None = None
-        self._pictures: EnvPictures | None = None
 
     # -- hooks -----------------------------------------------------------------------------------------------------
 
@@ -162,14 +160,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     def runner_options(self) -> Mapping[str, Any]:
         """Return the options of the Runner that belong to the task; the caller cannot give these. Default: none."""
         return {}
-
-    def setpoint_sizes(self) -> tuple[int, int]:
-        """Return the numbers of entries of a setpoint and of its rate. Default: the size of the runner's command."""
-        return self.runner.command.size, self.runner.command.size
-
-    def send(self, setpoint: Float64, rate: Float64 | None) -> None:
-        """Begin a step of the runner with the setpoints (envs, size) and their rates. Default: ``runner.send``."""
-        self.runner.send(setpoint, setpoint_rate=rate)
 
     def draw(self, env: int, random: np.random.Generator) -> ArrayLike:
         """Draw an episode of one env: keep its goal, and return the joint positions at its start (dof,) [rad or m].
@@ -295,9 +285,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         setpoint = np.where(begins[:, None], self._setpoint, setpoint)
         rate = self.rate(setpoint, self._setpoint)
         if rate is not None:
-            rate = np.where(begins[:, None], 0.0, self._returned("rate", rate, self._rate.shape, np.float64))
-        self._rate = np.zeros_like(self._rate) if rate is None else rate
-        self.send(setpoint, rate)
+            rate = np.where(begins[:, None], 0.0, self._returned("rate", rate, self._setpoint.shape, np.float64))
+        self.runner.send(setpoint, setpoint_rate=rate)
         self.action, self._setpoint, self._is_stepping = action, setpoint, True
 
     def step_wait(self) -> tuple[Float32, Float64, Bool, Bool, Document]:
@@ -345,7 +334,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture (height, width, 3) of each env, in RGB; None without a ``render_mode``.
 
-        The entities that ``build`` returned are drawn where they are, other content where ``build`` put it.
+        It shows robot and floor, not the content of ``build``.
 
         Raises
         ------
@@ -355,11 +344,15 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if self.render_mode is None:
             return None
         self._expect_no_step("render")
-        if self._pictures is None:
-            build, ground = self.runner.options.build, self.runner.options.ground
-            self._pictures = EnvPictures(self.robot, self.num_envs, ground, build, self.picture_size)
-        poses = None if self.runner.options.build is None else self.runner.poses()
-        return self._pictures.draw(self.runner.observe(), poses)
+        from batchpid.sim.view.film import Painter
+
+        painter = Painter(self.robot, 1, self.runner.options.ground, self.picture_size)
+        observed = self.runner.observe()
+        pictures = []
+        for env in range(self.num_envs):
+            row = observed.for_envs([env])
+            pictures.append(painter.picture(row.qpos, row.base_pose))
+        return tuple(pictures)
 
     def close_extras(self, **_: Any) -> None:
         """Close the runner."""

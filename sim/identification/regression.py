@@ -41,6 +41,8 @@ WEIGHT = 0.02
 """Weight of the prior at strength 1, over the effort's size."""
 EVIDENCE = 0.7
 """Decrease of the mean logarithm of the residual's square that counts for another reading of a log."""
+WORST = -1.0
+"""Largest such logarithm of a reading that is named."""
 ALIKE = 0.5
 """Difference of costs that are as good as equal: the first reading is named."""
 TRIED = 10.0
@@ -66,7 +68,9 @@ class Guess(NamedTuple):
     values: dict[str, Float64]
     """Values (joints,) or (1,) by kind of unknown."""
     cost: float
-    """Mean over the joints of the logarithm of the residual's mean square, over the effort's."""
+    """Mean over the joints of the logarithm of the residual's mean square, over that of all efforts."""
+    unexplained: float
+    """The same over that of the motors' efforts: above 0, these explain nothing."""
 
 
 def smooth(log: Log, timestep: float) -> Motion:
@@ -97,13 +101,13 @@ def better_reading(plant: Plant, drive: Drive, log: Log, names: Sequence[str]) -
     present, costs = _cost(plant, drive, first), dict[str, float]()
     for words, changed in _readings(first, names):
         costs[words] = _cost(plant, drive, changed)
-    if min(costs.values()) > present - EVIDENCE:
+    if min(costs.values()) > min(present - EVIDENCE, WORST):
         return ""
     return next(words for words, cost in costs.items() if cost < min(costs.values()) + ALIKE)
 
 
 def _cost(plant: Plant, drive: Drive, log: Log) -> float:
-    return Regression([plant], [drive], [log], [smooth(log, drive.timestep)]).best().cost
+    return Regression([plant], [drive], [log], [smooth(log, drive.timestep)]).best().unexplained
 
 
 def _readings(log: Log, names: Sequence[str]) -> Iterator[tuple[str, Log]]:
@@ -176,7 +180,7 @@ class Regression:
 
     def _at(self, first: int, second: int) -> Guess:
         effort, rows = self.efforts[first, second], list[Float64]()
-        cost = 0.0
+        cost = unexplained = 0.0
         for joint, moves in enumerate(self._moves.T):
             columns = [-self._acceleration, -self._velocity, -self._sign, effort, np.ones_like(effort)]
             matrix = np.stack([column[moves, joint] for column in columns], axis=1)
@@ -184,12 +188,15 @@ class Regression:
             links, whole = (np.mean(table**2) for table in (target, matrix[:, 3]))
             values, residual = _bounded(matrix, target, links < LEAST_SHARE**2 * whole)
             size = np.sqrt((matrix[:, 3] ** 2).mean()) + np.sqrt((target**2).mean()) + 1e-12
-            cost += np.log((residual**2).mean() / size**2 + 1e-12) / len(self._moves.T)
+            share = 1 / len(self._moves.T)
+            cost += share * np.log((residual**2).mean() / size**2 + 1e-12)
+            motor = values[3] ** 2 * (matrix[:, 3] ** 2).mean()
+            unexplained += share * np.log((residual**2).mean() / (motor + 1e-12) + 1e-12)
             rows.append(values)
         names = ("armature", "damping", "friction", "strength", "bias")
         motors = dict(zip(names, np.array(rows).T, strict=True))
         delays = {"delay": DELAYS[[second]], "setpoint_delay": SETPOINT_DELAYS[[first]]}
-        return Guess(motors | delays, cost)
+        return Guess(motors | delays, float(cost), float(unexplained))
 
 
 def _bounded(matrix: Float64, target: Float64, is_strong: bool) -> tuple[Float64, Float64]:

@@ -126,7 +126,7 @@ def _begin(options: RunnerOptions, envs: int) -> Any:
     start = partial(options.control.init, options.robot, envs)
     if options.backend != "jax":
         return start()
-    with own_settings(options.dtype):  # its arrays have this dtype, not JAX's default in this process
+    with own_settings("float64"):  # its arrays have this dtype, not JAX's default in this process
         return unflatten(state := start(), flatten(state))
 
 

@@ -20,7 +20,6 @@ from batchpid.sim.engine.missed_contacts import MissedContacts
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.acting_draws import acting_actuators, acting_params, variation
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays, Ticks
-from batchpid.sim.loop.backend import obstacle
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.faults import FaultContainment, far, finite, near
 from batchpid.sim.loop.native_executor import NativeExecutor
@@ -94,12 +93,11 @@ class EnvGroup:
         layout = make_layout(options, self._acting_params, self._actuators)
         layout = with_model(options, pack, layout, constants, self._controller)
         self._layout, self._constants = layout, constants
-        # Native wherever the engine has native steps, under backend "numpy" too: the bits are the same. XLA for "jax",
-        # if nothing stands in its way; else the calls of NumPy, which also serve controllers in Python.
+        # Native wherever the engine has native steps, under backend "numpy" too: the bits are the same.
         self._executor: NumPyExecutor | XLAExecutor
         if not isinstance(pack, CompiledPack) or not pack.steps_natively:
             self._executor = NumPyExecutor(options, pack, layout, constants)
-        elif options.backend == "jax" and layout.control != "drive" and not obstacle(options, self._actuators):
+        elif options.backend == "jax":
             self._executor = XLAExecutor(options, pack, layout, constants, self._controller)
         else:
             self._executor = NativeExecutor(options, pack, layout, constants)

@@ -56,7 +56,6 @@ class Loop:
             joints=robot.joints,
             dissipation=robot.dissipation,
             fixed_base=robot.fixed_base,
-            merge_fixed=robot.merge_fixed,
             mjcf=options.mjcf,
             **options.values_for("scene"),
         )

@@ -36,10 +36,8 @@ class NativeExecutor(NumPyExecutor):
         self._force: CompiledModel | None = None
         if (layout.measures and self._gravity) or (self._reads_force and not self._steps_read_force):
             self._force = pack.force_model()
-        has_own_law = options.backend == "numpy" or layout.law is None  # under "jax" the law is XLA's
-        if layout.control == "custom":
-            has_own_law = options.backend == "numpy" and _is_native(self._controller)
-        self._compiles = has_own_law and is_compiled(constants, pack.dof)
+        has_native_law = layout.control != "custom" or _is_native(self._controller)
+        self._compiles = has_native_law and is_compiled(constants, pack.dof)
 
     def run(
         self, state: StepState, measured: Measured, command: Command, span: Span, table: Table | None = None

@@ -17,7 +17,6 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import COUPLING_STEPS, REFRESH_STEPS, sim_step
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.faults import sound
-from batchpid.sim.loop.jitted import jitted_controller, jitted_law
 from batchpid.sim.loop.step_setup import needs_qvel
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
 from batchpid.sim.options import RunnerOptions
@@ -138,13 +137,13 @@ def with_model(
     options: RunnerOptions, pack: EnginePack, layout: Layout, constants: Constants, controller: OwnController | None
 ) -> Layout:
     """Return ``layout`` with model functions for NumPy arrays, natively compiled where possible."""
-    jitted, motors, (gravity, coriolis) = options.backend == "jax", constants.motors, passive_forces(options)
-    model = Model(mass_matrix_of(pack.spec, _is_native(pack)), partial(_joint_mass_matrix, pack), noise=NoiseBlocks())
-    if layout.law is not None and jitted:
-        model = model._replace(law=partial(jitted_law, options.dtype, pack.size))
-    if controller is not None:
-        call = partial(jitted_controller, options.dtype, pack.size, controller) if jitted else controller
-        model = model._replace(controller=call)
+    motors, (gravity, coriolis) = constants.motors, passive_forces(options)
+    model = Model(
+        mass_matrix_of(pack.spec, _is_native(pack)),
+        partial(_joint_mass_matrix, pack),
+        controller=controller,
+        noise=NoiseBlocks(),
+    )
     if motors is not None and _is_native(pack):
         model = model._replace(stages=compiled_stages(motors, (pack.size, pack.dof)))
     if constants.friction.coulomb is not None and _is_native(pack):

@@ -173,8 +173,6 @@ class Snapshot:
     actuators: bp.Actuators | None = None
     episodes: NDArray[np.int64] | None = None
     """Stream and episode of each env (envs, 2), from which everything is drawn again; None without randomization."""
-    targets: NDArray[np.float64] | None = None
-    """Last joint setpoints (envs, dof) of a runner whose setpoints are poses; else None."""
     motion: NDArray[np.float64] | None = None
     """Last joint setpoints and their rates (2, envs, dof); None where setpoints are not for joints."""
 
@@ -219,7 +217,7 @@ class Snapshot:
             "head": np.array(json.dumps(head)),
             **flatten({"params": arrays, _ACTUATORS: _options(self.actuators), **vars(self.states)}, "."),
         }
-        for name in ("episodes", "targets", "motion"):
+        for name in ("episodes", "motion"):
             if (rows := getattr(self, name)) is not None:
                 tables[name] = rows
         write_atomically(file_path("path", path), lambda file: np.savez(file, **tables))
@@ -269,11 +267,6 @@ class Snapshot:
             episodes.shape != (num_envs, 2) or episodes.dtype != np.int64 or (episodes < 0).any()
         ):
             raise ValueError(f"its episodes are not counts (envs, 2) of {num_envs} envs")
-        targets = tables.pop("targets", None)
-        if (targets is None) != (about["setpoint_space"] == "joints"):
-            raise ValueError("its targets do not fit its setpoint_space")
-        if targets is not None and (targets.shape != (num_envs, dof) or not np.isfinite(targets).all()):
-            raise ValueError(f"its targets are not positions of {num_envs} envs of {dof} joints")
         motion = tables.pop("motion", None)
         groups = _groups(tables)
         motors = groups.pop(_ACTUATORS, None)
@@ -304,7 +297,7 @@ class Snapshot:
         )
         if motion is not None and (motion.shape != (2, num_envs, dof) or motion.dtype != np.float64):
             raise ValueError(f"its motion is not a setpoint and a rate of {num_envs} envs of {dof} joints")
-        return cls(about, steps, params, states, actuators, episodes, targets, motion)
+        return cls(about, steps, params, states, actuators, episodes, motion)
 
     def __repr__(self) -> str:
         about = self.about

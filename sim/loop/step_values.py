@@ -146,7 +146,7 @@ class Model(NamedTuple):
     when: Callable[[Any, Callable[[], Any], Any], Any] = when
     """:func:`when`, or a conditional of JAX."""
     law: Callable[..., Any] = PIDLaw.advance
-    """:meth:`batchpid.sim.loop.pid_law.PIDLaw.advance`, or its compiled form."""
+    """:meth:`batchpid.sim.loop.pid_law.PIDLaw.advance`, or a law with its arguments."""
     controller: Any = None
     """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort), and, if it limits efforts
     itself, the mask of joints with limited efforts."""

@@ -2,8 +2,8 @@
 
 The program is a loop over the sim steps, ``lax.while_loop``: :func:`batchpid.sim.loop.control_step.control_step`,
 traced, then :func:`batchpid.sim.engine.native.xla.sim_step`. It stops early where an env may have failed,
-which Python handles. All groups of envs have the same number of rows (:mod:`batchpid.sim.loop.jitted`), so that one
-program serves them all.
+which Python handles. The number of rows is a multiple of ROWS for any group of envs, so that one program serves all
+groups, and the results of an env do not depend on its group.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from batchpid.arrays.array_types import Array, Rows
+from batchpid.arrays.array_types import Array, Pytree, Rows
 from batchpid.arrays.jax_settings import own_settings
 from batchpid.arrays.trees import mapped
 from batchpid.sim.engine.native import xla
@@ -22,11 +22,27 @@ from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import sim_step
 from batchpid.sim.loop.custom import OwnController, controller_errors
-from batchpid.sim.loop.jitted import padded, put
 from batchpid.sim.loop.numpy_executor import Ran, Span, passive_forces
 from batchpid.sim.loop.step_setup import needs_qvel
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
 from batchpid.sim.options import RunnerOptions
+
+ROWS = 16
+"""Number of which the rows in a program are a multiple."""
+
+
+def padded(rows: Any) -> Rows:
+    """Return ``rows`` (envs, ...) followed by copies of the first row, up to a multiple of ROWS."""
+    rows = np.asarray(rows)
+    missing = -len(rows) % ROWS
+    return np.concatenate([rows, np.repeat(rows[:1], missing, 0)])
+
+
+def put(tree: Pytree) -> Any:
+    """Return a structure of arrays as JAX arrays on the CPU."""
+    import jax
+
+    return jax.device_put(tree, jax.local_devices(backend="cpu")[0])
 
 
 class Carry(NamedTuple):
@@ -74,7 +90,7 @@ class XLAExecutor:
         k, friction, timestep = spread(constants.k), spread(constants.friction), np.float64(constants.timestep)
         arrays = constants._replace(timestep=timestep, k=k, limits=limits, friction=friction)
         rows = (pack.size, pack.dof)
-        with own_settings(options.dtype):
+        with own_settings("float64"):
             self._constants = put(arrays)
             self._bodies = put(tables)
             self._zero = put(padded(np.zeros(rows)))
@@ -84,13 +100,13 @@ class XLAExecutor:
         pack = self._pack
         qpos, qvel = pack.read_qpos(), pack.read_qvel()
         passive = pack.passive_force(self._gravity, self._coriolis) if self._gravity else None
-        with own_settings(self._options.dtype):
+        with own_settings("float64"):
             return put(Measured(padded(qpos), padded(qvel), None if passive is None else padded(passive)))
 
     def run(self, state: StepState, measured: Measured, command: Command, span: Span, table: Any = None) -> Ran:
         """Run the sim steps of a tick, or until an env may have failed."""
         native = self._bind()
-        with own_settings(self._options.dtype):
+        with own_settings("float64"):
             steps = np.array([span.begin, span.steps, 0, 0], np.int32)
             steps[2:].view(np.uint64)[0] = native.prepare()
             command = command.map(padded)
@@ -107,18 +123,13 @@ class XLAExecutor:
 
     def rows(self, array: Array) -> Rows:
         """Return an array of the executor as a new NumPy array."""
-        return np.array(array, bool if array.dtype == bool else np.float64)[: self._pack.size]
+        return np.array(array)[: self._pack.size]
 
     def numpy_state(self, state: StepState) -> StepState:
-        """Return a state of the executor with NumPy arrays: float64, except for the caller's own controller."""
+        """Return a state of the executor with NumPy arrays."""
         import jax
 
-        def rows(leaf: Array, keep: bool = False) -> Rows:
-            array = np.array(leaf)[: self._pack.size]
-            return array if keep or array.dtype.kind != "f" else array.astype(np.float64)
-
-        law = jax.tree.map(partial(rows, keep=self._controller is not None), state.law)
-        state = jax.tree.map(rows, state._replace(law=None))._replace(law=law)
+        state = jax.tree.map(lambda leaf: np.array(leaf)[: self._pack.size], state)
         return state if state.age is None else state._replace(age=state.age.astype(np.int64))
 
     def _started(self, state: StepState) -> StepState:

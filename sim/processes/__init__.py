@@ -1,1 +1,1 @@
-"""Start of child processes, and a thread for calls that no signal may interrupt. Knows nothing of robots."""
+"""A thread for calls that no signal may interrupt. Knows nothing of robots."""

@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import _thread
 import contextlib
-import os
-import signal
 from collections.abc import Callable
 from contextvars import copy_context
 from queue import Empty, SimpleQueue
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
@@ -65,36 +63,3 @@ def start_thread(*functions: Callable[[], None]) -> None:
             function()
 
     _thread.start_new_thread(run, ())
-
-
-class BackgroundThread:
-    """Thread that runs jobs one after another, and lives as long as the process."""
-
-    def __init__(self) -> None:
-        self._jobs: SimpleQueue[Job[Any]] = SimpleQueue()
-        self._owner = 0
-
-    def put(self, job: Job[Any]) -> None:
-        """Run ``job`` after those before it."""
-        if self._owner != os.getpid():  # a fork has no threads but the one that forked
-            jobs: SimpleQueue[Job[Any]] = SimpleQueue()
-            start_thread(lambda: _run_all(jobs))
-            self._jobs, self._owner = jobs, os.getpid()
-        self._jobs.put(job)
-
-    def call(self, function: Callable[[], T]) -> T:
-        """Return ``function()``, called in the thread after all jobs so far."""
-        job = Job(function)
-        self.put(job)
-        return job.result()
-
-
-def _run_all(jobs: SimpleQueue[Job[Any]]) -> None:
-    # A process started here inherits that, so that Ctrl-C reaches the caller alone.
-    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    while True:
-        jobs.get().run()
-
-
-BACKGROUND = BackgroundThread()
-"""Thread that opens the resources of workers."""

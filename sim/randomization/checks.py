@@ -14,16 +14,20 @@ from batchpid.motors import DRIVEN
 from batchpid.motors.actuators import FIELDS, TABLE
 from batchpid.sim.randomization.fields import Field, elements, nominal_values, parts
 from batchpid.sim.randomization.randomization import EVENTS, PHYSICAL, START, Randomization
+from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 
 _HUGE = 1e300
 
 
-def check_robot(randomization: Randomization, robot: Robot) -> None:
-    """Check that the names and ranges of ``randomization`` fit ``robot``. Raises InvalidArgumentError if not."""
+def check_robot(randomization: Randomization, robot: Robot, mjcf: MjcfFile | None = None) -> None:
+    """Check that the names and ranges of ``randomization`` fit ``robot``. Raises InvalidArgumentError if not.
+
+    ``mjcf`` as for :func:`batchpid.sim.randomization.fields.nominal_values`.
+    """
     for name, each in randomization.given.items():
         if name in PHYSICAL:
-            _check_range(name, each, robot)
+            _check_range(name, each, robot, mjcf)
         elif name in START:
             list(parts(name, each, robot.joint_names))
     _check_pushes(randomization, robot)
@@ -119,9 +123,9 @@ def prepared_actuators(
     )
 
 
-def _check_range(name: str, each: Field, robot: Robot) -> None:
+def _check_range(name: str, each: Field, robot: Robot, mjcf: MjcfFile | None) -> None:
     """Check the results of the least and the largest draws."""
-    columns, nominal, bounds = elements(name, robot), nominal_values(name, robot), PHYSICAL[name]
+    columns, nominal, bounds = elements(name, robot), nominal_values(name, robot, mjcf), PHYSICAL[name]
     strict = bounds.above
     for _, chosen, distribution in parts(name, each, columns):
         if name in ("payload", "center_of_mass") and distribution.operation == "scale":

@@ -12,7 +12,7 @@ from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.command import TWIST_UNITS
 from batchpid.sim.randomization.distributions import Distribution, read_distribution
-from batchpid.sim.robot.parts import CONTACT_FRICTION
+from batchpid.sim.robot.parts import CONTACT_FRICTION, MjcfFile
 from batchpid.sim.robot.robot import Robot
 
 Field = Distribution | Mapping[str, Distribution]
@@ -51,13 +51,16 @@ def parts(name: str, each: Field, columns: Sequence[str]) -> Iterator[tuple[str,
         yield f"{name}.{element}", [at for at, owner in enumerate(owners) if owner == element], distribution
 
 
-def nominal_values(name: str, robot: Robot) -> Float64:
-    """Return the nominal values of a field in :data:`PHYSICAL` (elements,); NaN for masses that the engine finds."""
+def nominal_values(name: str, robot: Robot, mjcf: MjcfFile | None = None) -> Float64:
+    """Return the nominal values of a field in :data:`PHYSICAL` (elements,); NaN for masses that the engine finds.
+
+    ``mjcf`` is the file that the engine simulates, with its own friction.
+    """
     if name == "link_mass":
         masses = {link.name: link.mass for link in robot.links}
         return np.array([masses[link] for link in elements(name, robot)], np.float64)  # None is NaN
     known = {"friction": robot.friction, "damping": robot.damping, "gravity": np.array([0.0, 0.0, -9.81])}
-    known |= {"ground_friction": np.array([CONTACT_FRICTION])}
+    known |= {"ground_friction": np.array([CONTACT_FRICTION if mjcf is None else mjcf.friction])}
     return known.get(name, np.zeros(len(elements(name, robot))))
 
 

@@ -1,74 +1,53 @@
-"""Recorder: every tick of a runner streamed to an .h5 file that can be read at any time, even after a kill.
+"""Recorder: every tick of a runner, streamed to an HDF5 file that can be read at any time, even after a kill.
 
-A thread makes the file, appends the recorded ticks every half second in HDF5's single-writer mode, and completes it. A
-tick waits while the oldest row that is not on disk was recorded more than :data:`MAX_LAG` ago, so that a kill loses at
-most a second's ticks, however slow the disk. The file grows as ``NAME.partial`` and gets its name when it is complete;
-an existing file of that name is not touched before. See :mod:`batchpid.sim.recording.recording_files` for its
-content.
-
-The runner gives a completed tick to :meth:`Recorder.append`, which only queues it, and calls :meth:`Recorder.wait`
-before the next: Ctrl-C interrupts the wait, in which nothing has begun, and loses no tick. It can interrupt the other
-calls at any moment, but not the thread. So they take no lock that the thread needs, and can be repeated.
+The runner calls :meth:`Recorder.prepare` before a tick, and :meth:`Recorder.append` after it, with Ctrl-C held back.
 """
 
 from __future__ import annotations
 
-import contextlib
-import math
 import os
 import time
-from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from batchpid.arrays.array_types import Rows
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import flag, instance, integer
-from batchpid.errors import BatchPIDError, ClosedError, InUseError, InvalidArgumentError
-from batchpid.sim.loop.faults import Fault
-from batchpid.sim.observation import RECORDED, Observation, Redraw
-from batchpid.sim.processes.background import Job, start_thread
+from batchpid.errors import ClosedError, InUseError, InvalidArgumentError
+from batchpid.sim.loop.arrays import Command
+from batchpid.sim.observation import Observation, Redraw, RunInfo
 from batchpid.sim.recording import recording_files as files
-from batchpid.sim.recording.partial_file import PartialFile
 from batchpid.sim.recording.recording_files import RecordingError
 
 if TYPE_CHECKING:
+    import h5py
+
     from batchpid.sim.runner import Runner
 
 WRITE_PERIOD = 0.5
-"""Time from one write to the next [s]."""
-MAX_LAG = 0.75
-"""Age of the oldest row that is not on disk at which the next tick waits for it [s]."""
-MAX_BUFFER = 64 << 20
-"""Bytes that may wait to be written."""
-_RETRY = 0.002  # seconds between two looks whether a tick may go on
-
-
-class _Row(NamedTuple):
-    recorded: float
-    """Time of the call [s]."""
-    time: float
-    setpoint: Rows
-    observation: Observation
+"""Time from one write to the next [s]. A kill loses the ticks since the last one."""
 
 
 class Recorder(SingleOwner):
     """Recorder of every tick of ``runner`` until it is closed.
+
+    The file appears with the first tick. If a tick cannot be written, the next one raises RecordingError before it
+    begins, and so does :meth:`close`.
 
     Parameters
     ----------
     path
         File to write, ending in .h5 or .hdf5.
     runner
-        Runner to record.
+        Runner to record. While it is recorded all its ticks have the same length.
     seed
         Seed of the run, if it has one; kept in the recording.
     overwrite
-        Whether a complete recording replaces an existing file of that name, at the end.
+        Whether an existing file of that name is replaced.
 
     Raises
     ------
@@ -76,10 +55,6 @@ class Recorder(SingleOwner):
         The file exists, its name ends otherwise, or another Recorder records the runner.
     ClosedError
         The runner is closed.
-    MissingDependencyError
-        h5py is not installed.
-    RecordingError
-        The file cannot be made.
     """
 
     instead = "close it, and record the next run with another Recorder"
@@ -92,93 +67,74 @@ class Recorder(SingleOwner):
         if instance("runner", runner, Runner, "pass the runner to record").closed:
             raise ClosedError("this Runner is closed; record one that is not")
         if runner.recorder is not None:
-            raise InvalidArgumentError(
-                "runner", f"is being recorded already, to {runner.recorder.path}", remedy="close that Recorder first"
-            )
-        overwrite, self._runner = flag("overwrite", overwrite), runner
-        self.path: Path = files.check_path(path, files.HDF5, overwrite=overwrite)
-        self.partial: Path = _free_name(self.path)
-        seed = None if seed is None else integer("seed", seed, 0, 2**63 - 1)
-        info = replace(runner.info, seed=seed, complete=False)
-        files.load_h5py()
-        seen = [table.nbytes for table in runner.observe() if table is not None]
-        self._row_bytes = sum(seen) + 8 * runner.num_envs * runner.command.size
-        self._rows: SimpleQueue[_Row | None] = SimpleQueue()  # None: the end
-        self._wake: SimpleQueue[None] = SimpleQueue()  # ends the pause between two writes
-        self._oldest = math.inf  # when the oldest row was recorded that is being written
-        self._faults: tuple[Fault, ...] = runner.faults  # up to the last row
-        self._episodes, self._redraws = runner.episodes, list[Redraw]()
+            problem = f"is being recorded already, to {runner.recorder.path}"
+            raise InvalidArgumentError("runner", problem, remedy="close that Recorder first")
+        self._mode = "w" if flag("overwrite", overwrite) else "x"
+        self.path: Path = files.check_path(path, overwrite=overwrite)
+        self._seed = None if seed is None else integer("seed", seed, 0, 2**63 - 1)
+        self._runner = runner
+        self._info: RunInfo | None = None  # at the first tick
+        self._file: h5py.File | None = None
+        self._rows: list[dict[str, Rows | None]] = []  # not written yet
+        self._count = 0  # of written rows
+        self._last_write = time.monotonic()
+        self._redraws: list[Redraw] = []
         self._rates = False  # whether a recorded tick had rates
-        self._end: Callable[[PartialFile], None] | None = None
-        self._error: RecordingError | None = None
-        self._has_raised = False
-        tick = runner.timestep * runner.substeps
-        self._creation = creation = Job(
-            lambda: PartialFile(self.path, self.partial, info, runner.num_envs, tick, overwrite=overwrite)
-        )
-        self._writing = writing = Job(self._write_rows)
-        try:
-            start_thread(creation.run, writing.run)
-            creation.result()
-            runner.recorder = self
-        except BaseException:
-            self._finish_with(PartialFile.discard)
-            raise
+        self._error: Exception | None = None
+        self._is_closed = False
+        runner.recorder = self
 
-    def wait(self) -> None:
-        """Return when the next tick may begin: the oldest row that is not on disk is not too old. The runner calls it.
+    def prepare(self) -> None:
+        """Keep the state before the first tick.
 
         Raises
         ------
         RecordingError
-            The ticks before could not be written.
+            An earlier tick could not be written.
         """
-        while not self._writing.done and (self._is_full() or time.monotonic() - self._oldest > MAX_LAG):
-            self._wake.put(None)
-            time.sleep(_RETRY)
-        self._check()
+        if self._error is not None:
+            cause = " ".join(str(self._error).split())  # HDF5 writes several lines
+            raise RecordingError(f"{self.path}: cannot be written: {cause}") from self._error
+        if self._info is None:
+            self._episodes = self._runner.episodes
+            self._info = replace(self._runner.info, seed=self._seed, complete=False)
 
-    def append(self, time_: float, setpoint: Rows, observation: Observation, has_rates: bool) -> None:
-        """Record the state at ``time_`` [s], reached under ``setpoint`` (envs, size), with rates or without.
-
-        The runner calls it, and Ctrl-C waits until it has returned.
-        """
-        self._faults, episodes = self._runner.faults, self._runner.episodes
+    def append(self, time_: float, command: Command, observation: Observation) -> None:
+        """Record the state at ``time_`` [s] after a tick under ``command``. The arrays may change afterwards."""
+        episodes = self._runner.episodes
         for env in np.flatnonzero((episodes != self._episodes).any(1)).tolist():
             self._redraws.append(Redraw(time_, env, *episodes[env].tolist()))
         self._episodes = episodes
-        self._rates |= has_rates
-        self._rows.put(_Row(time.monotonic(), time_, np.array(setpoint), observation))
+        self._rates |= command.setpoint_rate is not None
+        feedforward = None if command.feedforward is None else np.array(command.feedforward)
+        inputs = {"time": np.array(time_), "setpoint": np.array(command.setpoint), "feedforward": feedforward}
+        self._rows.append(inputs | observation._asdict())
+        if time.monotonic() - self._last_write > WRITE_PERIOD:
+            with suppress(RecordingError):  # the next tick raises it
+                self._write()
 
     def close(self, complete: bool = True) -> None:
-        """Write the remaining rows and give the file its name. May be called again, as after an interrupt.
+        """Write the remaining rows and close the file. May be called again, as after an interrupt.
 
-        If the recording is to be ``complete``, a tick whose call was interrupted is completed first. One that is not
-        keeps its partial name where a file of that name exists.
+        If the recording is to be ``complete``, a tick whose call was interrupted is completed first.
+
+        Raises
+        ------
+        RecordingError
+            The file cannot be written.
         """
-        runner, failure = self._runner, None
-        if runner.recorder is self:
-            if complete:
-                try:
-                    runner.settle()
-                except (InUseError, RecordingError):
-                    pass  # the tick of a call in another thread is not recorded; an error of the disk is raised below
-                except BatchPIDError as error:
-                    failure = error
-                self._faults = runner.faults
-            runner.recorder = None
-        faults, redraws = files.faults_text(self._faults), files.redraws_text(self._redraws)
-        self._finish_with(lambda file: file.finish(complete, faults, redraws, self._rates))
+        if self._is_closed:
+            return
         try:
-            self._writing.result()
-            self._check()
-        except RecordingError:
-            if self._has_raised:
-                return
-            self._has_raised = True
-            raise
-        if failure is not None:
-            raise failure
+            if complete:
+                with suppress(InUseError):  # the tick of a call in another thread is not recorded
+                    self._runner.settle()
+                self.prepare()
+        finally:
+            if self._info is not None and self._error is None:
+                self._finish(replace(self._info, complete=complete))
+            self._runner.recorder = None
+            self._is_closed = True
 
     def __enter__(self) -> Recorder:
         return self
@@ -186,63 +142,56 @@ class Recorder(SingleOwner):
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.close(complete=kind is None)
 
-    def _check(self) -> None:
-        if self._error is not None:
-            raise self._error
+    def _finish(self, info: RunInfo) -> None:
+        """Write the remaining rows and the events of the run, and close the file."""
+        self._write()
+        if self._file:  # not closed yet
+            runner = self._runner
+            info = replace(info, faults=runner.faults, redraws=tuple(self._redraws), rates=self._rates)
+            values = files.attributes(info)
+            self._file.attrs.update({name: values[name] for name in ("complete", "faults", "redraws", "rates")})
+            self._file.close()
 
-    def _finish_with(self, end: Callable[[PartialFile], None]) -> None:
-        """Make the thread write the remaining rows and call ``end``; only the first ``end`` counts."""
-        if self._end is None:
-            self._end = end
-        self._rows.put(None)
-        self._wake.put(None)
+    def _write(self) -> None:
+        """Write the rows that are not written yet, into a new file at first. Raises RecordingError."""
+        import h5py
 
-    def _is_full(self) -> bool:
-        return self._rows.qsize() * self._row_bytes > MAX_BUFFER
-
-    # -- in the thread -----------------------------------------------------------------------------------------------
-
-    def _write_rows(self) -> None:
-        """Write the recorded rows every half second until the end, and end the file."""
+        rows, runner = self._rows, self._runner
+        tick = runner.timestep * runner.substeps
         try:
-            file = self._creation.result()
-        except Exception:
-            return  # the constructor raises it
-        try:
-            while (first := self._rows.get()) is not None:
-                self._oldest = first.recorded
-                self._pause()
-                rows = [(row.time, row.setpoint, *row.observation) for row in (first, *self._take_rows())]
-                columns = zip(("time", *RECORDED), zip(*rows, strict=True), strict=True)
-                file.append({name: np.array(column) for name, column in columns if column[0] is not None})
-                self._oldest = math.inf
-        except RecordingError as error:
+            if self._file is None:
+                assert self._info is not None
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self._file = h5py.File(self.path, self._mode, libver=files.LIBVER, locking=False)
+                self._datasets = files.create_datasets(self._file, self._info, runner.num_envs, tick)
+            if rows:
+                files.write_rows(self._datasets, self._count, _stacked(rows))
+        except (OSError, RuntimeError) as error:
             self._error = error
-            return
-        assert self._end is not None
-        self._end(file)
-
-    def _pause(self) -> None:
-        """Wait for the time of the next write."""
-        with contextlib.suppress(Empty):
-            while True:  # of the last pause
-                self._wake.get_nowait()
-        if self._end is None and not self._is_full():
-            with contextlib.suppress(Empty):
-                self._wake.get(timeout=WRITE_PERIOD)
-
-    def _take_rows(self) -> list[_Row]:
-        rows = []
-        for _ in range(self._rows.qsize()):
-            row = self._rows.get()
-            if row is None:
-                self._rows.put(None)
-                break
-            rows.append(row)
-        return rows
+            if self._file is not None:
+                _abandon(self._file)
+            self.prepare()  # raises
+        self._count += len(rows)
+        self._rows = []
+        self._last_write = time.monotonic()
 
 
-def _free_name(path: Path) -> Path:
-    """Return the first of ``NAME.partial``, ``NAME.partial2``, ... that does not exist."""
-    names = (path.with_name(f"{path.name}.partial{number}") for number in ("", *range(2, 10**6)))
-    return next(name for name in names if not os.path.lexists(name))
+def _stacked(rows: list[dict[str, Rows | None]]) -> dict[str, Rows | None]:
+    """Return the arrays of successive ticks, ticks first; None where no tick has one, 0 where some have none."""
+    arrays: dict[str, Rows | None] = {}
+    for name in rows[0]:
+        column = [row[name] for row in rows]
+        present = next((array for array in column if array is not None), None)
+        if present is not None:
+            column = [np.zeros_like(present) if array is None else array for array in column]
+        arrays[name] = None if present is None else np.array(column)
+    return arrays
+
+
+def _abandon(file: h5py.File) -> None:
+    """Close a file that cannot be written, without another write: HDF5 would crash the process at its end."""
+    memory = os.memfd_create("batchpid-recording", os.MFD_CLOEXEC)
+    os.dup2(memory, file.id.get_vfd_handle(), inheritable=False)
+    os.close(memory)
+    with suppress(OSError, RuntimeError):
+        file.close()

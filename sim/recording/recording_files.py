@@ -1,10 +1,10 @@
-"""Rollouts in files: written as a whole, or tick by tick by :class:`batchpid.sim.Recorder`, and read back.
+"""Recordings: HDF5 files with the arrays of a :class:`batchpid.sim.Rollout` under their names, ticks first.
 
-A file is .npz (NumPy) or .h5 (HDF5). Both hold the arrays of a :class:`batchpid.sim.Rollout` under their names, ticks
-first, and the known fields of its :class:`batchpid.sim.RunInfo`: as further arrays in an .npz file, as attributes of an
-.h5 file. ``params``, ``versions`` and ``faults`` are JSON text. An .h5 file has checksums too: the attribute
-``checksum`` of all others, and the dataset ``checksum`` of each tick's rows (Fletcher-32 covers whole chunks, whose
-older rows a kill would lose).
+Each field of its :class:`batchpid.sim.RunInfo` is an attribute of the file: a number, a text, an array of them, or JSON
+(:data:`CODECS`). Two more are ``num_envs`` and ``tick`` [s]. The dataset ``feedforward`` is empty where none was given.
+
+A row is valid if its ``time`` is a number: times are written last, and only after the other arrays are on the disk. So
+any reader of HDF5 can read the file after a kill, up to the last row that has a time.
 """
 
 from __future__ import annotations
@@ -12,38 +12,31 @@ from __future__ import annotations
 import io
 import json
 import os
-import zlib
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, fields, replace
-from functools import partial
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Document, Kind, Rows
+from batchpid.arrays.array_types import Document, Rows
 from batchpid.checks.validate import file_path, instance, integer
-from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependencyError
-from batchpid.io.files import read_npz, write_atomically
+from batchpid.errors import BatchPIDError, InvalidArgumentError
+from batchpid.io.files import write_atomically
 from batchpid.sim.command import CommandSpec
 from batchpid.sim.loop.faults import Fault
-from batchpid.sim.observation import RECORDED, Observation, Redraw, Rollout, RunInfo
-from batchpid.sim.recording.hdf5 import NOT_WRITTEN, read_hdf5
+from batchpid.sim.observation import Observation, Quantity, Redraw, Rollout, RunInfo
 
 if TYPE_CHECKING:
-    import h5py
+    import h5py  # functions load it, since commands that record nothing start sooner without it
 
-FORMAT = "batchpid-recording-1"
+FORMAT = "batchpid-recording-2"
 HDF5 = (".h5", ".hdf5")
-_DRAW = "draw."  # in front of the names of draws
-_TEXTS = ("versions", "randomization", "sweep", "options")  # mappings, as JSON
-_COMMAND_NAMES, _COMMAND_UNITS = "command_names", "command_units"
-CHUNK_BYTES = 1 << 18  # approximate size of a chunk of an .h5 file
-DTYPES: Document = {"time": np.float64} | {name: quantity.dtype for name, quantity in RECORDED.items()}
-"""Dtype of each array of a recording."""
+LIBVER = ("v108", "v108")
+"""Versions of HDF5's format. Later ones mark a file that was not closed, and HDF5 then refuses to open it."""
+CHUNK_BYTES = 1 << 18
+"""Approximate size of a chunk of a dataset."""
 
 
 class RecordingError(BatchPIDError, OSError):
@@ -58,7 +51,7 @@ def write_recording(
     Parameters
     ----------
     path
-        File to write, ending in .npz (compressed), .h5 or .hdf5.
+        File to write, ending in .h5 or .hdf5.
     seed
         Seed of the run, kept in the recording; default: the seed in ``rollout.info``.
     overwrite
@@ -68,264 +61,187 @@ def write_recording(
     ------
     InvalidArgumentError
         The file exists already, or its name ends otherwise.
-    MissingDependencyError
-        h5py is not installed, which .h5 files need.
     RecordingError
         The file cannot be written.
     """
     instance("rollout", rollout, Rollout, "pass what runner.rollout() returned")
-    path = check_path(path, (".npz", *HDF5), overwrite=overwrite)
+    path = check_path(path, overwrite=overwrite)
     info = rollout.info if seed is None else replace(rollout.info, seed=integer("seed", seed, 0, 2**63 - 1))
-    h5py = None if path.suffix.lower() == ".npz" else load_h5py()
+    import h5py
 
-    def write(file: Any) -> None:
-        if h5py is None:
-            tables: Document = rollout.arrays() | _attributes(info, rollout.num_envs, rollout.tick)
-            np.savez_compressed(file, **tables)
-            return
-        whole = io.BytesIO()  # HDF5 can crash the process after a write that failed
-        with h5py.File(whole, "w", libver="latest") as opened:
-            append_rows(create_datasets(opened, info, rollout.num_envs, rollout.tick), rollout.arrays())
-        file.write(whole.getbuffer())
-
+    content = io.BytesIO()  # on a full disk HDF5 could not close its own file
+    with h5py.File(content, "w", libver=LIBVER) as file:
+        write_rows(create_datasets(file, info, rollout.num_envs, rollout.tick), 0, rollout.arrays())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, write, overwrite)
-    except FileExistsError:
-        raise RecordingError(f"{path}: was made by another program meanwhile; give another name") from None
+        write_atomically(path, content.getvalue(), overwrite)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be written: {error.strerror or error}") from error
     return path
 
 
-def read_recording(path: str | os.PathLike[str], *, every: int = 1, max_bytes: int | None = None) -> Rollout:
-    """Read a recording: complete, cut short by a kill (``NAME.h5.partial``), or one that is still being written.
+def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
+    """Read a recording: complete, cut short by a kill, or one that is still being written.
 
-    ``info.complete`` of the result says whether the run came to its end. The file may come from a stranger: nothing in
-    it is executed, no other file is opened, and checksums are verified.
+    ``info.complete`` of the result says whether the run came to its end. Nothing in the file is executed; SECURITY.md
+    says what a file of a stranger can do.
 
     Parameters
     ----------
     path
-        An .npz or .h5 file of any name.
+        An HDF5 file of any name.
     every
         Keep every n-th tick.
-    max_bytes
-        Largest size of the arrays in the file; default 1 GiB, or eight times the size of the file if that is more.
 
     Raises
     ------
     RecordingError
-        The file is missing, damaged, too large, or no recording.
-    MissingDependencyError
-        h5py is not installed, which .h5 files need.
+        The file is missing, damaged, or no recording.
     """
+    import h5py
+
     path, every = file_path("path", path), integer("every", every, 1, 10**9)
-    max_bytes = None if max_bytes is None else integer("max_bytes", max_bytes, 0, 2**63 - 1)
     try:
-        if path.is_dir():
-            raise RecordingError(f"{path}: is a folder, not a recording")
         if not path.is_file():
-            raise RecordingError(f"{path}: there is no such file; after a kill look for {path.name}.partial")
-        limit = max(1 << 30, 8 * path.stat().st_size) if max_bytes is None else max_bytes
-        with path.open("rb") as file:
-            zipped = file.read(2) == b"PK"
-        if zipped:
-            attributes = read_npz(path, limit)
-            arrays = {name: attributes.pop(name)[::every] for name in DTYPES if name in attributes}
-        else:
-            load_h5py()
-            arrays, attributes = read_hdf5(path, ("checksum", *DTYPES), every, limit)
-        checksums = arrays.pop("checksum", None)
-        present = DTYPES.keys() & arrays.keys()
-        if "guarded" not in arrays and "qpos" in arrays:  # recorded before there were guards
-            arrays["guarded"] = np.zeros(arrays["qpos"].shape, bool)
-        info = _info(attributes)
-        dtypes = {name: DTYPES[name] for name in ("time", *info.recorded)}
-        if lacking := dtypes.keys() - arrays:
-            raise ValueError(f"it does not hold {', '.join(sorted(lacking))}")
-        arrays = {name: arrays[name].astype(dtype, casting="same_kind", copy=False) for name, dtype in dtypes.items()}
-        tick = float(attributes["tick"] if "tick" in attributes else attributes["timestep"] * attributes["substeps"])
-        _check(arrays, tick, info)
-        if checksums is not None and not np.array_equal(
-            checksums, row_checksums({name: rows for name, rows in arrays.items() if name in present})
-        ):
-            raise ValueError("its data are damaged: a checksum differs")
-    except (RecordingError, MissingDependencyError):
-        raise
-    except Exception as error:  # a damaged file can make the libraries raise anything
+            raise FileNotFoundError("there is no such file")
+        with h5py.File(path, "r", locking=False) as file:
+            if file.attrs.get("format") != FORMAT:
+                raise ValueError(f"its format is not {FORMAT}")
+            info = read_info(file.attrs)
+            num_envs, tick = int(file.attrs["num_envs"]), float(file.attrs["tick"])
+            time = file["time"][:]
+            is_written = np.isfinite(time)
+            count = len(time) if is_written.all() else int(is_written.argmin())
+            rows = slice(0, count, every)
+            arrays = {"time": time[rows]}
+            for name, quantity in info.recorded.items():
+                shape = (len(arrays["time"]), *info.row_shape(name, num_envs))
+                arrays[name] = _read_rows(file[name], rows, shape, quantity)
+            if not file["feedforward"].id.get_storage_size():
+                arrays["feedforward"] = None
+    except Exception as error:  # a damaged file can make HDF5 raise anything
         raise RecordingError(f"{path}: cannot be read as a recording: {error or type(error).__name__}") from error
-    time, setpoint = (arrays.pop(name) for name in ("time", "setpoint"))
-    return Rollout(time, setpoint, Observation(**arrays), tick * every, info)
+    own = {name: arrays.pop(name) for name in ("time", "setpoint", "feedforward")}
+    return Rollout(**own, observation=Observation(**arrays), tick=tick * every, info=info)
 
 
-def check_path(path: str | os.PathLike[str], suffixes: tuple[str, ...], *, overwrite: bool) -> Path:
+def _read_rows(dataset: h5py.Dataset, rows: slice, shape: tuple[int, ...], quantity: Quantity) -> Rows:
+    array: Rows = dataset[rows]
+    if array.shape != shape:
+        raise ValueError(f"its {dataset.name} has shape {array.shape}, not {shape}")
+    return array.astype(quantity.dtype, casting="same_kind", copy=False)
+
+
+def check_path(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
     """Return ``path`` if a recording can be written there.
 
     Raises
     ------
     InvalidArgumentError
-        It ends in none of ``suffixes``, or the file exists and ``overwrite`` is False.
+        Its suffix is none of :data:`HDF5`, or the file exists and ``overwrite`` is False.
     """
-    path = file_path("path", path, suffixes)
+    path = file_path("path", path, HDF5)
     if os.path.lexists(path) and not overwrite:
-        raise InvalidArgumentError(
-            "path", "exists already", value=str(path), remedy="choose another name, or pass overwrite=True"
-        )
+        remedy = "choose another name, or pass overwrite=True"
+        raise InvalidArgumentError("path", "exists already", value=str(path), remedy=remedy)
     return path
 
 
-def load_h5py() -> Any:
-    """Return the package h5py; raise MissingDependencyError if it is not installed."""
-    try:
-        import h5py
-    except ImportError:
-        raise MissingDependencyError("h5py", "recording to HDF5", "record") from None
-    return h5py
-
-
 def create_datasets(file: h5py.File, info: RunInfo, num_envs: int, tick: float) -> dict[str, h5py.Dataset]:
-    """Write ``info`` to a new .h5 file, and return empty datasets that can grow: time and :attr:`RunInfo.recorded`."""
-    for name, value in _attributes(info, num_envs, tick).items():
-        file.attrs[name] = value
-    datasets = {"time": file.create_dataset("time", (0,), "f8", maxshape=(None,), chunks=(1024,), fillvalue=np.nan)}
+    """Write ``info`` to a new file; return empty datasets that can grow: time and :attr:`RunInfo.recorded`."""
+    file.attrs.update(attributes(info) | {"format": FORMAT, "num_envs": num_envs, "tick": tick})
+    datasets = {"time": file.create_dataset("time", (0,), "f8", maxshape=(None,), chunks=(4096,), fillvalue=np.nan)}
     datasets["time"].attrs["unit"] = ["s"]
     for name, quantity in info.recorded.items():
-        row = info.row_shape(name, num_envs)
-        dtype = np.dtype(quantity.dtype)
-        rows = max(1, CHUNK_BYTES // (int(np.prod(row)) * dtype.itemsize))
+        row, dtype = info.row_shape(name, num_envs), np.dtype(quantity.dtype)
+        rows = max(1, CHUNK_BYTES // max(1, int(np.prod(row)) * dtype.itemsize))
         datasets[name] = file.create_dataset(name, (0, *row), dtype, maxshape=(None, *row), chunks=(rows, *row))
         if info.units_of(name):
             datasets[name].attrs["unit"] = list(info.units_of(name))
-    datasets["checksum"] = file.create_dataset(
-        "checksum", (0,), "i8", maxshape=(None,), chunks=(1024,), fillvalue=NOT_WRITTEN
-    )
     return datasets
 
 
-def append_rows(datasets: Mapping[str, h5py.Dataset], arrays: Mapping[str, Rows]) -> None:
-    """Append ``arrays``, ticks first, to the datasets of their names; their checksums, which readers count, last."""
-    arrays = {name: np.ascontiguousarray(arrays[name], dtype) for name, dtype in DTYPES.items() if name in datasets}
-    for name, rows in (arrays | {"checksum": row_checksums(arrays)}).items():
-        dataset = datasets[name]
-        done = len(dataset)
-        dataset.resize(done + len(rows), axis=0)
-        dataset[done:] = rows
-        dataset.flush()
+def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Mapping[str, Any]) -> None:
+    """Write ``arrays``, ticks first, from row ``first`` on; it can be repeated if it was interrupted."""
+    time = datasets["time"]
+    end = first + len(arrays["time"])
+    for name, dataset in datasets.items():
+        rows = arrays.get(name)
+        if dataset is not time:
+            dataset.resize(end, axis=0)
+            if rows is not None:
+                dataset[first:end] = rows
+    time.file.flush()  # a row is valid once it has a time, so times follow when the rest is on the disk
+    time.resize(end, axis=0)
+    time[first:end] = arrays["time"]
+    time.file.flush()
 
 
-def row_checksums(arrays: Mapping[str, Rows]) -> NDArray[np.int64]:
-    """Return the CRC-32 of each tick's rows of all ``arrays``, (ticks,)."""
-    sums = np.zeros(len(arrays["time"]), np.int64)
-    for tick, rows in enumerate(zip(*map(np.ascontiguousarray, arrays.values()), strict=True)):
-        for row in rows:
-            sums[tick] = zlib.crc32(row, sums[tick])
-    return sums
+# -- attributes ------------------------------------------------------------------------------------------------------
 
 
-def attribute_checksum(attributes: Document) -> int:
-    """Return the CRC-32 of all ``attributes`` but the checksum."""
-    values = {name: np.asarray(value).tolist() for name, value in attributes.items() if name != "checksum"}
-    return zlib.crc32(json.dumps(values, sort_keys=True).encode())
+def _dump_draws(draws: Mapping[str, Rows], joints: tuple[str, ...]) -> str:
+    return json.dumps({name: rows.tolist() for name, rows in draws.items()})
 
 
-def faults_text(faults: Iterable[Fault]) -> str:
-    """Return ``faults`` as the JSON text that a recording holds."""
-    return json.dumps([fault._asdict() for fault in faults])
+def _load_draws(text: str, joints: tuple[str, ...]) -> dict[str, Rows]:
+    return {name: np.array(rows, np.float64) for name, rows in json.loads(text).items()}
 
 
-def redraws_text(redraws: Iterable[Redraw]) -> str:
-    """Return ``redraws`` as the JSON text that a recording holds."""
-    return json.dumps([list(redraw) for redraw in redraws])
+Codec = tuple[Callable[[Any, tuple[str, ...]], str], Callable[[str, tuple[str, ...]], Any]]
+_MAPPING: Codec = (lambda value, joints: json.dumps(dict(value)), lambda text, joints: json.loads(text))
+CODECS: dict[str, Codec] = {
+    "params": (
+        lambda params, joints: bp.dumps_params(params, joints, format="json"),
+        lambda text, joints: bp.loads_params(text, joints)[0],
+    ),
+    "actuators": (
+        lambda actuators, joints: bp.motors.dumps_actuators(actuators, joints, format="json"),
+        lambda text, joints: bp.motors.loads_actuators(text, joints)[0],
+    ),
+    "own_command": (
+        lambda command, joints: json.dumps([command.names, command.units]),
+        lambda text, joints: CommandSpec(*json.loads(text)),
+    ),
+    "faults": (
+        lambda faults, joints: json.dumps([fault._asdict() for fault in faults]),
+        lambda text, joints: tuple([Fault(**fault) for fault in json.loads(text)]),
+    ),
+    "redraws": (
+        lambda redraws, joints: json.dumps(redraws),
+        lambda text, joints: tuple([Redraw(*redraw) for redraw in json.loads(text)]),
+    ),
+    "draws": (_dump_draws, _load_draws),
+    "versions": _MAPPING,
+    "randomization": _MAPPING,
+    "options": _MAPPING,
+}
+"""Fields of :class:`RunInfo` that are JSON in a recording: functions (value, joint names) that write and read them."""
 
 
-def _attributes(info: RunInfo, num_envs: int, tick: float) -> Document:
-    """Return the known fields of ``info`` as numbers, texts, and arrays of them."""
-    known = {name: value for name, value in vars(info).items() if value is not None and name != "description"}
-    known |= {name: list(value) for name, value in known.items() if isinstance(value, tuple)}
-    known["faults"] = faults_text(info.faults)
-    if (command := known.pop("own_command", None)) is not None:
-        known |= {_COMMAND_NAMES: list(command.names), _COMMAND_UNITS: list(command.units)}
-    if info.params is not None:
-        known["params"] = bp.dumps_params(info.params, info.joint_names, format="json")
-    if info.actuators is not None:
-        known["actuators"] = bp.motors.dumps_actuators(info.actuators, info.joint_names, format="json")
-    for name in _TEXTS:
-        if name in known:
-            known[name] = json.dumps(dict(known[name]))
-    known["redraws"] = redraws_text(info.redraws)
-    known |= {f"{_DRAW}{name}": rows for name, rows in known.pop("draws", {}).items()}
-    known |= {"format": FORMAT, "num_envs": num_envs, "tick": tick}
-    return known | {"checksum": attribute_checksum(known)}
+def attributes(info: RunInfo) -> Document:
+    """Return the fields of ``info`` that are not None as texts, numbers, and arrays of them."""
+    values: Document = {name: value for name, value in vars(info).items() if value is not None}
+    values.pop("description", None)
+    for name, value in values.items():
+        if name in CODECS:
+            values[name] = CODECS[name][0](value, info.joint_names)
+        elif isinstance(value, tuple):
+            values[name] = list(value)
+    return values
 
 
-def _info(attributes: Document) -> RunInfo:
+def read_info(values: Mapping[str, Any]) -> RunInfo:
     """Return the :class:`RunInfo` in the attributes of a recording."""
-    if (found := str(attributes.get("format", FORMAT))) != FORMAT:
-        raise ValueError(f"its format is {found!r}, not {FORMAT!r}")
-    known = {
-        field.name: attributes[field.name]
-        for field in fields(RunInfo)
-        if field.name in attributes.keys() - {"description"}
-    }
-    if lacking := [field.name for field in fields(RunInfo) if field.default is MISSING and field.name not in known]:
-        raise ValueError(f"it does not say its {', '.join(lacking)}")
-    if "checksum" in attributes and attributes["checksum"] != attribute_checksum(attributes):
-        raise ValueError("its attributes are damaged: the checksum differs")
-    names = tuple(map(str, known["joint_names"]))
-    readers: dict[str, Callable[[Any], Any]] = {
-        "params": lambda text: bp.loads_params(str(text), names)[0],
-        "actuators": lambda text: bp.motors.loads_actuators(str(text), names)[0],
-        "seed": lambda value: None if str(value) == "none" else int(value),
-        "redraws": lambda text: tuple(Redraw(*redraw) for redraw in json.loads(str(text))),
-        "faults": lambda text: tuple(Fault(**fault) for fault in json.loads(str(text))),
-    }
-    kinds = get_type_hints(RunInfo)
-    for name in ("units", "lower", "upper", "effort_limit"):
-        if np.shape(known[name]) != (len(names),):
-            raise ValueError(f"its {name} are {np.shape(known[name])}, not one for each of {len(names)} joints")
-    draws = {name.removeprefix(_DRAW): _numbers(rows) for name, rows in attributes.items() if name.startswith(_DRAW)}
-    command = None
-    if _COMMAND_NAMES in attributes:
-        command = CommandSpec(attributes[_COMMAND_NAMES].tolist(), attributes[_COMMAND_UNITS].tolist())
-    return RunInfo(
-        **{name: readers.get(name, partial(_plain, kinds[name]))(value) for name, value in known.items()},
-        draws=draws or None,
-        own_command=command,
-    )
-
-
-def _plain(kind: Kind, value: Rows) -> Any:
-    """Return a value of a field of :class:`RunInfo` of this type: a text, number, bool, array, names, or a mapping."""
-    if isinstance(kind, UnionType):
-        kind = next(each for each in get_args(kind) if each is not NoneType)
-    if kind in (str, float, int, bool):
-        return kind(value)
-    if get_origin(kind) is Mapping:
-        return dict(json.loads(str(value)))
-    return tuple(map(str, value)) if kind == tuple[str, ...] else _numbers(value)
-
-
-def _numbers(value: Rows) -> Rows:
-    if value.dtype.kind not in "iuf":
-        raise ValueError(f"it has {value.dtype} in place of numbers")
-    return value
-
-
-def _check(arrays: Mapping[str, Rows], tick: float, info: RunInfo) -> None:
-    """Check that shapes agree and times are numbers."""
-    ticks, dof = len(arrays["time"]), len(info.joint_names)
-    envs = arrays["ok"].shape[-1] if arrays["ok"].ndim else 0
-    shapes = {name: (ticks, *info.row_shape(name, envs)) for name in info.recorded}
-    for name, shape in ({"time": (ticks,)} | shapes).items():
-        if arrays[name].shape != shape:
-            raise ValueError(f"its {name} has shape {arrays[name].shape}, not {shape}")
-    if not (0 < tick < np.inf and np.isfinite(arrays["time"]).all()):
-        raise ValueError("its times are not finite")
-    if info.start is not None and info.start.shape != (envs, dof):
-        raise ValueError(f"its start has shape {info.start.shape}, not {(envs, dof)}")
-    if info.episodes is not None and info.episodes.shape != (envs, 2):
-        raise ValueError(f"its episodes have shape {info.episodes.shape}, not {(envs, 2)}")
-    for name, rows in (info.draws or {}).items():
-        if rows.ndim != 2 or len(rows) != envs:
-            raise ValueError(f"its draws of {name} have shape {rows.shape}, not one row for each of {envs} envs")
+    joints = tuple(values["joint_names"])
+    read: Document = {}
+    for name in {field.name for field in fields(RunInfo)} & set(values):
+        value = values[name]
+        if name in CODECS:
+            read[name] = CODECS[name][1](value, joints)
+        elif isinstance(value, np.ndarray):
+            is_text = value.dtype.kind == "O" or not value.size
+            read[name] = tuple(value) if is_text else value
+        else:
+            read[name] = value.item() if isinstance(value, np.generic) else value
+    return RunInfo(**read)

@@ -17,7 +17,7 @@ from batchpid.arrays.digest import digest
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import RobotError
 from batchpid.sim.robot.link_repair import DENSITY
-from batchpid.sim.robot.merging import place_links
+from batchpid.sim.robot.merging import Separate, place_links
 from batchpid.sim.robot.meshes import note_meshes, read_mesh
 from batchpid.sim.robot.xml import number, numbers
 from batchpid.task_space.rotations import from_rpy, multiply, rotate
@@ -58,18 +58,24 @@ class LinkShape(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def link_shapes(urdf: str, merge_fixed: bool) -> dict[str, list[LinkShape]]:
-    """Return the shapes of every simulated link of a sanitised URDF, by name; an empty list without shapes.
+def own_shapes(urdf: str) -> dict[str, list[LinkShape]]:
+    """Return the shapes of every link of a sanitised URDF, by name; an empty list without shapes.
 
     Raises RobotError for a mesh that cannot be read.
     """
-    shapes: dict[str, list[LinkShape]] = {at.link: [] for at in place_links(urdf, merge_fixed).values()}
-    placements = place_links(urdf, merge_fixed)
-    for link in etree.fromstring(urdf.encode(), etree.XMLParser(huge_tree=True)).findall("link"):
-        name = link.get("name", "")
+    links = etree.fromstring(urdf.encode(), etree.XMLParser(huge_tree=True)).findall("link")
+    named = [(link.get("name", ""), link) for link in links]
+    return {name: [_read(element, name) for element in link.findall("collision")] for name, link in named}
+
+
+@lru_cache(maxsize=16)
+def link_shapes(urdf: str, separate: Separate = ()) -> dict[str, list[LinkShape]]:
+    """Return the shapes of every simulated link of a sanitised URDF, by name; an empty list without shapes."""
+    placements = place_links(urdf, separate)
+    shapes: dict[str, list[LinkShape]] = {at.link: [] for at in placements.values()}
+    for name, of_link in own_shapes(urdf).items():
         at = placements[name]
-        for element in link.findall("collision"):
-            shape = _read(element, name)
+        for shape in of_link:
             place = at.position + rotate(at.wxyz, shape.position)
             shapes[at.link].append(shape._replace(position=place, wxyz=multiply(at.wxyz, shape.wxyz)))
     return shapes

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Document, Float64, Rows
 from batchpid.arrays.digest import digest
-from batchpid.arrays.display import html_table
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
@@ -24,7 +23,6 @@ from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import (
     DISSIPATION,
-    HEADERS,
     FileDefaults,
     Joint,
     LinkMass,
@@ -32,7 +30,6 @@ from batchpid.sim.robot.parts import (
     Placement,
     Settings,
     Urdf,
-    joint_rows,
 )
 from batchpid.sim.robot.self_collision import SelfContact, Srdf, self_contact
 from batchpid.sim.robot.setpoint_limits import setpoint_guard
@@ -100,8 +97,8 @@ class RobotDescription(Urdf):
     """Robot as its URDF describes it; every array is in the order of ``joint_names``.
 
     ``joints`` are the degrees of freedom, the moving joints of ``all_joints``. ``bodies`` is the placement of every
-    link, by name, in its simulated link: links joined by fixed joints are simulated as one, unless ``merge_fixed`` is
-    False. ``settings`` come from a bundled robot, ``defaults`` and ``mjcf`` from an MJCF file, else None.
+    link, by name, in its simulated link: links joined by fixed joints are simulated as one. ``settings`` come from a
+    bundled robot, ``defaults`` and ``mjcf`` from an MJCF file, else None.
     ``package_dirs`` are the folders in which meshes are looked up first. ``actuators`` are its motors and sensors, None
     for ideal ones. ``base_start`` is the pose (7,) at which the file places a floating base, None if it does not.
     """
@@ -112,7 +109,6 @@ class RobotDescription(Urdf):
     joints: tuple[Joint, ...]
     dissipation: str
     fixed_base: bool
-    merge_fixed: bool
     bodies: Mapping[str, Placement]
     settings: Settings | None
     package_dirs: tuple[Path, ...] = ()
@@ -131,9 +127,6 @@ class RobotDescription(Urdf):
         joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
         head = f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
         return f"{head}\n  joints={joints})"
-
-    def _repr_html_(self) -> str:
-        return html_table(repr(self).partition("\n")[0].rstrip(",") + ")", HEADERS, joint_rows(self.joints))
 
     @property
     def dof(self) -> int:
@@ -279,7 +272,7 @@ class RobotDescription(Urdf):
         """Return the info of a run of this robot; ``options`` are further fields of :class:`batchpid.sim.RunInfo`."""
         shared = (
             *("joint_names", "units", "lower", "upper", "effort_limit"),
-            *("urdf", "dissipation", "merge_fixed", "fixed_base"),
+            *("urdf", "dissipation", "fixed_base"),
         )
         known = {name: getattr(self, name) for name in shared}
         return RunInfo(robot=self.name, description=self, **known, **options)
@@ -295,7 +288,7 @@ class RobotDescription(Urdf):
 
         Raises RobotError if a link's mass comes from its shapes, and a mesh cannot be read.
         """
-        inertias = simulated(self.urdf, True).inertias
+        inertias = simulated(self.urdf).inertias
         low, high = np.where(self.continuous, [[-np.inf], [np.inf]], [self.lower, self.upper])
         limits = {"lower": low, "upper": high}
         return rigid_tree(self.urdf, inertias, coupling=self.coupling, fixed_base=self.fixed_base, **limits)
@@ -303,8 +296,7 @@ class RobotDescription(Urdf):
     @cached_property
     def simulated_tree(self) -> RigidTree:
         """Tree of the simulated links, without coupling."""
-        merge = self.merge_fixed
-        return rigid_tree(simulated(self.urdf, merge).urdf, body_inertias(self.urdf, merge), fixed_base=self.fixed_base)
+        return rigid_tree(simulated(self.urdf).urdf, body_inertias(self.urdf), fixed_base=self.fixed_base)
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
         """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof), on a fixed base."""
@@ -354,7 +346,7 @@ class RobotDescription(Urdf):
             "srdf": digest(self.srdf.disabled, self.srdf.enabled),
             "settings": digest(self.settings) if self.defaults is None else digest(self.defaults),
             "mjcf": None if self.mjcf is None else digest(replace(self.mjcf, path="")),
-            **{name: getattr(self, name) for name in ("self_collision", "dissipation", "fixed_base", "merge_fixed")},
+            **{name: getattr(self, name) for name in ("self_collision", "dissipation", "fixed_base")},
             "base_start": self.base_start,
         }
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from lxml import etree
 
-from batchpid.arrays.display import html_table
 from batchpid.checks.warn import warn
 from batchpid.errors import RobotError
 
@@ -64,15 +63,10 @@ class Finding:
 
 
 class Findings(list[Finding]):
-    """List of findings with a representation for people: a line, or in a notebook a row, for each."""
+    """List of findings with a representation for people: a line for each."""
 
     def __repr__(self) -> str:
         return "\n".join(map(str, self)) or "[]"
-
-    def _repr_html_(self) -> str:
-        headers = ("", "where", "finding", "remedy")
-        rows = ((each.severity, each.where, " ".join([each.text, each.figures]).strip(), each.remedy) for each in self)
-        return html_table("Findings" if self else "No findings", headers if self else (), rows)
 
 
 def summary(findings: Iterable[Finding]) -> list[str]:

@@ -23,6 +23,8 @@ from batchpid.sim.robot.xml import number, numbers
 from batchpid.task_space.rotations import from_rpy, multiply, rotate, to_rpy
 from batchpid.task_space.spatial_inertia import SpatialInertia, total
 
+Separate = tuple[str, ...]
+"""Links that are not merged into their parents."""
 _IDENTITY = Placement("", read_only(np.zeros(3)), read_only(np.array([1.0, 0.0, 0.0, 0.0])))
 
 
@@ -50,21 +52,21 @@ class Edge(NamedTuple):
     element: etree._Element
 
 
-def place_links(urdf: str, merge_fixed: bool = True) -> dict[str, Placement]:
-    """Return the placement of every link of a sanitised URDF, in its body if ``merge_fixed``, else each in itself."""
+def place_links(urdf: str, separate: Separate = ()) -> dict[str, Placement]:
+    """Return the placement of every link of a sanitised URDF in its body; links ``separate`` begin a body."""
     root = etree.fromstring(urdf.encode())
-    return _place(root, _merged_joints(edges_of(root)) if merge_fixed else set())
+    return _place(root, _merged_joints(edges_of(root), separate))
 
 
-def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInertia], merge: bool = True) -> Merged:
-    """Return the robot of a sanitised URDF with its fixed joints merged, or as it is, and with all inertias written.
+def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInertia], separate: Separate = ()) -> Merged:
+    """Return the robot of a sanitised URDF with its fixed joints merged, and with all inertias written.
 
     ``inertia_of_shapes(link)`` is the inertia of a link with collision shapes but without
     ``<inertial>``, in the frame of that link.
     """
     root = etree.fromstring(urdf.encode())
     edges = edges_of(root)
-    merged = _merged_joints(edges) if merge else set[str]()
+    merged = _merged_joints(edges, separate)
     bodies = _place(root, merged)
     links = {link.get("name", ""): link for link in root.findall("link")}
     inertias = {name: inertia for name, link in links.items() if (inertia := _inertial(link)) is not None}
@@ -113,14 +115,16 @@ def edges_of(root: etree._Element) -> list[Edge]:
     return edges
 
 
-def _merged_joints(edges: Sequence[Edge]) -> set[str]:
-    """Return the fixed joints to merge: all except those whose merge would change the order of joints below them."""
+def _merged_joints(edges: Sequence[Edge], separate: Separate) -> set[str]:
+    """Return the fixed joints to merge: all except those of ``separate`` links, and those whose merge would change the
+    order of joints below them.
+    """
     wanted = [edge.name for edge in edges if edge.moves]
     carriers: set[str] = set()  # links with a joint that moves below them
     for edge in reversed(edges):
         if edge.moves or edge.child in carriers:
             carriers.add(edge.parent)
-    fixed = [edge for edge in edges if not edge.moves]
+    fixed = [edge for edge in edges if not edge.moves and edge.child not in separate]
     merged = {edge.name for edge in fixed}
     if _moving_order(edges, merged) == wanted:
         return merged

@@ -151,7 +151,7 @@ class MjcfFile:
     digest of what was read. ``bodies`` are the names of all bodies, ``falling`` those of bodies on free joints that are
     not the robot's. ``loops`` are the equality constraints that close loops of the robot's links. ``is_alone`` is False
     if more than the robot moves. ``has_floor`` is True if planes of the world can collide, unless the root is fixed to
-    the origin in place of its free joint.
+    the origin in place of its free joint. ``friction`` is the coefficient of its ground, the first of these planes.
     """
 
     path: str
@@ -162,6 +162,7 @@ class MjcfFile:
     loops: tuple[str, ...] = ()
     is_alone: bool = True
     has_floor: bool = False
+    friction: float = 1.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)

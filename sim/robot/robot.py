@@ -54,7 +54,6 @@ class Robot(RobotDescription):
         missing_meshes: str = "skip",
         dissipation: str = "urdf",
         fixed_base: bool | None = None,
-        merge_fixed: bool = True,
         self_collision: str = "auto",
         actuators: bp.Actuators | str | Path | None = None,
         strict: bool = False,
@@ -74,9 +73,6 @@ class Robot(RobotDescription):
         fixed_base
             True to fix the root link to the world. Default True, unless the root of a URDF is a link without mass and
             shapes and its only joint is floating or planar: then the base floats, and the root is that joint's child.
-        merge_fixed
-            True to simulate links that are joined by fixed joints as one, with the exact inertia: fewer links, faster
-            steps. False keeps every link, and contacts between links that are joined through other links.
         self_collision
             ``"auto"``: links that are neighbours, or touch or overlap at the start pose or in nearly every sampled pose
             do not collide (:attr:`self_contact`). ``"urdf"``: all links collide. An .srdf next to the URDF, of the same
@@ -105,7 +101,7 @@ class Robot(RobotDescription):
         choice("dissipation", dissipation, DISSIPATION)
         choice("self_collision", self_collision, SELF_COLLISION)
         fixed_base = None if fixed_base is None else flag("fixed_base", fixed_base)
-        strict, merge_fixed = flag("strict", strict), flag("merge_fixed", merge_fixed)
+        strict = flag("strict", strict)
         if not isinstance(package_dirs, list | tuple):
             problem = "must be a list of folders"
             raise InvalidArgumentError("package_dirs", problem, value=package_dirs, remedy="pass a list of paths")
@@ -124,10 +120,10 @@ class Robot(RobotDescription):
         if not any(joint.moves for joint in urdf.all_joints):
             raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
         # From here on links mean bodies: those that fixed joints hold together are one.
-        bodies = place_links(urdf.urdf, merge_fixed)
+        bodies = place_links(urdf.urdf)
         if (count := len({at.link for at in bodies.values()})) > MAX_LINKS:
             problem = f"has {count} links that move; PhysX holds at most {MAX_LINKS} in one robot"
-            raise RobotError(f"{path}: {problem}; {'split the robot' if merge_fixed else 'load with merge_fixed=True'}")
+            raise RobotError(f"{path}: {problem}; split the robot")
         joints = couple([joint for joint in urdf.all_joints if joint.moves])
         beside = path.with_suffix(".srdf")
         srdf = read_srdf(beside, [link.name for link in urdf.links]) if os.path.isfile(beside) else Srdf()
@@ -142,7 +138,6 @@ class Robot(RobotDescription):
             joints=joints,
             dissipation=dissipation,
             fixed_base=fixed_base,
-            merge_fixed=merge_fixed,
             package_dirs=folders,
             bodies=bodies,
             settings=_read_settings(path.with_suffix(".yaml"), joints) if bundled else None,

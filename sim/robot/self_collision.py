@@ -120,7 +120,7 @@ def self_contact(robot: Any) -> SelfContact:
     """
     solid = [link.name for link in robot.links if link.num_shapes]
     bodies = _rigid_bodies(robot.all_joints)
-    shapes, tree = link_shapes(robot.urdf, robot.merge_fixed), robot.simulated_tree
+    shapes, tree = link_shapes(robot.urdf), robot.simulated_tree
     contacts = Contacts(tree, shapes, frozenset(), ground=False)
     computed: tuple[DisabledPair, ...] = ()
     if robot.self_collision == "none":
@@ -132,7 +132,7 @@ def self_contact(robot: Any) -> SelfContact:
     listed = {pair.links: pair for pair in (*computed, *robot.srdf.disabled)}
     pairs = [pair for links, pair in listed.items() if links not in robot.srdf.enabled and links <= set(solid)]
     ignored = [pair.links for pair in pairs]
-    _, left_over = link_groups(robot.urdf, robot.merge_fixed, robot.fixed_base, robot.joints, ignored)
+    _, left_over = link_groups(robot.urdf, (), robot.fixed_base, robot.joints, ignored)
     return SelfContact(
         pairs=tuple(pair for pair in pairs if pair.links not in left_over),
         left_over=tuple(pair for pair in pairs if pair.links in left_over),

@@ -1,4 +1,4 @@
-"""Visible surfaces of a robot: the shapes of its URDF as coloured triangles, for a view that has no SAPIEN renderer.
+"""Visible surfaces of a robot: the shapes of its URDF as coloured triangles, for page and films.
 
 A link is drawn by its ``<visual>`` elements; where it has none, or one of their mesh files cannot be read, by its
 collision shapes. Unreadable files are reported. A robot of which nothing can be drawn is drawn by rods between its

@@ -18,8 +18,8 @@ from lxml import etree
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.read_only import read_only
-from batchpid.sim.robot.collision_shapes import LinkShape, inertia_of, link_shapes
-from batchpid.sim.robot.merging import Merged, edges_of, merge_fixed_links, place_links
+from batchpid.sim.robot.collision_shapes import LinkShape, inertia_of, own_shapes
+from batchpid.sim.robot.merging import Merged, Separate, edges_of, merge_fixed_links, place_links
 from batchpid.sim.robot.parts import LinkMass, Urdf
 from batchpid.sim.robot.xml import numbers
 from batchpid.task_space.rigid_tree import RigidTree
@@ -49,43 +49,43 @@ class Body(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def simulated(urdf: str, merge_fixed: bool) -> Merged:
-    """Return the simulated robot, with its fixed joints merged or not; its text has the inertia of every link."""
+def simulated(urdf: str, separate: Separate = ()) -> Merged:
+    """Return the simulated robot, with its fixed joints merged; its text has the inertia of every link."""
 
     def of_shapes(link: str) -> SpatialInertia:
-        return inertia_of(link_shapes(urdf, False)[link])
+        return inertia_of(own_shapes(urdf)[link])
 
-    return merge_fixed_links(urdf, of_shapes, merge_fixed)
+    return merge_fixed_links(urdf, of_shapes, separate)
 
 
-def body_inertias(urdf: str, merge_fixed: bool) -> dict[str, SpatialInertia]:
+def body_inertias(urdf: str, separate: Separate = ()) -> dict[str, SpatialInertia]:
     """Return the inertia of every simulated link, by name, in its frame."""
-    parts = _parts(urdf, merge_fixed, ())
+    parts = _parts(urdf, separate, ())
     return {name: total([part.inertia for part in members]) for name, members in parts.items()}
 
 
-def center_of_mass(urdf: str, merge_fixed: bool, link: str) -> tuple[str, Float64]:
+def center_of_mass(urdf: str, separate: Separate, link: str) -> tuple[str, Float64]:
     """Return the simulated link that contains ``link`` of the URDF, and in its frame the center of mass of ``link``.
 
     For a link without mass that is its origin.
     """
-    at, inertia = place_links(urdf, merge_fixed)[link], simulated(urdf, merge_fixed).inertias.get(link)
+    at, inertia = place_links(urdf, separate)[link], simulated(urdf, separate).inertias.get(link)
     return at.link, at.position if inertia is None else inertia.moved(at.position, at.wxyz).center
 
 
-def varied_bodies(urdf: str, merge_fixed: bool, carrier: str, links: Sequence[str]) -> dict[str, Body]:
+def varied_bodies(urdf: str, separate: Separate, carrier: str, links: Sequence[str]) -> dict[str, Body]:
     """Return the simulated links with varying mass, by name: they contain ``links`` or ``carrier``."""
-    loaded, place = center_of_mass(urdf, merge_fixed, carrier)
+    loaded, place = center_of_mass(urdf, separate, carrier)
     return {
         body: Body(members, place if body == loaded else None)
-        for body, members in _parts(urdf, merge_fixed, links).items()
+        for body, members in _parts(urdf, separate, links).items()
         if body == loaded or any(part.column is not None for part in members)
     }
 
 
-def _parts(urdf: str, merge_fixed: bool, links: Sequence[str]) -> dict[str, list[Part]]:
+def _parts(urdf: str, separate: Separate, links: Sequence[str]) -> dict[str, list[Part]]:
     """Return the links with mass of every simulated body; a body without any gets one part of ``NO_MASS``."""
-    placements, inertias = place_links(urdf, merge_fixed), simulated(urdf, merge_fixed).inertias
+    placements, inertias = place_links(urdf, separate), simulated(urdf, separate).inertias
     parts: dict[str, list[Part]] = defaultdict(list)
     for name, at in placements.items():
         members = parts[at.link]
@@ -100,12 +100,12 @@ _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
 
 
 def link_masses(robot: Urdf) -> dict[str, LinkMass]:
-    """Return the mass of every link of the URDF, whether links are merged or not.
+    """Return the mass of every link of the URDF.
 
     Raises RobotError for a mesh that cannot be read.
     """
     repaired = {each.link for each in robot.repairs if each.code == "inertia"}
-    inertias, shapes, masses = simulated(robot.urdf, True).inertias, link_shapes(robot.urdf, False), {}
+    inertias, shapes, masses = simulated(robot.urdf).inertias, own_shapes(robot.urdf), {}
     for link in robot.links:
         if (given := inertias.get(link.name)) is None:
             masses[link.name] = LinkMass(0.0, "none", 0.0, 0.0)

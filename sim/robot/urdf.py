@@ -66,7 +66,10 @@ def read_source(path: Path, fixed_base: bool, missing_meshes: str) -> tuple[etre
         raise MissingDependencyError("mujoco>=3.17", "reading an MJCF file") from error
     from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
 
-    mjcf = read_mjcf(path, root.get("model") or path.stem, fixed_base, missing_meshes)
+    try:
+        mjcf = read_mjcf(path, root.get("model") or path.stem, fixed_base, missing_meshes)
+    except UnicodeDecodeError as error:
+        raise RobotError(f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8") from error
     return mjcf.root, [*findings, *mjcf.findings], mjcf
 
 

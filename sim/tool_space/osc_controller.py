@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array
+from batchpid.arrays.digest import digest
 from batchpid.arrays.display import summary
 from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.leaves import frozen
@@ -161,6 +162,11 @@ class OperationalSpace:
     def params(self) -> ts.OSCParams:
         """Params of the law, one row for all envs, read-only."""
         return self._params
+
+    @property
+    def version(self) -> str:
+        """Digest of all that the law depends on, besides the robot."""
+        return digest(self.link, self.point, self._posture, self._params, self.tree, self.command.names)
 
     def __repr__(self) -> str:
         return summary(type(self).__name__, [self.link, "setpoints " + " ".join(self.command.names)])

@@ -1,4 +1,4 @@
-"""Gains by simulation: moves to evaluate them on, their evaluation, the search for them, and sweeps.
+"""Gains by simulation: moves to evaluate them on, their evaluation, and the search for them.
 
 Names are loaded when they are first used.
 """

@@ -27,11 +27,11 @@ from lxml import etree
 from batchpid.arrays.array_types import Document
 from batchpid.checks.validate import integer, number
 from batchpid.errors import BatchPIDError, InvalidArgumentError, RobotError
-from batchpid.sim.processes.fork_server import ONE_THREAD
 from batchpid.sim.robot.parts import MOVING_TYPES
 from batchpid.sim.robot.urdf import is_mjcf
 from batchpid.sim.robot.xml import SIZE_LIMIT, parse_xml
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
+from batchpid.sim.workers.worker import ONE_THREAD
 
 STAGES = ("reading the description", "building it in the engine", "checking it", "drawing moves", "moving it")
 """Stages of a survey of one robot, named in :attr:`RobotReport.error`."""

@@ -1,49 +1,40 @@
-"""Page that shows robots: charts of a joint, a frame at the tool, and the loop that keeps real time."""
+"""Page that shows robots: their scene, charts of a joint, controls, and the loop that keeps real time."""
 
 from __future__ import annotations
 
 import io
-import threading
 import time
-from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, redirect_stdout, suppress
+from contextlib import AbstractContextManager, redirect_stdout
 from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Document
-from batchpid.checks.single_owner import SingleOwner
+from batchpid.arrays.array_types import Document, Float64, Rows
 from batchpid.errors import MissingDependencyError
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.findings import summary
+from batchpid.sim.robot.shapes import Surface
 from batchpid.sim.view.panel import Panel, ViewData
 from batchpid.sim.view.playback import HISTORY_SECONDS
-from batchpid.sim.view.scene import RobotScene
-from batchpid.sim.view.simulation import LiveSimulation
+from batchpid.sim.view.scene import FIELD_OF_VIEW, TILE, RobotScene
 
 CHARTS_EVERY = 5
-"""Frames between two updates of the charts."""
-STATUS_EVERY = 15
-"""Frames between two updates of the status."""
-NOTICE_SECONDS = 1.0
-"""Shortest time between two notices of refused messages [s]."""
+"""Frames between two updates of charts and status."""
 
 
-class View(SingleOwner, AbstractContextManager["View"]):
-    """Page that shows ``data``, served at ``host`` and ``port``, or at the next free port, until :meth:`close`.
+class View(AbstractContextManager["View"]):
+    """Page that shows ``data``, served at ``host`` and ``port``, or at a free port, until :meth:`close`.
 
-    Only somebody who knows :attr:`url` can open it. Messages of a page are checked; refusals are shown on the pages.
+    Only somebody who knows :attr:`url` can open it.
 
     Raises
     ------
-    InvalidArgumentError
-        The host is not an address of this machine, or no port is free.
     MissingDependencyError
         The package ``viser`` is missing.
+    OSError
+        The host is not an address of this machine.
     """
 
     def __init__(self, data: ViewData, *, host: str = "127.0.0.1", port: int = 8080) -> None:
@@ -54,30 +45,26 @@ class View(SingleOwner, AbstractContextManager["View"]):
         except ImportError:
             raise MissingDependencyError("viser", "the browser view", "view") from None
         self.data = data
-        self._problems: deque[str] = deque(maxlen=1)
-        self._gate = gate = Gate(host, port, self._problems.append)
+        gate = Gate(host, port)
         with redirect_stdout(io.StringIO()):  # viser's banner
             make = partial(viser.ViserServer, host=host, port=gate.port, verbose=False, label="batchpid")
             self._server: Any = gate.start(make)
-        self.url = gate.url
-        """Address of the page, with the token that opens it."""
         self.port = gate.port
         """Port of the page."""
+        name = "127.0.0.1" if host == "0.0.0.0" else host
+        self.url = f"http://{name}:{gate.port}/{gate.token}/"
+        """Address of the page, with the token that opens it."""
         self.rate, self.factor = 0.0, 0.0
         """Frames per second of wall time, and real-time factor."""
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(43, 92, 199))
-        self._scene = RobotScene(self._server, data.robot, data.groups, data.per_group, data.ground)
-        self.findings = summary(self._scene.findings)
-        """Sentences on meshes that cannot be read, which the page shows as well."""
-        self.panel = Panel(self._server, data, self._problems.append, self.findings)
-        self._scene.on_click(self.panel.select)
-        self._gizmo: TargetGizmo | None = None
-        if isinstance(data, LiveSimulation) and data.command is not None:
-            layout, panel = self._scene.layout, self.panel
-            self._gizmo = TargetGizmo(
-                self._server, data, layout.positions, layout.reach, panel.requests.put, lambda: panel.only_watched
-            )
+        # A browser without a GPU transforms every vertex in software: the more robots, the coarser.
+        deviation = min(6e-3, 2.5e-4 + 1.25e-4 * data.num_envs)
+        scene = RobotScene(data.robot, data.num_envs, data.ground, deviation)
+        self.findings = summary(scene.findings)
+        """Sentences on meshes that cannot be read."""
+        self.panel = Panel(gui, data)
+        self._nodes = SceneNodes(self._server, scene, data.frame().info.sets_positions, self.panel.select)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
         charts = gui.add_panel()
@@ -85,38 +72,40 @@ class View(SingleOwner, AbstractContextManager["View"]):
             self._charts = Charts(gui, data)
         charts.dock_left()
         charts.set_width(380)
-        self._stopped = self._settled = False
-        self._noticed = 0.0
-        self._shown: tuple[Any, ...] = ()
+        self._stopped = False
 
     def run(self, seconds: float | None = None) -> None:
         """Serve the page for ``seconds`` of wall time, or until :meth:`stop` or Ctrl-C."""
         data, panel = self.data, self.panel
-        began = deadline = time.monotonic()
-        laps: deque[tuple[float, float]] = deque([(began, data.frame().time[0])], maxlen=45)
+        began = deadline = lap = time.monotonic()
         count = 0
-        with ThreadPoolExecutor(1) as executor:
-            while not self._stopped and (seconds is None or time.monotonic() - began < seconds):
-                panel.requests.run()
-                frame = data.frame()
-                # The workers compute the next frame while this one is sent.
-                job = executor.submit(data.advance) if panel.frames_left > 0 else None
-                panel.frames_left = max(0, panel.frames_left - 1)
-                if clients := self._server.get_clients():
-                    self._show(frame, count)
-                    self._notify(list(clients.values()))
-                if job is not None:
-                    job.result()
-                now = time.monotonic()
-                laps.append((now, data.frame().time[0]))
-                (first, start), (last, end) = laps[0], laps[-1]
-                if last > first:
-                    self.rate = (len(laps) - 1) / (last - first)
-                    self.factor = max(0.0, end - start) / (last - first)
+        self._show(charts=True)
+        while not self._stopped and (seconds is None or time.monotonic() - began < seconds):
+            requested = panel.run_requests()
+            running = panel.frames_left > 0
+            if running:
+                panel.frames_left -= 1
+                data.advance()
                 count += 1
-                # A late frame is not caught up, which would only hurry the next ones.
-                deadline = max(deadline + data.period / panel.speed, now)
-                time.sleep(deadline - now)
+            now = time.monotonic()
+            due = running and count % CHARTS_EVERY == 0
+            if due:
+                self.rate = CHARTS_EVERY / (now - lap)
+                self.factor = self.rate * data.period
+                lap = now
+            if running or requested:
+                self._show(charts=requested or due)
+            # A late frame is not caught up, which would only hurry the next ones.
+            deadline = max(deadline + data.period / panel.speed, now)
+            time.sleep(deadline - now)
+
+    def _show(self, charts: bool) -> None:
+        """Send the present frame to the pages, and with ``charts`` these and the status."""
+        panel, frame = self.panel, self.data.frame()
+        self._nodes.update(frame, panel.env)
+        if charts:
+            self._charts.update(panel.env, panel.joint)
+            panel.update_status(frame, self.factor, self.rate)
 
     def stop(self) -> None:
         """Make :meth:`run` return after the present frame. Safe to call from any thread."""
@@ -126,46 +115,96 @@ class View(SingleOwner, AbstractContextManager["View"]):
         """Close the page and its data."""
         self.stop()
         self.data.close()
-        self._gate.close()
-        # After a browser has connected, viser takes about 5 s to end its threads. They are daemons: do not wait.
-        thread = threading.Thread(target=self._server.stop, daemon=True)
         with redirect_stdout(io.StringIO()):
-            thread.start()
-            thread.join(timeout=0.5)
+            self._server.stop()
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _notify(self, clients: list[Any]) -> None:
-        """Show the last problem on every page, at intervals: strangers must not flood them."""
-        if self._problems and time.monotonic() - self._noticed > NOTICE_SECONDS:
-            self._noticed, problem = time.monotonic(), self._problems.pop()[:300]
-            for client in clients:
-                with suppress(UserWarning):  # the page is closed by now, and warnings are errors
-                    client.add_notification("Not accepted", problem, auto_close_seconds=8.0, color="red")
 
-    def _show(self, frame: Rollout, count: int) -> None:
-        """Send changes: charts and status at intervals, and once more when the robots come to rest."""
-        panel = self.panel
-        watched = (panel.env, panel.joint, panel.show_setpoint)
-        shown = (frame.qpos.tobytes(), frame.setpoint.tobytes(), frame.time[0], *watched)
-        settled = shown == self._shown
-        settling = settled and not self._settled
-        self._shown, self._settled = shown, settled
-        if not settled:
-            self._scene.update(frame, panel.env, panel.show_setpoint)
-        if self._gizmo is not None:
-            self._gizmo.update(panel.env)
-        if settling or (not settled and count % CHARTS_EVERY == 0):
-            self._charts.update(panel.env, panel.joint)
-        if settling or (not settled and count % STATUS_EVERY == 0):
-            panel.update_status(frame, self.factor, self.rate)
+_SETPOINT_COLOUR = (70, 130, 255)
+_NO_SHADOW = {"cast_shadow": False, "receive_shadow": False}
 
 
-_COLOURS = ("#15803d", "#d97706")
-"""Colour of each group's curves."""
-_LIMIT_RATIO = 4.0
-"""A limit is drawn where it is less than this many times the largest effort."""
+class SceneNodes:
+    """A ``scene`` on a viser ``server``, with the setpoint of a robot if ``sets_positions`` of joints.
+
+    ``select(robot)`` is called when a robot is clicked.
+
+    Every surface is one node, which is placed once for each robot. A frame is therefore two small arrays for each
+    surface, for any number of robots.
+    """
+
+    def __init__(self, server: Any, scene: RobotScene, sets_positions: bool, select: Callable[[int], None]) -> None:
+        import trimesh  # installed with viser
+
+        self._server, self._scene = server, scene
+        api = server.scene
+        api.set_up_direction("+z")
+        # Where a browser draws in software, the environment map costs more than all robots.
+        api.configure_environment_map(None)
+        api.configure_default_lights(enabled=True, cast_shadow=False)
+        api.add_light_ambient("/lights/ambient", color=(235, 240, 255), intensity=1.3)
+        api.add_grid(
+            "/floor",
+            *(2 * scene.half_floor),
+            cell_size=TILE,
+            section_size=2 * TILE,
+            shadow_opacity=0.0,
+            plane_color=(200, 208, 220),
+            plane_opacity=float(scene.ground),
+            position=(0.0, 0.0, scene.floor),
+        )
+        ring = trimesh.creation.annulus(0.30 * scene.reach, 0.335 * scene.reach, height=1e-3, sections=48)
+        self._ring = api.add_mesh_simple("/selected", ring.vertices, ring.faces, color=_SETPOINT_COLOUR, **_NO_SHADOW)
+        count = len(scene.positions)
+        self._robots: list[Any] = []
+        self._setpoints: list[Any] = []
+        for index, surface in enumerate(scene.surfaces):
+            red, green, blue, alpha = surface.rgba
+            colour = tuple(round(255 * value) for value in (red, green, blue))
+            opacity = alpha if alpha < 1 else None
+            node = self._add_surface(f"/robots/{index}", surface, count, colour, opacity=opacity)
+            self._robots.append(node)
+            if sets_positions:
+                path, options = f"/setpoint/{index}", {"opacity": 0.22, **_NO_SHADOW}
+                self._setpoints.append(self._add_surface(path, surface, 1, _SETPOINT_COLOUR, **options))
+        for node in self._robots:
+            node.on_click(lambda event: select(event.instance_index))
+        camera = server.initial_camera
+        camera.position, camera.look_at = tuple(scene.eye), tuple(scene.target)
+        camera.fov = FIELD_OF_VIEW
+
+    def update(self, frame: Rollout, env: int) -> None:
+        """Place every robot, the ring under robot ``env``, and its setpoint."""
+        scene = self._scene
+        with self._server.atomic():
+            base = None if frame.base_pose is None else frame.base_pose[0]
+            _place(self._robots, scene.place(frame.qpos[0], base))
+            self._ring.position = (*scene.positions[env][:2], scene.floor + 0.004)
+            if self._setpoints:
+                _place(self._setpoints, scene.poses(frame.setpoint[0, [env]], np.array([env])))
+
+    def _add_surface(self, path: str, surface: Surface, copies: int, colour: Any, **options: Any) -> Any:
+        return self._server.scene.add_batched_meshes_simple(
+            path,
+            surface.vertices.astype(np.float32),
+            surface.faces.astype(np.uint32),
+            batched_wxyzs=np.tile(np.array([1, 0, 0, 0], np.float32), (copies, 1)),
+            batched_positions=np.zeros((copies, 3), np.float32),
+            batched_colors=colour,
+            lod="off",
+            **options,
+        )
+
+
+def _place(nodes: list[Any], poses: Float64) -> None:
+    """Put the nodes of surfaces at poses (robots, surfaces, 7)."""
+    for node, pose in zip(nodes, poses.astype(np.float32).swapaxes(0, 1), strict=True):
+        node.batched_positions = np.ascontiguousarray(pose[:, :3])
+        node.batched_wxyzs = np.ascontiguousarray(pose[:, 3:])
+
+
 _MIN_RANGE = {"min": -0.012, "max": 0.012}
 """Smallest range of a vertical axis [rad, m, N m or N]: noise alone should not fill a chart."""
 _SCALES = {
@@ -175,11 +214,10 @@ _SCALES = {
 
 
 class Charts:
-    """Three charts in ``gui``, of one joint of the same robot in every group."""
+    """Two charts in ``gui``: position and setpoint, and effort, of one joint of a robot."""
 
     def __init__(self, gui: Any, data: ViewData) -> None:
         self._data = data
-        names = data.groups if len(data.groups) > 1 else ("",)
 
         def chart(title: str, *series: Document) -> Any:
             return gui.add_uplot(
@@ -188,106 +226,30 @@ class Charts:
                 title=title,
                 scales=_SCALES,
                 legend={"show": True, "live": False},
-                height=168,
+                height=220,
                 axes=({"size": 30, "stroke": "#6b7280"}, {"size": 56, "stroke": "#6b7280"}),
                 padding=(4, 14, 0, 0),
             )
 
-        def curves(quantity: str) -> list[Document]:
-            return [
-                {"label": f"{quantity} {name}".strip(), "stroke": colour, "width": 2}
-                for name, colour in zip(names, _COLOURS, strict=False)
-            ]
-
-        dashed = {"width": 1, "dash": [6, 4]}
-        limits = ({"label": f"{end} limit", "stroke": "#b6bcc6", **dashed} for end in ("lower", "upper"))
-        self._sets_positions = data.frame().info.sets_positions
-        target = [{"label": "setpoint", "stroke": "#4a82ff", **dashed}] if self._sets_positions else []
-        self._position = chart("position", *curves("qpos"), *target)
-        self._error = chart("error", *curves("error"))
-        self._error.visible = self._sets_positions
-        self._effort = chart("effort", *limits, *curves("effort"))
+        setpoint = {"label": "setpoint", "stroke": "#4a82ff", "width": 1, "dash": [6, 4]}
+        self._position = chart("position", {"label": "qpos", "stroke": "#15803d", "width": 2}, setpoint)
+        self._effort = chart("effort", {"label": "effort", "stroke": "#15803d", "width": 2})
 
     def update(self, env: int, joint: int) -> None:
-        """Draw the recent past of a joint of robot ``env`` of every group."""
-        data, history = self._data, self._data.history()
-        if len(history.time) < 2:
-            return
+        """Draw the recent past of a joint of robot ``env``."""
+        history = self._data.history()
         past = history.time - history.time[-1]
-        robots = env + data.per_group * np.arange(len(data.groups))
-        arrays = (history.qpos, history.setpoint if self._sets_positions else history.qpos, history.effort)
-        qpos, setpoint, effort = (array[:, robots, joint].T.astype(np.float64) for array in arrays)
-        # A far limit would flatten the curve, and a gap (NaN) would empty the chart: such a limit repeats the curve.
-        largest = np.abs(effort).max()
-        limits = [
-            np.full(len(past), limit) if abs(limit) < _LIMIT_RATIO * largest else effort[0]
-            for limit in data.effort_limits(env, joint)
-        ]
-        described = data.robot.joints[joint]
-        drawn = [*qpos, setpoint[0]] if self._sets_positions else qpos
-        positions = np.round(drawn, 4)  # smaller differences make a flat line jitter
-        for chart, title, curves in (
-            (self._position, f"{described.name} [{described.unit}]", positions),
-            (self._error, f"setpoint - qpos [{described.unit}]", setpoint - qpos),
-            (self._effort, f"effort [{described.effort_unit}]", [*limits, *effort]),
-        ):
-            if chart.title != title:
-                chart.title = title
-            chart.data = (past, *curves)
+        if len(past) < 2:
+            return
+        described = self._data.robot.joints[joint]
+        positions = history.qpos[:, env, joint]
+        setpoints = history.setpoint[:, env, joint] if history.info.sets_positions else positions
+        self._draw(self._position, f"{described.name} [{described.unit}]", past, positions, setpoints)
+        self._draw(self._effort, f"effort [{described.effort_unit}]", past, history.effort[:, env, joint])
 
-
-_SIZE = 0.25
-"""Length of an axis, in reaches of the robot."""
-
-
-class TargetGizmo:
-    """Draggable frame of a viser ``server`` at the setpoint of control "osc".
-
-    Parameters
-    ----------
-    positions
-        Positions of the robots on the page (envs, 3) [m].
-    reach
-        Reach of the robot [m].
-    put
-        Function that queues a request until the next frame.
-    only_watched
-        Function that returns whether a drag moves the target of the watched robot alone.
-    """
-
-    def __init__(
-        self,
-        server: Any,
-        live: LiveSimulation,
-        positions: NDArray[np.float64],
-        reach: float,
-        put: Callable[[Callable[[], object]], None],
-        only_watched: Callable[[], bool],
-    ) -> None:
-        self._live, self._positions, self._put, self._only_watched = live, positions, put, only_watched
-        self._env = 0
-        self._shown: bytes | None = None
-        self._frame = server.scene.add_transform_controls("/target", scale=_SIZE * reach, depth_test=False)
-        self._frame.on_update(self._dragged)
-        self.update(0)
-
-    def update(self, env: int) -> None:
-        """Put the frame at the target of a robot, unless it is there."""
-        target = self._live.setpoint[env]
-        if (env, target.tobytes()) != (self._env, self._shown):
-            self._env, self._shown = env, target.tobytes()
-            self._frame.position = tuple(self._positions[env] + target[:3])
-            self._frame.wxyz = tuple(target[3:] / np.linalg.norm(target[3:]))
-
-    async def _dragged(self, event: Any) -> None:
-        if event.phase == "update":
-            pose = np.concatenate([self._frame.position, self._frame.wxyz], dtype=np.float64)
-            self._put(partial(self._move, self._env, pose))
-
-    def _move(self, env: int, pose: NDArray[np.float64]) -> None:
-        """Set the target to a pose on the page, between two frames; a refused one brings the frame back."""
-        self._shown = None
-        target = pose - np.concatenate([self._positions[env], np.zeros(4)])
-        self._live.set_target(target, env=env if self._only_watched() else None)
-        if env == self._env:  # the frame is where the pointer has it
-            self._shown = self._live.setpoint[env].tobytes()
+    @staticmethod
+    def _draw(chart: Any, title: str, past: Float64, *curves: Rows) -> None:
+        if chart.title != title:
+            chart.title = title
+        # Smaller differences make a flat line jitter, and a number that is not finite would empty the chart.
+        chart.data = (past, *(np.nan_to_num(np.round(curve, 4).astype(np.float64)) for curve in curves))

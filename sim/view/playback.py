@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.observation import Rollout, RunInfo
+from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.view.scene import MAX_ROBOTS
 
 HISTORY_SECONDS = 8.0
 """Longest past that the charts show [s]."""
@@ -23,7 +25,7 @@ class Playback:
     Raises
     ------
     InvalidArgumentError
-        The run has another number of joints than the robot.
+        The run has more robots than fit on a page, or another number of joints than the robot.
     RobotNotFoundError
         The robot of the run is not bundled.
     """
@@ -37,10 +39,10 @@ class Playback:
                 f"has {joints} joints, robot {robot.name!r} has {robot.dof}",
                 remedy="give the robot that was recorded",
             )
-        self.robot, self.per_group = robot, rollout.num_envs
-        self.groups = ("recorded",)
+        self.robot = robot
+        self.num_envs = integer("num_envs", rollout.num_envs, 1, MAX_ROBOTS)
         self.ground = robot.has_ground if rollout.info.ground is None else rollout.info.ground
-        """True if the run had a ground at height 0; for an older recording, the default of the robot."""
+        """True if the run had a ground at height 0."""
         self._rollout = replace(rollout, time=rollout.time - rollout.time[0])
         self.duration = float(self._rollout.time[-1])
         """Time from the first row to the last [s]."""
@@ -54,15 +56,6 @@ class Playback:
     def history(self) -> Rollout:
         """Return the rows up to the present one, of the last :data:`HISTORY_SECONDS`."""
         return self._since(self._now - HISTORY_SECONDS)
-
-    def info_of(self, robot: int) -> RunInfo:
-        """Return the options of the run of one robot."""
-        return self._rollout.info.for_envs([robot])
-
-    def effort_limits(self, robot: int, joint: int) -> tuple[float, float]:
-        """Return the effort limits in the URDF [N m or N]."""
-        limit = float(self.robot.effort_limit[joint])
-        return -limit, limit
 
     def advance(self) -> None:
         """Go to the next frame; after the last to the first."""
@@ -80,14 +73,12 @@ class Playback:
         """Do nothing: a playback holds no resources."""
 
     def _since(self, start: float) -> Rollout:
-        """Return the rows from a time [s] to the present one; numbers that are not finite become 0."""
+        """Return the rows from a time [s] to the present one."""
         first, last = rows_at(self._rollout, np.array([start, self._now])).tolist()
-        part = self._rollout.for_ticks(slice(first, last + 1))
-        finite = part.observation.map(lambda array: np.nan_to_num(array, posinf=0.0, neginf=0.0))
-        return replace(part, observation=finite)
+        return self._rollout.for_ticks(slice(first, last + 1))
 
 
-def rows_at(rollout: Rollout, seconds: float | NDArray[np.float64]) -> NDArray[np.int64]:
+def rows_at(rollout: Rollout, seconds: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the rows of ``rollout`` that are shown at times [s] since its first row."""
     elapsed = rollout.time - rollout.time[0]
-    return np.searchsorted(elapsed, np.asarray(seconds) - 1e-9).clip(0, len(elapsed) - 1)
+    return np.searchsorted(elapsed, seconds - 1e-9).clip(0, len(elapsed) - 1)

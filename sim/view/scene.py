@@ -1,154 +1,85 @@
-"""Robots in the browser. Every surface is one node of the page that is placed once for each robot.
-
-A frame is therefore two small arrays for each surface, for any number of robots.
-"""
+"""Robots on a floor: the scene that the page and films draw."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid.task_space as ts
-from batchpid.arrays.array_types import Document, Float64, Rows
-from batchpid.sim.observation import Rollout
+from batchpid.arrays.array_types import Float64, Rows
+from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.shapes import Surface, surfaces
-from batchpid.sim.view.layout import FIELD_OF_VIEW, TILE, RobotLayout, arrange_robots
+from batchpid.sim.robot.shapes import surfaces
 from batchpid.task_space.rotations import placed
 
-_SETPOINT_COLOUR = (70, 130, 255)
-_DIVERGED_COLOUR = np.array([200, 40, 40], np.uint8)
-_TINT, _TINT_SHARE = np.array([255, 150, 40]), 0.5
-"""Colour mixed into the colours of the second group's robots, and its share."""
-_FLOOR_COLOURS = np.array([[189, 198, 211], [203, 211, 222]], np.uint8)
-_TILE_PIXELS = 16
-"""Edge of a tile in the floor's picture, in which tiles blend over one pixel."""
-_NO_SHADOW = {"cast_shadow": False, "receive_shadow": False}
-_SETPOINT_STYLE = {"batched_colors": _SETPOINT_COLOUR, "opacity": 0.22, **_NO_SHADOW}
+MAX_ROBOTS = 64
+"""Largest number of robots in a scene."""
+FIELD_OF_VIEW = math.radians(42)
+"""Vertical field of view of the camera [rad]."""
+TILE = 0.5
+"""Edge of a tile of the floor [m]."""
+_PITCH = 1.3
+"""Distance between neighbours, in reaches: two robots overlap only when both stretch out."""
+_CAMERA_DIRECTION = np.array([-0.62, -0.80, 0.52]) / np.linalg.norm([-0.62, -0.80, 0.52])
 
 
 class RobotScene:
-    """``per_group`` robots for each of ``groups``, on the floor of a viser ``server``.
+    """``count`` robots in a square around the origin, on a floor.
 
-    The floor is tiled if physics has a ``ground``; otherwise it is a grid at the height of the lowest link.
+    The floor is at height 0 if physics has a ``ground``, otherwise at the lowest point of the start pose. ``deviation``
+    [m] is the largest distance of a triangle from a round surface.
     """
 
-    def __init__(self, server: Any, robot: Robot, groups: tuple[str, ...], per_group: int, ground: bool) -> None:
-        self._server, self._tree = server, robot.rigid_tree
-        self.layout = arrange_robots(robot, len(groups), per_group, ground)
-        count = len(self.layout.positions)
+    def __init__(self, robot: Robot, count: int, ground: bool, deviation: float) -> None:
+        self._tree = robot.rigid_tree
+        self.ground = ground
         self.findings: list[Finding] = []
         """Meshes that cannot be read. Their links are drawn by the collision shapes, or not at all."""
-        self._robots: list[Any] = []
-        self._setpoints: list[Any] = []
-        self._links: list[int] = []
-        self._colours: list[NDArray[np.uint8]] = []
-        # A browser without a GPU transforms every vertex in software: the more robots, the coarser.
-        deviation = 5e-4 if count <= 4 else 1.5e-3 if count < 16 else 3e-3 if count < 48 else 6e-3  # [m]
-        for index, surface in enumerate(surfaces(robot, deviation, self.findings)):
-            colours = _group_colours(surface.rgba, len(groups), per_group)
-            opacity = surface.rgba[3] if surface.rgba[3] < 1 else None
-            node = self._add_surface(f"/robots/{index}", surface, count, batched_colors=colours, opacity=opacity)
-            self._robots.append(node)
-            self._setpoints.append(self._add_surface(f"/setpoint/{index}", surface, 1, **_SETPOINT_STYLE))
-            self._links.append(self._tree.index(surface.link))
-            self._colours.append(colours)
-        self._shown_setpoint: tuple[Any, ...] | None = None
-        self._ok = np.ones(count, bool)
-        self._add_surroundings(groups, ground)
+        self.surfaces = surfaces(robot, deviation, self.findings)
+        """Coloured triangles of one robot."""
+        self._links = [self._tree.index(surface.link) for surface in self.surfaces]
+        # The 95th percentile over seeded poses: a single stretched pose should not push all robots apart.
+        samples = ts.link_poses(self._tree, robot.sample(200, seed=0))
+        distances = np.linalg.norm(samples[..., :2], axis=-1).max(1)
+        self.reach = max(0.3, float(np.quantile(distances, 0.95)))
+        """Horizontal reach of a robot [m]."""
+        row, column = np.divmod(np.arange(count), round(math.sqrt(count)))
+        grid = np.stack([column, row, 0 * row], axis=1)
+        self.positions: Float64 = _PITCH * self.reach * (grid - grid.max(0) / 2)
+        """Positions of the robots (count, 3) [m]."""
+        frames = ts.link_poses(self._tree, robot.start)[:, 2].min()
+        lowest = min(float(frames), robot_model(robot).height(robot.start, base_too=True))
+        self.floor = 0.0 if ground else lowest
+        """Height of the floor [m]."""
+        corner = np.abs(self.positions[0, :2]) + 2.0 * self.reach
+        self.half_floor: Float64 = TILE * np.ceil(corner / TILE)
+        """Half the edges of the floor under all robots (2,) [m], in whole tiles."""
+        self.target: Float64 = np.array([0.0, 0.0, self.floor + 0.35 * self.reach])
+        """Point that the camera looks at (3,) [m]."""
+        size = 2 * math.hypot(*self.positions[0, :2]) + 2.0 * self.reach
+        self.eye: Float64 = 1.16 * size * _CAMERA_DIRECTION + [0.0, 0.0, self.floor]
+        """Position of the camera (3,) [m]."""
+        self._qpos = np.tile(robot.start, (count, 1))
+        self._base = np.tile([0.0, 0, 0, 1, 0, 0, 0], (count, 1))
 
-    def update(self, frame: Rollout, selected: int, show_setpoint: bool) -> None:
-        """Place every robot, the ring under the selected one, and its setpoint if that is shown and is a pose."""
-        positions, ok = self.layout.positions, frame.ok[0]
-        with self._server.atomic():
-            base = None if frame.base_pose is None else frame.base_pose[0]
-            self._place(self._robots, frame.qpos[0], positions, base)
-            if (ok != self._ok).any():
-                self._ok = ok
-                for node, colours in zip(self._robots, self._colours, strict=True):
-                    node.batched_colors = np.where(ok[:, None], colours, _DIVERGED_COLOUR)
-            setpoint = frame.setpoint[0, selected]
-            show_setpoint = show_setpoint and frame.info.sets_positions
-            if (shown := (selected, show_setpoint, setpoint.tobytes())) != self._shown_setpoint:
-                self._shown_setpoint = shown
-                self._ring.position = (*positions[selected][:2], self.layout.floor + 0.004)
-                for node in self._setpoints:
-                    node.visible = show_setpoint
-                if show_setpoint:
-                    own = None if base is None else base[[selected]]
-                    self._place(self._setpoints, setpoint[None], positions[selected][None], own)
+    def place(self, qpos: Rows, base_pose: Rows | None = None) -> Float64:
+        """Return the poses of the surfaces (count, surfaces, 7) [m] at the joint positions (count, dof) [rad or m].
 
-    def on_click(self, select: Callable[[Any], None]) -> None:
-        """Call ``select(robot)`` when a robot is clicked, with the number that the page sent."""
+        ``base_pose`` (count, 7) are the poses of floating bases. A robot with a number that is not finite stays where
+        it was.
+        """
+        finite = np.isfinite(qpos).all(1, keepdims=True)
+        if base_pose is not None:
+            finite &= np.isfinite(base_pose).all(1, keepdims=True)
+            self._base = np.where(finite, base_pose, self._base)
+        self._qpos = np.where(finite, qpos, self._qpos)
+        return self.poses(self._qpos, np.arange(len(qpos)))
 
-        async def clicked(event: Any) -> None:
-            select(event.instance_index)
-
-        for node in self._robots:
-            node.on_click(clicked)
-
-    def _add_surface(self, path: str, surface: Surface, copies: int, **options: Any) -> Any:
-        return self._server.scene.add_batched_meshes_simple(
-            path,
-            surface.vertices.astype(np.float32),
-            surface.faces.astype(np.uint32),
-            batched_wxyzs=np.tile(np.array([1, 0, 0, 0], np.float32), (copies, 1)),
-            batched_positions=np.zeros((copies, 3), np.float32),
-            lod="off",
-            **options,
-        )
-
-    def _place(self, nodes: list[Any], qpos: Rows, positions: Float64, base: Rows | None) -> None:
-        poses = ts.link_poses(self._tree, qpos)
-        if base is not None:
-            poses = placed(base.astype(np.float64)[:, None], poses)
-        position, wxyz = (poses[..., :3] + positions[:, None]).astype(np.float32), poses[..., 3:].astype(np.float32)
-        for node, link in zip(nodes, self._links, strict=True):
-            node.batched_positions = np.ascontiguousarray(position[:, link])
-            node.batched_wxyzs = np.ascontiguousarray(wxyz[:, link])
-
-    def _add_surroundings(self, groups: tuple[str, ...], ground: bool) -> None:
-        """Add floor, lights, the ring under the selected robot, labels of the groups, and set the camera."""
-        import trimesh  # installed with viser
-
-        scene, layout = self._server.scene, self.layout
-        scene.set_up_direction("+z")
-        # Where a browser draws in software, the environment map costs more than all robots.
-        scene.configure_environment_map(None)
-        scene.configure_default_lights(enabled=True, cast_shadow=False)
-        scene.add_light_ambient("/lights/ambient", color=(235, 240, 255), intensity=1.3)
-        low, high = layout.corners
-        place: Document = {"position": (*(low + high) / 2, layout.floor)}
-        if ground:  # an image is not lit and costs a third of tiles made of triangles
-            scene.add_image("/floor", _tiles(layout), *(high - low), format="png", **place, **_NO_SHADOW)
-        else:
-            scene.add_grid("/floor", *(high - low), cell_size=TILE, section_size=2 * TILE, shadow_opacity=0.0, **place)
-        ring = trimesh.creation.annulus(0.30 * layout.reach, 0.335 * layout.reach, height=1e-3, sections=48)
-        self._ring = scene.add_mesh_simple("/selected", ring.vertices, ring.faces, color=_SETPOINT_COLOUR, **_NO_SHADOW)
-        if len(groups) > 1:
-            for group, positions in zip(groups, np.split(layout.positions, len(groups)), strict=True):
-                x, y, _ = positions.mean(0)
-                scene.add_label(f"/groups/{group}", group, position=(x, y, layout.floor + 1.9 * layout.reach))
-        camera = self._server.initial_camera
-        camera.position, camera.look_at = tuple(layout.camera), tuple(layout.target)
-        camera.fov = FIELD_OF_VIEW
-
-
-def _tiles(layout: RobotLayout) -> NDArray[np.uint8]:
-    """Return the picture of a tiled floor under all robots."""
-    low, high = layout.corners
-    columns, rows = np.rint((high - low) / TILE).astype(int)
-    tiles = (np.indices((rows, columns)).sum(0) + 1) % 2
-    pixels = np.kron(tiles, np.ones((_TILE_PIXELS, _TILE_PIXELS), int))
-    return _FLOOR_COLOURS[pixels]
-
-
-def _group_colours(rgba: tuple[float, ...], groups: int, per_group: int) -> NDArray[np.uint8]:
-    """Return the colour of a surface on every robot (robots, 3), tinted in the second group."""
-    own = 255 * np.array(rgba[:3])
-    rows = [own, own + _TINT_SHARE * (_TINT - own)][:groups]
-    return np.repeat(rows, per_group, axis=0).round().astype(np.uint8)
+    def poses(self, qpos: Float64, robots: Rows) -> Float64:
+        """Return the poses of the surfaces (n, surfaces, 7) [m] of n ``robots`` at ``qpos`` (n, dof) [rad or m]."""
+        links = ts.link_poses(self._tree, qpos)[:, self._links]
+        poses = placed(self._base[robots][:, None], links)
+        poses[..., :3] += self.positions[robots][:, None]
+        return poses

@@ -1,31 +1,51 @@
-"""Node of a cluster: a pool of workers in a process that Ray starts on a machine, and the caller's end of it."""
+"""Machines of a Ray cluster as workers of a pool.
+
+Ray finds the machines, starts one actor on each and carries the messages. The actor has a pool of worker processes for
+a slice of the envs. It is lost with its machine, with any of its workers, or when it does not answer in time; the
+caller's pool then replaces it, here or on another machine, as it replaces a worker process.
+"""
 
 from __future__ import annotations
 
-import io
+import logging
 import os
 import pickle
-import sys
-import time
+from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import Future
-from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
-import batchpid as bp
-from batchpid.errors import InvalidArgumentError
-from batchpid.io.files import standard_streams_occupied
+from batchpid.errors import InvalidArgumentError, MissingDependencyError, WorkerError
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.failure import Failure, failure_of
-from batchpid.sim.processes.background import BACKGROUND, Job
-from batchpid.sim.workers.cluster import Cluster, NodeInfo
+from batchpid.sim.ray_options import Ray
 from batchpid.sim.workers.exchange import SharedArrays
-from batchpid.sim.workers.requests import ReadDigest, Request, Run, Start
+from batchpid.sim.workers.placement import split_in_shares
+from batchpid.sim.workers.requests import Build, Request, Start
 from batchpid.sim.workers.worker import Worker, WorkerLost, pickled
 
-START_LIMIT, SILENCE_LIMIT = 60.0, 20.0
-"""Seconds after which a node is lost that has not started, or whose process does not answer a call to nothing."""
-_BEAT_INTERVAL = 1.0  # seconds between two such calls
+NODE_STEPS = 25_000
+"""Sim steps times envs of a worker in one request to its node, at most, unless a tick has more: half a second."""
+
+
+class Machine(NamedTuple):
+    """Machine of a cluster, and the workers that it can have."""
+
+    node_id: str
+    address: str
+    workers: int
+
+
+class NodeInfo(NamedTuple):
+    """Machine of a cluster, and the processes that run some of a runner's envs there."""
+
+    address: str
+    """Address of the machine."""
+    envs: slice
+    """Envs of the runner."""
+    pid: int
+    """Process that holds the pool of workers."""
+    pids: tuple[int, ...]
+    """Worker processes."""
 
 
 class Answer(NamedTuple):
@@ -40,7 +60,7 @@ class Answer(NamedTuple):
 
 
 class Node:
-    """Pool of the envs of one machine. Ray makes it an actor, which is called by one thread at a time, and beats."""
+    """Pool of the envs of one machine, as a Ray actor."""
 
     def __init__(self) -> None:
         self._pool: Any = None
@@ -48,111 +68,159 @@ class Node:
     def start(self, message: bytes, workers: int, address: str) -> Answer:
         """Start the pool; return a :class:`NodeInfo`.
 
-        ``message`` is pickled: the type of the pool, the :class:`Start` of its envs, the most ticks of a request, and
-        the params of the canonical episode.
+        ``message`` is pickled: the type of the pool, the :class:`Start` of its envs, and the most ticks of a request.
         """
-        return _answer(lambda: Answer(self._start(pickle.loads(message), workers, address)))
+        pool_type, start, ticks = pickle.loads(message)
 
-    def _start(self, message: tuple[Any, Start, int, bp.PIDParams], workers: int, address: str) -> NodeInfo:
-        pool_type, start, ticks, canonical = message
-        # The caller replaces a node that has lost a worker: it keeps the requests to replay.
-        options = start.options.with_values(workers=workers, cluster=None, recover=False)
-        self._pool = pool_type(options, start.params, start.envs, ticks)
-        self._pool.open()
-        digest = self._run(ReadDigest(canonical)).result
-        pids = tuple(worker.pid for worker in self._pool.workers)
-        return NodeInfo(address, start.envs, os.getpid(), pids, _processor(), digest)
+        def open_pool() -> Answer:
+            options = start.options.with_values(workers=workers, cluster=None)
+            self._pool = pool_type(options, start.params, start.envs, ticks)
+            # The caller replaces a node that has lost a worker: it keeps the requests to replay.
+            self._pool.max_losses = 1
+            self._pool.open()
+            pids = tuple(worker.pid for worker in self._pool.workers)
+            return Answer(NodeInfo(address, start.envs, os.getpid(), pids))
+
+        return _answer(open_pool)
 
     def execute(self, request: Request) -> Answer:
         """Execute a request, which has the part of this node's envs."""
-        return _answer(lambda: self._run(request))
 
-    def beat(self) -> None:
-        """Answer, also during a request."""
+        def run() -> Answer:
+            outcome = self._pool.run(request)
+            self._pool.start_replay_from(None)
+            arrays = self._pool.arrays.at(slice(outcome.num_ticks)) if outcome.num_ticks else None
+            if outcome.failure is not None:
+                return Answer(None, outcome.failure.portable(), arrays)
+            return Answer(request.join(outcome.results), None, arrays)
 
-    def _run(self, request: Request) -> Answer:
-        outcome = self._pool.run(request)
-        if outcome.failure is not None:
-            return Answer(None, outcome.failure.portable(), self._pool.arrays.at(slice(outcome.num_ticks)))
-        arrays = self._pool.arrays.at(slice(outcome.num_ticks)) if outcome.num_ticks else None
-        return Answer(request.join(outcome.results), None, arrays)
+        return _answer(run)
 
 
 def _answer(act: Callable[[], Answer]) -> Answer:
     try:
         return act()
-    except WorkerLost as error:  # without the advice to turn recovery on
-        return Answer(None, Failure(0, 0, 0, WorkerLost(str(error.__cause__ or error))))
+    except WorkerLost as error:
+        return Answer(None, Failure(0, 0, 0, WorkerLost(str(error.__cause__))))
     except Exception as error:
         return Answer(None, failure_of(error).portable())
 
 
-def _processor() -> str:
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
+class Cluster:
+    """Machines of ``num_envs`` envs.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The cluster has no machine with enough CPUs.
+    MissingDependencyError
+        The package ``ray`` is missing.
+    """
+
+    def __init__(self, options: Ray, num_envs: int) -> None:
+        self.ray: Any = _connect(options)
+        """The module."""
+        self.options = options
+        machines = self._machines()[: options.nodes]
+        if not machines:
+            least = options.cpus_per_node or 1
+            remedy = "lower cpus_per_node, or add larger machines"
+            raise InvalidArgumentError("cluster", f"has no machine of {least} CPUs", remedy=remedy)
+        parts = split_in_shares(num_envs, [machine.workers for machine in machines])
+        used = [(envs, machine) for envs, machine in zip(parts, machines, strict=True) if envs.stop > envs.start]
+        self.slices = [envs for envs, _ in used]
+        """Envs of each node."""
+        self.widest = max(-(-(envs.stop - envs.start) // machine.workers) for envs, machine in used)
+        """Most envs of one worker."""
+        self.machines = [machine for _, machine in used]
+        """Machine of each node."""
+        self._losses: Counter[str] = Counter()
+
+    def replace(self, index: int) -> None:
+        """Choose another machine for a lost node, if there is one that has lost fewer. Raises WorkerError for none."""
+        self._losses[self.machines[index].node_id] += 1
+        nodes = Counter(machine.node_id for machine in self.machines)
+        candidates = self._machines()
+        if not candidates:
+            raise WorkerError(f"the cluster has no machine left for node {index}; restore a snapshot in a new Runner")
+        self.machines[index] = min(candidates, key=lambda one: (self._losses[one.node_id], nodes[one.node_id]))
+
+    def _machines(self) -> list[Machine]:
+        """Return the machines, those with most CPUs first."""
+        least, machines = self.options.cpus_per_node, []
+        for node in self.ray.nodes():
+            cpus = int(node["Resources"].get("CPU", 0))
+            if node["Alive"] and cpus >= (least or 1):
+                machines.append(Machine(node["NodeID"], node["NodeManagerAddress"], least or cpus))
+        return sorted(machines, key=lambda machine: (-machine.workers, machine.address, machine.node_id))
+
+
+def _connect(options: Ray) -> Any:
+    """Return the module ray, connected to the cluster."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # without it, a warning
+    try:
+        import ray
+    except ImportError:
+        raise MissingDependencyError("ray", "cluster='ray'", "ray") from None
+    if ray.is_initialized():
+        return ray
+    logging.getLogger("ray").setLevel(logging.ERROR)
+    address = options.address or os.environ.get("RAY_ADDRESS") or "auto"
+    try:
+        if address != "local":
+            ray.init(address, log_to_driver=False, configure_logging=False)
+    except ConnectionError:
+        if address != "auto":
+            raise
+    if not ray.is_initialized():
+        cpus = len(os.sched_getaffinity(0))
+        ray.init("local", num_cpus=cpus, include_dashboard=False, log_to_driver=False, configure_logging=False)
+    return ray
 
 
 class NodeWorker(Worker):
-    """Caller's end of a node. Ray is called in the background thread, where no signal interrupts it."""
+    """Caller's end of a node."""
 
-    def __init__(self, cluster: Cluster, start: Start, shared: SharedArrays, message: bytes | None = None) -> None:
-        self._cluster, self._index, self._envs = cluster, start.index, start.envs
-        self._start, self._shared = start, shared
-        self._arrays = Arrays.from_fields(shared.arrays)
+    def __init__(self, start: Start, shared: SharedArrays, cluster: Cluster, pool_type: Any) -> None:
+        super().__init__(start, shared)
+        self._cluster, self._arrays = cluster, Arrays.from_fields(shared.arrays)
         ticks = len(self._arrays.observation.ok)
-        whole = cluster.pool_type, start, ticks, cluster.canonical
-        self._message = pickled(whole, start.options) if message is None else message
-        self._bell = _Bell()
+        self._message = pickled((pool_type, start, ticks), start.options)
         self._actor: Any = None
-        self._call: Future[Answer] | None = None
-        self._beat: Future[None] | None = None
-        self._sent_at = self._heard_at = 0.0
-        self._is_replacement = self._has_beaten = False
-        self._ticks = 0  # of the current run
         self.info: NodeInfo | None = None
         """Known when the node has started."""
 
     def open(self) -> None:
-        self._machine, reserved = self._cluster.place(self._index)
-        self._is_replacement = not reserved
-        BACKGROUND.call(lambda: self._open(reserved))
-
-    def _open(self, reserved: int) -> None:
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        machine, options = self._machine, self._cluster.options
+        cpus = self._machine.workers
+        if self.info is not None:  # the CPUs are taken until the lost actor has ended
+            cpus, self.info = 0, None
+            self._cluster.replace(self._start.index)
         actor_type = self._cluster.ray.remote(Node).options(
-            num_cpus=reserved,
-            max_concurrency=2,  # one for the beats
-            scheduling_strategy=NodeAffinitySchedulingStrategy(machine.node_id, soft=False),
-            runtime_env=options.runtime_env,
+            num_cpus=cpus,
+            scheduling_strategy=NodeAffinitySchedulingStrategy(self._machine.node_id, soft=False),
+            runtime_env=self._cluster.options.runtime_env,
         )
         self._actor = actor_type.remote()
-        self._begin(self._actor.start.remote(self._message, machine.workers, machine.address))
-
-    def fileno(self) -> int:
-        return self._bell.fileno()
 
     def send(self, request: Request) -> None:
-        self._ticks = request.ticks if isinstance(request, Run) else 0
-        part = request.for_envs(self._envs)
-        BACKGROUND.call(lambda: self._begin(self._actor.execute.remote(part)))
-
-    def _begin(self, reference: Any) -> None:
-        self._sent_at = self._heard_at = time.monotonic()
-        self._beat, self._call, bell = None, reference.future(), self._bell
-        self._call.add_done_callback(lambda _: bell.ring())
+        self._limit = self.limit(request)
+        if isinstance(request, Build):
+            machine = self._machine
+            self._call = self._actor.start.remote(self._message, machine.workers, machine.address)
+        else:
+            self._call = self._actor.execute.remote(request.for_envs(self.envs))
 
     def receive(self) -> Any:
-        assert self._call is not None
-        self._bell.read(8)
-        seconds = time.monotonic() - self._sent_at
+        exceptions = self._cluster.ray.exceptions
         try:
-            answer = self._call.result()
-        except self._cluster.ray.exceptions.RayError as error:
-            raise self._lost(_cause(error)) from error
-        result, failure, arrays = answer
-        self._call = None
+            result, failure, arrays = self._cluster.ray.get(self._call, timeout=self._limit)
+        except exceptions.GetTimeoutError as error:
+            raise self._lost("is stuck: no answer in time") from error
+        except exceptions.RayError as error:
+            raise self._lost(f"died ({type(error).__name__}: {error})") from error
         if failure is not None and isinstance(failure.error, WorkerLost):
             raise self._lost(f"lost a worker: {failure.error}")
         if arrays is not None:
@@ -161,77 +229,21 @@ class NodeWorker(Worker):
                 tables: Any = zip(ours, theirs, strict=True)
                 for table, rows in tables:
                     if table is not None:
-                        table[:tick, self._envs] = rows
+                        table[:tick, self.envs] = rows
         if failure is not None:
-            return failure.of_worker(self._name)
-        if self.info is None:
-            return self._join(result)
-        if self._ticks and self._index == 0:
-            self._cluster.note_time(seconds, result)
+            return failure.of_worker(f"node {self.label}")
+        if isinstance(result, NodeInfo):
+            self.info = result
         return result
 
-    def _join(self, info: NodeInfo) -> None:
-        try:
-            self._cluster.admit(info, self._machine)
-        except InvalidArgumentError as error:
-            if self._is_replacement:
-                raise self._lost(str(error)) from error  # another machine may do
-            raise
-        self.info = info
-
-    def check_alive(self, idle_limit: float, limit: float) -> None:
-        now = time.monotonic()
-        if self._beat is not None and self._beat.done() and self._beat.exception() is None:
-            self._beat, self._heard_at, self._has_beaten = None, now, True
-        silence = now - self._heard_at
-        if self._beat is None and silence > _BEAT_INTERVAL:
-            self._beat = BACKGROUND.call(lambda: self._actor.beat.remote().future())
-        if silence > (SILENCE_LIMIT if self._has_beaten else START_LIMIT):
-            asleep = f"has not answered for {silence:.0f} s"
-            raise self._lost(asleep if self._has_beaten else "has not started; are its CPUs taken?")
-        if now - self._sent_at > limit:
-            raise self._lost(f"is stuck: no answer within {limit:.0f} s; raise timeout= if that was too short")
-
-    def close(self, patience: float) -> None:
-        if not sys.is_finalizing():
-            BACKGROUND.put(Job(self._kill))  # after the call that opened it, which may have been interrupted
-
-    def successor(self) -> Self:
-        return type(self)(self._cluster, self._start, self._shared, self._message)
-
-    def _kill(self) -> None:
+    def close(self) -> None:
         actor, self._actor = self._actor, None
         if actor is not None and self._cluster.ray.is_initialized():
             self._cluster.ray.kill(actor)
 
     @property
-    def _name(self) -> str:
-        return f"node {self._index} ({self._machine.address}, envs {self._envs.start} to {self._envs.stop - 1})"
+    def _machine(self) -> Machine:
+        return self._cluster.machines[self._start.index]
 
     def _lost(self, cause: str) -> WorkerLost:
-        if self.info is None:
-            self._cluster.note_failure(self._machine)
-        return WorkerLost(f"{self._name} {cause}")
-
-
-class _Bell(io.FileIO):
-    """Event descriptor, readable after :meth:`ring`; closed with its last reference."""
-
-    def __init__(self) -> None:
-        with standard_streams_occupied():
-            super().__init__(os.eventfd(0, os.EFD_CLOEXEC), "r+")
-
-    def ring(self) -> None:
-        """Make the descriptor readable; called by a thread of Ray."""
-        os.eventfd_write(self.fileno(), 1)
-
-    def __del__(self) -> None:
-        self.close()  # without the ResourceWarning of its base
-
-
-def _cause(error: Exception) -> str:
-    """Return what Ray says about a lost actor, in one line."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    telling = ("The actor died because", "ModuleNotFoundError", "ImportError")
-    known = [line for line in lines if line.startswith(telling)]
-    return f"died ({type(error).__name__}: {(known or lines or [''])[0]})"
+        return WorkerLost(f"node {self.label} on {self._machine.address} {cause}")

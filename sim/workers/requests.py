@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import pickle
-import struct
 from abc import ABC, abstractmethod
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
@@ -17,34 +15,26 @@ from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Rows
-from batchpid.io.versions import package_versions
 from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.loop import Loop
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot
-from batchpid.sim.observation import OBSERVED
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
-
-_RUN = struct.Struct(f"<cII{len(Command._fields)}?")  # b"R", ticks, substeps, Command.given
-_TICKS, _SUBSTEPS, _STEP = 5, 20, 0.1
-"""Canonical episode: ticks, sim steps in each, and its setpoint [rad, m, N m or N], small enough for any robot."""
 
 
 class Request(ABC):
     """Base of all requests, which are frozen dataclasses."""
 
-    idle_limit = 10.0
-    """Seconds for which a worker may be asleep meanwhile: ``build`` may wait for something."""
     changes_loop = True
     """True if the replacement of a lost worker repeats the request, and an error in it closes the pool."""
     ticks = 0
     """Ticks of the arrays that hold observations afterwards; 0: the observation does not change."""
+    substeps = 10
+    """Sim steps of each tick, or those that take about as long as the request."""
+    patience = 0.0
+    """Further time that the request may take [s]."""
     counts_ticks = False
     """True if the ticks that every env completed before an error are kept."""
-
-    def limit(self, num_envs: int) -> float:
-        """Return an upper bound of the request's time for ``num_envs`` envs [s]."""
-        return 1e-2 * num_envs
 
     def for_envs(self, envs: slice) -> Self:
         """Return the part of some envs, of fields that are arrays (envs, ...) or have such a method."""
@@ -64,7 +54,7 @@ class Request(ABC):
         """Write the rows of some envs to the shared arrays (ticks, envs, ...)."""
 
     def encode(self, envs: slice) -> bytes:
-        """Return the message from which :func:`decode` makes the part of some envs in their worker."""
+        """Return the message for a worker, pickled: the part of its envs."""
         return pickle.dumps(self.for_envs(envs))
 
     @abstractmethod
@@ -76,42 +66,34 @@ class Request(ABC):
         return None
 
 
-def decode(message: bytes) -> Request:
-    """Return the request of a message from :meth:`Request.encode`."""
-    if message[:1] == b"R":
-        _, ticks, substeps, *given = _RUN.unpack(message)
-        return Run(ticks, substeps, given=tuple(given))
-    request: Request = pickle.loads(message)
-    return request
-
-
 @dataclass(frozen=True)
-class Start(Request):
-    """Build the loop of ``envs``; a new worker does it before any other request, without being sent it."""
+class Start:
+    """All that the loop of one worker is built from."""
 
     index: int
     """Of the worker."""
     envs: slice
+    """Rows in the arrays of the pool."""
     options: RunnerOptions
     params: bp.PIDParams
     """Of these envs."""
     first_env: int = 0
     """Number of the pool's first env within the runner; each node of a cluster has a pool for some of the envs."""
 
-    @property
-    def numbers(self) -> slice:
-        """Rows of ``envs`` in the runner."""
-        return slice(self.first_env + self.envs.start, self.first_env + self.envs.stop)
+    def build(self, arrays: Arrays) -> Loop:
+        """Return the loop, with the shared arrays (ticks, envs, ...) of the pool's envs."""
+        envs = slice(self.first_env + self.envs.start, self.first_env + self.envs.stop)
+        return Loop(self.options, self.params, envs, arrays.at((slice(None), self.envs)))
 
-    def limit(self, num_envs: int) -> float:
-        return 60.0 + super().limit(num_envs)  # mostly imports, from a disk that may be slow
+
+@dataclass(frozen=True)
+class Build(Request):
+    """Build the loop; each worker has the :class:`Start` of its loop."""
+
+    patience = 60.0  # mostly imports, from a disk that may be slow
 
     def apply(self, loop: Loop) -> None:
         pass
-
-    def build(self, arrays: Arrays) -> Loop:
-        """Return the loop, with the shared arrays (ticks, envs, ...) of the pool's envs."""
-        return Loop(self.options, self.params, self.numbers, arrays.at((slice(None), self.envs)))
 
 
 @dataclass(frozen=True)
@@ -136,13 +118,7 @@ class Run(Request):
     ticks: int = field()
     substeps: int = field()
     command: Command = Command(None)  # noqa: RUF009  (immutable)
-    given: tuple[bool, ...] | None = None
-    """Which arrays of the command are used. None in the calling process, where ``command`` shows it; see ``encode``."""
     counts_ticks = True
-    idle_limit = 0.7  # it only computes
-
-    def limit(self, num_envs: int) -> float:
-        return 1e-3 * self.ticks * self.substeps * num_envs  # a sim step of an env takes about 20 us
 
     def for_envs(self, envs: slice) -> Self:
         return replace(self, command=self.command.map(itemgetter((slice(None), envs))))
@@ -153,10 +129,11 @@ class Run(Request):
                 table[: self.ticks, envs] = rows[:, envs]
 
     def encode(self, envs: slice) -> bytes:
-        return _RUN.pack(b"R", self.ticks, self.substeps, *map(is_not, self.command, repeat(None)))
+        given = tuple(map(is_not, self.command, repeat(None)))  # Command.given, without one more call in a tick
+        return pickle.dumps((self.ticks, self.substeps, given))
 
     def apply(self, loop: Loop) -> float:
-        return loop.run(self.ticks, self.substeps, self.command.given if self.given is None else self.given)
+        return loop.run(self.ticks, self.substeps, self.command.given)
 
     def join(self, results: list[float]) -> float:
         return max(results)
@@ -236,47 +213,3 @@ class ReadPoses(Request):
 
     def join(self, results: list[list[Rows]]) -> list[Rows]:
         return [rows for poses in results for rows in poses]
-
-
-@dataclass(frozen=True)
-class ReadDigest(Request):
-    """Run the canonical episode, under ``params`` of one env, and read its digest."""
-
-    params: bp.PIDParams
-    changes_loop = False
-
-    def for_envs(self, envs: slice) -> Self:
-        return self
-
-    def apply(self, loop: Loop) -> str:
-        return canonical_digest(loop.options, self.params)
-
-    def join(self, results: list[str]) -> str:
-        return " ".join(sorted(set(results)))
-
-
-def canonical_digest(options: RunnerOptions, params: bp.PIDParams) -> str:
-    """Return a digest of batchpid's version and of every bit of an episode of one robot, without the user's content.
-
-    Digests are equal on machines that round in the same way. ``params`` are of one env. The episode runs the law, the
-    physics and the robot that the runner with ``options`` runs, with the instructions that NumPy, OpenBLAS and XLA
-    choose on this machine.
-    """
-    robot = options.robot
-    options = replace(options, num_envs=1, build=None, randomization=None, actuators=None)
-    layout = Arrays.layout(_TICKS, 1, robot.dof, options.command.size)
-    fields = {name: np.zeros(shape, dtype) for name, (shape, dtype) in layout.items()}
-    arrays = Arrays.from_fields(fields)
-    start = robot.start[None]
-    neutral = np.asarray(options.command.neutral)
-    arrays.command.setpoint[:] = robot.coupled(start + _STEP) if options.sets_positions else neutral + _STEP
-    loop = Loop(options, params, slice(0, 1), arrays)
-    try:
-        loop.reset(np.ones(1, bool), start, np.zeros_like(start))
-        loop.run(_TICKS, _SUBSTEPS, Command(arrays.command.setpoint).given)
-    finally:
-        loop.close()
-    digest = hashlib.sha256(str(package_versions(("batchpid",)).get("batchpid")).encode())
-    for name in OBSERVED:
-        digest.update(getattr(arrays.observation, name).tobytes())
-    return digest.hexdigest()

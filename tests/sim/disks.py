@@ -1,4 +1,4 @@
-"""Small, full and read-only disks of tests."""
+"""Small disks of tests."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import resource
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -23,18 +23,6 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
         yield folder
     finally:
         subprocess.run(["umount", str(folder)], check=True)
-
-
-def fill(folder: Path) -> None:
-    """Fill the disk that is mounted at ``folder``."""
-    with suppress(OSError), (folder / "filler").open("ab", buffering=0) as file:
-        while True:
-            file.write(bytes(1 << 16))
-
-
-def make_read_only(folder: Path) -> None:
-    """Make the disk that is mounted at ``folder`` read-only."""
-    subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
 
 
 @contextmanager

@@ -9,17 +9,8 @@ from collections.abc import Iterable
 
 import psutil
 
-from batchpid.sim.processes.fork_server import server_pid
-
 PATIENCE = 200.0
 """Timeout [s] of events that should happen soon; long enough for a busy machine."""
-
-
-def children() -> set[psutil.Process]:
-    """Return the children of this process and of its fork server; libraries of other tests may have some that stay."""
-    server = server_pid()
-    direct = {child for child in psutil.Process().children() if child.pid != server}
-    return direct if server is None else direct | set(psutil.Process(server).children())
 
 
 def send(pid: int, number: int) -> None:
@@ -36,11 +27,6 @@ def have_ended(pids: Iterable[int], seconds: float = PATIENCE) -> bool:
             return True
         time.sleep(0.02)
     return False
-
-
-def shared_memory() -> set[str]:
-    """Return the names of the files in shared memory; semaphores are of libraries in other tests."""
-    return {name for name in os.listdir("/dev/shm") if not name.startswith("sem.")}
 
 
 def _runs(pid: int) -> bool:

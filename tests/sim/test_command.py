@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -285,27 +284,13 @@ def rollout(arm):
         return runner.rollout(setpoints)
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".h5"])
-def test_recordings_hold_names_and_units(arm, rollout, suffix, tmp_path):
-    if suffix == ".h5":
-        pytest.importorskip("h5py")
-    read = read_recording(write_recording(rollout, tmp_path / f"run{suffix}"))
+def test_recordings_hold_names_and_units(rollout, tmp_path):
+    read = read_recording(write_recording(rollout, tmp_path / "run.h5"))
     assert_identical(read, rollout)
     assert read.info.command == rollout.info.command == CommandSpec(("x", "z", "gain <b>"), ("m", "m", ""))
     assert read.setpoint.shape == (12, N, 3)
     assert not read.info.sets_positions
     assert read.for_envs([1, 2]).setpoint.shape == (12, 2, 3)
-
-
-def test_a_labelled_dataset_has_entries(rollout):
-    pytest.importorskip("xarray")
-    from batchpid.sim.recording import to_dataset
-
-    data = to_dataset(rollout)
-    assert data.setpoint.dims == ("time", "env", "entry")
-    assert data.setpoint.sel(entry="z").shape == (12, N)
-    assert data.entry_unit.values.tolist() == ["m", "m", ""]
-    assert data.qpos.dims == ("time", "env", "joint")
 
 
 @pytest.mark.slow
@@ -321,31 +306,18 @@ def test_plots_draw_entries_in_axes_of_their_own(rollout, tmp_path):
         assert [axes.get_title(loc="left") for axes in other.axes if axes.get_title(loc="left")] == titles[:2]
 
 
-def test_a_recording_plays_back_with_numbers_by_name(arm, rollout):
+def test_a_recording_plays_back(arm, rollout):
     pytest.importorskip("viser")
     from batchpid.sim.view import Playback, View
 
     playback = Playback(rollout, arm)
-    view = View(playback, port=18090)
-    try:
-        shown = []
-        assert view.panel._entries is not None
-        view.panel._entries = SimpleNamespace(content="")
-        for _ in range(3):
-            playback.advance()
-            view._show(playback.frame(), 0)
-            shown.append(view.panel._entries.content)
-        numbers = playback.frame().setpoint[0, 0]
-        assert f"x {numbers[0]:.4g} m, z {numbers[1]:.4g} m, gain &lt;b&gt; {numbers[2]:.4g}<" in shown[-1]
-        assert not view.panel._show_setpoint.handle.visible
-        assert not view._charts._error.visible
-        assert not any(node.visible for node in view._scene._setpoints)
-    finally:
-        view.close()
+    with View(playback, port=18090) as view:
+        view.run(seconds=0.2)
+    assert playback.frame().time[0] > 0
 
 
 def test_identification_and_metrics_refuse_such_runs(arm, rollout):
-    path = write_recording(rollout, "run.npz")
+    path = write_recording(rollout, "run.h5")
     for call in (lambda: step_response_metrics(arm, rollout, np.zeros((N, 2))), lambda: identify(arm, [path])):
         with pytest.raises(InvalidArgumentError, match="not of joints"):
             call()

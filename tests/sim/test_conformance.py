@@ -25,6 +25,7 @@ from option_values import ARM, MOTORS, box
 from robots import load_bundled
 
 import batchpid as bp
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim import LogUniform, Normal, Randomization, Robot, Runner, RunnerKeywords, Snapshot, Uniform
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
 
@@ -59,7 +60,7 @@ class Feature(NamedTuple):
     engines: tuple[str, ...] = ENGINES
     accelerations: bool = False
     repeats: bool = True
-    """Whether a second episode is bit-identical: not with noise, nor with checkpoints at other ticks of the episode."""
+    """Whether a second episode is bit-identical: not with noise."""
     exact: bool = False
     """Whether results are bit-identical with and without native code, instead of close."""
     alike: bool = True
@@ -106,7 +107,6 @@ FEATURES: dict[str, Feature] = {
     "drive with an integral": Feature({"control": "drive"}, EFFORTS, exact=True),
     "efforts": Feature({"control": "effort"}, exact=True),
     "osc": Feature({"control": "osc"}),
-    "setpoints of a tool": Feature({"setpoint_space": "tool", "tool": "hand"}),
     "own controller": Feature({"control": Damped()}, exact=True),
     "guard": Feature({"guard": GUARD}),
     "guarded drive": Feature({"control": "drive", "guard": GUARD}, exact=True),
@@ -122,7 +122,6 @@ FEATURES: dict[str, Feature] = {
     "compensation of gravity alone": Feature({"compensate": "gravity"}),
     "no compensation": Feature({"compensate": "none", "physics": "fast"}),
     "no collisions": Feature({"collisions": False, "ground": False}),
-    "checkpoints": Feature({"checkpoint_steps": 25}, repeats=False),
     "a reset at a fault": Feature({"on_fault": "reset", "speed_limit": 2.0}),
     "contact sensors": Feature({"contacts": ["hand"], "wrenches": ["arm"]}),
     "user content": Feature({"build": functools.partial(box, 0.05)}, engines=SAPIEN),
@@ -379,7 +378,13 @@ def in_workers(case: tuple[str, str]) -> None:
 
 
 def in_xla(case: tuple[str, str]) -> None:
-    """The law in XLA is close to NumPy, and bit-identical in a worker."""
+    """The law in XLA is close to NumPy, and bit-identical in a worker; a feature that it lacks is refused."""
+    try:
+        make(case, backend="jax").close()
+    except InvalidArgumentError as error:
+        if "which the program of backend 'jax' does not have" not in str(error):
+            raise
+        return
     check_close(reference(case, "jax"), reference(case), 1e-5)
     with make(case, workers=1, backend="jax") as runner:
         check_equal(program(runner, case), reference(case, "jax"))
@@ -423,11 +428,9 @@ def test_every_option_has_a_row() -> None:
         "first_env",
         "workers",
         "cluster",
-        "recover",
         "timeout",
         "engine",
         "backend",
-        "dtype",
         "params",
     }
     of_programs = {"timestep", "substeps", "on_invalid_input"}

@@ -37,7 +37,6 @@ def test_a_runner(hinge, workers):
 
 
 def test_a_recorder(hinge, tmp_path):
-    pytest.importorskip("h5py")
     with Runner(hinge, 1, workers=0) as runner, Recorder(tmp_path / "run.h5", runner) as recorder:
         refuses(recorder, "another Recorder")
         runner.step([0.1])

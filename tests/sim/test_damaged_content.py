@@ -25,9 +25,9 @@ from option_values import ARM, MOTORS
 import batchpid as bp
 import batchpid.task_space as ts
 from batchpid.errors import BatchPIDError
-from batchpid.sim import Robot, Runner, Snapshot, read_recording, write_recording
+from batchpid.sim import Robot, Runner, Snapshot
 from batchpid.sim.identification import read_logs
-from batchpid.sim.identification.setpoint_files import read_setpoints
+from batchpid.sim.setpoint_files import read_setpoints
 from batchpid.sim.tuning import load_randomization, random_moves
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of unusual values
@@ -56,21 +56,11 @@ def write_table(path: Path, quantity: str = "qpos") -> None:
     np.savetxt(path, table, "%.6g", ",", header=",".join(names), comments="")
 
 
-def write_runs(path: Path) -> None:
-    """Write a YAML file that lists logs, and the log."""
-    write_table(path.with_name("log.csv"))
-    entries = [{"log": "log.csv", "payload": 0.5, "sign": {JOINTS[0]: -1}}, {"log": "log.csv", "held_out": True}]
-    path.write_text(yaml.safe_dump({"gains": "designed", "logs": entries}))
-
-
 def write_run(path: Path) -> None:
-    """Write a recording or a snapshot of two arms."""
+    """Write a snapshot of two arms."""
     with Runner(ARM, 2, params=PARAMS, **SHORT) as runner:
-        rollout = runner.rollout(np.tile(ARM.start + 0.1, (3, 1)))
-        if path.stem == "recording":
-            write_recording(rollout, path)
-        else:
-            runner.snapshot().save(path)
+        runner.rollout(np.tile(ARM.start + 0.1, (3, 1)))
+        runner.snapshot().save(path)
 
 
 MOVES = random_moves(ARM, 1, 0)
@@ -84,14 +74,11 @@ KINDS = {
     "drawn.yaml": Kind(
         lambda path: path.write_text(yaml.safe_dump(DRAWN)), lambda path: load_randomization(path, ARM).to_dict()
     ),
-    "runs.yaml": Kind(write_runs, lambda path: read_logs(ARM, [path])),
     "log.csv": Kind(write_table, lambda path: read_logs(ARM, [path])),
     "motion.csv": Kind(
         lambda path: write_table(path, "setpoint_rate"), lambda path: read_setpoints(ARM, path, timestep=1e-3)
     ),
     "snapshot.npz": Kind(write_run, Snapshot.load),
-    "recording.npz": Kind(write_run, read_recording),
-    "recording.h5": Kind(write_run, read_recording),
 }
 
 
@@ -213,10 +200,9 @@ def changed_tree(draw: st.DrawFn, tree: Any, leaves: list) -> Any:
 
 
 @pytest.fixture
-def good(request, tmp_path, monkeypatch):
+def good(request, tmp_path):
     """Kind, path, content and value of a good file."""
     kind, path = KINDS[request.param], tmp_path / request.param
-    monkeypatch.setattr("batchpid.sim.recording.recording_files.CHUNK_BYTES", 256)
     kind.write(path)
     return kind, path, path.read_bytes(), plain(kind.read(path))
 
@@ -224,7 +210,7 @@ def good(request, tmp_path, monkeypatch):
 def check(good, content: bytes) -> None:
     """Check that a file with ``content`` is refused with its name in the error, or read with the right value."""
     kind, path, original, value = good
-    is_binary = path.suffix in (".npz", ".h5")
+    is_binary = path.suffix == ".npz"
     path.write_bytes(content)
     try:
         here, there = (plain(decoded(path.suffix, each)) for each in (content, original))
@@ -244,7 +230,7 @@ def check(good, content: bytes) -> None:
         path.write_bytes(original)
 
 
-of_all_kinds = pytest.mark.parametrize("good", [name for name in KINDS if name != "recording.h5"], indirect=True)
+of_all_kinds = pytest.mark.parametrize("good", list(KINDS), indirect=True)
 EXAMPLES = {
     "derandomize": True,
     "phases": [Phase.generate],
@@ -257,14 +243,6 @@ EXAMPLES = {
 @settings(max_examples=25, **EXAMPLES)
 @given(st.data())
 def test_bytes(good, data):
-    check(good, data.draw(changed_bytes(good[2])))
-
-
-@pytest.mark.parametrize("good", ["recording.h5"], indirect=True)
-@settings(max_examples=6, **EXAMPLES)
-@given(st.data())
-def test_bytes_of_hdf5(good, data):
-    """Few examples: each file is read in a new process."""
     check(good, data.draw(changed_bytes(good[2])))
 
 

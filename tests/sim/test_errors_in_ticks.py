@@ -50,11 +50,11 @@ class ListRecorder:
     def __init__(self):
         self.rows = []
 
-    def wait(self):
+    def prepare(self):
         pass
 
-    def append(self, time_, setpoint, observation, has_rates):
-        self.rows.append((time_, setpoint, observation))
+    def append(self, time_, command, observation):
+        self.rows.append((time_, command.setpoint, observation))
 
 
 def run(runner, way):

@@ -1,4 +1,4 @@
-"""Each feature of a robot with each control, command space and engine: it reaches its goal, or is refused by name."""
+"""Each feature of a robot with each control and engine: it reaches its goal, or is refused by name."""
 
 from __future__ import annotations
 
@@ -24,24 +24,18 @@ from batchpid.trajectories import minimum_jerk
 from tests.c_programs import COMPILERS, TABLE, compiled
 
 PAIRS = [pair for pair in itertools.combinations(FEATURES, 2) if not joints_of(pair[0]) & joints_of(pair[1])]
-CONTROLS = [("pid", "joints"), ("pid", "tool"), ("drive", "joints"), ("drive", "tool"), ("osc", "joints")]
-REFUSED = {
-    "floating base": {("pid", "tool"), ("drive", "tool"), ("osc", "joints")},
-    "mimic of a continuous joint": {("pid", "tool"), ("drive", "tool")},
-    "sliding mimic of a continuous joint": {("pid", "tool"), ("drive", "tool")},
-}
+CONTROLS = ["pid", "drive", "osc"]
+REFUSED = {"floating base": {"osc"}}
 """Controls that refuse a feature; all others have to reach their goal."""
 
 
-def reach(robot: Robot, control: str, space: str, engine: str) -> None:
+def reach(robot: Robot, control: str, engine: str) -> None:
     """Assert that the robot reaches its goal, within a turn of each continuous joint."""
     start, goal = poses(robot)
     options: dict = {"control": control}
     if control == "osc":
         options = {"control": OperationalSpace(robot, "l8", posture=goal)}
-    elif space == "tool":
-        options |= {"setpoint_space": "tool", "tool": "l8"}
-    with_pose = control == "osc" or space == "tool"
+    with_pose = control == "osc"
     setpoint = ts.link_poses(robot.kinematic_tree(), goal, ["l8"])[0] if with_pose else goal
     with Runner(robot, 1, workers=0, engine=engine, ground=False, **options) as runner:
         runner.reset(start)
@@ -64,10 +58,10 @@ def reach(robot: Robot, control: str, space: str, engine: str) -> None:
     np.testing.assert_allclose(last[still], robot.coupling.positions(last)[still], atol=1e-4)
 
 
-def check(features: tuple[str, ...], command: tuple[str, str], engine: str) -> None:
+def check(features: tuple[str, ...], command: str, engine: str) -> None:
     refuses = any(command in REFUSED.get(feature, ()) for feature in features)
     try:
-        reach(robot_with(*features), *command, engine)
+        reach(robot_with(*features), command, engine)
     except BatchPIDError:
         if not refuses:
             raise
@@ -180,9 +174,9 @@ def test_every_feature_is_identified_or_refused(feature, tmp_path):
         runner.reset(start)
         run = runner.rollout(robot.coupled(start + swing)[:, None])
     assert run.ok.all()
-    path = write_recording(run, tmp_path / "run.npz")
+    path = write_recording(run, tmp_path / "run.h5")
     try:
-        found = identify(robot, [path], params=params, evaluations=6, workers=0)
+        found = identify(robot, [path], params=params, evaluations=6)
     except BatchPIDError:
         if feature != "floating base":
             raise

@@ -166,8 +166,6 @@ GOOD_RUNNER = {
     "speed_limit": 100.0,
     "randomization": Randomization(payload=Uniform(0, 1)),
     "on_invalid_input": "raise",
-    "recover": True,
-    "checkpoint_steps": 100,
     "timeout": 10.0,
 }
 STEP = {"setpoint": ARRAY, "setpoint_rate": ARRAY, "feedforward": ARRAY}

@@ -72,14 +72,14 @@ def test_of_a_runner(hand):
 
 def test_writes_to_a_snapshot_do_not_reach_the_runner(panda):
     def run(write):
-        options = {"randomization": Randomization(payload=Uniform(0, 1)), "setpoint_space": "tool"}
+        options = {"randomization": Randomization(payload=Uniform(0, 1))}
         with Runner(panda, 1, workers=0, **options) as runner:
             runner.reset(panda.settings.target)
             taken, restored = runner.snapshot(), runner.snapshot()
             runner.restore(restored)
             if write:
-                taken.episodes[:], restored.targets[:] = 7, panda.start + 0.2
-            after = runner.step(runner.observe().tool_pose)
+                taken.episodes[:] = 7
+            after = runner.step(panda.settings.target)
             return after.qpos, runner.reset() and runner.draws["payload"]
 
     for mine, other in zip(run(write=True), run(write=False), strict=True):

@@ -1,10 +1,9 @@
-"""Ctrl-C at any moment leaves runner, recording and snapshots as before a call, or as after it; twice it ends them."""
+"""Ctrl-C waits for the request in progress; a second one ends it and closes the runner."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import random
 import signal
 import threading
 
@@ -12,54 +11,14 @@ import numpy as np
 import pytest
 from identical import assert_identical
 from processes import have_ended
-from twin import ROBOT, SUBSTEPS, CtrlC, N, Twin, nothing_left
+from robots import load_bundled
 
 from batchpid.errors import ClosedError
 from batchpid.sim import Recorder, Robot, Runner, read_recording
 
-INTERRUPTS = int(os.environ.get("BATCHPID_SOAK_INTERRUPTS", "100"))
+ROBOT = load_bundled("panda")
+N, SUBSTEPS = 2, 5
 NEAR = 0.9 * ROBOT.start + 0.1 * ROBOT.settings.target
-SETPOINTS = np.tile(ROBOT.settings.target, (12, 1))
-FIRST = np.arange(N) == 0
-NAMES = ("step", "exchange", "rollout", "set_params", "reset", "snapshot", "restore", "record", "reopen", "construct")
-
-
-def call(twin, name, disturb):
-    """Execute one command on ``twin``."""
-    arguments = {
-        "step": (SETPOINTS[0],),
-        "exchange": (SETPOINTS[0],),
-        "rollout": (SETPOINTS,),
-        "set_params": (ROBOT.params(kp=25.0 + twin.runner.time),),
-        "reset": (NEAR, FIRST),
-    }
-    if name == "restore":
-        if not twin.snapshots:
-            twin.snapshot()
-        twin.step(SETPOINTS[0])
-        arguments[name] = (twin.snapshots[-1],)
-    getattr(twin, name)(*arguments.get(name, ()), disturb)
-
-
-def interrupt_at_random(count, workers, folder):
-    chance, ctrl_c = random.Random(count), CtrlC()
-    with nothing_left():
-        twin = Twin(folder, workers)
-        for number in range(count):
-            name = NAMES[number % len(NAMES)]
-            call(twin, name, ctrl_c.after(chance.uniform(0, 0.3 if name == "reopen" and workers else 4e-3 * SUBSTEPS)))
-        twin.close()
-    return ctrl_c.happened
-
-
-def test_ctrl_c_at_some_moments(tmp_path):
-    assert interrupt_at_random(len(NAMES), 1, tmp_path) == len(NAMES)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("workers", [0, 2])
-def test_ctrl_c_at_random_moments(workers, tmp_path):
-    assert interrupt_at_random(INTERRUPTS, workers, tmp_path) == INTERRUPTS
 
 
 class SignalsAt:

@@ -7,7 +7,8 @@ import pytest
 from identical import assert_identical
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Robot, Rollout, RunInfo, Runner
+from batchpid.sim import Fault, Robot, Rollout, RunInfo, Runner
+from batchpid.sim.observation import RULES, Redraw
 
 
 @pytest.fixture(scope="module")
@@ -52,12 +53,6 @@ def test_unknown_fields_are_named(rollout):
         _ = rollout.speed
 
 
-GATHERED = {"rates", "faults", "redraws", "complete"}
-"""Fields of RunInfo that all parts of a run contribute to."""
-OF_THE_START = {"params", "actuators", "start", "seed", "versions", "begun", "draws", "episodes", "description"}
-"""Fields that the joined rollout has from its first part. All others are the same in all parts."""
-
-
 def another(value):
     """Return a value of the same kind that is different."""
     if isinstance(value, bool) or value is None:
@@ -75,30 +70,59 @@ def another(value):
     return f"{value}+" if isinstance(value, str) else value + 1
 
 
-@pytest.mark.parametrize("name", [each.name for each in dataclasses.fields(RunInfo)])
+def test_every_field_has_a_rule():
+    assert RULES.keys() == {field.name for field in dataclasses.fields(RunInfo)}
+
+
+@pytest.mark.parametrize("name", RULES)
 def test_every_field_of_a_rollout_is_joined_or_has_to_be_the_same(name, rollout):
-    """The start, its draws and the origin are the first part's."""
+    """State and origin are the first part's."""
     parts = [rollout.for_ticks(slice(0, 2)), rollout.for_ticks(slice(2, None))]
     changed = dataclasses.replace(parts[1].info, **{name: another(getattr(parts[1].info, name))})
     parts[1] = dataclasses.replace(parts[1], info=changed)
-    if name not in GATHERED | OF_THE_START:
+    if RULES[name].join is None:
         with pytest.raises(InvalidArgumentError, match=f"parts: .*{name}"):
             Rollout.join(parts)
         return
     joined = getattr(Rollout.join(parts).info, name)
-    kept = getattr(changed if name in GATHERED else parts[0].info, name)
-    assert joined is kept or np.array_equal(joined, kept)
+    expected = getattr(changed if name in ("rates", "faults", "redraws", "complete") else parts[0].info, name)
+    assert joined is expected or np.array_equal(joined, expected)
 
 
-def test_redraws_and_faults_of_all_parts_are_joined(rollout):
-    redraws = [(0.1, 0, 0, 1), (0.2, 1, 1, 1), (0.3, 2, 2, 1)]
-    known = [(redraws[:1], ("a",)), (redraws[:2], ("a",)), (redraws[2:], ("a", "b"))]
-    parts = [
-        dataclasses.replace(rollout, info=dataclasses.replace(rollout.info, redraws=tuple(seen), faults=faults))
-        for seen, faults in known
-    ]
-    info = Rollout.join(parts).info
-    assert (info.redraws, info.faults, info.complete) == (tuple(redraws), ("a", "b"), True)
+def with_events(rollout):
+    """Return a rollout of 3 envs with a fault in each of the first two ticks, and a redraw in the second and third."""
+    time, tick = rollout.time, rollout.tick
+    faults = tuple([Fault(env, 2, time[env], "panda_joint1", "setpoint", "hold") for env in (0, 1)])
+    redraws = (Redraw(time[1], 2, 2, 1), Redraw(time[2], 1, 1, 1))
+    episodes = np.array([[0, 0], [1, 0], [2, 0]])
+    info = dataclasses.replace(rollout.info, faults=faults, redraws=redraws, draws={}, episodes=episodes)
+    return dataclasses.replace(rollout, info=info, feedforward=np.full(rollout.qpos.shape, tick))
+
+
+def test_events_of_some_envs_have_their_new_numbers(rollout):
+    rollout = with_events(rollout)
+    part = rollout.for_envs([2, 1])
+    assert [fault.env for fault in part.info.faults] == [1]
+    assert [redraw.env for redraw in part.info.redraws] == [0, 1]
+    assert part.feedforward.shape == part.qpos.shape
+    assert rollout.for_envs(slice(0, 1)).info.redraws == ()
+    assert [fault.env for fault in rollout.for_envs(np.array([False, True, True])).info.faults] == [0]
+
+
+def test_some_ticks_begin_where_those_before_have_ended(rollout):
+    rollout = with_events(rollout)
+    first, second = rollout.for_ticks(slice(0, 2)), rollout.for_ticks(slice(2, None))
+    np.testing.assert_array_equal(first.info.start, rollout.info.start)
+    np.testing.assert_array_equal(second.info.start, rollout.qpos[1])
+    assert first.info.draws == {}
+    assert second.info.draws is None
+    assert second.info.episodes.tolist() == [[0, 0], [1, 0], [2, 1]]
+    assert [redraw.env for redraw in second.info.redraws] == [1]
+    assert rollout.for_ticks(slice(0, 1)).info.faults == rollout.info.faults[:1]
+    whole = Rollout.join([first, second])
+    assert_identical(whole, rollout)
+    np.testing.assert_array_equal(whole.feedforward, rollout.feedforward)
+    assert (whole.info.redraws, whole.info.faults) == (rollout.info.redraws, rollout.info.faults)
 
 
 def test_parts_with_other_ticks_or_envs_are_refused(rollout):

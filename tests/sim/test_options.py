@@ -62,7 +62,7 @@ def test_every_option_is_documented_where_it_is_declared():
 def test_commands_and_recordings_take_switches_from_their_declaration():
     """A new switch changes its declaration and the code where it acts, and no other module."""
     switches = [each.name for each in fields(RunnerKeywords) if isinstance(each.default, bool)]
-    assert {"collisions", "recover"} <= {*switches}
+    assert "collisions" in switches
     root = Path(inspect.getfile(RunnerKeywords)).parent
     texts = {path.name: path.read_text() for folder in ("cli", "recording") for path in (root / folder).glob("*.py")}
     assert {"rollout.py", "recording_files.py"} <= texts.keys()
@@ -80,8 +80,7 @@ def test_an_option_without_a_field_in_recordings_is_kept_among_their_options(tmp
     with Runner(PANDA, 1, workers=0) as runner:
         run = runner.rollout(np.tile(PANDA.start, (2, 1)))
     run = dataclasses.replace(run, info=dataclasses.replace(run.info, options=kept["options"]))
-    for name in ("run.npz", "run.h5"):
-        assert read_recording(write_recording(run, tmp_path / name)).info.options == kept["options"]
+    assert read_recording(write_recording(run, tmp_path / "run.h5")).info.options == kept["options"]
 
 
 def test_options_are_plain_values_of_their_documented_type():

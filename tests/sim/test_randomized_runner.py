@@ -18,7 +18,6 @@ from batchpid.sim import (
     Runner,
     Uniform,
     read_recording,
-    write_recording,
 )
 
 N, TICKS = 6, 4
@@ -127,16 +126,12 @@ def test_a_fault_that_resets_keeps_the_draws():
         assert_identical(runner.rollout(command).for_envs([2]), first.for_envs([2]), skip=["time"])
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".h5"])
-def test_a_recording_holds_the_distributions_and_the_draws(suffix, tmp_path):
-    path = tmp_path / f"run{suffix}"
+def test_a_recording_holds_the_distributions_and_the_draws(tmp_path):
+    path = tmp_path / "run.h5"
     with make() as runner:
         runner.reset()
-        if suffix == ".h5":
-            with Recorder(path, runner):
-                runner.rollout(setpoints())
-        else:
-            write_recording(runner.rollout(setpoints()), path)
+        with Recorder(path, runner):
+            runner.rollout(setpoints())
         draws, order = runner.draws, runner.episodes
     info = read_recording(path).info
     assert Randomization.from_dict(info.randomization) == EVERYTHING
@@ -144,7 +139,7 @@ def test_a_recording_holds_the_distributions_and_the_draws(suffix, tmp_path):
     assert info.draws.keys() == draws.keys()
     for name, rows in draws.items():
         np.testing.assert_array_equal(info.draws[name], rows, name)
-    part = info.for_envs([1])
+    part = info.for_envs(np.array([1]))
     np.testing.assert_array_equal(part.draws["payload"], draws["payload"][[1]])
     np.testing.assert_array_equal(part.episodes, [[1, 1]])
 
@@ -162,5 +157,5 @@ def test_a_recording_holds_the_episodes_that_begin_in_it(tmp_path):
     again = Randomization.from_dict(info.randomization).draw(PANDA, order)
     for name, rows in again.values.items():
         np.testing.assert_array_equal(rows, draws[name], name)
-    assert info.for_envs(slice(4, 6)).redraws == ((begun.time, 0, 4, 1),)
-    assert info.for_envs([1]).redraws == ()
+    assert info.for_envs(np.array([4, 5])).redraws == ((begun.time, 0, 4, 1),)
+    assert info.for_envs(np.array([1])).redraws == ()

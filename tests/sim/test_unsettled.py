@@ -214,7 +214,7 @@ def test_a_drive_that_is_too_weak():
 
 def test_a_recording_needs_its_robot(tmp_path):
     case = CASES["a setpoint outside the limits"]
-    rollout, path = run(case, "mujoco"), tmp_path / "run.npz"
+    rollout, path = run(case, "mujoco"), tmp_path / "run.h5"
     write_recording(rollout, path)
     read = read_recording(path)
     with pytest.raises(InvalidArgumentError, match="robot: of this run is not known"):

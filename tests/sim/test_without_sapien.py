@@ -52,7 +52,7 @@ from batchpid.__main__ import main
 os.chdir(tempfile.mkdtemp())
 for command in (
     "inspect panda",
-    "rollout panda --seconds 0.5 --num-envs 2 --workers 0 --out run.npz",
+    "rollout panda --seconds 0.5 --num-envs 2 --workers 0 --out run.h5",
     "compare panda --moves 1 --workers 0 --seconds 0.2",
     "export panda --to mjcf --out panda.xml",
 ):

@@ -25,7 +25,14 @@ from batchpid.sim.robot.mjcf.mjcf_tree import Tree
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.task_space.rotations import inverse, rotate
 
-_REMOVED = ("tuples", "sensors", "actuators", "keys", "cameras", "lights")
+REMOVED = ("tuples", "sensors", "actuators", "keys", "cameras", "lights")
+"""Elements of a file that a scene does not have."""
+
+
+_OF_CONTACTS = "material", "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"
+"""Attributes of a geom that a default class may set, for contacts and for its appearance."""
+_EVERYTHING = 2**31 - 1
+"""Mask of a geom that collides with every geom that collides at all."""
 
 
 class BodyFrame(NamedTuple):
@@ -69,7 +76,8 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
     for body in scene.bodies[1:]:
         body.name = names.bodies[body.id]
         body.gravcomp *= body.id not in robot
-    for each in [each for kind in _REMOVED for each in getattr(scene, kind)]:
+        body.sleep = mujoco.mjtSleepPolicy.mjSLEEP_AUTO  # no body sleeps
+    for each in [each for kind in REMOVED for each in getattr(scene, kind)]:
         scene.delete(each)
     root, start = "", _start(model)
     for joint in scene.joints:
@@ -90,12 +98,24 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
     return FileScene(scene, bodies, frames, root, own)
 
 
+def check_links(spec: SceneSpec, file: MjcfFile, links: Iterable[str]) -> None:
+    """Raise RobotError for a link that MuJoCo does not have: several joints of one body have links between them."""
+    placements = place_links(spec.urdf, spec.separate)
+    for link in links:
+        if placements[link].link not in file.bodies:
+            problem = f"link {link!r} lies between two joints of one body, and is no body of its own in MuJoCo"
+            raise RobotError(f"{file.path}: {problem}; name the link of the body for sensors and payloads")
+
+
 def set_ground(scene: MjSpec, ground: bool) -> None:
     """Switch contacts with the planes of the world on or off. A scene without planes gets one at height 0 for on."""
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     planes = [each for each in scene.worldbody.geoms if each.type == plane and (each.contype or each.conaffinity)]
     if ground and not planes:
-        scene.worldbody.add_geom(type=plane, size=[0, 0, 1])
+        added, plain = scene.worldbody.add_geom(type=plane, size=[0, 0, 1]), mujoco.MjSpec().worldbody.add_geom()
+        for name in _OF_CONTACTS:  # not those of the file's default class
+            setattr(added, name, getattr(plain, name))
+        added.contype = added.conaffinity = _EVERYTHING
     for each in [] if ground else planes:
         each.contype, each.conaffinity = 0, 0
 
@@ -122,7 +142,7 @@ def _frames(model: MjModel, robot: dict[int, str], spec: SceneSpec) -> tuple[dic
 
     A body's link has the body's axes, and its origin at the anchor of the body's last hinge.
     """
-    placements, names = place_links(spec.urdf, spec.merge_fixed), dict[str, str]()
+    placements, names = place_links(spec.urdf, spec.separate), dict[str, str]()
     frames: dict[str, BodyFrame] = {}
     for body, name in robot.items():
         if name not in placements:  # the world, if the robot does not include it

@@ -22,7 +22,7 @@ _CONTACT, _WRENCH = 4, 6
 
 def contact_bodies(spec: SceneSpec) -> list[str]:
     """Return the simulated link of each link of ``spec.contacts``."""
-    bodies = place_links(spec.urdf, spec.merge_fixed)
+    bodies = place_links(spec.urdf, spec.separate)
     return [bodies[link].link for link in spec.contacts or ()]
 
 

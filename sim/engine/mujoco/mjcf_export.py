@@ -88,11 +88,10 @@ def to_mjcf(
         dissipation=robot.dissipation,
         ground=robot.has_ground,
         fixed_base=robot.fixed_base,
-        merge_fixed=robot.merge_fixed,
         engine="mujoco",
     )
     # The bodies are those that the engine simulates; inertias and efforts are then written with all their digits.
-    inertias = body_inertias(spec.urdf, spec.merge_fixed)
+    inertias = body_inertias(spec.urdf, spec.separate)
     scene, names = robot_spec(spec, inertias)
     scene.modelname, scene.option.disableflags = robot.name, 0
     for link, name in names.items():

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Document, MjModel, MjSpec
 from batchpid.errors import RobotError
-from batchpid.sim.engine.mujoco.file_scene import BodyFrame, file_scene, set_ground
+from batchpid.sim.engine.mujoco.file_scene import REMOVED, BodyFrame, file_scene, set_ground
 from batchpid.sim.engine.mujoco.link_sensors import add_link_sensors
 from batchpid.sim.engine.physics import MujocoSolver
 from batchpid.sim.engine.scene_spec import SceneSpec
@@ -84,7 +84,7 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     """
     if spec.mjcf is not None:
         return _file_model(spec, spec.mjcf, drives)
-    inertias = body_inertias(spec.urdf, spec.merge_fixed)
+    inertias = body_inertias(spec.urdf, spec.separate)
     scene, names = robot_spec(spec, inertias)
     if drives:
         _add_drives(scene, spec)
@@ -124,8 +124,9 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
     try:
         model = scene.compile()
     except ValueError as error:
-        problem = f"MuJoCo cannot compile it without its actuators: {' '.join(str(error).split())}"
-        raise RobotError(f"{file.path}: {problem}; remove what refers to them") from error
+        problem = f"MuJoCo cannot compile the scene: {' '.join(str(error).split())}"
+        remedy = f"correct it; nothing may refer to {', '.join(REMOVED)}, which are left out"
+        raise RobotError(f"{file.path}: {problem}; {remedy}") from error
     qpos, qvel = _places(model, spec)
     armature, damping = found.own
     model.dof_armature[qvel], model.dof_frictionloss[qvel] = np.maximum(armature, 0.0), 0.0
@@ -191,7 +192,7 @@ def _set_options(scene: MjSpec, spec: SceneSpec) -> None:
 
 def _add_links(scene: MjSpec, spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> dict[str, str]:
     """Add the simulated links of ``spec`` as bodies; return the name of the body of each."""
-    root = etree.fromstring(simulated(spec.urdf, spec.merge_fixed).urdf.encode())
+    root = etree.fromstring(simulated(spec.urdf, spec.separate).urdf.encode())
     above = {joint.find("child").get("link"): joint for joint in root.findall("joint")}
     names = {link: _unused("world_link", inertias) if link == "world" else link for link in inertias}
     limits = {joint.name: (joint.lower, joint.upper) for joint in spec.joints}
@@ -244,7 +245,7 @@ def _add_links(scene: MjSpec, spec: SceneSpec, inertias: dict[str, SpatialInerti
 
 def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
     """Add the collision shapes, the pairs of bodies that do not collide, and the ground."""
-    shapes = link_shapes(spec.urdf, spec.merge_fixed)
+    shapes = link_shapes(spec.urdf, spec.separate)
     owners = {link: list(dict.fromkeys(shape.owner for shape in of_link)) for link, of_link in shapes.items()}
     ignored = {frozenset(pair) for pair in spec.ignored}
     solid, split = [link for link in owners if owners[link]], set[str]()

@@ -28,13 +28,6 @@ class MujocoEngine:
         """Return whether these are :class:`batchpid.sim.MujocoSolver`."""
         return isinstance(settings, MujocoSolver)
 
-    def least_memory(self, num_envs: int, dof: int) -> int:
-        """Return a lower estimate of the bytes of ``num_envs`` robots, and of the working memory of their groups.
-
-        The groups share the working memory (:mod:`batchpid.sim.engine.mujoco.data_pool`).
-        """
-        return num_envs * (1_000 + 300 * dof) + min(num_envs, self.group_size) * 300_000
-
     def make_pack(
         self,
         spec: SceneSpec,

@@ -19,6 +19,7 @@ from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.model_pack import ModelPack
 from batchpid.sim.engine.mujoco.data_pool import STATE, DataPool, rest
+from batchpid.sim.engine.mujoco.file_scene import check_links
 from batchpid.sim.engine.mujoco.link_sensors import MujocoLinkSensors
 from batchpid.sim.engine.mujoco.model_builder import FLOATING, LARGEST_FORCE, RobotMj, robot_model, set_inertia
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
@@ -27,12 +28,15 @@ from batchpid.sim.engine.native_model import NativeModel
 from batchpid.sim.engine.robot_model import passive_force, scene_tree, turned_back
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.sim.robot.mimics import coupling_of
+from batchpid.sim.robot.parts import CONTACT_FRICTION
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.rotations import inverse
 
 _KEPT = STATE & ~int(mujoco.mjtState.mjSTATE_CTRL)
 """Parts of the state in snapshots: all but the targets of drives, which every tick writes."""
+_LEAST_FRICTION = 1e-5
+"""Smallest coefficient of friction in MuJoCo."""
 _JOINTS = ("dof_armature", "dof_damping", "actuator_biasprm", "actuator_forcerange")
 """Fields of ``mujoco.MjModel`` that joints and drives change."""
 
@@ -66,6 +70,9 @@ class MujocoPack(ModelPack):
             if self.steps_natively:
                 reads = spec.fixed_base and self.steps_read_force(True, True)
                 self._constraint.use(self._joint_model, None if reads else self._bias_model)
+        if spec.mjcf is not None:
+            sensed = (*(spec.contacts or ()), *(spec.wrenches or ()))
+            check_links(spec, spec.mjcf, [*sensed, carrier] if carrier else sensed)
         self._stiffness = self._rate_gain = self._target_rate = np.zeros((1, self.dof))
         self._make_data(robot_model(spec))
         if variation is not None:
@@ -308,7 +315,22 @@ class MujocoPack(ModelPack):
             if gravity is not None:
                 model.opt.gravity[:] = gravity[row]
             if friction is not None:
-                model.geom_friction[:, 0] = model.pair_friction[:, :2] = friction[row]
+                shapes, pairs, nominal = self._rubbing
+                share, base = friction[row] / max(nominal, _LEAST_FRICTION), self._robot.model
+                model.geom_friction[shapes, 0] = share * base.geom_friction[shapes, 0]
+                model.pair_friction[pairs, :2] = share * base.pair_friction[pairs, :2]
+
+    @cached_property
+    def _rubbing(self) -> tuple[Any, Any, float]:
+        """Masks of the shapes of robot and ground, and of the pairs of these, and the friction of the ground."""
+        robot, file = self._robot, self.spec.mjcf
+        model = robot.model
+        if file is None:
+            return slice(None), slice(None), CONTACT_FRICTION
+        bodies = {*robot.bodies.values(), *(body for frame in robot.frames.values() for body in frame.welded)} - {0}
+        is_ground = (model.geom_bodyid == 0) & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+        shapes = np.isin(model.geom_bodyid, [*bodies]) | is_ground
+        return shapes, shapes[model.pair_geom1] & shapes[model.pair_geom2], file.friction
 
     def _change_masses(self, rows: Sequence[int]) -> None:
         if not self._masses.added:
@@ -386,7 +408,7 @@ class MujocoPack(ModelPack):
         """Give back all that fits the present kind of model alone: working memory, and data made for its size."""
         self._pool.leave(self)
         self._own_step = None
-        for name in ("_scratch",):
+        for name in ("_scratch", "_rubbing"):
             self.__dict__.pop(name, None)
 
 

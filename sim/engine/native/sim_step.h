@@ -34,8 +34,7 @@ struct Group {
   char message[256];                 // of an exception of the engine
 };
 
-template <class T>
-void copy_row(VectorXf const &from, T *to, std::ptrdiff_t dof) {
+inline void copy_row(VectorXf const &from, double *to, std::ptrdiff_t dof) {
   if (from.size != dof) throw std::bad_exception();
   for (std::ptrdiff_t joint = 0; joint < dof; ++joint) to[joint] = from.data[joint];
 }
@@ -58,8 +57,7 @@ inline void constrain_row(Group const &group, std::size_t row, float *qf) {
 
 // One sim step of the robots in SAPIEN: apply efforts and read (robots, dof) each, robot by robot, each while it is in the
 // cache.
-template <class T>
-void step_in_sapien(Group const &group, T const *effort, T *qpos, T *qvel, T *passive) {
+inline void step_in_sapien(Group const &group, double const *effort, double *qpos, double *qvel, double *passive) {
   Gateway const &gateway = *group.gateway;
   Functions const &call = gateway.functions;
   std::ptrdiff_t const dof = gateway.dof, all = group.robots * dof;
@@ -79,8 +77,8 @@ void step_in_sapien(Group const &group, T const *effort, T *qpos, T *qvel, T *pa
       copy_row(call.compute_passive_force(robot, group.gravity != 0, group.coriolis != 0), passive + at, dof);
     }
   }
-  if (!moves) std::fill_n(qvel, all, T{});
-  if (!bears) std::fill_n(passive, all, T{});
+  if (!moves) std::fill_n(qvel, all, 0.0);
+  if (!bears) std::fill_n(passive, all, 0.0);
 }
 
 // Apply the efforts of a robot in MuJoCo, and those of its constraint.
@@ -100,8 +98,7 @@ inline void apply_efforts(Group const &group, std::int64_t row) {
 }
 
 // The same in MuJoCo. Return false, with a message, after an error of it.
-template <class T>
-bool step_in_mujoco(Group &group, T const *effort, T *qpos, T *qvel, T *passive) {
+inline bool step_in_mujoco(Group &group, double const *effort, double *qpos, double *qvel, double *passive) {
   Mujoco const &mujoco = *group.mujoco;
   std::int64_t const dof = group.dof;
   bool good = true;
@@ -115,9 +112,9 @@ bool step_in_mujoco(Group &group, T const *effort, T *qpos, T *qvel, T *passive)
     if (!group.skip[row]) good = advance(mujoco, row, dof, FARTHEST, group.message);
     for (std::int64_t joint = 0; joint < dof; ++joint) {
       std::int64_t const place = mujoco.qvel_at[joint];
-      qpos[at + joint] = static_cast<T>(mujoco.qpos[row][mujoco.qpos_at[joint]]);
-      qvel[at + joint] = static_cast<T>(mujoco.qvel[row][place]);
-      passive[at + joint] = static_cast<T>(group.gravity ? mujoco.bias[row][place] : 0.0);
+      qpos[at + joint] = mujoco.qpos[row][mujoco.qpos_at[joint]];
+      qvel[at + joint] = mujoco.qvel[row][place];
+      passive[at + joint] = group.gravity ? mujoco.bias[row][place] : 0.0;
     }
   }
   mujoco.set_log_handler(before);
@@ -125,8 +122,8 @@ bool step_in_mujoco(Group &group, T const *effort, T *qpos, T *qvel, T *passive)
 }
 
 // Do one sim step in the engine of the group; rows beyond its robots repeat the first one. Return the status.
-template <class T>
-std::int32_t try_sim_step(Group &group, std::int64_t rows, T const *effort, T *qpos, T *qvel, T *passive) {
+inline std::int32_t try_sim_step(Group &group, std::int64_t rows, double const *effort, double *qpos, double *qvel,
+                                 double *passive) {
   auto const in_sapien = [&] { step_in_sapien(group, effort, qpos, qvel, passive); };
   bool const good = group.mujoco != nullptr ? step_in_mujoco(group, effort, qpos, qvel, passive)
                                             : succeeds(group.message, in_sapien);
@@ -138,7 +135,7 @@ std::int32_t try_sim_step(Group &group, std::int64_t rows, T const *effort, T *q
     if (group.speed_limit && !(std::fabs(qvel[at]) <= group.speed_limit[at % dof])) status |= TOO_FAST;
   }
   for (std::int64_t row = group.robots; row < rows; ++row) {
-    for (T *table : {qpos, qvel, passive}) std::copy_n(table, dof, table + row * dof);
+    for (double *table : {qpos, qvel, passive}) std::copy_n(table, dof, table + row * dof);
   }
   return status;
 }

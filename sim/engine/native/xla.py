@@ -58,6 +58,7 @@ def sim_step(address: Any, step: Any, effort: Array) -> tuple[Any, Any, Any, Any
     """
     import jax
 
+    obstacle()  # registers the function in this process
     like = jax.ShapeDtypeStruct(effort.shape, effort.dtype)
     results = (like, like, like, jax.ShapeDtypeStruct((), np.int32))
     qpos, qvel, passive, status = jax.ffi.ffi_call("batchpid_sim_step", results)(address, step, effort)

@@ -95,11 +95,6 @@ T *data(Array const *array) {
   return static_cast<T *>(array->data);
 }
 
-template <class T>
-std::int32_t call(Group &group, Array **in, Array **out) {
-  return try_sim_step(group, in[2]->dims[0], data<T const>(in[2]), data<T>(out[0]), data<T>(out[1]), data<T>(out[2]));
-}
-
 // (address of the Group as u32[2], number of the step, effort) -> qpos, qvel, passive force, Status. The number of the
 // step is not used: no two calls have the same arguments, so that none can be merged or moved out of a loop.
 extern "C" inline Error *batchpid_sim_step(CallFrame *frame) {
@@ -112,20 +107,14 @@ extern "C" inline Error *batchpid_sim_step(CallFrame *frame) {
   std::memcpy(&group, in[0]->data, sizeof(group));
   auto const robots = group->robots;
   for (Array const *array : {in[2], out[0], out[1], out[2]}) {
-    if (array->dtype != in[2]->dtype || array->rank != 2 || array->dims[0] != in[2]->dims[0] ||
+    if (array->dtype != F64 || array->rank != 2 || array->dims[0] != in[2]->dims[0] ||
         array->dims[1] != group->dof || array->dims[0] < robots || robots == 0) {
       return invalid(frame->api, "an array has a wrong shape or type");
     }
   }
   if (out[3]->dtype != S32) return invalid(frame->api, "the status is no int32");
-  std::int32_t *status = data<std::int32_t>(out[3]);
-  if (in[2]->dtype == F64) {
-    *status = call<double>(*group, in, out);
-  } else if (in[2]->dtype == F32) {
-    *status = call<float>(*group, in, out);
-  } else {
-    return invalid(frame->api, "the arrays are neither float32 nor float64");
-  }
+  *data<std::int32_t>(out[3]) = try_sim_step(*group, in[2]->dims[0], data<double const>(in[2]), data<double>(out[0]),
+                                             data<double>(out[1]), data<double>(out[2]));
   return nullptr;
 }
 

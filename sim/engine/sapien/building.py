@@ -76,7 +76,7 @@ def parse(spec: SceneSpec) -> ArticulationBuilder:
     Raises RobotError if SAPIEN's loader refuses the description, or finds other than one articulated robot in it.
     """
     with _building:
-        builder = _load(simulated(spec.urdf, spec.merge_fixed).urdf, spec.fixed_base)
+        builder = _load(simulated(spec.urdf, spec.separate).urdf, spec.fixed_base)
         if not spec.collisions:
             for link in builder.link_builders:
                 link.collision_records = []
@@ -97,7 +97,7 @@ def shape_owners(spec: SceneSpec) -> dict[str, list[str]]:
     """Return the link of the URDF that owns each collision shape of each simulated link, in the engine's order."""
     if not spec.collisions:
         return {link.name: [] for link in parse(spec).link_builders}
-    return simulated(spec.urdf, spec.merge_fixed).owners
+    return simulated(spec.urdf, spec.separate).owners
 
 
 def _load(urdf: str, fixed_base: bool) -> ArticulationBuilder:
@@ -186,7 +186,7 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
             remedy = "repair the file, or remove that <collision>"
             raise RobotError(f"link {link.name!r}: SAPIEN cannot build a collision shape from {files}; {remedy}")
     ignored = {frozenset(pair) for pair in spec.ignored}
-    words, _ = link_groups(spec.urdf, spec.merge_fixed, spec.fixed_base, spec.joints, ignored)
+    words, _ = link_groups(spec.urdf, spec.separate, spec.fixed_base, spec.joints, ignored)
     owners = shape_owners(spec)
     for link in robot.links:
         for shape, owner in zip(link.collision_shapes, owners[link.name], strict=True):
@@ -219,7 +219,7 @@ def link_frames(spec: SceneSpec, robot: Any) -> Frames:
     entities = {link.name: link.entity for link in robot.links}
     return {
         name: (entities[at.link], None if at.link == name else Pose(at.position, at.wxyz))
-        for name, at in place_links(spec.urdf, spec.merge_fixed).items()
+        for name, at in place_links(spec.urdf, spec.separate).items()
     }
 
 

@@ -23,7 +23,7 @@ class LinkSensors:
 
     def __init__(self, spec: SceneSpec, robots: list[Any], systems: list[Any]) -> None:
         self._robots, self._systems, self._spec = robots, systems, spec
-        bodies, links = place_links(spec.urdf, spec.merge_fixed), [link.name for link in robots[0].links]
+        bodies, links = place_links(spec.urdf, spec.separate), [link.name for link in robots[0].links]
         self._contacts = [links.index(bodies[link].link) for link in spec.contacts or ()]
         self._wrenches = [links.index(link) for link in spec.wrenches or ()]
         parents = [None if joint.parent_link is None else joint.parent_link.name for joint in robots[0].joints]

@@ -25,13 +25,6 @@ class SapienEngine:
         """Return whether these are :class:`batchpid.sim.Physics`."""
         return isinstance(settings, Physics)
 
-    def least_memory(self, num_envs: int, dof: int) -> int:
-        """Return a lower estimate of the bytes of ``num_envs`` robots, each with a PhysX system.
-
-        Chains of 1 to 30 boxes and jaco2 take up to 35 % more; a panda, with large collision meshes, 2.7 times as much.
-        """
-        return num_envs * (405_000 + 6_000 * dof)
-
     def make_pack(
         self,
         spec: SceneSpec,

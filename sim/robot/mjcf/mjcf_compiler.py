@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -27,6 +28,10 @@ _ERRORS = (ValueError, mujoco.FatalError)
 """Errors of MuJoCo's parser and compiler."""
 _CHECKED = (".stl", ".obj")
 """Formats of meshes that :func:`mesh_problem` and MuJoCo both read."""
+
+
+if mujoco.get_mju_user_warning() is None:  # else MuJoCo appends warnings to a file in the working folder, too
+    mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))
 
 
 class Attempt(NamedTuple):

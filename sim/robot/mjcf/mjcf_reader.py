@@ -96,6 +96,7 @@ def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> Mjcf
     free = model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
     floats = any(names.is_of_robot(body) for body in free)
     planes = np.flatnonzero((model.geom_bodyid == 0) & (model.geom_type == PLANE))
+    grounds = [int(plane) for plane in planes if can_collide(model, int(plane))]
     return MjcfFile(
         path=str(path),
         reading=compiled.reading,
@@ -104,7 +105,8 @@ def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> Mjcf
         falling=tuple(names.bodies[int(body)] for body in free if not names.is_of_robot(body)),
         loops=tuple(loops),
         is_alone=all(names.is_of_robot(body) for body in model.jnt_bodyid),
-        has_floor=any(can_collide(model, int(geom)) for geom in planes) and not (floats and fixed_base),
+        has_floor=bool(grounds) and not (floats and fixed_base),
+        friction=float(model.geom_friction[grounds[0], 0]) if grounds else 1.0,
     )
 
 

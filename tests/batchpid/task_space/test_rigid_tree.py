@@ -167,7 +167,6 @@ def test_jax_computes_the_same(x64):
 
 def test_merged_links_are_known_by_name():
     robot = robot_of(0)
-    assert robot.merge_fixed
     tree = tree_of(0)
     assert set(tree.links) == {link.name for link in robot.links}
     moving = {joint.child_link for joint in robot.joints}

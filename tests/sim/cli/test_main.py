@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import re
+import signal
 import subprocess
 import sys
 import time
@@ -11,11 +11,11 @@ import warnings
 from pathlib import Path
 from typing import Annotated
 
+import psutil
 import pytest
+from processes import PATIENCE, have_ended
 
-import batchpid
 from batchpid import __version__ as version
-from batchpid import startup
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import cli
@@ -85,7 +85,7 @@ def test_every_command_is_a_frozen_dataclass_with_help(name, batchpid):
 
 @pytest.mark.parametrize("name", [name for name in cli.COMMANDS if "robot" in fields_of(name)])
 def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
-    recording = ["run.npz"] if "recording" in fields_of(name) else []
+    recording = ["run.h5"] if "recording" in fields_of(name) else []
     parsed = cli.parse([name, *recording, "jaco2", "--missing-meshes", "error", "--package-dirs", "a", "b"])
     assert parsed.robot == "jaco2"
     assert vars(parsed.meshes) == {"missing_meshes": "error", "package_dirs": (Path("a"), Path("b"))}
@@ -130,19 +130,6 @@ def test_a_bug_keeps_its_traceback(stub, monkeypatch):
         cli.main(["stub"])
 
 
-def test_ctrl_c_in_a_destructor_ends_the_command(batchpid, stub, monkeypatch):
-    class Interrupted:
-        def __del__(self):
-            raise KeyboardInterrupt
-
-    def run(self):
-        Interrupted()
-        time.sleep(60)
-
-    monkeypatch.setattr(stub, "run", run)
-    assert batchpid("stub") == (130, "", "batchpid: interrupted\n")
-
-
 def test_warnings_are_one_line(batchpid, stub, monkeypatch):
     def run(self):
         warnings.simplefilter("always")
@@ -168,47 +155,23 @@ for words in (["--help"], *([name, "--help"] for name in COMMANDS)):
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
-HIDING = ["json", "numpy", "sim", "assets", "tyro", "signal"]
+def test_a_reader_that_ends_is_a_status_without_a_line(tmp_path):
+    line = f"{sys.executable} -m batchpid inspect panda --all | head -c 1; exit ${{PIPESTATUS[0]}}"
+    ran = subprocess.run(["bash", "-c", line], cwd=tmp_path, capture_output=True, text=True)
+    assert ran.returncode in (0, 141)
+    assert ran.stderr == ""
 
 
-@pytest.mark.parametrize("command", ["-m", pytest.param("script", marks=pytest.mark.slow)])
-def test_modules_in_the_working_folder_are_not_imported_by_the_command(command, tmp_path):
-    for name in HIDING:
-        (tmp_path / f"{name}.py").write_text("raise SystemExit(f'{__name__} of the user')")
-    script = "import sys; sys.argv[0] = '/usr/bin/batchpid'; from batchpid.__main__ import main; sys.exit(main())"
-    program = [sys.executable, "-P", "-c", script] if command == "script" else [sys.executable, "-m", "batchpid"]
-    ran = subprocess.run([*program, "inspect", "panda"], cwd=tmp_path, capture_output=True, text=True)
-    assert (ran.returncode, ran.stderr) == (0, "")
-    assert "panda_joint7" in ran.stdout
-
-
-@pytest.mark.parametrize("name", ["json", "numpy", "secrets"])
-def test_a_program_beside_a_file_that_hides_a_module_is_told_so(name, tmp_path):
-    hiding = tmp_path / f"{name}.py"
-    hiding.write_text("print('the program of the user')")
-    for program in (["-c", "from batchpid.sim import Robot"], [tmp_path / "program.py"]):
-        (tmp_path / "program.py").write_text("from batchpid.sim import Robot")
-        ran = subprocess.run([sys.executable, *program], cwd=tmp_path, capture_output=True, text=True)
-        line = (
-            f"ImportError: {hiding} hides the module {name!r} that batchpid needs; rename it or run in another folder"
-        )
-        assert ran.stderr.splitlines()[-1] == line
-        assert ran.stdout == ""
-
-
-def test_harmless_names_beside_a_program_are_accepted(tmp_path):
-    for name in ("os", "test", "calendar", "robots"):
-        (tmp_path / f"{name}.py").touch()
-    subprocess.run([sys.executable, "-c", "from batchpid.sim import Robot"], cwd=tmp_path, check=True)
-
-
-def test_every_imported_package_is_checked():
-    root = Path(batchpid.__file__).parents[1]
-    # An import is a line of its own, with one module: ruff sees to that.
-    line = re.compile(r"^ *(?:import +(\w+)(?: as \w+|[.\w]*)$|from +(\w+)[.\w]* +import )", re.MULTILINE)
-    imported = set()
-    for path in (*root.glob("batchpid/**/*.py"), *root.glob("batchpid/sim/**/*.py")):
-        imported |= {name for names in line.findall(path.read_text()) for name in names if name}
-    assert {"numpy", "sapien", "mujoco", "jax"} <= imported
-    packages = imported - sys.stdlib_module_names - {"batchpid"}
-    assert packages <= set(startup.IMPORTED)
+@pytest.mark.parametrize("seconds", [1.0, 4.0])
+def test_ctrl_c_ends_a_command_in_one_line_and_its_processes(seconds, tmp_path):
+    words = ["demo", "--num-envs", "2", "--workers", "2", "--seconds", "1000"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "batchpid", *words], stderr=subprocess.PIPE, stdout=subprocess.PIPE, cwd=tmp_path
+    )
+    time.sleep(seconds)
+    family = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(signal.SIGINT)
+    error = process.communicate(timeout=PATIENCE)[1].decode()
+    assert (process.returncode, error.splitlines()[-1]) == (130, "batchpid: interrupted")
+    assert "Traceback" not in error
+    assert have_ended([child.pid for child in family])

@@ -21,15 +21,15 @@ WORDS = {
     "compare": ("compare", "arm.urdf"),
     "excite": ("excite", "arm.urdf"),
     "export": ("export", "arm.urdf"),
-    "identify": ("identify", "arm.urdf", "run.npz"),
+    "identify": ("identify", "arm.urdf", "run.h5"),
     "inspect": ("inspect", "arm.urdf"),
     "survey": ("survey", "arm.urdf"),
-    "plot": ("plot", "run.npz"),
+    "plot": ("plot", "run.h5"),
 }
 """Words of each command that writes, without its outputs."""
 SUFFIXES = {"picture": ".png", "json": ".json", "out": ".yaml"}
 MJCF = "<mujoco><worldbody><body><joint name='a'/><geom size='.1'/></body></worldbody></mujoco>"
-OUT = {"rollout": ".npz", "excite": ".csv", "export": ".h", "survey": ".md"}
+OUT = {"rollout": ".h5", "excite": ".csv", "export": ".h", "survey": ".md"}
 
 
 def output_flags() -> list[tuple[str, str]]:
@@ -45,7 +45,7 @@ def files(tmp_path_factory):
     robot = Robot.load(write(folder, one_joint(), "arm.urdf"))
     with Runner(robot, 1, workers=0, substeps=10) as runner:
         rollout = runner.rollout(np.tile(robot.start, (60, 1, 1)))
-    write_recording(rollout, folder / "run.npz")
+    write_recording(rollout, folder / "run.h5")
     return folder
 
 
@@ -84,15 +84,15 @@ def test_every_command_with_outputs_has_force():
 @pytest.mark.usefixtures("empty_pictures")
 def test_default_names_say_what_they_show(files, batchpid, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "run.npz").write_bytes((files / "run.npz").read_bytes())
+    (tmp_path / "run.h5").write_bytes((files / "run.h5").read_bytes())
     (tmp_path / "run.png").write_text("kept")
-    for words in ((), ("--kind", "efforts"), ("--versus", files / "run.npz")):
-        status, _, complaint = batchpid("plot", "run.npz", *words)
+    for words in ((), ("--kind", "efforts"), ("--versus", files / "run.h5")):
+        status, _, complaint = batchpid("plot", "run.h5", *words)
         assert status == 0, complaint
-        status, _, complaint = batchpid("plot", "run.npz", *words)
+        status, _, complaint = batchpid("plot", "run.h5", *words)
         assert "exists already" in complaint
-        assert batchpid("plot", "run.npz", *words, "--force")[0] == 0
-    names = {"run.npz", "run.png", "run-responses.png", "run-efforts.png", "run-versus-run.png"}
+        assert batchpid("plot", "run.h5", *words, "--force")[0] == 0
+    names = {"run.h5", "run.png", "run-responses.png", "run-efforts.png", "run-versus-run.png"}
     assert {path.name for path in tmp_path.iterdir()} == names
     assert (tmp_path / "run.png").read_text() == "kept"
 
@@ -109,7 +109,7 @@ def test_the_demo_can_be_repeated_for_another_robot_and_with_force(batchpid, tmp
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"panda-demo.png", "jaco2-demo.png"}
 
 
-INPUTS = {"gains": "a.yaml", "actuators": "a.yaml", "randomize": "a.yaml", "trajectory": "m.csv", "versus": "run.npz"}
+INPUTS = {"gains": "a.yaml", "actuators": "a.yaml", "randomize": "a.yaml", "trajectory": "m.csv", "versus": "run.h5"}
 """Flags of files to read, besides those in WORDS."""
 
 
@@ -119,7 +119,7 @@ def test_a_file_that_a_command_reads_is_never_replaced(name, flag, make, files, 
     monkeypatch.chdir(tmp_path)
     names = {field.name for field in dataclasses.fields(COMMANDS[name])}
     words = [*WORDS[name], *(word for each, file in INPUTS.items() if each in names for word in (f"--{each}", file))]
-    read = {file for file in words if str(file).endswith((".urdf", ".yaml", ".csv", ".npz"))}
+    read = {file for file in words if str(file).endswith((".urdf", ".yaml", ".csv", ".h5"))}
     for file in read:
         (tmp_path / file).write_text("kept")
     for file in read:
@@ -141,7 +141,7 @@ def test_an_export_does_not_replace_its_robot(target, file, batchpid, tmp_path):
 
 def test_no_two_outputs_are_one_file(files, batchpid, tmp_path):
     same = tmp_path / "a.json"
-    _, _, complaint = batchpid("identify", files / "arm.urdf", files / "run.npz", "--out", same, "--json", same)
+    _, _, complaint = batchpid("identify", files / "arm.urdf", files / "run.h5", "--out", same, "--json", same)
     assert "json: is another output of this run" in complaint
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 
+import h5py
 import numpy as np
 import pytest
 
@@ -17,15 +18,20 @@ from tests.sim.tiny_urdf import LIMIT, joint, link, one_joint, robot, write
 SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
 
 
+def contents(path):
+    """Return the arrays and attributes of a recording."""
+    with h5py.File(path) as file:
+        return {name: dataset[:] for name, dataset in file.items()} | dict(file.attrs)
+
+
 def saved(batchpid, path, *flags):
     status, _, err = batchpid("rollout", *SHORT, "--force", "--out", path, *flags)
     assert status in (0, 3), err  # 3: so short a run does not settle
-    with np.load(path) as file:
-        return dict(file)
+    return contents(path)
 
 
 def test_the_file_holds_the_rollout_of_a_runner_with_tuned_gains(batchpid, tmp_path, panda):
-    file = saved(batchpid, tmp_path / "run.npz", "--spread", 0, "--substeps", 10)
+    file = saved(batchpid, tmp_path / "run.h5", "--spread", 0, "--substeps", 10)
     with Runner(panda, 3, params=panda.tuned(), workers=0, substeps=10) as runner:
         expected = runner.rollout(np.broadcast_to(panda.settings.target, (10, panda.dof)))
     for name, value in expected.arrays().items():
@@ -38,7 +44,7 @@ def test_the_file_holds_the_rollout_of_a_runner_with_tuned_gains(batchpid, tmp_p
 
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_start_poses_are_near_and_within_limits_and_do_not_depend_on_their_number(name, batchpid, tmp_path):
-    robot, path = Robot.load(name), tmp_path / "run.npz"
+    robot, path = Robot.load(name), tmp_path / "run.h5"
     short = ("--engine", "mujoco", "--seconds", 0.01)
     poses, more, other = (
         saved(batchpid, path, name, *short, "--num-envs", envs, "--seed", seed)["start"]
@@ -55,10 +61,9 @@ def test_start_poses_are_near_and_within_limits_and_do_not_depend_on_their_numbe
 @pytest.fixture(scope="module")
 def default_motion(tmp_path_factory):
     """File of the short rollout without further flags."""
-    path = tmp_path_factory.mktemp("rollout") / "run.npz"
+    path = tmp_path_factory.mktemp("rollout") / "run.h5"
     assert main(["rollout", *map(str, SHORT), "--out", str(path)]) == 0
-    with np.load(path) as file:
-        return dict(file)
+    return contents(path)
 
 
 @pytest.mark.quick_rows(4)
@@ -77,14 +82,14 @@ def default_motion(tmp_path_factory):
     ids=lambda flags: flags[0],
 )
 def test_every_flag_changes_the_motion(flags, batchpid, default_motion, tmp_path):
-    other = saved(batchpid, tmp_path / "b.npz", *flags)
+    other = saved(batchpid, tmp_path / "b.h5", *flags)
     assert np.abs(default_motion["qpos"][-1] - other["qpos"][-1]).max() > 1e-6
 
 
 def test_gains_from_a_file(batchpid, tmp_path, panda):
     params = panda.params(kp=7.0, ki=0.0, kd=1.0)
     bp.save_params(tmp_path / "gains.yaml", params, panda.joint_names)
-    file = saved(batchpid, tmp_path / "run.npz", "--gains", tmp_path / "gains.yaml", "--spread", 0)
+    file = saved(batchpid, tmp_path / "run.h5", "--gains", tmp_path / "gains.yaml", "--spread", 0)
     with Runner(panda, 3, workers=0, params=params) as runner:
         expected = runner.rollout(np.broadcast_to(panda.settings.target, (5, panda.dof)))
     np.testing.assert_array_equal(file["qpos"], expected.qpos)
@@ -95,7 +100,7 @@ def test_tuned_gains_run_as_they_were_tuned(batchpid, tmp_path, panda):
     """By name, or from the params file with its gain units and measurement rate."""
     path = panda.path.with_name("panda.tuned.yaml")
     at_start = ("--spread", 0, "--gains")
-    by_name, by_file = (saved(batchpid, tmp_path / "run.npz", *at_start, each) for each in ("tuned", path))
+    by_name, by_file = (saved(batchpid, tmp_path / "run.h5", *at_start, each) for each in ("tuned", path))
     with Runner(panda, 3, workers=0, params=panda.tuned()) as runner:
         expected = runner.rollout(np.broadcast_to(panda.settings.target, (5, panda.dof)))
     np.testing.assert_array_equal(by_name["qpos"], expected.qpos)
@@ -120,7 +125,7 @@ def test_any_urdf_runs_with_gains_from_a_file(batchpid, tmp_path, panda):
     path.write_text(panda.path.read_text())
     assert batchpid("rollout", path, *SHORT)[0] == 0  # with designed gains
     bp.save_params(tmp_path / "gains.json", panda.params(), panda.joint_names)
-    file = saved(batchpid, tmp_path / "run.npz", path, "--gains", tmp_path / "gains.json")
+    file = saved(batchpid, tmp_path / "run.h5", path, "--gains", tmp_path / "gains.json")
     # Without settings it holds its start pose: zero, moved inside the limits.
     np.testing.assert_allclose(file["setpoint"][0, 0], np.clip(np.zeros(9), panda.lower, panda.upper))
 
@@ -143,13 +148,13 @@ def test_the_status_is_3_if_no_env_settles_in_a_second(batchpid, seconds, status
 def test_a_tool_is_moved_to_a_pose(batchpid, tmp_path):
     goal = [0.4, 0.1, 0.5, 0.0, 1.0, 0.0, 0.0]
     flags = "--control", "osc", "--tool", "panda_hand", "--setpoint", *goal
-    status, said, err = batchpid("rollout", *SHORT, "--force", "--out", tmp_path / "run.npz", *flags)
+    status, said, err = batchpid("rollout", *SHORT, "--force", "--out", tmp_path / "run.h5", *flags)
     assert status == 0, err
     assert "Tool: panda_hand" in said
     assert "still approaches the setpoint" in said
-    with np.load(tmp_path / "run.npz") as file:
-        np.testing.assert_array_equal(file["setpoint"], np.broadcast_to(goal, (5, 3, 7)))
-        error = 1e3 * np.linalg.norm(file["tool_pose"][..., :3] - goal[:3], axis=-1)
+    file = contents(tmp_path / "run.h5")
+    np.testing.assert_array_equal(file["setpoint"], np.broadcast_to(goal, (5, 3, 7)))
+    error = 1e3 * np.linalg.norm(file["tool_pose"][..., :3] - goal[:3], axis=-1)
     line = next(line for line in said.splitlines() if line.startswith("position [mm]"))
     assert line.split()[-1] == f"{error[-1].max():.3g}"
 
@@ -203,16 +208,16 @@ def following_errors(report):
 def test_a_trajectory_is_followed_as_by_a_runner_with_its_rates(batchpid, tmp_path, panda, motion):
     path = tmp_path / "motion.csv"
     path.write_text(csv(panda, motion, "setpoint_rate"))
-    flags = ("--num-envs", 3, "--workers", 0, "--spread", 0, "--out", tmp_path / "run.npz")
+    flags = ("--num-envs", 3, "--workers", 0, "--spread", 0, "--out", tmp_path / "run.h5")
     status, said, error = batchpid("rollout", "--trajectory", path, *flags)
     assert status == 0, error
     assert "Rates of the setpoints: from the file." in said
     rows = np.loadtxt(path, delimiter=",", skiprows=1)[1:, 1:]
     with Runner(panda, 3, workers=0, params=panda.tuned(), substeps=10) as runner:
         expected = runner.rollout(rows[:, :9], setpoint_rates=rows[:, 9:])
-    with np.load(tmp_path / "run.npz") as file:
-        for name, value in expected.arrays().items():
-            np.testing.assert_array_equal(file[name], value)
+    file = contents(tmp_path / "run.h5")
+    for name, value in expected.arrays().items():
+        np.testing.assert_array_equal(file[name], value)
     error = np.abs(expected.qpos - expected.setpoint)[:, 0].max(0)
     assert error.max() < 2e-3
     np.testing.assert_allclose(following_errors(said)[0], error, rtol=0.06)
@@ -221,37 +226,37 @@ def test_a_trajectory_is_followed_as_by_a_runner_with_its_rates(batchpid, tmp_pa
 def test_rates_that_a_file_lacks_are_central_differences(batchpid, tmp_path, panda, motion):
     path = tmp_path / "motion.csv"
     path.write_text(csv(panda, motion))
-    status, said, error = batchpid("rollout", "--trajectory", path, *ONE, "--out", tmp_path / "run.npz")
+    status, said, error = batchpid("rollout", "--trajectory", path, *ONE, "--out", tmp_path / "run.h5")
     assert status == 0, error
     assert "Rates of the setpoints: central differences of the rows.\n" in said
     setpoints = np.loadtxt(path, delimiter=",", skiprows=1)[:, 1:]
     with Runner(panda, 1, workers=0, params=panda.tuned(), substeps=10) as runner:
         expected = runner.rollout(setpoints[1:], setpoint_rates=np.gradient(setpoints, 0.005, axis=0)[1:])
-    with np.load(tmp_path / "run.npz") as file:
-        np.testing.assert_allclose(file["qpos"], expected.qpos, atol=1e-6)
+    file = contents(tmp_path / "run.h5")
+    np.testing.assert_allclose(file["qpos"], expected.qpos, atol=1e-6)
     assert following_errors(said)[0].max() < 2e-3
 
 
 def test_a_file_without_a_row_at_time_0_begins_at_the_start_pose(batchpid, tmp_path, panda, motion):
     path = tmp_path / "motion.csv"
     path.write_text(csv(panda, motion, start=False))
-    status, said, error = batchpid("rollout", "--trajectory", path, *ONE, "--out", tmp_path / "run.npz")
+    status, said, error = batchpid("rollout", "--trajectory", path, *ONE, "--out", tmp_path / "run.h5")
     assert status == 0, error
-    with np.load(tmp_path / "run.npz") as file:
-        np.testing.assert_array_equal(file["start"][0], panda.start.astype(np.float32))
-        np.testing.assert_allclose(file["time"], motion.time)
+    file = contents(tmp_path / "run.h5")
+    np.testing.assert_array_equal(file["start"][0], panda.start.astype(np.float32))
+    np.testing.assert_allclose(file["time"], motion.time)
     assert following_errors(said)[0].max() < 2e-3
 
 
 def test_the_first_row_is_the_start_of_env_0_and_others_spread_around_it(batchpid, tmp_path, panda):
     path = tmp_path / "motion.csv"
     path.write_text(csv(panda, through([panda.settings.target] * 2), start=False))
-    status, _, error = batchpid("rollout", "--trajectory", path, *SHORT[:4], "--out", tmp_path / "run.npz")
+    status, _, error = batchpid("rollout", "--trajectory", path, *SHORT[:4], "--out", tmp_path / "run.h5")
     assert status == 0, error
-    with np.load(tmp_path / "run.npz") as file:
-        away = np.abs(file["start"] - panda.settings.target).max(1)
-        assert away[0] < 1e-6 < 0.01 < away[1:].min() <= away[1:].max() <= 0.3 + 1e-6
-        assert len(file["time"]) == 1
+    file = contents(tmp_path / "run.h5")
+    away = np.abs(file["start"] - panda.settings.target).max(1)
+    assert away[0] < 1e-6 < 0.01 < away[1:].min() <= away[1:].max() <= 0.3 + 1e-6
+    assert len(file["time"]) == 1
 
 
 @pytest.mark.parametrize(
@@ -266,7 +271,7 @@ def test_the_first_row_is_the_start_of_env_0_and_others_spread_around_it(batchpi
 def test_files_of_other_programs_read_as_those_of_this_one(batchpid, tmp_path, panda, motion, style):
     runs = []
     for name, form in (("plain", {}), ("other", style)):
-        path, out = tmp_path / f"{name}.csv", tmp_path / f"{name}.npz"
+        path, out = tmp_path / f"{name}.csv", tmp_path / f"{name}.h5"
         path.write_bytes(csv(panda, motion, "setpoint_rate", "setpoint_acceleration", **form).encode("utf-8-sig"))
         status, said, error = batchpid("rollout", "--trajectory", path, *ONE, "--engine", "mujoco", "--out", out)
         assert status == 0, error
@@ -297,7 +302,7 @@ def test_rates_take_the_short_way_round_and_followers_need_no_column(batchpid, t
     follower = joint("right", "base", "r", inner=LIMIT + '<mimic joint="left" multiplier="-0.5"/>', origin="0 -1 1")
     turning = joint("turn", "base", "t", "continuous", '<limit effort="50" velocity="9"/>', origin="0 3 1")
     parts = (*map(link, ("base", "l", "r", "t")), follower, joint("left", "base", "l", origin="0 1 1"), turning)
-    arm, path, out = write(tmp_path, robot(*parts)), tmp_path / "motion.csv", tmp_path / "run.npz"
+    arm, path, out = write(tmp_path, robot(*parts)), tmp_path / "motion.csv", tmp_path / "run.h5"
     path.write_text("time,setpoint:left,setpoint:turn\n0,0.1,3.13\n0.01,0.12,-3.13\n0.02,0.14,-3.11\n")
     status, said, error = batchpid("rollout", arm, "--trajectory", path, *ONE, "--out", out)
     assert status == 0, error
@@ -382,39 +387,13 @@ def test_flags_that_contradict_a_trajectory_are_refused(batchpid, tmp_path, pand
 @pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
 def test_a_trajectory_without_rates_is_a_log(batchpid, panda, tmp_path, motion):
     """It has no accelerations either, so that gains in efforts follow it."""
-    path, out = tmp_path / "motion.csv", tmp_path / "run.npz"
+    path, out = tmp_path / "motion.csv", tmp_path / "run.h5"
     path.write_text(csv(panda, motion, "setpoint_rate", "setpoint_acceleration"))
     flags = ("--no-rates", "--gains", "tutorial", "--out", out)
     status, said, error = batchpid("rollout", "--trajectory", path, *ONE, *flags)
     assert status == 0, error
     assert "not given" in said
     assert read_recording(out).info.rates is False
-
-
-@pytest.mark.parametrize(
-    "flags", [("--randomize", "payload"), pytest.param(("--control", "osc"), marks=pytest.mark.slow)], ids=str
-)
-def test_a_run_that_resumes_ends_with_the_file_of_one_that_was_not_stopped(flags, batchpid, tmp_path, monkeypatch):
-    whole, parts = tmp_path / "whole.h5", tmp_path / "parts.h5"
-    words = ("rollout", *SHORT, "--engine", "mujoco", *flags)
-    assert batchpid(*words, "--out", whole)[0] == 0
-    with monkeypatch.context() as patch:  # the second part fails
-        made = iter([Runner])
-        patch.setattr("batchpid.sim.tuning.sweep.Runner", lambda *words, **options: next(made)(*words, **options))
-        patch.setattr("batchpid.sim.cli.run.PART", 2)
-        with pytest.raises(StopIteration):
-            main([*map(str, words), "--out", str(parts), "--resume"])
-    assert [path.name for path in (tmp_path / "parts.h5.parts").iterdir()] == ["0.h5"]
-    status, said, err = batchpid(*words, "--out", parts, "--resume")
-    assert status == 0, err
-    assert f"written: {parts}" in said
-    one, other = map(read_recording, (whole, parts))
-    for name, rows in one.arrays().items():
-        np.testing.assert_array_equal(rows, other.arrays()[name])
-    status, _, err = batchpid(*words, "--seed", 1, "--out", parts, "--resume")
-    assert status == 2
-    assert "is of another sweep (" in err
-    assert not (tmp_path / "parts.h5.parts").exists()
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -433,4 +412,4 @@ def test_the_figures_are_those_of_the_table(command, batchpid, tmp_path):
 def test_the_ground_is_on_or_off(batchpid, tmp_path):
     arm = write(tmp_path, one_joint())
     for word, expected in (("on", True), ("off", False)):
-        assert bool(saved(batchpid, tmp_path / "a.npz", arm, "--ground", word)["ground"]) is expected
+        assert bool(saved(batchpid, tmp_path / "a.h5", arm, "--ground", word)["ground"]) is expected

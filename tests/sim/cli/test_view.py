@@ -43,20 +43,18 @@ def test_tuned_gains_and_files_of_gains(batchpid, tmp_path):
     for gains in ("tuned", "tutorial", tmp_path / "plain.yaml"):
         status, _, err = batchpid("view", *SHORT, "--gains", gains, "--time-limit", 0.1)
         assert (status, err) == (0, "")
-    assert "--control drive" in batchpid("view", *SHORT, "--gains", "drive:20,5")[2]
+    assert "must be PID gains" in batchpid("view", *SHORT, "--gains", "drive:20,5")[2]
 
 
 def test_the_first_64_of_many_recorded_robots_are_shown(batchpid, tmp_path):
-    run = write(tmp_path / "run.npz", envs=70)
+    run = write(tmp_path / "run.h5", envs=70)
     status, said, _ = batchpid("view", *SHORT, "--play", run, "--time-limit", 0.2)
     assert status == 0
     assert "the first 64 of 70" in said
 
 
-def test_a_mesh_that_cannot_be_read_is_named_on_the_page_and_in_the_terminal(batchpid, tmp_path, monkeypatch):
-    """And a robot without ground, drawn by the real server, over a grid."""
-    texts = []
-    monkeypatch.setattr("viser.GuiApi.add_html", lambda self, content, **_: texts.append(content))
+def test_a_mesh_that_cannot_be_read_is_named(batchpid, tmp_path):
+    """And a robot without ground is drawn, over a grid."""
     (tmp_path / "<b>.stl").write_text("version https://git-lfs.github.com/spec/v1")
     seen = [f'<visual><geometry><mesh filename="{name}"/></geometry></visual>' for name in ("no.stl", "&lt;b>.stl")]
     box = '<collision><geometry><box size="1 1 1"/></geometry></collision>'
@@ -75,9 +73,6 @@ def test_a_mesh_that_cannot_be_read_is_named_on_the_page_and_in_the_terminal(bat
         "batchpid: warning: link 'arm' ('<b>.stl'): mesh cannot be read (a git-lfs pointer instead of the mesh: run "
         "git lfs pull): collision shapes are drawn instead; repair the file",
     ]
-    first, second = filter(None, texts)
-    assert "mesh not found" in first
-    assert "&lt;b&gt;.stl" in second
 
 
 def test_a_port_in_use_is_named_with_the_next(batchpid):
@@ -89,14 +84,14 @@ def test_a_port_in_use_is_named_with_the_next(batchpid):
 
 
 def test_a_run_of_another_robot_with_the_name_of_a_bundled_one_is_not_shown_as_that(batchpid, tmp_path):
-    run = write(tmp_path / "my run.npz", urdf=load_bundled("panda").urdf.replace("0.333", "0.433"))
+    run = write(tmp_path / "my run.h5", urdf=load_bundled("panda").urdf.replace("0.333", "0.433"))
     said = "robot: 'panda' of the recording is another one than the bundled robot of that name; name its URDF: batchpid"
     assert f"{said} view PATH/TO/ROBOT.urdf --play '{run}'" in batchpid("view", "--play", run)[2]
     assert f"{said} plot '{run}' PATH/TO/ROBOT.urdf --film a.gif" in batchpid("plot", run, "--film", "a.gif")[2]
 
 
 def test_a_run_of_a_robot_that_is_not_bundled_asks_for_its_urdf(batchpid, tmp_path):
-    run = write(tmp_path / "run.npz", robot="arm")
+    run = write(tmp_path / "run.h5", robot="arm")
     assert (
         "robot: 'arm' of the recording is not bundled; name its URDF: batchpid view PATH/TO/ROBOT.urdf --play"
         in batchpid("view", "--play", run)[2]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
 
+import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Randomization, Robot, Runner, Uniform
 
@@ -23,8 +24,13 @@ def arm(tool: str = INERTIAL) -> str:
     )
 
 
-def both(folder, text: str) -> list[Robot]:
-    return [Robot.load(write(folder, text), merge_fixed=merge) for merge in (True, False)]
+def load(folder, text: str) -> Robot:
+    return Robot.load(write(folder, text))
+
+
+def fixed_links(of: Robot) -> list[str]:
+    """Return the links that fixed joints hold; with wrenches measured, they are not merged."""
+    return [each.child_link for each in of.all_joints if not each.moves]
 
 
 def motion(of: Robot, ticks: int = 30, **options) -> np.ndarray:
@@ -37,24 +43,26 @@ def motion(of: Robot, ticks: int = 30, **options) -> np.ndarray:
 @pytest.mark.parametrize("physics", ["accurate", "fast"])
 @pytest.mark.parametrize("seed", [0, 3])
 def test_motion_of_random_trees_is_that_of_all_links(seed, physics, tmp_path):
-    ours, theirs = (
-        motion(each, physics=physics) for each in both(tmp_path, robot(*random_tree(np.random.default_rng(seed), 9)))
-    )
+    tree = load(tmp_path, robot(*random_tree(np.random.default_rng(seed), 9)))
+    ours, theirs = (motion(tree, physics=physics, wrenches=links) for links in (None, fixed_links(tree)))
     assert np.ptp(theirs, axis=0).max() > 0.1
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("tool", [INERTIAL + BOX, BOX, BOX + CAPSULE, ""])
 def test_mass_is_that_of_all_links(tool, tmp_path):
-    ours, theirs = (each.mass_matrix([0.3, -0.4]) for each in both(tmp_path, arm(tool)))
-    np.testing.assert_allclose(ours, theirs, atol=2e-5)  # links of 1e-6 kg
+    loaded = load(tmp_path, arm(tool))
+    ours = loaded.mass_matrix([0.3, -0.4])
+    theirs = ts.mass_matrix(loaded.rigid_tree, np.array([0.3, -0.4]))
+    np.testing.assert_allclose(ours[0], theirs, atol=2e-5)  # links of 1e-6 kg
 
 
 @pytest.mark.parametrize("name", ["camera", "bracket", "lower"])
 def test_payload_acts_at_the_link_that_carries_it(name, tmp_path):
     drawn = Randomization(payload=Uniform(1.5, 1.5), payload_link=name)
-    merged, unmerged = both(tmp_path, arm())
-    ours, theirs, none = motion(merged, randomization=drawn), motion(unmerged, randomization=drawn), motion(merged)
+    loaded = load(tmp_path, arm())
+    ours, none = motion(loaded, randomization=drawn), motion(loaded)
+    theirs = motion(loaded, randomization=drawn, wrenches=fixed_links(loaded))
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-4)
     assert np.abs(ours - none).max() > 1e-3
 
@@ -63,9 +71,10 @@ def test_poses_of_links_are_watched_by_name(tmp_path):
     def build(scene, env):
         return ["camera", "upper", next(each for each in scene.entities if each.name == "lower")]
 
-    poses = []
-    for loaded in both(tmp_path, arm()):
-        with Runner(loaded, 1, params=loaded.params(kp=5.0), build=build, workers=0) as runner:
+    poses, loaded = [], load(tmp_path, arm())
+    for links in (None, fixed_links(loaded)):
+        options = {"params": loaded.params(kp=5.0), "wrenches": links}
+        with Runner(loaded, 1, build=build, workers=0, **options) as runner:
             runner.reset(qpos=np.array([0.3, -0.4]))
             poses.append(runner.poses()[0])
     np.testing.assert_allclose(*poses, atol=2e-6)

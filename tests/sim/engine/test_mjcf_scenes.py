@@ -14,7 +14,8 @@ from batchpid.sim import FaultWarning, Randomization, Robot, Runner, Snapshot, U
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.mujoco.mujoco_engine import ENGINE  # noqa: E402
 from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
-from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
+from batchpid.sim.engine.scene_spec import SceneSpec, Variation  # noqa: E402
+from batchpid.sim.randomization.fields import nominal_values  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits")
 
@@ -223,9 +224,8 @@ def test_an_object_that_diverges_is_a_fault_of_its_env(load):
 def test_a_closed_loop_has_no_tree(load):
     robot = load(FOUR_BAR)
     options = {"num_envs": 1, "workers": 0, "engine": "mujoco"}
-    for given, argument in (({"control": "osc"}, "control"), ({"setpoint_space": "tool"}, "setpoint_space")):
-        with pytest.raises(InvalidArgumentError, match=f"^{argument}.*'loop'"):
-            Runner(robot, **options, **given)
+    with pytest.raises(InvalidArgumentError, match=r"^control.*'loop'"):
+        Runner(robot, **options, control="osc")
     with pytest.raises(InvalidArgumentError, match=r"gain_units.*'loop'"):
         Runner(robot, params=robot.designed(), **options)
     with Runner(robot, **options) as runner:  # its default gains need no tree
@@ -267,21 +267,21 @@ def test_what_a_scene_does_not_have_is_refused(load):
         Runner(robot, 1, workers=0, engine="mujoco")
 
 
-@pytest.mark.parametrize("merge_fixed", [True, False])
-def test_masses_and_damping_vary(load, merge_fixed):
+@pytest.mark.parametrize("wrenches", [None, ["tip"]])
+def test_masses_and_damping_vary(load, wrenches):
     """A randomized robot moves as the file with other numbers, also where several bodies are one link."""
     tip = (
         '<body name="tip" pos=".2 0 0" quat=".9 .1 .3 0"><inertial pos=".01 0 .02" mass="{}" diaginertia="{}"/></body>'
     )
     arm = ARM.replace(f"{LINK}</body>", f"{LINK}{{}}</body>")
-    robot = load(arm.format(tip.format(0.2, "1e-4 2e-4 2.5e-4")), merge_fixed=merge_fixed)
+    robot = load(arm.format(tip.format(0.2, "1e-4 2e-4 2.5e-4")))
     heavy = arm.format(tip.format(0.4, "2e-4 4e-4 5e-4")).replace('damping=".5"', 'damping="1"')
     model = mujoco.MjModel.from_xml_string(heavy.replace('damping=".2"', 'damping=".4"'))
     twice = Uniform(2.0, 2.0, operation="scale")
     varied = Randomization(link_mass={"tip": twice}, damping=twice)
     rows = efforts(robot, 15)  # without contacts, whose softness in MuJoCo depends on how mass is divided among bodies
     options = {"control": "effort", "compensate": "none", "substeps": 10, "randomization": varied}
-    with Runner(robot, 2, workers=0, engine="mujoco", **options) as runner:
+    with Runner(robot, 2, workers=0, engine="mujoco", wrenches=wrenches, **options) as runner:
         ours = run(runner, rows)
     theirs = in_mujoco(robot, model, rows, 10)
     np.testing.assert_allclose(ours, np.broadcast_to(theirs[:, None], ours.shape), rtol=0, atol=1e-8)
@@ -488,3 +488,79 @@ def test_a_floating_robot_starts_where_its_file_places_its_root_body(load, name,
             seen = runner.reset(base_pose=start, base_twist=[0, 0, 0.1, 0, 0.2, 0])
             np.testing.assert_allclose(seen.base_pose[0], start, atol=1e-6)
             np.testing.assert_allclose(seen.base_twist[0], [0, 0, 0.1, 0, 0.2, 0], atol=1e-6)
+
+
+BOX = '<geom type="box" size=".2 .2 .05" mass="5" contype="{0}" conaffinity="{0}"/>'
+DEFAULTS = {
+    "none": ("", 1),
+    "masks": ('contype="0" conaffinity="0"', 1),
+    "other masks": ("", 2),
+    "material": ('material="m"', 1),
+    "contact": ('margin=".2" condim="1" friction="0" solref=".1 1"', 1),
+}
+
+
+@pytest.mark.parametrize("name", DEFAULTS)
+def test_the_ground_that_is_added_is_not_of_the_files_default_class(load, name):
+    default, mask = DEFAULTS[name]
+    body = f'<body name="t" pos="0 0 .1"><freejoint/>{BOX.format(mask).replace("/>", " {}/>")}{{}}</body>'
+    own = 'margin="0" condim="3" friction="1 .005 .0001" solref=".02 1"'
+    geom = '<geom size=".05" contype="0" conaffinity="0"/>'
+    leg = f'<body pos="0 0 .2"><joint name="a" axis="0 1 0" range="-1 1"/>{geom}</body>'
+    head = f'<default><geom {default}/></default><asset><material name="m"/></asset>'
+    text = f"<mujoco>{head}<worldbody>{body.format(own, leg)}</worldbody></mujoco>"
+    with Runner(load(text, fixed_base=False), 1, workers=0, engine="mujoco") as runner:
+        for _ in range(100):
+            seen = runner.step([0.0])
+    np.testing.assert_allclose(seen.base_pose[0], [0, 0, 0.05, 1, 0, 0, 0], atol=1e-3)
+
+
+def test_a_sleep_policy_has_no_effect(load):
+    text = WALKER.replace('<body name="trunk"', '<body name="trunk" sleep="init"')
+    for fixed in (True, False):
+        with Runner(load(text, fixed_base=fixed), 1, workers=0, engine="mujoco") as runner:
+            assert runner.step([0.02]).qpos[0, 0] != 0
+
+
+def test_a_link_between_two_joints_of_a_body_has_no_sensor_and_no_payload(load):
+    robot = load(ARM)
+    (between,) = {link.name for link in robot.links} - {*robot.mjcf.bodies}
+    payload = Randomization(payload=Uniform(0.1, 0.2), payload_link=between)
+    for options in ({"contacts": [between]}, {"wrenches": [between]}, {"randomization": payload}):
+        with pytest.raises(RobotError, match=f"'{between}' lies between two joints of one body"):
+            Runner(robot, 1, workers=0, engine="mujoco", **options)
+
+
+@pytest.mark.parametrize(
+    ("draw", "ground", "arm"),
+    [
+        (Uniform(0.0, 0.0), 0.8, 0.4),
+        (Uniform(0.5, 0.5, operation="scale"), 0.4, 0.2),
+        (Uniform(0.2, 0.2, operation="abs"), 0.2, 0.1),
+        (Uniform(-0.6, -0.6), 0.2, 0.1),
+    ],
+)
+def test_ground_friction_is_drawn_around_that_of_the_file(load, draw, ground, arm):
+    text = ARM.replace(LINK, LINK[:-2] + ' friction=".4"/>')
+    robot = load(text.replace('type="plane"', 'type="plane" friction=".8"'))
+    spec = SceneSpec(robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf)
+    nominal = nominal_values("ground_friction", robot, robot.mjcf)
+    pack = ENGINE.make_pack(spec, 1, variation=Variation(ground_friction=draw.apply(nominal, draw.low)))
+    (model,) = pack.models
+    bodies = [model.body(body).name for body in model.geom_bodyid]
+    friction = dict(zip(bodies, model.geom_friction[:, 0], strict=True))
+    expected = {"world": ground, "fore": arm, "cube": 1.0, "lid": 1.0}
+    assert {name: friction[name] for name in expected} == pytest.approx(expected)
+
+
+def test_no_log_file_is_written(tmp_path, monkeypatch, capfd):
+    """Not by a worker, either, where MuJoCo warns of a small memory."""
+    boxes = "".join(f'<body pos="{x} 0 .04"><freejoint/>{BOX.format(1)}</body>' for x in range(8))
+    arm = '<body pos="0 0 1"><joint name="j" axis="0 1 0"/><geom size=".1"/></body>'
+    text = f'<mujoco><size memory="30K"/><worldbody><geom type="plane" size="1 1 1"/>{boxes}{arm}</worldbody></mujoco>'
+    (tmp_path / "scene.xml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    with Runner(Robot.load("scene.xml"), 1, workers=1, engine="mujoco") as runner:
+        runner.step([0.0])
+    assert "MuJoCo: Insufficient arena memory" in capfd.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.xml"]

@@ -18,11 +18,11 @@ FREE = {"control": "effort", "compensate": "none", "ground": False, "workers": 0
 
 
 def load(name, folder, **options):
-    """Return a bundled robot, or for a number one of twelve links, with fixed joints, merged for even numbers."""
+    """Return a bundled robot, or for a number one of twelve links, with fixed joints."""
     if isinstance(name, str):
         return Robot.load(name, **options)
     path = write(folder, robot(*random_tree(np.random.default_rng(name), 12)))
-    return Robot.load(path, merge_fixed=name % 2 == 0, **options)
+    return Robot.load(path, **options)
 
 
 def own_model(arm):
@@ -124,7 +124,7 @@ WORLDS = {
 def test_a_robot_of_drawn_masses_moves_as_one_whose_urdf_has_them(world, fixed_base, engine, tmp_path):
     drawn, change = WORLDS[world]
     arm = load(1, tmp_path, fixed_base=fixed_base)
-    other = Robot.load(write(tmp_path, edited(arm, change), "other.urdf"), merge_fixed=False, fixed_base=fixed_base)
+    other = Robot.load(write(tmp_path, edited(arm, change), "other.urdf"), fixed_base=fixed_base)
     efforts, runs = np.tile(np.linspace(-9.0, 9.0, arm.dof), (20, 1)), []
     for each, options in ((arm, {"randomization": Randomization(**drawn)}), (other, {}), (arm, {})):
         with Runner(each, 1, engine=engine, substeps=10, **FREE, **options) as runner:

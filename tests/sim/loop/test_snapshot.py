@@ -70,10 +70,11 @@ def test_a_new_process_and_a_copy_go_on_from_it(jaco2: Robot, tmp_path: Path) ->
     np.testing.assert_array_equal(np.load(tmp_path / "qpos.npy"), went_on.qpos)
 
 
-def test_in_free_motion_the_barrier_changes_the_last_bits_only() -> None:
+def test_in_free_motion_the_barrier_changes_the_last_bits_only(monkeypatch) -> None:
     results = []
-    for checkpoint_steps in (None, 40):
-        with make(checkpoint_steps=checkpoint_steps, ground=False) as runner:
+    for checkpoint_steps in (8000, 40):
+        monkeypatch.setattr("batchpid.sim.runner.CHECKPOINT_STEPS", checkpoint_steps)
+        with make(ground=False) as runner:
             results.append(runner.rollout(np.tile(GOAL, (20, 1))))
     np.testing.assert_allclose(results[0].qpos, results[1].qpos, rtol=0, atol=1e-7)
     assert np.abs(results[0].qpos[-1]).max() > 1e-3
@@ -165,7 +166,6 @@ DAMAGES = {
     "envs as text": about(num_envs="2"),
     "fewer joints": about(joints=["a"]),
     "a randomization without episodes": about(randomization={}),
-    "a tool without targets": about(setpoint_space="tool"),
     "no integral": array("controller.integral", None),
     "no start": array("containment.start_qvel", None),
     "no state": array("engine", None),
@@ -250,10 +250,10 @@ def test_a_file_holds_the_state_of_every_part(options: Any, tmp_path: Path) -> N
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Snapshot of a runner with episodes and targets."""
+    """Snapshot of a runner with episodes."""
     path = tmp_path_factory.mktemp("snapshot") / "drawn.npz"
     randomization = Randomization(payload=Uniform(0, 0.5))
-    with make(setpoint_space="tool", tool="hand", randomization=randomization, params=None) as runner:
+    with make(randomization=randomization) as runner:
         runner.snapshot().save(path)
     return path
 
@@ -266,13 +266,9 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
         array("episodes", lambda rows: rows - 9),
         array("episodes", None),
         about(randomization=None),
-        array("targets", lambda rows: rows[:1]),
-        array("targets", lambda rows: rows * np.nan),
-        array("targets", None),
-        about(setpoint_space="joints"),
     ],
 )
-def test_episodes_and_targets_that_do_not_agree_are_refused(drawn: Path, damage: Any, tmp_path: Path) -> None:
+def test_episodes_that_do_not_agree_are_refused(drawn: Path, damage: Any, tmp_path: Path) -> None:
     parts = read(drawn)
     assert Snapshot.load(write(tmp_path / "rewritten.npz", *parts)).episodes.shape == (N, 2)
     damage(*parts)

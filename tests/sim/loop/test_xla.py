@@ -7,12 +7,13 @@ import sys
 
 import numpy as np
 import pytest
+from featured import robot_with
 from identical import assert_identical
 from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Runner
+from batchpid.sim import Randomization, Runner, Uniform
 
 pytest.importorskip("jax")
 N = 5
@@ -30,15 +31,13 @@ def rollout(robot, backend="jax", ticks=20, envs=N, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("physics", ["accurate", "fast"])
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
-def test_two_seconds_of_motion(name, physics, dtype):
+def test_two_seconds_of_motion(name, physics):
     robot = load_bundled(name)
     options = {"ticks": 200, "substeps": 20, "physics": physics}
-    ours, theirs = rollout(robot, dtype=dtype, **options), rollout(robot, "numpy", **options)
-    atol = 1e-5 if dtype == "float64" else 1e-3
-    np.testing.assert_allclose(ours.qpos[-1], theirs.qpos[-1], rtol=0, atol=atol)
+    ours, theirs = rollout(robot, **options), rollout(robot, "numpy", **options)
+    np.testing.assert_allclose(ours.qpos[-1], theirs.qpos[-1], rtol=0, atol=1e-5)
 
 
 class NumPyOnly:
@@ -57,13 +56,30 @@ def test_a_controller_that_cannot_be_traced_is_an_error(panda):
         runner.step(np.zeros(panda.dof))
 
 
-def test_the_backend_says_what_is_a_program(panda):
-    actuators = bp.make_actuators(panda.dof, strength=0.9)
-    with Runner(panda, 2, backend="jax", workers=0, substeps=2, actuators=actuators) as runner:
-        assert "a call each sim step" in runner.backend
-        runner.step(panda.start)
-        runner.actuators = None
-        assert "a call each sim step" not in runner.backend or "BATCHPID_NATIVE=0" in runner.backend
+COUPLED = robot_with("mimic")
+LACKING = {
+    "actuators": {"actuators": bp.make_actuators(9, strength=0.9)},
+    "control": {"control": "drive"},
+    "guard": {"guard": True},
+    "randomization": {"randomization": Randomization(payload=Uniform(0, 1))},
+    "robot": {"robot": COUPLED},
+}
+
+
+@pytest.mark.parametrize("name", LACKING)
+def test_options_that_the_program_lacks_are_refused_by_name(panda, name):
+    with pytest.raises(InvalidArgumentError, match=rf"^{name}: .*backend 'jax'.*use backend='numpy'"):
+        Runner(**{"robot": panda, "num_envs": 2, "backend": "jax", "workers": 0} | LACKING[name])
+
+
+def test_actuators_in_flight_and_a_missing_extension_are_refused(panda, monkeypatch):
+    with Runner(panda, 2, backend="jax", workers=0) as runner:
+        assert runner.backend == "law in XLA, in one program with native sim steps"
+        with pytest.raises(InvalidArgumentError, match=r"actuators: .*backend 'jax'"):
+            runner.actuators = bp.make_actuators(panda.dof, strength=0.9)
+    monkeypatch.setenv("BATCHPID_NATIVE", "0")
+    with pytest.raises(InvalidArgumentError, match=r"backend: .*BATCHPID_NATIVE=0"):
+        Runner(panda, 2, backend="jax", workers=0)
 
 
 def test_jax_is_not_imported_unless_it_is_asked_for():

@@ -34,17 +34,14 @@ OPTIONS = {
     "pid": {},
     "mass matrix": {"params": {"gain_units": "mass_matrix", "kd": 20.0, "effort_limit": 80.0}},
     "controller": {"control": Integrator()},
-    "pid, a call each step": {"actuators": {"lag": 0.01}},
-    "controller, a call each step": {"control": Integrator(), "actuators": {"lag": 0.01}},
 }
 
 
 def motion(case, workers=0):
     """Return a rollout with a reset and a restored snapshot; the env 1 of a controller fails."""
     robot, options = load_bundled(RUBBING), dict(OPTIONS[case])
-    for name, make in {"params": bp.make_params, "actuators": bp.make_actuators}.items():
-        if name in options:
-            options[name] = make(robot.dof, *([100.0] if name == "params" else []), **options[name])
+    if "params" in options:
+        options["params"] = bp.make_params(robot.dof, 100.0, **options["params"])
     setpoint = np.tile(robot.start, (4, 3, 1))
     setpoint[2:, 1, 0] = 0.7
     with Runner(robot, 3, backend="jax", workers=workers, substeps=3, **options) as runner:
@@ -97,6 +94,6 @@ def test_the_state_of_a_controller_has_the_precision_of_the_runner():
     for wide in (False, True):
         with (
             changed(jax_enable_x64=wide),
-            Runner(load_bundled(RUBBING), 2, backend="jax", control=Integrator(), workers=0, dtype="float64") as runner,
+            Runner(load_bundled(RUBBING), 2, backend="jax", control=Integrator(), workers=0) as runner,
         ):
             assert runner.snapshot().states.controller["sum"].dtype == np.float64

@@ -60,12 +60,11 @@ def test_without_fixed_joints_nothing_changes(tmp_path):
     assert merge_fixed_links(text, none_asked).urdf == text
 
 
-def test_without_merging_every_link_is_placed_in_itself(tmp_path):
-    parts = link("a"), link("b"), link("c"), joint("h", "a", "b"), joint("f", "b", "c", "fixed", "")
-    kept = load(tmp_path, *parts, merge_fixed=False)
-    assert not kept.merge_fixed
-    assert [at.link for at in kept.bodies.values()] == ["a", "b", "c"]
-    assert [at.link for at in load(tmp_path, *parts).bodies.values()] == ["a", "b", "b"]
+def test_links_whose_wrench_is_measured_begin_a_body(tmp_path):
+    fixed = joint("f", "b", "c", "fixed", ""), joint("g", "c", "d", "fixed", "")
+    loaded = load(tmp_path, link("a"), link("b"), link("c"), link("d"), joint("h", "a", "b"), *fixed)
+    assert [at.link for at in loaded.bodies.values()] == ["a", "b", "b", "b"]
+    assert [at.link for at in place_links(loaded.urdf, ("c",)).values()] == ["a", "b", "c", "c"]
 
 
 @pytest.mark.parametrize("given", [True, False])

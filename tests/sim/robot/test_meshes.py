@@ -228,5 +228,5 @@ def test_robots_of_other_content_differ_in_what_they_say_about_themselves(tmp_pa
     assert moved.describe() == first.describe(), "equal but for the folder"
     (tmp_path / "m.stl").write_bytes(ascii_stl())
     assert Robot.load(path).describe()["urdf"] != first.describe()["urdf"]
-    for name, value in (("merge_fixed", False), ("fixed_base", False), ("self_collision", "none")):
+    for name, value in (("fixed_base", False), ("self_collision", "none")):
         assert Robot.load(path, **{name: value}).describe()[name] == value != first.describe()[name]

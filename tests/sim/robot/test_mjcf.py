@@ -111,14 +111,15 @@ def two_links(joint='<joint name="j"/>', rest="", geom=BOX):
 
 
 def spec_of(robot, **options):
-    options = {"ground": False, "merge_fixed": robot.merge_fixed} | options
+    options = {
+        "ground": False,
+    } | options
     return SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 5e-4, SOLVERS["accurate"], **options)
 
 
-@pytest.mark.parametrize("merge_fixed", [True, False])
 @pytest.mark.parametrize("name", TEXTS)
-def test_mass_matrix_and_bias_are_those_of_the_file(load, name, merge_fixed):
-    robot = load(TEXTS[name], merge_fixed=merge_fixed, self_collision="none")
+def test_mass_matrix_and_bias_are_those_of_the_file(load, name):
+    robot = load(TEXTS[name], self_collision="none")
     model = mujoco.MjModel.from_xml_string(TEXTS[name])
     data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
     joints = [3 if each == "joint3" else model.joint(each).id for each in robot.joint_names]  # that has no name
@@ -132,7 +133,7 @@ def test_mass_matrix_and_bias_are_those_of_the_file(load, name, merge_fixed):
         mujoco.mj_fullM(model, data, full)
         matrices.append(full[np.ix_(dofs, dofs)] - np.diag(model.dof_armature[dofs]))
         biases.append(data.qfrc_bias[dofs].copy())
-    massless = 1e-4 if name == "chain" or not merge_fixed else 1e-9  # links that both engines give 1e-6 kg
+    massless = 1e-4 if name == "chain" else 1e-9  # links that both engines give 1e-6 kg
     for dynamics, tolerance in (
         (scene_model(spec_of(robot, collisions=False)), massless),
         (robot.dynamics(), 1e-4),
@@ -721,3 +722,10 @@ def test_an_unwritable_cache_is_an_error(load, monkeypatch, tmp_path):
 def test_is_drawn_by_its_shapes(load):
     pytest.importorskip("trimesh")
     assert {surface.link for surface in surfaces(load(ARM))} == {"base", "upper", "fore", "flange", "hand"}
+
+
+def test_a_name_in_another_encoding_is_an_error_with_the_file(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_bytes(ARM.replace('"base"', '"körper"').encode("latin-1"))
+    with pytest.raises(RobotError, match=r"arm\.xml: a name is not UTF-8"):
+        Robot.load(path)

@@ -107,16 +107,12 @@ def test_a_stand_and_light_frames_may_have_any_figures(tmp_path):
 
 
 def test_masses_are_those_of_the_simulation(tmp_path):
-    """Of each link, with and without merged links, and in the robot's repr without SAPIEN."""
+    """Of each link, and in the robot's repr without SAPIEN."""
     shaped = arm(tmp_path, by_shapes=True)
-    for merge_fixed in (True, False):
-        masses = Robot.load(shaped.path, merge_fixed=merge_fixed).link_masses
-        assert {name: mass.source for name, mass in masses.items()} == {
-            "base": "none",
-            **dict.fromkeys("abc", "shapes"),
-        }
-        assert masses["a"].mass == pytest.approx(4.0)
-        assert masses["a"].size == pytest.approx(np.sqrt(0.18))
-        assert masses["a"].gyration == pytest.approx(np.sqrt(0.17 / 12))
+    masses = shaped.link_masses
+    assert {name: mass.source for name, mass in masses.items()} == {"base": "none", **dict.fromkeys("abc", "shapes")}
+    assert masses["a"].mass == pytest.approx(4.0)
+    assert masses["a"].size == pytest.approx(np.sqrt(0.18))
+    assert masses["a"].gyration == pytest.approx(np.sqrt(0.17 / 12))
     assert ", 3 links with the mass of shapes, path=" in repr(shaped)
     assert ", 9 kg, path=" in repr(arm(tmp_path))

@@ -26,10 +26,8 @@ def test_every_robot_has_a_target_within_its_limits(seed, low, width):
         warnings.simplefilter("ignore")
         loaded = Robot.load(write(Path(folder), f'<robot name="x">{text}</robot>'))
     assert not loaded.limit_violations(loaded.target)
-    moves = np.abs(loaded.target - loaded.start)
-    np.testing.assert_allclose(
-        moves, np.minimum(0.25 * np.maximum(loaded.upper - loaded.start, loaded.start - loaded.lower), 0.5)
-    )
+    room = np.maximum(loaded.upper - loaded.start, loaded.start - loaded.lower)
+    np.testing.assert_allclose(np.abs(loaded.target - loaded.start), np.minimum(0.25 * room, 0.5), atol=1e-12)
     assert (load_bundled("panda").target == load_bundled("panda").settings.target).all()
 
 

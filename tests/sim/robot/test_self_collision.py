@@ -147,13 +147,12 @@ def test_an_effortless_robot_that_overlaps_at_rest_stays_there(tmp_path):
 
 
 def spec_of(loaded):
-    merge = loaded.merge_fixed
-    return SceneSpec(loaded.urdf, loaded.ignored_pairs, loaded.joints, 1e-3, None, ground=False, merge_fixed=merge)
+    return SceneSpec(loaded.urdf, loaded.ignored_pairs, loaded.joints, 1e-3, None, ground=False)
 
 
-@given(st.integers(0, 2**32), st.booleans())
+@given(st.integers(0, 2**32))
 @settings(deadline=None, max_examples=8)
-def test_contacts_are_of_all_pairs_but_the_disabled_and_the_neighbours(seed, merge_fixed):
+def test_contacts_are_of_all_pairs_but_the_disabled_and_the_neighbours(seed):
     rng = np.random.default_rng(seed)
     parts, body = [link("base", INERTIAL)], {}
     for arm in range(5):  # all at one place, each with a tool; the last on the first
@@ -167,7 +166,7 @@ def test_contacts_are_of_all_pairs_but_the_disabled_and_the_neighbours(seed, mer
         path = write(Path(folder), robot(*parts))
         lines = (f'<disable_collisions link1="{a}" link2="{b}"/>' for a, b in disabled)
         write(Path(folder), robot(*lines), "test.srdf")
-        loaded = Robot.load(path, self_collision="urdf", merge_fixed=merge_fixed)
+        loaded = Robot.load(path, self_collision="urdf")
         near = contacts_of(spec_of(loaded), False).near(loaded.start)
         seen = {frozenset((first, second)) for first, second, _ in near}
     far = {pair for pair in map(frozenset, pairs) if len({body[name] for name in pair}) == 2}

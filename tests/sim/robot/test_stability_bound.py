@@ -84,7 +84,7 @@ def test_the_bound_of_late_motors_predicts_the_first_unstable_gain(units, late, 
     grows = {}
     for share in (0.95, 1.05):
         scaled = params.replace(kp=params.kp * share / ratio, kd=params.kd * share / ratio)
-        options = {"workers": 0, "substeps": 1, "ground": False, "collisions": False, "dtype": "float64"}
+        options = {"workers": 0, "substeps": 1, "ground": False, "collisions": False}
         with Runner(known, 1, params=scaled, actuators=motors, **options) as runner:
             runner.reset(pose)
             goal = pose + 1e-4 * np.random.default_rng(1).normal(size=pose.shape)

@@ -98,8 +98,6 @@ def test_links_of_one_rigid_body_count_once(tmp_path):
     frames = (link(f"f{n}", "") + joint(f"k{n}", "arm", f"f{n}", "fixed", "") for n in range(300))
     path = write(tmp_path, robot(BASE, ARM, HINGE, *frames))
     assert len(Robot.load(path).links) == 302
-    with pytest.raises(RobotError, match=r"has 302 links.*load with merge_fixed=True"):
-        Robot.load(path, merge_fixed=False)
 
 
 def test_parts_that_sapien_needs_are_added_and_those_that_it_does_not_need_are_removed(tmp_path):

@@ -236,8 +236,7 @@ def test_control_osc_moves_a_link(panda):
 
 @pytest.mark.slow
 def test_the_pose_of_the_tool_is_observed_recorded_and_drawn(panda, tmp_path):
-    pytest.importorskip("h5py")
-    from batchpid.sim import Recorder, plots, read_recording, write_recording
+    from batchpid.sim import Recorder, plots, read_recording
 
     control, point = OperationalSpace(panda, HAND, point=[0, 0, 0.1]), [0.0, 0.0, 0.1]
     goals = np.broadcast_to(np.multiply(control.command.neutral, [1, 1, 1, -1, -1, -1, -1]), (6, 2, 7))
@@ -250,12 +249,10 @@ def test_the_pose_of_the_tool_is_observed_recorded_and_drawn(panda, tmp_path):
     for seen in (first, last, rollout):
         wanted = ts.link_poses(panda.kinematic_tree(), seen.qpos, [HAND], point=point)[..., 0, :]
         np.testing.assert_array_equal(seen.tool_pose, wanted.astype(np.float32))
-    write_recording(rollout, tmp_path / "run.npz")
-    for name in ("run.h5", "run.npz"):
-        recorded = read_recording(tmp_path / name)
-        np.testing.assert_array_equal(recorded.tool_pose, rollout.tool_pose)
-        assert recorded.info.tool == HAND
-        assert recorded.info.units_of("tool_pose") == ("m",) * 3 + ("",) * 4
+    recorded = read_recording(tmp_path / "run.h5")
+    np.testing.assert_array_equal(recorded.tool_pose, rollout.tool_pose)
+    assert recorded.info.tool == HAND
+    assert recorded.info.units_of("tool_pose") == ("m",) * 3 + ("",) * 4
     assert rollout.for_envs([1]).for_ticks(slice(2)).tool_pose.shape == (2, 1, 7)
     named = {axes.get_title(loc="left"): axes for axes in plots.step_responses(rollout, mark=1).axes}
     marked = [line.get_ydata() for line in named["setpoint qx"].get_lines()][-1]
@@ -264,18 +261,11 @@ def test_the_pose_of_the_tool_is_observed_recorded_and_drawn(panda, tmp_path):
         assert runner.reset().tool_pose is None
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"control": "osc"}, "control: 'osc' needs a fixed base, .*'panda' .*; load .*fixed_base=True, or control its"),
-        ({"setpoint_space": "tool"}, "setpoint_space: 'tool' needs a fixed base.*; load .*fixed_base=True"),
-    ],
-)
-def test_a_floating_base_is_refused(options, message):
+def test_a_floating_base_is_refused():
     floating = Robot.load("panda", fixed_base=False)
-    for tool in (None, HAND):
-        with pytest.raises(InvalidArgumentError, match=message):
-            Runner(floating, 1, workers=0, tool=tool, **options)
+    message = "control: 'osc' needs a fixed base, .*'panda' .*; load .*fixed_base=True, or control its"
+    with pytest.raises(InvalidArgumentError, match=message):
+        Runner(floating, 1, workers=0, control="osc")
     with pytest.raises(RobotError, match=r"fixed base; load the robot with fixed_base=True, or control its joints"):
         OperationalSpace(floating, HAND)
 

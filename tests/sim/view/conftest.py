@@ -6,23 +6,15 @@ import time
 
 import pytest
 
-FLAGS = [
+FLAGS = [  # every pixel is drawn by the processor
     "--headless=new",
     "--no-sandbox",
-    "--no-first-run",
-    "--no-default-browser-check",
-    "--disable-extensions",
-    "--disable-quic",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--hide-scrollbars",
-    "--ignore-gpu-blocklist",
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--disable-gpu-compositing",
-    "--window-size=1100,760",  # every pixel is drawn by the processor
+    "--hide-scrollbars",
+    "--window-size=1100,760",
 ]
 
 
@@ -85,8 +77,8 @@ def until():
     def until(condition, seconds=200, what="the condition"):
         deadline, pause = time.monotonic() + seconds, 0.05
         while time.monotonic() < deadline:
-            if found := condition():
-                return found
+            if value := condition():
+                return value
             time.sleep(pause)
             pause = min(0.5, 1.5 * pause)  # each check takes time from the page
         raise AssertionError(f"{what} did not happen within {seconds} s")

@@ -74,7 +74,7 @@ def test_robots_are_drawn_and_a_slider_moves_them(live, view, open_page, until):
     enter(page, "joint1 [rad]", 1.5)
     until(lambda: live.setpoint[0, 0] == 1.5, what="the number's setpoint")
     slide(page, "joint1 [rad]", 5)
-    until(lambda: live.setpoint[0, 0] == pytest.approx(1.55), what="the slider's setpoint")
+    until(lambda: live.setpoint[0, 0] == pytest.approx(1.505), what="the slider's setpoint")
     assert (live.setpoint[:, 0] == live.setpoint[0, 0]).all()
     press(page, "Run")
     until(lambda: live.frame().qpos[0, :, 0].min() > 1.0, what="the motion")
@@ -84,26 +84,23 @@ def test_robots_are_drawn_and_a_slider_moves_them(live, view, open_page, until):
     )
 
 
-def test_gains_pause_step_reset_and_push(live, view, open_page, until):
+def test_gains_pause_step_and_reset(live, view, open_page, until):
     page = open_page(view.url)
-    until(lambda: "no effort at its limit" in page.page_source, what="loading")
+    until(lambda: "saturated" in page.page_source, what="loading")
     press(page, "Step")
-    until(lambda: live.time == pytest.approx(live.period), what="one step")
+    until(lambda: live.frame().time[0] == pytest.approx(live.period), what="one step")
     press(page, "Gains")
     until(lambda: number_box(page, "kp").is_displayed(), what="the gains tab")
     enter(page, "kp", 77)
-    until(lambda: 77.0 in live.gains["pid"].params.kp, what="the gain")
-    press(page, "Disturb")
-    until(lambda: number_box(page, "Payload [kg]").is_displayed(), what="the disturbance tab")
-    enter(page, "Payload [kg]", 2)
-    until(lambda: live.payload == 2.0, what="the payload")
-    press(page, "+y")
+    until(lambda: 77.0 in live.params.kp, what="the gain")
+    press(page, "back to the first gains")
+    until(lambda: 77.0 not in live.params.kp, what="the first gains")
     press(page, "Run")
-    until(lambda: np.abs(live.frame().qpos[0] - live.start).max() > 0.02, what="the push")
+    until(lambda: live.frame().time[0] > 0.5, what="the run")
     press(page, "Pause")
     until(lambda: view.panel.frames_left == 0, what="the pause")
     press(page, "Reset")
-    until(lambda: live.time == 0.0, what="the reset")
+    until(lambda: live.frame().time[0] == 0.0, what="the reset")
     np.testing.assert_allclose(live.frame().qpos[0], live.start, atol=1e-6)
 
 

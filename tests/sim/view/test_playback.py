@@ -1,7 +1,5 @@
 """Playback of recorded runs."""
 
-import copy
-
 import numpy as np
 import pytest
 
@@ -40,19 +38,6 @@ def test_a_playback_seeks(rollout):
     assert playback.frame().time[0] == playback.duration
     playback.reset()
     assert playback.frame().time[0] == 0.0
-
-
-def test_non_finite_numbers_are_shown_as_zero(rollout):
-    bad = copy.deepcopy(rollout.for_ticks(slice(0, 2)))
-    bad.observation.qpos[1, 0] = np.nan
-    bad.observation.effort[1, 0] = np.inf
-    bad.observation.ok[1, 0] = False
-    playback = Playback(bad)
-    playback.seek(1.0)
-    frame = playback.frame()
-    assert not frame.qpos[0, 0].any()
-    assert not frame.effort[0, 0].any()
-    assert frame.ok[0].tolist() == [False, True]
 
 
 def test_a_rollout_of_another_robot_is_refused(jaco2, rollout):
