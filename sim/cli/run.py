@@ -18,9 +18,9 @@ from batchpid.sim.cli.flags import MeshOptions
 from batchpid.sim.cli.outputs import bar
 from batchpid.sim.cli.report import run_report, tool_report, trajectory_report
 from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.setpoint_files import Setpoints
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
+from batchpid.sim.setpoint_files import Setpoints
 from batchpid.sim.tuning.evaluation import (
     Evaluation,
     evaluate_gains,

@@ -130,9 +130,10 @@ def _readings(log: Log, names: Sequence[str]) -> Iterator[tuple[str, Log]]:
             order[[first, second]] = second, first
             yield f"{column} of {names[first]} and {names[second]} exchanged", changed(sides, eye[order])
     yield f"{log.kind} of all joints with the other sign", changed((False, True), -eye)
-    for words, factor in {"thousandths of SI units": 1e-3, "degrees": np.pi / 180}.items():
-        yield f"{log.kind} in {words}", changed((False, True), factor * eye)
-    for shift in np.arange(0.01, 0.06, 0.01) if log.kind == "setpoint" else ():
+    if log.kind == "effort":
+        yield "effort in thousandths of SI units", changed((False, True), 1e-3 * eye)
+        return
+    for shift in np.arange(0.01, 0.06, 0.01):
         words = f"setpoints that were logged {1e3 * shift:.0f} ms late"
         yield words, replace(log, command_time=log.command_time - shift)
 

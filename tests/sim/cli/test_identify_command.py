@@ -53,11 +53,11 @@ def test_motors_are_written_for_other_commands(batchpid, log, tmp_path):
 def test_a_log_that_nothing_explains_ends_in_an_error_and_no_file(batchpid, log, tmp_path):
     """The setpoints are of another motion. --force writes the file all the same."""
     time = 0.002 * np.arange(500)
-    table = np.stack([time, 0.3 * np.sin(8.1 * time + 1), 0.3 * np.sin(5 * time)], axis=1)
+    table = np.stack([time, 0.3 * np.sin(8.1 * time + 1), 0.3 * np.sin(5 * time) + 0.1 * np.sin(17 * time)], axis=1)
     np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="time,setpoint:hinge,qpos:hinge", comments="")
     out = tmp_path / "motors.yaml"
     words = ("identify", log[0], tmp_path / "log.csv", "--gains", log[2], "--no-payload", "--out", out)
-    status, said, error = batchpid(*words)
+    status, _, error = batchpid(*words)
     assert status == 2
     assert "less than half" in error
     assert not out.exists()

@@ -81,7 +81,11 @@ def test_a_compensation_through_the_motors_is_part_of_the_model(robot, compensat
 
 @pytest.mark.slow
 def test_a_payload_is_found_and_a_known_one_is_not_found_again(robot, tmp_path):
-    tool = '<link name="load"><inertial><mass value="0.4"/><inertia ixx="1e-9" ixy="0" ixz="0" iyy="1e-9" iyz="0" izz="1e-9"/>'
+    tensor = " ".join(
+        f'{name}="{value}"'
+        for name, value in zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), [1e-9] * 3 + [0] * 3, strict=True)
+    )
+    tool = f'<link name="load"><inertial><mass value="0.4"/><inertia {tensor}/>'
     fixed = '<joint name="f" type="fixed"><parent link="fore"/><child link="load"/><origin xyz="0 0 0.15"/></joint>'
     loaded = load(tmp_path, URDF.replace("</robot>", f"{tool}</inertial></link>{fixed}</robot>"))
     rollout = run(loaded, motion())
