@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 
-import numpy as np
 import pytest
 
 import batchpid as bp
@@ -50,13 +49,12 @@ def test_motors_are_written_for_other_commands(batchpid, log, tmp_path):
     assert (tmp_path / "motors-fit.png").exists()
 
 
-def test_a_log_that_nothing_explains_ends_in_an_error_and_no_file(batchpid, log, tmp_path):
-    """The setpoints are of another motion. --force writes the file all the same."""
-    time = 0.002 * np.arange(500)
-    table = np.stack([time, 0.3 * np.sin(8.1 * time + 1), 0.3 * np.sin(5 * time) + 0.1 * np.sin(17 * time)], axis=1)
-    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="time,setpoint:hinge,qpos:hinge", comments="")
+def test_a_fit_that_leaves_too_much_of_the_error_ends_in_no_file(batchpid, log, tmp_path, monkeypatch):
+    """--force writes the file all the same."""
+    monkeypatch.setattr("batchpid.sim.identification.result.EXPLAINS", 0.0)
+    robot, recording, gains = log
     out = tmp_path / "motors.yaml"
-    words = ("identify", log[0], tmp_path / "log.csv", "--gains", log[2], "--no-payload", "--out", out)
+    words = ("identify", robot, recording, "--gains", gains, "--no-payload", "--out", out)
     status, _, error = batchpid(*words)
     assert status == 2
     assert "less than half" in error
