@@ -352,7 +352,7 @@ def _joined_rates(values: Sequence[bool | None]) -> bool | None:
 _FIRST = itemgetter(0)
 RULES: dict[str, Rule] = dict.fromkeys(
     (
-        *("robot", "joint_names", "units", "lower", "upper", "effort_limit", "urdf", "dissipation", "merge_fixed"),
+        *("robot", "joint_names", "units", "lower", "upper", "effort_limit", "urdf", "dissipation"),
         *("fixed_base", "timestep", "substeps", "control", "tool", "own_command", "compensate", "engine", "physics"),
         *("collisions", "ground", "contacts", "wrenches", "randomization", "options"),
     ),

@@ -251,7 +251,7 @@ def _read_bag(path: Path, reading: Reading) -> dict[str, Float64]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise MissingDependencyError("rosbags", "a log in a ROS bag", "logs") from None
+        raise MissingDependencyError("rosbags", "a log in a ROS bag", "tune") from None
     topics = {reading.topic: _MEASURED} | ({reading.command_topic: _COMMANDED} if reading.command_topic else {})
     samples = {topic: defaultdict[str, list[tuple[int, float]]](list) for topic in topics}
     try:
