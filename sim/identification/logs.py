@@ -126,7 +126,7 @@ def logs_of_rollout(
     changes = np.abs(np.diff(rollout.time) - rollout.tick)
     obstacles = {
         f"is of the joints {', '.join(info.joint_names)}": info.joint_names != robot.joint_names,
-        "was made with setpoints that are not positions or efforts of joints": info.own_command is not None,
+        "was made with setpoints that are not of joints": info.own_command is not None,
         f"was made under control {info.control!r}": info.control not in (None, "pid", "effort"),
         f"holds {recorded}s": kind not in (None, recorded),
         "was made with setpoint rates": bool(info.rates) and recorded == "setpoint",
