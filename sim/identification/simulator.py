@@ -36,13 +36,13 @@ from batchpid.motors.guard import Guard
 from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
 from batchpid.native.tracing import Trace, trace_trees
-from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.engine.scene_spec import added_friction
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import REFRESH_STEPS, control_step
 from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Step, StepState
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import robot_model
 from batchpid.task_space import native_rows
 from batchpid.task_space.rigid_tree import RigidTree
 

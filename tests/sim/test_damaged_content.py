@@ -207,6 +207,11 @@ def good(request, tmp_path):
     return kind, path, path.read_bytes(), plain(kind.read(path))
 
 
+def repeats(here: list, there: list) -> bool:
+    """Return whether a table is another one with rows repeated, which a log leaves out with a warning."""
+    return [row for at, row in enumerate(here) if at == 0 or row != here[at - 1]] == there
+
+
 def check(good, content: bytes) -> None:
     """Check that a file with ``content`` is refused with its name in the error, or read with the right value."""
     kind, path, original, value = good
@@ -214,7 +219,7 @@ def check(good, content: bytes) -> None:
     path.write_bytes(content)
     try:
         here, there = (plain(decoded(path.suffix, each)) for each in (content, original))
-        same, may_be = here == there, holds(here, there)
+        same, may_be = here == there, holds(here, there) or (path.suffix == ".csv" and repeats(here, there))
     except Exception:  # no tree: a text file must be refused, and a binary file may have the original's value
         same, may_be = is_binary, is_binary
     try:
