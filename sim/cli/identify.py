@@ -73,7 +73,7 @@ class IdentifyCommand:
     actuators file."""
     force: flags.Force = False
 
-    imports = ("batchpid.sim.plots", "batchpid.sim.robot.robot_model", "batchpid.sim.identification.identification")
+    imports = ("batchpid.sim.plots", "batchpid.sim.identification.identification")
 
     def run(self) -> None:
         """Run the command."""

@@ -42,7 +42,6 @@ from batchpid.sim.loop.control_step import REFRESH_STEPS, control_step
 from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Step, StepState
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.robot_model import robot_model
 from batchpid.task_space import native_rows
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -114,7 +113,7 @@ class Plant:
     """Logged ``joints`` of ``robot``, with a known ``payload`` at its tool [kg]."""
 
     def __init__(self, robot: Robot, joints: tuple[int, ...], payload: float = 0.0) -> None:
-        coupling, tree = robot.coupling, robot_model(robot, False).tree.held
+        coupling, tree = robot.coupling, robot.dynamics(False).tree
         moves = np.isin(coupling.leader, joints)
         number = np.cumsum(moves) - 1
         followers = [
