@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 import batchpid as bp
 from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.warn import warn
-from batchpid.errors import InvalidArgumentError
 from batchpid.sim.observation import Observation
 from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
-from batchpid.sim.robot.loop_stability import StabilityWarning, stability_report
+from batchpid.sim.robot.loop_stability import StabilityWarning
 
 LISTED = 4
 """Envs that a warning lists for each joint."""
@@ -189,9 +188,12 @@ class DriveChatterCheck:
         kp, kd = (np.zeros((1, self._robot.dof)) if leaf is None else leaf for leaf in (params.kp, params.kd))
         armature = None if actuators is None else actuators.armature
         least = 0.0 if armature is None else armature.min(0)
+        robot, coupling = self._robot, self._robot.coupling
+        matrix = coupling.reduced(robot.mass_matrix(robot.start) + least * np.eye(robot.dof))[0]
+        matrix = matrix + 0.5 * self._timestep * np.diag(coupling.reduced_damping(robot.damping))
         try:
-            inertia = stability_report(self._robot, params, self._robot.start, self._timestep, least).inertia
-        except InvalidArgumentError:  # the robot's mass matrix is not positive definite
+            inertia = coupling.of_all(1 / np.diagonal(np.linalg.inv(matrix)))
+        except np.linalg.LinAlgError:
             return
         limit = math.inf if params.effort_max is None else np.asarray(params.effort_max, np.float64)
         speed = self._timestep * limit / (2 * inertia)  # w: the report's inertia is I + dt b / 2
