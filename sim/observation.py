@@ -215,7 +215,7 @@ class RunInfo:
     engine: str | None = None
     """Physics engine: "sapien"."""
     physics: str | None = None
-    """Solver settings: "accurate", "fast", "free", or the text of a :class:`batchpid.sim.Physics`."""
+    """Solver settings: "accurate", "fast", or the text of a :class:`batchpid.sim.Physics`."""
     collisions: bool | None = None
     """False if the robots had no collision shapes."""
     ground: bool | None = None
@@ -352,7 +352,7 @@ def _joined_rates(values: Sequence[bool | None]) -> bool | None:
 _FIRST = itemgetter(0)
 RULES: dict[str, Rule] = dict.fromkeys(
     (
-        *("robot", "joint_names", "units", "lower", "upper", "effort_limit", "urdf", "dissipation", "merge_fixed"),
+        *("robot", "joint_names", "units", "lower", "upper", "effort_limit", "urdf", "dissipation"),
         *("fixed_base", "timestep", "substeps", "control", "tool", "own_command", "compensate", "engine", "physics"),
         *("collisions", "ground", "contacts", "wrenches", "randomization", "options"),
     ),
