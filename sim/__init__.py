@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 if __name__ == "sim":  # the folder of a checkout, under the name that it had before
@@ -29,7 +28,7 @@ if __name__ == "sim":  # the folder of a checkout, under the name that it had be
 from batchpid.sim.command import CommandSpec
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
-from batchpid.sim.observation import Observation, Rollout, RunInfo, register_findings, register_plot
+from batchpid.sim.observation import Observation, Rollout, RunInfo
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
@@ -112,18 +111,4 @@ def _dynamics(robot: RobotDescription, ground: bool | None) -> Dynamics:
     return robot_model(robot, ground)
 
 
-def _plot() -> Callable[..., Any]:
-    from batchpid.sim.plots import step_responses
-
-    return step_responses
-
-
-def _findings(rollout: Rollout, robot: RobotDescription) -> list[Finding]:
-    from batchpid.sim.robot.unsettled import unsettled_findings
-
-    return unsettled_findings(rollout, robot)
-
-
 register_dynamics(_dynamics)
-register_plot(_plot)
-register_findings(_findings)

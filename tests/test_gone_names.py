@@ -12,9 +12,13 @@ GONE = (
     # one a line, as a regular expression; sorted
     "_repr_html_",
     "h5[.]partial",
+    "integral-limit",
     "open_dataset",
+    "register_findings",
+    "register_plot",
     "rollout .*--resume",
     "sim[.]sweep",
+    "start-in-ground",
     "to_dataset",
     "xarray",
     r"--duration\b",

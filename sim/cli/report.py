@@ -13,9 +13,9 @@ from tabulate import tabulate
 from batchpid.arrays.array_types import Rows
 from batchpid.metrics import StepMetrics
 from batchpid.sim import Robot, Rollout, Runner
+from batchpid.sim.diagnosis.findings import settled_envs, short_words
 from batchpid.sim.identification.setpoint_files import Setpoints
 from batchpid.sim.robot.findings import Findings
-from batchpid.sim.robot.unsettled import settled_envs, short_words
 from batchpid.sim.tuning.evaluation import Evaluation, arm_joints, following_error
 from batchpid.task_space.frames import pose_error
 
