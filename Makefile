@@ -5,7 +5,7 @@
 # make docs     the API reference and the guides, as pages in out/site
 # make bench    benchmarks and their baselines, on an idle machine (10 minutes); the last lines compare them
 # make bench-check  ratios of speeds against their floors: 3 minutes, on an idle machine
-# make figures  measure and redraw docs/performance.md (7 to 25 minutes, on an idle machine)
+# make figures  measure and redraw docs/performance.md (5 to 15 minutes, on an idle machine)
 # make soak     the slow tests, each result as it comes (an hour)
 # make wheel    dist/: the sdist, and from it the wheel, tried in a clean environment; needs network and a C++ compiler
 #
@@ -31,7 +31,7 @@ BUILD := $(STEP) "compiling native extensions" env -u BATCHPID_NATIVE $(RUN) -u 
 # Compiled modules are kept, whatever the caller's setting: the tests start hundreds of processes that import them.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-isa check docs format bench bench-check figures accuracy soak wheel clean
+.PHONY: demo test test-isa check docs format bench bench-check figures soak wheel clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.base
@@ -82,14 +82,6 @@ figures: $(VENV)/.dev
 	$(call bench_case,panda,fast)
 	$(call bench_case,jaco2,accurate)
 	$(call bench_case,jaco2,fast)
-	@$(RUN) bench/motions.py --ticks 20 --rounds 2 --json $(MEASURED)/motions.json
-	@$(RUN) -m pytest bench/test_few_robots.py bench/test_scaling.py bench/test_resources.py \
-		--benchmark-json $(MEASURED)/pytest.json
-	@$(RUN) bench/draw.py $(MEASURED)
-
-# The errors of the physics presets depend on physics and gains, not on the machine's speed.
-accuracy: $(VENV)/.dev
-	@$(RUN) bench/accuracy.py --json $(MEASURED)/accuracy.json
 	@$(RUN) bench/draw.py $(MEASURED)
 
 soak: $(VENV)/.dev

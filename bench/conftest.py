@@ -1,14 +1,17 @@
 """Fixtures of the benchmarks: the size of a run, and the summary of comparisons at its end.
 
-With ``--benchmark-disable`` (``make test``) every case, and every check of ``make bench-check``, runs once on the tiny
-workload ``SMOKE``, and floors of ratios are ignored: such a smoke run shows that the benchmarks work.
+With ``--benchmark-disable`` (``make test``) the benchmarks, and the checks of ``make bench-check``, run once on the
+tiny workload ``SMOKE``, and floors of ratios are ignored: such a smoke run shows that the benchmarks work. Of a
+benchmark with several robots, presets or numbers of envs it runs the panda, "accurate", and the largest number.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -54,16 +57,34 @@ def is_smoke(config: pytest.Config) -> bool:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[COMPARISONS] = []
+    if is_smoke(config):
+        os.environ["NUMBA_DISABLE_JIT"] = "1"  # compilation would take most of the time
     if config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.getoption("benchmark_only"):
         config.option.benchmark_disable = True  # "pytest" alone is a run of the tests
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Select the tests marked ``check``, too, in a smoke run."""
-    if is_smoke(config):
-        for item in items:
-            item.own_markers = [mark for mark in item.own_markers if mark.name != "check"]
+    """Select the tests marked ``check``, too, in a smoke run, and one workload of each benchmark."""
+    if not is_smoke(config):
+        return
+    benchmarks = [item for item in items if item.path.is_relative_to(Path(__file__).parent)]
+    largest: dict[str, int] = {}
+    for item in benchmarks:
+        item.own_markers = [mark for mark in item.own_markers if mark.name != "check"]
+        name, _, workload = item.name.partition("[")
+        largest[name] = max(largest.get(name, 0), num_envs(item))
+        if "jaco2" in workload or "fast" in workload:
+            items.remove(item)
+    for item in benchmarks:
+        if item in items and num_envs(item) < largest[item.name.partition("[")[0]]:
+            items.remove(item)
+
+
+def num_envs(item: pytest.Item) -> int:
+    """Return the number of envs in the name of an item, or 0."""
+    parameters: dict[str, Any] = item.callspec.params if hasattr(item, "callspec") else {}
+    return int(parameters.get("num_envs", 0))
 
 
 @pytest.fixture(scope="session")
@@ -73,8 +94,11 @@ def most(pytestconfig: pytest.Config) -> Size:
 
 
 @pytest.fixture(scope="module")
-def quick_smoke() -> Iterator[None]:
-    """Make JAX compile with few optimisations."""
+def quick_smoke(most: Size) -> Iterator[None]:
+    """Make JAX compile with few optimisations in a smoke run."""
+    if most.floors:
+        yield
+        return
     jax = pytest.importorskip("jax")
     jax.config.update("jax_disable_most_optimizations", True)
     yield

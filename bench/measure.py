@@ -17,7 +17,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 from unittest.mock import patch
@@ -131,7 +131,7 @@ def measure_rates(workload: Workload, names: Iterable[str] = CASES) -> dict[str,
     }
 
 
-def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, float]:
+def measure_phases(workload: Workload) -> dict[str, float]:
     """Return the microseconds per env step that each phase of the closed loop takes in a worker.
 
     Measured in this process with a worker's share of the envs. The control step runs in NumPy, with native calls into
@@ -142,7 +142,7 @@ def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, flo
     share = max(1, workload.num_envs // workload.processes)
     robot = workload.simulated_robot()
     shared = SharedArrays(Arrays.layout(1, share, robot.dof))
-    options = RunnerOptions(robot, share, physics=workload.physics, collisions=collisions)
+    options = RunnerOptions(robot, share, physics=workload.physics)
     loop = Loop(options, robot.params(), slice(0, share), Arrays.from_fields(shared.arrays))
     loop.reset(np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, robot.dof)))
     loop.ticks[0].command.setpoint[...] = workload.target
@@ -156,7 +156,7 @@ def measure_phases(workload: Workload, collisions: bool = True) -> dict[str, flo
     shared.close()
     env_steps = workload.steps * share
     spent["control"] = total - sum(spent.values())
-    spent["waiting"] = _waiting(workload, collisions) * env_steps
+    spent["waiting"] = _waiting(workload) * env_steps
     return {phase: seconds / env_steps * 1e6 for phase, seconds in spent.items()}
 
 
@@ -177,9 +177,9 @@ def _time_calls(pack: EnginePack, spent: dict[str, float]) -> None:
             setattr(pack, name, timed(phase, getattr(pack, name)))
 
 
-def _waiting(workload: Workload, collisions: bool) -> float:
+def _waiting(workload: Workload) -> float:
     """Return the mean seconds per env step of a tick beyond the work of a worker."""
-    with workload.runner(collisions=collisions) as runner:
+    with workload.runner() as runner:
         runner.step(workload.target)
         idle = 0.0
         for _ in range(workload.ticks):
@@ -233,8 +233,7 @@ def main(options: Options) -> None:
         "per_process": {
             case: round(ratios[case] * result.processes / workload.processes, 3) for case, result in results.items()
         },
-        "phases": _rounded(measure_phases(workload)),
-        "free_phases": _rounded(measure_phases(replace(workload, physics="free"), collisions=False)),
+        "phases": {phase: round(us, 2) for phase, us in measure_phases(workload).items()},
     }
     calls = native.describe_calls("SAPIEN", load_engine("sapien").native_obstacle())
     print(f"{options.robot}, {options.num_envs} envs, {workload.processes} processes, {calls}\n")
@@ -245,15 +244,10 @@ def main(options: Options) -> None:
     ]
     print(table(rows, ["case", "thousand env-steps/s", f"{OURS} / case", "per process"], "lrrr"))
     print("\nmicroseconds per env step in a worker:")
-    rows = [[name, *map(str, figures[key].values())] for name, key in ((OURS, "phases"), (FREE, "free_phases"))]
-    print(table(rows, ["", *figures["phases"]], "lrrrrrr"))
+    print(table([[OURS, *map(str, figures["phases"].values())]], ["", *figures["phases"]], "lrrrrrr"))
     if options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(options.json, json.dumps({"machine": machine()} | figures) + "\n")
-
-
-def _rounded(phases: dict[str, float]) -> dict[str, float]:
-    return {phase: round(us, 2) for phase, us in phases.items()}
 
 
 def machine() -> dict[str, Any]:

@@ -109,7 +109,7 @@ def test_thousands_of_envs(benchmark, report, most):
     It is a new process, because this one may use memory again that earlier tests have freed.
     """
     benchmark.group = "MuJoCo, in one process"
-    num_envs = min(8192, 100 * most.envs)
+    num_envs = min(8192, 20 * most.envs)
 
     def build():
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:

@@ -1,4 +1,4 @@
-"""PPO in JAX on batchpid/Walk-v0: one policy walks forward at a commanded speed with the bundled quadruped.
+"""PPO in JAX on the task in ``walk.py``: one policy walks forward at a commanded speed with the bundled quadruped.
 
     python examples/train_walk.py --picture train_walk.png
 
@@ -10,11 +10,11 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import ppo
 import tyro
 from matplotlib.figure import Figure
+from walk import WalkVectorEnv
 
 from batchpid.sim import Recorder, plots
 
@@ -45,7 +45,7 @@ def make_envs(config, num_envs, episode):
     """Return robots that are to walk forward."""
     task = {"commands": [[config.speed, 0.0, 0.0]] * 2, "max_episode_steps": episode}
     options = {"workers": config.workers, "engine": "mujoco", "physics": "fast", "timestep": config.timestep}
-    return gymnasium.make_vec("batchpid.sim.gym:batchpid/Walk-v0", num_envs, **task, **options)
+    return WalkVectorEnv(num_envs, **task, **options)
 
 
 def evaluate(act, config):
@@ -66,7 +66,7 @@ def draw(curve, config):
     """Return a figure of the speed over the env steps."""
     figure, (steps, _, speed, distance) = Figure(figsize=(6.5, 3.2), layout="constrained"), curve.T
     axes = figure.subplots()
-    axes.set_title(f"PPO on batchpid/Walk-v0: quadruped, seed {config.seed}", fontsize=11)
+    axes.set_title(f"PPO on a quadruped that walks, seed {config.seed}", fontsize=11)
     axes.axhline(config.speed, color="black", lw=0.8, ls="--", label="command")
     axes.plot(steps, speed, color="#15803d", label="forward, at the end of episodes")
     axes.plot(steps, distance / (config.episode / 50), color="#c2570c", label="along x, mean of episodes")

@@ -1,6 +1,6 @@
 """Runner: N robots in N headless scenes, stepped by worker processes under one batch controller.
 
-Each method makes a command of its arguments (:mod:`batchpid.sim.runner_commands`), and :meth:`Runner._execute` runs it.
+Each method makes an operation of its arguments (:mod:`batchpid.sim.operations`), and :meth:`Runner._execute` runs it.
 
 Longer than 350 lines because the public signatures and their documentation are spelled out for editors and readers.
 """
@@ -31,28 +31,28 @@ from batchpid.sim.loop.backend import describe
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo, empty_observation
-from batchpid.sim.options import RunnerOptions
-from batchpid.sim.run_warnings import RunWarnings
-from batchpid.sim.runner_arguments import count_ticks, read_command
-from batchpid.sim.runner_commands import (
-    ChangeActuators,
-    ChangeParams,
-    GoBack,
-    MakeSnapshot,
-    Read,
-    ResetEnvs,
-    RunnerCommand,
-    RunTicks,
+from batchpid.sim.operations import (
+    Operation,
+    ReadPoses,
+    ReadStateSizes,
+    Reset,
+    Restore,
+    Run,
+    SetActuators,
+    SetParams,
+    TakeSnapshot,
     restored,
     snapshot_of,
 )
+from batchpid.sim.options import RunnerOptions
+from batchpid.sim.run_warnings import RunWarnings
+from batchpid.sim.runner_arguments import count_ticks, read_command
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE, KINDS, OPTIONS, arguments_of, checked_option
 from batchpid.sim.runner_state import RunnerState
 from batchpid.sim.workers.contact_log import MissedContact
 from batchpid.sim.workers.node import NodeInfo
 from batchpid.sim.workers.one_call import OneCall
 from batchpid.sim.workers.pool import Outcome, WorkerPool
-from batchpid.sim.workers.requests import ReadPoses, ReadStateSizes, Restore
 
 CHECKPOINT_STEPS = 8000
 """Sim steps between checkpoints, from the last of which a lost worker is replayed."""
@@ -104,7 +104,7 @@ class Runner(SingleOwner):
         self._call, self._warnings = OneCall(), RunWarnings(checked)
         self._tool_pose = checked.tool_pose
         self._state = RunnerState.first(checked)
-        self._sent: RunTicks | None = None  # and not completed yet
+        self._sent: Run | None = None  # and not completed yet
         self._unreceived: Observation | None = None
         self._cause: BaseException | None = None  # of the end
         try:
@@ -118,13 +118,13 @@ class Runner(SingleOwner):
         """Start the workers, and reset all envs."""
         state, options = self._state, self.options
         seed = None if options.randomization is None else 0
-        start = ResetEnvs.read(options, state, self._warnings.limits, (None, None), None, seed, (None, None))
+        start = Reset.read(options, state, self._warnings.limits, (None, None), None, seed, (None, None))
         self._call.begin()
         try:
             self._call.waits = True
             self._pool = WorkerPool(options, state.params)
             self._pool.open()
-            outcome = self._pool.run(start.request(state))
+            outcome = self._pool.run(start)
             if outcome.failure is not None:
                 raise outcome.failure.error
             self._state = state = start.committed(state, outcome)
@@ -186,7 +186,7 @@ class Runner(SingleOwner):
         """
         self._ready("reset")
         limits, base = self._warnings.limits, (base_pose, base_twist)
-        self._execute(ResetEnvs.read(self.options, self._state, limits, (qpos, qvel), mask, seed, base))
+        self._execute(Reset.read(self.options, self._state, limits, (qpos, qvel), mask, seed, base))
         return self._pool.present.observation.copied(self._tool_pose)
 
     def step(
@@ -316,7 +316,7 @@ class Runner(SingleOwner):
                 done = min(ticks, number + self._max_ticks())
                 part = slice(number, done)
                 rows = command.map(itemgetter(part))
-                self._execute(RunTicks(rows, options.substeps, options.timestep))
+                self._execute(Run.after(self._state, rows, options.substeps, options.timestep))
                 for name in options.observed:
                     getattr(seen, name)[part] = getattr(self._pool.arrays.observation, name)[: done - number]
         next(shown, None)  # the end
@@ -340,7 +340,7 @@ class Runner(SingleOwner):
             There is no ``build``, or it returned more entities for one env than for another.
         """
         self._ready()
-        rows = [row for part in self._execute(Read(ReadPoses())).results for row in part]
+        rows = self._read(ReadPoses())
         counts = [len(row) for row in rows]
         if not rows or len(set(counts)) > 1:
             problem = f"returned {sorted(set(counts))} entities, by env" if rows else "was not given"
@@ -364,7 +364,7 @@ class Runner(SingleOwner):
             problem, remedy = "are those of an MJCF file in the engine 'mujoco'", "use robot.kinematic_tree() for links"
             raise InvalidArgumentError("names", problem, remedy=remedy)
         chosen = tuple([choice("names", name, self.options.mjcf.bodies) for name in names])
-        return np.stack([row for part in self._execute(Read(ReadPoses(chosen))).results for row in part])
+        return np.stack(self._read(ReadPoses(chosen)))
 
     @property
     def params(self) -> bp.PIDParams:
@@ -375,7 +375,7 @@ class Runner(SingleOwner):
     def params(self, params: bp.PIDParams) -> None:
         self._ready()
         checked = self.options.check_params(params)
-        self._execute(ChangeParams(checked))
+        self._execute(SetParams(checked))
         self._warnings.check_stability(checked, self._state.actuators)
         self._warnings.set_gains(checked, self._state.actuators)
 
@@ -391,7 +391,7 @@ class Runner(SingleOwner):
     def actuators(self, actuators: bp.Actuators | None) -> None:
         self._ready()
         checked = self.options.check_actuators(actuators)
-        self._execute(ChangeActuators(checked))
+        self._execute(SetActuators(checked))
         self._warnings.set_gains(self._state.params, checked)
 
     def snapshot(self) -> Snapshot:
@@ -420,10 +420,9 @@ class Runner(SingleOwner):
         """
         self._ready("restore")
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()").check(self.options.describe())
-        sizes = [size for part in self._execute(Read(ReadStateSizes())).results for size in part]
-        request = restored(self.options, snapshot, sizes)
-        self._execute(GoBack(request))
-        self._pool.start_replay_from(request)
+        restore = restored(self.options, snapshot, self._read(ReadStateSizes()))
+        self._execute(restore)
+        self._pool.start_replay_from(restore)
         self._warnings.set_gains(self._state.params, self._state.actuators)
         return self._pool.present.observation.copied(self._tool_pose)
 
@@ -568,23 +567,23 @@ class Runner(SingleOwner):
             self._execute(self._sent)
         return self._state
 
-    def _tick(self, given: dict[str, ArrayLike | None], substeps: int | None) -> RunTicks:
-        """Return the command for the arguments of :meth:`step`, checked."""
+    def _tick(self, given: dict[str, ArrayLike | None], substeps: int | None) -> Run:
+        """Return the operation for the arguments of :meth:`step`, checked."""
         command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
         count = self.substeps if substeps is None else checked_option("substeps", substeps)
         if self.recorder is not None and count != self.substeps:
             problem, remedy = f"is not the runner's {self.substeps}", "all ticks of a recording have the same length"
             raise InvalidArgumentError("substeps", problem, value=count, remedy=remedy)
-        return RunTicks(command, count, self.timestep)
+        return Run.after(self._state, command, count, self.timestep)
 
-    def _begin(self, command: RunTicks) -> None:
-        """Send the request of ticks, for :meth:`_execute` to complete."""
+    def _begin(self, run: Run) -> None:
+        """Send a request of ticks, for :meth:`_execute` to complete."""
         self._prepare_ticks()
         self._call.begin()
         try:
             self._call.waits = True
-            self._pool.begin(command.request(self._state))
-            self._sent = command
+            self._pool.begin(run)
+            self._sent = run
         except BaseException as error:
             self._fail(error)
             raise
@@ -593,34 +592,38 @@ class Runner(SingleOwner):
                 self._pool.close()
             self._call.end()
 
-    def _execute(self, command: RunnerCommand) -> Outcome:
-        """Execute a command, or complete the one that was sent; then issue warnings.
+    def _read(self, operation: Operation) -> Any:
+        """Return the result of an operation that reads from the loops of all envs."""
+        return operation.join(self._execute(operation).results)
+
+    def _execute(self, operation: Operation) -> Outcome:
+        """Execute an operation, or complete the one that was sent; then issue warnings.
 
         Ctrl-C does not interrupt it between the request and the new state. The runner is closed if the workers cannot
         complete the request, or if a second Ctrl-C ends it.
         """
-        call, pool, is_sent = self._call, self._pool, command is self._sent
-        ticks = command if isinstance(command, RunTicks) else None
+        call, pool, is_sent = self._call, self._pool, operation is self._sent
+        run = operation if isinstance(operation, Run) else None
         is_due = self.recorder is not None or self._state.steps_since_checkpoint >= CHECKPOINT_STEPS
-        if is_due and ticks is not None and not is_sent:
+        if is_due and run is not None and not is_sent:
             self._prepare_ticks()
         call.begin()
         try:
             call.waits, before = True, self._state
             if not is_sent:
-                pool.begin(command.request(before))
+                pool.begin(operation)
             outcome = pool.finish()
             call.waits = False
-            if outcome.failure is None or ticks is not None:
-                self._state = command.committed(before, outcome)
-            if ticks is not None and self.recorder is not None:
-                self._record(self.recorder, ticks, before, outcome)
+            if outcome.failure is None or run is not None:
+                self._state = operation.committed(before, outcome)
+            if run is not None and self.recorder is not None:
+                self._record(self.recorder, run, before, outcome)
             if is_sent:
                 self._sent, self._unreceived = (
                     None,
                     None if outcome.failure else self._pool.present.observation.copied(self._tool_pose),
                 )
-            if outcome.failure is not None and command.changes_loops:
+            if outcome.failure is not None and operation.changes_loop:
                 self._fail(outcome.failure.error)
         except BaseException as error:
             self._fail(error)
@@ -631,9 +634,9 @@ class Runner(SingleOwner):
             call.end()
         if outcome.failure is not None:
             raise outcome.failure.error
-        if ticks is not None and self._warnings.is_watching:
-            seconds, seen = ticks.substeps * ticks.timestep, outcome.ticks.arrays.observation
-            self._warnings.see(ticks.command, seen, outcome.num_ticks, seconds)
+        if run is not None and self._warnings.is_watching:
+            seconds, seen = run.substeps * self.timestep, outcome.ticks.arrays.observation
+            self._warnings.see(run.command, seen, outcome.num_ticks, seconds)
         faults, contacts = self._state.faults, self._state.contacts
         if pool.messages or faults.faults or contacts is not None:
             self._warnings.issue(faults, contacts, pool.messages)
@@ -646,11 +649,11 @@ class Runner(SingleOwner):
         if self.recorder is not None:
             self.recorder.prepare()
 
-    def _record(self, recorder: TickRecorder, ticks: RunTicks, before: RunnerState, outcome: Outcome) -> None:
+    def _record(self, recorder: TickRecorder, run: Run, before: RunnerState, outcome: Outcome) -> None:
         """Pass completed ticks on to the recorder."""
         for number, arrays in enumerate(outcome.completed):
-            time = (before.steps + (number + 1) * ticks.substeps) * ticks.timestep
-            recorder.append(time, ticks.command.map(itemgetter(number)), arrays.observation.copied(self._tool_pose))
+            time = (before.steps + (number + 1) * run.substeps) * self.timestep
+            recorder.append(time, run.command.map(itemgetter(number)), arrays.observation.copied(self._tool_pose))
 
     def _fail(self, error: BaseException) -> None:
         """End the runner, which cannot complete a command."""
@@ -662,7 +665,7 @@ class Runner(SingleOwner):
     def _take_snapshot(self) -> Snapshot:
         """Return a snapshot, from which the runner goes on, and a replacement of a lost worker begins."""
         state = self._state
-        snapshot = snapshot_of(self.options, state, self._execute(MakeSnapshot()).results)
+        snapshot = snapshot_of(self.options, state, self._read(TakeSnapshot()))
         self._pool.start_replay_from(Restore(snapshot, state.draws))
         return snapshot
 

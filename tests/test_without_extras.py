@@ -57,7 +57,7 @@ def modules_of_extras() -> list[str]:
 def test_the_index_lists_every_extra_for_users():
     rows = re.findall(r"^\| (.*) \|.*\|.*[GM]B \|$", INDEX.read_text(), re.MULTILINE)
     assert [row.strip("`") for row in rows if row != "none"][-1] == "all"
-    assert {row.strip("`") for row in rows} == {"none", "all", "sb3"} | FOR_USERS
+    assert {row.strip("`") for row in rows} == {"none", "all"} | FOR_USERS
 
 
 def test_the_base_contains_no_package_of_an_extra():

@@ -26,6 +26,17 @@ def namespace(*leaves: Array) -> Array:
     return np
 
 
+def in_dtype_of(params: Any, *arrays: Array) -> list[Any]:
+    """Return ``arrays`` in the dtype of the floats in ``params``, a named tuple; None stays None."""
+    like = next((leaf.dtype for leaf in params if getattr(leaf, "dtype", np.dtype(bool)).kind == "f"), None)
+    return [x if x is None or like is None or x.dtype == like else _as_dtype(x, like) for x in arrays]
+
+
+def _as_dtype(x: Array, dtype: DType) -> Array:
+    xp = namespace(x)
+    return x.astype(xp.result_type(np.zeros((), dtype)))  # in JAX float32 instead of float64, unless that is enabled
+
+
 def clip(x: Array, low: Array, high: Array, xp: ArrayModule) -> Array:
     """Return x within [low, high], either of which may be None; NaN stays NaN."""
     x = x if low is None else xp.maximum(x, low)

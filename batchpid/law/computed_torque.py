@@ -32,7 +32,7 @@ from typing import Any
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.choices import Everywhere, PerMassMatrix
-from batchpid.arrays.elementwise import clip, matrix_vector, namespace, row_minimum
+from batchpid.arrays.elementwise import clip, in_dtype_of, matrix_vector, namespace, row_minimum
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.coefficients import Coefficients
 from batchpid.law.params import PIDParams
@@ -62,6 +62,7 @@ def advance_with_mass_matrix(
     feedforward
         Effort added to the effort of the law [N m or N]: passive force and more.
     """
+    mass_matrix, feedforward, setpoint_acceleration = in_dtype_of(k, mass_matrix, feedforward, setpoint_acceleration)
     rates = measurement_rate, setpoint_rate, given_acceleration(k, setpoint_acceleration)
     new, terms = advance(_unlimited(k), state, setpoint, measurement, *rates)
     new, effort, unsaturated = _to_effort(k, state, new, terms.effort, mass_matrix, feedforward)
@@ -108,6 +109,7 @@ def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matri
     was, becomes = (isinstance(params.gain_units, PerMassMatrix) for params in (old, new))
     if state.integral is None or was == becomes:
         return state
+    (mass_matrix,) = in_dtype_of(new, mass_matrix)
     xp = namespace(state.integral, mass_matrix)
     if was:
         integral = matrix_vector(mass_matrix, state.integral)

@@ -11,6 +11,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, DType
 from batchpid.arrays.choices import CHOICES, HoldEffort
+from batchpid.arrays.elementwise import in_dtype_of
 from batchpid.checks.validate import instance, read_array, time_step
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
@@ -28,7 +29,10 @@ DRIVE_LACKS = {
 
 
 def checked_inputs(params: PIDParams, state: PIDState, measurement: Array, **inputs: Any) -> list[Any]:
-    """Return ``measurement`` and ``inputs`` as arrays that broadcast with the params and the state; None stays None."""
+    """Return ``measurement`` and ``inputs`` as arrays in the params' dtype that broadcast with params and state.
+
+    None stays None.
+    """
     instance("params", params, PIDParams, "build them with make_params")
     instance("state", state, PIDState, "begin with init(params, measurement)")
     arrays = {"measurement": _as_array("measurement", measurement)}
@@ -40,7 +44,7 @@ def checked_inputs(params: PIDParams, state: PIDState, measurement: Array, **inp
     usual = {whole, (1, joints)}  # a look saves most of the time
     if whole[-1:] != (joints,) or not usual.issuperset(of_params.union(*known.values())):
         _check_shapes(np.broadcast_shapes(*of_params), joints, known)
-    return list(arrays.values())
+    return in_dtype_of(params, *arrays.values())
 
 
 def check_alone(law: Any, measurement_rate: Array) -> None:

@@ -31,7 +31,7 @@ from typing import Any
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.choices import Everywhere, HoldEffort
-from batchpid.arrays.elementwise import clip, flush, namespace, nearest_turn, replace_envs, wrap
+from batchpid.arrays.elementwise import clip, flush, in_dtype_of, namespace, nearest_turn, replace_envs, wrap
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.input_checks import check_alone, check_drive, checked_inputs, checked_mask, checked_state, needs
 from batchpid.law.params import PIDParams
@@ -47,7 +47,7 @@ def init(params: PIDParams, measurement: Array) -> PIDState:
     """
     (measurement,) = checked_inputs(params, PIDState(), measurement)
     xp = namespace(*params, measurement)
-    y = xp.zeros_like(measurement, dtype=xp.result_type(params.kp, measurement)) + measurement
+    y = xp.zeros_like(measurement) + measurement
     # No two leaves share a buffer: JAX donates each of them.
     leaves = {
         name: y.copy() if name in ("measurement", "setpoint", "origin") else xp.zeros_like(y)
@@ -73,7 +73,8 @@ def step(
 ) -> tuple[PIDState, Any]:
     """Advance the law by ``dt`` seconds; return the state and the effort.
 
-    Arrays are (envs, joints), or (1, joints) for all envs, in the params' dtype; none is written to.
+    Arrays are (envs, joints), or (1, joints) for all envs, and taken in the params' dtype, which state and effort have;
+    none is written to.
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ def advance(
     """
     check_alone(k, measurement_rate)
     xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
-    r, y, r_rate, y_rate, ff = setpoint, measurement, setpoint_rate, measurement_rate, feedforward
+    r, y, r_rate, y_rate, ff = in_dtype_of(k, setpoint, measurement, setpoint_rate, measurement_rate, feedforward)
     finite = None
     if k.non_finite is not None:
         finite = xp.isfinite(r) & xp.isfinite(y)

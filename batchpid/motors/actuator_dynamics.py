@@ -35,7 +35,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.display import array_summary
-from batchpid.arrays.elementwise import TURN, clip, namespace, push_history, wrap
+from batchpid.arrays.elementwise import TURN, clip, in_dtype_of, namespace, push_history, wrap
 from batchpid.checks.validate import check_time_step
 from batchpid.motors import delay
 from batchpid.motors import sensor_noise as noise
@@ -106,6 +106,7 @@ def init(
         dt is not positive, or above 1 s; ``max_delay`` is traced and ``samples`` is missing, or it needs too many.
     """
     check_time_step("dt", dt)
+    qpos, qvel, effort = in_dtype_of(actuators, qpos, qvel, effort)
     xp = namespace(*actuators, qpos)
     zeros = xp.zeros_like(qpos)
     position, velocity = zeros + qpos, zeros if qvel is None else zeros + qvel
@@ -181,7 +182,8 @@ def deliver(
     ``effort`` is that asked for [N m or N], ``qpos`` and ``qvel`` are the joints' true positions [rad or m] and
     velocities, all (envs, joints); none is written to.
     """
-    return advance_effort(discretise(actuators, state, dt), state, effort, qpos, qvel)
+    inputs = in_dtype_of(actuators, effort, qpos, qvel)
+    return advance_effort(discretise(actuators, state, dt), state, *inputs)
 
 
 def measure(
@@ -191,7 +193,7 @@ def measure(
 
     ``qpos`` and ``qvel`` are the true positions [rad or m] and velocities; none is written to.
     """
-    return advance_measurement(discretise(actuators, state, dt), state, qpos, qvel)
+    return advance_measurement(discretise(actuators, state, dt), state, *in_dtype_of(actuators, qpos, qvel))
 
 
 class Stages(NamedTuple):

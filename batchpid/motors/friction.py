@@ -110,13 +110,22 @@ def init(
     check_time_step("dt", dt)
     if friction.coulomb is None:
         return FrictionState()
-    return refresh(friction, started(velocity, load), mass_matrix, dt, damping, stiffness)
+    return with_sliding(friction, refresh(friction, started(velocity, load), mass_matrix, dt, damping, stiffness))
 
 
 def started(velocity: Array, load: Array) -> FrictionState:
-    """Return the state of :func:`init` without K and w, which :func:`refresh` sets."""
+    """Return the state of :func:`init` before :func:`refresh` sets K and w, and :func:`with_sliding` the sliding."""
     zero = namespace(velocity, load).zeros_like(velocity)
     return FrictionState(load + zero, velocity + zero, zero, zero, zero)
+
+
+def with_sliding(friction: Friction, state: FrictionState) -> FrictionState:
+    """Return the state of joints at rest or in motion: a joint slides where friction at rest is less than K |v|."""
+    if friction.static is None:
+        return state
+    needed = abs((state.gain - state.memory) * state.velocity)
+    slides = needed > bound_of(friction, state.sliding, state.effort, state.velocity)
+    return state._replace(sliding=slides.astype(state.effort.dtype))
 
 
 def refresh(

@@ -24,7 +24,7 @@ from typing import Annotated, Any, NamedTuple
 
 from batchpid.arrays.array_types import Array, ArrayModule, DType
 from batchpid.arrays.display import array_summary
-from batchpid.arrays.elementwise import TURN, clip, namespace, wrap
+from batchpid.arrays.elementwise import TURN, clip, in_dtype_of, namespace, wrap
 from batchpid.arrays.field_tables import Field, check_leaves, declared
 from batchpid.arrays.leaves import LeafBuilder
 from batchpid.checks.validate import check_time_step
@@ -108,6 +108,7 @@ FIELDS = declared(make_guard, Field)
 
 def init(guard: Guard, qpos: Array) -> GuardState:
     """Return the state of a guard that starts at rest at ``qpos`` (envs, joints) [rad or m]."""
+    (qpos,) = in_dtype_of(guard, qpos)
     zeros = namespace(*guard, qpos).zeros_like(qpos)
     return GuardState(zeros + qpos, zeros)
 
@@ -119,6 +120,7 @@ def advance(guard: Guard, state: GuardState, setpoint: Array, dt: float) -> tupl
     Raises InvalidArgumentError if dt is a number that is not positive, or above 1 s.
     """
     check_time_step("dt", dt)
+    (setpoint,) = in_dtype_of(guard, setpoint)
     xp = namespace(*guard, setpoint, *state)
     target = clip(setpoint, guard.lower, guard.upper, xp)
     error = wrap(target - state.setpoint, guard.turns, xp)

@@ -48,7 +48,7 @@ from typing import NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Array, ArrayModule
-from batchpid.arrays.elementwise import clip, namespace, wrap
+from batchpid.arrays.elementwise import clip, in_dtype_of, namespace, wrap
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space import native_law
@@ -74,8 +74,9 @@ def init(params: OSCParams, qpos: Array) -> OSCState:
     Raises InvalidArgumentError for params of another type.
     """
     instance("params", params, OSCParams, MAKE_PARAMS)
+    (qpos,) = in_dtype_of(params, qpos)
     xp = namespace(*params, qpos)
-    posture = xp.zeros_like(qpos, dtype=xp.result_type(params.stiffness, qpos)) + qpos
+    posture = xp.zeros_like(qpos) + qpos
     integral = None if params.integral_gain is None else xp.zeros((len(posture), 6), posture.dtype)
     return OSCState(posture, integral)
 

@@ -93,6 +93,8 @@ def _run(arguments: list[str]) -> int:
 
 def parse(arguments: Sequence[str]) -> Any:
     """Return the command with its flags; for --help or unknown flags print help and raise SystemExit."""
+    if os.environ.get("NO_COLOR"):
+        os.environ["TERM"] = "dumb"  # tyro colours its help on every other terminal
     options = (
         tyro.conf.DisallowNone,  # a flag is left out, not given None
         tyro.conf.FlagCreatePairsOff,  # --force without --no-force

@@ -42,8 +42,8 @@ class DemoCommand:
     def run(self) -> int:
         """Run the command; return the exit status, 3 if no env settles."""
         from batchpid.sim import Runner, plots
-        from batchpid.sim.cli.report import exit_status
-        from batchpid.sim.cli.run import hold_setpoint, run_figures, start_poses
+        from batchpid.sim.cli.report import exit_status, run_figures
+        from batchpid.sim.cli.run import held, simulate, start_poses
 
         outputs, picture = OutputFiles(self), self.picture or beside(FOLDER / self.robot, "demo")
         picture = outputs.path("picture", picture, plots.FORMATS)
@@ -62,7 +62,8 @@ class DemoCommand:
             made = Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options)
         with made as runner:
             print(f"{title}, {robot.dof} joints, {len(runner.pids) or 1} processes, {runner.backend}", flush=True)
-            rollout, report = hold_setpoint(runner, start, settings.target, self.seconds)
+            setpoints = held(settings.target, self.seconds, runner.timestep * runner.substeps)
+            rollout, report = simulate(runner, start, setpoints)
         print(report)
         for note in settings.notes:
             print(f"Note: {note}")

@@ -5,11 +5,11 @@ from __future__ import annotations
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from batchpid.arrays.array_types import Array
+from batchpid.arrays.array_types import Array, Document
 from batchpid.checks.validate import array
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Recorder, Robot
@@ -54,12 +54,12 @@ class RolloutCommand:
     timestep: Annotated[float, flags.BOUNDS["timestep"]] = 1 / 2000
     """Time step of simulation and control [s]."""
     substeps: Annotated[int, flags.BOUNDS["substeps"]] = 20
-    """Sim steps of a tick, from one sample to the next; with --trajectory as the times of its rows say."""
+    """Sim steps of a tick, from one sample to the next."""
     seed: flags.Seed = 0
     """Seed of the start poses."""
     spread: flags.Distance = 0.3
-    """Largest distance of a start pose from the robot's own, with --control osc from the bundled robot's target, with
-    --trajectory from its first row at time 0 [rad or m]; env 0 starts at that itself."""
+    """Largest distance of a start pose from the robot's own, with --control osc from its target, with --trajectory
+    from its first row at time 0 [rad or m]; env 0 starts at that itself."""
     runner: Annotated[flags.RunnerFlags, flags.group(RUNNER)] = field(default_factory=RUNNER)
     dissipation: Literal["urdf", "sapien"] = "urdf"
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""
@@ -78,14 +78,8 @@ class RolloutCommand:
     def run(self) -> int:
         """Run the command; return the exit status, 3 if a setpoint was held and no env settles."""
         from batchpid.sim import Runner, plots
-        from batchpid.sim.cli.report import exit_status
-        from batchpid.sim.cli.run import (
-            follow,
-            hold_pose,
-            hold_setpoint,
-            run_figures,
-            start_poses,
-        )
+        from batchpid.sim.cli.report import exit_status, run_figures
+        from batchpid.sim.cli.run import held, simulate, start_poses
         from batchpid.sim.tuning.randomization_presets import load_randomization
 
         outputs = OutputFiles(self)
@@ -93,45 +87,47 @@ class RolloutCommand:
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes))
-        randomization = None if self.randomize is None else load_randomization(self.randomize, robot)
-        target = robot.start if robot.settings is None else robot.settings.target
-        setpoints = None if self.trajectory is None else self._read(robot, self.trajectory)
-        params: Any = None
-        if osc := self.control == "osc":
+        options: Document = {"tool": self.tool, "timestep": self.timestep, "substeps": self.substeps}
+        options |= self.runner.options() | {"control": self.control}
+        if self.randomize is not None:
+            options["randomization"] = load_randomization(self.randomize, robot)
+
+        # Gains, or the controller of a tool.
+        columns = robot.joint_names
+        goal: Array = robot.target
+        if self.control == "osc":
             flags.refuse(self, ("gains",), "are for the control of joints")
-            control: Any = OperationalSpace(robot, self.tool or default_tool(robot), posture=target)
-            start = start_poses(robot, self.num_envs, self.spread, self.seed, target)
-            goal: Array = control.tool_pose(target) if self.setpoint is None else self.setpoint
-            setpoint = array("setpoint", goal, (1, 7), control.command.names, kind="entry")[0]
-        else:
-            center = None if setpoints is None else setpoints.start
-            start = start_poses(robot, self.num_envs, self.spread, self.seed, center)
-            goal = target if self.setpoint is None else self.setpoint
-            setpoint = array("setpoint", goal, (1, robot.dof), robot.joint_names)[0]
-            gains = gain_set(robot, self.gains or ("drive" if self.control == "drive" else None))
-            params, control = gains.params, "drive" if gains.control == "drive" else self.control
-            if self.rates and setpoints is not None and setpoints.acceleration is not None:
-                _check_accelerations(self.trajectory, control == "pid" and params.gain_units is not None)
-        with waiting(f"building {self.num_envs} robots"):
-            made = Runner(
-                robot,
-                self.num_envs,
-                params=params,
-                control=control,
-                tool=self.tool,
-                timestep=self.timestep,
-                **self.runner.options(),
-                substeps=self.substeps if setpoints is None else setpoints.substeps,
-                randomization=randomization,
+            options["control"] = control = OperationalSpace(
+                robot, self.tool or default_tool(robot), posture=robot.target
             )
+            goal, columns = control.tool_pose(robot.target), control.command.names
+        else:
+            gains = gain_set(robot, self.gains or ("drive" if self.control == "drive" else None))
+            options["params"] = gains.params
+            if gains.control == "drive":
+                options["control"] = "drive"
+
+        # Setpoints: of a file, or one that is held.
+        center, rates = robot.target if self.control == "osc" else robot.start, Document()
+        if self.trajectory is not None:
+            motion = self._read(robot, self.trajectory)
+            setpoints, options["substeps"] = motion.position, motion.substeps
+            center = center if motion.start is None else motion.start
+            if self.rates:
+                rates = {"setpoint_rates": motion.rate, "setpoint_accelerations": motion.acceleration}
+        else:
+            goal = goal if self.setpoint is None else self.setpoint
+            goal = array("setpoint", goal, (1, len(columns)), columns, kind="entry")[0]
+            setpoints = held(goal, self.seconds, self.timestep * self.substeps)
+
+        with waiting(f"building {self.num_envs} robots"):
+            made = Runner(robot, self.num_envs, **options)
         with (
             made as runner,
-            Recorder(out, runner, seed=self.seed, overwrite=self.force) if out else nullcontext(),
+            nullcontext() if out is None else Recorder(out, runner, seed=self.seed, overwrite=self.force),
         ):
-            if setpoints is not None:
-                rollout, report = follow(runner, start, setpoints, self.rates)
-            else:
-                rollout, report = (hold_pose if osc else hold_setpoint)(runner, start, setpoint, self.seconds)
+            start = start_poses(robot, self.num_envs, self.spread, self.seed, center)
+            rollout, report = simulate(runner, start, setpoints, **rates)
         print(report)
         if out is not None:
             print(f"written: {out}")
@@ -141,30 +137,23 @@ class RolloutCommand:
         if picture is not None:
             figure = plots.step_responses(rollout, mark=0, title=robot.name)
             print(f"picture: {plots.save(figure, picture)}")
-        return 0 if setpoints is not None else exit_status(robot, rollout)
+        return 0 if self.trajectory is not None else exit_status(robot, rollout)
 
     def _read(self, robot: Robot, path: Path) -> Setpoints:
-        """Return the setpoints in a file, if no flag contradicts them."""
+        """Return the setpoints in a file, and print whence their rates are."""
         from batchpid.sim.identification.setpoint_files import read_setpoints
 
-        others = {
-            "--setpoint": self.setpoint is not None,
-            "--seconds": self.seconds != RolloutCommand.seconds,
-            "--control osc": self.control == "osc",
-        }
-        for name, is_given in others.items():
-            if is_given:
-                remedy = "leave one of them out; a trajectory has joint setpoints, and lasts as long as its file"
-                raise InvalidArgumentError("trajectory", f"excludes {name}", remedy=remedy)
+        if self.control == "osc":
+            remedy = "leave one of them out; a trajectory has joint setpoints"
+            raise InvalidArgumentError("trajectory", "excludes --control osc", remedy=remedy)
+        flags.refuse(self, ("setpoint", "seconds", "substeps"), "is as --trajectory says")
         setpoints = read_setpoints(robot, path, self.timestep)
-        if self.substeps not in (RolloutCommand.substeps, setpoints.substeps):
-            problem, remedy = f"differs from the ticks of {path}", f"leave it out, or use {setpoints.substeps}"
-            raise InvalidArgumentError("substeps", problem, value=self.substeps, remedy=remedy)
+        rates = "central differences of the rows"
+        if not self.rates:
+            rates = "not given"
+        elif setpoints.has_rates:
+            rates = "from the file"
+        elif setpoints.steps:
+            rates += f"; {setpoints.steps} changes are too fast for the velocity limits: steps, with rate 0"
+        print(f"Rates of the setpoints: {rates}.\n")
         return setpoints
-
-
-def _check_accelerations(path: Path | None, are_taken: bool) -> None:
-    """Raise InvalidArgumentError unless the gains take the accelerations in a file."""
-    if not are_taken:
-        problem, remedy = "needs gains in accelerations", "use --gains designed, or remove the columns"
-        raise InvalidArgumentError(f"{path}: column setpoint_acceleration", problem, remedy=remedy)

@@ -1,8 +1,9 @@
-"""Runs of the commands: to a setpoint, over the moves that gains are compared on, or read from a recording."""
+"""Runs of the commands: to setpoints, over the moves that gains are compared on, or read from a recording."""
 
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -11,30 +12,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from batchpid.arrays.array_types import Document, Rows
+from batchpid.arrays.array_types import Rows
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot, Rollout, Runner, read_recording
 from batchpid.sim.cli.flags import MeshOptions
 from batchpid.sim.cli.outputs import bar
-from batchpid.sim.cli.report import run_report, tool_report, trajectory_report
+from batchpid.sim.cli.report import run_report
 from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.identification.setpoint_files import Setpoints
 from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.robot.run_checks import SetpointWarning
 from batchpid.sim.runner_keywords import DEFAULT_ENGINE
-from batchpid.sim.tuning.evaluation import (
-    Evaluation,
-    evaluate_gains,
-    following_error,
-    run_moves,
-    step_response_metrics,
-)
+from batchpid.sim.tuning.evaluation import Evaluation, evaluate_gains
 from batchpid.sim.tuning.gain_sets import GainSet
-from batchpid.sim.tuning.moves import Moves, random_moves, tutorial_move
+from batchpid.sim.tuning.moves import random_moves, tutorial_move
 from batchpid.sim.tuning.randomization_presets import at_the_joints, reseeded
-from batchpid.task_space.frames import pose_error
-
-AXES = ("x", "y", "z", "rx", "ry", "rz")
-"""Axes of the error of a pose."""
 
 
 def start_poses(
@@ -53,57 +44,19 @@ def start_poses(
     return robot.coupled(np.clip(poses, robot.lower, robot.upper))
 
 
-def hold_setpoint(runner: Runner, start: Rows, setpoint: Rows, seconds: float) -> tuple[Rollout, str]:
-    """Hold ``setpoint`` (dof,) from ``start`` (envs, dof) for ``seconds``; return the rollout and a report on it."""
-    moves = Moves(start, np.broadcast_to(setpoint, start.shape), ("to the setpoint",) * len(start))
-    began = time.perf_counter()
-    rollout, metrics = run_moves(runner, moves, seconds, bar("simulating", unit="tick"))
-    return rollout, run_report(runner, rollout, metrics, time.perf_counter() - began)
-
-
-def hold_pose(runner: Runner, start: Rows, goal: Rows, seconds: float) -> tuple[Rollout, str]:
-    """Hold the pose ``goal`` (7,) of a tool from ``start`` (envs, dof) for ``seconds``; return rollout and report."""
+def simulate(runner: Runner, start: Rows, setpoints: Rows, **rates: Rows | None) -> tuple[Rollout, str]:
+    """Run ``setpoints`` (ticks, size) from rest at ``start`` (envs, dof); return the rollout and a report on it."""
     began = time.perf_counter()
     runner.reset(start, seed=None if runner.options.randomization is None else 0)
-    ticks = max(2, round(seconds / (runner.timestep * runner.substeps)))
-    rollout = runner.rollout(np.tile(goal, (ticks, 1)), progress=bar("simulating", unit="tick"))
-    return rollout, tool_report(runner, rollout, time.perf_counter() - began)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SetpointWarning)  # the report has the finding
+        rollout = runner.rollout(setpoints, progress=bar("simulating", unit="tick"), **rates)
+    return rollout, run_report(runner, rollout, time.perf_counter() - began)
 
 
-def follow(runner: Runner, start: Rows, setpoints: Setpoints, rates: bool) -> tuple[Rollout, str]:
-    """Follow setpoints of a file from ``start`` (envs, dof), with rates or without; return the rollout and a report."""
-    began = time.perf_counter()
-    runner.reset(start, seed=None if runner.options.randomization is None else 0)
-    rollout = runner.rollout(
-        setpoints.position,
-        setpoint_rates=setpoints.rate if rates else None,
-        setpoint_accelerations=setpoints.acceleration if rates else None,
-        progress=bar("simulating", unit="tick"),
-    )
-    return rollout, trajectory_report(runner, rollout, setpoints if rates else None, time.perf_counter() - began)
-
-
-def run_figures(robot: Robot, rollout: Rollout) -> Document:
-    """Return the figures of a rollout for --json, lists by env: of steps, or of setpoints that move, or of a tool."""
-    info, failed = rollout.info, np.flatnonzero(~rollout.ok.all(0))
-    about = {name: getattr(info, name) for name in ("robot", "control", "engine", "physics")}
-    seconds = rollout.tick * len(rollout.time)
-    figures: Document = about | {"num_envs": rollout.num_envs, "seconds": seconds, "failed": failed}
-    if rollout.tool_pose is not None:
-        error = np.abs(pose_error(rollout.setpoint[-1, :, :7], rollout.tool_pose[-1].astype(float)))
-        return figures | {"tool": info.tool, "final_error": dict(zip(AXES, error.T, strict=True))}
-    if (rollout.setpoint != rollout.setpoint[0]).any():
-        columns = {"following_error": following_error(robot, rollout)}
-    else:
-        start = robot.start if info.start is None else info.start.astype(np.float64)
-        with_effort = info.control != "drive"
-        columns = step_response_metrics(robot, rollout, start, with_effort=with_effort)._asdict()
-    joints = zip(robot.joint_names, robot.units, strict=True)
-    of_joints = {name: {"unit": unit} for name, unit in joints}
-    for column, rows in columns.items():
-        for name, figure in zip(robot.joint_names, np.asarray(rows).T, strict=True):
-            of_joints[name][column] = figure
-    return figures | {"joints": of_joints}
+def held(setpoint: Rows, seconds: float, tick: float) -> Rows:
+    """Return rows (ticks, size) that hold ``setpoint`` (size,) for ``seconds``, two ticks at least."""
+    return np.tile(setpoint, (max(2, round(seconds / tick)), 1))
 
 
 def evaluate_sets(
@@ -124,15 +77,14 @@ def evaluate_sets(
     titles = {engine: load_engine(engine).title for engine in engines}
     unseen = tutorial_move(robot) + random_moves(robot, moves, seed + 1)
 
-    def evaluate(each: GainSet, engine: str) -> Evaluation:
-        drawn = reseeded(randomization, seed + 1)
-        drawn = at_the_joints(drawn) if each.control == "drive" else drawn
-        name = each.name if len(titles) == 1 else f"{each.name}, {titles[engine]}"
-        known = options | {"name": name, "control": each.control, "randomization": drawn, "engine": engine}
-        known["follow"] = True
-        return evaluate_gains(robot, each.params, unseen, **known)
+    def evaluate(gains: GainSet, engine: str) -> Evaluation:
+        draws = reseeded(randomization, seed + 1)
+        draws = at_the_joints(draws) if gains.control == "drive" else draws
+        name = gains.name if len(titles) == 1 else f"{gains.name}, {titles[engine]}"
+        further = options | {"control": gains.control, "randomization": draws, "engine": engine}
+        return evaluate_gains(robot, gains.params, unseen, name=name, follow=True, **further)
 
-    return [evaluate(*each) for each in bar("comparing", unit="set")(list(product(sets, titles)))]
+    return [evaluate(*pair) for pair in bar("comparing", unit="set")(list(product(sets, titles)))]
 
 
 def read_run(path: Path, robot: str | None, meshes: MeshOptions, usage: str) -> tuple[Rollout, Robot]:

@@ -49,13 +49,6 @@ def absolute_band(robot: RobotDescription) -> Float64:
     return np.array([PRISMATIC_BAND if joint.type == "prismatic" else REVOLUTE_BAND for joint in robot.joints])
 
 
-def short_words(findings: Findings, joint: str | None = None) -> str:
-    """Return the words for a cell of a table: for the first finding of ``joint``, else the first; "never" for none."""
-    of_joint = [finding for finding in findings if finding.joint == joint]
-    first = next(iter([*of_joint, *findings]), None)
-    return "never" if first is None else first.code.replace("-", " ")
-
-
 def settled_envs(rollout: Rollout, robot: RobotDescription) -> Bool:
     """Return the envs of a ``rollout`` of ``robot`` that have not failed and whose joints all settle (envs,)."""
     return np.asarray(~_Run(rollout, robot).unsettled.any(1))

@@ -138,7 +138,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self.runner = Runner(self.robot, self.num_envs, substeps=substeps, **self._options)
         self._generators = np.random.default_rng().spawn(self.num_envs)
         self._starts = np.tile(self.robot.start, (self.num_envs, 1))
-        self._setpoint, self._rate = (np.zeros((self.num_envs, entries)) for entries in self.setpoint_sizes())
+        self._setpoint = np.zeros((self.num_envs, self.runner.command.size))
         self.action = np.zeros((self.num_envs, size))
         self._observation = np.zeros((self.num_envs, *self.single_observation_space.shape), np.float32)
         self._success = self._diverged = np.zeros(self.num_envs, bool)
@@ -160,14 +160,6 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     def runner_options(self) -> Mapping[str, Any]:
         """Return the options of the Runner that belong to the task; the caller cannot give these. Default: none."""
         return {}
-
-    def setpoint_sizes(self) -> tuple[int, int]:
-        """Return the numbers of entries of a setpoint and of its rate. Default: the size of the runner's command."""
-        return self.runner.command.size, self.runner.command.size
-
-    def send(self, setpoint: Float64, rate: Float64 | None) -> None:
-        """Begin a step of the runner with the setpoints (envs, size) and their rates. Default: ``runner.send``."""
-        self.runner.send(setpoint, setpoint_rate=rate)
 
     def draw(self, env: int, random: np.random.Generator) -> ArrayLike:
         """Draw an episode of one env: keep its goal, and return the joint positions at its start (dof,) [rad or m].
@@ -293,9 +285,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         setpoint = np.where(begins[:, None], self._setpoint, setpoint)
         rate = self.rate(setpoint, self._setpoint)
         if rate is not None:
-            rate = np.where(begins[:, None], 0.0, self._returned("rate", rate, self._rate.shape, np.float64))
-        self._rate = np.zeros_like(self._rate) if rate is None else rate
-        self.send(setpoint, rate)
+            rate = np.where(begins[:, None], 0.0, self._returned("rate", rate, self._setpoint.shape, np.float64))
+        self.runner.send(setpoint, setpoint_rate=rate)
         self.action, self._setpoint, self._is_stepping = action, setpoint, True
 
     def step_wait(self) -> tuple[Float32, Float64, Bool, Bool, Document]:

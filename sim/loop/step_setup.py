@@ -119,6 +119,7 @@ def reset_friction(layout: Layout, constants: Constants, state: StepState, pack:
     falls = not pack.spec.fixed_base  # then gravity does not load the joints
     velocity, load = pack.read_qvel(), constants.coupling.efforts(pack.passive_force(not falls, True))
     fresh = refreshed(layout, constants, friction_model.started(velocity, load), pack.read_qpos())
+    fresh = friction_model.with_sliding(model, fresh)
     age = np.zeros(pack.size, np.int64)
     if state.age is not None:
         fresh, age = replace_envs(state.friction, fresh, mask), np.where(mask, 0, state.age)

@@ -266,7 +266,7 @@ class Robot(RobotDescription):
         """Return params with the gains of the servos of an MJCF file: kp and, on the measurement alone, kd.
 
         Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of the servo's control;
-        a velocity servo has kd alone. For <pid>, its plugin and <dcmotor> ki and its limit are included.
+        a velocity servo has kd alone. For <pid> and <dcmotor> ki and its limit are included.
 
         Raises
         ------

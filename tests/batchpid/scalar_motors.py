@@ -59,6 +59,10 @@ class ScalarFriction:
     load: float = 0.0
     slides: bool = False
 
+    def __post_init__(self) -> None:
+        held = max(self.coulomb, self.static) + self.load * abs(self.effort)
+        self.slides |= self.gain * abs(self.velocity) > held
+
     def step(self, effort: float, velocity: float) -> float:
         bound, rest = self.coulomb, max(self.coulomb, self.static)
         if not self.slides:

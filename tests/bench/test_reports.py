@@ -1,22 +1,15 @@
-"""Runs of the benchmarks and of the slow tests report their results."""
+"""Runs of the benchmarks report their results."""
 
-import re
-import tomllib
 from types import SimpleNamespace
 
-from scripts import ROOT, load_script
-
-
-def recipe(target):
-    """Return the lines of a target of the Makefile."""
-    return re.search(rf"^{target}:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE)[1]
+from scripts import load_script
 
 
 def lines_of(comparisons, disabled):
     conftest, lines = load_script("conftest"), []
-    found = [conftest.Comparison(*each) for each in comparisons]
     options = {"benchmark_disable": disabled, "benchmark_enable": False}
-    config = SimpleNamespace(stash={conftest.COMPARISONS: found}, getoption=options.__getitem__)
+    stash = {conftest.COMPARISONS: [conftest.Comparison(*row) for row in comparisons]}
+    config = SimpleNamespace(stash=stash, getoption=options.__getitem__)
     reporter = SimpleNamespace(section=lines.append, write_line=lines.append)
     conftest.pytest_terminal_summary(reporter, config)
     return lines
@@ -29,19 +22,3 @@ def test_the_last_lines_say_what_was_compared_with_what():
     assert head == "panda: closed loop over"
     assert [row.split(maxsplit=1) for row in rows] == [["3.10", "tutorial"], ["0.92", "bare engine  (floor 0.76)"]]
     assert not lines_of(ratios, disabled=True)
-
-
-def test_every_benchmark_is_part_of_the_tests():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    assert "bench" in project["tool"]["pytest"]["ini_options"]["testpaths"]
-    assert "--benchmark-disable" in recipe("test")
-
-
-def test_the_slow_tests_print_each_result_as_it_comes():
-    assert " -vv " in recipe("soak")
-
-
-def test_slow_tests_have_no_limits_of_their_own():
-    """The common limit ends a test that hangs, on a busy machine too."""
-    own = re.compile(r"mark\.slow\)?\n@pytest\.mark\.timeout|mark\.timeout\(\d+\)\n@pytest\.mark\.slow")
-    assert not [path.name for path in (ROOT / "tests").rglob("test_*.py") if own.search(path.read_text())]

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from robots import load_bundled
+from scipy.spatial.transform import Rotation
 
 import batchpid as bp
 import batchpid.sim
@@ -122,6 +123,49 @@ def test_the_motor_of_each_kind_of_controller_is_identified(run, tmp_path, kind)
     ):
         if (name, kind) != ("command_delay", "velocity"):  # nothing of it shows in measured efforts
             assert getattr(found, name)[0, 0] == pytest.approx(value, rel=near)
+
+
+def test_the_gait_of_the_quadruped_walks(run):
+    distances = [float(number) for number in re.findall(r"\d\.\d+", run("walk.py").partition("walked")[2])]
+    assert len(distances) == 4
+    assert min(distances) > 0.1
+
+
+def test_the_reward_of_walking_is_the_one_that_is_documented(monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLES)
+    task = runpy.run_path(str(EXAMPLES / "walk.py"))["WalkVectorEnv"]
+    envs = task(3, engine="mujoco", physics="fast", timestep=1 / 500, workers=0, max_episode_steps=None)
+    envs.reset(seed=4)
+    random, last = np.random.default_rng(0), np.zeros((3, 12))
+    for _ in range(5):
+        action = random.uniform(-1, 1, (3, 12))
+        observation, reward, *_ = envs.step(action)
+        seen = envs.observed
+        turn = Rotation.from_quat(seen.base_pose[:, 3:], scalar_first=True).inv()
+        velocity, rate = turn.apply(seen.base_twist[:, :3]), turn.apply(seen.base_twist[:, 3:])
+        tilt, command = turn.apply([0.0, 0.0, 1.0]), observation[:, 9:12]
+        expected = np.exp(-((command - velocity)[:, :2] ** 2).sum(1) / 0.1)
+        expected += 0.5 * np.exp(-((command - rate)[:, 2] ** 2) / 0.25)
+        expected -= velocity[:, 2] ** 2 + 0.02 * (rate[:, :2] ** 2).sum(1) + 2 * (1 - tilt[:, 2] ** 2)
+        expected -= 1e-4 * (seen.effort**2).sum(1) + 0.01 * ((action - last) ** 2).sum(1)
+        np.testing.assert_allclose(reward, expected, atol=1e-4)
+        last = action
+    envs.runner.reset(base_pose=[[0, 0, 0.31, 1, 0, 0, 0], [0, 0, 0.1, 1, 0, 0, 0], [0, 0, 0.6, 0.85, 0.53, 0, 0]])
+    assert envs.step(np.zeros((3, 12)))[2].tolist() == [False, True, True]  # it lies, or is tilted
+    envs.close()
+
+
+def test_a_tool_reaches_its_goals_and_pushes_a_box(run):
+    assert "4 of 4 hands are at their goals" in run("tool_reach.py")
+    moved = [float(number) for number in re.findall(r"0\.\d+", run("push.py"))]
+    assert len(moved) == 2
+    assert min(moved) > 0.02
+
+
+@pytest.mark.slow
+def test_stable_baselines3_trains(run):
+    pytest.importorskip("stable_baselines3")
+    assert "trained for 128 steps" in run("stable_baselines.py")
 
 
 needs_training = pytest.mark.skipif(importlib.util.find_spec("optax") is None, reason="needs the extra [train]")

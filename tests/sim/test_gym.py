@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 
 from batchpid.errors import CallOrderError, InvalidArgumentError  # noqa: E402
 from batchpid.sim import CommandSpec, FaultWarning, Randomization, Robot, Runner, Uniform  # noqa: E402
-from batchpid.sim.gym import PushVectorEnv, ReachEnv, ReachVectorEnv, ToolReachVectorEnv, WalkVectorEnv  # noqa: E402
+from batchpid.sim.gym import ReachEnv, ReachVectorEnv  # noqa: E402
 from tests.sim.tiny_urdf import LIMIT, joint, link, robot, write  # noqa: E402
 
 ID = "batchpid.sim.gym:batchpid/Reach-v0"
@@ -93,23 +93,6 @@ def same(ours, theirs):
     return data_equivalence(ours[:-1], theirs[:-1], exact=True) and str(plain(ours[-1])) == str(plain(theirs[-1]))
 
 
-@pytest.mark.slow
-def test_results_depend_on_the_seed_and_not_on_the_workers():
-    def run(workers, seed):
-        with_workers = ReachVectorEnv(5, workers=workers, actions="increment")
-        first, _ = with_workers.reset(seed=seed)
-        action = np.full((5, 9), 0.5, np.float32)
-        last = [with_workers.step(action)[0] for _ in range(3)][-1]
-        with_workers.close()
-        return first, last
-
-    first, last = run(0, 3)
-    np.testing.assert_array_equal((first, last), run(2, 3))
-    other, _ = run(0, 4)
-    np.testing.assert_array_equal(first[1:], other[:-1])  # env k has seed + k
-    assert (first[0] != other[0]).any()
-
-
 def test_steps_that_are_begun_and_waited_for_are_bit_identical_to_steps():
     ours, theirs = (ReachVectorEnv(2, workers=workers, max_episode_steps=3) for workers in (1, 0))
     assert same(ours.reset(seed=2), theirs.reset(seed=2))
@@ -123,26 +106,6 @@ def test_steps_that_are_begun_and_waited_for_are_bit_identical_to_steps():
         ours.step_wait()
     ours.close()
     theirs.close()
-
-
-@pytest.mark.slow
-def test_a_setpoint_at_the_goal_reaches_it_and_raises_the_reward():
-    gains = {"kp": 600.0, "kd": 50.0, "ki": 0.0, "derivative_filter_time": 2e-3}
-    probe = ReachVectorEnv(1, workers=0)
-    env = ReachVectorEnv(2, workers=0, params=probe.robot.params(**gains), tolerance=0.05, max_episode_steps=None)
-    obs, _ = env.reset(seed=0)
-    goal = obs[:, 18:]
-    action = 2 * (goal - env.low) / (env.high - env.low) - 1
-    rewards = []
-    for _ in range(150):
-        obs, reward, terminated, _, info = env.step(action)
-        rewards.append(reward)
-        assert not terminated.any()
-    assert (rewards[-1] > rewards[0]).all()
-    assert info["success"].all()
-    np.testing.assert_allclose(info["error"], np.abs(obs[:, :9] - goal).max(1), atol=1e-6)
-    probe.close()
-    env.close()
 
 
 def test_a_failed_env_terminates_with_a_finite_observation_and_begins_again(panda):
@@ -293,7 +256,6 @@ class Bounded(Hold):
     command = CommandSpec(("x", "z"), lower=0.0, upper=1.0)
 
 
-WALK = {"engine": "mujoco", "workers": 0}
 REFUSED = [
     (ReachVectorEnv, {"robto": "panda"}, "robto"),
     (ReachVectorEnv, {"substeps": 5}, "substeps"),
@@ -306,19 +268,6 @@ REFUSED = [
     (ReachVectorEnv, {"control": Bounded(), "actions": "increment"}, "max_increment"),
     (ReachEnv, {"max_episode_steps": 9}, "max_episode_steps"),
     (lambda num, **options: gymnasium.make_vec(ID, num, **options), {"robto": "panda"}, "robto"),
-    (ToolReachVectorEnv, {"robot": "jaco2"}, "posture"),
-    (ToolReachVectorEnv, {"control": "pid"}, "control"),
-    (ToolReachVectorEnv, {"tool": "hand"}, "tool"),
-    (ToolReachVectorEnv, {"workspace": -1.0}, "workspace"),
-    (ToolReachVectorEnv, {"posture": np.zeros(3)}, "posture"),
-    (PushVectorEnv, {"build": print}, "build"),
-    (PushVectorEnv, {"engine": "mujoco"}, "build"),
-    (WalkVectorEnv, WALK | {"robot": Robot.load("quadruped")}, "robot"),
-    (WalkVectorEnv, WALK | {"control": "effort"}, "control"),
-    (WalkVectorEnv, WALK | {"ground": False}, "ground"),
-    (WalkVectorEnv, WALK | {"commands": [[1.0, 0, 0], [0.5, 0, 0]]}, "commands"),
-    (WalkVectorEnv, WALK | {"gait": np.zeros((2, 12))}, "gait"),
-    (WalkVectorEnv, WALK | {"posture": np.zeros(3)}, "posture"),
 ]
 
 
@@ -348,30 +297,15 @@ def test_refused_calls_name_their_argument_and_the_env_goes_on():
     env.close()
 
 
-class WithoutRates(ReachVectorEnv):
-    def rate(self, setpoint, last):
-        return None
-
-
 @pytest.mark.filterwarnings("ignore::batchpid.sim.MovingSetpointWarning")
 def test_increments_are_followed_closely():
-    """Half a second into a constant increment joints are at most 20 ms behind the setpoint, and without rates 0.2 s.
-
-    At first they have to reach its speed, and are 45 ms behind at most.
-    """
-    behind = {}
-    for task in (ReachVectorEnv, WithoutRates):
-        envs = task(1, actions="increment", workers=0, collisions=False, max_increment=0.005, max_episode_steps=None)
-        envs.reset(seed=3)
-        action = np.array([[1.0, -1, 1, -1, 1, 1, -1, 0, 0]])
-        start = envs._setpoint.copy()
-        lags = []
-        for _ in range(50):
-            envs.step(action)
-            lags.append(np.abs(envs._setpoint - envs.observed.qpos)[0, :7].max() / 0.25)
-        assert np.abs(envs._setpoint - start)[0, :7].min() > 0.2
-        behind[task] = max(lags), max(lags[25:])
-        envs.close()
-    assert behind[ReachVectorEnv][0] < 0.045
-    assert behind[ReachVectorEnv][1] < 0.02
-    assert behind[WithoutRates][1] > 0.2
+    """After half a second of constant increments, joints are at most 20 ms behind the setpoint."""
+    rate = 0.25  # [rad/s]
+    envs = ReachVectorEnv(1, actions="increment", workers=0, collisions=False, max_increment=rate / 50)
+    start = envs.reset(seed=3)[0][0, :7].astype(float)
+    action = np.array([[1.0, -1, 1, -1, 1, 1, -1, 0, 0]])
+    for _ in range(50):
+        observation, *_ = envs.step(action)
+    behind = rate - np.abs(observation[0, :7] - start)
+    assert np.abs(behind).max() < 0.02 * rate
+    envs.close()

@@ -100,7 +100,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
 
 def check_links(spec: SceneSpec, file: MjcfFile, links: Iterable[str]) -> None:
     """Raise RobotError for a link that MuJoCo does not have: several joints of one body have links between them."""
-    placements = place_links(spec.urdf, spec.merge_fixed)
+    placements = place_links(spec.urdf, spec.separate)
     for link in links:
         if placements[link].link not in file.bodies:
             problem = f"link {link!r} lies between two joints of one body, and is no body of its own in MuJoCo"

@@ -8,11 +8,8 @@ speed V / K. (MuJoCo's documentation, "DC Motor Model".)
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Iterator
-from contextlib import suppress
-from functools import cache
 from typing import Any, NamedTuple
 
 import mujoco
@@ -23,8 +20,6 @@ from batchpid.arrays.array_types import MjModel
 _POSITION, _VOLTAGE, _NO_INPUT = 1, 8, 16
 """Inputs of an actuator: bits of ``mjtCtrlInput`` (3.12 and later)."""
 _GAIN, _BIAS, _DYN = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn
-PID_PLUGIN = "mujoco.pid"
-"""Plugin with the law of a servo with an integral. (MuJoCo's repository, plugin/actuator/README.md.)"""
 
 
 class Servo(NamedTuple):
@@ -50,10 +45,10 @@ class Line(NamedTuple):
 
 
 def servo_of(model: MjModel, actuator: int) -> Servo | None:
-    """Return the gains of a servo, of <pid>, its plugin or the controller of <dcmotor>; None for other actuators."""
+    """Return the gains of a servo, of <pid> or the controller of <dcmotor>; None for other actuators."""
     gain, dynamics = model.actuator_gainprm[actuator], model.actuator_dynprm[actuator]
-    if (plugin := plugin_name(model, model.actuator_plugin[actuator])) is not None:
-        return _plugin_servo(model, actuator) if plugin == PID_PLUGIN else None
+    if model.actuator_plugin[actuator] >= 0:
+        return None
     if _is_dcmotor(model, actuator):
         return Servo(gain[4], gain[6], gain[5], dynamics[8] or math.inf, dynamics[7] or math.inf)
     if model.actuator_biastype[actuator] != _BIAS.mjBIAS_AFFINE or not model.actuator_biasprm[actuator, 1:3].any():
@@ -64,50 +59,6 @@ def servo_of(model: MjModel, actuator: int) -> Servo | None:
         return Servo(kp, kv, gain[0], imax, dynamics[1] or math.inf)
     scale = _velocity_scale(model, actuator, kp, kv)
     return Servo(kp, kv, rate=math.inf if scale is None else scale * _most(model, actuator, "ctrl"))
-
-
-def plugin_name(model: MjModel, instance: int) -> str | None:
-    """Return the name of the plugin of an instance, None for -1."""
-    if instance < 0:
-        return None
-    name = ctypes.cast(_library().mjp_getPluginAtSlot(int(model.plugin[instance])), ctypes.POINTER(ctypes.c_char_p))
-    return (name[0] or b"").decode()  # the first field of mjpPlugin
-
-
-def _plugin_servo(model: MjModel, actuator: int) -> Servo:
-    """Return the gains of the plugin "mujoco.pid"."""
-    given = {key: value for key, (_, value) in _plugin_config(model, actuator).items()}
-    ki = given.get("ki", 0.0)
-    imax = given["imax"] / ki if ki and "imax" in given else math.inf
-    return Servo(given.get("kp", 0.0), given.get("kd", 0.0), ki, imax, given.get("slewmax", math.inf))
-
-
-def _plugin_config(model: MjModel, actuator: int) -> dict[str, tuple[str, float]]:
-    """Return the texts that the plugin "mujoco.pid" is given, with the number that it reads from each by strtod."""
-    config = {}
-    for key in ("kp", "ki", "kd", "imax", "slewmax"):
-        text = _library().mj_getPluginConfig(model._address, int(model.actuator_plugin[actuator]), key.encode())
-        if text:
-            config[key] = text.decode(errors="replace"), float(_library().strtod(text, None))
-    return config
-
-
-def _is_number(text: str, value: float) -> bool:
-    """Return whether the whole text is the finite number ``value``."""
-    with suppress(ValueError):
-        return text.isascii() and "_" not in text and math.isfinite(value) and float(text) == value
-    return False
-
-
-@cache
-def _library() -> Any:
-    """Return MuJoCo's library with its functions for plugins, which the Python package does not offer."""
-    library = ctypes.CDLL(mujoco._functions.__file__)  # finds the symbols of the libraries that it is linked to
-    library.mjp_getPluginAtSlot.restype = ctypes.c_void_p
-    library.mj_getPluginConfig.restype = ctypes.c_char_p
-    library.mj_getPluginConfig.argtypes = ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p
-    library.strtod.restype, library.strtod.argtypes = ctypes.c_double, (ctypes.c_char_p, ctypes.c_void_p)
-    return library
 
 
 def _velocity_scale(model: MjModel, actuator: int, kp: float, kv: float) -> float | None:
@@ -175,12 +126,8 @@ def unread(model: MjModel, actuator: int, servo: Servo | None) -> Iterator[tuple
     bias, dynamics = model.actuator_biasprm[actuator], model.actuator_dynprm[actuator]
     kinds = [int(getattr(model, f"actuator_{each}type")[actuator]) for each in ("gain", "bias", "dyn")]
     gain = float(model.actuator_gainprm[actuator, 0])
-    plugin = plugin_name(model, model.actuator_plugin[actuator])
-    if plugin not in (None, PID_PLUGIN):
-        yield f"is driven by the plugin {plugin!r}, which is not simulated", "give the joint gains, or use <pid>", ""
-    if plugin is not None:
-        if kinds[2] != _DYN.mjDYN_NONE:
-            yield "has dynamics of its own, which are not simulated", "give lag= to make_actuators", ""
+    if model.actuator_plugin[actuator] >= 0:
+        yield "is driven by a plugin, which is not simulated", "give the joint gains, or use <pid>", ""
     elif _is_dcmotor(model, actuator):
         effects = {
             "cogging": bias[0],
@@ -210,15 +157,9 @@ def unread(model: MjModel, actuator: int, servo: Servo | None) -> Iterator[tuple
         yield "has a negative gain, which is 0 here", "correct the file", f"{least:g}"
     if servo is not None and servo.kp > 0 and not _has_position(model, actuator):
         yield "is a spring, as it has no position input: here the setpoint is its position", "set the setpoint to 0", ""
-    if servo is not None and plugin is None and _velocity_scale(model, actuator, *servo[:2]) and not servo.kp:
+    if servo is not None and _velocity_scale(model, actuator, *servo[:2]) and not servo.kp:
         text = "is a velocity servo, and a setpoint is a position here: its gain kv is the gain kd, which damps"
         yield text, 'add a <position> servo to the file, give the joint a kp, or use control="effort"', ""
-    if plugin == PID_PLUGIN:
-        for key, (text, value) in _plugin_config(model, actuator).items():
-            if not _is_number(text, value):
-                yield f"has {key}={text!r}, of which MuJoCo reads {value:g}", "write one finite number", ""
-    if plugin == PID_PLUGIN and servo is not None and not any(servo[:3]):
-        yield f"has no gains in the configuration of its plugin {plugin!r}", "add kp, ki or kd to its <config>", ""
     if servo is not None and servo.rate == 0:
         yield "keeps its setpoint, as its rate is limited to 0: the limit is not used", "correct the file", ""
     group = int(model.actuator_group[actuator])
@@ -234,7 +175,6 @@ def setpoint_range(model: MjModel, actuator: int, servo: Servo) -> tuple[float, 
     ends = _range(model, actuator, "ctrl") if chosen else input_range(model, actuator)
     if ends is None:
         return -math.inf, math.inf
-    chosen |= bool(model.actuator_plugin[actuator] >= 0)
     gain = 1.0 if chosen else float(model.actuator_gainprm[actuator, 0]) / servo.kp
     low, high = sorted(float(gain * end) for end in ends)
     return low, high
@@ -244,7 +184,7 @@ def _has_position(model: MjModel, actuator: int) -> bool:
     """Return whether an input of a servo is its setpoint."""
     if _is_pid(model, actuator) or _is_dcmotor(model, actuator):
         return bool(_inputs(model, actuator) & _POSITION)
-    return bool(model.actuator_plugin[actuator] >= 0 or model.actuator_gainprm[actuator, 0])
+    return bool(model.actuator_gainprm[actuator, 0])
 
 
 def _is_pid(model: MjModel, actuator: int) -> bool:

@@ -14,7 +14,6 @@ from batchpid.arrays.array_types import MjModel
 from batchpid.arrays.digest import digest
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.mjcf.mjcf_compiler import ALONE, Attempt, Names, compile_file, label
-from batchpid.sim.robot.mjcf.mjcf_laws import plugin_name
 from batchpid.sim.robot.mjcf.mjcf_motors import Motors, read_couplings, read_motors
 from batchpid.sim.robot.mjcf.mjcf_shapes import PLANE, can_collide, excluded_pairs
 from batchpid.sim.robot.mjcf.mjcf_tree import Tree
@@ -180,7 +179,7 @@ def _unused(model: MjModel, names: Names, key: int | None) -> list[Finding]:
         if names.is_of_robot(body):
             found.append(Finding("note", "gravcomp", text, remedy, link=names.bodies[int(body)]))
     for body in np.flatnonzero(model.body_plugin >= 0):
-        text = f"{ALONE} the plugin {plugin_name(model, model.body_plugin[body])!r} of the body"
+        text = f"{ALONE} the plugin of the body"
         remedy = "in SAPIEN expect the body to be rigid and to move freely"
         found.append(Finding("warning", "unknown-element", text, remedy, link=names.bodies[int(body)]))
     return found

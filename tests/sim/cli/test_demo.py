@@ -31,7 +31,7 @@ def test_demo_draws(batchpid, tmp_path):
     path = tmp_path / "new" / "demo.png"
     status, said, _ = batchpid("demo", "jaco2", *SHORT, "--workers", 1, "--picture", path)
     assert status == 0
-    lines = ("env-steps/s", "real-time factor", "Setpoints out of limits: none.", str(path))
+    lines = ("env-steps/s", "real-time factor", str(path))
     assert all(line in said for line in lines)
     with Image.open(path) as picture:
         assert picture.width > 1000

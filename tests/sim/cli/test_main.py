@@ -66,6 +66,14 @@ def test_a_missing_or_unknown_command_lists_those_there_are(batchpid):
         assert all(name in err for name in cli.COMMANDS)
 
 
+@pytest.mark.parametrize("value", ["", "1"])
+def test_no_color_holds_in_help(value, batchpid, monkeypatch):
+    monkeypatch.setenv("NO_COLOR", value)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    assert ("\x1b[" in batchpid("demo", "--help")[1]) == (not value)
+
+
 def test_version(batchpid):
     assert batchpid("--version") == (0, f"{version}\n", "")
 

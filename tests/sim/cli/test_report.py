@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from batchpid.sim import Observation, Rollout
 from batchpid.sim.cli import report
-from batchpid.sim.tuning import step_response_metrics
 
 TICKS, ENVS = 200, 5
 
@@ -32,63 +33,43 @@ def first_order_lag(panda, setpoint, time_constant=0.05):
         tick=0.01,
         info=panda.run_info(),
     )
-    return rollout, np.array(start)
+    return rollout
 
 
-def rows(panda, metrics, findings=()):
-    """Return the table's lines by joint name."""
-    lines = report.joint_table(panda, metrics, findings).splitlines()
-    return {name: next(line for line in lines if line.startswith(name)) for name in panda.joint_names}
+def report_of(panda, rollout):
+    """Return the lines of the report, and those of the table by joint."""
+    lines = report.run_report(SimpleNamespace(robot=panda, timestep=5e-4), rollout, 1.0).splitlines()
+    return lines, {name: next(line for line in lines if line.startswith(name)) for name in panda.joint_names}
 
 
 def test_a_run_that_settles(panda):
-    rollout, start = first_order_lag(panda, panda.settings.target)
-    metrics = step_response_metrics(panda, rollout, start)
-    # exp(-t / 0.05) falls below 2 % after 0.196 s.
-    np.testing.assert_allclose(metrics.settling_time, 0.05 * np.log(50), atol=2e-3)
-    table = rows(panda, metrics)
-    assert all("0.20 s / 0.20 s" in row and "5 of 5" in row for row in table.values())
-    said = list(report.outcome_lines(panda, rollout, metrics, rollout.findings()))
-    assert said == [
-        "Every joint of every env settled within 2 s to 2 % of its move.",
-        "Setpoints out of limits: none.",
-    ]
+    lines, table = report_of(panda, first_order_lag(panda, panda.settings.target))
+    assert all("0.20 s / 0.20 s" in row for row in table.values())  # exp(-t / 0.05) falls below 2 % after 0.196 s
+    assert lines[-1] == "Every joint of every env settled within 2 s to 2 % of its move."
 
 
 def test_one_joint_that_rings_and_one_that_overshoots(panda):
-    rollout, start = first_order_lag(panda, panda.settings.target)
+    rollout = first_order_lag(panda, panda.settings.target)
     rollout.qpos[:, 2, 0] = 1 + 0.3 * np.sin(40 * rollout.time)
     rollout.qpos[50:, :, 5] += 0.5 * np.exp(-np.arange(150) / 10)[:, None]
-    metrics = step_response_metrics(panda, rollout, start)
-    table = rows(panda, metrics, rollout.findings())
-    assert "oscillates" in table["panda_joint1"]
+    lines, table = report_of(panda, rollout)
+    assert "0.20 s / never" in table["panda_joint1"]
     assert "0%" in table["panda_joint1"]  # the overshoot of the envs that settled
-    assert "4 of 5" in table["panda_joint1"]
     assert "50% / 50%" in table["panda_joint6"]
-    said = " ".join(report.outcome_lines(panda, rollout, metrics, rollout.findings()))
-    assert "NOT SETTLED" in said
-    assert "panda_joint1 (1)" in said
-    assert "panda_joint6" not in said
+    (line,) = [line for line in lines if line.startswith("NOT SETTLED")]
+    assert "panda_joint1 (1)" in line
+    assert "panda_joint6" not in line
+    assert next(line for line in lines if line.startswith("WHY")).startswith("WHY: joint 'panda_joint1': ")
 
 
-def test_envs_that_diverged_are_named(panda):
-    rollout, start = first_order_lag(panda, panda.settings.target)
-    rollout.qpos[100:, 3] = np.nan
-    rollout.ok[100:, 3] = False
-    metrics = step_response_metrics(panda, rollout, start)
-    table = rows(panda, metrics)
-    assert all("diverged" in row and "4 of 5" in row for row in table.values())
-    said = list(report.outcome_lines(panda, rollout, metrics, rollout.findings()))
-    assert said[0].startswith("DIVERGED: 1 of 5 envs are no longer finite, the first after 1.01 s: env 3.")
-    assert not any("settled" in line for line in said)
-
-
-def test_envs_held_at_a_finite_pose_after_diverging_count_as_diverged(panda):
-    rollout, start = first_order_lag(panda, panda.settings.target)
-    rollout.ok[100:] = False
-    metrics = step_response_metrics(panda, rollout, start)
-    assert np.isinf(metrics.settling_time).all()
-    assert "DIVERGED: 5 of 5" in next(report.outcome_lines(panda, rollout, metrics, rollout.findings()))
+def test_envs_that_failed_are_named_even_if_they_are_held_at_a_finite_pose(panda):
+    rollout = first_order_lag(panda, panda.settings.target)
+    rollout.qpos[100:, 3], rollout.ok[100:, 3] = np.nan, False
+    rollout.ok[150:, 4] = False
+    lines, table = report_of(panda, rollout)
+    assert all("never" in row for row in table.values())
+    assert "FAILED: 2 of 5 envs, the first after 1.01 s: env 3, 4." in lines
+    assert not any("ettled within" in line for line in lines)
 
 
 def test_the_speed_is_env_steps_and_real_time_factors():

@@ -213,3 +213,12 @@ def test_light_joints_neither_chatter_nor_diverge(control, tmp_path):
         rollout = runner.rollout(np.zeros((800, 1, 1)) + (0.0 if control == "effort" else 0.3))
     assert rollout.ok.all()
     assert np.abs(rollout.qvel[700:]).max() < 0.05
+
+
+@pytest.mark.parametrize("native", ["1", "0"])
+def test_a_robot_that_moves_at_its_reset_slides_from_the_first_step(native, tmp_path, monkeypatch):
+    monkeypatch.setenv("BATCHPID_NATIVE", native)
+    inertia, coulomb, speed, seconds = 0.1, 0.5, 4.0, 0.15
+    motors = bp.make_actuators(1, coulomb=coulomb, static=5 * coulomb)
+    gone = push(wheel(tmp_path, inertia), 0.0, seconds, qvel=speed, engine="mujoco", actuators=motors).qpos[-1, 0, 0]
+    assert gone == pytest.approx(speed * seconds - 0.5 * coulomb / inertia * seconds**2, abs=1e-3)

@@ -41,9 +41,7 @@ TARGETS = (
 )
 
 
-def configured(**config):
-    entries = "".join(f'<config key="{key}" value="{value}"/>' for key, value in config.items())
-    return f'<plugin plugin="mujoco.pid" {{}} actdim="{len({"ki", "slewmax"} & {*config})}">{entries}</plugin>'
+PLUGIN = '<plugin plugin="mujoco.pid" {} actdim="0"><config key="kp" value="5"/></plugin>'
 
 
 SHORTCUTS = (
@@ -63,10 +61,7 @@ SHORTCUTS = (
     '<pid kp="5" input="vel ff" {}/>',
     '<dcmotor nominal="24 6 3" {}/>',
     '<dcmotor nominal="24 6 3" input="pos" controller="5 0 1" {}/>',
-    configured(kp=5, kd=2),
-    configured(kp=5, ki=3, kd=2, imax=4),
-    configured(kp=5, slewmax=1e12),
-    configured(kp="nothing"),
+    PLUGIN,
 )
 
 
@@ -148,7 +143,7 @@ def test_every_actuator_acts_as_in_mujoco_or_is_named(tmp_path, targets):
         elif not any(each.code in ("actuator", "limits") and each.joint == "j" for each in robot.repairs):
             check_law(robot, model, text)
             read += 1
-    assert min(read, named) > 3
+    assert min(read, named) > 1
 
 
 @pytest.fixture
@@ -161,24 +156,6 @@ def load(tmp_path):
         return Robot.load(path, self_collision="none")
 
     return load
-
-
-@pytest.mark.parametrize("extras", ["", 'gear="-2"', 'forcerange="-9 9"', 'ctrlrange="-.1 .25"'])
-@pytest.mark.parametrize("imax", [None, 2])
-def test_the_pid_plugin_moves_as_in_mujoco(load, extras, imax):
-    config = {"kp": 200, "ki": 300, "kd": 20} | ({} if imax is None else {"imax": imax})
-    robot = load(configured(**config).format(f'joint="j" {extras}'))
-    text = robot.path.read_text().replace("1e-9", "5e-4").replace("<worldbody>", WITHOUT_CONTACT)
-    model = mujoco.MjModel.from_xml_string(text)
-    data, gear = mujoco.MjData(model), model.actuator_gear[0, 0]
-    data.ctrl[0] = 0.2 * gear
-    mujoco.mj_step(model, data, 400)
-    options = {"control": "pid", "engine": "mujoco", "compensate": "none", "ground": False, "workers": 0}
-    with Runner(robot, 1, substeps=400, params=robot.mjcf_gains(), **options) as runner:
-        runner.reset([0, 0])
-        ends = runner.step([0.2, 0]).qpos[0]
-    assert abs(ends[0]) > 0.05
-    np.testing.assert_allclose(ends, data.qpos, atol=2e-3)
 
 
 WITHOUT_CONTACT = '<option><flag contact="disable"/></option><worldbody>'
@@ -207,27 +184,6 @@ def test_stiff_servos_diverge_as_pid_and_not_as_drives(load, kp, kv):
     with Runner(robot, 1, params=robot.mjcf_gains(), control="drive", **options) as runner:
         runner.reset([0, 0])
         np.testing.assert_allclose(runner.step(goal).qpos[0], data.qpos, atol=1e-3)
-
-
-def test_the_plugin_has_ranges(load):
-    robot = load(configured(kp=5, ki=4, kd=2, imax=2, slewmax=3).format('joint="j" gear="2" ctrlrange="-1 1"'))
-    gains = robot.mjcf_gains()
-    np.testing.assert_allclose(np.ravel([gains.kp, gains.ki, gains.kd])[::2], [20, 16, 8])
-    assert gains.integral_max[0, 0] == 2 * 2
-    np.testing.assert_array_equal(robot.effort_limit, np.inf)  # not the range of its setpoint
-    assert robot.velocity_limit[0] == 1.5
-    assert any("setpoint is not limited" in str(each) and "-0.5 to 0.5" in str(each) for each in robot.repairs)
-
-
-@pytest.mark.parametrize(
-    "text", ["40", " 4e1", "+.5", "40 3", "4abc", "0x10", "1e1x", "1,5", ".5.5", "1_0", "abc", "\u0663"]
-)
-def test_numbers_of_a_plugin_are_those_that_mujoco_reads(load, text):
-    robot = load(configured(kp=text, kd=1).format('joint="j" name="motor"'))
-    model = mujoco.MjModel.from_xml_path(str(robot.path))
-    assert robot.mjcf_gains().kp[0, 0] == efforts(model, [[1.0]], [[0.0, 0.0]])[0]
-    told = [each for each in robot.repairs if f"'motor' has kp={text!r}" in each.text]
-    assert len(told) == (text not in ("40", " 4e1", "+.5"))
 
 
 def test_targets_of_velocity_have_a_range(load):
@@ -262,4 +218,4 @@ def test_a_plugin_that_mujoco_lacks_is_named(load):
     ):
         load("", extension='<extension><plugin plugin="some.thing"/></extension>')
     with pytest.raises(RobotError, match=r"uses the plugin 'mujoco\.pid' without <extension>; add"):
-        load(configured(kp=1).format('joint="j"'), extension="")
+        load(PLUGIN.format('joint="j"'), extension="")

@@ -1,24 +1,27 @@
-"""Commands of a Runner: each makes one request to the workers, and the state of the runner after it.
+"""Operations of a Runner: each says what the workers do with their loops, and what the state of the runner is then.
 
-A command holds checked arguments and changes nothing by itself. The runner executes its request, and then replaces its
-state by the result of :meth:`RunnerCommand.committed`.
+An operation holds checked arguments for all envs and changes nothing by itself. The runner sends it to the workers, and
+then replaces its state by the result of :meth:`Operation.committed`.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+import pickle
+from dataclasses import dataclass, field, replace
+from itertools import chain, repeat
+from operator import is_not, itemgetter
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 import batchpid as bp
-from batchpid.arrays.array_types import Bool, Float64
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.validate import env_mask
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.loop.arrays import Command
+from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.custom import initial_state
+from batchpid.sim.loop.loop import Loop
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot, initial_actuators
 from batchpid.sim.observation import untouched
 from batchpid.sim.options import IDEAL, RunnerOptions
@@ -27,44 +30,27 @@ from batchpid.sim.robot.run_checks import SetpointCheck
 from batchpid.sim.runner_arguments import accelerated, base_rows, joint_rows
 from batchpid.sim.runner_state import RunnerState
 from batchpid.sim.workers.pool import Outcome
-from batchpid.sim.workers.requests import Request, Reset, Restore, Run, SetActuators, SetParams, TakeSnapshot
+from batchpid.sim.workers.requests import Request
 
 
-class RunnerCommand(ABC):
-    """Base of all commands, which are frozen dataclasses."""
-
-    changes_loops = True
-    """True if an error in the loops leaves them in no valid state."""
-
-    @abstractmethod
-    def request(self, state: RunnerState) -> Request:
-        """Return the request to the workers for this command after ``state``."""
+class Operation(Request):
+    """Base of all operations, which are frozen dataclasses."""
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        """Return the state after the command, from the state before it and the outcome in the workers."""
+        """Return the state after the operation, from the state before it and the outcome in the workers."""
         return state
 
 
 @dataclass(frozen=True)
-class Read(RunnerCommand):
-    """Read from the loops, without a change of state."""
-
-    what: Request
-    changes_loops = False
-
-    def request(self, state: RunnerState) -> Request:
-        return self.what
-
-
-@dataclass(frozen=True)
-class ResetEnvs(RunnerCommand):
+class Reset(Operation):
     """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), floating bases at ``base`` (envs, 13)."""
 
     mask: Bool
     qpos: Float64
     qvel: Float64
-    base: Float64 | None
-    draws: Draws
+    draws: Draws = NOTHING
+    base: Float64 | None = None
+    ticks = 1
 
     @classmethod
     def read(
@@ -77,7 +63,7 @@ class ResetEnvs(RunnerCommand):
         seed: int | ArrayLike | None,
         base: tuple[ArrayLike | None, ArrayLike | None],
     ) -> Self:
-        """Return the command for arguments of :meth:`batchpid.sim.Runner.reset`."""
+        """Return the operation for arguments of :meth:`batchpid.sim.Runner.reset`."""
         robot, num_envs, randomization, draws = options.robot, options.num_envs, options.randomization, state.draws
         qpos = joint_rows(options, "qpos", robot.start if pose[0] is None else pose[0])
         qvel = joint_rows(options, "qvel", 0.0 if pose[1] is None else pose[1])
@@ -89,10 +75,10 @@ class ResetEnvs(RunnerCommand):
         elif seed is not None:
             raise InvalidArgumentError("seed", "has no effect without a randomization", remedy="leave it out")
         qpos, qvel = robot.coupling.positions(qpos), robot.coupling.rates(qvel)
-        return cls(chosen, qpos, qvel, base_rows(options, *base, qpos, chosen), draws)
+        return cls(chosen, qpos, qvel, draws, base_rows(options, *base, qpos, chosen))
 
-    def request(self, state: RunnerState) -> Reset:
-        return Reset(self.mask, self.qpos, self.qvel, self.draws, self.base)
+    def apply(self, loop: Loop) -> None:
+        loop.reset(self.mask, self.qpos, self.qvel, self.draws, self.base)
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
         chosen, motion = self.mask[:, None], state.motion
@@ -105,18 +91,38 @@ class ResetEnvs(RunnerCommand):
 
 
 @dataclass(frozen=True)
-class RunTicks(RunnerCommand):
-    """Run the ticks of ``command`` (ticks, envs, ...), each of ``substeps`` sim steps of ``timestep`` [s]."""
+class Run(Operation):
+    """Run ``ticks`` of ``substeps`` sim steps under ``command`` (ticks, envs, ...), which travels in the arrays."""
 
-    command: Command
-    substeps: int
-    timestep: float
+    ticks: int = field()  # without the default of the base class
+    substeps: int = field()
+    command: Command = field()
+    counts_ticks = True
 
-    def request(self, state: RunnerState) -> Run:
-        command = self.command
+    @classmethod
+    def after(cls, state: RunnerState, command: Command, substeps: int, timestep: float) -> Self:
+        """Return the operation for ticks of sim steps of ``timestep`` [s] that follow on ``state``."""
         if command.setpoint_rate is not None and state.motion is not None and state.params.gain_units is not None:
-            command = accelerated(command, state.motion, self.substeps * self.timestep)
-        return Run(len(command.setpoint), self.substeps, command)
+            command = accelerated(command, state.motion, substeps * timestep)
+        return cls(len(command.setpoint), substeps, command)
+
+    def for_envs(self, envs: slice) -> Self:
+        return replace(self, command=self.command.map(itemgetter((slice(None), envs))))
+
+    def write(self, arrays: Arrays, envs: slice) -> None:
+        for table, rows in zip(arrays.command, self.command, strict=True):
+            if rows is not None:
+                table[: self.ticks, envs] = rows[:, envs]
+
+    def encode(self, envs: slice) -> bytes:
+        given = tuple(map(is_not, self.command, repeat(None)))  # Command.given, without one more call in a tick
+        return pickle.dumps((self.ticks, self.substeps, given))
+
+    def apply(self, loop: Loop) -> float:
+        return loop.run(self.ticks, self.substeps, self.command.given)
+
+    def join(self, results: list[float]) -> float:
+        return max(results)
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
         setpoint, rate, *_ = self.command
@@ -144,57 +150,62 @@ class RunTicks(RunnerCommand):
 
 
 @dataclass(frozen=True)
-class ChangeParams(RunnerCommand):
-    """Change the params between ticks."""
+class SetParams(Operation):
+    """Change gains, limits and times between ticks."""
 
     params: bp.PIDParams
 
-    def request(self, state: RunnerState) -> SetParams:
-        return SetParams(self.params)
+    def apply(self, loop: Loop) -> None:
+        loop.set_params(self.params)
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
         return state._replace(params=self.params)
 
 
 @dataclass(frozen=True)
-class ChangeActuators(RunnerCommand):
-    """Change the actuators between ticks."""
+class SetActuators(Operation):
+    """Change the actuators between ticks; None removes them."""
 
     actuators: bp.Actuators | None
 
-    def request(self, state: RunnerState) -> SetActuators:
-        return SetActuators(self.actuators)
+    def apply(self, loop: Loop) -> None:
+        loop.set_actuators(self.actuators)
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
         return state._replace(actuators=self.actuators)
 
 
 @dataclass(frozen=True)
-class MakeSnapshot(RunnerCommand):
-    """Read the state of all envs; they continue from this state."""
+class TakeSnapshot(Operation):
+    """Read the state of every env, and go on as if restored from it."""
 
-    def request(self, state: RunnerState) -> TakeSnapshot:
-        return TakeSnapshot()
+    def apply(self, loop: Loop) -> EnvStates:
+        return loop.snapshot()
+
+    def join(self, results: list[EnvStates]) -> EnvStates:
+        return EnvStates.join(results)
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
         return state._replace(steps_since_checkpoint=0)
 
 
 @dataclass(frozen=True)
-class GoBack(RunnerCommand):
-    """Put all envs into the state of a snapshot."""
+class Restore(Operation):
+    """Put every env into its state in ``snapshot``, with its params and ``draws``."""
 
-    restore: Restore
+    snapshot: Snapshot
+    draws: Draws = NOTHING
+    ticks = 1
 
-    def request(self, state: RunnerState) -> Restore:
-        return self.restore
+    def apply(self, loop: Loop) -> None:
+        loop.restore(self.snapshot, self.draws)
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        snapshot = self.restore.snapshot
+        snapshot = self.snapshot
         return state._replace(
             params=snapshot.params,
             actuators=snapshot.actuators,
-            draws=self.restore.draws,
+            draws=self.draws,
             faults=state.faults.restored(snapshot.states.containment["step"]),
             motion=None if snapshot.motion is None else (snapshot.motion[0], snapshot.motion[1]),
             steps=snapshot.steps,
@@ -202,19 +213,48 @@ class GoBack(RunnerCommand):
         )
 
 
-def snapshot_of(options: RunnerOptions, state: RunnerState, results: list[EnvStates]) -> Snapshot:
-    """Return the snapshot of a runner in ``state``, with the states of its envs that the workers have read."""
+@dataclass(frozen=True)
+class ReadStateSizes(Operation):
+    """Read the number of values in the engine's state of each env."""
+
+    changes_loop = False
+
+    def apply(self, loop: Loop) -> list[int]:
+        return loop.state_sizes()
+
+    def join(self, results: list[list[int]]) -> list[int]:
+        return [*chain.from_iterable(results)]
+
+
+@dataclass(frozen=True)
+class ReadPoses(Operation):
+    """Read the poses of the entities that ``build`` returned, or of the bodies ``names`` of a file."""
+
+    names: tuple[str, ...] | None = None
+    changes_loop = False
+
+    def for_envs(self, envs: slice) -> Self:
+        return self
+
+    def apply(self, loop: Loop) -> list[Rows]:
+        return loop.poses(self.names)
+
+    def join(self, results: list[list[Rows]]) -> list[Rows]:
+        return [*chain.from_iterable(results)]
+
+
+def snapshot_of(options: RunnerOptions, state: RunnerState, states: EnvStates) -> Snapshot:
+    """Return the snapshot of a runner in ``state``, with the ``states`` of its envs that the workers have read."""
     motion = None
     if state.motion is not None:
         last, rate = state.motion
         motion = np.stack([last, np.zeros_like(last) if rate is None else rate])
     episodes = None if options.randomization is None else state.draws.episodes.copy()
-    about, states = options.describe(), EnvStates.join(results)
-    return Snapshot(about, state.steps, state.params, states, state.actuators, episodes, motion)
+    return Snapshot(options.describe(), state.steps, state.params, states, state.actuators, episodes, motion)
 
 
 def restored(options: RunnerOptions, snapshot: Snapshot, sizes: list[int]) -> Restore:
-    """Return the request that restores a snapshot, checked and copied.
+    """Return the operation that restores a snapshot, checked and copied.
 
     ``sizes`` are the numbers of values in the engine's state of each env.
     """

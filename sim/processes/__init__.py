@@ -1,1 +1,0 @@
-"""A thread for calls that no signal may interrupt. Knows nothing of robots."""
