@@ -196,7 +196,7 @@ def jerk_limited(
     try:
         import ruckig
     except ImportError:
-        raise MissingDependencyError("ruckig", "jerk_limited()", "ruckig") from None
+        raise MissingDependencyError("ruckig", "jerk_limited()") from None
     x0, way = _move(start, target)
     asked = {
         "current_position": x0,

@@ -1,4 +1,4 @@
-"""Third-party baselines of the benchmark: Gymnasium's AsyncVectorEnv, and MuJoCo (extra ``peers``)."""
+"""Third-party baselines of the benchmark: Gymnasium's AsyncVectorEnv, and MuJoCo."""
 
 from __future__ import annotations
 

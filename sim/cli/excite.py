@@ -39,7 +39,7 @@ class ExciteCommand:
     """File to write: .csv. Default: out/ROBOT.excite.csv."""
     force: flags.Force = False
 
-    imports = ("batchpid.sim.engine.robot_model", "batchpid.sim.identification.excitation")
+    imports = ("batchpid.sim.robot.robot_model", "batchpid.sim.identification.excitation")
 
     def run(self) -> None:
         """Run the command."""

@@ -184,8 +184,7 @@ TimeLimit = Annotated[float | None, Field("s"), _flag("Stop after this wall-cloc
 Randomize = Annotated[
     str | None,
     _flag(
-        "Draw the robot of each move or env: payload, model, or a YAML file (docs/randomization.md), e.g. "
-        "`payload: {uniform: [0, 0.5]}`.",
-        metavar="NAME|FILE",
+        "Draw the robot of each move or env: a YAML file (docs/randomization.md), e.g. `payload: {uniform: [0, 0.5]}`.",
+        metavar="FILE",
     ),
 ]

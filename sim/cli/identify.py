@@ -96,7 +96,7 @@ class IdentifyCommand:
 
     imports = (
         "batchpid.sim.plots",
-        "batchpid.sim.engine.robot_model",
+        "batchpid.sim.robot.robot_model",
         "batchpid.sim.identification.identification",
     )
 

@@ -47,7 +47,7 @@ class InspectCommand:
     json: flags.Json = None
     force: flags.Force = False
 
-    imports = ("batchpid.sim.engine.robot_model",)
+    imports = ("batchpid.sim.robot.robot_model",)
 
     def run(self) -> int:
         """Run the command and return its exit status."""

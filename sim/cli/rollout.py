@@ -80,7 +80,7 @@ class RolloutCommand:
         from batchpid.sim import Runner, plots
         from batchpid.sim.cli.report import exit_status, run_figures
         from batchpid.sim.cli.run import held, simulate, start_poses
-        from batchpid.sim.tuning.randomization_presets import load_randomization
+        from batchpid.sim.tuning.randomization_files import load_randomization
 
         outputs = OutputFiles(self)
         out = outputs.path("out", self.out, HDF5)

@@ -233,7 +233,7 @@ def read_bag(path: Path, reading: Reading) -> list[dict[str, Float64]]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise MissingDependencyError("rosbags", "a log in a ROS bag", "logs") from None
+        raise MissingDependencyError("rosbags", "a log in a ROS bag", "tune") from None
     topics = {reading.topic: _MEASURED} | ({reading.command_topic: _COMMANDED} if reading.command_topic else {})
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:

@@ -34,7 +34,6 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.coupling import Coupling, Follower
 from batchpid.motors.friction import Friction, bound_of
-from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.engine.scene_spec import added_friction
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.logged_control import LoggedControl, LoggedDrive
@@ -86,7 +85,7 @@ class Plant:
 
     def __init__(self, robot: Robot, joints: tuple[int, ...], drive: LoggedDrive) -> None:
         self.drive, own, coupling = drive, list(joints), robot.coupling
-        tree, whole = robot_model(robot, False).tree.held, robot.rigid_tree
+        tree, whole = robot.dynamics(False).tree, robot.rigid_tree
         moves = np.isin(coupling.leader, joints)
         number = np.cumsum(moves) - 1
         followers = [

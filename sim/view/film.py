@@ -142,7 +142,7 @@ def write_film(
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
     except ImportError:
-        raise MissingDependencyError("imageio-ffmpeg", "a film", "render") from None
+        raise MissingDependencyError("imageio-ffmpeg", "a film", "view") from None
     recorded = Playback(rollout, robot)
     painter = Painter(recorded.robot, rollout.num_envs, recorded.ground, size)
     rows = film_rows(rollout, rate).tolist()

@@ -188,22 +188,21 @@ class NodeWorker(Worker):
         ticks = len(self._arrays.observation.ok)
         self._message = pickled((pool_type, start, ticks), start.options)
         self._actor: Any = None
+        self._cpus = self._machine.workers  # to reserve
         self.info: NodeInfo | None = None
         """Known when the node has started."""
 
     def open(self) -> None:
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        cpus = self._machine.workers
-        if self.info is not None:  # the CPUs are taken until the lost actor has ended
-            cpus, self.info = 0, None
+        if not self._cpus:  # it replaces a lost one, which has the CPUs until it has ended
             self._cluster.replace(self._start.index)
         actor_type = self._cluster.ray.remote(Node).options(
-            num_cpus=cpus,
+            num_cpus=self._cpus,
             scheduling_strategy=NodeAffinitySchedulingStrategy(self._machine.node_id, soft=False),
             runtime_env=self._cluster.options.runtime_env,
         )
-        self._actor = actor_type.remote()
+        self._actor, self._cpus = actor_type.remote(), 0
 
     def send(self, request: Request) -> None:
         self._limit = self.limit(request)

@@ -168,7 +168,7 @@ def test_stable_baselines3_trains(run):
     assert "trained for 128 steps" in run("stable_baselines.py")
 
 
-needs_training = pytest.mark.skipif(importlib.util.find_spec("optax") is None, reason="needs the extra [train]")
+needs_training = pytest.mark.skipif(importlib.util.find_spec("optax") is None, reason="needs Optax")
 SMALL = ("--num-envs", "4", "--workers", "0", "--episode", "5", "--steps", "8", "--updates", "2", "--minibatches", "2")
 
 
