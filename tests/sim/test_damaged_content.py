@@ -23,7 +23,6 @@ from hypothesis import strategies as st
 from option_values import ARM, MOTORS
 
 import batchpid as bp
-import batchpid.task_space as ts
 from batchpid.errors import BatchPIDError
 from batchpid.sim import Robot, Runner, Snapshot
 from batchpid.sim.identification import read_logs
@@ -33,7 +32,6 @@ from batchpid.sim.tuning import load_randomization, random_moves
 pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of unusual values
 JOINTS = list(ARM.joint_names)
 PARAMS = ARM.params(kp=[[40.0, 20.0], [30.0, 10.0]], ki=5.0, kd=2.0, effort_limit=87.0, anti_windup="conditional")
-OSC = {"stiffness": [400.0, 300.0, 200.0, 90.0, 80.0, 70.0], "damping_ratio": 1.0, "posture_stiffness": 20.0}
 DRAWN = {"payload": {"uniform": [0.0, 0.3]}, "params": {"kp": {"log_uniform": [0.5, 2.0], "operation": "scale"}}}
 SHORT = {"workers": 0, "engine": "mujoco", "substeps": 4}
 
@@ -77,7 +75,6 @@ KINDS = {
     "motors.yaml": Kind(
         lambda path: bp.save_actuators(path, MOTORS, JOINTS), lambda path: bp.load_actuators(path, JOINTS)
     ),
-    "osc.yaml": Kind(lambda path: ts.save_osc_options(path, OSC), ts.load_osc_options),
     "drawn.yaml": Kind(
         lambda path: path.write_text(yaml.safe_dump(DRAWN)), lambda path: load_randomization(path, ARM).to_dict()
     ),
