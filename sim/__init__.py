@@ -18,7 +18,6 @@ from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
-from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding, RepairWarning
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
