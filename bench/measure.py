@@ -41,17 +41,16 @@ from batchpid.sim.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 
 OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"
-POLICY, FREE = "closed loop, policy network", "closed loop, no shapes, free"
+POLICY, NO_SHAPES = "closed loop, policy network", "closed loop, no shapes"
 LOOPS = {
     # case of the Runner: its options
     PYTHON: {},
     BY_TICKS: {},
     OURS: {},
     POLICY: {},
-    "closed loop, no shapes": {"collisions": False},
-    FREE: {"collisions": False, "physics": "free"},
+    NO_SHAPES: {"collisions": False},
 }
-XLA_LOOPS = {f"{name}, XLA": LOOPS[name] | {"backend": "jax"} for name in (OURS, POLICY, FREE)}
+XLA_LOOPS = {f"{name}, XLA": LOOPS[name] | {"backend": "jax"} for name in (OURS, POLICY, NO_SHAPES)}
 MUJOCO_LOOPS = {"closed loop, MuJoCo": {"engine": "mujoco"}}
 CASES = (*TUTORIALS, *ENGINES, *LOOPS)
 """Cases without JAX, MuJoCo and peers."""
@@ -201,7 +200,7 @@ class Options:
     num_envs: int = 64
     workers: int | None = None
     """Default: one for each available core."""
-    physics: Literal["accurate", "fast", "free"] = "accurate"
+    physics: Literal["accurate", "fast"] = "accurate"
     ticks: int = 100
     rounds: int = 5
     peers: bool = False

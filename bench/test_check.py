@@ -43,9 +43,6 @@ FLOORS = [
         "closed loop, policy network", OURS, 0.8, 0.7, "a small network at every sim step costs less than the engine"
     ),
     Floor("closed loop, no shapes", OURS, 1.08, 1.25, "purpose of collisions=False"),
-    Floor(
-        "closed loop, no shapes, free", OURS, 1.85, 1.25, "purpose of physics='free', against that of the closed loop"
-    ),
 ]
 FEW_FLOORS = {
     # robots in the caller's process over the tutorial's own loop: (accurate, fast)

@@ -36,7 +36,7 @@ def make_envs(config):
     """Return a vector env with gains that follow the setpoint: critically damped at 30 rad/s in every pose."""
     robot = Robot.load(config.robot)
     params = robot.params(kp=900.0, kd=60.0, ki=0.0, gain_units="mass_matrix", measurement_rate="measured")
-    options = {"params": params, "workers": config.workers, "collisions": False, "physics": "free"}
+    options = {"params": params, "workers": config.workers, "collisions": False}
     warnings.simplefilter("ignore", MissedContactWarning)  # any pose within the limits may be a goal
     task = {"robot": robot, "actions": "increment", "max_episode_steps": config.episode}
     return gymnasium.make_vec("batchpid.sim.gym:batchpid/Reach-v0", config.num_envs, **task, **options)

@@ -6,25 +6,8 @@ Importing it does not load SAPIEN; the first use of :class:`Runner` or of :meth:
 from __future__ import annotations
 
 import importlib
-import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
-
-if __name__ == "sim":  # the folder of a checkout, under the name that it had before
-    import warnings
-
-    class _Renamed:
-        """Importer of this package's modules under their former names, which would load them a second time."""
-
-        @staticmethod
-        def find_spec(name: str, *_: object) -> None:
-            """Refuse the former names."""
-            if name.startswith("sim."):
-                raise ModuleNotFoundError(f"{name} is now batchpid.{name}", name=name)
-
-    warnings.warn("the package 'sim' is now 'batchpid.sim'", DeprecationWarning, stacklevel=2)
-    sys.modules["sim"] = importlib.import_module("batchpid.sim")
-    sys.meta_path.insert(0, _Renamed())
 
 from batchpid.sim.command import CommandSpec
 from batchpid.sim.loop.faults import Fault, FaultWarning
@@ -36,7 +19,7 @@ from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
-from batchpid.sim.robot.description import Dynamics, RobotDescription, register_dynamics
+from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding, RepairWarning
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
@@ -106,12 +89,6 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(_LOADED_LATE[name]), name)
 
 
-def _dynamics(robot: RobotDescription, ground: bool | None) -> Dynamics:
-    from batchpid.sim.engine.robot_model import robot_model
-
-    return robot_model(robot, ground)
-
-
 def _plot() -> Callable[..., Any]:
     from batchpid.sim.plots import step_responses
 
@@ -124,6 +101,5 @@ def _findings(rollout: Rollout, robot: RobotDescription) -> list[Finding]:
     return unsettled_findings(rollout, robot)
 
 
-register_dynamics(_dynamics)
 register_plot(_plot)
 register_findings(_findings)

@@ -215,7 +215,7 @@ class RunInfo:
     engine: str | None = None
     """Physics engine: "sapien"."""
     physics: str | None = None
-    """Solver settings: "accurate", "fast", "free", or the text of a :class:`batchpid.sim.Physics`."""
+    """Solver settings: "accurate", "fast", or the text of a :class:`batchpid.sim.Physics`."""
     collisions: bool | None = None
     """False if the robots had no collision shapes."""
     ground: bool | None = None

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from operator import itemgetter
-
 import batchpid as bp
 from batchpid.checks.warn import warn
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
-from batchpid.sim.observation import Observation
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.robot.loop_stability import StabilityCheck
-from batchpid.sim.robot.run_checks import DriveChatterCheck, MovingSetpointCheck, SetpointCheck
+from batchpid.sim.robot.run_checks import MovingSetpointCheck, SetpointCheck
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContactLog, MissedContactWarning
 from batchpid.sim.workers.pool import RecoveryWarning
@@ -30,9 +27,6 @@ class RunWarnings:
         self._control = control
         self._stability = StabilityCheck(robot, timestep) if control == "pid" else None
         self._moving = MovingSetpointCheck(robot) if control == "pid" else None
-        self._chatter = (
-            DriveChatterCheck(robot, timestep) if control == "drive" and options.engine == "mujoco" else None
-        )
         self._has_warned_of_fault = self._has_warned_of_contact = False
 
     def check_stability(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
@@ -45,25 +39,18 @@ class RunWarnings:
         if isinstance(self._control, OperationalSpace):
             self._control.check_stability()
 
-    def set_gains(self, params: bp.PIDParams, actuators: bp.Actuators | None) -> None:
+    def set_params(self, params: bp.PIDParams) -> None:
         """Watch the next ticks for what these gains may lead to."""
         if self._moving is not None:
             self._moving.set_params(params)
-        if self._chatter is not None:
-            self._chatter.set_gains(params, actuators)
         self._update()
 
-    def see(self, command: Command, observation: Observation, num_ticks: int, seconds: float) -> None:
+    def see(self, command: Command, num_ticks: int, seconds: float) -> None:
         """Look at the first ticks of a command (ticks, envs, ...), of ``seconds`` each, and warn of what is found."""
         if self._moving is not None:
             self._moving.see(command.setpoint[:num_ticks], command.setpoint_rate is not None, seconds)
             if self._moving.found is not None:
                 self._moving.warn()
-                self._update()
-        if self._chatter is not None:
-            self._chatter.see(observation.map(itemgetter(slice(num_ticks))), seconds)
-            if self._chatter.found is not None:
-                self._chatter.warn()
                 self._update()
 
     def issue(self, faults: FaultLog, contacts: MissedContactLog | None, lost: list[str]) -> None:
@@ -79,5 +66,4 @@ class RunWarnings:
             warn(contacts.message(), MissedContactWarning)
 
     def _update(self) -> None:
-        checks = (self._moving, self._chatter)
-        self.is_watching = any(check is not None and check.is_watching for check in checks)
+        self.is_watching = self._moving is not None and self._moving.is_watching

@@ -132,7 +132,7 @@ class Runner(SingleOwner):
             self._call.end()
         self._warnings.issue(state.faults, state.contacts, self._pool.warnings)
         self._warnings.check_stability(state.params, state.actuators)
-        self._warnings.set_gains(state.params, state.actuators)
+        self._warnings.set_params(state.params)
         self._warnings.check_controller()
 
     def __repr__(self) -> str:
@@ -367,7 +367,7 @@ class Runner(SingleOwner):
         checked = self.options.check_params(params)
         self._execute(SetParams(checked))
         self._warnings.check_stability(checked, self._state.actuators)
-        self._warnings.set_gains(checked, self._state.actuators)
+        self._warnings.set_params(checked)
 
     @property
     def actuators(self) -> bp.Actuators | None:
@@ -382,7 +382,6 @@ class Runner(SingleOwner):
         self._ready()
         checked = self.options.check_actuators(actuators)
         self._execute(SetActuators(checked))
-        self._warnings.set_gains(self._state.params, checked)
 
     def snapshot(self) -> Snapshot:
         """Return the state of all envs, physics and controller, for :meth:`restore`.
@@ -409,11 +408,11 @@ class Runner(SingleOwner):
             It is of another robot, number of envs, timestep, control, ...; the message names the options.
         """
         self._ready("restore")
-        instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()").check(self.options.describe())
-        restore = restored(self.options, snapshot, self._read(ReadStateSizes()))
+        instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
+        restore = restored(self.options, self._state, snapshot, self._read(ReadStateSizes()))
         self._execute(restore)
         self._pool.start_replay_from(restore)
-        self._warnings.set_gains(self._state.params, self._state.actuators)
+        self._warnings.set_params(self._state.params)
         return self._pool.present.observation.copied(self._tool_pose)
 
     def settle(self) -> None:
@@ -626,8 +625,7 @@ class Runner(SingleOwner):
         if outcome.failure is not None:
             raise outcome.failure.error
         if run is not None and self._warnings.is_watching:
-            seconds, seen = run.substeps * self.timestep, outcome.ticks.arrays.observation
-            self._warnings.see(run.command, seen, outcome.num_ticks, seconds)
+            self._warnings.see(run.command, outcome.num_ticks, run.substeps * self.timestep)
         faults, contacts = self._state.faults, self._state.contacts
         if pool.warnings or faults.faults or contacts is not None:
             self._warnings.issue(faults, contacts, pool.warnings)

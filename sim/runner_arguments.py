@@ -13,10 +13,10 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.checks.validate import array, entries, read_array, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.command import POSE_UNITS, TWIST_UNITS
-from batchpid.sim.engine.robot_model import base_start
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FARTHEST, ORIGIN
 from batchpid.sim.options import RunnerOptions
+from batchpid.sim.robot.robot_model import base_start
 from batchpid.sim.robot.run_checks import SetpointCheck
 from batchpid.sim.runner_state import Motion, RunnerState
 
@@ -119,7 +119,7 @@ def base_rows(
 ) -> Float64 | None:
     """Return poses and twists (envs, 13) of floating bases to reset to, at joint positions ``qpos``.
 
-    By default a base is at rest at :func:`batchpid.sim.engine.robot_model.base_start`.
+    By default a base is at rest at :func:`batchpid.sim.robot.robot_model.base_start`.
     """
     robot, num_envs = options.robot, options.num_envs
     if robot.fixed_base:

@@ -67,7 +67,7 @@ Backend = Literal["numpy", "jax"]
 EngineName = Literal["sapien", "mujoco"]
 DEFAULT_ENGINE: EngineName = "mujoco" if find_spec("sapien") is None else "sapien"
 """SAPIEN where it is installed, which is on Linux with x86-64; elsewhere MuJoCo."""
-PhysicsPreset = Literal["accurate", "fast", "free"]
+PhysicsPreset = Literal["accurate", "fast"]
 FaultAction = Literal["hold", "reset"]
 InvalidInputAction = Literal["raise", "contain"]
 Place = Literal["snapshot", "recording", "scene"]

@@ -179,6 +179,7 @@ def write_files() -> None:
     panda = Robot.load("panda")
     shutil.copy(panda.path, "arm.urdf")
     Path("arm.xml").write_text(MJCF)
+    Path("payload.yaml").write_text("payload: {uniform: [0, 0.5]}")
     bp.save_params("gains.yaml", panda.params(), panda.joint_names)
     bp.save_actuators("motors.yaml", bp.make_actuators(panda.dof, command_delay=0.005), panda.joint_names)
 

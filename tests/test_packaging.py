@@ -95,27 +95,6 @@ def test_the_command_checks_the_packages_before_it_imports_them():
     assert PROJECT["project"]["scripts"] == {"batchpid": "batchpid.__main__:main"}
 
 
-@pytest.mark.skipif(not (ROOT / "sim").exists(), reason="an sdist has the package in batchpid/ alone")
-def test_the_folder_of_a_checkout_still_imports_as_sim_with_a_warning():
-    code = """
-import warnings
-with warnings.catch_warnings(record=True) as seen:
-    warnings.simplefilter("always")
-    import sim
-    from sim import Robot
-import batchpid.sim
-assert sim is batchpid.sim and Robot is batchpid.sim.Robot
-assert [each.category for each in seen] == [DeprecationWarning], seen
-try:
-    import sim.observation
-except ModuleNotFoundError as error:
-    assert str(error) == "sim.observation is now batchpid.sim.observation"
-else:
-    raise AssertionError("sim.observation would be a second copy")
-"""
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
-
-
 @pytest.mark.parametrize(
     ("required", "status", "message"),
     [

@@ -48,7 +48,7 @@ class CompareCommand:
         from batchpid.sim import plots
         from batchpid.sim.cli.report import draw_first_move, evaluation_table, motion_difference
         from batchpid.sim.cli.run import evaluate_sets
-        from batchpid.sim.tuning.randomization_presets import load_randomization
+        from batchpid.sim.tuning.randomization_files import load_randomization
 
         outputs = OutputFiles(self)
         picture = outputs.path("picture", self.picture, plots.FORMATS)

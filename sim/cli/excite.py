@@ -39,14 +39,14 @@ class ExciteCommand:
     """File to write: .csv. Default: out/ROBOT.excite.csv."""
     force: flags.Force = False
 
-    imports = ("batchpid.sim.engine.robot_model", "batchpid.sim.identification.excitation")
+    imports = ("batchpid.sim.robot.robot_model", "batchpid.sim.identification.excitation")
 
     def run(self) -> None:
         """Run the command."""
         from batchpid.io.files import write_atomically
         from batchpid.sim.cli.report import table
         from batchpid.sim.identification.excitation import excite
-        from batchpid.sim.identification.setpoint_files import setpoint_csv
+        from batchpid.sim.setpoint_files import setpoint_csv
 
         out = self.out or FOLDER / f"{Path(self.robot).stem}.excite.csv"
         out = OutputFiles(self).path("out", out, (".csv",))

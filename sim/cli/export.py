@@ -71,7 +71,7 @@ class ExportCommand:
     """File to write. Default: out/ROBOT-pid.h, or another ending."""
     force: flags.Force = False
 
-    imports = ("batchpid.sim.engine.robot_model", "batchpid.sim.tuning.gain_sets", "batchpid.export")
+    imports = ("batchpid.sim.robot.robot_model", "batchpid.sim.tuning.gain_sets", "batchpid.export")
 
     def run(self) -> None:
         """Run the command."""

@@ -25,7 +25,7 @@ from batchpid.sim.runner_keywords import DEFAULT_ENGINE
 from batchpid.sim.tuning.evaluation import Evaluation, evaluate_gains
 from batchpid.sim.tuning.gain_sets import GainSet
 from batchpid.sim.tuning.moves import random_moves, tutorial_move
-from batchpid.sim.tuning.randomization_presets import at_the_joints, reseeded
+from batchpid.sim.tuning.randomization_files import at_the_joints, reseeded
 
 
 def start_poses(

@@ -61,7 +61,7 @@ class TuneCommand:
         from batchpid.sim.cli.report import draw_first_move, evaluation_table
         from batchpid.sim.cli.run import evaluate_sets
         from batchpid.sim.tuning.evaluation import arm_joints
-        from batchpid.sim.tuning.randomization_presets import load_randomization
+        from batchpid.sim.tuning.randomization_files import load_randomization
         from batchpid.sim.tuning.search import tune
 
         outputs, named = OutputFiles(self), FOLDER / Path(self.robot).stem

@@ -19,8 +19,6 @@ PHYSICS = {
     "accurate": Physics("TGS", 10),
     # At 2 kHz PGS keeps its error with 4 iterations, which TGS does not; see docs/performance.md.
     "fast": Physics("PGS", 4),
-    # Without contact only joint limits need iterations.
-    "free": Physics("PGS", 1),
 }
 
 
@@ -44,6 +42,5 @@ class MujocoSolver:
     """Time constant of contacts [s], at least two sim steps."""
 
 
-_FAST = MujocoSolver(iterations=20, tolerance=1e-6, elliptic=False)
-SOLVERS = {"accurate": MujocoSolver(), "fast": _FAST, "free": _FAST}
-"""Presets, by the names of the option ``physics``. Without contact only joint limits are left to iterate on."""
+SOLVERS = {"accurate": MujocoSolver(), "fast": MujocoSolver(iterations=20, tolerance=1e-6, elliptic=False)}
+"""Presets, by the names of the option ``physics``."""

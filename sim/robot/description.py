@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 import batchpid as bp
-from batchpid.arrays.array_types import Bool, Document, Float64, Rows
+from batchpid.arrays.array_types import Bool, Document, Float64
 from batchpid.arrays.digest import digest
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import InvalidArgumentError
@@ -31,13 +31,11 @@ from batchpid.sim.robot.parts import (
     Settings,
     Urdf,
 )
+from batchpid.sim.robot.robot_model import RobotModel
 from batchpid.sim.robot.self_collision import SelfContact, Srdf, self_contact
 from batchpid.sim.robot.setpoint_limits import setpoint_guard
 from batchpid.sim.robot.simulated_links import body_inertias, link_masses, rigid_tree, simulated
 from batchpid.task_space.rigid_tree import RigidTree
-
-if TYPE_CHECKING:
-    from batchpid.sim.robot.contacts import Near
 
 GRAVITY_MARGIN = 2.0  # of the effort that holds the joint still
 SPEED = 3.0  # [rad/s or m/s], at which the joint's damping is overcome
@@ -57,39 +55,6 @@ def suggested_effort_limit(gravity: Float64, mass_matrix: Float64, friction: Arr
 
 
 LIMIT_TOLERANCE = 1e-6  # rad or m
-
-
-class Dynamics(Protocol):
-    """Dynamics and contacts of one robot at given poses (n, dof)."""
-
-    def mass_matrix(self, qpos: Rows) -> Float64:
-        """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg]."""
-
-    def inverse_dynamics(self, qpos: Rows, qvel: Rows, qacc: Rows) -> Float64:
-        """Return the efforts (n, dof) [N m or N] of a motion, gravity included."""
-
-    def forward_dynamics(self, qpos: Rows, qvel: Rows, effort: Rows) -> Float64:
-        """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort``, gravity included."""
-
-    def standing_inertia(self, qpos: Rows) -> Float64:
-        """Return the inertia (dof,) that each joint moves at one pose (dof,) if the base floats and its feet stand."""
-
-    def in_contact(self, qpos: Rows, clearance: float = 0.0) -> Bool:
-        """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,)."""
-
-    def near(self, qpos: Rows, within: float) -> list[Near]:
-        """Return the pairs of shapes closer than ``within`` [m] to each other or to the ground, at one pose (dof,)."""
-
-
-_load_dynamics: list[Callable[[RobotDescription, bool | None], Dynamics]] = []
-
-
-def register_dynamics(dynamics: Callable[[RobotDescription, bool | None], Dynamics]) -> None:
-    """Set the function that returns the dynamics of a robot with or without a ground.
-
-    :mod:`sim` calls it, because robots must not import engines.
-    """
-    _load_dynamics[:] = [dynamics]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -307,12 +272,13 @@ class RobotDescription(Urdf):
         still = np.zeros_like(qpos)
         return self.coupling.efforts(self.dynamics().inverse_dynamics(qpos, still, still))
 
-    def dynamics(self, ground: bool | None = None) -> Dynamics:
+    def dynamics(self, ground: bool | None = None) -> RobotModel:
         """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed base.
 
         ``ground``: whether there is a ground at height 0; default :attr:`has_ground`.
         """
-        return _load_dynamics[0](self, ground)
+        has_ground = self.has_ground if ground is None else ground
+        return _model(self, has_ground)
 
     @cached_property
     def self_contact(self) -> SelfContact:
@@ -359,3 +325,9 @@ class RobotDescription(Urdf):
         rows = np.atleast_2d(np.asarray(qpos, np.float64))
         outside = (rows < self.lower - LIMIT_TOLERANCE) | (rows > self.upper + LIMIT_TOLERANCE)
         return [(int(env), int(joint), float(rows[env, joint])) for env, joint in np.argwhere(outside)]
+
+
+@lru_cache(maxsize=8)
+def _model(robot: RobotDescription, ground: bool) -> RobotModel:
+    ignored = frozenset(map(frozenset, robot.ignored_pairs))
+    return RobotModel(robot.simulated_tree.held, robot.coupling, robot.urdf, ignored, ground)

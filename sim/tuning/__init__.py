@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     )
     from batchpid.sim.tuning.gain_sets import GainSet, gain_set
     from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
-    from batchpid.sim.tuning.randomization_presets import load_randomization, payload_capacity
+    from batchpid.sim.tuning.randomization_files import load_randomization
     from batchpid.sim.tuning.robot_survey import find_robots, survey
     from batchpid.sim.tuning.search import Tuning, tune
 
@@ -37,7 +37,6 @@ __all__ = [
     "following_error",
     "gain_set",
     "load_randomization",
-    "payload_capacity",
     "random_moves",
     "run_moves",
     "search_moves",
@@ -61,7 +60,7 @@ _MODULES = {
     ),
     "gain_sets": ("GainSet", "gain_set"),
     "moves": ("Moves", "random_moves", "search_moves", "tutorial_move"),
-    "randomization_presets": ("load_randomization", "payload_capacity"),
+    "randomization_files": ("load_randomization",),
     "robot_survey": ("find_robots", "survey"),
     "search": ("Tuning", "tune"),
 }

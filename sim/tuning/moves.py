@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.robot.description import Dynamics
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.robot_model import RobotModel
 
 KINDS = ("large", "small", "one joint", "all alike")
 """Kinds of random moves, in turn: up to ``size``; up to a tenth of it; of one joint; of all joints by one fraction."""
@@ -156,7 +156,7 @@ def random_moves(robot: Robot, count: int, seed: int = 0, size: float = 2.0, gro
     return draw_moves(robot, count, draw)
 
 
-def easy_pose(robot: Robot, dynamics: Dynamics, poses: Float64) -> tuple[Float64, NDArray[np.bool_]]:
+def easy_pose(robot: Robot, dynamics: RobotModel, poses: Float64) -> tuple[Float64, NDArray[np.bool_]]:
     """Return the pose about which moves lie if they are hard to find, and the joints that can move (dof,).
 
     It is the start pose if its links are well apart and the effort limits hold it easily. Otherwise a better pose is

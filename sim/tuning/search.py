@@ -40,7 +40,7 @@ from batchpid.sim.tuning.candidates import Candidates, first_gains, loop_delay
 from batchpid.sim.tuning.cost import Weights
 from batchpid.sim.tuning.evaluation import SUBSTEPS
 from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
-from batchpid.sim.tuning.randomization_presets import reseeded
+from batchpid.sim.tuning.randomization_files import reseeded
 from batchpid.sim.workers.contact_log import MissedContactWarning
 
 INITIAL_SPREAD = 0.12

@@ -8,7 +8,6 @@ import numpy as np
 
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.sim.engine.robot_model import robot_model
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.shapes import surfaces
@@ -50,7 +49,7 @@ class RobotScene:
         self.positions: Float64 = _PITCH * self.reach * (grid - grid.max(0) / 2)
         """Positions of the robots (count, 3) [m]."""
         frames = ts.link_poses(self._tree, robot.start)[:, 2].min()
-        lowest = min(float(frames), robot_model(robot).height(robot.start, base_too=True))
+        lowest = min(float(frames), robot.dynamics().height(robot.start, base_too=True))
         self.floor = 0.0 if ground else lowest
         """Height of the floor [m]."""
         corner = np.abs(self.positions[0, :2]) + 2.0 * self.reach

@@ -11,7 +11,7 @@ import pytest
 import batchpid as bp
 from batchpid.sim import Robot, Runner, StabilityWarning
 from batchpid.sim.tuning import tune
-from tests.sim.tiny_urdf import joint, link, one_joint, robot, write
+from tests.sim.tiny_urdf import joint, link, robot, write
 
 BAD, GOOD = {"kp": 10.0, "ki": 0.0, "kd": [1.0, 5e4]}, {"kp": 10.0, "ki": 0.0, "kd": 1.0}
 
@@ -121,82 +121,3 @@ def test_candidates_of_a_search_do_not_warn(arm):
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", StabilityWarning)
         tune(arm, generations=1, population=6, seconds=0.1, workers=0)
-
-
-def light_joint(folder, inertia, effort, damping):
-    body = f'<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="{inertia}" iyz="0" izz="1"/></inertial>'
-    inner = f'<limit lower="-3" upper="3" effort="{effort}" velocity="9"/><dynamics damping="{damping}"/>'
-    return Robot.load(write(folder, one_joint(inner, arm=body)))
-
-
-def sticks(inertia, effort, damping, kp, kd, timestep):
-    """Return whether the force of MuJoCo's own servo still alternates between its limits after a second."""
-    mujoco = pytest.importorskip("mujoco")
-    model = mujoco.MjModel.from_xml_string(
-        f"""<mujoco><option integrator="implicitfast" gravity="0 0 0" timestep="{timestep}"/><worldbody><body>
-        <inertial pos="0 0 0" mass="1" diaginertia="1 {inertia} 1"/><joint name="j" axis="0 1 0" damping="{damping}"/>
-        </body></worldbody><actuator><position joint="j" kp="{kp}" kv="{kd + timestep * kp}"
-        forcerange="-{effort} {effort}"/></actuator></mujoco>"""
-    )
-    data, forces = mujoco.MjData(model), []
-    data.ctrl[0] = 0.3
-    for _ in range(round(1 / timestep)):
-        mujoco.mj_step(model, data)
-        forces.append(data.actuator_force[0])
-    last = np.array(forces[-60:])
-    return bool((last[1:] * last[:-1] < -0.99 * effort**2).all())
-
-
-DRIVEN = {"engine": "mujoco", "control": "drive", "compensate": "none", "ground": False}
-
-
-@pytest.mark.parametrize("seed", range(16))
-def test_a_drive_that_sticks_in_mujoco_is_named(tmp_path, seed):
-    """A force at its limit is not implicit: the joint alternates where kd dt > 2 I, and does not below."""
-    pytest.importorskip("mujoco.batch")
-    rng = np.random.default_rng(seed)
-    inertia, timestep, ratio = 10 ** rng.uniform(-4, -2), rng.choice([5e-4, 2e-3]), [0.6, 20.0][seed % 2]
-    kd = ratio * 2 * inertia / timestep
-    kp, damping = 10 * kd, 0.2 * inertia / timestep
-    effort = kp * rng.uniform(0.02, 0.1)
-    arm = light_joint(tmp_path, inertia, effort, damping)
-    substeps = int(rng.choice([1, 7, 20]))
-
-    def move():
-        options = {"params": arm.params(kp=kp, ki=0, kd=kd), "timestep": timestep, "substeps": substeps}
-        with make(arm, **DRIVEN, **options) as runner:
-            runner.reset([0])
-            runner.rollout(np.full((round(1 / timestep / substeps), 1), 0.3))
-
-    _, messages = warned(move)
-    assert sticks(inertia, effort, damping, kp, kd, timestep) == (ratio > 1)
-    assert len(messages) == (ratio > 1)
-    assert all("env 0, joint 'hinge': its drive alternates between its effort limits" in each for each in messages)
-
-
-def test_the_env_that_sticks_is_named_once_and_lower_gains_help(tmp_path):
-    pytest.importorskip("mujoco.batch")
-    arm = light_joint(tmp_path, 1e-3, 20, 2)
-    kd = np.array([[0.5], [100]])
-    with make(arm, 2, params=arm.params(kp=10 * kd, ki=0, kd=kd), **DRIVEN) as runner:
-
-        def move():
-            runner.reset([0])
-            for _ in range(30):
-                runner.step([0.2])
-
-        _, (message,) = warned(move)
-        assert "env 1, joint 'hinge'" in message
-        assert "engine='sapien'" in message
-        assert warned(move)[1] == []
-    with make(arm, 1, params=arm.params(kp=5, ki=0, kd=0.5), **DRIVEN) as runner:
-        assert warned(lambda: runner.rollout(np.full((100, 1), 0.2)))[1] == []
-
-
-@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
-def test_drives_of_bundled_robots_do_not_warn(panda, jaco2, engine):
-    pytest.importorskip("mujoco.batch")
-    for each in (panda, jaco2):
-        with make(each, **DRIVEN | {"engine": engine}) as runner:
-            goal = np.clip(each.start + 1.0, each.lower, each.upper)
-            assert warned(lambda runner=runner, goal=goal: runner.rollout(np.tile(goal, (30, 1))))[1] == []

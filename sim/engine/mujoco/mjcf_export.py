@@ -24,10 +24,10 @@ from batchpid.motors.guard import Guard, check_guard
 from batchpid.sim.engine.mujoco.mjcf_actuators import FAR, MjcfActuators
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
 from batchpid.sim.engine.physics import SOLVERS
-from batchpid.sim.engine.robot_model import base_start
 from batchpid.sim.engine.scene_spec import SceneSpec, added_friction, own_friction
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.link_repair import nearest_physical
+from batchpid.sim.robot.robot_model import base_start
 from batchpid.sim.robot.simulated_links import body_inertias
 from batchpid.task_space.spatial_inertia import SpatialInertia
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -70,12 +71,13 @@ def test_start_poses_are_near_and_within_limits_and_do_not_depend_on_their_numbe
         ("--dissipation", "sapien"),
         ("--timestep", "0.001"),
         ("--spread", "0.1"),
-        ("--randomize", "payload"),
+        ("--randomize", "payload.yaml"),
         ("--setpoint", "0", "-0.5", "0", "-1", "0", "1", "0", "0", "0"),
     ],
     ids=lambda flags: flags[0],
 )
 def test_every_flag_changes_the_motion(flags, saved):
+    Path("payload.yaml").write_text("payload: {uniform: [0, 0.5]}")
     plain, other = saved()[0], saved(*flags)[0]
     assert np.abs(plain.qpos[-1] - other.qpos[-1]).max() > 1e-6
 

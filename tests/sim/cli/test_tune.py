@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import shlex
+from pathlib import Path
 
 import pytest
 from robots import load_bundled
@@ -36,8 +37,9 @@ def test_tune_writes_the_better_gains_with_settings_and_a_command_that_works(is_
     drawback = "chatter: tuned 3, designed 2"
     monkeypatch.setattr("batchpid.sim.tuning.evaluation.Evaluation.drawback", lambda *_: drawback if is_worse else None)
     robot = Robot.load(write(tmp_path, one_joint(), "my arm.urdf"))
+    Path("payload.yaml").write_text("payload: {uniform: [0, 0.5]}")
     bp.save_actuators("motors.yaml", bp.make_actuators(1, command_delay=0.001), robot.joint_names)
-    flags = ("--no-collisions", "--actuators", "motors.yaml", "--randomize", "payload", "--out", "gains.yaml")
+    flags = ("--no-collisions", "--actuators", "motors.yaml", "--randomize", "payload.yaml", "--out", "gains.yaml")
     status, said, error = batchpid("tune", "my arm.urdf", *SHORT, *flags)
     assert status == 0, error
     assert (f"the tuned ones are rejected: {drawback}." in said) == is_worse

@@ -40,7 +40,7 @@ def roll_out(robot, start, target, ticks=TICKS, **options):
         ("panda", {"guard": True}),
         ("panda", {"actuators": batchpid.make_actuators(9, command_delay=0.002)}),
         ("panda", {"randomization": Randomization(payload=Uniform(0, 1), link_mass=Uniform(1, 2))}),
-        ("jaco2", {"physics": "free"}),
+        ("jaco2", {"physics": "fast"}),
         (RUBBING, {"control": "drive", "physics": "fast"}),
     ],
     ids=str,

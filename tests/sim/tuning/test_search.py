@@ -16,7 +16,6 @@ from batchpid.sim.tuning import (
     Weights,
     arm_joints,
     evaluate_gains,
-    load_randomization,
     random_moves,
     tune,
     tutorial_move,
@@ -133,7 +132,7 @@ def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(
     encoder = 2 * np.pi / 2**18
     motors = make_actuators(robot.dof, command_delay=0.005, position_resolution=encoder)
     robot = dataclasses.replace(robot, actuators=motors)
-    payload = load_randomization("payload", robot)
+    payload = Randomization(payload=Uniform(0, 0.5))
     found = tune(robot, generations=1, randomization=payload)
     moves = tutorial_move(robot) + random_moves(robot, 20, 1)
     judged = evaluate_gains(robot, found.params, moves, randomization=dataclasses.replace(payload, seed=1))
