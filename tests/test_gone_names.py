@@ -98,6 +98,15 @@ GONE = (
     r"usual_variation",
     r"view[^\n]* --control",
     r"weight_origin",
+    r"--evaluations",
+    r"--sim-steps",
+    r"--time-unit",
+    r"--measured\b",
+    r"batchpid identify --resume",
+    r"held_out_error\(",
+    r"measured_motors",
+    r"read_region",
+    r"sim_steps=",
 )
 FILES = [
     path
