@@ -199,18 +199,14 @@ def _stability(
     severity, code = ("warning", "unstable") if unstable else ("note", "near-unstable")
     diverges = "it oscillates or diverges" if report.late else "it diverges, alternating from step to step"
     effect = diverges if unstable else "it may diverge in other poses"
-    text = f"the sampled PID loop is at {report.robot_ratio:.3g} times its stability bound at the start pose: {effect}"
+    joint = robot.joint_names[int(np.argmax(report.participation))]
+    text = (
+        f"the sampled PID loop is at {report.robot_ratio:.3g} times its stability bound, mostly of joint {joint!r}, at "
+        f"the start pose: {effect}"
+    )
     other = "" if report.late else implicit_remedy(params)
     remedy = f"{report.remedy}, a derivative_filter_time, {other}or gain_units='mass_matrix'"
     yield Finding(severity, code, text, remedy)
-    for index in np.flatnonzero(robot.independent & (report.joint_ratio >= NEAR_BOUND)):
-        joint, ratio = robot.joints[index], report.joint_ratio[index]
-        unit = "kg" if joint.type == "prismatic" else "kg m^2"
-        text = (
-            f"kd*dt/I = {report.kd_dt[index]:.3g}, kp*dt^2/I = {report.kp_dt2[index]:.2g} at its inertia of "
-            f"{report.inertia[index]:.2g} {unit}: {ratio:.2g} times the bound of this joint alone"
-        )
-        yield Finding(severity, code, text, f"use at most {0.5 / ratio:.1g} times its kd and kp", joint.name)
 
 
 def _ringing(
