@@ -34,15 +34,11 @@ from batchpid.sim.robot.parts import DISSIPATION
 class StabilityReport(NamedTuple):
     """Share of the stability range that the gains use at one pose; arrays are (dof,).
 
-    ``inertia``: I of each joint, with the others free [kg m^2 or kg]; ``kd_dt``: kd dt / I, as the filter passes it;
-    ``kp_dt2``: kp dt^2 / I; ``joint_ratio``, ``robot_ratio``: of each joint alone and of the whole robot, 1 is the
-    bound; ``participation``: share of each joint in the mode that is the first to become unstable. Followers have the
-    figures of their leaders, with which they move.
+    ``joint_ratio``, ``robot_ratio``: of each joint alone and of the whole robot, 1 is the bound; ``participation``:
+    share of each joint in the mode that is the first to become unstable. Followers have the figures of their leaders,
+    with which they move.
     """
 
-    inertia: Float64
-    kd_dt: Float64
-    kp_dt2: Float64
     joint_ratio: Float64
     robot_ratio: float
     participation: Float64
@@ -91,13 +87,11 @@ def gains_at(
     params: bp.PIDParams,
     qpos: Float64,
     timestep: float,
-    armature: Float64 | float = 0.0,
     actuators: bp.Actuators | None = None,
 ) -> Gains:
-    """Return ``params`` and the robot at ``qpos`` (dof,); ``armature`` (dof,) is inertia of motors [kg m^2 or kg].
+    """Return ``params`` and the robot at ``qpos`` (dof,), with ``actuators`` as motors.
 
-    Implicit params become params of the explicit law at ``timestep`` [s]. ``actuators`` are the motors, instead of
-    their armature alone.
+    Implicit params become params of the explicit law at ``timestep`` [s].
     """
     params, motors, independent = as_explicit(params, timestep), actuators or bp.Actuators(), robot.coupling.independent
 
@@ -111,11 +105,10 @@ def gains_at(
     delay = column(motors.command_delay) + column(motors.sensor_delay)
     late, lag = delay[:, independent], column(motors.lag)[:, independent]
     strength = column(motors.strength, 1.0)[:, independent]
-    armature = np.broadcast_to(armature, (1, robot.dof)) + column(motors.armature)
     of_mass, joints = isinstance(params.gain_units, PerMassMatrix), late.shape[1]
     if of_mass and actuators is None:  # the law knows the plant
         return Gains(np.eye(joints)[None], np.zeros((1, joints)), kp, ki, kd, tau, late, lag, None)
-    matrix, damping = _matrix(robot, qpos, armature), robot.damping + column(motors.viscous)
+    matrix, damping = _matrix(robot, qpos, column(motors.armature)), robot.damping + column(motors.viscous)
     damping = np.stack([robot.coupling.reduced_damping(row) for row in damping])
     if not of_mass:
         return Gains(matrix, damping, strength * kp, strength * ki, strength * kd, tau, late, lag, None)
@@ -137,7 +130,6 @@ def stability_report(
     params: bp.PIDParams,
     qpos: Float64,
     timestep: float,
-    armature: Float64 | float = 0.0,
     actuators: bp.Actuators | None = None,
 ) -> StabilityReport:
     """Return the share of the stability range that ``params`` (their least stable env) use at ``qpos`` (dof,).
@@ -145,7 +137,7 @@ def stability_report(
     ``actuators`` are motors and sensors, of which delay, lag, strength, armature and viscous friction count; rows are
     envs, as of the params.
     """
-    gains, dt = gains_at(robot, params, qpos, timestep, armature, actuators), timestep
+    gains, dt = gains_at(robot, params, qpos, timestep, actuators), timestep
     rows = max(len(leaf) for leaf in gains if leaf is not None)
     matrices, damping, kp, _, kd, tau, delay, lag = (
         np.broadcast_to(leaf, (rows, *leaf.shape[1:])) for leaf in gains[:8]
@@ -158,14 +150,12 @@ def stability_report(
     if gains.model is not None:
         unit = np.diagonal(gains.model[min(worst, len(gains.model) - 1)])
         kp, kd = unit * kp, unit * kd
-    kd_dt, kp_dt2 = kd * dt / inertia * dt / (dt + 2 * tau), kp * dt**2 / inertia
     alone = {"filter_time": tau, "delay": delay[worst], "lag": lag[worst]}  # the inertia includes the damping
     columns = {name: leaf[:, None] for name, leaf in alone.items()}
     joint_ratio = bp.stability_bound(inertia[:, None, None], kp[:, None], kd[:, None], dt, **columns).ratio
-    figures = inertia, kd_dt, kp_dt2, joint_ratio, bound.participation[worst]
-    inertia, kd_dt, kp_dt2, joint_ratio, participation = map(robot.coupling.of_all, figures)
+    joint_ratio, participation = map(robot.coupling.of_all, (joint_ratio, bound.participation[worst]))
     ratio, is_late = float(bound.ratio[worst]), bool(delay.any() or lag.any())
-    return StabilityReport(inertia, kd_dt, kp_dt2, joint_ratio, ratio, participation, worst, is_late)
+    return StabilityReport(joint_ratio, ratio, participation, worst, is_late)
 
 
 def slow_oscillation(
@@ -190,8 +180,7 @@ class StabilityWarning(UserWarning):
 
     The bound holds at the start pose, and counts delays, lag, strength, armature and viscous friction of the actuators.
     Noise and limits of efforts are not in it: beyond it, a joint with limits oscillates instead of diverging. With
-    ``dissipation="sapien"``, which adds friction that is not in the formula, there is no warning. Under control "drive"
-    in MuJoCo the warning names the first joint that sticks, see :mod:`batchpid.sim.robot.run_checks`.
+    ``dissipation="sapien"``, which adds friction that is not in the formula, there is no warning.
     """
 
 

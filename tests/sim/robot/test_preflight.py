@@ -106,12 +106,6 @@ def test_poses_beyond_limits_are_reported_by_joint(panda):
     }
 
 
-def test_options_of_load_that_change_the_physics_are_reported(tmp_path):
-    path = write(tmp_path, one_joint(LIMIT + '<dynamics friction="0.2"/>'))
-    assert "replaced by SAPIEN's default 0.05" in codes(Robot.load(path, dissipation="sapien").check())["friction"].text
-    assert "floating-base" in codes(Robot.load(path, fixed_base=False).check())
-
-
 def test_links_that_overlap_at_the_start_are_reported(tmp_path):
     box = INERTIAL + COLLISION
     text = robot(link("b"), link("l", box), link("r", box), joint("j", "b", "l"), joint("k", "b", "r"))
@@ -181,7 +175,7 @@ def test_the_tutorials_gains_are_unstable_on_the_jaco2s_light_links(jaco2):
     assert {None, "j2s7s300_joint_5", "j2s7s300_joint_finger_tip_1"} <= named
     assert "j2s7s300_joint_2" not in named
     (tip,) = (finding for finding in findings if finding.joint == "j2s7s300_joint_finger_tip_1")
-    assert re.search(r"kd\*dt/I = 18\.\d, kp\*dt\^2/I = 0\.046 at its inertia of 5\.4e-07 kg m\^2", tip.text)
+    assert tip.detail == "9.3 times"
     slower = [finding.code for finding in jaco2.check(params=jaco2.params(kp=0.01, ki=0.0, kd=1e-5))]
     assert "unstable" not in slower
 
