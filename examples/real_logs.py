@@ -28,8 +28,6 @@ MOTOR = {"armature": 0.02, "viscous": 0.1, "coulomb": 0.15, "command_delay": 0.0
 """The motor of all four robots."""
 STRENGTH = {"torque": 0.9, "servo": 0.5, "velocity": 1.0, "mit": 0.9}
 """Share of the torque that is delivered; of the servo torque per volt, kt / R [N m / V]."""
-N_M_PER_A = 1.6
-"""Drive gain of the robot under the velocity loop: torque constant times gear ratio."""
 
 
 def wave(seconds: float) -> np.ndarray:
@@ -72,12 +70,10 @@ def servo(robot: Robot, out: Path, seconds: float) -> list[str]:
 
 
 def velocity(robot: Robot, out: Path, seconds: float) -> list[str]:
-    """Write positions and currents, at 500 Hz: the drive gain is in a list of logs."""
+    """Write positions, and currents times the drive gain, at 500 Hz."""
     params = bp.make_params(1, kp=60.0, kd=3.0, effort_limit=12.0)
     time, qpos, effort = move(robot, "velocity", wave(seconds), params)
-    amperes = effort / N_M_PER_A
-    _write(out / "velocity.csv", time=time[::2], **{"measured_effort:hinge": amperes[::2], "qpos:hinge": qpos[::2]})
-    (out / "velocity.yaml").write_text(f"scale: {{hinge: {N_M_PER_A}}}\nlogs:\n- log: velocity.csv\n")
+    _write(out / "velocity.csv", time=time[::2], **{"measured_effort:hinge": effort[::2], "qpos:hinge": qpos[::2]})
     return ["--compensate", "none"]
 
 
@@ -108,7 +104,7 @@ def main() -> None:
     robot = Robot.load(options.out / "hinge.urdf")
     for kind in (torque, servo, velocity, mit):
         flags = kind(robot, options.out, options.seconds)
-        log = options.out / f"{kind.__name__}.{'yaml' if kind is velocity else 'csv'}"
+        log = options.out / f"{kind.__name__}.csv"
         words = [options.out / "hinge.urdf", log, *flags, "--timestep", f"{DT:g}", "--no-payload"]
         print("batchpid identify", *words)
 

@@ -207,7 +207,7 @@ class Restore(Operation):
             actuators=snapshot.actuators,
             draws=self.draws,
             faults=state.faults.restored(snapshot.states.containment["step"]),
-            motion=None if snapshot.motion is None else (snapshot.motion[0], snapshot.motion[1]),
+            motion=None if snapshot.motion is None else (snapshot.motion[:, 0], snapshot.motion[:, 1]),
             steps=snapshot.steps,
             steps_since_checkpoint=0,
         )
@@ -248,32 +248,34 @@ def snapshot_of(options: RunnerOptions, state: RunnerState, states: EnvStates) -
     motion = None
     if state.motion is not None:
         last, rate = state.motion
-        motion = np.stack([last, np.zeros_like(last) if rate is None else rate])
+        motion = np.stack([last, np.zeros_like(last) if rate is None else rate], axis=1)
     episodes = None if options.randomization is None else state.draws.episodes.copy()
     return Snapshot(options.describe(), state.steps, state.params, states, state.actuators, episodes, motion)
 
 
-def restored(options: RunnerOptions, snapshot: Snapshot, sizes: list[int]) -> Restore:
-    """Return the operation that restores a snapshot, checked and copied.
+def restored(options: RunnerOptions, state: RunnerState, snapshot: Snapshot, sizes: list[int]) -> Restore:
+    """Return the operation that restores a snapshot in a runner in ``state``, checked and copied.
 
     ``sizes`` are the numbers of values in the engine's state of each env.
     """
     robot, randomization, draws = options.robot, options.randomization, NOTHING
+    present = snapshot_of(options, state, snapshot.states)
+    snapshot.check_options(present.about)
+    snapshot.check_tables(present.tables())
     params = options.check_params(snapshot.params)
     acting = actuators = options.check_actuators(IDEAL if snapshot.actuators is None else snapshot.actuators)
     if randomization is not None and snapshot.episodes is not None:
         draws = randomization.draw(robot, snapshot.episodes)
         acting = randomization.randomized_actuators(actuators, draws, robot)
-    snapshot.states.check(
+    fresh = EnvStates.fresh(
         options.num_envs,
         robot.dof,
-        initial_state(options, params),
-        options.has_stiction(acting),
-        initial_actuators(acting, options.num_envs, robot.dof, options.timestep),
-        options.guard is not None,
-        sizes,
-        options.command.size,
-        untouched(options.num_envs, options.observed),
-        options.has_pushes,
+        stiction=options.has_stiction(acting),
+        guard=options.guard is not None,
+        pushes=options.has_pushes,
+        controller=initial_state(options, params),
+        actuators=initial_actuators(acting, options.num_envs, robot.dof, options.timestep),
+        sensors=untouched(options.num_envs, options.observed),
     )
+    snapshot.states.check(fresh, options.command.size, sizes)
     return Restore(replace(snapshot, params=params, actuators=actuators), draws).copy()

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.choices import MeasuredRate
 from batchpid.checks.validate import instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.export.differences import Differences, strategies
@@ -59,58 +58,42 @@ class Drive(Differences):
     def lack_motors(self, has: Collection[str]) -> None:
         """Add the effects of the actuators that are on and not in ``has``."""
         for effect, field in EFFECTS.items():
-            values = self.motor(effect, field.neutral)
-            if effect not in has and (on := values != field.neutral).any():
-                unit, problem = field.unit.removeprefix("1"), _PROBLEMS.get(effect, "none in the target")
-                self.append(f"{effect}: {problem}; here {self.listed(values, on)} {unit}".rstrip())
-        if self.actuators.limit_positions is not None:
-            self.append("position_limit: no limit by position")
+            if effect not in has:
+                values, problem = self.motor(effect, field.neutral), _PROBLEMS.get(effect, "none in the target")
+                self.add(effect, problem, values != field.neutral, values, field.unit.removeprefix("1"))
+        self.add("position_limit", "no limit by position", self.actuators.limit_positions is not None)
 
     def compare_integral(self, clamps: ArrayLike) -> None:
         """Add the differences of a target that limits its integral alone, symmetrically.
 
         The target passes the limit by up to one step, except at the joints of the mask ``clamps``.
         """
-        integrates = self.value("ki") > 0
-        limited = np.isfinite(self.value("effort_min", -math.inf)) | np.isfinite(self.value("effort_max", math.inf))
-        for effect in ("effort_limit", "saturation_effort"):
-            limited |= np.isfinite(self.motor(effect, math.inf))
-        winds = integrates & limited & (np.array(strategies(self.params)) != "none")
-        if winds.any():
-            limits = self.listed(self.integral_limit, winds)
-            self.append(f"anti_windup: the integral goes on at the effort's limit, up to {limits} N m or N")
+        integrates, limits = self.value("ki") > 0, self.integral_limit
         low, high = self.value("integral_min", -math.inf), self.value("integral_max", math.inf)
-        limited = np.isfinite(low) | np.isfinite(high)
-        uneven = integrates & (-low != high) & clamps
-        passed = integrates & limited & ~np.asarray(clamps)
-        if uneven.any():
-            limits = self.listed(self.integral_limit, uneven)
-            self.append(f"integral_limit: {limits} N m or N, the same in both directions")
-        if passed.any():
-            limits = self.listed(self.integral_limit, passed)
-            self.append(f"integral_limit: {limits} N m or N, passed by up to one step, ki dt |e|")
+        ends = [self.value("effort_min", -math.inf), self.value("effort_max", math.inf)]
+        ends += [self.motor(effect, math.inf) for effect in ("effort_limit", "saturation_effort")]
+        winds = np.isfinite(ends).any(0) & (np.array(strategies(self.params)) != "none")
+        rows = (
+            ("anti_windup", "the integral goes on at the effort's limit, up to its own", winds),
+            ("integral_limit", "the same in both directions", (-low != high) & clamps),
+            ("integral_limit", "passed by up to one step, ki dt |e|", np.isfinite(limits) & ~np.asarray(clamps)),
+        )
+        for option, problem, where in rows:
+            self.add(option, problem, integrates & where, limits, "N m or N")
 
     def _compare(self) -> None:
-        params = self.params
-        lowest, highest = self.value("integral_min", -math.inf), self.value("integral_max", math.inf)
-        if params.ki is not None and (least := np.clip(0.0, lowest, highest)).any():
-            size = self.listed(least, least != 0)
-            self.append(
-                f"integral_limit: an integral within limits that exclude 0 begins at {size} N m or N, here at 0"
-            )
+        params, acts = self.params, self.params.kd is not None
+        excluded = (self.value("integral_min", -math.inf) > 0) | (self.value("integral_max", math.inf) < 0)
+        self.add("integral_limit", "an integral whose limits exclude 0 begins at 0", excluded & (params.ki is not None))
         self.lack("effort_rate_limit", "the change of the effort is not limited", math.inf, "N m/s or N/s")
         self.lack("setpoint_weight", "P acts on the whole setpoint (b = 1), so steps overshoot more", 1.0)
-        if params.kd is not None:
-            if params.setpoint_weight_derivative is not None:
-                weights = self.listed(self.value("setpoint_weight_derivative"))
-                self.append(
-                    f"setpoint_weight_derivative: acts on the target's velocity alone (c = 1); here c = {weights}"
-                )
-            self.lack("derivative_filter_time", "no filter", 0.0, "s")
-            if not isinstance(params.measurement_rate, MeasuredRate):
-                self.append("measurement_rate: the derivative is the simulator's velocity, not a difference")
         self.lack("deadband", "none: P acts on the whole error", 0.0, "rad or m")
-        if params.continuous is not None:
-            self.append("continuous: errors are not taken the short way round")
-        if params.non_finite is not None:
-            self.append("non_finite: inputs are not checked")
+        self.add("continuous", "errors are not taken the short way round", params.continuous is not None)
+        self.add("non_finite", "inputs are not checked", params.non_finite is not None)
+        if acts:
+            weight = self.value("setpoint_weight_derivative")
+            given = params.setpoint_weight_derivative is not None
+            self.add("setpoint_weight_derivative", "acts on the target's velocity alone (c = 1)", given, weight)
+            self.lack("derivative_filter_time", "no filter", 0.0, "s")
+            problem = "the derivative is the simulator's velocity, not a difference"
+            self.add("measurement_rate", problem, params.measurement_rate is None)

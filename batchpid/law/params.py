@@ -16,7 +16,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, Document, DType
 from batchpid.arrays.choices import CHOICES, Everywhere, PerMassMatrix
-from batchpid.arrays.display import params_summary
+from batchpid.arrays.display import array_summary
 from batchpid.arrays.field_tables import Field, check_leaves, declared
 from batchpid.arrays.leaves import LeafBuilder
 from batchpid.checks.validate import is_traced, known_keywords
@@ -84,7 +84,7 @@ class PIDParams(NamedTuple):
         return PIDParams(*(leaf[:, joints] if _is_array(leaf) else leaf for leaf in self))
 
     def __repr__(self) -> str:
-        return params_summary(self)
+        return array_summary(self, "envs", "joints")
 
     def options(self) -> Document:
         """Return the options that are on, as arguments of :func:`make_params` that build these params again.

@@ -7,7 +7,6 @@ twists, wrenches and Jacobians have linear parts first. NumPy computes in float6
 from batchpid.task_space.inverse_kinematics import IKResult, InverseKinematicsWarning, inverse_kinematics
 from batchpid.task_space.operational_space import init, osc, reset, track
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
-from batchpid.task_space.osc_files import load_osc_options, save_osc_options
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
 from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDynamics, Tool, task_dynamics
 from batchpid.task_space.rigid_tree import RigidTree
@@ -35,12 +34,10 @@ __all__ = [
     "jacobian",
     "jacobian_rate",
     "link_poses",
-    "load_osc_options",
     "make_osc_params",
     "mass_matrix",
     "osc",
     "reset",
-    "save_osc_options",
     "task_dynamics",
     "track",
 ]

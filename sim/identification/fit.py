@@ -1,186 +1,254 @@
-r"""Fit of simulated motions to logs: maximum likelihood by nonlinear least squares.
+r"""Fit: nonlinear least squares of simulated against measured positions.
 
-The negative logarithm of the likelihood (:mod:`batchpid.sim.identification.problem`) depends on the sizes sigma of the
-residuals r. Since log(x) <= x - 1, it decreases whenever the weighted sum of squares does::
-
-    sum over rows and joints of (r / sigma)^2 + sum over unknowns of ((theta - m) / s)^2
-
-with the sizes before the step and a weak prior of means m and standard deviations s. Steps that reduce it, by
-``scipy.optimize.least_squares`` in a trust region within the bounds (M. A. Branch, T. F. Coleman and Y. Li, "A
-subspace, interior, and conjugate gradient method for large-scale bound-constrained minimization problems", SIAM Journal
-on Scientific Computing 21, 1999), alternate with new sizes.
-
-Residuals and Jacobian of a joint in a stretch, [J r], have many rows. The steps depend on its products of columns only,
-so the triangular QR factor of [J r], which has the same products, takes its place.
+A log of efforts is simulated in windows, each from a free initial state, whose effect is projected out of residuals and
+derivatives (H. G. Bock, "Recent advances in parameter identification techniques for ODE", 1983). A log of setpoints is
+simulated as a whole. Residuals over their size, with the loss of SciPy's "soft_l1" against outliers, and the unknowns'
+distances from the prior are minimised by ``scipy.optimize.least_squares``. All candidates of an evaluation - the
+present point, one change of each unknown and of each initial state - are simulated in one batch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
+import batchpid as bp
 from batchpid.arrays.array_types import Float64
-from batchpid.errors import InvalidArgumentError
-from batchpid.sim.identification.problem import FitEvaluation, Problem
+from batchpid.arrays.trees import structure
+from batchpid.sim.identification.log import Log
+from batchpid.sim.identification.regression import Motion
+from batchpid.sim.identification.simulator import Candidates, Drive, Plant, Stretch, simulate
+from batchpid.sim.identification.unknowns import Unknowns
 
-GAIN, LEAST_GAIN, STEP = 5e-3, 2e-4, 0.1
-"""The fit ends with a step that decreases the cost by less than LEAST_GAIN, or by less than GAIN if it is shorter than
-STEP standard deviations of the unknowns; and if linear residuals promise less than LEAST_GAIN."""
-TRIES = 4
-"""Most evaluations for one good step."""
-_ONE_STEP = 1.0
-"""Relative tolerance of the sum of squares that ends least_squares with its first good step."""
-_INSIDE = 1e-9
-"""Least distance of points from the bounds, over typical sizes."""
+WINDOW = 0.3
+"""Length of a window of a log of efforts [s]."""
+SETTLE = 0.3
+"""Time after the start of a log under the PID law in which the initial state is forgotten [s]: it is not fitted."""
+HELD_OUT = 0.25
+"""Share of each log, at its end, that is held out."""
+MOST_WINDOWS = 500
+"""Most windows that are fitted; of more, evenly spaced ones are."""
+MOST_NUMBERS = 2**24
+"""Most numbers of the derivatives; of more, evenly spaced rows are fitted."""
+ENVS = 2048
+"""Most simulations at once."""
+STEP = 1e-2
+"""Change of an unknown's coordinate for a finite difference."""
+STATE_STEPS = 1e-3, 1e-2
+"""Changes of initial positions and velocities."""
+FARTHEST = 3.0
+"""Largest residual [rad or m], that of a simulation that diverges."""
+OUTLIER = 2.0
+"""Residual over its size from which it counts less."""
 
 
-class FitStep(NamedTuple):
-    """State of a fit before a step: all that the rest of the fit depends on."""
+class Window(NamedTuple):
+    """Stretch of a log to simulate, and the rows of the log that it is compared with."""
 
-    theta: Float64
-    """Point (unknowns,)."""
-    left: int
-    """Evaluations that are left."""
-    last: Float64
-    """Point before the last step; ``theta`` at the start."""
-    cost: float
-    """Cost there; inf at the start."""
+    log: int
+    stretch: Stretch
+    measured: Float64
+    """Positions (rows, joints)."""
+    time: Float64
+    """Times (rows,) [s]."""
+    fitted: Any
+    """Fitted rows; the others are held out (rows,) bool."""
 
-    @classmethod
-    def first(cls, theta: Float64, evaluations: int) -> FitStep:
-        """Return the state at the start of a fit."""
-        return cls(theta, evaluations, theta, np.inf)
+
+class Evaluation(NamedTuple):
+    """Residuals of each window (rows, joints), and derivatives (rows, joints, unknowns)."""
+
+    residuals: list[Float64]
+    derivatives: list[Float64]
 
 
 class Solution(NamedTuple):
-    """Best point of a fit."""
+    """Result of a fit."""
 
-    theta: Float64
-    cost: float
-    """Negative logarithm of the likelihood, over rows and joints."""
-    sizes: Float64
-    """Sizes of the residuals (stretches, joints) [rad or m]."""
-    windows: list[FitEvaluation]
-    promised: float
-    """Further decrease of the cost that linear residuals would allow; not small if the fit stopped before an
-    optimum."""
+    point: Float64
+    """Coordinates of the unknowns."""
+    evaluation: Evaluation
+    """Residuals and derivatives there."""
+    size: Float64
+    """Size of the residuals (joints,)."""
+    converged: bool
 
 
-def fit(problem: Problem, begin: FitStep, report: Callable[[FitStep, float], None] = lambda *_: None) -> Solution:
-    """Return the best point from ``begin`` on.
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Windows of logs, the simulation of each log, and the unknowns."""
 
-    ``report`` is called before each step with the state and the cost.
-    """
-    from scipy.optimize import least_squares
+    plants: Sequence[Plant]
+    drives: Sequence[Drive]
+    """Plant and drive of each log."""
+    windows: Sequence[Window]
+    unknowns: Unknowns
+    run: Callable[..., Any] = map
+    """``map``, or that of a pool of processes."""
 
-    factors = _Factors(problem, begin.left)
-    scale, spread = problem.unknowns.scale, problem.unknowns.spread
-    bounds = problem.unknowns.low / scale, problem.unknowns.high / scale
-    x, last, cost = _inside(begin.theta / scale, bounds), begin.last / scale, begin.cost
-    if not np.isfinite(factors.at(x * scale)[0]).all():
-        remedy = "check the params that drove the robot, --timestep and the units of the logs"
-        raise InvalidArgumentError(
-            "logs", "move otherwise than any robot that was simulated: all diverge", remedy=remedy
-        )
-    while True:
-        factors.keep(x * scale)
-        factor, sizes, windows = factors.at(x * scale)
-        determinants = np.concatenate([window.determinant for window in windows])
-        before, cost = cost, float(problem.costs(sizes, determinants).mean())
-        report(FitStep(x * scale, factors.left, last * scale, before), cost)
-        gain = before - cost
-        weighed = factor / sizes[..., None, None]
-        moved = np.max(np.abs(x - last) / _deviations(weighed, scale / spread))
-        promised = _promised(weighed, (bounds[0] - x, bounds[1] - x)) / problem.count
-        done = gain < LEAST_GAIN or (gain < GAIN and moved < STEP) or promised < LEAST_GAIN
-        if done or factors.left <= 0:
-            return Solution(x * scale, cost, sizes, windows, promised)
+    def evaluate(self, point: Float64, steps: Float64 | None = None, free_states: bool = True) -> Evaluation:
+        """Return residuals at a point (unknowns,), and derivatives by ``steps`` (unknowns,); None: no derivatives.
 
-        def residuals(x: Float64, sizes: Float64 = sizes) -> Float64:
-            found = factors.at(x * scale)[0][..., -1] / sizes[..., None]
-            return np.append(found.ravel(), (x * scale - problem.unknowns.prior) / spread)
-
-        def jacobian(x: Float64, sizes: Float64 = sizes) -> Float64:
-            found = -factors.at(x * scale)[0][..., :-1] / sizes[..., None, None]
-            return np.vstack([found.reshape(-1, len(x)), np.diag(scale / spread)])
-
-        # One evaluation is of x itself, whose value is known.
-        most = min(TRIES, factors.left) + 1
-        options: Any = {"ftol": _ONE_STEP, "xtol": 1e-6, "gtol": None, "x_scale": "jac"}
-        last = x
-        x = _inside(least_squares(residuals, x, jacobian, bounds, max_nfev=most, **options).x, bounds)
-
-
-def _inside(x: Float64, bounds: tuple[Float64, Float64]) -> Float64:
-    return np.clip(x, bounds[0] + _INSIDE, bounds[1] - _INSIDE)
-
-
-def _deviations(factors: Float64, prior: Float64) -> Float64:
-    """Return the standard deviations of the unknowns for white noise, from the weighted factors."""
-    table = factors[..., :-1].reshape(-1, len(prior))
-    root = np.linalg.qr(np.vstack([table, np.diag(prior)]), mode="r")
-    return np.linalg.norm(np.linalg.inv(root), axis=1)
-
-
-def _promised(factors: Float64, bounds: tuple[Float64, Float64]) -> float:
-    """Return the decrease of the negative logarithm of the likelihood by the best step within ``bounds``.
-
-    Residuals are taken as linear, r - J d. A direction that a bound closes, such as to a payload below 0, promises
-    nothing.
-    """
-    from scipy.optimize import lsq_linear
-
-    table = factors.reshape(-1, factors.shape[-1])
-    if not np.isfinite(table).all():
-        return np.inf
-    residuals = table[:, -1]
-    left = residuals - table[:, :-1] @ lsq_linear(table[:, :-1], residuals, bounds, method="bvls").x
-    return 0.5 * float(residuals @ residuals - left @ left)
-
-
-class _Factors:
-    """Triangular factors of [J r] by point, with J in units of the unknowns' typical sizes."""
-
-    def __init__(self, problem: Problem, left: int) -> None:
-        self.left = left
-        self._problem = problem
-        self._known: dict[bytes, tuple[Float64, Float64, list[FitEvaluation]]] = {}
-
-    def keep(self, theta: Float64) -> None:
-        """Discard all points except ``theta``."""
-        self._known = {theta.tobytes(): self.at(theta)}
-
-    def at(self, theta: Float64) -> tuple[Float64, Float64, list[FitEvaluation]]:
-        """Return the factors, the sizes of the residuals, and residuals and Jacobian of all windows.
-
-        Factors are (stretches, joints, rows, unknowns + 1), inf if the simulation diverges; sizes (stretches, joints).
+        Initial states of windows are projected out if they are free.
         """
-        key = theta.tobytes()
-        if key not in self._known:
-            # The one at the start does not count, so that a fit may resume there. A point that is moved off a bound
-            # may be one too many.
-            self.left = max(0, self.left - bool(self._known))
-            self._known[key] = self._evaluate(theta)
-        return self._known[key]
+        joints = self.windows[0].measured.shape[1]
+        changes = np.zeros((0, len(point))) if steps is None else np.diag(steps)
+        shifts = np.zeros((2 * joints if free_states and self.drives[0].params is None else 0, 2, joints))
+        for number in range(len(shifts)):
+            side = number // joints
+            shifts[number, side, number % joints] = STATE_STEPS[side]
+        points = np.concatenate([point[None], point + changes, np.repeat(point[None], len(shifts), axis=0)])
+        states = np.concatenate([np.zeros((1 + len(changes), 2, joints)), shifts])
+        candidates = self.unknowns.candidates(self.unknowns.values(points))
+        groups = self._groups(len(points))
+        tasks = [self._task(group, candidates, states) for group in groups]
+        tables = [table for group in self.run(_simulated, tasks) for table in group]
+        residuals: list[Any] = [None] * len(self.windows)
+        slopes: list[Any] = [None] * len(self.windows)
+        for number, table in zip([number for group in groups for number in group], tables, strict=True):
+            errors = np.clip(self.windows[number].measured - table, -FARTHEST, FARTHEST)
+            residual, change = errors[0], np.moveaxis(errors[1:] - errors[0], 0, 2)
+            slope = change[..., : len(changes)] / (1.0 if steps is None else steps)
+            residuals[number], slopes[number] = _projected(residual, slope, change[..., len(changes) :])
+        return Evaluation(residuals, slopes)
 
-    def _evaluate(self, theta: Float64) -> tuple[Float64, Float64, list[FitEvaluation]]:
-        problem, scale = self._problem, self._problem.unknowns.scale
-        with np.errstate(invalid="ignore", over="ignore"):  # simulations that diverge end at inf
-            windows = problem.evaluate(theta)
-        sizes = problem.sizes([window.white for window in windows])
-        count = len(theta) + 1
-        factors = np.zeros((*sizes.shape, count, count))
-        places = [
-            (window, rows) for window, stretches in zip(windows, problem.stretches, strict=True) for rows in stretches
-        ]
-        for number, (window, rows) in enumerate(places):
-            for joint in range(sizes.shape[1]):
-                table = np.column_stack([window.jacobian[rows, joint] * scale, window.white[rows, joint]])
-                if np.isfinite(table[:, -1]).all():
-                    factor = np.linalg.qr(np.nan_to_num(table), mode="r")
-                    factors[number, joint, : len(factor)] = factor
-                else:
-                    factors[number, joint] = np.inf
-        return factors, sizes, windows
+    def _task(self, group: list[int], candidates: Candidates, states: Float64) -> Any:
+        """Return the arguments of :func:`simulate` for a group of windows."""
+        logs = [self.windows[number].log for number in group]
+        drive = self.drives[logs[0]]
+        if drive.params is not None:
+            laws = [self.drives[log].params for log in logs]
+            drive = drive._replace(params=bp.PIDParams(*map(_stacked, zip(*laws, strict=True))))
+        stretches = [self.windows[number].stretch for number in group]
+        return self.plants[logs[0]], drive, candidates, states, stretches
+
+    def _groups(self, candidates: int) -> list[list[int]]:
+        """Return the numbers of windows that are simulated at once."""
+        alike = defaultdict[Any, list[int]](list)
+        for number, (log, *_) in enumerate(self.windows):
+            alike[id(self.plants[log]), structure(self.drives[log].params)].append(number)
+        many = max(1, ENVS // candidates)
+        return [group[at : at + many] for group in alike.values() for at in range(0, len(group), many)]
+
+    def solve(
+        self, start: Float64, evaluations: int, size: Float64 | None = None, progress: Callable[[], Any] | None = None
+    ) -> Solution:
+        """Return the fit from a point ``start``, with residuals of a ``size`` (joints,), or that at the start."""
+        from scipy.optimize import least_squares
+
+        first = self.evaluate(start, np.full(len(start), STEP))
+        size = self.size(first) if size is None else size
+        kept = {start.tobytes(): (first, self.system(first, start, size))}
+
+        def at(point: Float64) -> Any:
+            if point.tobytes() not in kept:
+                evaluation = self.evaluate(point, np.full(len(point), STEP))
+                kept.clear()
+                kept[point.tobytes()] = evaluation, self.system(evaluation, point, size)
+                if progress is not None:
+                    progress()
+            return kept[point.tobytes()]
+
+        found = least_squares(
+            lambda point: at(point)[1][0],
+            start,
+            lambda point: at(point)[1][1],
+            x_scale="jac",
+            loss="soft_l1",
+            f_scale=OUTLIER,
+            ftol=1e-5,
+            xtol=1e-3,
+            gtol=1e-8,
+            max_nfev=evaluations,
+        )
+        evaluation = at(found.x)[0]
+        return Solution(found.x, evaluation, self.size(evaluation), found.status > 0)
+
+    def system(self, evaluation: Evaluation, point: Float64, size: Float64) -> tuple[Float64, Float64]:
+        """Return residuals and derivatives (n, unknowns) of the fitted rows over their ``size``, then of the prior."""
+        rows = sum(int(window.fitted.sum()) for window in self.windows)
+        every = 1 + rows * len(size) * len(point) // MOST_NUMBERS
+        residuals, slopes = list[Float64](), list[Float64]()
+        for window, residual, slope in zip(self.windows, *evaluation, strict=True):
+            residuals.append((residual[window.fitted][::every] / size).ravel())
+            slopes.append((slope[window.fitted][::every] / size[:, None]).reshape(-1, len(point)))
+        residuals.append((point - self.unknowns.prior) / self.unknowns.spread)
+        slopes.append(np.diag(1 / self.unknowns.spread))
+        return np.concatenate(residuals), np.concatenate(slopes)
+
+    def size(self, evaluation: Evaluation) -> Float64:
+        """Return the size of fitted residuals (joints,): the root mean square, the largest tenth of each joint cut."""
+        rows = [residual[window.fitted] for window, residual in zip(self.windows, evaluation.residuals, strict=True)]
+        errors = np.abs(np.concatenate(rows))
+        return np.sqrt((np.minimum(errors, np.quantile(errors, 0.9, axis=0)) ** 2).mean(0)) + 1e-9
+
+    def error(self, point: Float64, mask: Callable[[Window], Any], free_states: bool = True) -> Float64:
+        """Return the root mean square (joints,) of the position error at the rows of each window that ``mask`` has."""
+        residuals = self.evaluate(point, None, free_states).residuals
+        rows = [residual[mask(window)] for window, residual in zip(self.windows, residuals, strict=True)]
+        return np.sqrt((np.concatenate(rows) ** 2).mean(0))
+
+
+def _simulated(task: Any) -> list[Float64]:
+    return simulate(*task)
+
+
+def _stacked(parts: Any) -> Any:
+    """Return the rows of several logs as one array; options that are no arrays are the same in all."""
+    return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else parts[0]
+
+
+def _projected(residual: Float64, slope: Float64, basis: Float64) -> tuple[Float64, Float64]:
+    """Return residual (rows, joints) and ``slope`` (rows, joints, n) without what ``basis`` explains."""
+    if not basis.shape[2]:
+        return residual, slope
+    flat = basis.reshape(-1, basis.shape[2])
+    q, _ = np.linalg.qr(flat / (np.linalg.norm(flat, axis=0) + 1e-12))
+    left = residual.reshape(-1) - q @ (q.T @ residual.reshape(-1))
+    table = slope.reshape(len(flat), -1)
+    return left.reshape(residual.shape), (table - q @ (q.T @ table)).reshape(slope.shape)
+
+
+def windows_of(number: int, log: Log, motion: Motion, timestep: float, whole: bool) -> list[Window]:
+    """Return the windows of a log; one for ``whole``. A window begins where the held-out part begins."""
+    total = len(motion.qpos) - 1
+    share = {None: 1 - HELD_OUT, False: np.inf, True: -1.0}[log.settings.held_out]
+    if whole:
+        settle = min(SETTLE, 0.2 * log.seconds)
+        return [_window(number, log, motion, timestep, 0, total, settle, share)]
+    edge = round(0.05 / timestep)
+    split = int(np.clip(share, 0.0, 1.0) * total)
+    first = max(split + 1, edge)
+    length = min(round(WINDOW / timestep), max(total - first, split - edge))
+    starts = [*range(edge, split - length + 1, length), *range(first, total - length + 1, length)]
+    return [_window(number, log, motion, timestep, start, start + length, 0.0, share) for start in starts]
+
+
+def _window(
+    number: int, log: Log, motion: Motion, dt: float, first: int, last: int, settle: float, share: float
+) -> Window:
+    """Return the window from sim step ``first`` to ``last`` of the log's grid."""
+    at = (log.time - log.time[0]) / dt
+    rows = np.flatnonzero((at > first + settle / dt + 1e-6) & (at <= last + 1e-6))
+    step = np.maximum(np.ceil(at[rows] - 1e-6).astype(int), first + 1)
+    before = np.maximum(step - at[rows], 0.0) * dt
+    past = 0 if settle else min(first, round(0.1 / dt))
+    commands = slice(first - past, last)
+    forward = None if motion.feedforward is None else motion.feedforward[commands]
+    qpos, qvel = (motion.qpos[first], motion.qvel[first]) if first else _start(log)
+    stretch = Stretch(qpos, qvel, motion.command[commands], past, forward, step - first - 1, before)
+    fitted = log.time[rows] <= log.time[0] + share * log.seconds
+    return Window(number, stretch, log.qpos[rows], log.time[rows], fitted)
+
+
+def _start(log: Log) -> tuple[Float64, Float64]:
+    """Return position and velocity at the start of a log: a line through its first 30 ms; small speeds are rest."""
+    count = max(4, int((log.time <= log.time[0] + 0.03).sum()))
+    slope, place = np.polyfit(log.time[:count] - log.time[0], log.qpos[:count], 1)
+    speed = np.abs(np.diff(log.qpos, axis=0) / np.diff(log.time)[:, None])
+    moves = np.abs(slope) > 0.2 * np.sqrt((speed**2).mean(0))
+    return np.where(moves, place, log.qpos[:count].mean(0)), np.where(moves, slope, 0.0)

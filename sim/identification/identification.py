@@ -1,4 +1,4 @@
-"""Identification of motors from logs: regression, fit, uncertainty, and the error on the held-out part."""
+"""Identification of a robot's motors from logs, as a function of the library."""
 
 from __future__ import annotations
 
@@ -7,260 +7,343 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
+from importlib.util import find_spec
 from multiprocessing import get_context
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Float64
-from batchpid.arrays.digest import digest
-from batchpid.checks.validate import choice, flag, integer
-from batchpid.errors import InvalidArgumentError
-from batchpid.io.versions import package_versions
-from batchpid.motors.actuator_files import dumps_actuators, loads_actuators
-from batchpid.native.availability import obstacle
-from batchpid.sim.identification.diagnosis import diagnose
-from batchpid.sim.identification.effort_ratios import EffortRatios, effort_ratios
-from batchpid.sim.identification.fit import FitStep, Solution
-from batchpid.sim.identification.fit_search import (
-    NEIGHBOUR_EVALUATIONS,
-    Progress,
-    State,
-    begin,
-    extended,
-    likely_drives,
-    search,
-    variants,
-)
-from batchpid.sim.identification.held_out import error_of, ideal_motors, motors_of, residuals_of_ideal
-from batchpid.sim.identification.inputs import read_inputs
-from batchpid.sim.identification.log import Log
-from batchpid.sim.identification.logged_control import LoggedDrive
-from batchpid.sim.identification.plant import Plant
-from batchpid.sim.identification.problem import Problem
-from batchpid.sim.identification.regression import Motion, Regression, smooth
-from batchpid.sim.identification.result import Fit, Identification, actuators_at
-from batchpid.sim.identification.statistics import LARGEST_MISFIT, misfits, uncertainty
-from batchpid.sim.identification.unknowns import EXTRAS, KINDS, LAW, Motors, Unknowns
-from batchpid.sim.identification.windows import rows_of
-from batchpid.sim.options import worker_count
+from batchpid.checks.validate import choice, flag, instance, integer, number
+from batchpid.checks.warn import warn
+from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.sim.identification.fit import MOST_WINDOWS, Problem, windows_of
+from batchpid.sim.identification.intervals import intervals_of
+from batchpid.sim.identification.log import Log, LogWarning, checked
+from batchpid.sim.identification.logs import Reading, read_logs
+from batchpid.sim.identification.regression import STRENGTHS, Guess, Motion, Regression, better_reading, smooth
+from batchpid.sim.identification.result import Identification
+from batchpid.sim.identification.simulator import Drive, Plant
+from batchpid.sim.identification.unknowns import BASIC, EXTRAS, LAW, Unknowns
+from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import Compensation
-from batchpid.sim.tuning.history import HistoryFile
+
+STILL = {"rad": 1e-3, "m": 1e-4}
+"""Standard deviation of the positions up to which a joint did not move."""
+SHARE, SHAKEN = 0.01, 1.5
+"""The same as a share of the joint that moved most, and over the noise from row to row."""
+BEYOND = 3.0
+"""Effort over the robot's limit from which it looks like another unit."""
+FOLLOWS = 0.02
+"""Standard deviation of the positions, over that of the setpoints, up to which a joint is stuck, and gives a little."""
+
+
+class Data(NamedTuple):
+    """Logs of the joints that moved, and the robots and control that made them."""
+
+    robot: Robot
+    """The robot, which rests where the joints that did not move are."""
+    logs: list[Log]
+    motions: list[Motion]
+    plants: list[Plant]
+    drives: list[Drive]
+    """Motion, plant and drive of each log."""
+    still: list[str]
+    """Names of the joints that did not move."""
 
 
 def identify(
     robot: Robot,
     logs: Iterable[str | os.PathLike[str] | Log],
-    *,
     params: bp.PIDParams | None = None,
+    *,
     compensate: Compensation | None = None,
     timestep: float | None = None,
-    sim_steps: int = 1,
     payload: bool = True,
-    hold: bool = False,
     extras: Sequence[str] = (),
-    evaluations: int = 25,
-    seed: int = 0,
-    workers: int | None = None,
-    history: Path | str | None = None,
-    progress: Callable[[Any], Any] | None = None,
+    reading: Reading | None = None,
+    evaluations: int = 30,
+    workers: int = 0,
+    progress: Callable[[], Any] | None = None,
 ) -> Identification:
     """Find the motors of ``robot`` from logs of its motion.
 
     Parameters
     ----------
     logs
-        Files (:mod:`batchpid.sim.identification.logs`), lists of logs with settings of their own
-        (:mod:`batchpid.sim.identification.log_lists`), or logs that were read.
+        Files (:mod:`batchpid.sim.identification.logs`), or logs that were read, which may have settings of their own.
     params
         Params of the PID law that drove the robot, of all its joints or of those in the logs: the setpoints of the logs
-        are used. None: the efforts.
+        are used. None: those of a recording, or the efforts.
     compensate
-        Forces that the robot compensates by itself, or "none". The fit determines whether the compensation passes
-        through the motors. For a log of the complete efforts, compensation included, use "none"; where the log shows
-        it, the fit determines this, too. Default: as the recordings say, else "gravity+coriolis+friction".
+        Forces that the robot compensates by itself, or "none", as for logs of the complete efforts. Default: as the
+        recordings say, else "gravity+coriolis+friction".
     timestep
         Time step of the control that drove the robot [s]. Default: as the recordings say, else 1/2000.
-    sim_steps
-        Number of sim steps in each. Use more than one if the robot, or its simulator, moved in smaller steps than its
-        control, as a real robot under control at 500 Hz or less. Otherwise half the difference of the steps counts as
-        delay.
     payload
-        Find a payload at the tool, too. Efforts that were measured then count as exact; otherwise their scale is found
-        as strength.
-    hold
-        Commands hold from row to row of a file: :func:`batchpid.sim.identification.logs.read_logs`.
+        Find a payload at the tool, too.
     extras
-        Effects to try beside those of every fit, by name. Each is kept at the joints whose error on the held-out part
-        falls: "load_friction", "stribeck" (friction at rest and the speed at which it has fallen), "offset" (of the
-        encoder); and of the law in the robot, for logs of setpoints, "saturation" (its effort limit), "slew" (the limit
-        of the setpoints' rate), "kd" (a factor of that gain). "gain" is a factor of all gains of a law of which only
-        the form is known; the strength, which has the same effect, is then 1.
+        Further unknowns: "load_friction", "stribeck" (friction at rest and the speed at which it has fallen), "offset"
+        (of the encoder), "mass" (factors of the links' masses); and of the law, for logs of setpoints, "saturation"
+        (its effort limit), "slew" (the limit of the setpoints' rate), "kd", and "gain", a factor of all gains.
+    reading
+        Units and names in the files.
     evaluations
-        Largest number of evaluations of each fit, with and without noise in the law. An evaluation simulates the robot
-        and, for each unknown, a perturbed robot.
-    seed
-        Seed of CMA-ES, which finds the start of the fit.
+        Largest number of evaluations of the fit.
     workers
-        Number of processes, 0 for this one; the result does not depend on it. Default: one per available core.
-    history
-        File (.json), written before each step. If it exists the fit resumes from it.
+        Number of processes, 0 for this one.
     progress
-        Wraps the range of evaluations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
+        Called after each evaluation.
 
     Raises
     ------
     InvalidArgumentError
-        An option is out of range or contradicts a recording, a file holds no log of this robot, or a history is of
-        another fit.
+        An option is out of range or contradicts a recording, or a file holds no log of this robot.
     MissingDependencyError
-        A package is missing.
+        SciPy is missing.
 
     Warns
     -----
     LogWarning
-        A joint is at a limit, or did not move.
+        A log was changed when it was read, or a joint did not move.
     """
-    evaluations, seed = integer("evaluations", evaluations, 1, 1000), integer("seed", seed, 0, 2**31 - 1)
-    processes = worker_count(workers)
-    payload, gains_known = flag("payload", payload), "gain" not in extras
     for name in extras:
-        choice("extras", name, [*EXTRAS, "gain"])
-    resting, found, assumed, still = inputs = read_inputs(robot, logs, params, compensate, timestep, sim_steps, hold)
-    if params is None and (of_law := [name for name in extras if name in LAW]):
+        choice("extras", name, [*EXTRAS])
+    data = _read(robot, logs, params, compensate, timestep, reading)
+    guess = _guess(data)
+    # An effect of the law, which the regression does not have, may look like another reading.
+    if {*LAW}.isdisjoint(extras) and _is_odd(data, guess) and (words := _better_reading(data)):
+        raise InvalidArgumentError("logs", f"make sense with {words}", remedy="correct the log or its options")
+    unknowns = _unknowns(data, guess, [*extras], flag("payload", payload))
+    with _pool(workers) as run:
+        problem = Problem(data.plants, data.drives, _windows(data), unknowns, run)
+        found = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
+    if not found.explains and (words := _better_reading(data)):
+        return replace(found, advice=f"the logs make more sense with {words}: correct the log or its options")
+    return found
+
+
+def _read(
+    robot: Robot,
+    logs: Iterable[Any],
+    params: bp.PIDParams | None,
+    compensate: str | None,
+    timestep: float | None,
+    reading: Reading | None,
+) -> Data:
+    """Return the inputs; the arguments are those of :func:`identify`."""
+    if find_spec("scipy") is None:
+        raise MissingDependencyError("scipy", "identification", "tune")
+    instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
+    sources = [logs] if isinstance(logs, str | os.PathLike | Log) else list(logs)
+    read = list[Log]()
+    for source in sources:
+        if isinstance(source, Log):
+            read += checked(source.settings.robot or robot, source)
+        else:
+            read += read_logs(robot, [source], None if params is None else "setpoint", reading=reading)
+    if not read:
+        raise InvalidArgumentError("logs", "are missing", remedy="name one file or more")
+    if params is not None:
+        params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, read[0])
+    forces = str(_recorded("compensate", compensate, read, "gravity+coriolis+friction")).removesuffix("+friction")
+    choice("compensate", forces, ("gravity+coriolis", "gravity", "none"))
+    dt = number("timestep", _recorded("timestep", timestep, read, 1 / 2000), 1e-5, 0.01, "seconds")
+    laws = [_law(robot, log, params) for log in read]
+    for log, law in zip(read, laws, strict=True):
+        if log.joints != read[0].joints or log.kind != read[0].kind:
+            problem = f"holds other joints or commands than {read[0].source}"
+            raise InvalidArgumentError(log.source, problem, remedy="fit them one by one")
+        if (law is None) != (log.kind == "effort"):
+            remedy = "give the params that drove the robot" if law is None else "give no params"
+            raise InvalidArgumentError(log.source, f"holds {log.kind}s", remedy=remedy)
+        if law is not None and law.gain_units is not None:
+            problem = "have gains per inertia or mass matrix, which a fit does not simulate"
+            raise InvalidArgumentError("params", problem, remedy="log the efforts, and give no params")
+    if all(log.settings.held_out for log in read):
+        raise InvalidArgumentError("logs", "are all held out", remedy="set held_out of some of them")
+    moves = _moves(robot, read)
+    still = [robot.joint_names[joint] for joint, moving in zip(read[0].joints, moves, strict=True) if not moving]
+    start = robot.start
+    places = np.concatenate([log.qpos for log in read]).mean(0)
+    start[np.array(read[0].joints)[~moves]] = places[~moves]
+    parts = [log.part(joints=moves) for log in read]
+    resting = _resting(robot, start) if still else robot
+    own = [resting if log.settings.robot is None else _resting(log.settings.robot, start) for log in parts]
+    plants = dict[Any, Plant]()
+    for log, each in zip(parts, own, strict=True):
+        plants.setdefault((id(log.settings.robot), log.settings.payload), Plant(each, log.joints, log.settings.payload))
+    drives = [Drive(dt, None if law is None else law.for_joints(moves), forces) for law in laws]
+    chosen = [plants[id(log.settings.robot), log.settings.payload] for log in parts]
+    return Data(resting, parts, [smooth(log, dt) for log in parts], chosen, drives, still)
+
+
+def _resting(robot: Robot, start: Float64) -> Robot:
+    """Return ``robot`` with the start pose ``start`` (dof,)."""
+    return replace(robot, settings=None, defaults=FileDefaults(start))
+
+
+def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
+    """Return the params that drove a log; raise InvalidArgumentError if a recording contradicts them."""
+    known = None if log.params is None else _of_joints(log.params, robot, log)
+    law = params if log.settings.params is None else _of_joints(log.settings.params, robot, log)
+    if known is None or law is None:
+        return known if law is None else law
+    for name in ("kp", "ki", "kd"):
+        recorded, present = (
+            np.zeros(1) if gain is None else gain for gain in (getattr(known, name), getattr(law, name))
+        )
+        if not np.allclose(recorded, present, rtol=1e-6):
+            problem = f"contradict {log.source}, which was recorded with another {name}"
+            raise InvalidArgumentError("params", problem, remedy="leave them out: a recording has its own")
+    return law
+
+
+def _of_joints(params: bp.PIDParams, robot: Robot, log: Log) -> bp.PIDParams:
+    """Return the params of the joints of a log, one row."""
+    if params.num_envs != 1:
+        raise InvalidArgumentError("params", f"hold {params.num_envs} envs", remedy="give those of the logged robot")
+    if params.num_joints == len(log.joints):
+        return params
+    if params.num_joints != robot.dof:
+        problem = f"hold {params.num_joints} joints; the robot has {robot.dof}, the logs {len(log.joints)}"
+        raise InvalidArgumentError("params", problem, remedy="give one gain per joint of the robot")
+    return params.for_joints(list(log.joints))
+
+
+def _recorded(name: str, value: Any, logs: list[Log], default: Any) -> Any:
+    """Return an option as the recordings say, or its ``value``, or the default."""
+    for log in logs:
+        recorded = getattr(log, name)
+        if recorded is None:
+            continue
+        value = recorded if value is None else value
+        same = np.isclose(recorded, value) if name == "timestep" else recorded == value
+        if not same:
+            problem = f"contradicts {log.source}, which was made with {recorded!r}"
+            raise InvalidArgumentError(name, problem, value=value, remedy="leave the option out")
+    return default if value is None else value
+
+
+def _moves(robot: Robot, logs: list[Log]) -> Any:
+    """Return the mask (joints,) of the joints that moved; warn about the others, which are jammed or not driven."""
+    joints, qpos = logs[0].joints, np.concatenate([log.qpos for log in logs])
+    noise = np.sqrt(np.mean(np.concatenate([np.diff(log.qpos, axis=0) for log in logs]) ** 2, axis=0) / 2)
+    spread = qpos.std(0)
+    least = np.clip(SHARE * spread.max(), 1e-9, [STILL[robot.units[joint]] for joint in joints])
+    moves = spread > np.maximum(least, SHAKEN * noise)
+    if logs[0].kind == "setpoint":
+        asked = np.concatenate([log.command for log in logs]).std(0)
+        degrees = moves & (asked > 30 * spread) & (asked < 90 * spread)
+        if degrees.any():
+            name = robot.joint_names[joints[int(np.argmax(degrees))]]
+            problem = f"have setpoints of joint {name!r} that move 57 times as far as its positions"
+            raise InvalidArgumentError("logs", problem, remedy="setpoints look like degrees: give both in rad")
+        moves &= spread > FOLLOWS * asked
+    names = ", ".join(repr(robot.joint_names[joint]) for joint, moving in zip(joints, moves, strict=True) if not moving)
+    if not moves.any():
+        raise InvalidArgumentError("logs", f"show no motion of any joint ({names})", remedy="record a motion")
+    if names:
+        warn(f"{names} did not move, or did not follow its setpoint: left out, and held in place", LogWarning)
+    return moves
+
+
+def _guess(data: Data) -> Guess:
+    """Return the motors by the regression, and set whether the compensation passes through them."""
+    fitted = [at for at, log in enumerate(data.logs) if not log.settings.held_out]
+    guesses = []
+    for through in (True, False) if data.drives[0].compensate != "none" else (True,):
+        drives = [drive._replace(through=through) for drive in data.drives]
+        parts = zip(*[(data.plants[at], drives[at], data.logs[at], data.motions[at]) for at in fitted], strict=True)
+        guess = Regression(*parts).best()
+        guesses.append((guess.cost - (0.1 if through else 0.0), drives, guess))
+    _, data.drives[:], best = min(guesses, key=lambda option: option[0])
+    return best
+
+
+def _is_odd(data: Data, guess: Guess) -> bool:
+    """Return whether a strength is at its bound, or efforts are far beyond the limits of the robot."""
+    if data.logs[0].kind == "effort":
+        most = np.quantile(np.abs(np.concatenate([log.command for log in data.logs])), 0.99, axis=0)
+        limits = data.robot.effort_limit[list(data.logs[0].joints)]
+        if (most > BEYOND * np.where(limits > 0, limits, np.inf)).any():
+            return True
+    return bool(np.isin(guess.values["strength"], STRENGTHS).any())
+
+
+def _better_reading(data: Data) -> str:
+    names = [data.robot.joint_names[joint] for joint in data.logs[0].joints]
+    return better_reading(data.plants[0], data.drives[0], data.logs[0], names)
+
+
+def _unknowns(data: Data, guess: Guess, extras: list[str], payload: bool) -> Unknowns:
+    """Return the unknowns with typical sizes from the motion."""
+    first = data.logs[0]
+    if first.kind == "effort" and (of_law := [name for name in extras if name in LAW]):
         remedy = "leave it out, or give the params of the law"
         raise InvalidArgumentError("extras", "is of a law, and the logs hold efforts", value=of_law[0], remedy=remedy)
-    joints, params, timestep = inputs.joints, assumed.params, assumed.timestep
-    settings = {
-        **resting.describe(),
-        "still": still,
-        "logs": [log.source for log in found],
-        "data": digest([replace(log, source="", settings=log.settings._replace(robot=None)) for log in found]),
-        "robots": digest([own and own.describe() for own in (log.settings.robot for log in found)]),
-        "command": found[0].kind,
-        "params": None if params is None else digest(params),
-        "compensate": assumed.compensate,
-        "timestep": assumed.timestep * assumed.substeps,
-        "sim_steps": assumed.substeps,
-        "payload": payload,
-        "extras": [*extras],
-        "evaluations": evaluations,
-        "seed": seed,
-        "native": not obstacle(),
-        "versions": package_versions(("batchpid", "sapien", "numpy", "scipy", "cmaes")),
-    }
-    record = HistoryFile(history, "fit", settings)
-    motions = [smooth(log, timestep) for log in found]
-    fitted = [log for log in found if not log.settings.held_out]
-    fitted_motions = [each for each, log in zip(motions, found, strict=True) if not log.settings.held_out]
-    drives = likely_drives(resting, joints, assumed, fitted, fitted_motions, payload, gains_known)
-    unknowns = _unknowns(resting, joints, *drives[0], motions, payload)
-    if not gains_known:
-        unknowns = unknowns.plus(["gain"], range(len(joints)), {})
-    ratios = None if found[0].measured is None else effort_ratios(inputs)
-    unknowns = unknowns.without(_known(found[0], payload, ratios))
-    ideal = ideal_motors(robot, joints)
-    pool: Any = nullcontext()
-    if processes > 1:
-        pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
-    with pool as executor:
-
-        def fit_under(drive: LoggedDrive, regression: Regression, record: HistoryFile) -> tuple[Problem, Solution]:
-            """Return the likeliest fit under ``drive``."""
-            problems = [
-                Problem(resting, joints, each, found, motions, unknowns, executor) for each in variants(drive, motions)
-            ]
-            counts = len(unknowns.names), max(evaluations, NEIGHBOUR_EVALUATIONS), len(problems)
-            known = record.state(lambda found: State.of_plain(found, *counts))
-            state = known or State(FitStep.first(begin(problems[0], regression, ideal, seed), evaluations))
-            return search(problems, state, evaluations, record, Progress(len(problems), evaluations, progress))
-
-        fits_of_drives = [fit_under(*drives[0], record)]
-        if misfits(*fits_of_drives[0]).max() > LARGEST_MISFIT:  # the compensation may be wrong
-            fits_of_drives += [fit_under(*each, HistoryFile(None, "fit", settings)) for each in drives[1:]]
-        problem, best = min(fits_of_drives, key=lambda each: each[1].cost)
-        for name in extras:
-            if name in EXTRAS:
-                problem, best = extended(problem, best, EXTRAS[name])
-        unknowns = problem.unknowns
-        before, after = residuals_of_ideal(problem, robot), [window.residual for window in best.windows]
-        sure = uncertainty(problem, best)
-        saved = problem.residuals(_saved(robot, joints, unknowns, best.theta)[None])
-    errors = error_of(problem, before), error_of(problem, saved)
-    if not errors[1] < errors[0]:  # the fit failed: nothing is known
-        sure = sure._replace(identified=np.zeros_like(sure.identified))
-    fits = tuple(
-        Fit(w.log, found[w.log].time[rows_of(w)], w.fitted, b[0], a)
-        for w, b, a in zip(problem.windows, before, after, strict=True)
-    )
-    errors_of_fit = np.concatenate([r[w.fitted] for r, w in zip(after, problem.windows, strict=True)])
-    noise = np.sqrt((errors_of_fit**2).mean(0))
-    names = [robot.joint_names[joint] for joint in joints]
-    regressions = {each.compensation: regression for each, regression in drives}
-    diagnosis = diagnose(regressions[problem.drive.compensation], fitted, names)
-    estimate = best.theta
-    if ratios is not None:
-        own = [at for at, (kind, _) in enumerate(ratios.names) if kind in unknowns.known]
-        unknowns = unknowns.plus_known(tuple(ratios.names[at] for at in own))
-        more = [ratios.names[at][0] for at in own], ratios.estimate[own], ratios.deviation[own]
-        estimate, sure = np.append(estimate, more[1]), sure.plus(*more)
-    return Identification(
-        robot,
-        joints,
-        unknowns,
-        estimate,
-        sure,
-        (errors[0], errors[1]),
-        misfits(problem, best),
-        noise,
-        problem.drive,
-        settings,
-        fits,
-        diagnosis,
-    )
+    kinds = [kind for kind in BASIC if not (kind == "delay" and first.measured)]
+    kinds = [kind for kind in kinds if not (kind == "strength" and "gain" in extras)]
+    kinds += ["setpoint_delay"] * (first.kind == "setpoint") + ["payload"] * payload
+    kinds += [kind for name in extras for kind in EXTRAS[name]]
+    qpos, qvel, qacc = (np.concatenate([motion[part] for motion in data.motions]) for part in range(3))
+    poses = np.ascontiguousarray(qpos[:: max(1, len(qpos) // 200)])
+    dynamics = data.plants[0].dynamics([()] * len(poses), poses, np.zeros_like(poses))
+    dynamics.update()
+    links = np.diagonal(dynamics.matrix, axis1=1, axis2=2).mean(0)
+    speed = np.maximum(np.sqrt((qvel**2).mean(0)), 1e-3)
+    inertia = links + guess.values["armature"]
+    effort = np.maximum(inertia * np.sqrt((qacc**2).mean(0)) + guess.values["friction"], 0.1 * inertia)
+    sizes = {"inertia": links, "damping": effort / speed, "effort": effort, "speed": 0.1 * speed}
+    sizes |= {"friction": 0.3 * np.maximum(guess.values["friction"], 0.05 * effort)}
+    sizes |= {"top_speed": np.quantile(np.abs(qvel), 0.99, axis=0)}
+    if first.kind == "setpoint":
+        errors = np.concatenate([np.abs(motion.command - motion.qpos) for motion in data.motions])
+        sizes["error"] = 0.7 * np.quantile(errors, 0.95, axis=0)
+    starts = dict(guess.values)
+    if "gain" in extras:
+        starts["gain"] = starts.pop("strength")
+    bodies = data.plants[0].bodies() if "mass" in extras else {}
+    return Unknowns.of(data.robot, first.joints, kinds, starts, sizes, bodies)
 
 
-def _known(log: Log, payload: bool, ratios: EffortRatios | None) -> Motors:
-    """Return the values of kinds that are no unknowns of a fit of logs such as ``log``.
-
-    Measured efforts have no delay, and count as exact if a payload is to be found; else the strength is their scale.
-    Behind the gear they are free of the motor's inertia and friction.
-    """
-    if ratios is not None:
-        return ratios.values(("strength", "delay", "lag"))
-    if not log.is_measured:
-        return {}
-    of_motor = ("armature", "damping", "friction") if log.sensor == "link" else ()
-    kinds = ("delay", *of_motor, *(("strength",) if payload else ()))
-    return {kind: np.full((1, 1), KINDS[kind].neutral) for kind in kinds}
+def _windows(data: Data) -> list[Any]:
+    dt, whole = data.drives[0].timestep, data.logs[0].kind == "setpoint"
+    windows = [
+        window
+        for at, (log, motion) in enumerate(zip(data.logs, data.motions, strict=True))
+        for window in windows_of(at, log, motion, dt, whole)
+    ]
+    return windows[:: 1 + len(windows) // MOST_WINDOWS]
 
 
-def _unknowns(
-    robot: Robot, joints: tuple[int, ...], drive: LoggedDrive, start: Regression, motions: list[Motion], payload: bool
-) -> Unknowns:
-    """Return the unknowns with typical sizes from the motion."""
-    plant, motors = Plant(robot, joints, drive), start.best.motors
-    qpos = np.concatenate([motion.qpos[::200] for motion in motions])
-    matrix = plant.mass_matrix(qpos, np.zeros((len(qpos), 1)))
-    links, armature = np.diagonal(matrix, axis1=1, axis2=2).mean(0), motors["armature"][0]
-    inertia = links + armature
-    speed, acceleration = (
-        np.sqrt(np.mean(np.concatenate([getattr(motion, name) for motion in motions]) ** 2, axis=0))
-        for name in ("qvel", "qacc")
-    )
-    speed = np.maximum(speed, 1e-3)
-    effort = np.maximum(inertia * acceleration + motors["friction"][0], inertia * 0.1)
-    known = np.flatnonzero(start.ratios_only) if start.gains_known else range(len(joints))
-    return Unknowns.of(links, armature, effort, speed, payload, [*known])
+def _pool(workers: int) -> Any:
+    """Return a context of ``map``, or of that of a pool of processes."""
+    if integer("workers", workers, 0, 1000) < 2:
+        return nullcontext(map)
+    return _Pool(workers)
 
 
-def _saved(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Float64) -> Float64:
-    """Return ``theta`` as its actuators file describes it, with the stopping time and payload of ``theta``."""
-    text = dumps_actuators(actuators_at(robot, joints, unknowns, theta), robot.joint_names)
-    found = unknowns.motors(theta[None])
-    common = float(found["stopping"][0, 0]), float(found["payload"][0, 0])
-    motors = motors_of(loads_actuators(text, robot.joint_names)[0], robot, joints, *common)
-    return unknowns.point(motors | {name: found[name] for name in LAW if name in found})
+class _Pool:
+    def __init__(self, workers: int) -> None:
+        self._executor = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+
+    def __enter__(self) -> Any:
+        return self._executor.map
+
+    def __exit__(self, *error: object) -> None:
+        self._executor.shutdown()
+
+
+def _fitted(data: Data, problem: Problem, evaluations: int, progress: Callable[[], Any] | None) -> Identification:
+    """Return the fit: first of all unknowns, then of those that the logs show."""
+    fitted = replace(problem, windows=[window for window in problem.windows if window.fitted.any()])
+    rough = fitted.solve(problem.unknowns.start, evaluations // 2, progress=progress)
+    shown = intervals_of(fitted, rough).shown
+    unknowns, hidden = problem.unknowns.only(shown), problem.unknowns.only(~shown)
+    fitted = replace(fitted, unknowns=unknowns)
+    solution = fitted.solve(rough.point[shown], evaluations, rough.size, progress)
+    intervals, problem = intervals_of(fitted, solution), replace(problem, unknowns=unknowns)
+    return Identification.of(data.logs, data.still, problem, solution, intervals, hidden, fitted)

@@ -1,258 +1,388 @@
-"""Result of an identification: motors with their intervals, as plain values and as actuators."""
+"""Result of an identification: values with intervals, a report, an actuators file, and draws from its region."""
 
 from __future__ import annotations
 
 import os
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import choice, integer
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.identification.confidence_region import KEY, Region
-from batchpid.sim.identification.diagnosis import Diagnosis
-from batchpid.sim.identification.held_out import ASSUMED
-from batchpid.sim.identification.logged_control import LoggedDrive
-from batchpid.sim.identification.statistics import INTERVAL, Uncertainty
-from batchpid.sim.identification.unknowns import ADDED, DESCRIBED, KINDS, Unknowns, kind_of
+from batchpid.io import documents
+from batchpid.sim.identification.fit import STEP, Problem, Solution, Window
+from batchpid.sim.identification.intervals import INTERVAL, Intervals
+from batchpid.sim.identification.log import Log
+from batchpid.sim.identification.simulator import Drive
+from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknown, Unknowns
+from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.urdf_export import to_urdf
 
-SHORT = 30.0
-"""Length of a log [s] below which intervals hold for its motion only."""
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+KEY = "confidence_region"
+"""Key of an actuators file, under "about"."""
+LEAST_GAIN = 0.1
+"""Least share of the remaining squared error that a further unknown has to explain to be named."""
+ALIKE = 0.6
+"""Share of the best explanation from which another one is as good."""
+EXPLAINS = 0.5
+"""Share of the position error with ideal motors that a file may leave."""
 
 
-class Fit(NamedTuple):
-    """Position errors along a simulated stretch of a log: measured less simulated positions [rad or m]."""
-
-    log: int
-    """Number of the log."""
-    time: Float64
-    """Times (rows,) [s]."""
-    fitted: NDArray[np.bool_]
-    """Fitted rows; the others were held out (rows,)."""
-    before: Float64
-    """Errors of the robot as described (rows, joints)."""
-    after: Float64
-    """Errors of the robot as identified."""
-
-
-class Identification(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Identification:
     """Motors that explain the logs, with their uncertainty."""
 
     robot: Robot
     joints: tuple[int, ...]
-    """Numbers of the joints that the logs hold."""
+    """Numbers of the joints that the logs hold and that moved."""
     unknowns: Unknowns
-    estimate: Float64
-    """Point that was found (unknowns,)."""
-    uncertainty: Uncertainty
+    """Unknowns that the logs show."""
+    hidden: Unknowns
+    """Unknowns of which the logs show nothing; they have the values of ideal motors."""
+    values: Float64
+    """Values of the unknowns (unknowns,)."""
+    intervals: Intervals
     held_out_error: tuple[float, float]
-    """Root mean square of the position error [rad or m] on the held-out part of the logs, of the robot as described and
-    as identified; inf if the simulation diverges."""
-    misfits: Float64
-    """Held-out residuals over the noise of the sensors (joints,): about 1 if the model explains the motion."""
-    noise: Float64
-    """Root mean square of the residuals (joints,) [rad or m]."""
-    drive: LoggedDrive
-    """Control of the robot, as assumed or found."""
-    settings: Document
-    """Logs, options and versions, for the record."""
-    fits: tuple[Fit, ...]
-    """Errors along each stretch of the logs that was simulated."""
-    diagnosis: Diagnosis
-    """Links whose masses seem off, and the stretch of the logs that disagrees most."""
+    """Root mean square of the position error [rad or m] on the held-out part of the logs, simulated from the logged
+    state, of the robot as described and as identified."""
+    errors: tuple[Float64, Float64, Float64]
+    """The same by joint (joints,), and with the initial state of each window fitted, as in the fit."""
+    converged: bool
+    """False if the fit has stopped at the largest number of evaluations."""
+    advice: str
+    """Sentence on an effect that would lower the error most, or "none"."""
+    logs: tuple[str, ...]
+    """Names of the logs."""
+    still: tuple[str, ...]
+    """Joints that did not move."""
+    drive: Drive
+    problem: Problem
+    point: Float64
 
-    def interval(self, kind: str, joint: int | None = None) -> tuple[float, float, float] | None:
-        """Return estimate, lower and upper end of the 95 % interval; None if the logs do not identify the unknown.
+    @classmethod
+    def of(
+        cls,
+        logs: Sequence[Log],
+        still: Sequence[str],
+        problem: Problem,
+        solution: Solution,
+        intervals: Intervals,
+        hidden: Unknowns,
+        fitted: Problem,
+    ) -> Identification:
+        """Return the result of a ``solution`` of the ``fitted`` windows of a ``problem``."""
+        unknowns = problem.unknowns
+        judged = any(not window.fitted.all() for window in problem.windows)
 
-        ``kind`` is a name of :data:`batchpid.sim.identification.unknowns.KINDS`: "armature", "damping", "friction",
-        "strength" or "bias" of a ``joint``, by its number among :attr:`joints`; or "delay", "stopping" or "payload",
-        without joint. Fits with further effects also have kinds of
-        :data:`batchpid.sim.identification.unknowns.ADDED`, each of a joint.
+        def mask(window: Window) -> Any:
+            return ~window.fitted if judged else window.fitted
 
-        Raises
-        ------
-        InvalidArgumentError
-            The logs do not hold that joint, or there is no such unknown.
-        """
-        kind = choice("kind", kind, list(dict.fromkeys(name for name, _ in self.unknowns.names)))
-        if kind_of(kind).per_joint != (joint is not None):
-            remedy = f"give its number, 0 to {len(self.joints) - 1}" if kind_of(kind).per_joint else "leave it out"
-            raise InvalidArgumentError("joint", f"does not go with {kind!r}", value=joint, remedy=remedy)
-        if joint is not None:
-            joint = integer("joint", joint, 0, len(self.joints) - 1)
-        if (kind, joint) not in self.unknowns.names:
-            return None
-        index = self.unknowns.names.index((kind, joint))
-        return self._row(index) if self.uncertainty.identified[index] else None
+        ideal = replace(problem, unknowns=replace(unknowns, entries=()))
+        before = ideal.error(np.zeros(0), mask, free_states=False)
+        after = problem.error(solution.point, mask, free_states=False)
+        free = problem.error(solution.point, mask)
+        total = tuple(float(np.sqrt((errors**2).mean())) for errors in (before, after))
+        return cls(
+            unknowns.robot,
+            unknowns.joints,
+            unknowns,
+            hidden,
+            unknowns.values(solution.point[None])[0],
+            intervals,
+            (total[0], total[1]),
+            (before, after, free),
+            solution.converged,
+            advice(fitted, solution),
+            tuple(log.source for log in logs),
+            tuple(still),
+            problem.drives[0],
+            problem,
+            solution.point,
+        )
 
-    def _row(self, index: int) -> tuple[float, float, float]:
-        """Return estimate, lower and upper end of the 95 % interval of an unknown, however wide."""
-        value, half = self.estimate[index], INTERVAL * self.uncertainty.deviation[index]
-        low, high = self.unknowns.low[index], self.unknowns.high[index]
-        return float(value), float(max(value - half, low)), float(min(value + half, high))
+    def interval(self, kind: str, joint: int | str | None = None) -> tuple[float, float, float] | None:
+        """Return estimate, lower and upper end of the 95 % interval; None if the logs show nothing of it.
 
-    @property
-    def not_identified(self) -> list[str]:
-        """Unknowns that the logs do not identify, e.g. "elbow: strength"."""
-        of_joints, others = self.missing()
-        return [f"{joint}: {kind}" for joint, kinds in of_joints.items() for kind in kinds] + others
-
-    def missing(self) -> tuple[dict[str, list[str]], list[str]]:
-        """Return the kinds of unknowns that the logs do not identify, by joint, and the others: delay and payload."""
-        of_joints: dict[str, list[str]] = {}
-        others = []
-        for (kind, joint), known in zip(self.unknowns.names, self.uncertainty.identified, strict=True):
-            if not known and joint is not None:
-                of_joints.setdefault(self.robot.joint_names[self.joints[joint]], []).append(kind)
-            elif not known and kind != "stopping":
-                others.append(kind)
-        return of_joints, others
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write :meth:`actuators` to a .yaml or .json file: all values, with their intervals and the names of the logs.
-
-        The values are a joint optimum, and correlated: all are kept, also those whose interval is wide.
-        """
-        of_joints, others = self.missing()
-        document, motors = self.document(), self.unknowns.motors(self.estimate[None])
-        names = [self.robot.joint_names[number] for number in self.joints]
-        logged = set(names)
-        own = zip(self.robot.joint_names, self.robot.independent, strict=True)
-        about = {
-            "identified_from": self.settings["logs"],
-            "held_out_error": document["held_out_error"],
-            "misfit": document["misfit"],
-            ASSUMED: self.drive.assumptions
-            | {kind: float(motors[kind][0, 0]) for kind in ("stopping", "payload")}
-            | ({"slew": dict(zip(names, motors["slew"][0].tolist(), strict=True))} if "slew" in motors else {}),
-            "intervals": document["joints"]
-            | {kind: document[kind] for kind, joint in self.unknowns.names if joint is None and kind in document},
-            KEY: self.region.to_dict(),
-            "not_well_determined": of_joints | ({"all joints": others} if others else {}),
-            "did_not_move_hence_ideal": self.settings["still"],
-            "not_in_the_logs_hence_ideal": [
-                name for name, free in own if free and name not in logged and name not in self.settings["still"]
-            ],
-        }
-        bp.save_actuators(path, self.actuators(), self.robot.joint_names, about)
-
-    @property
-    def region(self) -> Region:
-        """Joint confidence region of all unknowns."""
-        joints = [self.robot.joint_names[number] for number in self.joints]
-        names = tuple((kind, None if joint is None else joints[joint]) for kind, joint in self.unknowns.names)
-        return Region(names, self.estimate, self.uncertainty.deviation, self.uncertainty.correlation)
-
-    def corrected_urdf(self) -> str:
-        """Return the URDF of the robot with the masses of :attr:`diagnosis`, and tensors in proportion.
+        ``kind`` is a name of :data:`batchpid.sim.identification.unknowns.KINDS`, ``joint`` the number of a joint among
+        :attr:`joints`, the name of a link for "mass", None for "delay", "setpoint_delay" and "payload".
 
         Raises
         ------
         InvalidArgumentError
-            No link's mass seems off.
-        RobotError
-            The robot's file cannot be read, or has changed since.
+            There is no such unknown.
         """
-        if not self.diagnosis.links:
-            remedy = "leave the option out; the robot's description is as good as these logs tell"
-            raise InvalidArgumentError("corrected_urdf", "no link's mass seems off", remedy=remedy)
-        return to_urdf(self.robot, mass_factors=self.diagnosis.links).text
+        kind = choice("kind", kind, list(KINDS))
+        places = {(entry.kind, entry.joint if entry.link is None else entry.link): entry for entry in self._all()}
+        if (kind, joint) not in places:
+            known = ", ".join(sorted({name for name, _ in places}))
+            raise InvalidArgumentError("joint", f"is no place of the unknown {kind!r}", value=joint, remedy=known)
+        entry = places[kind, joint]
+        return None if entry not in self.unknowns.entries else self._row(self.unknowns.entries.index(entry))
 
-    def document(self) -> Document:
-        """Return the result as plain values: for each unknown the estimate and its 95 % interval, however wide.
+    def _all(self) -> tuple[Unknown, ...]:
+        return self.unknowns.entries + self.hidden.entries
 
-        "not_identified" names the unknowns that are not well determined.
-        """
-
-        def row(kind: str, joint: int | None = None) -> list[float]:
-            if (kind, joint) not in self.unknowns.names:
-                return [kind_of(kind).neutral] * 3
-            return list(self._row(self.unknowns.names.index((kind, joint))))
-
-        document: Document = {
-            "joints": {
-                self.robot.joint_names[number]: {kind: row(kind, joint) for kind in self.unknowns.per_joint}
-                for joint, number in enumerate(self.joints)
-            }
-        }
-        document |= {kind: row(kind) for kind, joint in self.unknowns.names if joint is None and kind != "stopping"}
-        return document | {
-            "held_out_error": [value if np.isfinite(value) else None for value in self.held_out_error],
-            "misfit": self.misfit if np.isfinite(self.misfit) else None,
-            "not_identified": self.not_identified,
-            "strength_taken_as_1": self.strength_taken,
-            "singular_values": self.uncertainty.singular_values.tolist(),
-            "noise": self.noise.tolist(),
-            "diagnosis": self.diagnosis.to_dict(),
-            "compensation": "through the motors" if self.drive.through else self.drive.compensate,
-            "about": self.settings,
-        }
-
-    @property
-    def strength_taken(self) -> list[str]:
-        """Joints of which the logs show only ratios to the strength: it is taken as 1."""
-        if "strength" in self.unknowns.known:
-            return []
-        known = self.unknowns.joints_of("strength") + self.unknowns.joints_of("gain")
-        return [self.robot.joint_names[number] for at, number in enumerate(self.joints) if at not in known]
-
-    @property
-    def finds_gains(self) -> bool:
-        """True if :meth:`gains` differ from the params of the law that were given."""
-        return not {"gain", "kd", "saturation"}.isdisjoint(self.unknowns.per_joint)
-
-    def gains(self) -> bp.PIDParams | None:
-        """Return the params of the law that was found, of the logged joints; None for logs of efforts."""
-        return self.drive.of(self.unknowns.motors(self.estimate[None])).params
-
-    @property
-    def misfit(self) -> float:
-        """The largest of :attr:`misfits`."""
-        return float(self.misfits.max())
-
-    @property
-    def worst_joint(self) -> str:
-        """Name of the joint with the largest of :attr:`misfits`."""
-        return self.robot.joint_names[self.joints[int(self.misfits.argmax())]]
-
-    @property
-    def is_short(self) -> bool:
-        """True if there is one log of less than :data:`SHORT`, which shows nothing of other motions, loads and days."""
-        return len({fit.log for fit in self.fits}) == 1 and sum(float(np.ptp(fit.time)) for fit in self.fits) < SHORT
+    def _row(self, at: int) -> tuple[float, float, float]:
+        value, half = float(self.values[at]), INTERVAL * float(self.intervals.deviation[at])
+        low = self.unknowns.entries[at].floor if KINDS[self.unknowns.entries[at].kind].positive else -np.inf
+        return value, max(value - half, low), value + half
 
     @property
     def explains(self) -> bool:
-        """True if the error on the held-out part fell."""
-        return self.held_out_error[1] < self.held_out_error[0]
+        """True if less than half of the error with ideal motors is left."""
+        return self.held_out_error[1] < EXPLAINS * self.held_out_error[0]
+
+    @property
+    def not_identified(self) -> list[str]:
+        """Unknowns of which the logs show nothing, e.g. "elbow: strength"."""
+        return [self._name(entry) for entry in self.hidden.entries]
+
+    def _name(self, entry: Unknown) -> str:
+        joint = None if entry.joint is None else self.robot.joint_names[self.joints[entry.joint]]
+        place = joint or entry.link
+        return entry.kind if place is None else f"{place}: {entry.kind}"
 
     def actuators(self) -> bp.Actuators:
-        """Return the actuators at the point that was found; joints that are not in the logs are ideal.
+        """Return the actuators that were found; joints that are not in the logs are ideal.
 
-        Friction is the excess over the friction in the robot's description, at least 0.
+        Friction and damping are in addition to the robot's description.
         """
-        return actuators_at(self.robot, self.joints, self.unknowns, self.estimate)
+        tables = self.unknowns.tables(self.values[None])
+        options = dict[str, Any]()
+        for name, table in tables.items():
+            kind = KINDS[name]
+            if kind.target != "motor":
+                continue
+            column = np.full(self.robot.dof, kind.neutral)
+            described = getattr(self.robot, DESCRIBED[name])[list(self.joints)] if name in DESCRIBED else 0.0
+            column[list(self.joints)] = np.maximum(table[0] - described, 0.0) if name in DESCRIBED else table[0]
+            if name == "delay":
+                column[:] = table[0, 0]
+            options[kind.field] = column
+        if "static" in options:
+            options["static"] = options["static"] + options.get("coulomb", 0.0)
+        return bp.make_actuators(self.robot.dof, **options, joint_names=self.robot.joint_names)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write :meth:`actuators` to a .yaml or .json file, with intervals, the region, and what is not of motors."""
+        document = self.document()
+        names = [[entry.kind, self._place(entry)] for entry in self.unknowns.entries]
+        rows = [[float(f"{value:.5f}") for value in row[: at + 1]] for at, row in enumerate(self.intervals.correlation)]
+        region = {
+            "unknowns": names,
+            "estimate": self.values.tolist(),
+            "standard_deviation": self.intervals.deviation.tolist(),
+            "correlation": rows,
+        }
+        about = {key: document[key] for key in ("identified_from", "held_out_error", "intervals", "not_shown")}
+        about["did_not_move_hence_ideal"] = list(self.still)
+        bp.save_actuators(path, self.actuators(), self.robot.joint_names, about | {KEY: region})
+
+    def _place(self, entry: Unknown) -> str | None:
+        return entry.link if entry.joint is None else self.robot.joint_names[self.joints[entry.joint]]
+
+    def document(self) -> Document:
+        """Return the result as plain values: estimate and 95 % interval of each unknown, and the errors."""
+        intervals: Document = {}
+        for at, entry in enumerate(self.unknowns.entries):
+            place = self._place(entry)
+            table = intervals if place is None else intervals.setdefault(place, {})
+            table[entry.kind] = list(self._row(at))
+        return {
+            "intervals": intervals,
+            "not_shown": self.not_identified,
+            "held_out_error": list(self.held_out_error),
+            "converged": self.converged,
+            "compensation_through_motors": self.drive.compensate != "none" and self.drive.through,
+            "identified_from": list(self.logs),
+            "advice": self.advice,
+        }
+
+    def corrected_urdf(self) -> str:
+        """Return the URDF of the robot with the masses that were found; the links of a body keep their shares.
+
+        Raises
+        ------
+        InvalidArgumentError
+            The masses were no unknowns (extras=["mass"]).
+        """
+        factors = {
+            link: float(value)
+            for entry, value in zip(self.unknowns.entries, self.values, strict=True)
+            for link in (self.unknowns.bodies[entry.link] if entry.link is not None else ())
+        }
+        if not factors:
+            raise InvalidArgumentError("corrected_urdf", "no mass was found", remedy="identify with extras=['mass']")
+        return to_urdf(self.robot, mass_factors=factors).text
+
+    def gains(self) -> bp.PIDParams | None:
+        """Return the params of the law that was found, of the logged joints; None without unknowns of the law."""
+        law = self.unknowns.candidates(self.values[None]).law
+        if self.drive.params is None or law.keys().isdisjoint(("gain", "kd", "saturation")):
+            return None
+        from batchpid.sim.identification.simulator import changed_params
+
+        return changed_params(self.drive.params, law)
+
+    def figure(self) -> Figure:
+        """Return a picture of the position errors along the first log, before and after."""
+        from batchpid.sim import plots
+
+        windows = [window for window in self.problem.windows if window.log == 0]
+        shown = replace(self.problem, windows=windows)
+        ideal = replace(shown, unknowns=replace(self.unknowns, entries=()))
+        before = ideal.evaluate(np.zeros(0), free_states=False).residuals
+        after = shown.evaluate(self.point, free_states=False).residuals
+        parts = zip(windows, before, after, strict=True)
+        errors = [plots.FitErrors(window.time, window.fitted, first, second) for window, first, second in parts]
+        names, units = ([table[joint] for joint in self.joints] for table in (self.robot.joint_names, self.robot.units))
+        title = f"{self.robot.name}: position error, shaded where it was not fitted"
+        return plots.fit_errors(errors, names, units, title)
+
+    def report(self) -> str:
+        """Return values, intervals and errors as text."""
+        kinds = list(dict.fromkeys(entry.kind for entry in self._all() if entry.joint is not None))
+        names = [self.robot.joint_names[joint] for joint in self.joints]
+        cells = {(entry.kind, self._place(entry)): self._cell(at) for at, entry in enumerate(self.unknowns.entries)}
+        rows = [["95 % intervals, SI units", *kinds]]
+        rows += [[name, *(cells.get((kind, name), "not shown") for kind in kinds)] for name in names]
+        widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+        lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+        lines += [""]
+        for entry in self._all():
+            if entry.joint is None:
+                lines.append(f"{self._name(entry)}: {cells.get((entry.kind, entry.link), 'not shown by these logs')}")
+        if self.drive.compensate != "none":
+            way = "through its motors" if self.drive.through else "apart from its motors"
+            lines.append(f"the robot compensates {self.drive.compensate} {way}")
+        before, after = self.held_out_error
+        free = float(np.sqrt((self.errors[2] ** 2).mean()))
+        lines.append(
+            f"position error on the held-out part, simulated from the logged state: {before:.3g} with ideal motors, "
+            f"{after:.3g} with these"
+        )
+        if self.drive.params is None:
+            lines.append(f"with the initial state of each 0.3 s fitted: {free:.3g}")
+        joints = [f"{name} {error:.2g}" for name, error in zip(names, self.errors[1], strict=True)]
+        lines.append(f"by joint: {', '.join(joints)}")
+        if self.hidden.entries:
+            lines.append(f"not shown by these logs, hence as ideal: {', '.join(self.not_identified)}")
+        if not self.converged:
+            lines.append("the fit has not converged: the values are the best so far")
+        lines.append(self.advice)
+        return "\n".join(lines)
+
+    def _cell(self, at: int) -> str:
+        value, low, high = self._row(at)
+        half = max(high - value, value - low)
+        if half > abs(value) and KINDS[self.unknowns.entries[at].kind].positive:
+            return f"< {high:.2g}"
+        digits = int(np.clip(np.ceil(np.log10(abs(value) / half)) + 1, 1, 6)) if value and half else 3
+        return f"{value:.{digits}g} ± {half:.1g}"
 
 
-def actuators_at(robot: Robot, joints: tuple[int, ...], unknowns: Unknowns, theta: Float64) -> bp.Actuators:
-    """Return the actuators of ``robot`` at a point (unknowns,); joints that are not in ``joints`` are ideal."""
-    found, options = unknowns.motors(theta[None]), dict[str, Any]()
-    for name, kind in (KINDS | ADDED).items():
-        if kind.field is None or name not in found:
+def advice(problem: Problem, solution: Solution) -> str:
+    """Return a sentence on the effect that would explain most of the remaining error of a fit, by its derivatives.
+
+    One further unknown at a time joins those of the fit.
+    """
+    unknowns = problem.unknowns
+    plant = problem.plants[0]
+    present = {entry.kind for entry in unknowns.entries}
+    further = [Unknown("mass", None, 1.0, 1.0, link=link) for link in plant.bodies() if "mass" not in present]
+    for kind in ("offset", "load_friction", *(("kd",) if problem.drives[0].params is not None else ())):
+        if kind not in present:
+            start = {"offset": 0.0, "load_friction": 1e-4, "kd": 1.0}[kind]
+            size = float(KINDS[kind].size)
+            further += [Unknown(kind, joint, start, size) for joint in range(len(unknowns.joints))]
+    entries = (*unknowns.entries, *further)
+    wide = replace(unknowns, entries=entries, bodies=plant.bodies())
+    point = np.concatenate([solution.point, [entry.coordinate(entry.start) for entry in further]])
+    steps = np.full(len(point), STEP)
+    steps[[at for at, entry in enumerate(entries) if entry.kind == "load_friction"]] = 4.0
+    wider = replace(problem, unknowns=wide)
+    residual, matrix = wider.system(wider.evaluate(point, steps), point, solution.size)
+    count = len(unknowns.entries)
+    weight = (1 + residual**2 / 4) ** -0.25
+    weight[-len(further) :] = 0.1 * np.array([entry.spread for entry in further])  # each may change by a factor
+    residual, matrix = weight * residual, weight[:, None] * matrix
+    strengths = [at for at, entry in enumerate(unknowns.entries) if entry.kind == "strength"]
+    gains, changes, distances = list[float](), list[float](), list[float]()
+    for number in range(len(further)):
+        columns = [*range(count), count + number]
+        change, *_ = np.linalg.lstsq(matrix[:, columns], -residual, rcond=1e-10)
+        left = residual + matrix[:, columns] @ change
+        gains.append(1 - float(left @ left) / float(residual @ residual))
+        changes.append(float(change[-1]))
+        distances.append(float((((solution.point + change[:-1]) / unknowns.spread) ** 2)[strengths].sum()))
+    if not further or max(gains) < LEAST_GAIN:
+        return "no further effect that was tried would explain a tenth of the remaining error"
+    # Explanations that are as good as equal differ in how far they bring the strengths from 1.
+    alike = sorted(np.flatnonzero(np.array(gains) > ALIKE * max(gains)), key=lambda number: distances[number])
+    words = " or ".join(_effect(problem, further[number], changes[number]) for number in alike[:2])
+    text = f"{words} would explain {100 * gains[alike[0]]:.0f} % of the remaining squared error"
+    kinds = {further[number].kind for number in alike[:2]}
+    weigh = "; or the strengths are as found: weigh the link" if "mass" in kinds else ""
+    return f"{text} (extras: {', '.join(sorted(kinds))}){weigh}"
+
+
+def _effect(problem: Problem, entry: Unknown, change: float) -> str:
+    """Return a change of an unknown in words."""
+    if entry.link is not None:
+        percent = 100 * float(np.expm1(np.clip(change, -1.5, 1.5)))
+        return f"link {entry.link} {abs(percent):.0f} % {'heavier' if percent > 0 else 'lighter'}"
+    names = problem.unknowns.robot.joint_names
+    return f"{entry.kind} of {names[problem.unknowns.joints[entry.joint or 0]]}"
+
+
+def draw_motors(path: str | os.PathLike[str], robot: Robot, count: int, seed: int = 0) -> bp.Actuators:
+    """Return ``count`` sets of motors of ``robot``, drawn from the confidence region in an actuators file.
+
+    With the estimate m, standard deviations d and correlations R, a draw is m + d * (R^1/2 z) with normal z, within
+    the bounds of the unknowns. Effects outside of the region keep their values in the file. Friction and damping are in
+    addition to the robot's description. For ``robot.tuned(actuators=...)`` or a Runner with as many envs.
+
+    Raises
+    ------
+    InvalidArgumentError
+        The file has no region, or one of other joints.
+    FileNotFoundError
+        There is no such file.
+    """
+    nominal, document = load_robot_actuators(str(path), robot), documents.read(path)
+    count, source = integer("count", count, 1, 100_000), f"{path}: {KEY}"
+    try:
+        region = document["about"][KEY]
+        names, rows = [tuple(name) for name in region["unknowns"]], region["correlation"]
+        estimate, deviation = (np.array(region[key], float) for key in ("estimate", "standard_deviation"))
+        correlation = np.zeros((len(names), len(names)))
+        for at, row in enumerate(rows):
+            correlation[at, : at + 1] = correlation[: at + 1, at] = row
+        kinds = [(KINDS[kind], kind, None if place is None else place) for kind, place in names]
+        numbers = [robot.joint_names.index(place) if kind.per == "joint" else None for kind, _, place in kinds]
+        values, vectors = np.linalg.eigh(correlation)
+        z = np.random.default_rng(seed).normal(size=(count, len(names)))
+        points = estimate + deviation * (z @ (vectors * np.sqrt(np.maximum(values, 0.0))).T)
+    except (KeyError, IndexError, TypeError, ValueError) as bad:
+        remedy = "write the file with `batchpid identify` of this robot"
+        raise InvalidArgumentError(source, f"is missing or cannot be read ({bad})", remedy=remedy) from None
+    columns: dict[str, Float64] = {}
+    for (kind, name, _), joint, drawn in zip(kinds, numbers, points.T, strict=True):
+        if kind.target != "motor":
             continue
-        column = np.full(robot.dof, kind.neutral)
-        if not kind.per_joint:
-            column[:] = found[name][0]
-        elif name in DESCRIBED:
-            column[list(joints)] = np.maximum(found[name][0] - getattr(robot, DESCRIBED[name])[list(joints)], 0.0)
-        else:
-            column[list(joints)] = found[name][0]
-        options[kind.field] = column
-    if "static" in options:  # below Coulomb's it has no effect, nor has the Stribeck velocity
-        more = options["static"] > options["coulomb"]
-        options |= {name: np.where(more, options[name], 0.0) for name in ("static", "stribeck")}
-    return bp.make_actuators(robot.dof, **options, joint_names=robot.joint_names)
+        leaf = getattr(nominal, kind.field)
+        table = columns.setdefault(kind.field, np.full((count, robot.dof), kind.neutral if leaf is None else leaf))
+        described = getattr(robot, DESCRIBED[name])[joint] if name in DESCRIBED else 0.0
+        drawn = np.maximum(drawn - described, 1e-3 if name == "strength" else 0.0) if kind.positive else drawn
+        table[:, slice(None) if joint is None else joint] = drawn[:, None] if joint is None else drawn
+    if "static" in columns:
+        columns["static"] = columns["static"] + columns.get("coulomb", 0.0)
+    return nominal.replace(**columns)

@@ -32,7 +32,6 @@ class OwnController:
         self._options, self._controller = options, options.control
         self._reporting = options.control.reporting if isinstance(options.control, OperationalSpace) else None
         self._structure: Any = None
-        self._like: Document = {}
 
     def init(self, envs: int) -> dict[str, Rows]:
         """Return a checked copy of the controller's initial state for ``envs`` envs.

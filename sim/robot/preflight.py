@@ -168,13 +168,10 @@ def _stability(
     severity, code, effect = "note", "near-unstable", "it may diverge in other poses"
     if report.robot_ratio >= 1:
         severity, code, effect = "warning", "unstable", report.effect
-    text = f"the sampled PID loop is at {report.robot_ratio:.3g} times its stability bound at the start pose: {effect}"
+    joint, ratio = robot.joint_names[int(np.argmax(report.participation))], f"{report.robot_ratio:.3g}"
+    text = f"the sampled PID loop is at {ratio} times its stability bound, mostly of joint {joint!r}, at the start pose"
     other = "" if report.late else implicit_remedy(params)
-    yield Finding(severity, code, text, f"{report.remedy}, {other}or robot.designed()")
-    for index in np.flatnonzero(robot.independent & (report.joint_ratio >= NEAR_BOUND)):
-        ratio = report.joint_ratio[index]
-        text, remedy = "this joint alone is near its bound, or beyond it", "lower its kd and kp"
-        yield Finding(severity, code, text, remedy, robot.joint_names[index], detail=f"{ratio:.2g} times")
+    yield Finding(severity, code, f"{text}: {effect}", f"{report.remedy}, {other}or robot.designed()")
 
 
 def _ringing(

@@ -155,7 +155,7 @@ def test_options_that_it_does_not_have_are_refused():
     with pytest.raises(InvalidArgumentError, match="discretization"):
         p.replace(gain_units="effort")
     assert p.replace(gain_units="effort", discretization="explicit").discretization is None
-    assert "discretization implicit" in repr(p)
+    assert "ImplicitLaw" in repr(p)
 
 
 def test_a_params_file_keeps_it():

@@ -106,7 +106,7 @@ FEATURES: dict[str, Feature] = {
     "drive": Feature({"control": "drive"}, exact=True),
     "drive with an integral": Feature({"control": "drive"}, EFFORTS, exact=True),
     "efforts": Feature({"control": "effort"}, exact=True),
-    "osc": Feature({"control": "osc"}),
+    "osc": Feature({"control": "osc", "tool": "hand"}),
     "own controller": Feature({"control": Damped()}, exact=True),
     "guard": Feature({"guard": GUARD}),
     "guarded drive": Feature({"control": "drive", "guard": GUARD}, exact=True),

@@ -23,17 +23,15 @@ from hypothesis import strategies as st
 from option_values import ARM, MOTORS
 
 import batchpid as bp
-import batchpid.task_space as ts
 from batchpid.errors import BatchPIDError
 from batchpid.sim import Robot, Runner, Snapshot
 from batchpid.sim.identification import read_logs
-from batchpid.sim.identification.setpoint_files import read_setpoints
+from batchpid.sim.setpoint_files import read_setpoints
 from batchpid.sim.tuning import load_randomization, random_moves
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of unusual values
 JOINTS = list(ARM.joint_names)
 PARAMS = ARM.params(kp=[[40.0, 20.0], [30.0, 10.0]], ki=5.0, kd=2.0, effort_limit=87.0, anti_windup="conditional")
-OSC = {"stiffness": [400.0, 300.0, 200.0, 90.0, 80.0, 70.0], "damping_ratio": 1.0, "posture_stiffness": 20.0}
 DRAWN = {"payload": {"uniform": [0.0, 0.3]}, "params": {"kp": {"log_uniform": [0.5, 2.0], "operation": "scale"}}}
 SHORT = {"workers": 0, "engine": "mujoco", "substeps": 4}
 
@@ -56,13 +54,6 @@ def write_table(path: Path, quantity: str = "qpos") -> None:
     np.savetxt(path, table, "%.6g", ",", header=",".join(names), comments="")
 
 
-def write_runs(path: Path) -> None:
-    """Write a YAML file that lists logs, and the log."""
-    write_table(path.with_name("log.csv"))
-    entries = [{"log": "log.csv", "payload": 0.5, "sign": {JOINTS[0]: -1}}, {"log": "log.csv", "held_out": True}]
-    path.write_text(yaml.safe_dump({"gains": "designed", "logs": entries}))
-
-
 def write_run(path: Path) -> None:
     """Write a snapshot of two arms."""
     with Runner(ARM, 2, params=PARAMS, **SHORT) as runner:
@@ -77,11 +68,9 @@ KINDS = {
     "motors.yaml": Kind(
         lambda path: bp.save_actuators(path, MOTORS, JOINTS), lambda path: bp.load_actuators(path, JOINTS)
     ),
-    "osc.yaml": Kind(lambda path: ts.save_osc_options(path, OSC), ts.load_osc_options),
     "drawn.yaml": Kind(
         lambda path: path.write_text(yaml.safe_dump(DRAWN)), lambda path: load_randomization(path, ARM).to_dict()
     ),
-    "runs.yaml": Kind(write_runs, lambda path: read_logs(ARM, [path])),
     "log.csv": Kind(write_table, lambda path: read_logs(ARM, [path])),
     "motion.csv": Kind(
         lambda path: write_table(path, "setpoint_rate"), lambda path: read_setpoints(ARM, path, timestep=1e-3)
@@ -215,6 +204,11 @@ def good(request, tmp_path):
     return kind, path, path.read_bytes(), plain(kind.read(path))
 
 
+def repeats(here: list, there: list) -> bool:
+    """Return whether a table is another one with rows repeated, which a log leaves out with a warning."""
+    return [row for at, row in enumerate(here) if at == 0 or row != here[at - 1]] == there
+
+
 def check(good, content: bytes) -> None:
     """Check that a file with ``content`` is refused with its name in the error, or read with the right value."""
     kind, path, original, value = good
@@ -222,7 +216,7 @@ def check(good, content: bytes) -> None:
     path.write_bytes(content)
     try:
         here, there = (plain(decoded(path.suffix, each)) for each in (content, original))
-        same, may_be = here == there, holds(here, there)
+        same, may_be = here == there, holds(here, there) or (path.suffix == ".csv" and repeats(here, there))
     except Exception:  # no tree: a text file must be refused, and a binary file may have the original's value
         same, may_be = is_binary, is_binary
     try:

@@ -176,7 +176,7 @@ def test_every_feature_is_identified_or_refused(feature, tmp_path):
     assert run.ok.all()
     path = write_recording(run, tmp_path / "run.h5")
     try:
-        found = identify(robot, [path], params=params, evaluations=6, workers=0)
+        found = identify(robot, [path], params=params, evaluations=6)
     except BatchPIDError:
         if feature != "floating base":
             raise

@@ -150,32 +150,26 @@ class GroupClearance:
             "models": [model._address for model in models],
             "places": [each.geom_xpos.ctypes.data for each in data],
             "turns": [each.geom_xmat.ctypes.data for each in data],
-            "shapes": [model.body_geomnum.ctypes.data for model in models],
-            "types": [model.body_contype.ctypes.data for model in models],
-            "affinities": [model.body_conaffinity.ctypes.data for model in models],
         }
         arrays: Arrays = {name: np.array(rows, np.uint64) for name, rows in addresses.items()}
         arrays |= tables | {name: np.zeros((robots, ways)) for name in ("moved", "rate")}
         arrays |= {"last": np.zeros((robots, dof + 7 * floats)), "open": np.zeros((robots, bodies), np.int8)}
         arrays |= {"left": np.zeros((robots, pairs), np.uint16), "wait": np.ones(robots, np.int32)}
-        arrays |= {name: np.zeros(bodies, np.int32) for name in ("no_shapes", "some_types", "some_affinities")}
+        arrays |= {name: np.zeros(bodies, np.int32) for name in ("no_shapes", "some_types")}
         arrays["brief"] = np.zeros(robots, np.int8)
         arrays["near"] = np.full((robots, _MOST_NEAR), -1, np.int32)
         arrays["age"] = np.full(robots, _NEVER, np.int32)
         self.arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         self._kept = models, data
-        flags, counts, types, affinities = places() or (0, 0, 0, 0)
+        fields = zip(("flags", "counts", "types_at", "affinities_at"), places() or (), strict=True)
         self._fields = Clearance(
             kinematics=kinematics,
             number=pairs,
             ways=ways,
             size=bodies,
-            flags=flags,
-            counts=counts,
-            types_at=types,
-            affinities_at=affinities,
             contact=_NO_CONTACT,
             floats=floats,
+            **dict(fields),
             **{name: array.ctypes.data for name, array in self.arrays.items()},
         )
 

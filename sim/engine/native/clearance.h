@@ -48,10 +48,8 @@ struct Clearance {
   char *brief;                       // (robots,): whether the last proof held for BRIEF sim steps or less
   std::int32_t *near;                // (robots, MOST_NEAR): pairs that are checked one by one; -1 after the last
   char *open;                        // (robots, all bodies): whether the body has a pair without a proof
-  std::int32_t const *const *shapes;  // (robots,): number of shapes of each body, body_geomnum in mjModel
-  std::int32_t const *const *types, *const *affinities;  // (robots,): body_contype and body_conaffinity in mjModel
   std::int32_t const *no_shapes;     // (all bodies,): zeros
-  std::int32_t *some_types, *some_affinities;  // (all bodies,): for bodies in pairs without a proof; work space
+  std::int32_t *some_types;          // (all bodies,): masks of bodies in pairs without a proof; work space
   std::int64_t number, ways, size;   // number of pairs, of ways, and of all bodies
   // Offsets in mjModel [bytes]: of opt.disableflags, body_geomnum, body_contype and body_conaffinity.
   std::int64_t flags, counts, types_at, affinities_at;
@@ -308,27 +306,39 @@ inline Looked looked_at(Clearance const &clearance, std::int64_t row, std::int64
   return wait == 0 ? Looked::NONE : Looked::SOME;
 }
 
-// Make MuJoCo's collision detection check these shapes of one robot. With NONE the bodies also have no shapes, so that
-// MuJoCo does not compute the shapes' positions: only collision detection and proofs read them, and a proof computes
-// them first. With SOME the other bodies collide with nothing, but the positions of all shapes are computed, because
-// MuJoCo derives from them the axes along which it sorts bodies.
-inline void switch_contacts(Clearance const &clearance, std::int64_t row, Looked which) {
+// Fields of an mjModel that select the shapes for MuJoCo's collision detection.
+struct Shapes {
+  std::int32_t flags;
+  std::int32_t const *counts, *types, *affinities;
+};
+
+inline Shapes get_shapes(Clearance const &clearance, std::int64_t row) {
+  char const *model = static_cast<char const *>(clearance.models[row]);
+  auto const pointer = [&](std::int64_t place) { return *reinterpret_cast<std::int32_t const *const *>(model + place); };
+  return {*reinterpret_cast<std::int32_t const *>(model + clearance.flags), pointer(clearance.counts),
+          pointer(clearance.types_at), pointer(clearance.affinities_at)};
+}
+
+inline void set_shapes(Clearance const &clearance, std::int64_t row, Shapes const &shapes) {
   char *model = static_cast<char *>(clearance.models[row]);
-  bool const none = which == Looked::NONE, some = which == Looked::SOME;
-  auto const point = [&](std::int64_t place, std::int32_t const *to) {
-    *reinterpret_cast<std::int32_t const **>(model + place) = to;
-  };
-  auto &flags = *reinterpret_cast<std::int32_t *>(model + clearance.flags);
-  flags = none ? flags | clearance.contact : flags & ~clearance.contact;
-  point(clearance.counts, none ? clearance.no_shapes : clearance.shapes[row]);
-  std::int32_t const *types = clearance.types[row], *affinities = clearance.affinities[row];
-  for (std::int64_t body = 0; some && body < clearance.size; ++body) {
-    bool const open = clearance.open[row * clearance.size + body] != 0;
-    clearance.some_types[body] = open ? types[body] : 0;
-    clearance.some_affinities[body] = open ? affinities[body] : 0;
+  *reinterpret_cast<std::int32_t *>(model + clearance.flags) = shapes.flags;
+  *reinterpret_cast<std::int32_t const **>(model + clearance.counts) = shapes.counts;
+  *reinterpret_cast<std::int32_t const **>(model + clearance.types_at) = shapes.types;
+  *reinterpret_cast<std::int32_t const **>(model + clearance.affinities_at) = shapes.affinities;
+}
+
+// Return the fields with which MuJoCo checks a part of the shapes `all` of one robot. With NONE the bodies also have no
+// shapes, so that MuJoCo does not compute the shapes' positions: only collision detection and proofs read them, and a
+// proof computes them first. With SOME the other bodies collide with nothing, but the positions of all shapes are
+// computed, because MuJoCo derives from them the axes along which it sorts bodies. Types and affinities are equal.
+inline Shapes part_of(Shapes const &all, Clearance const &clearance, std::int64_t row, Looked which) {
+  if (which == Looked::NONE) {
+    return {all.flags | clearance.contact, clearance.no_shapes, all.types, all.affinities};
   }
-  point(clearance.types_at, some ? clearance.some_types : types);
-  point(clearance.affinities_at, some ? clearance.some_affinities : affinities);
+  for (std::int64_t body = 0; body < clearance.size; ++body) {
+    clearance.some_types[body] = clearance.open[row * clearance.size + body] != 0 ? all.types[body] : 0;
+  }
+  return {all.flags, all.counts, clearance.some_types, clearance.some_types};
 }
 
 }  // namespace batchpid

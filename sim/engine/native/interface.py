@@ -63,8 +63,7 @@ class Clearance(ctypes.Structure):
             (name, ctypes.c_void_p)
             for name in ("last", "moved", "left", "rate", "wait", "age", "brief", "near", "open")
         ),
-        *((name, ctypes.c_void_p) for name in ("shapes", "types", "affinities")),
-        *((name, ctypes.c_void_p) for name in ("no_shapes", "some_types", "some_affinities")),
+        *((name, ctypes.c_void_p) for name in ("no_shapes", "some_types")),
         *((name, ctypes.c_int64) for name in ("number", "ways", "size")),
         *((name, ctypes.c_int64) for name in ("flags", "counts", "types_at", "affinities_at")),
         *((name, ctypes.c_int32) for name in ("contact", "floats")),

@@ -95,10 +95,11 @@ class StoppedClock {
 inline bool advance(Mujoco const &mujoco, std::int64_t row, std::int64_t dof, double farthest, char *message) {
   std::jmp_buf frame;
   Clearance const *clearance = mujoco.clearance;
+  Shapes const shapes = clearance == nullptr ? Shapes{} : get_shapes(*clearance, row);
   Messages::text = message;
   Messages::frame = &frame;
   if (setjmp(frame) != 0) {
-    if (clearance != nullptr) switch_contacts(*clearance, row, Looked::ALL);
+    if (clearance != nullptr) set_shapes(*clearance, row, shapes);
     Messages::frame = nullptr;
     return false;
   }
@@ -116,9 +117,9 @@ inline bool advance(Mujoco const &mujoco, std::int64_t row, std::int64_t dof, do
     if (clearance != nullptr) {
       looked = looked_at(*clearance, row, dof, mujoco.data[row], mujoco.qpos[row], mujoco.qpos_at);
     }
-    if (looked != Looked::ALL) switch_contacts(*clearance, row, looked);
+    if (looked != Looked::ALL) set_shapes(*clearance, row, part_of(shapes, *clearance, row, looked));
     mujoco.step1(mujoco.models[row], mujoco.data[row]);
-    if (looked != Looked::ALL) switch_contacts(*clearance, row, Looked::ALL);
+    if (looked != Looked::ALL) set_shapes(*clearance, row, shapes);
   }
   Messages::frame = nullptr;
   return true;

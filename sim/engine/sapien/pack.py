@@ -144,7 +144,8 @@ class Pack(ModelPack):
         return self._calls
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
-        return self.spec.fixed_base and self._is_model
+        # To compute a force, PhysX overwrites the joint forces that the sensors read after the step.
+        return self.spec.fixed_base and self._is_model and self._sensors is None
 
     def compiled_step(
         self,

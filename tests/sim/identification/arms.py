@@ -1,0 +1,83 @@
+"""A two-joint arm in the vertical plane, and logs of it from a Runner with known motors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+import batchpid as bp
+from batchpid.sim import Robot, Runner
+from batchpid.sim.identification import Log, logs_of_rollout
+
+URDF = """<robot name="arm"><link name="base"/>
+<link name="upper"><inertial><origin xyz="0 0 0.2"/><mass value="2"/>
+<inertia ixx="0.03" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.005"/></inertial></link>
+<link name="fore"><inertial><origin xyz="0 0 0.15"/><mass value="1"/>
+<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.002"/></inertial></link>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.5"/>
+<axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="40" velocity="6"/></joint>
+<joint name="elbow" type="revolute"><parent link="upper"/><child link="fore"/><origin xyz="0 0 0.4"/>
+<axis xyz="0 1 0"/><limit lower="-2.5" upper="2.5" effort="20" velocity="6"/></joint></robot>"""
+TRUTH = {
+    "armature": [0.05, 0.02],
+    "viscous": [0.3, 0.2],
+    "coulomb": [0.4, 0.2],
+    "strength": [0.9, 0.95],
+    "command_delay": 0.0034,
+}
+DT = 0.001
+FALLING = np.array([0.5, 0.3])
+STEPS = 5
+"""Sim steps of a tick."""
+
+
+def load(folder, text: str = URDF) -> Robot:
+    """Return the arm."""
+    path = folder / "arm.urdf"
+    path.write_text(text)
+    return Robot.load(path)
+
+
+def motion(seconds: float = 3.0, seed: int = 0) -> np.ndarray:
+    """Return setpoints (ticks, 2) that begin at rest."""
+    time, rng = np.arange(0, seconds, STEPS * DT)[:, None], np.random.default_rng(seed)
+    frequency, phase = np.array([0.4, 0.9, 2.1]), rng.uniform(0, 6, (2, 3))
+    waves = np.sin(2 * np.pi * frequency * time[..., None] + phase) @ np.array([0.5, 0.3, 0.1])
+    return waves * np.minimum(1.0, time / 0.5) ** 2
+
+
+def gains() -> bp.PIDParams:
+    """Return the gains of the arm."""
+    return bp.make_params(2, [120.0, 40.0], kd=[8.0, 2.0])
+
+
+def run(robot: Robot, setpoints: np.ndarray, control: str = "pid", compensate: str = "none", **options):
+    """Return the rollout of a runner that begins at the first setpoint, or at FALLING for efforts."""
+    actuators = bp.make_actuators(2, **(TRUTH | options.pop("actuators", {})))
+    options = {"workers": 0, "timestep": DT, "substeps": STEPS, "engine": "mujoco", "control": control} | options
+    params = None if control == "effort" else gains()
+    with Runner(robot, 1, params=params, compensate=compensate, actuators=actuators, **options) as runner:
+        runner.reset(FALLING if control == "effort" else setpoints[0])
+        return runner.rollout(setpoints)
+
+
+def log_of(robot: Robot, rollout, noise: float = 0.0, **settings) -> Log:
+    """Return the log of a rollout, with noise of its positions and other settings."""
+    (log,) = logs_of_rollout(robot, rollout)
+    shaken = log.qpos + noise * np.random.default_rng(1).standard_normal(log.qpos.shape)
+    return replace(log, qpos=shaken, settings=log.settings._replace(**settings))
+
+
+def effort_run(robot: Robot, driven: tuple[float, float] = (1.0, 1.0)):
+    """Return the rollout of efforts that follow :func:`motion` in a loop at the rate of the ticks."""
+    setpoints, rows = motion(), []
+    actuators = bp.make_actuators(2, **TRUTH)
+    options = {"workers": 0, "timestep": DT, "substeps": STEPS, "engine": "mujoco", "compensate": "none"}
+    with Runner(robot, 1, control="effort", actuators=actuators, **options) as runner:
+        seen = runner.reset(np.zeros(2))
+        for setpoint in setpoints:
+            rows.append(driven * ([60.0, 20.0] * (setpoint - seen.qpos[0]) - [5.0, 1.0] * seen.qvel[0]))
+            seen = runner.step(rows[-1])
+        runner.reset(np.zeros(2))
+        return runner.rollout(np.array(rows))

@@ -1,0 +1,287 @@
+"""Motors from logs of an arm whose motors are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arms import DT, TRUTH, URDF, effort_run, gains, load, log_of, motion, run
+
+import batchpid as bp
+from batchpid.sim import Robot, Runner
+from batchpid.sim.identification import Log, LogWarning, draw_motors, identify
+
+pytest.importorskip("scipy")
+
+KINDS = {"armature": "armature", "damping": "viscous", "friction": "coulomb", "strength": "strength"}
+NOISE = 2e-5
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return load(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def log(robot):
+    """Log of setpoints."""
+    return log_of(robot, run(robot, motion()), NOISE)
+
+
+@pytest.fixture(scope="module")
+def effort_log(robot):
+    return log_of(robot, effort_run(robot), NOISE)
+
+
+@pytest.fixture(scope="module")
+def found(robot, log):
+    return identify(robot, [log], payload=False)
+
+
+def assert_right(found, truth=TRUTH, near=0.02):
+    """Assert that the values are near the truth, and within their intervals with few exceptions."""
+    outside = 0
+    for kind, field in KINDS.items():
+        for joint, true in enumerate(truth[field]):
+            value, low, high = found.interval(kind, joint)
+            assert value == pytest.approx(true, rel=near), f"{kind} of joint {joint}"
+            outside += not low <= true <= high
+    value, low, high = found.interval("delay")
+    assert value == pytest.approx(truth["command_delay"], abs=3e-4)
+    assert outside + (not low <= truth["command_delay"] <= high) <= 2
+
+
+def test_motors_are_found_from_setpoints(found):
+    assert_right(found)
+    assert found.explains
+    assert found.converged
+    assert found.interval("setpoint_delay")[0] < 3e-4
+
+
+def test_motors_are_found_from_efforts(robot, effort_log):
+    found = identify(robot, [effort_log], payload=False)
+    assert_right(found)
+    assert found.held_out_error[1] < 0.05 * found.held_out_error[0]
+
+
+def test_the_number_of_workers_does_not_change_the_result(robot, effort_log):
+    short = effort_log.part(slice(0, 200), slice(0, 200))
+    both = [identify(robot, [short], payload=False, evaluations=2, workers=workers) for workers in (0, 2)]
+    np.testing.assert_allclose(both[0].values, both[1].values, rtol=1e-6)
+
+
+@pytest.mark.parametrize("compensate", [pytest.param("gravity", marks=pytest.mark.slow), "gravity+coriolis+friction"])
+def test_a_compensation_through_the_motors_is_part_of_the_model(robot, compensate):
+    log = log_of(robot, run(robot, motion(), compensate=compensate), NOISE)
+    found = identify(robot, [log], payload=False)
+    assert found.drive.through
+    assert_right(found)
+
+
+@pytest.mark.slow
+def test_a_payload_is_found_and_a_known_one_is_not_found_again(robot, tmp_path):
+    tensor = " ".join(
+        f'{name}="{value}"'
+        for name, value in zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), [1e-9] * 3 + [0] * 3, strict=True)
+    )
+    tool = f'<link name="load"><inertial><mass value="0.4"/><inertia {tensor}/>'
+    fixed = '<joint name="f" type="fixed"><parent link="fore"/><child link="load"/><origin xyz="0 0 0.15"/></joint>'
+    loaded = load(tmp_path, URDF.replace("</robot>", f"{tool}</inertial></link>{fixed}</robot>"))
+    rollout = run(loaded, motion())
+    found = identify(robot, [log_of(robot, rollout, NOISE)])
+    assert found.interval("payload")[0] == pytest.approx(0.4, rel=0.05)
+    known = identify(robot, [log_of(robot, rollout, NOISE, payload=0.4)])
+    assert known.interval("payload") is None or known.interval("payload")[0] < 0.02
+
+
+@pytest.mark.slow
+def test_delays_of_setpoints_rate_limits_and_gains_are_unknowns_of_the_control(robot):
+    setpoints = motion()
+    late = np.vstack([setpoints[:1]] * 4 + [setpoints[:-4]])
+    rollout = run(robot, late, guard=robot.guard(rate=np.array([2.0, 1.5])))
+    begin, qpos = rollout.time - rollout.tick, rollout.qpos[:, 0].astype(float)
+    log = Log("log", (0, 1), "setpoint", rollout.time, qpos, begin, setpoints, True, DT, "none")
+    weak = gains().replace(kp=0.5 * gains().kp, kd=0.5 * gains().kd)
+    found = identify(robot, [log], weak, payload=False, extras=["slew", "gain"])
+    assert found.interval("setpoint_delay")[0] == pytest.approx(0.02, abs=1e-3)
+    assert [found.interval("slew", joint)[0] for joint in (0, 1)] == pytest.approx([2.0, 1.5], rel=0.03)
+    strengths = np.array(TRUTH["strength"])
+    assert [found.interval("gain", joint)[0] for joint in (0, 1)] == pytest.approx(2 * strengths, rel=0.03)
+    np.testing.assert_allclose(found.gains().kp, gains().kp * strengths, rtol=0.03)
+
+
+@pytest.mark.slow
+def test_further_effects_are_found_on_request(robot):
+    more = {"load_friction": [0.1, 0.08], "position_offset": [0.03, -0.02]}
+    log = log_of(robot, run(robot, motion(), actuators=more), NOISE)
+    log = replace(log, qpos=log.qpos + more["position_offset"])
+    found = identify(robot, [log], payload=False, extras=["load_friction", "offset"])
+    for joint in (0, 1):
+        assert found.interval("load_friction", joint)[0] == pytest.approx(more["load_friction"][joint], rel=0.1)
+        assert found.interval("offset", joint)[0] == pytest.approx(more["position_offset"][joint], rel=0.03)
+
+
+@pytest.mark.slow
+def test_a_wrong_mass_is_named_and_found_on_request(robot, tmp_path):
+    text = URDF.replace('mass value="1"', 'mass value="1.4"').replace('ixx="0.01"', 'ixx="0.014"')
+    heavy = load(tmp_path, text.replace('iyy="0.01"', 'iyy="0.014"').replace('izz="0.002"', 'izz="0.0028"'))
+    log = log_of(robot, run(heavy, motion()), NOISE)
+    found = identify(robot, [log], payload=False)
+    assert "link fore" in found.advice
+    assert "heavier" in found.advice
+    better = identify(robot, [log], payload=False, extras=["mass"])
+    factors = {link: better.interval("mass", link)[0] for link in ("upper", "fore")}
+    assert factors["fore"] / factors["upper"] == pytest.approx(1.4, rel=0.05)  # all masses and strengths have one scale
+    (tmp_path / "corrected.urdf").write_text(better.corrected_urdf())
+    corrected = Robot.load(tmp_path / "corrected.urdf").mass_matrix(np.zeros((1, 2)))[0, 1, 1]
+    assert corrected == pytest.approx(factors["fore"] * robot.mass_matrix(np.zeros((1, 2)))[0, 1, 1])
+    with pytest.raises(bp.InvalidArgumentError, match="no mass was found"):
+        found.corrected_urdf()
+
+
+def test_an_unknown_that_nothing_shows_is_not_in_the_file(robot):
+    """Joint 1 is never commanded: it swings."""
+    log = log_of(robot, effort_run(robot, (1.0, 0.0)), NOISE)
+    found = identify(robot, [log], payload=False)
+    assert found.interval("strength", 1) is None
+    assert "elbow: strength" in found.not_identified
+    assert "not shown by these logs" in found.report()
+    strength = found.actuators().strength
+    assert strength is None or strength[0, 1] == 1.0
+
+
+READINGS = {
+    "effort of all joints with the other sign": ("effort", lambda log: {"command": -log.command}),
+    "effort in thousandths of SI units": ("effort", lambda log: {"command": 1e3 * log.command}),
+    "qpos of shoulder and elbow exchanged": ("setpoint", lambda log: {"qpos": log.qpos[:, ::-1]}),
+    "setpoints look like degrees": ("setpoint", lambda log: {"command": np.degrees(log.command)}),
+}
+
+
+@pytest.mark.parametrize("words", READINGS)
+def test_another_reading_that_explains_a_log_is_named(robot, log, effort_log, words):
+    kind, change = READINGS[words]
+    wrong = effort_log if kind == "effort" else log
+    with pytest.raises(bp.InvalidArgumentError, match=words):
+        identify(robot, [replace(wrong, **change(wrong))], payload=False)
+
+
+@pytest.mark.slow
+def test_setpoints_that_were_logged_late_are_named(robot, log):
+    late = replace(log, command_time=log.command_time + 0.03)
+    with pytest.raises(bp.InvalidArgumentError, match="setpoints that were logged 30 ms late"):
+        identify(robot, [late], payload=False)
+
+
+def test_joints_that_did_not_move_are_left_out(robot, log):
+    still = log.qpos * [1.0, 0.0]
+    with pytest.warns(LogWarning, match="'elbow' did not move"):
+        found = identify(robot, [replace(log, qpos=still, command=log.command * [1, 0])], payload=False)
+    assert found.joints == (0,)
+    assert found.still == ("elbow",)
+    with pytest.raises(bp.InvalidArgumentError, match="show no motion of any joint"):
+        identify(robot, [replace(log, qpos=0 * still, command=0 * log.command)])
+
+
+def test_the_saved_file_is_what_was_found_and_holds_the_region(robot, found, tmp_path):
+    found.save(tmp_path / "motors.yaml")
+    motors = bp.load_actuators(tmp_path / "motors.yaml", robot.joint_names)[0]
+    for kind, field in KINDS.items():
+        assert getattr(motors, field)[0].tolist() == [found.interval(kind, joint)[0] for joint in (0, 1)]
+    setpoints = motion()
+    with Runner(
+        robot,
+        1,
+        params=gains(),
+        workers=0,
+        timestep=DT,
+        substeps=5,
+        engine="mujoco",
+        compensate="none",
+        actuators=motors,
+    ) as runner:
+        runner.reset(setpoints[0])
+        simulated = runner.rollout(setpoints).qpos
+    np.testing.assert_allclose(simulated, run(robot, setpoints).qpos, atol=1e-3)
+    drawn = draw_motors(tmp_path / "motors.yaml", robot, 200)
+    spread = drawn.strength.std(0)
+    deviations = [
+        found.intervals.deviation[found.unknowns.entries.index(entry)]
+        for entry in found.unknowns.entries
+        if entry.kind == "strength"
+    ]
+    np.testing.assert_allclose(spread, deviations, rtol=0.2)
+    assert (drawn.coulomb >= 0).all()
+    bp.save_actuators(tmp_path / "plain.yaml", motors, robot.joint_names)
+    with pytest.raises(bp.InvalidArgumentError, match="confidence_region"):
+        draw_motors(tmp_path / "plain.yaml", robot, 2)
+
+
+def test_the_report_has_all_values_and_errors(found):
+    report = found.report()
+    for words in ("shoulder", "elbow", "armature", "setpoint_delay", "with ideal motors", "by joint"):
+        assert words in report
+    document = found.document()
+    assert document["intervals"]["elbow"]["strength"][0] == found.interval("strength", 1)[0]
+    assert len(found.figure().axes) == 2
+
+
+@pytest.mark.slow
+def test_held_out_logs_are_not_fitted(robot, log):
+    other = replace(log, settings=log.settings._replace(held_out=True), command=log.command + 0.3)
+    short = replace(log, settings=log.settings._replace(held_out=False))
+    found = identify(robot, [short, other], payload=False, evaluations=8)
+    assert found.held_out_error[1] > 0.05
+    assert found.interval("strength", 0)[0] == pytest.approx(0.9, rel=0.01)
+
+
+WRONG = {
+    "contradict .* another kp": {"params": gains().replace(kp=100.0)},
+    "contradicts .* was made with 'none'": {"compensate": "gravity"},
+    "contradicts .* was made with 0.001": {"timestep": 0.002},
+    "extras": {"extras": ["speed"]},
+    "evaluations": {"evaluations": 0},
+    "hold 3 joints": {"params": bp.make_params(3, 1.0)},
+}
+
+
+@pytest.mark.parametrize("problem", WRONG)
+def test_options_that_contradict_a_recording_are_refused(robot, log, problem):
+    with pytest.raises(bp.InvalidArgumentError, match=problem):
+        identify(robot, [log], **WRONG[problem])
+
+
+def test_logs_of_efforts_refuse_what_is_of_a_law(robot, effort_log, log):
+    with pytest.raises(bp.InvalidArgumentError, match="is of a law"):
+        identify(robot, [effort_log], extras=["slew"])
+    with pytest.raises(bp.InvalidArgumentError, match="give no params"):
+        identify(robot, [effort_log], gains())
+    with pytest.raises(bp.InvalidArgumentError, match="fit them one by one"):
+        identify(robot, [effort_log, log])
+    with pytest.raises(bp.InvalidArgumentError, match="are missing"):
+        identify(robot, [])
+
+
+def test_intervals_name_unknowns_that_there_are(found):
+    for place in (("strength", 5), ("delay", 0), ("mass", "fore"), ("speed", 0)):
+        with pytest.raises(bp.InvalidArgumentError):
+            found.interval(*place)
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth(robot):
+    """Of 90 to 99 % of the unknowns, as 95 % intervals do."""
+    inside = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        truth = {
+            field: (np.array(value) * rng.uniform(0.6, 1.4, np.shape(value))).tolist() for field, value in TRUTH.items()
+        }
+        log = log_of(robot, run(robot, motion(seed=seed), actuators=truth), 1e-4)
+        found = identify(robot, [log], payload=False)
+        for kind, field in KINDS.items():
+            for joint, true in enumerate(truth[field]):
+                _, low, high = found.interval(kind, joint)
+                inside.append(low <= true <= high)
+    assert 0.88 <= np.mean(inside) <= 1.0

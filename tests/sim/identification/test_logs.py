@@ -1,0 +1,236 @@
+"""Logs from files: columns, units, checks, recordings and bags."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arms import gains, load, motion, run
+
+import batchpid as bp
+from batchpid.sim import Randomization, Runner, Uniform, write_recording
+from batchpid.sim.identification import LogWarning, Reading, logs_of_rollout, read_logs
+from batchpid.sim.identification.log import checked
+
+JOINTS = ("shoulder", "elbow")
+TIME = 0.005 * np.arange(200)
+
+
+@pytest.fixture
+def robot(tmp_path):
+    return load(tmp_path)
+
+
+def table(kind: str = "setpoint", **changes) -> dict:
+    """Return the columns of a log, the joints in another order than the robot's."""
+    columns = {"time": TIME}
+    for number, joint in enumerate(reversed(JOINTS)):
+        columns[f"{kind}:{joint}"] = 0.5 * np.sin(3 * TIME) + number
+        columns[f"qpos:{joint}"] = 0.5 * np.sin(3 * TIME - 0.1) + number
+    return columns | changes
+
+
+def write(path, columns, delimiter=","):
+    rows = zip(*columns.values(), strict=True)
+    lines = [delimiter.join(columns), *(delimiter.join(str(value) for value in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def read(robot, folder, columns, kind=None, **reading):
+    return read_logs(robot, [write(folder / "log.csv", columns)], kind, reading=Reading(**reading))
+
+
+def test_columns_are_found_by_name_in_the_order_of_the_robot(robot, tmp_path):
+    (log,) = read(robot, tmp_path, table(mode=["idle"] * 200, note=[""] * 200))
+    assert (log.joints, log.kind, log.held) == ((0, 1), "setpoint", False)
+    np.testing.assert_allclose(log.qpos, np.stack([table()[f"qpos:{joint}"] for joint in JOINTS], axis=1))
+    (other,) = read_logs(robot, [write(tmp_path / "log.txt", table(), ";")])
+    np.testing.assert_array_equal(other.command, log.command)
+
+
+def test_units_signs_and_names_are_options(robot, tmp_path):
+    (plain,) = read(robot, tmp_path, table("effort"))
+    columns = {name.replace(":", ":arm_"): values for name, values in table("effort").items()}
+    columns = {"time_ms": 1e3 * columns.pop("time")} | columns
+    for name in columns:
+        if name.startswith("qpos"):
+            columns[name] = np.degrees(columns[name])
+        if name.endswith("elbow"):
+            columns[name] = -columns[name]
+        if name == "effort:arm_shoulder":
+            columns[name] = columns[name] / 3
+    reading = {"degrees": True, "prefix": "arm_", "sign": {"elbow": -1}, "scale": {"shoulder": 3.0}, "hold": True}
+    (log,) = read(robot, tmp_path, columns, **reading)
+    assert log.held
+    for name in ("time", "qpos", "command"):
+        np.testing.assert_allclose(getattr(log, name), getattr(plain, name), atol=1e-12)
+
+
+def test_measured_efforts_take_the_place_of_commands(robot, tmp_path):
+    (log,) = read(robot, tmp_path, table("measured_effort"))
+    assert (log.kind, log.measured) == ("effort", True)
+    both = table("effort") | {f"measured_effort:{joint}": TIME for joint in JOINTS}
+    assert not read(robot, tmp_path, both)[0].measured
+
+
+def changed(name, row, value, kind="setpoint"):
+    columns = {key: values.astype(object) for key, values in table(kind).items()}
+    columns[name][row] = value
+    return columns
+
+
+FAULTS = {
+    r"has no column 'time', but a": {"a": TIME},
+    r"has no column qpos:JOINT": {"time": TIME, "effort:elbow": TIME},
+    r"has no column setpoint:JOINT": {"time": TIME, "qpos:elbow": TIME},
+    r"column setpoint:elbow.* is missing": {"time": TIME, "qpos:elbow": TIME, "qpos:shoulder": TIME}
+    | {"setpoint:shoulder": TIME},
+    r"knee": {"time": TIME, "qpos:knee": TIME},
+    r"line 12, column 'qpos:elbow' is empty or not finite": changed("qpos:elbow", 10, ""),
+    r"line 12, column 'qpos:elbow' is not a number": changed("qpos:elbow", 10, "1 rad"),
+    r"line 12: time decreases": changed("time", 10, 0.0),
+    r"far beyond the joint's limits.*--degrees": {name: 60 * v if name[0] == "q" else v for name, v in table().items()},
+    r"one row per 5 s": table(time=1e3 * TIME),
+    r"has 40 rows": {name: values[:40] for name, values in table().items()},
+    r"has a feedforward, which efforts include": table("effort") | {f"feedforward:{joint}": TIME for joint in JOINTS},
+}
+
+
+@pytest.mark.parametrize("problem", FAULTS)
+def test_faults_name_the_column_and_the_line(robot, tmp_path, problem):
+    with pytest.raises(bp.InvalidArgumentError, match=problem):
+        read(robot, tmp_path, FAULTS[problem])
+
+
+def test_repeated_rows_are_left_out(robot, tmp_path):
+    rows = np.sort(np.r_[np.arange(200), 50, 120])
+    with pytest.warns(LogWarning, match="2 rows repeat a time, the first at line 53"):
+        (log,) = read(robot, tmp_path, {name: values[rows] for name, values in table().items()})
+    assert len(log.time) == len(log.command) == 200
+
+
+def test_a_log_is_divided_at_gaps(robot, tmp_path):
+    rows = np.r_[np.arange(80), np.arange(120, 200)]
+    first, second = read(robot, tmp_path, {name: values[rows] for name, values in table().items()})
+    assert (len(first.time), len(second.time)) == (80, 80)
+    assert second.time[0] == TIME[120]
+    assert second.command_time[0] == TIME[120]
+    rows = np.r_[np.arange(20), np.arange(120, 200)]
+    with pytest.warns(LogWarning, match="too short, left out: line 2 to line 21"):
+        (only,) = read(robot, tmp_path, {name: values[rows] for name, values in table().items()})
+    assert len(only.time) == 80
+
+
+def test_wrapped_positions_become_continuous_once(robot, tmp_path):
+    """A joint whose type is not continuous is named in a warning. A log that was checked is not checked again."""
+    turning = 3.0 + np.sin(3 * TIME)
+    wrapped = (turning + np.pi) % (2 * np.pi) - np.pi
+    columns = table(**{"qpos:elbow": wrapped, "setpoint:elbow": wrapped})
+    with pytest.warns(LogWarning, match="positions of elbow jump by whole turns"):
+        (log,) = read(robot, tmp_path, columns)
+    np.testing.assert_allclose(log.qpos[:, 1], turning, atol=1e-12)
+    np.testing.assert_allclose(log.command[:, 1], turning, atol=1e-12)
+    assert checked(robot, log) == [log]
+    with pytest.raises(bp.InvalidArgumentError, match="jumps by"):
+        read(robot, tmp_path, table(**{"qpos:elbow": np.where(TIME < 0.5, 0.0, 4.5)}))
+
+
+def test_hdf5_columns_read_as_those_of_a_csv_file(robot, tmp_path):
+    h5py = pytest.importorskip("h5py")
+    (plain,) = read(robot, tmp_path, table())
+    for place in ("", "data/"):
+        path = tmp_path / f"log{len(place)}.h5"
+        with h5py.File(path, "w") as file:
+            for name, values in table().items():
+                file[place + name] = values
+        (log,) = read_logs(robot, [path])
+        np.testing.assert_allclose(log.qpos, plain.qpos)
+    with h5py.File(tmp_path / "aloha.h5", "w") as file:
+        file["observations/qpos"], file["action"] = np.zeros((100, 2)), np.zeros((100, 2))
+    with pytest.raises(bp.InvalidArgumentError, match=r"no column 'time' and no qpos:JOINT, but action, observations"):
+        read_logs(robot, [tmp_path / "aloha.h5"])
+
+
+def test_a_recording_says_what_it_knows(robot, tmp_path):
+    rollout = run(robot, motion(1.0), compensate="gravity")
+    pytest.importorskip("h5py")
+    (log,) = read_logs(robot, [write_recording(rollout, tmp_path / "run.h5")])
+    assert (log.kind, log.held, log.timestep, log.compensate) == ("setpoint", True, 0.001, "gravity")
+    np.testing.assert_allclose(log.params.kp, gains().kp)
+    np.testing.assert_allclose(log.command_time, rollout.time - rollout.tick)
+
+
+REFUSED = {
+    "guard changed": {"guard": 0.1},
+    "randomization": {"randomization": Randomization(payload=Uniform(0.1, 0.2))},
+    "setpoint rates": {"rates": True},
+    "under control 'drive'": {"control": "drive"},
+}
+
+
+@pytest.mark.parametrize("problem", REFUSED)
+def test_runs_that_a_fit_cannot_simulate_are_refused(robot, problem):
+    options = dict(REFUSED[problem])
+    if "guard" in options:
+        options["guard"] = robot.guard(rate=np.full(2, options["guard"]))
+    if options.pop("rates", False):
+        with Runner(robot, 1, params=gains(), workers=0, engine="mujoco") as runner:
+            runner.reset(np.zeros(2))
+            rollout = runner.rollout(motion(0.5), setpoint_rates=0 * motion(0.5))
+    else:
+        actuators = dict.fromkeys(("strength", "command_delay")) if "control" in options else {}
+        rollout = run(robot, motion(0.5), actuators=actuators, **options)
+    with pytest.raises(bp.InvalidArgumentError, match=problem):
+        logs_of_rollout(robot, rollout)
+
+
+def bag(path, messages):
+    """Write messages (topic, time [s], values by joint) of states, positions and efforts alike."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.LATEST)
+    names = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "sensor_msgs/msg/JointState")
+    header, stamp, state = (types.types[name] for name in names)
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = dict.fromkeys(topic for topic, *_ in messages)
+        places = {topic: writer.add_connection(topic, state.__msgtype__, typestore=types) for topic in topics}
+        for topic, time, values in messages:
+            moment = 1_700_000_000_000_000_000 + round(1e9 * time)
+            numbers, none = np.array([*values.values()], float), np.zeros(0)
+            message = state(header(stamp(*divmod(moment, 10**9)), ""), [*values], numbers, none, numbers)
+            writer.write(places[topic], moment, types.serialize_cdr(message, state.__msgtype__))
+    return path
+
+
+def test_messages_of_a_bag_are_merged_by_joint(robot, tmp_path):
+    """Joints come in any order, in messages of their own, and beside other devices."""
+    pytest.importorskip("rosbags")
+    messages = []
+    for row, time in enumerate(TIME):
+        states = {"elbow": np.sin(time), "shoulder": np.cos(time)}
+        if row % 3:
+            states = dict(reversed(states.items()))
+        messages += [("/joint_states", time, states), ("/joint_states", time, {"finger": 0.0})]
+    with pytest.warns(LogWarning, match="finger: no joint of the robot"):
+        (log,) = read_logs(robot, [bag(tmp_path / "bag", messages)])
+    np.testing.assert_allclose(log.qpos, np.stack([np.cos(TIME), np.sin(TIME)], axis=1), atol=1e-9)
+    assert log.measured
+    apart = [
+        (topic, time + late, {joint: np.sin(time + late)})
+        for time in TIME
+        for topic, late, joint in (
+            ("/joint_states", 0.0, "shoulder"),
+            ("/joint_states", 0.001, "elbow"),
+            ("/commands", 0.0, "elbow"),
+            ("/commands", 0.0, "shoulder"),
+        )
+    ]
+    path = bag(tmp_path / "apart", apart)
+    (log,) = read_logs(robot, [path], "setpoint", reading=Reading(command_topic="/commands"))
+    np.testing.assert_allclose(log.qpos[1:], np.sin(TIME[1:, None]) * np.ones(2), atol=1e-5)
+    with pytest.raises(bp.InvalidArgumentError, match=r"no values in the topic '/states'.*: /commands, /joint_states"):
+        read_logs(robot, [path], reading=Reading(topic="/states"))
+    (tmp_path / "damaged.mcap").write_bytes(b"nothing")
+    with pytest.raises(bp.InvalidArgumentError, match="cannot be read"):
+        read_logs(robot, [tmp_path / "damaged.mcap"])
