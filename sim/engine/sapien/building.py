@@ -193,13 +193,12 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
     for link in robot.links:
         link.set_linear_damping(dissipation.link_damping)
         link.set_angular_damping(dissipation.link_damping)
-        link.set_max_linear_velocity(FASTEST)
-        link.set_max_angular_velocity(FASTEST)
+        link.max_linear_velocity = link.max_angular_velocity = FASTEST
     for built, joint in zip(robot.active_joints, spec.joints, strict=True):
         if joint.mimic is not None and not joint.continuous:
             built.set_limits([[joint.lower, joint.upper]])  # the URDF's may keep it from following
         built.set_friction(dissipation.joint_friction)
-        built.set_max_velocity(FASTEST)
+        built.max_velocity = FASTEST
         if dissipation.modelled:
             # SAPIEN implements the URDF's damping as a drive, with an error that depends on the solver; this is exact,
             # with the effort of batchpid.motors.friction.
