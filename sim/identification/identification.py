@@ -340,7 +340,7 @@ class _Pool:
 def _fitted(data: Data, problem: Problem, evaluations: int, progress: Callable[[], Any] | None) -> Identification:
     """Return the fit: first of all unknowns, then of those that the logs show."""
     fitted = replace(problem, windows=[window for window in problem.windows if window.fitted.any()])
-    rough = fitted.solve(problem.unknowns.start, evaluations // 2, progress=progress)
+    rough = fitted.solve(problem.unknowns.start, max(evaluations // 4, 1), progress=progress)
     shown = intervals_of(fitted, rough).shown
     unknowns, hidden = problem.unknowns.only(shown), problem.unknowns.only(~shown)
     fitted = replace(fitted, unknowns=unknowns)

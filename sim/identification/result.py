@@ -328,7 +328,7 @@ def advice(problem: Problem, solution: Solution) -> str:
     # Explanations that are as good as equal differ in how far they bring the strengths from 1.
     alike = sorted(np.flatnonzero(np.array(gains) > ALIKE * max(gains)), key=lambda number: distances[number])
     words = " or ".join(_effect(problem, further[number], changes[number]) for number in alike[:2])
-    text = f"{words} would explain {100 * gains[alike[0]]:.0f} % of the remaining squared error"
+    text = f"{words} would explain {100 * max(gains):.0f} % of the remaining squared error"
     kinds = {further[number].kind for number in alike[:2]}
     weigh = "; or the strengths are as found: weigh the link" if "mass" in kinds else ""
     return f"{text} (extras: {', '.join(sorted(kinds))}){weigh}"

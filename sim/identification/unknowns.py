@@ -39,6 +39,8 @@ class Kind(NamedTuple):
     field: str = ""
     """Field of :class:`batchpid.Actuators`, for a motor."""
     positive: bool = True
+    most: float = np.inf
+    """Largest value."""
 
 
 KINDS = {
@@ -47,10 +49,10 @@ KINDS = {
     "friction": Kind("motor", "joint", "effort", 4.0, field="coulomb"),
     "strength": Kind("motor", "joint", 1.0, 0.3, 1.0, "strength"),
     "bias": Kind("motor", "joint", "effort", 10.0, field="bias", positive=False),
-    "delay": Kind("motor", "robot", 2e-3, 3.0, field="command_delay"),
-    "setpoint_delay": Kind("log", "robot", 5e-3, 3.0),
+    "delay": Kind("motor", "robot", 2e-3, 3.0, field="command_delay", most=0.1),
+    "setpoint_delay": Kind("log", "robot", 5e-3, 3.0, most=0.3),
     "payload": Kind("robot", "robot", 0.1, 4.0),
-    "load_friction": Kind("motor", "joint", 0.05, 2.0, field="load_friction"),
+    "load_friction": Kind("motor", "joint", 0.05, 2.0, field="load_friction", most=0.9),
     "static": Kind("motor", "joint", "friction", 2.0, field="static"),
     "stribeck": Kind("motor", "joint", "speed", 2.0, field="stribeck"),
     "offset": Kind("motor", "joint", 0.01, 20.0, field="position_offset", positive=False),
@@ -111,7 +113,8 @@ class Unknown:
         if not KINDS[self.kind].positive:
             return coordinates * self.size
         begin = self.coordinate(self.start)
-        return self.floor + self.size * np.exp(np.clip(coordinates, begin - FARTHEST, begin + FARTHEST))
+        values = self.floor + self.size * np.exp(np.clip(coordinates, begin - FARTHEST, begin + FARTHEST))
+        return np.minimum(values, KINDS[self.kind].most)
 
 
 @dataclass(frozen=True, eq=False)
