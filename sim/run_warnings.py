@@ -11,6 +11,7 @@ from batchpid.sim.robot.loop_stability import StabilityCheck
 from batchpid.sim.robot.run_checks import MovingSetpointCheck, SetpointCheck
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContactLog, MissedContactWarning
+from batchpid.sim.workers.pool import RecoveryWarning
 
 
 class RunWarnings:
@@ -52,11 +53,10 @@ class RunWarnings:
                 self._moving.warn()
                 self._update()
 
-    def issue(self, faults: FaultLog, contacts: MissedContactLog | None, messages: dict[type[Warning], str]) -> None:
-        """Warn of lost workers (``messages``, which are removed), faults and missed contacts."""
-        while messages:
-            category, message = messages.popitem()
-            warn(message, category)
+    def issue(self, faults: FaultLog, contacts: MissedContactLog | None, lost: list[str]) -> None:
+        """Warn of lost workers (the messages ``lost``, which are removed), faults and missed contacts."""
+        while lost:
+            warn(lost.pop(), RecoveryWarning)
         if faults.faults and not self._has_warned_of_fault:
             self._has_warned_of_fault = True
             more = "see runner.faults for more, of which there is no further warning"

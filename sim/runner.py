@@ -130,7 +130,7 @@ class Runner(SingleOwner):
             self._state = state = start.committed(state, outcome)
         finally:
             self._call.end()
-        self._warnings.issue(state.faults, state.contacts, self._pool.messages)
+        self._warnings.issue(state.faults, state.contacts, self._pool.warnings)
         self._warnings.check_stability(state.params, state.actuators)
         self._warnings.set_params(state.params)
         self._warnings.check_controller()
@@ -224,13 +224,8 @@ class Runner(SingleOwner):
         """
         if self._sent is not None or self._unreceived is not None or self._pool.closed:
             self._ready("step")
-        given = {
-            "setpoint": setpoint,
-            "setpoint_rate": setpoint_rate,
-            "setpoint_acceleration": setpoint_acceleration,
-            "feedforward": feedforward,
-        }
-        self._execute(self._tick(given, substeps))
+        command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
+        self._execute(self._tick(command, substeps))
         return self._pool.present.observation.copied(self._tool_pose)
 
     def send(
@@ -254,13 +249,8 @@ class Runner(SingleOwner):
             The observation of the last tick that was sent has not been received.
         """
         self._ready("send")
-        given = {
-            "setpoint": setpoint,
-            "setpoint_rate": setpoint_rate,
-            "setpoint_acceleration": setpoint_acceleration,
-            "feedforward": feedforward,
-        }
-        self._begin(self._tick(given, substeps))
+        command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
+        self._begin(self._tick(command, substeps))
 
     def recv(self) -> Observation:
         """Wait for the end of the tick that :meth:`send` began; return its observation.
@@ -566,8 +556,9 @@ class Runner(SingleOwner):
             self._execute(self._sent)
         return self._state
 
-    def _tick(self, given: dict[str, ArrayLike | None], substeps: int | None) -> Run:
+    def _tick(self, arrays: tuple[ArrayLike | None, ...], substeps: int | None) -> Run:
         """Return the operation for the arguments of :meth:`step`, checked."""
+        given = dict(zip(Command._fields, arrays, strict=True))
         command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
         count = self.substeps if substeps is None else checked_option("substeps", substeps)
         if self.recorder is not None and count != self.substeps:
@@ -636,8 +627,8 @@ class Runner(SingleOwner):
         if run is not None and self._warnings.is_watching:
             self._warnings.see(run.command, outcome.num_ticks, run.substeps * self.timestep)
         faults, contacts = self._state.faults, self._state.contacts
-        if pool.messages or faults.faults or contacts is not None:
-            self._warnings.issue(faults, contacts, pool.messages)
+        if pool.warnings or faults.faults or contacts is not None:
+            self._warnings.issue(faults, contacts, pool.warnings)
         return outcome
 
     def _prepare_ticks(self) -> None:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated
 
-from batchpid.arrays.array_types import Document
-from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import FOLDER, OutputFiles, beside, waiting, write_figures
-from batchpid.sim.tuning.gain_sets import gain_set
+from batchpid.sim.cli.outputs import FOLDER, beside
+from batchpid.sim.cli.rollout import RolloutCommand
 
 RUNNER = flags.runner_flags("ground", "workers", "engine", "backend")
 
@@ -37,39 +35,10 @@ class DemoCommand:
     json: flags.Json = None
     force: flags.Force = False
 
-    imports = ("batchpid.sim.plots", "batchpid.sim.runner")
+    imports = RolloutCommand.imports
 
     def run(self) -> int:
         """Run the command; return the exit status, 3 if no env settles."""
-        from batchpid.sim import Runner, plots
-        from batchpid.sim.cli.report import exit_status, run_figures
-        from batchpid.sim.cli.run import held, simulate, start_poses
-
-        outputs, picture = OutputFiles(self), self.picture or beside(FOLDER / self.robot, "demo")
-        picture = outputs.path("picture", picture, plots.FORMATS)
-        json = outputs.path("json", self.json, (".json",))
-        robot = Robot.load(self.robot, **vars(self.meshes))
-        settings = robot.settings
-        if settings is None:
-            raise InvalidArgumentError(
-                "robot", "has no tutorial setpoint", value=self.robot, remedy=f"run: batchpid rollout {self.robot}"
-            )
-        start = start_poses(robot, self.num_envs, self.spread, self.seed)
-        gains = gain_set(robot, self.gains)
-        title = f"{robot.name}: {self.num_envs} robots, {gains.control} at {settings.rate_hz:g} Hz, gains {gains.name}"
-        options: Document = {"params": gains.params, "control": gains.control} | self.runner.options()
-        with waiting(f"building {self.num_envs} robots"):
-            made = Runner(robot, self.num_envs, timestep=1 / settings.rate_hz, substeps=10, **options)
-        with made as runner:
-            print(f"{title}, {robot.dof} joints, {len(runner.pids) or 1} processes, {runner.backend}", flush=True)
-            setpoints = held(settings.target, self.seconds, runner.timestep * runner.substeps)
-            rollout, report = simulate(runner, start, setpoints)
-        print(report)
-        for note in settings.notes:
-            print(f"Note: {note}")
-        figure = plots.step_responses(rollout, mark=0, title=f"{title}; env 0 from the tutorial's pose")
-        print(f"\npicture: {plots.save(figure, picture)}")
-        if json is not None:
-            write_figures(json, run_figures(robot, rollout))
-            print(f"figures: {json}")
-        return exit_status(robot, rollout)
+        picture = self.picture or beside(FOLDER / Path(self.robot).stem, "demo")
+        same = flags.chosen(self, "robot num_envs gains seconds seed spread runner meshes json force")
+        return RolloutCommand(**same, picture=picture, substeps=10).run()

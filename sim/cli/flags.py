@@ -85,14 +85,6 @@ class RunnerFlags:
         given = {name: values.pop(name) for name in _SWITCHES if name in values}
         return values | {name: value == "on" for name, value in given.items() if value is not None}
 
-    def words(self) -> list[str]:
-        """Return the words of a command line that gives the flags that are not at their defaults."""
-        words = list[str]()
-        for each in fields(self):
-            if (value := getattr(self, each.name)) != each.default:
-                words += [f"--no-{each.name}"] if value is False else [f"--{each.name}", str(value)]
-        return words
-
 
 def runner_flags(*names: str) -> type[RunnerFlags]:
     """Return the flags of a Runner's options, by default of all that have one."""

@@ -29,6 +29,8 @@ SOURCES = {
 LIGHT = 1e-4
 """Share of the total mass up to which a link is light."""
 NO_GROUND = "No ground: links other than the fixed base reach it at the start pose."
+IN_JSON = ("type", "unit", "lower", "upper", "effort_limit", "velocity_limit", "damping", "friction")
+"""Figures of a joint for --json."""
 
 
 @dataclass(frozen=True)
@@ -51,34 +53,42 @@ class InspectCommand:
 
     def run(self) -> int:
         """Run the command and return its exit status."""
+        from batchpid.sim.cli.report import table
+
         json = OutputFiles(self).path("json", self.json, (".json",))
         robot = Robot.load(self.robot, **vars(self.meshes))
-        mass = sum(link.mass for link in robot.link_masses.values())
-        size = f"{robot.dof} degrees of freedom, {len(robot.links)} links, {mass:.4g} kg"
-        setpoint = None if robot.settings is None else robot.settings.target
-        findings = robot.check(setpoint=setpoint, control="drive")  # without gains
-        asked = self.gains is not None or robot.has_tuned  # designed gains keep the stability bound
-        gains = gain_set(robot, self.gains) if asked else None
+        masses = robot.link_masses
+        total = sum(link.mass for link in masses.values())
+        findings = robot.check(setpoint=robot.target, control="drive")  # without gains
+        has_gains = self.gains is not None or robot.has_tuned  # designed gains keep the stability bound
+        gains = gain_set(robot, self.gains) if has_gains else None
         calls = _calls(self.engine) if self.engine else None
+        size = f"{robot.dof} degrees of freedom, {len(robot.links)} links, {total:.4g} kg"
         print(f"{robot.name}: {size}, {robot.path}\n")
         print(sentences(findings) or "Nothing odd about it.")
         if gains is not None:
-            with_gains = robot.check(params=gains.params, setpoint=setpoint, control=gains.control)
-            of_gains = [finding for finding in with_gains if finding not in findings]
-            print(f"\nUnder gains {gains.name}:")
-            print(sentences(of_gains) or "Nothing odd.")
+            checked = robot.check(params=gains.params, setpoint=robot.target, control=gains.control)
+            of_gains = [finding for finding in checked if finding not in findings]
+            print(f"\nUnder gains {gains.name}:\n{sentences(of_gains) or 'Nothing odd.'}")
             findings += of_gains
-        print("\n" + joint_table(robot, fixed_too=self.all))
-        print("\n" + mass_table(robot, light_too=self.all))
+
+        fixed = [joint for joint in robot.all_joints if self.all and not joint.moves]
+        print("\n" + table(list(joint_rows([*robot.joints, *fixed])), HEADERS, "lllrrrrrl"))
+        shown = {name: link for name, link in masses.items() if self.all or link.mass > LIGHT * total}
+        rows = [
+            [name, f"{link.mass:.4g} kg" if link.mass else "none", SOURCES[link.source]] for name, link in shown.items()
+        ]
+        print("\n" + table(rows, ("link", "mass", "from"), "lrl"))
+        if len(shown) < len(masses):
+            print(f"Not shown: {len(masses) - len(shown)} links with little mass or none (--all).")
         print("\n" + contact_lines(robot, pairs_too=self.all))
         if calls is not None:
             print(f"\nEngine: {calls}.")
         if json is not None:
-            names = ("type", "unit", "lower", "upper", "effort_limit", "velocity_limit", "damping", "friction")
             figures = {
-                **{"robot": robot.name, "mass": mass, "findings": [asdict(each) for each in findings]},
-                "joints": {each.name: {name: getattr(each, name) for name in names} for each in robot.joints},
-                "links": {name: {"mass": link.mass, "source": link.source} for name, link in robot.link_masses.items()},
+                **{"robot": robot.name, "mass": total, "findings": [asdict(finding) for finding in findings]},
+                "joints": {joint.name: {name: getattr(joint, name) for name in IN_JSON} for joint in robot.joints},
+                "links": {name: {"mass": link.mass, "source": link.source} for name, link in masses.items()},
             }
             write_figures(json, figures)
             print(f"\nfigures: {json}")
@@ -94,52 +104,20 @@ def _calls(name: str) -> str:
     return describe_calls(f"{engine.title} {version}", engine.native_obstacle())
 
 
-def joint_table(robot: Robot, *, fixed_too: bool) -> str:
-    """Return a table of the moving joints, numbered as in qpos, and the fixed ones."""
-    from batchpid.sim.cli.report import table
-
-    fixed = [joint for joint in robot.all_joints if fixed_too and not joint.moves]
-    rows = list(joint_rows([*robot.joints, *fixed]))
-    return table(rows, HEADERS, "lllrrrrrl")
-
-
-def mass_table(robot: Robot, *, light_too: bool) -> str:
-    """Return a table of the masses of links and their sources, without light links, and the total."""
-    from batchpid.sim.cli.report import table
-
-    masses = robot.link_masses
-    total = sum(link.mass for link in masses.values())
-    shown = {name: link for name, link in masses.items() if light_too or link.mass > LIGHT * total}
-    rows = [
-        [name, f"{link.mass:.4g} kg" if link.mass else "none", SOURCES[link.source]] for name, link in shown.items()
-    ]
-    shares = {source: sum(link.mass for link in masses.values() if link.source == source) for source in SOURCES}
-    parts = [f"{share:.4g} kg from {SOURCES[source]}" for source, share in shares.items() if share]
-    lines = f"Total {total:.4g} kg" + f": {'; '.join(parts)}" * (len(parts) > 1) + "."
-    if hidden := len(masses) - len(shown):
-        lines += f" Not shown: {_count(hidden, 'link')} with little mass or none (--all)."
-    return table(rows, ("link", "mass", "from"), "lrl") + "\n" + _fill(lines)
-
-
 def contact_lines(robot: Robot, *, pairs_too: bool) -> str:
     """Return whether the robot's scenes have a ground, and the pairs of links that do not collide, by reason."""
-    contact = robot.self_contact
-    ground = "Ground at height 0." if robot.has_ground else NO_GROUND
-    if not contact.pairs:
+    ground, pairs = "Ground at height 0." if robot.has_ground else NO_GROUND, robot.self_contact.pairs
+    if not pairs:
         return f"{ground} All links collide."
-    reasons = Counter(pair.reason for pair in contact.pairs)
+    reasons = Counter(pair.reason for pair in pairs)
     counts = ", ".join(f"{count} {reason!r}" for reason, count in reasons.items())
-    count = _count(len(contact.pairs), "pair")
-    lines = [_fill(f"{ground} {count} of links excluded from collision: {counts}{'' if pairs_too else ' (--all)'}.")]
-    if not pairs_too:
-        return lines[0]
-    for title, pairs in (
-        *((f"Do not collide, {reason!r}", [p for p in contact.pairs if p.reason == reason]) for reason in reasons),
-        ("Collide, since PhysX's filter cannot hold them", contact.left_over),
-    ):
-        if pairs:
-            lines.append(_fill(f"{title}: {', '.join(f'{pair.first} - {pair.second}' for pair in pairs)}"))
-    return "\n".join(lines)
+    lines = [
+        f"{ground} {len(pairs)} pairs of links excluded from collision: {counts}{'' if pairs_too else ' (--all)'}."
+    ]
+    for reason in reasons if pairs_too else ():
+        names = ", ".join(f"{pair.first} - {pair.second}" for pair in pairs if pair.reason == reason)
+        lines.append(f"Do not collide, {reason!r}: {names}")
+    return "\n".join(map(_fill, lines))
 
 
 def sentences(findings: Sequence[Finding]) -> str:
@@ -150,7 +128,3 @@ def sentences(findings: Sequence[Finding]) -> str:
 def _fill(text: str) -> str:
     wrapper = textwrap.TextWrapper(120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
     return wrapper.fill(text.replace("N m", "N\xa0m")).replace("\xa0", " ")
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"

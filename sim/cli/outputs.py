@@ -11,11 +11,8 @@ import os
 import shlex
 import sys
 import weakref
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
-from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from batchpid.checks.validate import file_path
@@ -113,24 +110,6 @@ def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
         return shown
 
     return wrap
-
-
-@contextmanager
-def waiting(label: str, **options: Any) -> Iterator[None]:
-    """Show ``label`` and the time since on stderr, from 1 s on, while the block runs; ``options`` go to tqdm."""
-    ended = Event()
-
-    def show() -> None:
-        for _ in bar(label, bar_format="{desc}: {elapsed}", **options)(iter(partial(ended.wait, 0.5), True)):
-            pass
-
-    thread = Thread(target=show, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
 
 
 def close_bars() -> None:

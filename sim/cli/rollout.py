@@ -14,7 +14,7 @@ from batchpid.checks.validate import array
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Recorder, Robot
 from batchpid.sim.cli import flags
-from batchpid.sim.cli.outputs import OutputFiles, waiting, write_figures
+from batchpid.sim.cli.outputs import OutputFiles, write_figures
 from batchpid.sim.recording.recording_files import HDF5
 from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tuning.gain_sets import gain_set
@@ -80,6 +80,7 @@ class RolloutCommand:
         from batchpid.sim import Runner, plots
         from batchpid.sim.cli.report import exit_status, run_figures
         from batchpid.sim.cli.run import held, simulate, start_poses
+        from batchpid.sim.engine.protocol import load_engine
         from batchpid.sim.tuning.randomization_files import load_randomization
 
         outputs = OutputFiles(self)
@@ -87,7 +88,7 @@ class RolloutCommand:
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
         robot = Robot.load(self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes))
-        options: Document = {"tool": self.tool, "timestep": self.timestep, "substeps": self.substeps}
+        options: Document = {"timestep": self.timestep, "substeps": self.substeps}
         options |= self.runner.options() | {"control": self.control}
         if self.randomize is not None:
             options["randomization"] = load_randomization(self.randomize, robot)
@@ -101,11 +102,14 @@ class RolloutCommand:
                 robot, self.tool or default_tool(robot), posture=robot.target
             )
             goal, columns = control.tool_pose(robot.target), control.command.names
+            title = f"{robot.name}, control osc of {control.link}"
         else:
+            flags.refuse(self, ("tool",), "is for control 'osc'")
             gains = gain_set(robot, self.gains or ("drive" if self.control == "drive" else None))
             options["params"] = gains.params
             if gains.control == "drive":
                 options["control"] = "drive"
+            title = f"{robot.name}, control {options['control']}, gains {gains.name}"
 
         # Setpoints: of a file, or one that is held.
         center, rates = robot.target if self.control == "osc" else robot.start, Document()
@@ -120,22 +124,24 @@ class RolloutCommand:
             goal = array("setpoint", goal, (1, len(columns)), columns, kind="entry")[0]
             setpoints = held(goal, self.seconds, self.timestep * self.substeps)
 
-        with waiting(f"building {self.num_envs} robots"):
-            made = Runner(robot, self.num_envs, **options)
+        engine = load_engine(options["engine"]).title
+        print(f"{title}, {1 / self.timestep:g} Hz: {self.num_envs} robots in {engine}", flush=True)
         with (
-            made as runner,
+            Runner(robot, self.num_envs, **options) as runner,
             nullcontext() if out is None else Recorder(out, runner, seed=self.seed, overwrite=self.force),
         ):
             start = start_poses(robot, self.num_envs, self.spread, self.seed, center)
             rollout, report = simulate(runner, start, setpoints, **rates)
         print(report)
+        if robot.settings is not None and self.setpoint is None:
+            print(*(f"Note: {note}" for note in robot.settings.notes), sep="\n")
         if out is not None:
             print(f"written: {out}")
         if json is not None:
             write_figures(json, run_figures(robot, rollout))
             print(f"figures: {json}")
         if picture is not None:
-            figure = plots.step_responses(rollout, mark=0, title=robot.name)
+            figure = plots.step_responses(rollout, mark=0, title=title)
             print(f"picture: {plots.save(figure, picture)}")
         return 0 if self.trajectory is not None else exit_status(robot, rollout)
 

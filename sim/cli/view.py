@@ -44,7 +44,7 @@ class ViewCommand:
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 for all of this machine. Everyone who sees the printed address can use it."""
     port: Annotated[int, Field(low=1, high=65535)] = 8080
-    """Port, or the next free one if it is taken."""
+    """Port, or a free one if it is taken."""
     time_limit: flags.TimeLimit = None
 
     imports = ("batchpid.sim.view",)
@@ -75,7 +75,7 @@ class ViewCommand:
         gains = None if self.gains is None else gain_set(robot, self.gains)
         if gains and gains.control != "pid":
             raise InvalidArgumentError("gains", "must be PID gains", value=self.gains, remedy="name others")
-        live = LiveSimulation(
+        return LiveSimulation(
             robot,
             self.num_envs,
             period=1 / self.fps,
@@ -83,9 +83,6 @@ class ViewCommand:
             **self.runner.options(),
             params=gains and gains.params,
         )
-        if robot.settings is not None:
-            live.set_setpoint(robot.settings.target)
-        return live
 
     def _recorded(self, path: Path) -> Playback:
         """Return the run in the file; of many envs those that fit on the page."""

@@ -110,7 +110,7 @@ class Panel:
 
     def _add_setpoints(self, live: LiveSimulation) -> None:
         gui, robot = self._gui, live.robot
-        poses = {"start": robot.start} | ({} if robot.settings is None else {"target": robot.settings.target})
+        poses = {"start": robot.start, "target": robot.target}
         sliders: dict[int, Any] = {}
 
         def go_to(pose: str) -> None:

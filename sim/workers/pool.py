@@ -78,8 +78,8 @@ class WorkerPool(SingleOwner):
         self.max_losses = MAX_LOSSES
         self.recoveries = 0
         """Number of lost workers that were replaced."""
-        self.messages: dict[type[Warning], str] = {}
-        """Latest message of each category, for warnings."""
+        self.warnings: list[str] = []
+        """Messages about replaced workers, for warnings."""
         if options.cluster is not None:
             cluster = Cluster(options.cluster, num_envs)
             slices, widest, most_steps = cluster.slices, cluster.widest, NODE_STEPS
@@ -218,12 +218,14 @@ class WorkerPool(SingleOwner):
                     request.write(self.arrays, worker.envs)
                     worker.send(request)
                     result = worker.receive()
+                    if isinstance(result, Failure):  # of a ``build`` that works no more
+                        return result
             except WorkerLost as error:
                 loss = error
                 continue
             self.recoveries += 1
             seconds = time.monotonic() - began
-            self.messages[RecoveryWarning] = f"{cause}; replaced and replayed in {seconds:.1f} s"
+            self.warnings.append(f"{cause}; replaced and replayed in {seconds:.1f} s")
             return result
         remedy = "run these envs with workers=0 to see why"
         raise WorkerLost(f"{loss}; lost {self.max_losses} times during the same request: {remedy}") from loss

@@ -16,7 +16,10 @@ SHORT = ("--num-envs", 2, "--workers", 0, "--seconds", 0.02)
 def test_demo_reports_every_joint_and_where_it_differs_from_the_tutorial(batchpid, tmp_path):
     robot, path = load_bundled("panda"), tmp_path / "mine.yaml"
     bp.save_params(path, robot.params(kp=7.0), robot.joint_names)
-    titles = {path: "pid at 2000 Hz, gains mine.yaml", "drive:30,6": "drive at 2000 Hz, gains drive (30, 6)"}
+    titles = {
+        path: "control pid, gains mine.yaml, 2000 Hz",
+        "drive:30,6": "control drive, gains drive (30, 6), 2000 Hz",
+    }
     for gains, title in titles.items():
         status, said, _ = batchpid("demo", *SHORT, "--gains", gains, "--force")
         assert status == 0
@@ -36,11 +39,3 @@ def test_demo_draws(batchpid, tmp_path):
     with Image.open(path) as picture:
         assert picture.width > 1000
         assert len(np.unique(np.asarray(picture))) > 20
-
-
-def test_a_robot_without_tutorial_settings_is_sent_to_rollout(batchpid, tmp_path):
-    path = tmp_path / "arm.urdf"
-    path.write_text(load_bundled("panda").path.read_text())
-    status, _, err = batchpid("demo", path)
-    assert status == 2
-    assert f"batchpid rollout {path}" in err

@@ -105,7 +105,7 @@ def test_gains_pause_step_and_reset(live, view, open_page, until):
 
 
 def test_charts_draw_the_watched_joint(live, view, open_page, until):
-    live.set_setpoint(live.robot.settings.target)
+    live.set_setpoint(live.robot.target)
     view.panel.frames_left = 10
     page = open_page(view.url)
     until(lambda: "joint1 [rad]" in page.page_source, what="the chart's title")
@@ -120,7 +120,7 @@ def test_charts_draw_the_watched_joint(live, view, open_page, until):
 @pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def test_a_recorded_run_plays(jaco2, serve, open_page, until):
     with Runner(jaco2, 2, params=jaco2.params(), workers=0, substeps=66) as runner:
-        rollout = runner.rollout(np.broadcast_to(jaco2.settings.target, (45, jaco2.dof)))
+        rollout = runner.rollout(np.broadcast_to(jaco2.target, (45, jaco2.dof)))
     playback = Playback(rollout, jaco2)
     view = serve(playback, port=18090)
     page = open_page(view.url)

@@ -14,13 +14,13 @@ from batchpid.sim.view import film
 @pytest.fixture(scope="module")
 def rollout(panda):
     with Runner(panda, 3, params=panda.params(), workers=0) as runner:
-        return runner.rollout(np.broadcast_to(panda.settings.target, (20, panda.dof)))
+        return runner.rollout(np.broadcast_to(panda.target, (20, panda.dof)))
 
 
 @pytest.mark.parametrize("ground", [False, True])
 def test_a_robot_is_drawn_where_it_is(panda, ground):
     painter = film.Painter(panda, 2, ground, (160, 90))
-    start, target = panda.start, panda.settings.target
+    start, target = panda.start, panda.target
     first = painter.picture(np.array([start, target]))
     second = painter.picture(np.array([target, np.full(panda.dof, np.nan)]))  # the second keeps its pose
     third = painter.picture(np.array([start, start]))

@@ -11,7 +11,7 @@ from batchpid.sim.view import Playback
 @pytest.fixture(scope="module")
 def rollout(panda):
     with Runner(panda, 2, params=panda.params(), workers=0) as runner:
-        return runner.rollout(np.broadcast_to(panda.settings.target, (30, panda.dof)))
+        return runner.rollout(np.broadcast_to(panda.target, (30, panda.dof)))
 
 
 def test_a_rollout_plays_from_the_first_row_to_the_last_and_starts_over(panda, rollout):

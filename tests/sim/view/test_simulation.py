@@ -66,7 +66,7 @@ def test_the_tuned_gains_are_the_default_and_gains_in_other_units_can_follow(pan
 @pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def test_a_robot_that_diverged_comes_back_with_a_reset(live, panda):
     live.params = panda.params(kd=5000.0, effort_limit=np.inf)
-    live.set_setpoint(panda.settings.target)
+    live.set_setpoint(panda.target)
     with pytest.warns(FaultWarning):
         run(live, 12)
     assert not live.frame().ok.all()
