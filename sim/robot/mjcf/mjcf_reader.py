@@ -96,7 +96,7 @@ def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> Mjcf
     grounds = [int(plane) for plane in planes if can_collide(model, int(plane))]
     return MjcfFile(
         path=str(path),
-        reading=compiled.reading,
+        is_whole=compiled.is_whole,
         content=content_of(path),
         bodies=tuple(names.bodies.values()),
         falling=tuple(names.bodies[int(body)] for body in free if not names.is_of_robot(body)),
