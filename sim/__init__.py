@@ -6,20 +6,18 @@ Importing it does not load SAPIEN; the first use of :class:`Runner` or of :meth:
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from batchpid.sim.command import CommandSpec
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
-from batchpid.sim.observation import Observation, Rollout, RunInfo, register_findings, register_plot
+from batchpid.sim.observation import Observation, Rollout, RunInfo
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.ray_options import Ray
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
-from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding, RepairWarning
 from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
@@ -87,19 +85,3 @@ def __getattr__(name: str) -> Any:
     if name not in _LOADED_LATE:
         raise AttributeError(f"module 'batchpid.sim' has no attribute {name!r}")
     return getattr(importlib.import_module(_LOADED_LATE[name]), name)
-
-
-def _plot() -> Callable[..., Any]:
-    from batchpid.sim.plots import step_responses
-
-    return step_responses
-
-
-def _findings(rollout: Rollout, robot: RobotDescription) -> list[Finding]:
-    from batchpid.sim.robot.unsettled import unsettled_findings
-
-    return unsettled_findings(rollout, robot)
-
-
-register_plot(_plot)
-register_findings(_findings)

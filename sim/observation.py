@@ -20,19 +20,6 @@ from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
 from batchpid.sim.command import FORCE_UNITS, POSE_UNITS, TWIST_UNITS, WRENCH_UNITS, CommandSpec, joint_command
 
-_load_plot: list[Callable[[], Callable[..., Any]]] = []
-_find: list[Callable[..., Any]] = []
-
-
-def register_plot(load: Callable[[], Callable[..., Any]]) -> None:
-    """Set the function that returns the drawing function of rollouts; :mod:`batchpid.sim` calls it."""
-    _load_plot[:] = [load]
-
-
-def register_findings(find: Callable[..., Any]) -> None:
-    """Set the function (rollout, robot) that returns the findings of rollouts; :mod:`batchpid.sim` calls it."""
-    _find[:] = [find]
-
 
 class Quantity(NamedTuple):
     """Observed quantity: its dtype, meaning, unit ("rad|m" is the joint's own), and whether there is one per joint.
@@ -502,18 +489,22 @@ class Rollout:
         InvalidArgumentError
             The robot is not known, or has other joints than the run.
         """
+        from batchpid.sim.diagnosis.findings import unsettled_findings
+
         robot = self.info.description if robot is None else robot
         if robot is None:
             problem, remedy = "of this run is not known", "pass it: rollout.findings(Robot.load(...))"
             raise InvalidArgumentError("robot", problem, remedy=remedy)
-        return _find[0](self, robot)
+        return unsettled_findings(self, robot)
 
     def plot(self, **options: Any) -> Any:
         """Return a Matplotlib figure of the run, which a notebook shows: positions above efforts for each joint.
 
         ``options`` are arguments of :func:`batchpid.sim.plots.step_responses`: joints, band, mark, title.
         """
-        return _load_plot[0]()(self, **options)
+        from batchpid.sim.plots import step_responses
+
+        return step_responses(self, **options)
 
 
 def _is_equal(first: Any, second: Any) -> bool:

@@ -11,7 +11,7 @@ from tabulate import tabulate
 
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.sim import Finding, Robot, Rollout, Runner
-from batchpid.sim.robot.unsettled import settled_envs
+from batchpid.sim.diagnosis.findings import settled_envs
 from batchpid.sim.tuning.evaluation import Evaluation, arm_joints, following_error, step_response_metrics
 from batchpid.task_space.frames import pose_error
 

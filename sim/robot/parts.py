@@ -147,15 +147,16 @@ class FileDefaults:
 class MjcfFile:
     """MJCF file that MuJoCo simulates itself, with all that it holds besides the robot.
 
-    ``reading`` is the way in which it was read (:func:`batchpid.sim.robot.mjcf.mjcf_compiler.attempt`), ``content`` the
-    digest of what was read. ``bodies`` are the names of all bodies, ``falling`` those of bodies on free joints that are
-    not the robot's. ``loops`` are the equality constraints that close loops of the robot's links. ``is_alone`` is False
-    if more than the robot moves. ``has_floor`` is True if planes of the world can collide, unless the root is fixed to
-    the origin in place of its free joint. ``friction`` is the coefficient of its ground, the first of these planes.
+    ``is_whole`` says whether all of it is compiled (:func:`batchpid.sim.robot.mjcf.mjcf_compiler.attempt`), and
+    ``content`` is the digest of the files. ``bodies`` are the names of all bodies, ``falling`` those of bodies on free
+    joints that are not the robot's. ``loops`` are the equality constraints that close loops of the robot's links.
+    ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of the world can collide, unless
+    the root is fixed to the origin in place of its free joint. ``friction`` is the coefficient of its ground, the first
+    of these planes.
     """
 
     path: str
-    reading: str
+    is_whole: bool
     content: str
     bodies: tuple[str, ...]
     falling: tuple[str, ...] = ()
@@ -170,16 +171,14 @@ class Urdf:
     """URDF prepared for headless simulation.
 
     ``urdf`` is the text that the simulator parses. ``all_joints`` are in SAPIEN's order: breadth first from the root,
-    fixed joints counted, joints of one parent in the order of the file. ``missing_meshes`` names the collision meshes
-    that were not found or cannot be read, the latter with the reason. ``repairs`` are findings, one for each change
-    that the simulator needs.
+    fixed joints counted, joints of one parent in the order of the file. ``repairs`` are findings, one
+    for each change that the simulator needs.
     """
 
     name: str
     urdf: str
     all_joints: tuple[Joint, ...]
     links: tuple[Link, ...]
-    missing_meshes: tuple[str, ...]
     repairs: tuple[Finding, ...]
 
 

@@ -63,7 +63,7 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
 
     Raises RobotError if the file has changed since the robot was loaded.
     """
-    compiled = attempt(Path(file.path), spec.fixed_base, file.reading)
+    compiled = attempt(Path(file.path), spec.fixed_base, file.is_whole)
     scene, model = compiled.scene, compiled.model
     if model is None or content_of(Path(file.path)) != file.content:
         problem = compiled.problem or "it has another content"

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,13 +20,11 @@ import mujoco
 from batchpid.arrays.array_types import MjModel, MjSpec
 from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.meshes import LFS_PROBLEM, mesh_problem
+from batchpid.sim.robot.meshes import LFS_PROBLEM
 from batchpid.sim.robot.xml import LFS_POINTER, parse_xml
 
 _ERRORS = (ValueError, mujoco.FatalError)
 """Errors of MuJoCo's parser and compiler."""
-_CHECKED = (".stl", ".obj")
-"""Formats of meshes that :func:`mesh_problem` and MuJoCo both read."""
 
 
 if mujoco.get_mju_user_warning() is None:  # else MuJoCo appends warnings to a file in the working folder, too
@@ -37,13 +34,13 @@ if mujoco.get_mju_user_warning() is None:  # else MuJoCo appends warnings to a f
 class Attempt(NamedTuple):
     """Model of a file, or None with MuJoCo's reason; collision meshes whose geoms are left out, with the reason.
 
-    ``scene`` is the ``mujoco.MjSpec`` that was compiled, ``reading`` the way in which the file was read. ``weighing``
-    are the bodies whose mass depends on a geom that is left out, each with the mesh.
+    ``scene`` is the ``mujoco.MjSpec`` that was compiled, ``is_whole`` says whether the whole file was. ``weighing`` are
+    the bodies whose mass depends on a geom that is left out, each with the mesh.
     """
 
     scene: MjSpec
     model: MjModel
-    reading: str
+    is_whole: bool
     missing: tuple[str, ...] = ()
     weighing: tuple[tuple[str, str], ...] = ()
     problem: str = ""
@@ -54,69 +51,49 @@ def compile_file(path: Path, fixed_base: bool, missing_meshes: str, findings: li
 
     Raises RobotError if MuJoCo refuses the file, a missing mesh has an unknown mass, or missing meshes are refused.
     """
-    first = attempt(path, fixed_base, "unreadable")  # without geoms that are only drawn: their meshes take time to read
-    if first.model is not None and not first.missing and not first.weighing:
-        return first
-    whole = attempt(path, fixed_base, "whole")  # something may refer to a removed geom, and a missing file be elsewhere
+    lean = attempt(path, fixed_base, False)  # without geoms that are only drawn: their meshes take time to read
+    if lean.model is not None and not lean.missing and not lean.weighing:
+        return lean
+    whole = attempt(path, fixed_base, True)  # something may refer to a removed geom, and a missing file be elsewhere
     if whole.model is not None:
         return whole
-    best = next(
-        (each for each in _attempts(path, fixed_base, first, whole.problem) if each.model is not None or each.weighing),
-        whole,
-    )
-    if best.weighing:
-        listed = ", ".join(f"mesh {mesh} of body {body!r}" for mesh, body in best.weighing)
+    if lean.weighing:
+        listed = ", ".join(f"mesh {mesh} of body {body!r}" for mesh, body in lean.weighing)
         remedy = "restore the file, or give the body an <inertial>, with which the mesh may be missing"
         remedy += ' (unless inertiafromgeom is "true")'
         raise RobotError(f"{path}: the mass of a body is unknown without its mesh: {listed}; {remedy}")
-    names = ", ".join(best.missing)
+    names = ", ".join(lean.missing)
     if names and missing_meshes == "error":
         remedy = "restore the files, or pass missing_meshes='skip' to simulate without"
-        raise RobotError(f"{path}: collision mesh not found or not readable: {names}; {remedy}")
-    if best.model is None:
-        raise RobotError(_refusal(path, best.problem))
-    if names:
-        text = f"collision meshes not found or not readable, simulated without: {names}"
-        findings.append(Finding("warning", "missing-mesh", text, "put the files where the MJCF names them"))
-    return best
+        raise RobotError(f"{path}: collision mesh not found: {names}; {remedy}")
+    if lean.model is None:
+        raise RobotError(_refusal(path, whole.problem))
+    text = f"collision meshes not found, simulated without: {names}"
+    findings.append(Finding("warning", "missing-mesh", text, "put the files where the MJCF names them"))
+    return lean
 
 
-def _attempts(path: Path, fixed_base: bool, first: Attempt, problem: str) -> Iterator[Attempt]:
-    """Yield compilations without missing meshes, then, if MuJoCo's problem is a mesh, without damaged ones."""
-    yield first
-    yield attempt(path, fixed_base, "unreadable, drawn")
-    if re.search("stl|obj|mesh|vert|face", problem, re.IGNORECASE):
-        yield attempt(path, fixed_base, "damaged")
-        yield attempt(path, fixed_base, "damaged, drawn")
-
-
-def attempt(path: Path, fixed_base: bool, reading: str) -> Attempt:
-    """Return a compilation of the "whole" file, or without the geoms of meshes that are "unreadable" or "damaged".
-
-    Unless it is of the whole file, geoms that are only drawn are left out, too; "unreadable, drawn" and "damaged,
-    drawn" keep them.
-    """
+def attempt(path: Path, fixed_base: bool, is_whole: bool) -> Attempt:
+    """Return a compilation of the whole file, or without geoms that are only drawn and geoms of missing meshes."""
     left_out: tuple[Any, Any] = (), ()
-    problem_of, scene = {"unreadable": _unreadable, "damaged": _damaged}.get(reading.split(",")[0]), None
+    scene = None
     try:
         scene = mujoco.MjSpec.from_file(str(path))
-        if problem_of is not None:
-            left_out = _strip(scene, path, fixed_base, problem_of, reading.endswith("drawn"))
-        return Attempt(scene, scene.compile(), reading, *left_out)
+        if not is_whole:
+            left_out = _strip(scene, path, fixed_base)
+        return Attempt(scene, scene.compile(), is_whole, *left_out)
     except _ERRORS as error:
-        return Attempt(scene, None, reading, *left_out, " ".join(str(error).split()))
+        return Attempt(scene, None, is_whole, *left_out, " ".join(str(error).split()))
 
 
-def _strip(
-    spec: Any, path: Path, fixed_base: bool, problem_of: Callable[[Path], str | None], keeps_drawn: bool
-) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
+def _strip(spec: Any, path: Path, fixed_base: bool) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
     """Remove textures, geoms that add neither shape nor mass, and those of missing meshes; return the latter."""
     paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     absent = {}
     for mesh in spec.meshes:
         folder = path.parent / (getattr(mesh, "compiler", spec).meshdir or "")
         file = Path(mesh.file).name if spec.strippath else mesh.file
-        if mesh.file and (problem := problem_of(folder / file)):
+        if mesh.file and (problem := _missing(folder / file)):
             absent[mesh.name] = f"{mesh.file} ({problem})"
     missing: dict[str, None] = {}
     weighing: dict[tuple[str, str], None] = {}
@@ -129,7 +106,7 @@ def _strip(
             weighing[absent[geom.meshname], geom.parent.name] = None
         elif geom.meshname in absent and not drawn_only:
             missing[absent[geom.meshname]] = None
-        if drawn_only and not weighs and not keeps_drawn:
+        if drawn_only and not weighs:
             spec.delete(geom)
         elif geom.meshname in absent:  # something may refer to it
             geom.type, geom.size, geom.meshname = mujoco.mjtGeom.mjGEOM_SPHERE, [1e-3, 0, 0], ""
@@ -160,7 +137,7 @@ def _moves(body: Any) -> bool:
     return body is not None
 
 
-def _unreadable(path: Path) -> str | None:
+def _missing(path: Path) -> str | None:
     """Return the reason for which no program can read a mesh; None for other meshes."""
     try:
         with open(path, "rb") as file:
@@ -169,24 +146,12 @@ def _unreadable(path: Path) -> str | None:
         return "not found" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
 
 
-def _damaged(path: Path) -> str | None:
-    """Return the reason for which a mesh cannot be read, after a check of its format; None for other meshes."""
-    return _unreadable(path) or (mesh_problem(path) if path.suffix.lower() in _CHECKED else None)
-
-
 def _refusal(path: Path, problem: str) -> str:
     """Return the message for a file that MuJoCo refuses."""
-    plugin = re.search(r"plugin '?([\w.-]+)'? not found|unrecognized plugin '([^']*)'", problem)
-    if plugin is not None and plugin[1]:
-        remedy = "load its library with mujoco.mj_loadPluginLibrary, or remove <extension> and the elements that use it"
-        return f"{path}: uses the plugin {plugin[1]!r}, which MuJoCo {mujoco.__version__} has not loaded; {remedy}"
-    if plugin is not None:
-        remedy = f'add <extension><plugin plugin="{plugin[2]}"/></extension>, or remove the elements that use it'
-        return f"{path}: uses the plugin {plugin[2]!r} without <extension>; {remedy}"
     included = [each.get("file", "") for each in parse_xml(path).iter("{*}include")]
     for name in (*re.findall(r"'([^']+)'", problem), *included):
         with suppress(OSError, ValueError):
-            if _unreadable(path.parent / name) == LFS_PROBLEM:
+            if _missing(path.parent / name) == LFS_PROBLEM:
                 return f"{path}: {name} is a git-lfs pointer instead of the file; run git lfs pull"
     remedy = "restore the file" if "opening file" in problem else "correct it"
     return f"{path}: MuJoCo cannot compile the file: {problem}; {remedy}"

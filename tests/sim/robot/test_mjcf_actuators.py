@@ -10,7 +10,6 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.batch")
 
-from batchpid.errors import RobotError  # noqa: E402
 from batchpid.sim import Robot, Runner, StabilityWarning  # noqa: E402
 
 PID = '<extension><plugin plugin="mujoco.pid"/></extension>'
@@ -210,12 +209,3 @@ def test_an_actuator_of_another_object_is_named(load):
     robot = Robot.load(robot.path)
     assert robot.joint_names == ("j", "k")
     assert any("'number 0' acts on no joint of the robot" in str(each) for each in robot.repairs)
-
-
-def test_a_plugin_that_mujoco_lacks_is_named(load):
-    with pytest.raises(
-        RobotError, match=r"uses the plugin 'some\.thing', which MuJoCo .* has not loaded; load its library"
-    ):
-        load("", extension='<extension><plugin plugin="some.thing"/></extension>')
-    with pytest.raises(RobotError, match=r"uses the plugin 'mujoco\.pid' without <extension>; add"):
-        load(PLUGIN.format('joint="j"'), extension="")
