@@ -55,6 +55,8 @@ class EnginePack(Protocol):
         Friction and damping that the loop has to apply to the joints; None where the engine applies them.
     armature
         Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg], not included in :meth:`joint_mass_matrix`.
+    state_is_complete
+        Whether :meth:`read_state` holds everything that later steps depend on, so that a pack in use can be restored.
     """
 
     spec: SceneSpec
@@ -62,6 +64,7 @@ class EnginePack(Protocol):
     dof: int
     first_env: int
     qf: Rows
+    state_is_complete: bool
     friction: Friction
     armature: Float64
 
@@ -148,7 +151,7 @@ class EnginePack(Protocol):
         """
 
     def write_state_rows(self, states: Float64) -> None:
-        """Put all envs of this new pack into the states that :meth:`read_state` returned.
+        """Put all envs into the states that :meth:`read_state` returned; of a new pack, unless they are complete.
 
         Rows may be longer, with more NaN at the end. The loop writes efforts and suspension afterwards.
         """

@@ -82,12 +82,12 @@ class ReachVectorEnv(RobotVectorEnv):
         self.actions = choice("actions", actions, ACTIONS)
         self.tolerance = number("tolerance", tolerance, 0.0, 1e3, "rad or m")
         self._max_increment = max_increment
-        self._own = own_command(options.get("control"))
+        self._spec = own_command(options.get("control"))
         super().__init__(num_envs, robot, **options)
         law = self.runner.params.continuous if self.runner.control == "pid" else None
         turns = np.zeros(self.robot.dof) if law is None else np.asarray(law, np.float64).min(0) / TURN
         joint_turns = np.minimum(self._joints.turns, turns[self._joints.index])
-        self._setpoint_turns = joint_turns if self._own is None else np.zeros(len(self.action_names))
+        self._setpoint_turns = joint_turns if self._spec is None else np.zeros(len(self.action_names))
         self._goal = np.zeros((self.num_envs, len(self.joint_names)))
 
     def spaces(self) -> tuple[spaces.Box, spaces.Box]:
@@ -97,20 +97,20 @@ class ReachVectorEnv(RobotVectorEnv):
         span = self.high - self.low
         self._span = np.where(span > LIMIT_TOLERANCE, span, np.inf)
         self._margin = np.where(joints.continuous, 0.0, MARGIN * span)
-        own = self._own
+        spec = self._spec
         self.action_names, self._setpoint_low, self._setpoint_high = self.joint_names, self.low, self.high
-        if own is not None:
-            self.action_names = own.names
-            self._setpoint_low, self._setpoint_high = _finite_bounds(own)
+        if spec is not None:
+            self.action_names = spec.names
+            self._setpoint_low, self._setpoint_high = _finite_bounds(spec)
         max_increment = self._max_increment
         if max_increment is None:
-            if own is not None and self.actions == "increment":
-                remedy = f"give one number for each of {', '.join(own.names)}"
+            if spec is not None and self.actions == "increment":
+                remedy = f"give one number for each of {', '.join(spec.names)}"
                 raise InvalidArgumentError("max_increment", "is needed for the command of this control", remedy=remedy)
             fastest = self.robot.velocity_limit[joints.index]
-            max_increment = 0.0 if own is not None else np.minimum(fastest, MAX_SPEED) * self.step_seconds
+            max_increment = 0.0 if spec is not None else np.minimum(fastest, MAX_SPEED) * self.step_seconds
         names = self.action_names
-        kind: Any = "joint" if own is None else "entry"
+        kind: Any = "joint" if spec is None else "entry"
         self.max_increment = array("max_increment", max_increment, (1, len(names)), names, kind=kind)[0]
         low, high = joints.bounds()
         observation = spaces.Box(
@@ -131,15 +131,15 @@ class ReachVectorEnv(RobotVectorEnv):
         if self.actions == "setpoint":
             chosen = low + (action + 1) / 2 * (high - low)
         else:
-            last = setpoint if self._own is not None else setpoint[:, self._joints.index]
+            last = setpoint if self._spec is not None else setpoint[:, self._joints.index]
             chosen = np.clip(wrap(last + action * self.max_increment, self._setpoint_turns, np), low, high)
-        return self._joints.of_robot(chosen) if self._own is None else chosen
+        return self._joints.of_robot(chosen) if self._spec is None else chosen
 
     def rate(self, setpoint: Float64, last: Float64) -> Float64 | None:
         """Return the rates of increments, the short way round on continuous joints; None for other actions."""
-        if self.actions == "setpoint" or self._own is not None:
+        if self.actions == "setpoint" or self._spec is not None:
             return None
-        rate, index = np.zeros_like(setpoint), self._joints.index  # the rates of followers are those of their leaders
+        rate, index = np.zeros_like(setpoint), self._joints.index  # the runner gives followers their leaders' rates
         rate[:, index] = wrap((setpoint - last)[:, index], self._setpoint_turns, np) / self.step_seconds
         return rate
 

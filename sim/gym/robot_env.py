@@ -33,8 +33,9 @@ class RobotEnv(SingleOwner, gymnasium.Env):
     def __init__(self, robot: str | Robot | None = None, *, render_mode: str | None = None, **options: Any) -> None:
         check_keywords(type(self).__name__, options, [name for name in arguments_of(self.task) if name not in _FIXED])
         options |= {"workers": options.get("workers", 0), "autoreset_mode": AutoresetMode.DISABLED}
-        given: Document = {} if robot is None else {"robot": robot}
-        self._envs = self.task(1, **given, max_episode_steps=None, render_mode=render_mode, **options)
+        if robot is not None:
+            options["robot"] = robot
+        self._envs = self.task(1, max_episode_steps=None, render_mode=render_mode, **options)
         self.runner, self.render_mode = self._envs.runner, render_mode
         self.metadata = self._envs.metadata  # type: ignore[misc]
         self.observation_space = self._envs.single_observation_space

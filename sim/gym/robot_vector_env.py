@@ -118,11 +118,11 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         timestep = checked_option("timestep", options.get("timestep", RunnerOptions.timestep))
         substeps = round(1 / (number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second") * timestep))
         self.step_seconds = substeps * timestep
-        own = dict(self.runner_options())
-        for given in options:
-            if given in own:
-                raise InvalidArgumentError(given, f"is chosen by {name}", remedy=f"leave it out, or subclass {name}")
-        self._options = options | own
+        chosen = dict(self.runner_options())
+        for option in options:
+            if option in chosen:
+                raise InvalidArgumentError(option, f"is chosen by {name}", remedy=f"leave it out, or subclass {name}")
+        self._options = options | chosen
         self.single_observation_space, self.single_action_space = self.spaces()
         size: int = self.single_action_space.shape[0]
         self.action_names = getattr(self, "action_names", tuple(map(str, range(size))))
@@ -245,7 +245,7 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             )
         seeds: Sequence[int | None] | None = None
         if isinstance(seed, Sequence | np.ndarray):
-            seeds = [None if each is None else integer("seed", each, 0, LARGEST) for each in seed]
+            seeds = [None if entry is None else integer("seed", entry, 0, LARGEST) for entry in seed]
         elif seed is not None:
             first = integer("seed", seed, 0, LARGEST - self.num_envs)
             seeds = range(first, first + self.num_envs)
@@ -421,18 +421,21 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
 
     def _info(self, mask: Bool) -> Document:
         """Return the info of the masked envs in Gymnasium's vector style: each key and, as _key, the mask."""
-        own = {
+        further = {
             key: self._returned("info", value, (self.num_envs,), value.dtype)
             for key, value in self.info(self._observation).items()
         }
-        values = {"success": self._success, **own, "diverged": self._diverged}
+        values = {"success": self._success, **further, "diverged": self._diverged}
         info = {key: np.where(mask, value, np.zeros_like(value)) for key, value in values.items()}
         return info | {f"_{key}": mask.copy() for key in values}
 
 
 def arguments_of(task: type[RobotVectorEnv]) -> tuple[str, ...]:
-    """Return the names of the arguments of a task: its own, those of its bases, and the options of the runner."""
+    """Return the names of a task's arguments: its parameters, its bases' parameters, and the options of the runner."""
     bases = task.__mro__[: task.__mro__.index(RobotVectorEnv) + 1]
-    parameters = [each for base in bases for each in inspect.signature(base).parameters.values()]
-    names = dict.fromkeys(each.name for each in parameters if each.kind is not each.VAR_KEYWORD)
+    names: dict[str, None] = {}
+    for base in bases:
+        for name, parameter in inspect.signature(base).parameters.items():
+            if parameter.kind is not parameter.VAR_KEYWORD:
+                names[name] = None
     return (*names, *RUNNER_OPTIONS)

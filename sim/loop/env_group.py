@@ -66,6 +66,7 @@ class EnvGroup:
         self._own_actuators: bp.Actuators | None = None  # before the randomization
         self._actuators: bp.Actuators | None = None  # after it; None without effect on efforts or measurements
         self._episode = np.zeros(pack.size, np.int64)
+        self._drops_actuators = False  # of a pack in use, at the next write()
         self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
         self._motor = np.zeros((pack.size, pack.dof), np.float32)
         self._saturated, self._guarded = (np.zeros((pack.size, pack.dof), bool) for _ in range(2))
@@ -290,10 +291,16 @@ class EnvGroup:
             pushes={} if self._pushes is None else {name: rows.copy() for name, rows in self._pushes.counts.items()},
         )
 
+    def adopt(self, params: bp.PIDParams, actuators: bp.Actuators | None, draws: Draws) -> None:
+        """Take the params, actuators and draws of a snapshot; :meth:`write` puts them into effect."""
+        self._drops_actuators = actuators is None and self._own_actuators is not None
+        self.draws, self._params, self._own_actuators = draws, params, actuators
+        self._acting_params = acting_params(self._options, params, draws)
+
     def write(self, pack: EnginePack, states: EnvStates) -> None:
-        """Continue with the new ``pack`` in the given state."""
+        """Continue with ``pack`` in the given state."""
         self.pack = pack
-        if self._own_actuators is not None:
+        if self._own_actuators is not None or self._drops_actuators:
             pack.write_joints(self._take_actuators())
         pack.write_state_rows(states.engine)
         self._containment.write(states.containment)

@@ -142,19 +142,23 @@ class Loop:
         """Put every env into its state in ``snapshot``, with its params and ``draws``."""
         self._steps = snapshot.steps
         for group in self.groups:
-            group.draws = draws.for_envs(group.envs)
-        self.set_params(snapshot.params)
-        self.set_actuators(snapshot.actuators)
+            envs, motors = group.envs, snapshot.actuators
+            motors = None if motors is None else motors.for_envs(envs)
+            group.adopt(snapshot.params.for_envs(envs), motors, draws.for_envs(envs))
         self._place(snapshot.states)
         for group, ticks in zip(self.groups, self._group_ticks, strict=True):
             group.observe(ticks[0])
 
     def _place(self, states: EnvStates) -> None:
-        # The engine's contact caches, and the order in which it solves contacts, depend on its past. A new world has no
-        # past.
+        # The contact caches of some engines, and the order in which they solve contacts, depend on the past. A new
+        # world has no past.
+        varies = self.options.randomization is not None and self.options.randomization.changes_robot
         for group in self.groups:
-            group.pack.close()
-            group.write(self._build(group.envs, group.draws), states.for_envs(group.envs))
+            pack = group.pack
+            if varies or not pack.state_is_complete:
+                pack.close()
+                pack = self._build(group.envs, group.draws)
+            group.write(pack, states.for_envs(group.envs))
 
     def state_sizes(self) -> list[int]:
         """Return the number of values in the engine's state of each env."""

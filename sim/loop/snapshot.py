@@ -175,10 +175,33 @@ class Snapshot:
         tables = {"episodes": self.episodes, "motion": self.motion}
         return {name: rows for name, rows in tables.items() if rows is not None}
 
-    def for_envs(self, envs: slice | NDArray[np.intp]) -> Snapshot:
-        """Return the snapshot of some envs."""
+    def for_envs(self, envs: slice | Sequence[int] | NDArray[np.intp]) -> Snapshot:
+        """Return a snapshot of the envs with these numbers, in this order, and repeatedly where a number repeats.
+
+        A runner of as many envs restores it. An env continues bit by bit as the original would, with the noise of the
+        original's sensors, until it is reset.
+
+        Raises
+        ------
+        InvalidArgumentError
+            A number is not one of an env.
+        """
+        count = len(self.states.effort)
+        if not isinstance(envs, slice):
+            envs = np.asarray(envs)
+            if (
+                envs.ndim != 1
+                or envs.dtype.kind not in "iu"
+                or not envs.size
+                or not (envs < count).all()
+                or (envs < 0).any()
+            ):
+                problem, remedy = f"are not numbers of {count} envs", f"pass a sequence of 0 to {count - 1}"
+                raise InvalidArgumentError("envs", problem, value=envs, remedy=remedy)
+        num_envs = len(np.arange(count)[envs])
         return replace(
             self,
+            about=self.about | {"num_envs": num_envs},
             params=self.params.for_envs(envs),
             states=self.states.for_envs(envs),
             actuators=None if self.actuators is None else self.actuators.for_envs(envs),

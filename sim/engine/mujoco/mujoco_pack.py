@@ -47,6 +47,8 @@ class MujocoPack(ModelPack):
     Implements :class:`batchpid.sim.engine.protocol.CompiledPack` and DrivenPack.
     """
 
+    state_is_complete = True
+
     def __init__(
         self,
         spec: SceneSpec,
