@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.sim.identification.fit import OUTLIER, Evaluation, Problem, Solution
+from batchpid.sim.identification.fit import OUTLIER, FitResiduals, Problem, Solution
 from batchpid.sim.identification.unknowns import KINDS
 
 PARTS, LEAST_LOGS = 10, 5
@@ -70,7 +70,9 @@ def intervals_of(problem: Problem, solution: Solution) -> Intervals:
     return Intervals(np.sqrt(variance) * sizes, inverse / scale[:, None] / scale, shown)
 
 
-def _blocks(problem: Problem, evaluation: Evaluation, size: Float64, factors: Float64) -> list[tuple[Float64, Float64]]:
+def _blocks(
+    problem: Problem, evaluation: FitResiduals, size: Float64, factors: Float64
+) -> list[tuple[Float64, Float64]]:
     """Return derivatives (rows, unknowns) and residuals (rows,) of each part, weighted as by the loss."""
     tables = list[tuple[Float64, Float64, int]]()
     for window, residual, slope in zip(problem.windows, *evaluation, strict=True):
