@@ -135,8 +135,7 @@ class StabilityWarning(UserWarning):
 
     The bound holds at the start pose, and counts delays, lag, strength, armature and viscous friction of the actuators.
     Noise and limits of efforts are not in it: beyond it, a joint with limits oscillates instead of diverging. With
-    ``dissipation="sapien"``, which adds friction that is not in the formula, there is no warning. Under control "drive"
-    in MuJoCo the warning names the first joint that sticks, see :mod:`batchpid.sim.robot.run_checks`.
+    ``dissipation="sapien"``, which adds friction that is not in the formula, there is no warning.
     """
 
 
