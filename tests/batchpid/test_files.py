@@ -1,11 +1,13 @@
 """Files are replaced as a whole, and by one writer."""
 
 import ast
+import os
 from pathlib import Path
 
 import pytest
 
 import batchpid as bp
+from batchpid.io.files import write_atomically
 
 PARAMS = bp.make_params(1, 2.0)
 
