@@ -43,7 +43,7 @@ class RunnerState(NamedTuple):
         names = None if own is None else own.names
         faults, contacts = FaultLog(count, robot.joint_names, options.timestep, options.on_fault, names), None
         if options.misses_contacts:
-            nearest = lambda qpos: robot.dynamics().nearest_links(qpos)  # noqa: E731
+            nearest = lambda qpos: robot.dynamics().contacts.nearest_links(qpos)  # noqa: E731
             contacts = MissedContactLog(count, options.timestep, nearest)
         motion = (np.tile(robot.start, (count, 1)), None) if options.sets_positions else None
         return cls(options.params, options.actuators, draws, faults, contacts, motion)

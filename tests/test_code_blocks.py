@@ -58,7 +58,7 @@ RARE = {
     ),
     "sh": ("docs/two-engines.md", "docs/view.md", "docs/deploy.md", "docs/sim-to-real.md"),
 }
-ONLY_PARSED = ("tune", "identify", "survey")
+ONLY_PARSED = ("tune", "identify")
 
 
 def name(page: Path) -> str:

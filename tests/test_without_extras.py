@@ -21,7 +21,7 @@ MODULES = {"pycollada": "collada", "imageio-ffmpeg": "imageio_ffmpeg"}
 """Name of a package's module, where it is another than the package's."""
 NEEDED = {"tune": "tune", "identify": "tune", "view": "view"}
 """Commands of the two pages that need an extra."""
-SIZES = SHORTER | {"survey": ["--workers", "0"], "compare": ["--moves", "1", "--seconds", "0.1", "--workers", "0"]}
+SIZES = SHORTER | {"compare": ["--moves", "1", "--seconds", "0.1", "--workers", "0"]}
 PROGRAM = """
 import contextlib, io, json, sys, warnings
 from importlib.machinery import PathFinder

@@ -30,7 +30,6 @@ from batchpid.sim.cli.inspect import InspectCommand
 from batchpid.sim.cli.outputs import close_bars
 from batchpid.sim.cli.plot import PlotCommand
 from batchpid.sim.cli.rollout import RolloutCommand
-from batchpid.sim.cli.survey import SurveyCommand
 from batchpid.sim.cli.tune import TuneCommand
 from batchpid.sim.cli.view import ViewCommand
 
@@ -43,7 +42,6 @@ COMMANDS: dict[str, type[Any]] = {
     "identify": IdentifyCommand,
     "export": ExportCommand,
     "inspect": InspectCommand,
-    "survey": SurveyCommand,
     "plot": PlotCommand,
     "view": ViewCommand,
 }

@@ -291,7 +291,7 @@ class _Run:
         A robot on a floating base stands on the ground: there only pairs of links count.
         """
         ground = self.info.ground if self.robot.fixed_base else False
-        pairs = sorted(self.robot.dynamics(ground).near(qpos, within), key=itemgetter(2), reverse=True)
+        pairs = sorted(self.robot.dynamics(ground).contacts.near(qpos, within), key=itemgetter(2), reverse=True)
         nearest = {tuple(filter(None, pair)): distance for *pair, distance in pairs}
         return dict(sorted(nearest.items(), key=itemgetter(1)))
 

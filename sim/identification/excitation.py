@@ -161,7 +161,7 @@ def _contact(robot: Robot, position: Float64) -> _Obstacle | None:
 
     def apart(qpos: Float64, within: float = CLEARANCE) -> dict[tuple[str, str], float]:
         found: dict[tuple[str, str], float] = {}
-        for first, second, distance in dynamics.near(qpos, within):
+        for first, second, distance in dynamics.contacts.near(qpos, within):
             found[first, second] = min(distance, found.get((first, second), np.inf))
         return found
 

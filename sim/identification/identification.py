@@ -117,7 +117,11 @@ def identify(
     if {*LAW}.isdisjoint(extras) and _is_odd(data, guess) and (words := _better_reading(data)):
         raise InvalidArgumentError("logs", f"make sense with {words}", remedy="correct the log or its options")
     unknowns = _unknowns(data, guess, [*extras], flag("payload", payload))
-    with _pool(workers) as run:
+    pool: Any = nullcontext()
+    if integer("workers", workers, 0, 1000) > 1:
+        pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+    with pool as executor:
+        run = map if executor is None else executor.map
         problem = Problem(data.plants, data.drives, _windows(data), unknowns, run)
         found = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
     if not found.explains and (words := _better_reading(data)):
@@ -305,8 +309,7 @@ def _unknowns(data: Data, guess: Guess, extras: list[str], payload: bool) -> Unk
     starts = dict(guess.values)
     if "gain" in extras:
         starts["gain"] = starts.pop("strength")
-    bodies = data.plants[0].bodies() if "mass" in extras else {}
-    return Unknowns.of(data.robot, first.joints, kinds, starts, sizes, bodies)
+    return Unknowns.of(data.robot, first.joints, kinds, starts, sizes, data.plants[0].heavy_links)
 
 
 def _windows(data: Data) -> list[Any]:
@@ -319,28 +322,10 @@ def _windows(data: Data) -> list[Any]:
     return windows[:: 1 + len(windows) // MOST_WINDOWS]
 
 
-def _pool(workers: int) -> Any:
-    """Return a context of ``map``, or of that of a pool of processes."""
-    if integer("workers", workers, 0, 1000) < 2:
-        return nullcontext(map)
-    return _Pool(workers)
-
-
-class _Pool:
-    def __init__(self, workers: int) -> None:
-        self._executor = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-
-    def __enter__(self) -> Any:
-        return self._executor.map
-
-    def __exit__(self, *error: object) -> None:
-        self._executor.shutdown()
-
-
 def _fitted(data: Data, problem: Problem, evaluations: int, progress: Callable[[], Any] | None) -> Identification:
     """Return the fit: first of all unknowns, then of those that the logs show."""
     fitted = replace(problem, windows=[window for window in problem.windows if window.fitted.any()])
-    rough = fitted.solve(problem.unknowns.start, evaluations // 2, progress=progress)
+    rough = fitted.solve(problem.unknowns.start, max(evaluations // 4, 1), progress=progress)
     shown = intervals_of(fitted, rough).shown
     unknowns, hidden = problem.unknowns.only(shown), problem.unknowns.only(~shown)
     fitted = replace(fitted, unknowns=unknowns)

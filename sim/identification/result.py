@@ -214,11 +214,8 @@ class Identification:
         InvalidArgumentError
             The masses were no unknowns (extras=["mass"]).
         """
-        factors = {
-            link: float(value)
-            for entry, value in zip(self.unknowns.entries, self.values, strict=True)
-            for link in (self.unknowns.bodies[entry.link] if entry.link is not None else ())
-        }
+        pairs = zip(self.unknowns.entries, self.values.tolist(), strict=True)
+        factors = {entry.link: value for entry, value in pairs if entry.link is not None}
         if not factors:
             raise InvalidArgumentError("corrected_urdf", "no mass was found", remedy="identify with extras=['mass']")
         return to_urdf(self.robot, mass_factors=factors).text
@@ -297,14 +294,14 @@ def advice(problem: Problem, solution: Solution) -> str:
     unknowns = problem.unknowns
     plant = problem.plants[0]
     present = {entry.kind for entry in unknowns.entries}
-    further = [Unknown("mass", None, 1.0, 1.0, link=link) for link in plant.bodies() if "mass" not in present]
+    further = [Unknown("mass", None, 1.0, 1.0, link=link) for link in plant.heavy_links if "mass" not in present]
     for kind in ("offset", "load_friction", *(("kd",) if problem.drives[0].params is not None else ())):
         if kind not in present:
             start = {"offset": 0.0, "load_friction": 1e-4, "kd": 1.0}[kind]
             size = float(KINDS[kind].size)
             further += [Unknown(kind, joint, start, size) for joint in range(len(unknowns.joints))]
     entries = (*unknowns.entries, *further)
-    wide = replace(unknowns, entries=entries, bodies=plant.bodies())
+    wide = replace(unknowns, entries=entries)
     point = np.concatenate([solution.point, [entry.coordinate(entry.start) for entry in further]])
     steps = np.full(len(point), STEP)
     steps[[at for at, entry in enumerate(entries) if entry.kind == "load_friction"]] = 4.0
@@ -328,7 +325,7 @@ def advice(problem: Problem, solution: Solution) -> str:
     # Explanations that are as good as equal differ in how far they bring the strengths from 1.
     alike = sorted(np.flatnonzero(np.array(gains) > ALIKE * max(gains)), key=lambda number: distances[number])
     words = " or ".join(_effect(problem, further[number], changes[number]) for number in alike[:2])
-    text = f"{words} would explain {100 * gains[alike[0]]:.0f} % of the remaining squared error"
+    text = f"{words} would explain {100 * max(gains):.0f} % of the remaining squared error"
     kinds = {further[number].kind for number in alike[:2]}
     weigh = "; or the strengths are as found: weigh the link" if "mass" in kinds else ""
     return f"{text} (extras: {', '.join(sorted(kinds))}){weigh}"

@@ -150,15 +150,11 @@ class Plant:
             self._trees[masses] = replace(tree, coupling=Coupling.of(tree.dof, self._followers))
         return self._trees[masses]
 
-    def bodies(self) -> dict[str, list[str]]:
-        """Return the links of each moving body with a mass, by the name of its heaviest link."""
-        tree = self.tree
-        bodies = defaultdict[int, list[int]](list)
-        for link, body in enumerate(tree.link_bodies):
-            if body >= 0 and tree.mass[link] > 0:
-                bodies[body].append(link)
-        heaviest = {max(links, key=lambda link: tree.mass[link]): links for links in bodies.values()}
-        return {tree.links[first]: [tree.links[link] for link in links] for first, links in heaviest.items()}
+    @property
+    def heavy_links(self) -> list[str]:
+        """Moving links with a mass."""
+        links = zip(self.tree.links, self.tree.link_bodies, self.tree.mass, strict=True)
+        return [link for link, body, mass in links if body >= 0 and mass > 0 and link != PAYLOAD]
 
     def dynamics(self, masses: Sequence[Any], qpos: Float64, qvel: Float64) -> Dynamics:
         """Return the dynamics of robots at ``qpos`` and ``qvel`` (n, joints), arrays that may change."""

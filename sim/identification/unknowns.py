@@ -39,6 +39,8 @@ class Kind(NamedTuple):
     field: str = ""
     """Field of :class:`batchpid.Actuators`, for a motor."""
     positive: bool = True
+    most: float = np.inf
+    """Largest value."""
 
 
 KINDS = {
@@ -47,10 +49,10 @@ KINDS = {
     "friction": Kind("motor", "joint", "effort", 4.0, field="coulomb"),
     "strength": Kind("motor", "joint", 1.0, 0.3, 1.0, "strength"),
     "bias": Kind("motor", "joint", "effort", 10.0, field="bias", positive=False),
-    "delay": Kind("motor", "robot", 2e-3, 3.0, field="command_delay"),
-    "setpoint_delay": Kind("log", "robot", 5e-3, 3.0),
+    "delay": Kind("motor", "robot", 2e-3, 3.0, field="command_delay", most=0.1),
+    "setpoint_delay": Kind("log", "robot", 5e-3, 3.0, most=0.3),
     "payload": Kind("robot", "robot", 0.1, 4.0),
-    "load_friction": Kind("motor", "joint", 0.05, 2.0, field="load_friction"),
+    "load_friction": Kind("motor", "joint", 0.05, 2.0, field="load_friction", most=0.9),
     "static": Kind("motor", "joint", "friction", 2.0, field="static"),
     "stribeck": Kind("motor", "joint", "speed", 2.0, field="stribeck"),
     "offset": Kind("motor", "joint", 0.01, 20.0, field="position_offset", positive=False),
@@ -111,7 +113,8 @@ class Unknown:
         if not KINDS[self.kind].positive:
             return coordinates * self.size
         begin = self.coordinate(self.start)
-        return self.floor + self.size * np.exp(np.clip(coordinates, begin - FARTHEST, begin + FARTHEST))
+        values = self.floor + self.size * np.exp(np.clip(coordinates, begin - FARTHEST, begin + FARTHEST))
+        return np.minimum(values, KINDS[self.kind].most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +124,6 @@ class Unknowns:
     robot: Robot
     joints: tuple[int, ...]
     entries: tuple[Unknown, ...]
-    bodies: Mapping[str, Sequence[str]]
-    """Links of each body with an unknown mass, by the body's name."""
 
     @classmethod
     def of(
@@ -132,7 +133,7 @@ class Unknowns:
         kinds: Sequence[str],
         starts: Mapping[str, Float64],
         sizes: Mapping[str, Float64],
-        bodies: Mapping[str, Sequence[str]],
+        links: Sequence[str],
     ) -> Unknowns:
         """Return the unknowns of ``kinds``.
 
@@ -143,7 +144,7 @@ class Unknowns:
         for name in kinds:
             kind = KINDS[name]
             if kind.per == "link":
-                entries += [Unknown(name, None, 1.0, 1.0, link=link) for link in bodies]
+                entries += [Unknown(name, None, 1.0, 1.0, link=link) for link in links]
                 continue
             numbers: Sequence[int | None] = range(len(joints)) if kind.per == "joint" else (None,)
             for joint in numbers:
@@ -152,7 +153,7 @@ class Unknowns:
                 floor = 0.0 if name not in DESCRIBED else getattr(robot, DESCRIBED[name])[joints[joint or 0]]
                 start = max(start, floor + LEAST_START * size) if kind.positive else start
                 entries.append(Unknown(name, joint, start, size, float(floor)))
-        return cls(robot, joints, tuple(entries), bodies)
+        return cls(robot, joints, tuple(entries))
 
     @property
     def start(self) -> Float64:
@@ -203,20 +204,15 @@ class Unknowns:
         if "static" in fields:
             fields["static"] = fields["static"] + fields["coulomb"]
         longest = np.array([[fields["command_delay"].max()]]) if "command_delay" in fields else None
-        masses = list[tuple[tuple[str, float], ...]]()
-        for row in values:
-            factors = list[tuple[str, float]]()
-            for value, entry in zip(row.tolist(), self.entries, strict=True):
-                if entry.kind == "payload":
-                    factors.append((PAYLOAD, value))
-                elif entry.link is not None:
-                    factors += [(link, value) for link in self.bodies[entry.link]]
-            masses.append(tuple(factors))
+        heavy = {
+            at: entry.link or PAYLOAD for at, entry in enumerate(self.entries) if entry.kind in ("payload", "mass")
+        }
+        masses = tuple(tuple((link, float(row[at])) for at, link in heavy.items()) for row in values)
         delay = tables["setpoint_delay"][:, 0] if "setpoint_delay" in tables else np.zeros(len(values))
         law = {name: table for name, table in tables.items() if KINDS[name].target == "law"}
-        return Candidates(Actuators(**fields, max_delay=longest), law, delay, tuple(masses))
+        return Candidates(Actuators(**fields, max_delay=longest), law, delay, masses)
 
     def only(self, mask: Bool) -> Unknowns:
         """Return the unknowns of a mask (unknowns,); the others have their neutral value."""
         entries = tuple(entry for entry, stays in zip(self.entries, mask, strict=True) if stays)
-        return Unknowns(self.robot, self.joints, entries, self.bodies)
+        return Unknowns(self.robot, self.joints, entries)

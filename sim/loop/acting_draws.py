@@ -40,7 +40,6 @@ def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variati
     for name in PHYSICAL:
         if name in randomization.given:
             nominal = nominal_values(name, robot, options.mjcf)
-            nominal = np.nan_to_num(nominal, nan=1.0)  # an unknown mass can be scaled alone
             rows = np.tile(nominal, (size, 1)) if draws is None else randomization.apply(name, nominal, draws, robot)
             values[name] = rows / nominal if name == "link_mass" else rows
     for name in ("payload", "ground_friction"):

@@ -45,9 +45,9 @@ class Distribution(ABC):
         flag("shared", self.shared)
 
     @property
-    @abstractmethod
     def support(self) -> tuple[float, float]:
         """Smallest and largest value that can be drawn."""
+        return float(self.low), float(self.high)  # type: ignore[attr-defined]
 
     @abstractmethod
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
@@ -89,11 +89,6 @@ class Uniform(Distribution):
         super().__post_init__()
         self._numbers("low", "high", low=self._lowest)
         self._ordered(self.low, self.high)
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return self.low, self.high
 
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""
@@ -137,11 +132,6 @@ class Normal(Distribution):
     @property
     def _scale(self) -> float:
         return math.sqrt(2.0) * self.std
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Smallest and largest value that can be drawn."""
-        return float(self.low), float(self.high)
 
     def sample(self, generator: np.random.Generator, size: int) -> Float64:
         """Return independent draws (size,)."""

@@ -52,13 +52,12 @@ def parts(name: str, each: Field, columns: Sequence[str]) -> Iterator[tuple[str,
 
 
 def nominal_values(name: str, robot: Robot, mjcf: MjcfFile | None = None) -> Float64:
-    """Return the nominal values of a field in :data:`PHYSICAL` (elements,); NaN for masses that the engine finds.
+    """Return the nominal values of a field of the robot (elements,), 0 for others.
 
     ``mjcf`` is the file that the engine simulates, with its own friction.
     """
     if name == "link_mass":
-        masses = {link.name: link.mass for link in robot.links}
-        return np.array([masses[link] for link in elements(name, robot)], np.float64)  # None is NaN
+        return np.array([robot.link_masses[link].mass for link in elements(name, robot)])
     known = {"friction": robot.friction, "damping": robot.damping, "gravity": np.array([0.0, 0.0, -9.81])}
     known |= {"ground_friction": np.array([CONTACT_FRICTION if mjcf is None else mjcf.friction])}
     return known.get(name, np.zeros(len(elements(name, robot))))

@@ -100,13 +100,10 @@ class Randomization:
     def __post_init__(self) -> None:
         object.__setattr__(self, "seed", integer("seed", self.seed, 0, LARGEST))
         choice("each", self.each, get_args(Literal["episode", "env"]))
+        for name in (*GROUPS, *FIELDS):
+            object.__setattr__(self, name, _copied(getattr(self, name)))
         for group in GROUPS:
-            chosen = mapping(group, getattr(self, group))
-            chosen = {name: dict(each) if isinstance(each, Mapping) else each for name, each in chosen.items()}
-            object.__setattr__(self, group, chosen)
-        for name in (*PHYSICAL, *START, *EVENTS):
-            if isinstance(each := getattr(self, name), Mapping):
-                object.__setattr__(self, name, dict(each))
+            mapping(group, getattr(self, group))
         remedy = "pass e.g. Uniform(0, 0.5), or a mapping of names to such"
         for name, each in (self.given | self.events).items():
             given = list(each.values()) if isinstance(each, Mapping) and name not in SINGLE else [each]
@@ -125,8 +122,7 @@ class Randomization:
     @property
     def events(self) -> dict[str, Field]:
         """Given fields of events during an episode, by name."""
-        known = {name: getattr(self, name) for name in EVENTS}
-        return {name: each for name, each in known.items() if each is not None}
+        return {name: each for name in EVENTS if (each := getattr(self, name)) is not None}
 
     @property
     def changes_robot(self) -> bool:
@@ -240,14 +236,8 @@ class Randomization:
 
     def to_dict(self) -> Document:
         """Return the given fields as plain values, for :meth:`from_dict`."""
-
-        def plain(each: Any) -> Any:
-            if isinstance(each, Mapping):
-                return {name: plain(part) for name, part in each.items()}
-            return each.to_dict() if isinstance(each, Distribution) else each
-
         known = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {name: plain(value) for name, value in known.items() if value is not None and value != {}}
+        return {name: _plain(value) for name, value in known.items() if value is not None and value != {}}
 
     @classmethod
     def from_dict(cls, known: Mapping[str, Any]) -> Randomization:
@@ -261,13 +251,21 @@ class Randomization:
         known = mapping("randomization", known)
         names = [each.name for each in fields(cls)]
         values = {choice("randomization", name, names): value for name, value in known.items()}
-        for name in (*PHYSICAL, *START, *EVENTS):
-            if name in values:
-                values[name] = read_field(name, values[name])
+        values |= {name: read_field(name, values[name]) for name in FIELDS.keys() & values.keys()}
         for group in GROUPS:
             given = mapping(group, values.get(group, {}))
             values[group] = {name: read_field(f"{group}.{name}", value) for name, value in given.items()}
         return cls(**values)
+
+
+def _copied(each: Any) -> Any:
+    return {name: _copied(part) for name, part in each.items()} if isinstance(each, Mapping) else each
+
+
+def _plain(each: Any) -> Any:
+    if isinstance(each, Mapping):
+        return {name: _plain(part) for name, part in each.items()}
+    return each.to_dict() if isinstance(each, Distribution) else each
 
 
 FIELDS = declared(Randomization, Bounds)

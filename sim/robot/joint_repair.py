@@ -88,7 +88,7 @@ def _type(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
 def _axis(joint: etree._Element) -> Iterator[Finding]:
     """Replace an axis without direction by the URDF's default, x."""
     axis = joint.find("axis")
-    if axis is None or joint.get("type") == "fixed":
+    if axis is None:
         return
     if axis.get("xyz") is None:
         joint.remove(axis)  # the default of the URDF, on which SAPIEN fails

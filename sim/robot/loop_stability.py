@@ -69,16 +69,15 @@ def _loop(
         return np.broadcast_to(rows, (len(rows), robot.dof))[:, coupling.independent]
 
     def matrix(armature: Array) -> Float64:
-        rows = np.zeros((1, robot.dof)) if armature is None else np.asarray(armature, np.float64)
-        eye = np.eye(robot.dof)
-        return coupling.reduced(robot.mass_matrix(qpos) + np.broadcast_to(rows, (len(rows), robot.dof))[:, None] * eye)
+        rows = np.atleast_2d(np.zeros(robot.dof) if armature is None else np.asarray(armature, np.float64))
+        return coupling.reduced(robot.mass_matrix(qpos) + rows[:, None] * np.eye(robot.dof))
 
     loop: Document = {name: column(getattr(params, name)) for name in ("kp", "ki", "kd")}
     loop["filter_time"] = column(params.derivative_filter_time)
     loop |= {"delay": column(motors.command_delay) + column(motors.sensor_delay), "lag": column(motors.lag)}
     eye, strength = np.eye(loop["kp"].shape[1]), column(motors.strength, 1.0)
-    own = coupling.reduced_damping(robot.damping)
-    damping = own + column(motors.viscous)
+    viscous = np.zeros((1, robot.dof)) if motors.viscous is None else motors.viscous
+    damping = np.stack([coupling.reduced_damping(robot.damping + row) for row in viscous])
     if params.gain_units is None:
         loop |= {name: strength * loop[name] for name in ("kp", "ki", "kd")}
         return loop | {"mass_matrix": matrix(motors.armature), "damping": damping}
@@ -136,8 +135,7 @@ class StabilityWarning(UserWarning):
 
     The bound holds at the start pose, and counts delays, lag, strength, armature and viscous friction of the actuators.
     Noise and limits of efforts are not in it: beyond it, a joint with limits oscillates instead of diverging. With
-    ``dissipation="sapien"``, which adds friction that is not in the formula, there is no warning. Under control "drive"
-    in MuJoCo the warning names the first joint that sticks, see :mod:`batchpid.sim.robot.run_checks`.
+    ``dissipation="sapien"``, which adds friction that is not in the formula, there is no warning.
     """
 
 

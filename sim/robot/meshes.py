@@ -1,16 +1,14 @@
-"""Mesh files of a URDF: the search for them, and a check of their headers and sizes.
+"""Mesh files of a URDF: the search for them, their reading, and their content.
 
-SAPIEN silently drops a collision shape whose file it cannot read, and trusts the sizes in a header: 20 bytes can cost
-gigabytes. Formats other than those checked here are refused: in some, a truncated file ends the process.
+SAPIEN silently drops a collision shape whose file it cannot read, and a damaged file of some formats ends its process.
+So trimesh reads every file first.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
-import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,15 +16,14 @@ from urllib.parse import unquote
 
 import numpy as np
 from lxml import etree
-from numpy.typing import NDArray
 
 from batchpid.arrays.digest import digest
 from batchpid.errors import RobotError
 from batchpid.sim.robot.xml import LARGEST, LFS_POINTER
 
+FORMATS = (".stl", ".obj", ".dae", ".glb")
 SIZE_LIMIT = 2**27  # bytes of a mesh file
 LFS_PROBLEM = "a git-lfs pointer instead of the mesh: run git lfs pull"
-_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 
 
 def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | None:
@@ -38,37 +35,25 @@ def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | N
     the other case, and the name percent-encoded.
     """
     name = re.sub(r"^(file:/*)?\$\(find ([^)]+)\)", r"package://\2", name.strip().replace("\\", "/"))  # xacro, Windows
-    tried = []
-    for spelling in dict.fromkeys([name, unquote(name)]):
-        for each in _candidates(spelling, path, package_dirs):
-            if os.path.isfile(each):
-                return each.absolute()
-            tried.append(os.path.splitext(each))
-    for change in (str.lower, str.upper, str.title):
-        for stem, suffix in tried:
-            if os.path.isfile(found := stem + change(suffix)):
-                return Path(found).absolute()
+    spellings = dict.fromkeys([name, unquote(name)])
+    places = [os.path.splitext(place) for spelling in spellings for place in _candidates(spelling, path, package_dirs)]
+    for change in (str, str.lower, str.upper, str.title):
+        for stem, suffix in places:
+            if os.path.isfile(file := stem + change(suffix)):
+                return Path(file).absolute()
     return None
 
 
 def _candidates(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Iterator[Path]:
     """Yield the files that ``name`` may mean, the likeliest first."""
-    scheme, _, relative = name.rpartition("://")
     above = path.absolute().parents
-    if scheme in ("package", "model"):
-        relative = relative.lstrip("/")
-        package, _, within = relative.partition("/")
-        if within:
-            yield from (folder / relative for folder in (*package_dirs, *above))
-            yield from (folder / within for folder in (*package_dirs, *above))
-            yield from (folder / within for folder in _ros_packages(package))
+    if package := re.match(r"(?:package|model):/+([^/]+)/(.+)", name):
+        within = package[2]
+        yield from (folder / package[1] / within for folder in (*package_dirs, *above))
+        yield from (folder / within for folder in (*package_dirs, *above, *_ros_packages(package[1])))
         return
-    if not scheme and name.startswith("file:"):
-        relative = name.removeprefix("file:")
-    elif scheme == "file":
-        relative = relative.removeprefix("localhost")
-    if relative.strip("/"):
-        yield from (folder / relative for folder in (above[0], *package_dirs, *above[1:]))
+    relative = re.sub(r"^file:(//(localhost)?)?", "", name)
+    yield from (folder / relative for folder in (above[0], *package_dirs, *above[1:]))
 
 
 def _ros_packages(package: str) -> Iterator[Path]:
@@ -98,6 +83,43 @@ def read_mesh(path: str | Path) -> Any:
     return mesh
 
 
+def mesh_problem(path: Path) -> str | None:
+    """Return the reason for which a mesh file cannot be used, or None."""
+    if path.suffix.lower() not in FORMATS:
+        return f"format not among {', '.join(FORMATS)}"
+    try:
+        with open(path, "rb") as file:
+            data = file.read(SIZE_LIMIT + 1)
+        if not data or len(data) > SIZE_LIMIT:
+            return "empty" if not data else f"larger than {SIZE_LIMIT >> 20} MiB"
+        if data.startswith(LFS_POINTER):
+            return LFS_PROBLEM
+        if path.suffix.lower() == ".dae" and not _has_its_numbers(data):
+            return "arrays of other lengths than it says"
+        mesh = read_mesh(path)
+        corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+    except Exception as error:
+        return str(error) or type(error).__name__
+    if not len(corners):
+        return "damaged, or without faces"
+    return None if (np.abs(corners) <= LARGEST).all() else f"vertices that are not within {LARGEST:g} m"
+
+
+def _has_its_numbers(data: bytes) -> bool:
+    """Return whether the arrays of a COLLADA file are as long as it says: SAPIEN reads beyond them otherwise."""
+    root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True))
+    sizes = {}
+    for array in root.iter("{*}float_array"):
+        sizes["#" + array.get("id", "")] = size = len((array.text or "").split())
+        if array.get("count") != str(size):
+            return False
+    ends = (
+        (int(each.get("count", "0")) * int(each.get("stride", "1")) + int(each.get("offset", "0")), each.get("source"))
+        for each in root.iterfind("{*}library_geometries//{*}accessor")
+    )
+    return all(0 <= end <= sizes.get(source, -1) for end, source in ends)
+
+
 _in_use: dict[str, str] = {}
 """Digests of the mesh files that SAPIEN has read in this process; it never reads the same path again."""
 
@@ -122,91 +144,10 @@ def content_of(urdf: str) -> str:
     Raises RobotError for a file that cannot be read.
     """
     root = etree.fromstring(urdf.encode(), etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True))
-    digests: dict[str, str] = {}
     for mesh in root.iter("mesh"):
         name = mesh.get("filename", "")
         try:
-            digests[name] = digests.get(name) or digest(Path(name).read_bytes())
+            mesh.set("filename", digest(Path(name).read_bytes()))
         except OSError as error:
-            raise RobotError(
-                f"{name}: cannot be read: {error.strerror}; restore the mesh, or load the robot again"
-            ) from None
-        mesh.set("filename", digests[name])
+            raise RobotError(f"{error}; restore the mesh, or load the robot again") from None
     return etree.tostring(root, method="c14n", with_comments=False).decode()
-
-
-def mesh_problem(path: Path) -> str | None:
-    """Return the reason for which SAPIEN cannot use a mesh file, or None if the check of its format finds none."""
-    check = _CHECKS.get(path.suffix.lower())
-    if check is None:
-        return f"format not among {', '.join(_CHECKS)}"
-    try:
-        with open(path, "rb") as file:
-            data = file.read(SIZE_LIMIT + 1)
-    except OSError as error:
-        return f"cannot be read: {error.strerror}"
-    if data.startswith(LFS_POINTER):
-        return LFS_PROBLEM
-    if not data or len(data) > SIZE_LIMIT:
-        return f"larger than {SIZE_LIMIT >> 20} MiB" if data else "empty"
-    try:
-        return None if check(data) else "damaged or truncated"
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, etree.XMLSyntaxError):
-        return "damaged"
-
-
-def _stl(data: bytes) -> bool:
-    """84 bytes with the number of triangles and 50 for each; or text, to its last keyword."""
-    count = int.from_bytes(data[80:84], "little")
-    if count and len(data) == 84 + 50 * count:
-        return bool((np.abs(np.frombuffer(data, _TRIANGLE, offset=84)["corners"]) <= LARGEST).all())
-    return data.lstrip().startswith(b"solid") and b"facet" in data and b"endsolid" in data[-1024:]
-
-
-def _obj(data: bytes) -> bool:
-    """Three vertices and a face, of numbers, and no face of other vertices."""
-    vertices, faces = (re.findall(rb"^[ \t]*%b[ \t](.*)$" % kind, data, re.M) for kind in (b"v", b"f"))
-    corners = _numbers(b" ".join(vertices))
-    indices = _numbers(re.sub(rb"/\S*", b"", b" ".join(faces)))
-    inside = (indices != 0) & (np.abs(indices) <= len(vertices))
-    return len(vertices) >= 3 and len(indices) >= 3 and bool((np.abs(corners) <= LARGEST).all() and inside.all())
-
-
-def _numbers(text: bytes) -> NDArray[np.float64]:
-    """Return the numbers in ``text``, separated by blanks. Raises ValueError if there is anything else."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # NumPy's report of a word that is not a number
-        try:
-            return np.fromstring(text.decode("ascii"), sep=" ")
-        except DeprecationWarning as error:
-            raise ValueError(str(error)) from error
-
-
-def _dae(data: bytes) -> bool:
-    """Well-formed, with faces, as many coordinates as it says, and no count beyond them."""
-    root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True))
-    geometry = "{*}library_geometries//{*}"
-    arrays, accessors = root.findall(geometry + "float_array"), root.findall(geometry + "accessor")
-    faces = [face for kind in ("triangles", "polylist", "polygons") for face in root.findall(geometry + kind)]
-    sizes = {"#" + array.attrib["id"]: len((array.text or "").split()) for array in arrays}
-    complete = all(int(array.attrib["count"]) == sizes["#" + array.attrib["id"]] for array in arrays)
-    ends = [int(each.attrib["count"]) * int(each.get("stride", 1)) + int(each.get("offset", 0)) for each in accessors]
-    inside = all(0 <= end <= sizes[each.attrib["source"]] for end, each in zip(ends, accessors, strict=True))
-    counted = all(0 < int(face.attrib["count"]) <= len(data) for face in faces)
-    counted &= all("".join((index.text or "").split()).isdigit() for face in faces for index in face.iter("{*}p"))
-    return bool(arrays and faces) and complete and inside and counted
-
-
-def _glb(data: bytes) -> bool:
-    """Header and chunks within the file; meshes; no other file. glTF 2.0 specification, section 4."""
-    words = np.frombuffer(data[:20], "<u4")
-    size, end = int(words[2]), 20 + int(words[3])
-    if data[:4] != b"glTF" or words[1] != 2 or size > len(data) or end > size or data[16:20] != b"JSON":
-        return False
-    content = json.loads(data[20:end])
-    inside = all(buffer.get("uri", "data:").startswith("data:") for buffer in content.get("buffers", []))
-    binary = end == size or end + 8 + int.from_bytes(data[end : end + 4], "little") <= size
-    return bool(content["meshes"]) and inside and binary
-
-
-_CHECKS: dict[str, Callable[[bytes], bool]] = {".stl": _stl, ".obj": _obj, ".dae": _dae, ".glb": _glb}

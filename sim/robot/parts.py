@@ -171,16 +171,14 @@ class Urdf:
     """URDF prepared for headless simulation.
 
     ``urdf`` is the text that the simulator parses. ``all_joints`` are in SAPIEN's order: breadth first from the root,
-    fixed joints counted, joints of one parent in the order of the file. ``missing_meshes`` names the collision meshes
-    that were not found or cannot be read, the latter with the reason. ``repairs`` are findings, one for each change
-    that the simulator needs.
+    fixed joints counted, joints of one parent in the order of the file. ``repairs`` are findings, one
+    for each change that the simulator needs.
     """
 
     name: str
     urdf: str
     all_joints: tuple[Joint, ...]
     links: tuple[Link, ...]
-    missing_meshes: tuple[str, ...]
     repairs: tuple[Finding, ...]
 
 

@@ -10,9 +10,7 @@ brackets are the most extreme figures of the 66 robots of example-robot-data 6.0
 - its radius of gyration exceeds twice L and twice its size (0.6);
 - a joint bears more than a mass of 1000 L^3 kg at the distance L (10 L^3), by gravity or by inertia;
 - a limit or mimic offset of a hinge is from 4 pi to 1000 rad (10 rad), or an angle of an <origin> is beyond 2 pi (4.7
-  rad), as if degrees were read as radians;
-- the velocity limit of a hinge with limits is a multiple of 5 rad/s from 60 to 1000 rad/s, but neither 100 nor 1000
-  (others have up to 60 rad/s), and it has no effort limit, or a power of at least 1 kW.
+  rad), as if degrees were read as radians.
 
 Mass and inertia are not checked for a fixed base and for links with less than a hundredth of the total mass: sensors,
 frames and stands often have arbitrary figures.
@@ -28,7 +26,6 @@ from lxml import etree
 
 from batchpid.sim.robot.description import POSES, RobotDescription
 from batchpid.sim.robot.findings import Finding, finding_of
-from batchpid.sim.robot.parts import Joint
 from batchpid.sim.robot.xml import numbers
 from batchpid.task_space.rigid_tree import GRAVITY
 
@@ -49,20 +46,17 @@ FARTHEST, PLACEHOLDER = 4 * np.pi, 1000.0
 """Bounds between which limits of a hinge are taken for degrees [rad]; larger ones mean "no limit"."""
 TURN = 2 * np.pi + 0.01
 """Bound of an angle of an origin [rad]."""
-FASTEST, POWER = 60.0, 1000.0
-"""Velocity [rad/s] and power [W] from which a round velocity limit is taken for degrees per second."""
 
 _UNITS = "give sizes in metres, meshes in millimetres with <mesh scale='0.001 0.001 0.001'>"
 
 
 def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
     """Yield a finding for each implausible size, mass, inertia, load and angle."""
-    masses, (reach, next_joint, fixed) = robot.link_masses, _distances(robot)
+    masses, (reach, next_joint) = robot.link_masses, _distances(robot)
     length = max(reach, SHORT)
-    sizes = {name: mass.size for name, mass in masses.items() if mass.size > 0}
-    by_shapes = [name for name, mass in masses.items() if mass.source == "shapes"]
     total = sum(mass.mass for mass in masses.values())
     of_reach = f"the robot's chain of joints is {reach:.3g} m long"
+    sizes = {name: mass.size for name, mass in masses.items() if mass.size > 0}
     for name, size in sizes.items():
         if size > LARGEST * length:
             text = f"no robot has such large collision shapes: {of_reach}"
@@ -70,87 +64,64 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
     if sizes and max(sizes.values()) < SMALLEST * reach:
         text = f"no robot has such small collision shapes, at most {max(sizes.values()):.2g} m: {of_reach}"
         yield Finding("warning", "scale", text, "correct <mesh scale=>; the meshes may be in metres already")
+    root = robot.bodies[robot.all_joints[0].parent_link].link
     for name, mass in masses.items():
-        size, at_rest = max(mass.size, next_joint[name]), robot.fixed_base and name in fixed
+        at_rest = robot.fixed_base and robot.bodies[name].link == root
         if mass.source in ("shapes", "none") or mass.mass < JUDGED * total or at_rest:
             continue
+        size = max(mass.size, next_joint[name])
         if mass.size > 0 and not SPARSEST <= mass.mass / size**3 <= DENSEST:
             kind = "light" if mass.mass < SPARSEST * size**3 else "heavy"
-            remedy = "give <mass> in kg and <collision> in metres"
-            detail = f"{mass.mass:.3g} kg over {size:.3g} m"
-            yield Finding("warning", "mass", f"no link of such a size is so {kind}", remedy, link=name, detail=detail)
+            text, remedy = f"no link of such a size is so {kind}", "give <mass> in kg and <collision> in metres"
+            yield Finding("warning", "mass", text, remedy, link=name, detail=f"{mass.mass:.3g} kg over {size:.3g} m")
         if mass.gyration > GYRATION * max(length, size):
             text = f"no link has so much inertia for its mass: its radius of gyration exceeds the robot, {of_reach}"
             remedy, detail = "give <inertia> in kg m^2, about the centre of mass", f"{mass.gyration:.3g} m"
             yield Finding("warning", "inertia", text, remedy, link=name, detail=detail)
-    yield from _loads(robot, max(reach, 1.0), bool(by_shapes))
-    for joint in robot.all_joints:
-        yield from _degrees(joint)
-    yield from _turned(robot)
+    yield from _loads(robot, max(reach, 1.0))
+    yield from _degrees(robot)
 
 
-def _loads(robot: RobotDescription, length: float, by_shapes: bool) -> Iterator[Finding]:
+def _loads(robot: RobotDescription, length: float) -> Iterator[Finding]:
     """Yield a finding for each joint with a load beyond the weight of any robot of this ``length`` [m]."""
     poses = robot.sample(POSES, seed=0)
     gravity = np.abs(robot.holding_efforts(poses)).max(0)
     inertia = np.diagonal(robot.mass_matrix(poses), axis1=1, axis2=2).max(0)
-    for joint, force, moved in zip(robot.joints, gravity, inertia, strict=True):
-        arm = 1.0 if joint.type == "prismatic" else length
-        if max(force / (-GRAVITY[2] * arm), moved / arm**2) <= LOAD * length**3:
-            continue
-        unit = "kg" if joint.type == "prismatic" else "kg m^2"
+    arms = np.where([joint.type == "prismatic" for joint in robot.joints], 1.0, length)
+    for at in np.flatnonzero(np.maximum(gravity / (-GRAVITY[2] * arms), inertia / arms**2) > LOAD * length**3):
         text = f"no robot whose chain of joints is up to {length:.3g} m long has such a load"
-        remedy = "correct <mass> and <inertia>"
-        if by_shapes:
-            text += ", here from the size of collision shapes"
-            remedy = f"add <inertial> to links without, or {_UNITS}"
-        detail = f"gravity {force:.3g} {joint.effort_unit}, inertia {moved:.3g} {unit}"
-        yield Finding("warning", "load", text, remedy, joint.name, detail=detail)
+        remedy = f"correct <mass> and <inertia>; for links without, {_UNITS}"
+        detail = f"gravity {gravity[at]:.3g} {robot.joints[at].effort_unit}, inertia {inertia[at]:.3g}"
+        yield Finding("warning", "load", text, remedy, robot.joint_names[at], detail=detail)
 
 
-def _degrees(joint: Joint) -> Iterator[Finding]:
-    """Yield a finding for limits, a mimic offset or a velocity that look like degrees."""
-    if joint.type not in ("revolute", "continuous"):
-        return
-    angles = {name: getattr(joint, name) for name in ("lower", "upper", "soft_lower", "soft_upper")}
-    angles["mimic offset"] = 0.0 if joint.mimic is None else joint.mimic.offset
-    found = [f"{name} {angle:g} rad" for name, angle in angles.items() if FARTHEST < abs(angle) <= PLACEHOLDER]
-    speed = joint.velocity_limit
-    if found:
-        text = "angles of many turns, as if degrees were read as radians"
-        remedy = "give radians, and velocities in rad/s"
-        found += [f"velocity {speed:g} rad/s"] if np.isfinite(speed) else []
-        yield Finding("warning", "degrees", text, remedy, joint.name, detail=", ".join(found))
-        return
-    is_round = speed % 5 == 0 and speed not in (100.0, 1000.0)
-    if joint.type == "revolute" and FASTEST <= speed <= 1000 and is_round and speed * joint.effort_limit >= POWER:
-        text = "such a velocity limit is usually one in degrees per second"
-        yield Finding("note", "degrees", text, "give <limit velocity=> in rad/s", joint.name, detail=f"{speed:g} rad/s")
-
-
-def _turned(robot: RobotDescription) -> Iterator[Finding]:
-    """Yield a finding for each origin with an angle of more than a turn."""
+def _degrees(robot: RobotDescription) -> Iterator[Finding]:
+    """Yield a finding for limits and mimic offsets of a hinge, and for angles of an origin, that look like degrees."""
+    for joint in robot.all_joints:
+        angles = {name: getattr(joint, name) for name in ("lower", "upper", "soft_lower", "soft_upper")}
+        angles["mimic offset"] = 0.0 if joint.mimic is None else joint.mimic.offset
+        large = [f"{name} {angle:g} rad" for name, angle in angles.items() if FARTHEST < abs(angle) <= PLACEHOLDER]
+        if large and joint.unit == "rad":
+            text = "angles of many turns, as if degrees were read as radians"
+            remedy = "give radians, and velocities in rad/s"
+            yield Finding("warning", "degrees", text, remedy, joint.name, detail=", ".join(large))
     for origin in etree.fromstring(robot.urdf.encode()).iter("origin"):
-        angles = numbers(origin, "rpy", "0 0 0", robot.name)
-        if max(map(abs, angles)) > TURN:
+        if max(map(abs, numbers(origin, "rpy", "0 0 0", robot.name))) > TURN:
             text = "roll, pitch or yaw of more than a turn, as if degrees were read as radians"
-            detail = f"<{origin.getparent().tag}> rpy {' '.join(f'{angle:g}' for angle in angles)}"
+            detail = f"<{origin.getparent().tag}> rpy {origin.get('rpy')}"
             yield finding_of(origin, "warning", "degrees", text, "give <origin rpy=> in radians", detail)
 
 
-def _distances(robot: RobotDescription) -> tuple[float, dict[str, float], set[str]]:
-    """Return the length [m] of the longest chain of joints, slides extended; of each link the distance [m] to its
-    farthest joint; and the links that are fixed to the root.
+def _distances(robot: RobotDescription) -> tuple[float, dict[str, float]]:
+    """Return the length [m] of the longest chain of joints, slides extended, and of each link the distance [m] to its
+    farthest joint.
     """
     depth: dict[str, float] = defaultdict(float)
     farthest: dict[str, float] = defaultdict(float)
-    fixed = {link.name for link in robot.links} - {joint.child_link for joint in robot.all_joints}
     for joint in robot.all_joints:  # parents first
-        if joint.parent_link in fixed and not joint.moves:
-            fixed.add(joint.child_link)
         offset = float(np.linalg.norm(joint.origin))
         ends = (joint.lower, joint.upper) if joint.type == "prismatic" else ()
         travel = max((abs(end) for end in ends if np.isfinite(end)), default=0.0)
         depth[joint.child_link] = depth[joint.parent_link] + offset + travel
         farthest[joint.parent_link] = max(farthest[joint.parent_link], offset)
-    return max(depth.values(), default=0.0), farthest, fixed
+    return max(depth.values(), default=0.0), farthest

@@ -20,7 +20,6 @@ from batchpid.sim.robot.findings import SEVERITIES, Finding, Findings
 from batchpid.sim.robot.joint_repair import GIVE_RANGE
 from batchpid.sim.robot.link_repair import DENSITY
 from batchpid.sim.robot.loop_stability import implicit_remedy, slow_oscillation, stability_report
-from batchpid.sim.robot.parts import DISSIPATION, Joint
 from batchpid.sim.robot.plausibility import implausible_figures
 
 EXCESS = 0.01  # of the triangle inequality of principal moments, above which it is reported; less is rounding
@@ -41,17 +40,8 @@ def check(
     choice("control", control, ("pid", "drive", "effort"))
     names = robot.joint_names
     start = robot.start if qpos is None else within("qpos", array("qpos", qpos, (1, robot.dof), names), 1e6, names)[0]
-    findings = [
-        *implausible_figures(robot),
-        *robot.repairs,
-        *robot.srdf.findings,
-        *_links(robot),
-        *_robot(robot, start),
-        *_poses(robot, "start pose", start),
-    ]
-    for joint in robot.joints:
-        findings += _joint(joint, robot)
-    findings += _strength(robot)
+    findings = [*implausible_figures(robot), *robot.repairs, *robot.srdf.findings, *_links(robot)]
+    findings += [*_contacts(robot, start), *_poses(robot, "start pose", start), *_joints(robot), *_strength(robot)]
     if setpoint is not None:
         findings += _poses(robot, "setpoint", array("setpoint", setpoint, (1, robot.dof), names)[0])
     if params is not None:
@@ -66,43 +56,38 @@ def check(
 
 
 def _links(robot: RobotDescription) -> Iterator[Finding]:
-    carriers = {joint.child_link: joint for joint in robot.all_joints}
-    bodies = {link.name: robot.bodies[link.name].link for link in robot.links}
+    """Yield the links with an odd inertia tensor, or without mass or inertia of their own."""
+    bodies = {name: at.link for name, at in robot.bodies.items()}
+    root = bodies[robot.all_joints[0].parent_link]
     solid = {bodies[link.name] for link in robot.links if link.inertial or link.num_shapes}
     loaded = set(solid)  # bodies with mass in them or in the links that they carry
     for joint in reversed(robot.all_joints):
         if bodies[joint.child_link] in loaded:
             loaded.add(bodies[joint.parent_link])
     for link in robot.links:
+        name, body = link.name, bodies[link.name]
         if link.triangle_excess > EXCESS:
             text = "no body has such an inertia tensor, a moment above the sum of the others: simulated as given"
             detail = f"by {100 * link.triangle_excess:.0f} %"
-            yield Finding("note", "inertia", text, "correct <inertia>", link=link.name, detail=detail)
-        if link.inertial or (robot.fixed_base and bodies[link.name] not in carriers):
+            yield Finding("note", "inertia", text, "correct <inertia>", link=name, detail=detail)
+        if link.inertial or (robot.fixed_base and body == root):
             continue
-        if not link.num_shapes and (link.name != bodies[link.name] or link.name in solid):
-            continue  # adds nothing to its body
-        fixed = link.name in carriers and not carriers[link.name].moves
+        severity, detail = "warning" if name == body else "note", ""
         if link.num_shapes:
             effect = f"mass and inertia are those of the collision shapes, at {DENSITY:g} kg/m^3"
-        elif fixed:
-            effect = "it becomes a link of 1e-6 kg, which costs time in every step"
-        elif bodies[link.name] in loaded:
-            effect = "it becomes a link of 1e-6 kg; only the links that it carries have mass"
+            detail = f"{robot.link_masses[name].mass:.3g} kg"
+        elif name != body or body in solid:
+            continue  # adds nothing to its body
+        elif body in loaded:
+            severity, effect = "note", "it becomes a link of 1e-6 kg; only the links that it carries have mass"
         else:
             effect = "it becomes a link of 1e-6 kg, without load: gains per unit of effort cannot control it"
-        light = not link.num_shapes and bodies[link.name] in loaded
-        severity, text = "note" if fixed or light else "warning", f"no <inertial>: {effect}"
-        detail = f"{robot.link_masses[link.name].mass:.3g} kg" if link.num_shapes else ""
-        yield Finding(
-            severity, "no-inertia", text, "add <inertial> with mass and inertia", link=link.name, detail=detail
-        )
+        remedy = "add <inertial> with mass and inertia"
+        yield Finding(severity, "no-inertia", f"no <inertial>: {effect}", remedy, link=name, detail=detail)
 
 
-def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Finding]:
-    if not robot.fixed_base:
-        text = "gravity compensation carries the links as if the base were held; the law has to carry the base"
-        yield Finding("note", "floating-base", text, "use designed gains, which count the load of the base")
+def _contacts(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Finding]:
+    """Yield what is odd about contacts at the start pose."""
     if left_over := robot.self_contact.left_over:
         text = f"{len(left_over)} pairs that should not collide do, since PhysX's filter cannot hold them all"
         yield Finding("note", "pairs-left-over", text, "disable fewer pairs in the .srdf")
@@ -118,113 +103,89 @@ def _robot(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Find
 
 
 def _poses(robot: RobotDescription, what: str, qpos: NDArray[np.float64]) -> Iterator[Finding]:
-    effect = "SAPIEN snaps it back" if what == "start pose" else "out of reach"
     for _, index, value in robot.limit_violations(qpos):
         joint = robot.joints[index]
-        text, detail = f"{what} outside the limits: {effect}", f"{value:g} {joint.unit}, limits {_range(joint)}"
-        yield Finding("warning", "out-of-limits", text, "move it inside", joint.name, detail=detail)
+        detail = f"{value:g} {joint.unit}, limits [{joint.lower:g}, {joint.upper:g}]"
+        yield Finding(
+            "warning", "out-of-limits", f"{what} outside the limits", "move it inside", joint.name, None, detail
+        )
 
 
-def _joint(joint: Joint, robot: RobotDescription) -> Iterator[Finding]:
-    def found(severity: str, code: str, text: str, remedy: str, detail: str = "") -> Finding:
-        return Finding(severity, code, text, remedy, joint.name, detail=detail)
-
-    dissipation = DISSIPATION[robot.dissipation]
-    friction = f"{joint.friction:g} {joint.effort_unit}"
-    if dissipation.modelled and joint.friction >= joint.effort_limit > 0:
-        text, detail = "friction is not below the effort limit: no motion", f"{friction}, limit {joint.effort_limit:g}"
-        yield found("warning", "friction", text, "correct <dynamics friction=> or <limit effort=>", detail)
-    if not dissipation.modelled and joint.friction != dissipation.joint_friction:
-        text = f"friction of the URDF is replaced by SAPIEN's default {dissipation.joint_friction:g}"
-        yield found("note", "friction", text, "load with dissipation='urdf' to keep it", friction)
-    if (mimic := joint.mimic) is not None:
-        text = "mimics another joint, one degree of freedom with it: its own setpoints and gains have no effect"
-        offset = f" {mimic.offset:+g} {joint.unit}" if mimic.offset else ""
-        yield found("note", "mimic", text, "command the leader", f"{mimic.multiplier:g} x {mimic.joint!r}{offset}")
-    if joint.continuous:
-        remedy = "build params with robot.params(), which takes errors and rates the short way round"
-        yield found("note", "continuous", "position wraps: qpos jumps by whole turns", remedy)
-    if joint.lower == joint.upper:
-        remedy = "give <limit lower= upper=>, or make it fixed"
-        yield found("warning", "no-range", "limits without range: no motion", remedy, _range(joint))
-    elif not joint.continuous and math.isinf(joint.upper - joint.lower):
-        repaired = any(each.joint == joint.name and each.remedy == GIVE_RANGE for each in robot.repairs)
-        if not repaired:  # which says the same
-            yield found("note", "no-limits", "no position limits", f"{GIVE_RANGE}, so that setpoints can be checked")
-    if math.isinf(joint.effort_limit) and joint.mimic is None:
-        limit = f"{robot.design_effort_limit[robot.joints.index(joint)]:.3g} {joint.effort_unit}"
-        text = "no effort limit: designed and tuned gains stay within these, from gravity and inertia"
-        remedy = "give <limit effort=>, or pass effort_limit= to robot.params()"
-        yield found("note", "no-effort-limit", text, remedy, limit)
-
-
-def _range(joint: Joint) -> str:
-    return f"[{joint.lower:g}, {joint.upper:g}]"
+def _joints(robot: RobotDescription) -> Iterator[Finding]:
+    ranged = {each.joint for each in robot.repairs if each.remedy == GIVE_RANGE}  # their repairs say so
+    for joint, friction, suggested in zip(robot.joints, robot.friction, robot.design_effort_limit, strict=True):
+        name, mimic = joint.name, joint.mimic
+        if friction >= joint.effort_limit > 0:
+            text, remedy = "friction is not below the effort limit: no motion", "correct one of them"
+            detail = f"{friction:g} {joint.effort_unit}, limit {joint.effort_limit:g}"
+            yield Finding("warning", "friction", text, remedy, name, detail=detail)
+        if mimic is not None:
+            text = "mimics another joint, one degree of freedom with it: its own setpoints and gains have no effect"
+            detail = f"{mimic.multiplier:g} x {mimic.joint!r}"
+            yield Finding("note", "mimic", text, "command the leader", name, detail=detail)
+        if joint.continuous:
+            remedy = "build params with robot.params(), which takes errors and rates the short way round"
+            yield Finding("note", "continuous", "position wraps: qpos jumps by whole turns", remedy, name)
+        elif joint.lower == joint.upper:
+            remedy, detail = "give <limit lower= upper=>, or make it fixed", f"[{joint.lower:g}, {joint.upper:g}]"
+            yield Finding("warning", "no-range", "limits without range: no motion", remedy, name, detail=detail)
+        elif math.isinf(joint.upper - joint.lower) and name not in ranged:
+            remedy = f"{GIVE_RANGE}, so that setpoints can be checked"
+            yield Finding("note", "no-limits", "no position limits", remedy, name)
+        if math.isinf(joint.effort_limit) and mimic is None:
+            text = "no effort limit: designed and tuned gains stay within these, from gravity and inertia"
+            remedy = "give <limit effort=>, or pass effort_limit= to robot.params()"
+            detail = f"{suggested:.3g} {joint.effort_unit}"
+            yield Finding("note", "no-effort-limit", text, remedy, name, detail=detail)
 
 
 def _strength(robot: RobotDescription) -> Iterator[Finding]:
     """Yield the joints whose effort limit does not overcome gravity and friction in every pose."""
     load = np.abs(robot.holding_efforts(robot.sample(POSES, seed=0)))
-    needed = load + robot.friction
-    for index, (joint, limit) in enumerate(zip(robot.joints, robot.effort_limit, strict=True)):
-        share = float(np.mean(needed[:, index] >= limit))
-        if share == 0 or limit <= robot.friction[index]:
-            continue
-        friction = f", friction {joint.friction:g}" if robot.friction[index] else ""
-        gravity = f"gravity up to {load[:, index].max():.3g}{friction}, {100 * share:.0f} % of poses"
+    share = (load + robot.friction >= robot.effort_limit).mean(0)
+    for at in np.flatnonzero((share > 0) & (robot.effort_limit > robot.friction)):
+        joint = robot.joints[at]
         text = "effort limit does not overcome gravity and friction in every pose: some cannot be held or left"
-        remedy, detail = (
-            "expect no moves there, or correct <limit effort=>",
-            f"{limit:g} {joint.effort_unit}, {gravity}",
-        )
+        remedy = "expect no moves there, or correct <limit effort=>"
+        needs = f"gravity up to {load[:, at].max():.3g}, friction {joint.friction:g}, {100 * share[at]:.0f} % of poses"
+        detail = f"{joint.effort_limit:g} {joint.effort_unit}, {needs}"
         yield Finding("warning", "weak", text, remedy, joint.name, detail=detail)
 
 
 def _stability(
     robot: RobotDescription, params: bp.PIDParams, start: NDArray[np.float64], timestep: float
 ) -> Iterator[Finding]:
-    report = stability_report(robot, params, start, timestep, actuators=robot.actuators)
+    report = stability_report(robot, params, start, timestep, robot.actuators)
     if report.robot_ratio < 1:
         yield from _ringing(robot, params, start, timestep, report.env)
     if report.robot_ratio < NEAR_BOUND:
         return
     if params.discretization is not None:
-        text = (
-            f"the implicit law diverges where the model has {1 / report.robot_ratio:.3g} times the inertia of the "
-            "robot, or more"
-        )
+        inertia = f"{1 / report.robot_ratio:.3g} times the inertia of the robot"
+        text = f"the implicit law diverges where the model has {inertia}, or more"
         yield Finding("note", "near-unstable", text, "lower its kp and kd if the model may be as far off")
         return
-    unstable = report.robot_ratio >= 1
-    severity, code = ("warning", "unstable") if unstable else ("note", "near-unstable")
-    diverges = "it oscillates or diverges" if report.late else "it diverges, alternating from step to step"
-    effect = diverges if unstable else "it may diverge in other poses"
-    joint = robot.joint_names[int(np.argmax(report.participation))]
-    text = (
-        f"the sampled PID loop is at {report.robot_ratio:.3g} times its stability bound, mostly of joint {joint!r}, at "
-        f"the start pose: {effect}"
-    )
+    severity, code, effect = "note", "near-unstable", "it may diverge in other poses"
+    if report.robot_ratio >= 1:
+        severity, code, effect = "warning", "unstable", report.effect
+    joint, ratio = robot.joint_names[int(np.argmax(report.participation))], f"{report.robot_ratio:.3g}"
+    text = f"the sampled PID loop is at {ratio} times its stability bound, mostly of joint {joint!r}, at the start pose"
     other = "" if report.late else implicit_remedy(params)
-    remedy = f"{report.remedy}, a derivative_filter_time, {other}or gain_units='mass_matrix'"
-    yield Finding(severity, code, text, remedy)
+    yield Finding(severity, code, f"{text}: {effect}", f"{report.remedy}, {other}or robot.designed()")
 
 
 def _ringing(
     robot: RobotDescription, params: bp.PIDParams, start: NDArray[np.float64], timestep: float, env: int
 ) -> Iterator[Finding]:
-    found = slow_oscillation(robot, params, start, timestep, env)
-    zeta = float(found.damping_ratio)
-    if zeta >= RINGING:
-        return
-    left = math.exp(-2 * math.pi * zeta / math.sqrt(1 - zeta**2))
-    text = (
-        f"the PID loop rings at {found.frequency:.2g} Hz with a damping ratio of {zeta:.2g} at the start pose: after "
-        f"each period {100 * left:.0f} % of the amplitude is left"
-    )
-    joint = robot.joint_names[int(np.argmax(found.participation))]
-    yield Finding(
-        "note" if zeta > 0 else "warning", "ringing", text, "raise its kd, lower its ki, or use robot.designed()", joint
-    )
+    slow = slow_oscillation(robot, params, start, timestep, env)
+    zeta = float(slow.damping_ratio)
+    if zeta < RINGING:
+        left = math.exp(-2 * math.pi * zeta / math.sqrt(1 - zeta**2))
+        text = f"the PID loop rings at {slow.frequency:.2g} Hz with a damping ratio of {zeta:.2g} at the start pose"
+        text += f": after each period {100 * left:.0f} % of the amplitude is left"
+        joint = robot.joint_names[int(np.argmax(slow.participation))]
+        severity, remedy = "note" if zeta > 0 else "warning", "raise its kd, lower its ki, or use robot.designed()"
+        yield Finding(severity, "ringing", text, remedy, joint)
 
 
 def _params(robot: RobotDescription, params: bp.PIDParams, control: str) -> Iterator[Finding]:

@@ -115,8 +115,6 @@ class Robot(RobotDescription):
         if free_joint is not None and not fixed_base:
             base = free_base(root, free_joint, repairs)
         urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
-        if mjcf is not None:
-            urdf = replace(urdf, missing_meshes=(*mjcf.missing_meshes, *urdf.missing_meshes))
         if not any(joint.moves for joint in urdf.all_joints):
             raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
         # From here on links mean bodies: those that fixed joints hold together are one.

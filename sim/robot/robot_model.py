@@ -15,7 +15,7 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Array, Bool, Float64, Rows
 from batchpid.motors.coupling import Coupling
 from batchpid.sim.robot.collision_shapes import link_shapes
-from batchpid.sim.robot.contacts import Contacts, Near
+from batchpid.sim.robot.contacts import Contacts
 from batchpid.task_space.frames import matrix_of
 from batchpid.task_space.rigid_tree import RigidTree
 
@@ -77,7 +77,7 @@ class RobotModel:
             local = matrix_of(pose[3:]).T @ (point - pose[:3])
             return np.asarray(ts.jacobian(tree, joints, link, point=local)), of_base
 
-        feet = [jacobians(link, point) for link, point in self._contacts.feet(joints)]
+        feet = [jacobians(link, point) for link, point in self.contacts.feet(joints)]
         follow = np.zeros((6, tree.dof))
         if feet:
             of_joints, of_base = (np.concatenate([each[:3] for each in part]) for part in zip(*feet, strict=True))
@@ -97,7 +97,8 @@ class RobotModel:
         return replace(self.tree, coupling=self._coupling)
 
     @cached_property
-    def _contacts(self) -> Contacts:
+    def contacts(self) -> Contacts:
+        """Distances of the links to each other and to the ground."""
         return Contacts(self.tree, link_shapes(self._urdf), self._ignored, self._ground)
 
     def in_contact(self, qpos: Rows, clearance: float = 0.0) -> Bool:
@@ -105,25 +106,7 @@ class RobotModel:
 
         Links that a fixed joint connects may touch, and the base and the links fixed to it may touch the ground.
         """
-        return self._contacts.in_contact(qpos, clearance)
-
-    def near(self, qpos: Rows, within: float) -> list[Near]:
-        """Return the pairs of shapes closer than ``within`` [m] to each other or to the ground, at one pose (dof,)."""
-        return list(self._contacts.near(qpos, within))
-
-    def nearest_links(self, qpos: Rows) -> tuple[str, ...]:
-        """Return the two links of the URDF that are nearest to each other, or overlap most, at one pose (dof,).
-
-        One link if the other is the ground; no link if none are near each other.
-        """
-        return self._contacts.nearest_links(qpos)
-
-    def height(self, qpos: Rows, base_too: bool = False) -> float:
-        """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes.
-
-        With ``base_too`` the links that are fixed to the base count as well.
-        """
-        return self._contacts.height(qpos, base_too)
+        return self.contacts.in_contact(qpos, clearance)
 
 
 def base_start(robot: Any, qpos: Float64, ground: bool) -> Float64:
@@ -134,11 +117,11 @@ def base_start(robot: Any, qpos: Float64, ground: bool) -> Float64:
     and otherwise not below.
     """
     pose, model = np.array(robot.base_start or (0, 0, 0, 1, 0, 0, 0), np.float64), robot.dynamics()
-    height = model.height(np.nan_to_num(qpos), base_too=True)
+    height = model.contacts.height(np.nan_to_num(qpos), base_too=True)
     if not np.isfinite(height):
         return pose
     if robot.base_start is not None:
-        lowest = pose[2] + model.height(robot.start, base_too=True)
+        lowest = pose[2] + model.contacts.height(robot.start, base_too=True)
         pose[2] = (max(lowest, 0.0) if ground else lowest) - height
     elif ground:
         pose[2] = -height

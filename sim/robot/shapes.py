@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.robot.meshes import find_mesh, mesh_problem, read_mesh
+from batchpid.sim.robot.meshes import find_mesh, read_mesh
 from batchpid.sim.robot.urdf import is_mjcf
 from batchpid.sim.robot.xml import numbers, parse_xml
 from batchpid.task_space.rotations import from_rpy, rotate
 
 Rgba = tuple[float, ...]
+_REMEDY = "repair the file, put it next to the URDF, or pass package_dirs=[...] to Robot.load (--package-dirs)"
 
 DEVIATION = 2e-3  # default distance allowed between a chord and its arc [m]
 FEWEST, MOST = 6, 48  # bounds of the number of segments of a circle
@@ -87,7 +88,9 @@ def surfaces(
                 break
         if findings is not None:
             shown = "collision shapes are drawn instead" if parts else "it is not drawn"
-            findings += [error.finding(name, shown) for error in unreadable]
+            for mesh, reason in (error.args for error in unreadable):
+                text = f"mesh cannot be read ({reason}): {shown}"
+                findings.append(Finding("warning", "visual-mesh", text, _REMEDY, link=name, detail=repr(mesh)))
         for rgba, same in parts.items():
             joined: Any = concatenate(same)
             result.append(Surface(name, rgba, np.asarray(joined.vertices), np.asarray(joined.faces)))
@@ -123,31 +126,20 @@ def segments_of(radius: float, deviation: float) -> int:
 
 
 class _UnreadableMesh(Exception):
-    """Mesh file that is not found or cannot be read: its name, the reason, and the remedy."""
-
-    def __init__(self, name: str, reason: str, remedy: str) -> None:
-        super().__init__(name, reason, remedy)
-        self.name, self.reason, self.remedy = name, reason, remedy
-
-    def finding(self, link: str, shown: str) -> Finding:
-        """Return the finding for a ``link``; ``shown`` names the shapes drawn instead."""
-        text = f"mesh {self.reason}: {shown}"
-        return Finding("warning", "visual-mesh", text, self.remedy, link=link, detail=repr(self.name))
+    """Mesh file that is not found or cannot be read: its name and the reason."""
 
 
 def _read_mesh(name: str, robot: RobotDescription) -> Any:
     """Return the result of ``trimesh`` for a mesh file of the robot, in metres. Raises _UnreadableMesh."""
     path = find_mesh(name, robot.path, robot.package_dirs)
     if path is None:
-        remedy = "put the file next to the URDF, or pass package_dirs=[...] to Robot.load (--package-dirs)"
-        raise _UnreadableMesh(name, "not found", remedy)
-    problem = "no triangles"
+        raise _UnreadableMesh(name, "not found")
     try:
         loaded = read_mesh(path)
     except Exception as error:
-        loaded, problem = None, f"{type(error).__name__}: {error}"
-    if loaded is None or not len(loaded.faces):
-        raise _UnreadableMesh(name, f"cannot be read ({mesh_problem(path) or problem})", "repair the file")
+        raise _UnreadableMesh(name, f"{type(error).__name__}: {error}") from error
+    if not len(loaded.faces):
+        raise _UnreadableMesh(name, "no triangles")
     return loaded
 
 

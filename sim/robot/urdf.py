@@ -96,7 +96,7 @@ def read_urdf(
         A structure or number that SAPIEN cannot build, or a bad mesh.
     """
     repairs = list(repairs)
-    missing = repair_urdf(root, path, repairs, package_dirs, missing_meshes)
+    repair_urdf(root, path, repairs, package_dirs, missing_meshes)
     joints = [_read_joint(element, path) for element in root.findall("joint")]
     links = [_read_link(element, path) for element in root.findall("link")]
     added = [str(finding.link) for finding in repairs if finding.code == "missing-link"]
@@ -106,13 +106,13 @@ def read_urdf(
             element.remove(element.find("mimic"))  # batchpid.sim.engine.coupled_joints simulates it
     report(path, repairs, strict)
     text = etree.tostring(root, encoding="unicode")
-    return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(missing), tuple(repairs))
+    return Urdf(root.get("name", path.stem), text, tuple(ordered), tuple(links), tuple(repairs))
 
 
 def repair_urdf(
     root: etree._Element, path: Path, repairs: list[Finding], package_dirs: tuple[Path, ...], missing_meshes: str
-) -> list[str]:
-    """Repair the ``<robot>`` of the file at ``path``, and append the repairs; return its missing meshes. See above."""
+) -> None:
+    """Repair the ``<robot>`` of the file at ``path``, and append the repairs. See above."""
     if root.tag != "robot":
         problem = f"the root element is <{root.tag}>, not <robot> (URDF) or <mujoco> (MJCF)"
         raise RobotError(f"{path}: {problem}; is this a robot's file (not SDF, xacro, a part of an MJCF)?")
@@ -130,7 +130,6 @@ def repair_urdf(
         text = f"collision meshes not found or not readable, simulated without: {', '.join(missing)}"
         remedy = "repair the files, or pass package_dirs=[...] to Robot.load (--package-dirs on the command line)"
         repairs.append(Finding("warning", "missing-mesh", text, remedy))
-    return missing
 
 
 def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, ...]) -> list[str]:

@@ -17,6 +17,7 @@ from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.meshes import find_mesh
 from batchpid.sim.robot.repair import UNUSED
 from batchpid.sim.robot.urdf import read_source, read_urdf, repair_urdf
+from batchpid.task_space.rigid_tree import RigidTree
 
 
 def to_urdf(
@@ -34,7 +35,8 @@ def to_urdf(
     folder
         Of the new file: paths of meshes are relative to it. Default: absolute paths.
     mass_factors
-        Factors of the masses and inertia tensors of some links.
+        Factors of the masses and inertia tensors of rigid bodies, each by the name of one of its links. The links that
+        fixed joints connect keep their shares.
 
     Raises
     ------
@@ -52,7 +54,7 @@ def to_urdf(
     found += _copy_unused(source, root, path, packages)
     found += _lacking(robot)
     for link, factor in (mass_factors or {}).items():
-        _scale_mass(root, link, factor)
+        _scale_masses(root, robot.rigid_tree, link, factor)
     if folder is not None:
         for mesh in root.iter("mesh"):
             if os.path.isabs(name := mesh.get("filename", "")):
@@ -63,13 +65,21 @@ def to_urdf(
     return Exported(f'<?xml version="1.0"?>\n{text}\n', tuple(found))
 
 
-def _scale_mass(root: etree._Element, link: str, factor: float) -> None:
-    """Multiply mass and inertia tensor of a link by ``factor``."""
-    owner = next(each for each in root.findall("link") if each.get("name") == link)
-    for tag in ("mass", "inertia"):
-        for each in owner.iterfind(f"inertial/{tag}"):
-            for key, value in each.attrib.items():
-                each.set(key, repr(factor * float(value)))
+def _scale_masses(root: etree._Element, tree: RigidTree, link: str, factor: float) -> None:
+    """Multiply mass and inertia tensor of each link of a body by ``factor``; those by shapes become numbers."""
+    body = tree.link_bodies[tree.index(link)]
+    for index, name in enumerate(tree.links):
+        if tree.link_bodies[index] != body or not tree.mass[index]:
+            continue
+        owner = next(element for element in root.findall("link") if element.get("name") == name)
+        if (old := owner.find("inertial")) is not None:
+            owner.remove(old)
+        inertial = etree.SubElement(owner, "inertial")
+        etree.SubElement(inertial, "origin", xyz=" ".join(map(repr, tree.center[index].tolist())))
+        etree.SubElement(inertial, "mass", value=repr(factor * float(tree.mass[index])))
+        places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+        tensor = {key: repr(factor * float(tree.inertia[index][place])) for key, place in places.items()}
+        etree.SubElement(inertial, "inertia", **tensor)
 
 
 def _copy_unused(source: etree._Element, root: etree._Element, path: Path, packages: tuple[Path, ...]) -> list[str]:

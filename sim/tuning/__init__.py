@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from batchpid.sim.tuning.gain_sets import GainSet, gain_set
     from batchpid.sim.tuning.moves import Moves, random_moves, search_moves, tutorial_move
     from batchpid.sim.tuning.randomization_files import load_randomization
-    from batchpid.sim.tuning.robot_survey import find_robots, survey
     from batchpid.sim.tuning.search import Tuning, tune
 
 __all__ = [
@@ -33,7 +32,6 @@ __all__ = [
     "Weights",
     "arm_joints",
     "evaluate_gains",
-    "find_robots",
     "following_error",
     "gain_set",
     "load_randomization",
@@ -41,7 +39,6 @@ __all__ = [
     "run_moves",
     "search_moves",
     "step_response_metrics",
-    "survey",
     "tune",
     "tutorial_move",
     "within",
@@ -61,7 +58,6 @@ _MODULES = {
     "gain_sets": ("GainSet", "gain_set"),
     "moves": ("Moves", "random_moves", "search_moves", "tutorial_move"),
     "randomization_files": ("load_randomization",),
-    "robot_survey": ("find_robots", "survey"),
     "search": ("Tuning", "tune"),
 }
 _HOMES = {name: module for module, names in _MODULES.items() for name in names}

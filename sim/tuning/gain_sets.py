@@ -11,14 +11,11 @@ import numpy as np
 import batchpid as bp
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner_keywords import ControlMode
 
 NAMES = ("tuned", "designed", "tutorial", "mjcf", "drive")
 """Names of gain sets; "drive" is "drive:20,5"."""
-_OF_GAINS = ("actuator", "limits")
-"""Codes of findings about an MJCF file that concern its gains."""
 
 
 class GainSet(NamedTuple):
@@ -66,17 +63,13 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
 
 
 def _of_mjcf(path: Path, robot: Robot) -> bp.PIDParams:
-    """Return the gains of the servos in an MJCF file of a robot with the same joints; differences are warnings."""
+    """Return the gains of the servos in an MJCF file of a robot with the same joints."""
     joints = [robot.joint_names[joint] for joint in np.flatnonzero(robot.independent)]
     other = Robot.load(path)
     if missing := sorted(set(joints) - set(other.joint_names)):
         raise InvalidArgumentError("gains", f"{path.name} lacks joints", value=", ".join(missing), remedy="rename them")
     gains = other.mjcf_gains().for_joints([other.joint_names.index(joint) for joint in joints])
-    sentences = summary(finding for finding in other.repairs if finding.code in _OF_GAINS)
-    differences = [sentence.partition(": ")[2] for sentence in sentences]
     if gains.continuous is not None:
         turning = ", ".join(joint for joint, yes in zip(joints, gains.continuous[0], strict=True) if yes)
-        differences.append(f"continuous: errors are taken the short way round, which MuJoCo does not: {turning}")
-    for difference in differences:
-        warn(f"{path}: {difference}", UserWarning)
+        warn(f"{path}: continuous: errors are taken the short way round, which MuJoCo does not: {turning}", UserWarning)
     return gains.for_joints(robot.coupling.of_all(np.arange(len(joints))))

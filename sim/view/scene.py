@@ -49,7 +49,7 @@ class RobotScene:
         self.positions: Float64 = _PITCH * self.reach * (grid - grid.max(0) / 2)
         """Positions of the robots (count, 3) [m]."""
         frames = ts.link_poses(self._tree, robot.start)[:, 2].min()
-        lowest = min(float(frames), robot.dynamics().height(robot.start, base_too=True))
+        lowest = min(float(frames), robot.dynamics().contacts.height(robot.start, base_too=True))
         self.floor = 0.0 if ground else lowest
         """Height of the floor [m]."""
         corner = np.abs(self.positions[0, :2]) + 2.0 * self.reach

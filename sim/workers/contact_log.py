@@ -12,9 +12,6 @@ import numpy as np
 from batchpid.arrays.array_types import Rows
 from batchpid.sim.loop.arrays import Arrays
 
-LISTED = 5
-"""Contacts that a warning lists."""
-
 
 class MissedContactWarning(UserWarning):
     """Robots that are simulated without collisions would have touched something."""
@@ -61,9 +58,7 @@ class MissedContactLog:
 
     def message(self) -> str:
         """Return the text of a warning."""
-        listed, more = list(self.contacts)[:LISTED], len(self.contacts) - LISTED
-        found = "; ".join(map(str, listed)) + (f"; and {more} more" if more > 0 else "")
         return (
-            f"without collisions robots went through what they would have touched: {found}. Use collisions=True, or "
-            "other moves; see runner.missed_contacts for more, of which there is no further warning"
+            f"without collisions robots went through what they would have touched: {self.contacts[0]}. Use "
+            "collisions=True, or other moves; see runner.missed_contacts for more, of which there is no further warning"
         )

@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 from scripts import ROOT, load_script
+from tiny_urdf import one_joint, write
 
 
 @pytest.mark.slow
@@ -35,3 +36,10 @@ def test_draw(tmp_path):
     assert (docs / "performance.md").read_text() == (ROOT / "docs/performance.md").read_text(), "run bench/draw.py"
     assert json.loads((docs / "performance.json").read_text()) == figures
     assert (docs / "images/performance.png").stat().st_size > 10_000
+
+
+def test_a_robot_is_surveyed(tmp_path):
+    survey, path = load_script("survey"), write(tmp_path, one_joint())
+    assert survey.survey(path, "mujoco", 1)[1:3] == ["1", "1 of 1"]
+    path.write_text("<robot name='table'><link name='top'/></robot>")
+    assert "joints" in survey.survey(path, "mujoco", 1)[-1]

@@ -142,7 +142,6 @@ GOOD_PARAMS = {
     "anti_windup": "back_calculation",
     "tracking_time": 0.1,
     "continuous": np.zeros(DOF, bool),
-    "integration": "output_first",
     "measurement_rate": "measured",
     "gain_units": "effort",
     "discretization": "explicit",

@@ -119,14 +119,8 @@ def _load(urdf: str, fixed_base: bool) -> ArticulationBuilder:
 def _in_memory(text: str) -> Iterator[str]:
     """Provide ``text`` under a path, which SAPIEN's loader requires: an in-memory file, gone after the block."""
     with open(os.memfd_create("batchpid-text"), "w", encoding="utf-8") as file:
-        try:
-            file.write(text)
-            file.flush()
-        except OSError as error:
-            size, remedy = len(text), "raise the limit of file sizes (ulimit -f)"
-            raise RobotError(
-                f"the URDF of {size} bytes cannot be kept in memory: {error.strerror}; {remedy}"
-            ) from error
+        file.write(text)
+        file.flush()
         yield f"/proc/self/fd/{file.fileno()}"
 
 
@@ -199,13 +193,12 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
     for link in robot.links:
         link.set_linear_damping(dissipation.link_damping)
         link.set_angular_damping(dissipation.link_damping)
-        link.set_max_linear_velocity(FASTEST)
-        link.set_max_angular_velocity(FASTEST)
+        link.max_linear_velocity = link.max_angular_velocity = FASTEST
     for built, joint in zip(robot.active_joints, spec.joints, strict=True):
         if joint.mimic is not None and not joint.continuous:
             built.set_limits([[joint.lower, joint.upper]])  # the URDF's may keep it from following
         built.set_friction(dissipation.joint_friction)
-        built.set_max_velocity(FASTEST)
+        built.max_velocity = FASTEST
         if dissipation.modelled:
             # SAPIEN implements the URDF's damping as a drive, with an error that depends on the solver; this is exact,
             # with the effort of batchpid.motors.friction.

@@ -45,8 +45,6 @@ class Mjcf(NamedTuple):
     """Start pose by joint [rad or m]: the keyframe "home", else the reference pose."""
     base: tuple[float, ...] | None
     """Start pose (7,) of a floating base, from the same."""
-    missing_meshes: tuple[str, ...]
-    """Collision meshes that the robot is simulated without."""
     findings: tuple[Finding, ...]
     file: MjcfFile
 
@@ -59,7 +57,7 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> M
     """
     findings: list[Finding] = []
     compiled = compile_file(path, fixed_base, missing_meshes, findings)
-    model, missing = compiled.model, compiled.missing
+    model = compiled.model
     names = Names(model)
     tree = Tree(model, names, path, fixed_base, findings)
     mimics = read_couplings(model, names, findings)
@@ -73,7 +71,7 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> M
     at = model.jnt_qposadr[model.body_jntadr[tree.base]] if tree.base and not fixed_base else None
     base = None if at is None else tuple(pose[at : at + 7].tolist())
     file = _file(path, compiled, names, fixed_base)
-    return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, base, missing, tuple(findings), file)
+    return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, base, tuple(findings), file)
 
 
 def home(model: MjModel) -> int | None:

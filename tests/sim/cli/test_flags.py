@@ -19,12 +19,12 @@ from batchpid.sim.cli.outputs import bar
 RUNS_ROBOTS = {"demo", "rollout", "tune", "compare", "view"}
 HAVE = {
     "--gains": {"demo", "rollout", "compare", "identify", "export", "inspect", "view"},
-    "--seconds": {"demo", "rollout", "tune", "compare", "excite", "survey"},
-    "--engine": RUNS_ROBOTS | {"inspect", "survey"},
+    "--seconds": {"demo", "rollout", "tune", "compare", "excite"},
+    "--engine": RUNS_ROBOTS | {"inspect"},
     "--ground": RUNS_ROBOTS,
     "--spread": {"demo", "rollout", "view"},
-    "--json": {"demo", "rollout", "compare", "identify", "inspect", "survey"},
-    "--out": {"rollout", "tune", "excite", "identify", "export", "survey"},
+    "--json": {"demo", "rollout", "compare", "identify", "inspect"},
+    "--out": {"rollout", "tune", "excite", "identify", "export"},
     "--picture": {"demo", "rollout", "tune", "compare", "identify", "plot"},
     "--package-dirs": COMMANDS.keys(),
     "--missing-meshes": COMMANDS.keys(),
@@ -148,7 +148,6 @@ def written(folder: Path) -> set[Path]:
         ("inspect panda2", "'panda2'"),
         ("inspect --gains nothing", "gains: is neither"),
         ("compare arm.urdf --moves 0", "moves: leaves none"),
-        ("survey .", "hold no file *.urdf"),
         ("plot /dev/null", "/dev/null"),
         ("plot .", "."),
         ("view --port 99999", "port: out of range (got 99999)"),
@@ -157,8 +156,7 @@ def written(folder: Path) -> set[Path]:
     ],
 )
 def test_flags_that_contradict_each_other_are_answered_in_one_line(words, message, files, batchpid, monkeypatch):  # noqa: F811
-    if words != "survey .":
-        monkeypatch.chdir(files)
+    monkeypatch.chdir(files)
     before = written(Path())
     status, said, complaint = batchpid(*words.split())
     assert written(Path()) == before

@@ -23,13 +23,12 @@ WORDS = {
     "export": ("export", "arm.urdf"),
     "identify": ("identify", "arm.urdf", "run.h5"),
     "inspect": ("inspect", "arm.urdf"),
-    "survey": ("survey", "arm.urdf"),
     "plot": ("plot", "run.h5"),
 }
 """Words of each command that writes, without its outputs."""
 SUFFIXES = {"picture": ".png", "json": ".json", "out": ".yaml"}
 MJCF = "<mujoco><worldbody><body><joint name='a'/><geom size='.1'/></body></worldbody></mujoco>"
-OUT = {"rollout": ".h5", "excite": ".csv", "export": ".h", "survey": ".md"}
+OUT = {"rollout": ".h5", "excite": ".csv", "export": ".h"}
 
 
 def output_flags() -> list[tuple[str, str]]:

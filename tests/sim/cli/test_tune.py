@@ -49,7 +49,7 @@ def test_tune_writes_the_better_gains_with_settings_and_a_command_that_works(is_
     assert {"sapien", "numpy", "cmaes"} <= about["versions"].keys()
     assert not [name for name, value in about.items() if value in ("True", "False", "None")]
     assert (bp.load_params("gains.yaml")[0].kp == robot.designed().kp).all() or about["gains"] == "tuned"
-    assert (tmp_path / "gains-tune.png").stat().st_size > 10_000
+    assert (tmp_path / "gains-tune.png").stat().st_size > 5_000
     command = shlex.split(said.splitlines()[-1].removeprefix("next: "))
     assert command[:5] == ["batchpid", "rollout", "my arm.urdf", "--gains", "gains.yaml"]
     status, said, error = batchpid(*command[1:], "--num-envs", 1, "--workers", 0, "--seconds", 0.05)
@@ -67,7 +67,7 @@ def test_compare_lists_each_set_and_draws_the_first_two(batchpid, tmp_path):
     rows = {line.split("  ")[0]: line for line in said.splitlines() if " of 2" in line}
     assert rows.keys() == {"tuned", "mine.yaml", "drive (30, 6)"}
     assert "2 / 2 of 2" in rows["tuned"]
-    assert "too slow / too slow" in rows["mine.yaml"]
+    assert "never / never" in rows["mine.yaml"]
     assert picture.stat().st_size > 10_000
 
 

@@ -90,10 +90,8 @@ BAD |= {
     "OBJ of 1e30 m": ("d.obj", obj().replace(b"1.0", b"1e30")),
     "OBJ with a word for a number": ("d.obj", obj().replace(b"1.0", b"one")),
     "OBJ with a face of vertices that it lacks": ("d.obj", obj().replace(b"f 1 3 2", b"f 1 3 9")),
-    "OBJ with vertex 0": ("d.obj", obj().replace(b"f 1 3 2", b"f 0 3 2")),
     "STL named OBJ": ("d.obj", stl()),
     "DAE that claims 16 GB": ("e.dae", dae().replace(b'count="12"', b'count="%d"' % CLAIM)),
-    "DAE of 4 billion triangles": ("e.dae", dae().replace(b'triangles count="4"', b'triangles count="%d"' % CLAIM)),
     "DAE with a negative count": ("e.dae", dae().replace(b'count="12"', b'count="-12"')),
     "DAE without a count": ("e.dae", dae().replace(b'count="12"', b"")),
     "DAE without the source of an accessor": ("e.dae", dae().replace(b'source="#a"', b'source="#b"')),
@@ -117,7 +115,7 @@ def arm(name: str) -> str:
 def test_a_sound_mesh_is_simulated(name, tmp_path):
     (tmp_path / name).write_bytes(GOOD[name])
     loaded = Robot.load(write(tmp_path, arm(name)))
-    assert loaded.missing_meshes == ()
+    assert loaded.repairs == ()
     touching = loaded.dynamics().in_contact(np.array([[0.0], [np.pi]]), clearance=0.01)  # above the ground, and on it
     assert touching.tolist() == [False, True]
 
@@ -181,8 +179,8 @@ def test_an_unreadable_mesh_is_an_error_or_skipped_and_reported(case, tmp_path):
     with pytest.raises(RobotError, match=rf"not readable: {name} \(.*missing_meshes='skip'"):
         Robot.load(path, missing_meshes="error")
     loaded = Robot.load(path)
-    assert loaded.missing_meshes[0].startswith(f"{name} (")
-    assert "missing-mesh" in {finding.code for finding in loaded.check()}
+    (finding,) = (each for each in loaded.check() if each.code == "missing-mesh")
+    assert f"without: {name} (" in finding.text
     with Runner(loaded, 1, workers=0, params=loaded.params(kp=1.0)) as runner:
         assert runner.step([0.0]).ok.all()
 

@@ -103,7 +103,6 @@ def test_a_limit_that_is_not_positive(kind, key, text, limit, tmp_path):
         ('lower="-1.25"', 'lower="-170"', "'hinge' .lower -170 rad"),
         ('upper="1.25"', 'upper="90"', "'hinge' .upper 90 rad"),
         ('soft_upper_limit="0.75"', 'soft_upper_limit="80"', "'hinge' .*soft_upper 80 rad"),
-        ('velocity="2.5"', 'velocity="120"', "'hinge' .120 rad/s.*degrees per second"),
         ('offset="0.25"', 'offset="45"', "'follower' .mimic offset 45 rad"),
         ('rpy="0.125 0.25 0.5"', 'rpy="0 0 90"', "'arm' .*<inertial> rpy 0 0 90"),
     ],

@@ -65,7 +65,7 @@ def found(described: Robot) -> dict[str, str]:
         (
             {"size": 10.0, "by_shapes": True},
             "load",
-            r"gravity .* N m, inertia .*1.2 m long.*collision shapes; add <inertial>",
+            r"gravity .* N m, inertia .*1.2 m long.*correct <mass> and <inertia>; for links without, give sizes",
         ),
         ({"mass": 3000.0}, "mass", r"\(3e\+03 kg over 0.424 m\): no link of such a size is so heavy"),
         ({"mass": 3000.0}, "load", r"'j1' \(gravity .*: no robot .* has such a load; correct <mass>"),

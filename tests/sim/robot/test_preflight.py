@@ -106,12 +106,6 @@ def test_poses_beyond_limits_are_reported_by_joint(panda):
     }
 
 
-def test_options_of_load_that_change_the_physics_are_reported(tmp_path):
-    path = write(tmp_path, one_joint(LIMIT + '<dynamics friction="0.2"/>'))
-    assert "replaced by SAPIEN's default 0.05" in codes(Robot.load(path, dissipation="sapien").check())["friction"].text
-    assert "floating-base" in codes(Robot.load(path, fixed_base=False).check())
-
-
 def test_links_that_overlap_at_the_start_are_reported(tmp_path):
     box = INERTIAL + COLLISION
     text = robot(link("b"), link("l", box), link("r", box), joint("j", "b", "l"), joint("k", "b", "r"))

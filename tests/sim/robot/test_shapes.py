@@ -143,8 +143,8 @@ def test_meshes_that_cannot_be_read_are_reported_with_link_file_and_remedy(tmp_p
     (tmp_path / "empty.stl").write_text("")
     (tmp_path / "box.dae").write_text("<COLLADA/>")
     for name, reason, remedy in (
-        ("lost.stl", "not found", "package_dirs"),
-        ("empty.stl", r"cannot be read \(empty\)", "repair the file"),
+        ("lost.stl", r"\(not found\)", "package_dirs"),
+        ("empty.stl", r"\(no triangles\)", "repair the file"),
         ("box.dae", r"cannot be read \(", "repair the file"),
     ):
         for shape, shown in (
