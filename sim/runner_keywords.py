@@ -229,11 +229,11 @@ class RunnerKeywords:
         Literal["ray"] | Ray | None,
         option(
             role="processes",
-            flag="Run on a Ray cluster: that of RAY_ADDRESS, else of this machine (extra `ray`; docs/cluster.md).",
+            flag="Run on a Ray cluster: that of RAY_ADDRESS, else of this machine (extra `ray`; docs/reliability.md).",
         ),
     ] = None
     """``"ray"`` or :class:`batchpid.sim.Ray`: the workers run on the machines of a Ray cluster, with bit-identical
-    results (docs/cluster.md)."""
+    results (docs/reliability.md)."""
 
     def __post_init__(self) -> None:
         """Convert plain options to their declared type, and check their bounds."""

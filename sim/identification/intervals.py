@@ -25,6 +25,8 @@ PARTS, LEAST_LOGS = 10, 5
 """Number of parts of the logs; least number of logs that are the parts themselves."""
 INTERVAL = 2.0
 """Half width of a 95 % interval, over the standard deviation."""
+LEAST = 2.5e-3
+"""Least standard deviation over the value: the fit ends at changes of a thousandth."""
 SHOWN = 0.7
 """Standard deviation over that of the prior from which the logs show nothing of an unknown."""
 
@@ -67,7 +69,8 @@ def intervals_of(problem: Problem, solution: Solution) -> Intervals:
     variance = np.minimum(np.maximum(jackknife, square * np.diagonal(inverse)), prior**2)
     scale = np.sqrt(np.diagonal(inverse))
     shown = np.sqrt(square) * scale < SHOWN * prior
-    return Intervals(np.sqrt(variance) * sizes, inverse / scale[:, None] / scale, shown)
+    deviation = np.maximum(np.sqrt(variance) * sizes, LEAST * np.abs(values))
+    return Intervals(deviation, inverse / scale[:, None] / scale, shown)
 
 
 def _blocks(
