@@ -280,7 +280,7 @@ class RunInfo:
 
     def for_ticks(self, start: Rows | None, begin: float, end: float) -> RunInfo:
         """Return the info of the ticks between two times [s], where the first begins at the positions ``start``."""
-        span = TickRange(start, begin, end, tuple([each for each in self.redraws if each.time <= begin]))
+        span = TickRange(start, begin, end, tuple([redraw for redraw in self.redraws if redraw.time <= begin]))
         return self._followed(lambda rule, value: rule.for_ticks(value, span))
 
     def _followed(self, follow: Callable[[FieldRule, Any], Any]) -> RunInfo:

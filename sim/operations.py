@@ -115,8 +115,8 @@ class Run(Operation):
                 table[: self.ticks, envs] = rows[:, envs]
 
     def encode(self, envs: slice) -> bytes:
-        given = tuple(map(is_not, self.command, repeat(None)))  # Command.given, without one more call in a tick
-        return pickle.dumps((self.ticks, self.substeps, given))
+        are_given = tuple(map(is_not, self.command, repeat(None)))  # Command.given, without one more call in a tick
+        return pickle.dumps((self.ticks, self.substeps, are_given))
 
     def apply(self, loop: Loop) -> float:
         return loop.run(self.ticks, self.substeps, self.command.given)

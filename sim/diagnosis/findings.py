@@ -113,8 +113,8 @@ class _Run:
         start = self.info.start
         self.start: Float64 = np.asarray(self.qpos[0] if start is None else start, np.float64)
         self.failed: Bool = np.asarray(~rollout.ok.all(0))
-        own = self.info.own_command
-        self.is_pose = own is not None and self.info.tool is not None and own.size == 7
+        command = self.info.own_command
+        self.is_pose = command is not None and self.info.tool is not None and command.size == 7
         self.collides = self.info.collisions is not False
 
     def finding(self, rule: Rule, places: list[_Location], envs: NDArray[np.intp]) -> Finding:

@@ -142,18 +142,18 @@ class Problem:
 
         first = self.evaluate(start, np.full(len(start), STEP))
         size = self.size(first) if size is None else size
-        kept = {start.tobytes(): (first, self.system(first, start, size))}
+        systems = {start.tobytes(): (first, self.system(first, start, size))}
 
         def at(point: Float64) -> Any:
-            if point.tobytes() not in kept:
+            if point.tobytes() not in systems:
                 evaluation = self.evaluate(point, np.full(len(point), STEP))
-                kept.clear()
-                kept[point.tobytes()] = evaluation, self.system(evaluation, point, size)
+                systems.clear()
+                systems[point.tobytes()] = evaluation, self.system(evaluation, point, size)
                 if progress is not None:
                     progress()
-            return kept[point.tobytes()]
+            return systems[point.tobytes()]
 
-        found = least_squares(
+        optimum = least_squares(
             lambda point: at(point)[1][0],
             start,
             lambda point: at(point)[1][1],
@@ -165,8 +165,8 @@ class Problem:
             gtol=1e-8,
             max_nfev=evaluations,
         )
-        evaluation = at(found.x)[0]
-        return Solution(found.x, evaluation, self.size(evaluation), found.status > 0)
+        evaluation = at(optimum.x)[0]
+        return Solution(optimum.x, evaluation, self.size(evaluation), optimum.status > 0)
 
     def system(self, evaluation: FitResiduals, point: Float64, size: Float64) -> tuple[Float64, Float64]:
         """Return residuals and derivatives (n, unknowns) of the fitted rows over their ``size``, then of the prior."""

@@ -123,10 +123,10 @@ def identify(
     with pool as executor:
         run = map if executor is None else executor.map
         problem = Problem(data.plants, data.drives, _windows(data), unknowns, run)
-        found = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
-    if not found.explains and (words := _better_reading(data)):
-        return replace(found, advice=f"the logs make more sense with {words}: correct the log or its options")
-    return found
+        solution = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
+    if not solution.explains and (words := _better_reading(data)):
+        return replace(solution, advice=f"the logs make more sense with {words}: correct the log or its options")
+    return solution
 
 
 def _read(
@@ -175,10 +175,12 @@ def _read(
     start[np.array(read[0].joints)[~moves]] = places[~moves]
     parts = [log.part(joints=moves) for log in read]
     resting = _resting(robot, start) if still else robot
-    own = [resting if log.settings.robot is None else _resting(log.settings.robot, start) for log in parts]
+    robots = [resting if log.settings.robot is None else _resting(log.settings.robot, start) for log in parts]
     plants = dict[Any, Plant]()
-    for log, each in zip(parts, own, strict=True):
-        plants.setdefault((id(log.settings.robot), log.settings.payload), Plant(each, log.joints, log.settings.payload))
+    for log, at_rest in zip(parts, robots, strict=True):
+        plants.setdefault(
+            (id(log.settings.robot), log.settings.payload), Plant(at_rest, log.joints, log.settings.payload)
+        )
     drives = [LogControl(dt, None if law is None else law.for_joints(moves), forces) for law in laws]
     chosen = [plants[id(log.settings.robot), log.settings.payload] for log in parts]
     return Data(resting, parts, [smooth(log, dt) for log in parts], chosen, drives, still)
@@ -191,13 +193,13 @@ def _resting(robot: Robot, start: Float64) -> Robot:
 
 def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
     """Return the params that drove a log; raise InvalidArgumentError if a recording contradicts them."""
-    known = None if log.params is None else _of_joints(log.params, robot, log)
+    recorded_params = None if log.params is None else _of_joints(log.params, robot, log)
     law = params if log.settings.params is None else _of_joints(log.settings.params, robot, log)
-    if known is None or law is None:
-        return known if law is None else law
+    if recorded_params is None or law is None:
+        return recorded_params if law is None else law
     for name in ("kp", "ki", "kd"):
         recorded, present = (
-            np.zeros(1) if gain is None else gain for gain in (getattr(known, name), getattr(law, name))
+            np.zeros(1) if gain is None else gain for gain in (getattr(recorded_params, name), getattr(law, name))
         )
         if not np.allclose(recorded, present, rtol=1e-6):
             problem = f"contradict {log.source}, which was recorded with another {name}"
@@ -239,13 +241,13 @@ def _moves(robot: Robot, logs: list[Log]) -> Any:
     least = np.clip(SHARE * spread.max(), 1e-9, [STILL[robot.units[joint]] for joint in joints])
     moves = spread > np.maximum(least, SHAKEN * noise)
     if logs[0].kind == "setpoint":
-        asked = np.concatenate([log.command for log in logs]).std(0)
-        degrees = moves & (asked > 30 * spread) & (asked < 90 * spread)
+        commanded = np.concatenate([log.command for log in logs]).std(0)
+        degrees = moves & (commanded > 30 * spread) & (commanded < 90 * spread)
         if degrees.any():
             name = robot.joint_names[joints[int(np.argmax(degrees))]]
             problem = f"have setpoints of joint {name!r} that move 57 times as far as its positions"
             raise InvalidArgumentError("logs", problem, remedy="setpoints look like degrees: give both in rad")
-        moves &= spread > FOLLOWS * asked
+        moves &= spread > FOLLOWS * commanded
     names = ", ".join(repr(robot.joint_names[joint]) for joint, moving in zip(joints, moves, strict=True) if not moving)
     if not moves.any():
         raise InvalidArgumentError("logs", f"show no motion of any joint ({names})", remedy="record a motion")

@@ -153,15 +153,15 @@ class Regression:
             edge = min(round(EDGE / dt), len(motion.qpos) // 5)
             rows = np.arange(edge, len(motion.qpos) - edge, max(1, round(share)))
             required, held = _required(plant, drive, motion, rows)
-            asked = _efforts(plant, drive, motion)
+            commanded = _efforts(plant, drive, motion)
             if held is not None and drive.through:
-                asked = asked + held
+                commanded = commanded + held
             elif held is not None:
                 required = required - held[rows]
-            time = dt * np.arange(asked.shape[1])
+            time = dt * np.arange(commanded.shape[1])
             late = [
                 np.stack([interpolated(time[rows] - delay, time, effort) for delay in DELAYS])
-                for effort in (asked if self._setpoints else [lowpass(effort, cutoff, dt) for effort in asked])
+                for effort in (commanded if self._setpoints else [lowpass(effort, cutoff, dt) for effort in commanded])
             ]
             still = 0.01 * np.abs(motion.qvel).max(0) + 1e-9
             sign = lowpass(np.clip(motion.qvel / still, -1, 1), cutoff, dt)[rows]

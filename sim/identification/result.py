@@ -122,8 +122,8 @@ class Identification:
         kind = choice("kind", kind, list(KINDS))
         places = {(entry.kind, entry.joint if entry.link is None else entry.link): entry for entry in self._all()}
         if (kind, joint) not in places:
-            known = ", ".join(sorted({name for name, _ in places}))
-            raise InvalidArgumentError("joint", f"is no place of the unknown {kind!r}", value=joint, remedy=known)
+            names = ", ".join(sorted({name for name, _ in places}))
+            raise InvalidArgumentError("joint", f"is no place of the unknown {kind!r}", value=joint, remedy=names)
         entry = places[kind, joint]
         return None if entry not in self.unknowns.entries else self._row(self.unknowns.entries.index(entry))
 
@@ -258,8 +258,8 @@ class Identification:
             if entry.joint is None:
                 lines.append(f"{self._name(entry)}: {cells.get((entry.kind, entry.link), 'not shown by these logs')}")
         if self.drive.compensate != "none":
-            way = "through its motors" if self.drive.through else "apart from its motors"
-            lines.append(f"the robot compensates {self.drive.compensate} {way}")
+            path = "through its motors" if self.drive.through else "apart from its motors"
+            lines.append(f"the robot compensates {self.drive.compensate} {path}")
         before, after = self.held_out_error
         free = float(np.sqrt((self.errors[2] ** 2).mean()))
         lines.append(

@@ -122,7 +122,7 @@ class Randomization:
     @property
     def events(self) -> dict[str, Field]:
         """Given fields of events during an episode, by name."""
-        return {name: each for name in EVENTS if (each := getattr(self, name)) is not None}
+        return {name: distribution for name in EVENTS if (distribution := getattr(self, name)) is not None}
 
     @property
     def changes_robot(self) -> bool:

@@ -121,8 +121,8 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
                 arrays["feedforward"] = None
     except Exception as error:  # a damaged file can make HDF5 raise anything
         raise RecordingError(f"{path}: cannot be read as a recording: {error or type(error).__name__}") from error
-    own = {name: arrays.pop(name) for name in ("time", "setpoint", "feedforward")}
-    return Rollout(**own, observation=Observation(**arrays), tick=tick * every, info=info)
+    inputs = {name: arrays.pop(name) for name in ("time", "setpoint", "feedforward")}
+    return Rollout(**inputs, observation=Observation(**arrays), tick=tick * every, info=info)
 
 
 def _read_rows(dataset: h5py.Dataset, rows: slice, shape: tuple[int, ...], quantity: Quantity) -> Rows:

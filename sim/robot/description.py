@@ -207,8 +207,8 @@ class RobotDescription(Urdf):
         if self.settings is not None:
             return self.settings.target.copy()
         above, below = self.upper - self.start, self.lower - self.start
-        way = np.where(above >= -below, above, below)
-        return self.coupled(self.start + np.clip(0.25 * way, -0.5, 0.5))
+        distance = np.where(above >= -below, above, below)
+        return self.coupled(self.start + np.clip(0.25 * distance, -0.5, 0.5))
 
     def params(self, **options: Any) -> bp.PIDParams:
         """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's values filled in.

@@ -84,8 +84,8 @@ def _loop(
     if actuators is None:  # the law knows the plant
         return loop | {"mass_matrix": eye[None]}
     # The law knows the damping, too, as part of its matrix.
-    known = known_joints(robot)
-    model = matrix(known.armature) + timestep * eye * coupling.reduced_damping(robot.damping + known.viscous)
+    joints = known_joints(robot)
+    model = matrix(joints.armature) + timestep * eye * coupling.reduced_damping(robot.damping + joints.viscous)
     plant = matrix(motors.armature) + timestep * eye * damping[:, None]
     return loop | {"mass_matrix": plant, "model": strength[..., None] * model}
 

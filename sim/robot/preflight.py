@@ -112,7 +112,7 @@ def _poses(robot: RobotDescription, what: str, qpos: NDArray[np.float64]) -> Ite
 
 
 def _joints(robot: RobotDescription) -> Iterator[Finding]:
-    ranged = {each.joint for each in robot.repairs if each.remedy == GIVE_RANGE}  # their repairs say so
+    ranged = {repair.joint for repair in robot.repairs if repair.remedy == GIVE_RANGE}  # their repairs say so
     for joint, friction, suggested in zip(robot.joints, robot.friction, robot.design_effort_limit, strict=True):
         name, mimic = joint.name, joint.mimic
         if friction >= joint.effort_limit > 0:

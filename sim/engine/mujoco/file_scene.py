@@ -77,8 +77,8 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
         body.name = names.bodies[body.id]
         body.gravcomp *= body.id not in robot
         body.sleep = mujoco.mjtSleepPolicy.mjSLEEP_AUTO  # no body sleeps
-    for each in [each for kind in REMOVED for each in getattr(scene, kind)]:
-        scene.delete(each)
+    for element in [part for kind in REMOVED for part in getattr(scene, kind)]:
+        scene.delete(element)
     root, start = "", _start(model)
     for joint in scene.joints:
         if joint.type != mujoco.mjtJoint.mjJNT_FREE or joint.parent.id not in robot:
