@@ -32,7 +32,7 @@ P = TypeVar("P", bound=Path | None)
 class OutputFiles:
     """Output files of one run of a ``command``. With ``--force`` they replace files, but none that the command reads.
 
-    Every other flag whose value is the name of a file is one that the command reads.
+    The command reads the file that any other flag names.
     """
 
     def __init__(self, command: Any) -> None:

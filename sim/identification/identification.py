@@ -37,14 +37,14 @@ SHARE, SHAKEN = 0.01, 1.5
 BEYOND = 3.0
 """Effort over the robot's limit from which it looks like another unit."""
 FOLLOWS = 0.02
-"""Standard deviation of the positions, over that of the setpoints, up to which a joint is stuck, and gives a little."""
+"""Ratio of the standard deviation of positions to the setpoints', up to which a joint counts as stuck."""
 
 
 class Data(NamedTuple):
     """Logs of the joints that moved, and the robots and control that made them."""
 
     robot: Robot
-    """The robot, which rests where the joints that did not move are."""
+    """The robot, whose start pose has the positions of the joints that did not move."""
     logs: list[Log]
     motions: list[Motion]
     plants: list[Plant]
@@ -73,10 +73,10 @@ def identify(
     Parameters
     ----------
     logs
-        Files (:mod:`batchpid.sim.identification.logs`), or logs that were read, which may have settings of their own.
+        Files (:mod:`batchpid.sim.identification.logs`), or logs from :func:`read_logs`, each with separate settings.
     params
         Params of the PID law that drove the robot, of all its joints or of those in the logs: the setpoints of the logs
-        are used. None: those of a recording, or the efforts.
+        are used. None: the params of a recording, or the logged efforts.
     compensate
         Forces that the robot compensates by itself, or "none", as for logs of the complete efforts. Default: as the
         recordings say, else "gravity+coriolis+friction".
@@ -137,7 +137,7 @@ def _read(
     timestep: float | None,
     reading: Reading | None,
 ) -> Data:
-    """Return the inputs; the arguments are those of :func:`identify`."""
+    """Return the inputs for the arguments of :func:`identify`."""
     if find_spec("scipy") is None:
         raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")

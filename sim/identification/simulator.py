@@ -419,7 +419,7 @@ def _trace(layout: Layout, *structures: Any) -> Trace:
 
 
 def _returned(state: StepState) -> StepState:
-    """Return what a program returns of a state: without histories, which it changes in place."""
+    """Return the leaves of a state that a program returns: without histories, which it changes in place."""
     motors = None if state.motors is None else state.motors._replace(command=None, sensor=None)
     return state._replace(motors=motors)
 

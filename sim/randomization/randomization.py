@@ -81,8 +81,8 @@ class Randomization:
     ground_friction: Annotated[Distribution | None, Bounds("1", group="robot")] = None
     """Coefficient of sliding friction of the ground and of all shapes of the robot; nominal 0.3.
 
-    In the scene of an MJCF file it is nominally that of the file's ground, and the robot's shapes change by the same
-    factor."""
+    In the scene of an MJCF file the nominal value is the friction of the file's ground, and the robot's shapes change
+    by the same factor."""
     gravity: Annotated[Field | None, Bounds("m/s^2", low=-math.inf, group="robot")] = None
     """Gravity along the axes x, y and z of the world [m/s^2]; nominal 0, 0 and -9.81. The compensation has the nominal
     one."""

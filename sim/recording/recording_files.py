@@ -84,7 +84,7 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
     """Read a recording: complete, cut short by a kill, or one that is still being written.
 
     ``info.complete`` of the result says whether the run came to its end. Nothing in the file is executed; SECURITY.md
-    says what a file of a stranger can do.
+    lists the risks of files from strangers.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def check_path(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
     Raises
     ------
     InvalidArgumentError
-        Its suffix is none of :data:`HDF5`, or the file exists and ``overwrite`` is False.
+        Its suffix is not in :data:`HDF5`, or the file exists and ``overwrite`` is False.
     """
     path = file_path("path", path, HDF5)
     if os.path.lexists(path) and not overwrite:

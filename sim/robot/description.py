@@ -201,7 +201,7 @@ class RobotDescription(Urdf):
     def target(self) -> Float64:
         """Pose (dof,) [rad or m] for a first move, within the limits.
 
-        It is that of the bundled settings, else a quarter of the way from the start to the farther limit of each joint,
+        The target of the bundled settings, else a quarter of the way from the start to the farther limit of each joint,
         at most 0.5 rad or m.
         """
         if self.settings is not None:

@@ -87,7 +87,7 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
 
 
 def _contacts(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Finding]:
-    """Yield what is odd about contacts at the start pose."""
+    """Yield findings about contacts at the start pose."""
     if left_over := robot.self_contact.left_over:
         text = f"{len(left_over)} pairs that should not collide do, since PhysX's filter cannot hold them all"
         yield Finding("note", "pairs-left-over", text, "disable fewer pairs in the .srdf")

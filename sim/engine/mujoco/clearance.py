@@ -84,8 +84,8 @@ def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[NDArray[np.float64],
 
     A way is a joint; a floating base adds its displacement and its rotation. The bounds hold within a range of joint
     positions (2, dof), which is returned, too. A body's shapes and children are balls around points of the body; the
-    ball of a child has all that moves with it, at any pose. A way that moves both bodies of a pair, or neither, does
-    not change their distance.
+    ball of a child contains everything that moves with it, at any pose. A way that moves both bodies of a pair, or
+    neither, does not change their distance.
     """
     model, dof = robot.model, len(robot.qvel)
     travel = np.tile([[-np.inf], [np.inf]], (1, dof))
