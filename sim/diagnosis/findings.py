@@ -452,7 +452,7 @@ def _lacks_integral_action(run: _Run) -> Bool:
 
 # Facts come before symptoms: a fault of the input, setpoints that cannot be reached, links that touch, gains beyond the
 # bound. Each of them explains errors of all joints. Then come the motion and the effort of each joint at its end, the
-# causes of an effort at its limit and of oscillations before the causes of rest, since such a joint can rest for a moment.
+# causes of an effort at its limit and of oscillations before those of rest, since such a joint can rest for a moment.
 # Among these, a force that the model does not explain is a cause only where the whole env is at rest.
 RULES: tuple[Rule, ...] = (
     Rule(
