@@ -21,7 +21,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.trees import structure
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.regression import Motion
-from batchpid.sim.identification.simulator import Candidates, Drive, Plant, Stretch, simulate
+from batchpid.sim.identification.simulator import LogControl, Plant, PlantCandidates, Stretch, simulate
 from batchpid.sim.identification.unknowns import Unknowns
 
 WINDOW = 0.3
@@ -59,7 +59,7 @@ class Window(NamedTuple):
     """Fitted rows; the others are held out (rows,) bool."""
 
 
-class Evaluation(NamedTuple):
+class FitResiduals(NamedTuple):
     """Residuals of each window (rows, joints), and derivatives (rows, joints, unknowns)."""
 
     residuals: list[Float64]
@@ -71,7 +71,7 @@ class Solution(NamedTuple):
 
     point: Float64
     """Coordinates of the unknowns."""
-    evaluation: Evaluation
+    evaluation: FitResiduals
     """Residuals and derivatives there."""
     size: Float64
     """Size of the residuals (joints,)."""
@@ -83,14 +83,14 @@ class Problem:
     """Windows of logs, the simulation of each log, and the unknowns."""
 
     plants: Sequence[Plant]
-    drives: Sequence[Drive]
+    drives: Sequence[LogControl]
     """Plant and drive of each log."""
     windows: Sequence[Window]
     unknowns: Unknowns
     run: Callable[..., Any] = map
     """``map``, or that of a pool of processes."""
 
-    def evaluate(self, point: Float64, steps: Float64 | None = None, free_states: bool = True) -> Evaluation:
+    def evaluate(self, point: Float64, steps: Float64 | None = None, free_states: bool = True) -> FitResiduals:
         """Return residuals at a point (unknowns,), and derivatives by ``steps`` (unknowns,); None: no derivatives.
 
         Initial states of windows are projected out if they are free.
@@ -114,9 +114,9 @@ class Problem:
             residual, change = errors[0], np.moveaxis(errors[1:] - errors[0], 0, 2)
             slope = change[..., : len(changes)] / (1.0 if steps is None else steps)
             residuals[number], slopes[number] = _projected(residual, slope, change[..., len(changes) :])
-        return Evaluation(residuals, slopes)
+        return FitResiduals(residuals, slopes)
 
-    def _task(self, group: list[int], candidates: Candidates, states: Float64) -> Any:
+    def _task(self, group: list[int], candidates: PlantCandidates, states: Float64) -> Any:
         """Return the arguments of :func:`simulate` for a group of windows."""
         logs = [self.windows[number].log for number in group]
         drive = self.drives[logs[0]]
@@ -168,7 +168,7 @@ class Problem:
         evaluation = at(found.x)[0]
         return Solution(found.x, evaluation, self.size(evaluation), found.status > 0)
 
-    def system(self, evaluation: Evaluation, point: Float64, size: Float64) -> tuple[Float64, Float64]:
+    def system(self, evaluation: FitResiduals, point: Float64, size: Float64) -> tuple[Float64, Float64]:
         """Return residuals and derivatives (n, unknowns) of the fitted rows over their ``size``, then of the prior."""
         rows = sum(int(window.fitted.sum()) for window in self.windows)
         every = 1 + rows * len(size) * len(point) // MOST_NUMBERS
@@ -180,7 +180,7 @@ class Problem:
         slopes.append(np.diag(1 / self.unknowns.spread))
         return np.concatenate(residuals), np.concatenate(slopes)
 
-    def size(self, evaluation: Evaluation) -> Float64:
+    def size(self, evaluation: FitResiduals) -> Float64:
         """Return the size of fitted residuals (joints,): the root mean square, the largest tenth of each joint cut."""
         rows = [residual[window.fitted] for window, residual in zip(self.windows, evaluation.residuals, strict=True)]
         errors = np.abs(np.concatenate(rows))

@@ -24,7 +24,7 @@ from batchpid.sim.identification.log import Log, LogWarning, checked
 from batchpid.sim.identification.logs import Reading, read_logs
 from batchpid.sim.identification.regression import STRENGTHS, Guess, Motion, Regression, better_reading, smooth
 from batchpid.sim.identification.result import Identification
-from batchpid.sim.identification.simulator import Drive, Plant
+from batchpid.sim.identification.simulator import LogControl, Plant
 from batchpid.sim.identification.unknowns import BASIC, EXTRAS, LAW, Unknowns
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
@@ -48,7 +48,7 @@ class Data(NamedTuple):
     logs: list[Log]
     motions: list[Motion]
     plants: list[Plant]
-    drives: list[Drive]
+    drives: list[LogControl]
     """Motion, plant and drive of each log."""
     still: list[str]
     """Names of the joints that did not move."""
@@ -179,7 +179,7 @@ def _read(
     plants = dict[Any, Plant]()
     for log, each in zip(parts, own, strict=True):
         plants.setdefault((id(log.settings.robot), log.settings.payload), Plant(each, log.joints, log.settings.payload))
-    drives = [Drive(dt, None if law is None else law.for_joints(moves), forces) for law in laws]
+    drives = [LogControl(dt, None if law is None else law.for_joints(moves), forces) for law in laws]
     chosen = [plants[id(log.settings.robot), log.settings.payload] for log in parts]
     return Data(resting, parts, [smooth(log, dt) for log in parts], chosen, drives, still)
 

@@ -18,13 +18,15 @@ from typing import NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.sim.identification.fit import OUTLIER, Evaluation, Problem, Solution
+from batchpid.sim.identification.fit import OUTLIER, FitResiduals, Problem, Solution
 from batchpid.sim.identification.unknowns import KINDS
 
 PARTS, LEAST_LOGS = 10, 5
 """Number of parts of the logs; least number of logs that are the parts themselves."""
 INTERVAL = 2.0
 """Half width of a 95 % interval, over the standard deviation."""
+LEAST = 2.5e-3
+"""Least standard deviation over the value: the fit ends at changes of a thousandth."""
 SHOWN = 0.7
 """Standard deviation over that of the prior from which the logs show nothing of an unknown."""
 
@@ -67,10 +69,13 @@ def intervals_of(problem: Problem, solution: Solution) -> Intervals:
     variance = np.minimum(np.maximum(jackknife, square * np.diagonal(inverse)), prior**2)
     scale = np.sqrt(np.diagonal(inverse))
     shown = np.sqrt(square) * scale < SHOWN * prior
-    return Intervals(np.sqrt(variance) * sizes, inverse / scale[:, None] / scale, shown)
+    deviation = np.maximum(np.sqrt(variance) * sizes, LEAST * np.abs(values))
+    return Intervals(deviation, inverse / scale[:, None] / scale, shown)
 
 
-def _blocks(problem: Problem, evaluation: Evaluation, size: Float64, factors: Float64) -> list[tuple[Float64, Float64]]:
+def _blocks(
+    problem: Problem, evaluation: FitResiduals, size: Float64, factors: Float64
+) -> list[tuple[Float64, Float64]]:
     """Return derivatives (rows, unknowns) and residuals (rows,) of each part, weighted as by the loss."""
     tables = list[tuple[Float64, Float64, int]]()
     for window, residual, slope in zip(problem.windows, *evaluation, strict=True):

@@ -22,7 +22,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.sim.identification.log import Log, interpolated
-from batchpid.sim.identification.simulator import Candidates, Control, Drive, Plant
+from batchpid.sim.identification.simulator import Control, LogControl, Plant, PlantCandidates
 
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
@@ -92,7 +92,7 @@ def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
     return sosfiltfilt(butter(4, cutoff, fs=1 / timestep, output="sos"), table, axis=0, padlen=pad)
 
 
-def better_reading(plant: Plant, drive: Drive, log: Log, names: Sequence[str]) -> str:
+def better_reading(plant: Plant, drive: LogControl, log: Log, names: Sequence[str]) -> str:
     """Return the reading of a log that explains its efforts far better than the present one, in words; "" for none.
 
     Signs, exchanged joints, factors of units and times of the commands are tried. ``names`` are those of the joints.
@@ -106,7 +106,7 @@ def better_reading(plant: Plant, drive: Drive, log: Log, names: Sequence[str]) -
     return next(words for words, cost in costs.items() if cost < min(costs.values()) + ALIKE)
 
 
-def _cost(plant: Plant, drive: Drive, log: Log) -> float:
+def _cost(plant: Plant, drive: LogControl, log: Log) -> float:
     return Regression([plant], [drive], [log], [smooth(log, drive.timestep)]).best().unexplained
 
 
@@ -142,7 +142,7 @@ class Regression:
     """Efforts that motions of logs require, and efforts of the motors so far, for regressions at any delay."""
 
     def __init__(
-        self, plants: Sequence[Plant], drives: Sequence[Drive], logs: Sequence[Log], motions: Sequence[Motion]
+        self, plants: Sequence[Plant], drives: Sequence[LogControl], logs: Sequence[Log], motions: Sequence[Motion]
     ) -> None:
         dt = drives[0].timestep
         self._setpoints = drives[0].params is not None
@@ -230,7 +230,7 @@ def _bounded(matrix: Float64, target: Float64, is_strong: bool) -> tuple[Float64
     return values, target - matrix @ values
 
 
-def _required(plant: Plant, drive: Drive, motion: Motion, rows: Any) -> tuple[Float64, Float64 | None]:
+def _required(plant: Plant, drive: LogControl, motion: Motion, rows: Any) -> tuple[Float64, Float64 | None]:
     """Return the efforts (rows, joints) that a motion requires, and the compensation (steps, joints)."""
     q, v, a = (np.ascontiguousarray(table[rows]) for table in motion[:3])
     dynamics = plant.dynamics([()] * len(q), q, v)
@@ -244,12 +244,12 @@ def _required(plant: Plant, drive: Drive, motion: Motion, rows: Any) -> tuple[Fl
     return required, held.force
 
 
-def _efforts(plant: Plant, drive: Drive, motion: Motion) -> Float64:
+def _efforts(plant: Plant, drive: LogControl, motion: Motion) -> Float64:
     """Return logged efforts (1, steps, joints), or those of the law along a motion (setpoint delays, steps, joints)."""
     if drive.params is None:
         return motion.command[None]
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
-    ideal = Candidates(Actuators(), {}, SETPOINT_DELAYS, ((),) * count)
+    ideal = PlantCandidates(Actuators(), {}, SETPOINT_DELAYS, ((),) * count)
     first = np.tile(motion.qpos[0], (count, 1))
     control = Control(drive, ideal, first, np.tile(motion.qvel[0], (count, 1)), None, plant.turns)
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)

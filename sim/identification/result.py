@@ -17,7 +17,7 @@ from batchpid.io import documents
 from batchpid.sim.identification.fit import STEP, Problem, Solution, Window
 from batchpid.sim.identification.intervals import INTERVAL, Intervals
 from batchpid.sim.identification.log import Log
-from batchpid.sim.identification.simulator import Drive
+from batchpid.sim.identification.simulator import LogControl
 from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknown, Unknowns
 from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.robot import Robot
@@ -63,7 +63,7 @@ class Identification:
     """Names of the logs."""
     still: tuple[str, ...]
     """Joints that did not move."""
-    drive: Drive
+    drive: LogControl
     problem: Problem
     point: Float64
 

@@ -1,11 +1,13 @@
 """Files are replaced as a whole, and by one writer."""
 
 import ast
+import os
 from pathlib import Path
 
 import pytest
 
 import batchpid as bp
+from batchpid.io.files import write_atomically
 
 PARAMS = bp.make_params(1, 2.0)
 
@@ -27,6 +29,13 @@ def test_an_error_names_the_file_and_not_the_temporary_one(tmp_path):
     assert raised.value.filename == str(path)
 
 
+def test_a_pipe_or_device_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="not a regular file"):
+        write_atomically(tmp_path / "pipe", "text")
+    assert (tmp_path / "pipe").is_fifo()
+
+
 def test_a_write_that_fails_leaves_the_older_file(tmp_path, monkeypatch):
     path = tmp_path / "file.json"
     bp.save_params(path, PARAMS, ["a"])
@@ -45,7 +54,6 @@ def test_a_write_that_fails_leaves_the_older_file(tmp_path, monkeypatch):
 NOT_FILES = {
     "batchpid/io/files.py": "the atomic writer",
     "sim/engine/sapien/building.py": "text in memory",
-    "sim/recording/partial_file.py": "space for a growing recording",
     "sim/view/film.py": "messages in memory",
 }
 

@@ -162,6 +162,18 @@ def test_a_tool_reaches_its_goals_and_pushes_a_box(run):
     assert min(moved) > 0.02
 
 
+@pytest.mark.parametrize("flags", [(), ("--no-motors", "--delay", "0.03")])
+def test_a_plan_is_followed(run, flags):
+    small = ("--samples", "8", "--seconds", "0.2", "--workers", "0")
+    assert re.search(r"goes around: least distance \d+ mm", run("plan_reach.py", *small, *flags))
+
+
+@pytest.mark.slow
+def test_plans_go_around_the_ball_if_the_rollouts_have_the_motors(run):
+    assert "goes around" in run("plan_reach.py", "--delay", "0.03")
+    assert "touches" in run("plan_reach.py", "--delay", "0.03", "--no-motors")
+
+
 @pytest.mark.slow
 def test_stable_baselines3_trains(run):
     pytest.importorskip("stable_baselines3")

@@ -122,7 +122,6 @@ RUNNERS: list[tuple[dict[str, Any], str]] = [
     ),
     ({"robot": FREE, "randomization": Randomization(push={"vq": Uniform(0, 1)}, push_interval=Uniform(1, 2))}, "push"),
     ({"randomization": Randomization(ground_friction=Uniform(0, 1)), "collisions": False}, "ground_friction"),
-    ({"num_envs": 10**6, "workers": 2}, "num_envs"),
 ]
 
 
@@ -241,7 +240,7 @@ def test_a_refused_command_of_entries_names_the_entry() -> None:
 MADE: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     *(
         (Ray, options, next(iter(options)))
-        for options in ({"address": "ray://host:1"}, {"nodes": 0}, {"cpus_per_node": 0.5}, {"placement": "WIDE"})
+        for options in ({"address": "ray://host:1"}, {"nodes": 0}, {"cpus_per_node": 0.5})
     ),
     *(
         (lambda **options: CommandSpec(("x", "y"), **options), options, argument)
