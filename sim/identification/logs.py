@@ -124,6 +124,7 @@ def logs_of_rollout(
         "was made with setpoint rates": bool(info.rates) and recorded == "setpoint",
         "has setpoints that a guard changed": bool(np.any(rollout.guarded)),
         "was made with a randomization": bool(info.randomization),
+        "has params that were changed": info.params_changed and recorded == "setpoint",
         "has ticks of varied length": bool((changes > 1e-9 + 1e-6 * rollout.tick).any()),
         "has failed": not rollout.ok.all(),
     }

@@ -7,7 +7,7 @@ import pytest
 from arms import gains, load, motion, run
 
 import batchpid as bp
-from batchpid.sim import Randomization, Runner, Uniform, write_recording
+from batchpid.sim import Randomization, Recorder, Runner, Uniform, write_recording
 from batchpid.sim.identification import LogWarning, Reading, logs_of_rollout, read_logs
 from batchpid.sim.identification.log import checked
 
@@ -182,6 +182,17 @@ def test_runs_that_a_fit_cannot_simulate_are_refused(robot, problem):
         rollout = run(robot, motion(0.5), actuators=actuators, **options)
     with pytest.raises(bp.InvalidArgumentError, match=problem):
         logs_of_rollout(robot, rollout)
+
+
+def test_a_recording_of_changed_params_is_refused(robot, tmp_path):
+    path = tmp_path / "run.h5"
+    with Runner(robot, 1, params=gains(), workers=0, engine="mujoco") as runner, Recorder(path, runner):
+        for row in motion(0.5):
+            runner.step(row)
+            runner.params = gains().replace(kp=0.5 * gains().kp)
+        runner.params = gains()
+    with pytest.raises(bp.InvalidArgumentError, match="params that were changed"):
+        read_logs(robot, [path])
 
 
 def bag(path, messages):
