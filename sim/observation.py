@@ -215,6 +215,8 @@ class RunInfo:
     """True if setpoints were given with rates, and moved within the ticks; None if unknown, as after a kill."""
     params: PIDParams | None = None
     """PID parameters at the start."""
+    params_changed: bool = False
+    """True if they were changed in the run, or a snapshot was restored; known of a complete recording."""
     actuators: Actuators | None = None
     """Motors and sensors at the start, before draws of a randomization; None for ideal ones."""
     start: Rows | None = None
@@ -355,6 +357,7 @@ RULES |= {
     ),
     "episodes": FieldRule(lambda episodes, envs: episodes[envs], _episodes_at, _FIRST),
     "complete": FieldRule(join=all),
+    "params_changed": FieldRule(join=any),
     "rates": FieldRule(join=_joined_rates),
     "faults": FieldRule(
         _events_of,
