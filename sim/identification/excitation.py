@@ -160,10 +160,10 @@ def _contact(robot: Robot, position: Float64) -> _Obstacle | None:
     dynamics = robot.dynamics()
 
     def apart(qpos: Float64, within: float = CLEARANCE) -> dict[tuple[str, str], float]:
-        found: dict[tuple[str, str], float] = {}
+        distances: dict[tuple[str, str], float] = {}
         for first, second, distance in dynamics.contacts.near(qpos, within):
-            found[first, second] = min(distance, found.get((first, second), np.inf))
-        return found
+            distances[first, second] = min(distance, distances.get((first, second), np.inf))
+        return distances
 
     center = position[0]
     allowed = {pair: max(0.0, 0.5 * distance) for pair, distance in apart(center).items()}
