@@ -76,6 +76,7 @@ GONE = (
     r"gain_units=.inertia",
     r"held_out_error\(",
     r"integrate_first",
+    r"is_feasible",
     r"jitted_law",
     r"law in XLA \(float",
     r"make accuracy",

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext
 from dataclasses import replace
 from importlib.util import find_spec
-from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,7 +33,7 @@ SHARE, SHAKEN = 0.01, 1.5
 """The same as a share of the joint that moved most, and over the noise from row to row."""
 BEYOND = 3.0
 """Effort over the robot's limit from which it looks like another unit."""
-FOLLOWS = 0.02
+FOLLOWS = 0.01
 """Standard deviation of the positions, over that of the setpoints, up to which a joint is stuck, and gives a little."""
 
 
@@ -65,7 +62,6 @@ def identify(
     extras: Sequence[str] = (),
     reading: Reading | None = None,
     evaluations: int = 30,
-    workers: int = 0,
     progress: Callable[[], Any] | None = None,
 ) -> Identification:
     """Find the motors of ``robot`` from logs of its motion.
@@ -92,8 +88,6 @@ def identify(
         Units and names in the files.
     evaluations
         Largest number of evaluations of the fit.
-    workers
-        Number of processes, 0 for this one.
     progress
         Called after each evaluation.
 
@@ -117,13 +111,8 @@ def identify(
     if {*LAW}.isdisjoint(extras) and _is_odd(data, guess) and (words := _better_reading(data)):
         raise InvalidArgumentError("logs", f"make sense with {words}", remedy="correct the log or its options")
     unknowns = _unknowns(data, guess, [*extras], flag("payload", payload))
-    pool: Any = nullcontext()
-    if integer("workers", workers, 0, 1000) > 1:
-        pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-    with pool as executor:
-        run = map if executor is None else executor.map
-        problem = Problem(data.plants, data.drives, _windows(data), unknowns, run)
-        found = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
+    problem = Problem(data.plants, data.drives, _windows(data), unknowns)
+    found = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
     if not found.explains and (words := _better_reading(data)):
         return replace(found, advice=f"the logs make more sense with {words}: correct the log or its options")
     return found
@@ -240,11 +229,6 @@ def _moves(robot: Robot, logs: list[Log]) -> Any:
     moves = spread > np.maximum(least, SHAKEN * noise)
     if logs[0].kind == "setpoint":
         asked = np.concatenate([log.command for log in logs]).std(0)
-        degrees = moves & (asked > 30 * spread) & (asked < 90 * spread)
-        if degrees.any():
-            name = robot.joint_names[joints[int(np.argmax(degrees))]]
-            problem = f"have setpoints of joint {name!r} that move 57 times as far as its positions"
-            raise InvalidArgumentError("logs", problem, remedy="setpoints look like degrees: give both in rad")
         moves &= spread > FOLLOWS * asked
     names = ", ".join(repr(robot.joint_names[joint]) for joint, moving in zip(joints, moves, strict=True) if not moving)
     if not moves.any():

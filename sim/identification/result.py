@@ -155,20 +155,8 @@ class Identification:
 
         Friction and damping are in addition to the robot's description.
         """
-        tables = self.unknowns.tables(self.values[None])
-        options = dict[str, Any]()
-        for name, table in tables.items():
-            kind = KINDS[name]
-            if kind.target != "motor":
-                continue
-            column = np.full(self.robot.dof, kind.neutral)
-            described = getattr(self.robot, DESCRIBED[name])[list(self.joints)] if name in DESCRIBED else 0.0
-            column[list(self.joints)] = np.maximum(table[0] - described, 0.0) if name in DESCRIBED else table[0]
-            if name == "delay":
-                column[:] = table[0, 0]
-            options[kind.field] = column
-        if "static" in options:
-            options["static"] = options["static"] + options.get("coulomb", 0.0)
+        columns = _columns(self.unknowns, self.values[None])
+        options: dict[str, Any] = {name: column[0] for name, column in columns.items()}
         return bp.make_actuators(self.robot.dof, **options, joint_names=self.robot.joint_names)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -286,6 +274,25 @@ class Identification:
         return f"{value:.{digits}g} ± {half:.1g}"
 
 
+def _columns(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
+    """Return the fields of actuators (n, dof) with ``values`` (n, unknowns), without the description's part."""
+    robot, joints, columns = unknowns.robot, list(unknowns.joints), dict[str, Float64]()
+    for name, table in unknowns.tables(values).items():
+        kind = KINDS[name]
+        if kind.target != "motor":
+            continue
+        if kind.positive:
+            described = getattr(robot, DESCRIBED[name])[joints] if name in DESCRIBED else 0.0
+            table = np.maximum(table - described, 1e-3 * kind.neutral)
+        column = columns[kind.field] = np.full((len(values), robot.dof), kind.neutral)
+        column[:, joints] = table
+        if kind.per == "robot":
+            column[:] = table[:, :1]
+    if "static" in columns:
+        columns["static"] += columns.get("coulomb", 0.0)
+    return columns
+
+
 def advice(problem: Problem, solution: Solution) -> str:
     """Return a sentence on the effect that would explain most of the remaining error of a fit, by its derivatives.
 
@@ -363,23 +370,15 @@ def draw_motors(path: str | os.PathLike[str], robot: Robot, count: int, seed: in
         correlation = np.zeros((len(names), len(names)))
         for at, row in enumerate(rows):
             correlation[at, : at + 1] = correlation[: at + 1, at] = row
-        kinds = [(KINDS[kind], kind, None if place is None else place) for kind, place in names]
-        numbers = [robot.joint_names.index(place) if kind.per == "joint" else None for kind, _, place in kinds]
+        entries = tuple(
+            Unknown(kind, robot.joint_names.index(place) if KINDS[kind].per == "joint" else None, 0.0, 1.0)
+            for kind, place in names
+        )
         values, vectors = np.linalg.eigh(correlation)
         z = np.random.default_rng(seed).normal(size=(count, len(names)))
         points = estimate + deviation * (z @ (vectors * np.sqrt(np.maximum(values, 0.0))).T)
     except (KeyError, IndexError, TypeError, ValueError) as bad:
         remedy = "write the file with `batchpid identify` of this robot"
         raise InvalidArgumentError(source, f"is missing or cannot be read ({bad})", remedy=remedy) from None
-    columns: dict[str, Float64] = {}
-    for (kind, name, _), joint, drawn in zip(kinds, numbers, points.T, strict=True):
-        if kind.target != "motor":
-            continue
-        leaf = getattr(nominal, kind.field)
-        table = columns.setdefault(kind.field, np.full((count, robot.dof), kind.neutral if leaf is None else leaf))
-        described = getattr(robot, DESCRIBED[name])[joint] if name in DESCRIBED else 0.0
-        drawn = np.maximum(drawn - described, 1e-3 if name == "strength" else 0.0) if kind.positive else drawn
-        table[:, slice(None) if joint is None else joint] = drawn[:, None] if joint is None else drawn
-    if "static" in columns:
-        columns["static"] = columns["static"] + columns.get("coulomb", 0.0)
+    columns = _columns(Unknowns(robot, tuple(range(robot.dof)), entries), points)
     return nominal.replace(**columns)
