@@ -133,16 +133,7 @@ def _obstacle(robot: Robot, motion: Trajectory) -> _Obstacle | None:
     moves = np.ptp(motion.position, axis=0) > 0
     excess = np.where(moves, np.abs(effort) - robot.design_effort_limit, 0.0)
     if (excess > 0).any():
-        joint, limit = int(excess.max(0).argmax()), robot.design_effort_limit
-        needed = robot.holding_efforts(position[:1])[0]
-        weak = np.flatnonzero(moves & (np.abs(needed) + robot.friction > limit))
-        if weak.size:
-            joint = int(weak[0])
-            load = f"gravity and friction take {abs(needed[joint]) + robot.friction[joint]:.3g} of {limit[joint]:.3g}"
-            return _Obstacle(
-                f"joint {robot.joint_names[joint]!r} is too weak: {load} {robot.joints[joint].effort_unit}"
-            )
-        text = f"joint {robot.joint_names[joint]!r} is too weak to move"
+        text = f"joint {robot.joint_names[int(excess.max(0).argmax())]!r} is too weak to move"
         return _Obstacle(text, tuple(np.flatnonzero((excess > 0).any(0)).tolist()))
     return _contact(robot, position)
 

@@ -33,7 +33,7 @@ SHARE, SHAKEN = 0.01, 1.5
 """The same as a share of the joint that moved most, and over the noise from row to row."""
 BEYOND = 3.0
 """Effort over the robot's limit from which it looks like another unit."""
-FOLLOWS = 0.01
+FOLLOWS = 0.02
 """Standard deviation of the positions, over that of the setpoints, up to which a joint is stuck, and gives a little."""
 
 
@@ -180,15 +180,13 @@ def _resting(robot: Robot, start: Float64) -> Robot:
 
 def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
     """Return the params that drove a log; raise InvalidArgumentError if a recording contradicts them."""
-    known = None if log.params is None else _of_joints(log.params, robot, log)
-    law = params if log.settings.params is None else _of_joints(log.settings.params, robot, log)
-    if known is None or law is None:
-        return known if law is None else law
+    chosen = params if log.settings.params is None else log.settings.params
+    recorded, law = (None if one is None else _of_joints(one, robot, log) for one in (log.params, chosen))
+    if recorded is None or law is None:
+        return recorded if law is None else law
     for name in ("kp", "ki", "kd"):
-        recorded, present = (
-            np.zeros(1) if gain is None else gain for gain in (getattr(known, name), getattr(law, name))
-        )
-        if not np.allclose(recorded, present, rtol=1e-6):
+        pair = [0.0 if gain is None else gain for gain in (getattr(recorded, name), getattr(law, name))]
+        if not np.allclose(*pair, rtol=1e-6):
             problem = f"contradict {log.source}, which was recorded with another {name}"
             raise InvalidArgumentError("params", problem, remedy="leave them out: a recording has its own")
     return law
@@ -229,6 +227,11 @@ def _moves(robot: Robot, logs: list[Log]) -> Any:
     moves = spread > np.maximum(least, SHAKEN * noise)
     if logs[0].kind == "setpoint":
         asked = np.concatenate([log.command for log in logs]).std(0)
+        degrees = moves & (asked > 30 * spread) & (asked < 90 * spread)
+        if degrees.any():
+            name = robot.joint_names[joints[int(np.argmax(degrees))]]
+            problem = f"have setpoints of joint {name!r} that move 57 times as far as its positions"
+            raise InvalidArgumentError("logs", problem, remedy="setpoints look like degrees: give both in rad")
         moves &= spread > FOLLOWS * asked
     names = ", ".join(repr(robot.joint_names[joint]) for joint, moving in zip(joints, moves, strict=True) if not moving)
     if not moves.any():

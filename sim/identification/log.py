@@ -183,8 +183,11 @@ def _check_finite(robot: Robot, log: Log, places: list[str]) -> None:
             continue
         index, joint = (int(n) for n in np.argwhere(~np.isfinite(table))[0])
         column = "time" if quantity == "time" else f"{quantity}:{robot.joint_names[log.joints[joint]]}"
-        place = places[index] if index < len(places) else f"command {index + 1}"
-        raise error(log.source, f"{place}, column {column!r} is empty or not finite", "remove the row")
+        raise error(
+            log.source,
+            f"{places[min(index, len(places) - 1)]}, column {column!r} is empty or not finite",
+            "remove the row",
+        )
 
 
 def _unwrapped(robot: Robot, log: Log, places: list[str]) -> Log:

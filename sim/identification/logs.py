@@ -94,9 +94,6 @@ def _read(robot: Robot, path: Path, kind: CommandKind | None, reading: Reading) 
         columns = _read_bag(path, reading)
         joints = {name.partition(":")[2].removeprefix(reading.prefix) for name in columns if ":" in name}
         if others := sorted(joints - {*robot.joint_names}):
-            if joints.isdisjoint(robot.joint_names):
-                remedy = f"the robot has {', '.join(robot.joint_names)}: give the prefix of the names, or another topic"
-                raise error(str(path), f"has none of the robot's joints, but {', '.join(others)}", remedy)
             warn(f"{path}: {', '.join(others)}: no joint of the robot, left out", LogWarning)
             names = [f":{reading.prefix}{joint}" for joint in robot.joint_names]
             columns = {name: table for name, table in columns.items() if name == "time" or name.endswith((*names,))}

@@ -133,7 +133,6 @@ def _readings(log: Log, names: Sequence[str]) -> Iterator[tuple[str, Log]]:
     if log.kind == "effort":
         yield "effort in thousandths of SI units", changed((False, True), 1e-3 * eye)
         return
-    yield "setpoints in degrees", changed((False, True), np.pi / 180 * eye)
     for shift in np.arange(0.01, 0.06, 0.01):
         words = f"setpoints that were logged {1e3 * shift:.0f} ms late"
         yield words, replace(log, command_time=log.command_time - shift)
@@ -206,20 +205,28 @@ def _bounded(matrix: Float64, target: Float64, is_strong: bool) -> tuple[Float64
 
     The strength is 1 if ``is_strong``.
     """
-    from scipy.optimize import nnls
-
     size = np.abs(matrix).max(0) + 1e-12
-    power = max((target**2).mean(), 1e-12) * len(target)
-    least = np.array([0, 0, 0, STRENGTHS[0], 0])
-    # Rows of the prior, whose weight makes a strength 1; the bias is the difference of two numbers.
-    prior = np.diag(1e-4 * np.sqrt(len(target)) * size)
-    prior[3, 3] = np.sqrt(power) * (1e4 if is_strong else WEIGHT)
-    rows = np.vstack([matrix, prior])
-    goal = np.append(target, prior[3]) - rows @ least
-    numbers, _ = nnls(np.hstack([rows, -rows[:, 4:]]) / size[[0, 1, 2, 3, 4, 4]], goal)
-    numbers /= size[[0, 1, 2, 3, 4, 4]]
-    values = least + numbers[:5]
-    values[3], values[4] = min(values[3], STRENGTHS[1]), numbers[4] - numbers[5]
+    scaled = matrix / size
+    gram = scaled.T @ scaled
+    weight = WEIGHT**2 * len(target) * size[3] ** -2 * (target**2).mean() / max((target**2).mean(), 1e-12)
+    gram[np.arange(5), np.arange(5)] += 1e-8 * len(target)
+    gram[3, 3] += weight
+    moment = scaled.T @ target
+    moment[3] += weight * size[3]
+    fixed = np.array([False, False, False, is_strong, False])
+    values = size * fixed
+    for _ in range(4):
+        free = ~fixed
+        rest = moment[free] - gram[np.ix_(free, fixed)] @ values[fixed]
+        values[free] = np.linalg.solve(gram[np.ix_(free, free)], rest)
+        low = np.array([0, 0, 0, STRENGTHS[0] * size[3], -np.inf])
+        high = np.array([np.inf, np.inf, np.inf, STRENGTHS[1] * size[3], np.inf])
+        outside = free & ((values < low) | (values > high))
+        if not outside.any():
+            break
+        values, fixed = np.clip(values, low, high), fixed | outside
+    values /= size
+    values[3] = np.clip(values[3], *STRENGTHS)  # exactly, after the rounding of the division
     return values, target - matrix @ values
 
 

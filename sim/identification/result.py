@@ -11,7 +11,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64
-from batchpid.checks.validate import choice, integer
+from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.sim.identification.fit import STEP, Problem, Solution, Window
@@ -119,16 +119,12 @@ class Identification:
         InvalidArgumentError
             There is no such unknown.
         """
-        kind = choice("kind", kind, list(KINDS))
-        places = {(entry.kind, entry.joint if entry.link is None else entry.link): entry for entry in self._all()}
-        if (kind, joint) not in places:
-            known = ", ".join(sorted({name for name, _ in places}))
-            raise InvalidArgumentError("joint", f"is no place of the unknown {kind!r}", value=joint, remedy=known)
-        entry = places[kind, joint]
-        return None if entry not in self.unknowns.entries else self._row(self.unknowns.entries.index(entry))
-
-    def _all(self) -> tuple[Unknown, ...]:
-        return self.unknowns.entries + self.hidden.entries
+        entries = self.unknowns.entries + self.hidden.entries
+        for at, entry in enumerate(entries):
+            if (entry.kind, entry.joint if entry.link is None else entry.link) == (kind, joint):
+                return self._row(at) if at < len(self.values) else None
+        kinds = ", ".join(sorted({entry.kind for entry in entries}))
+        raise InvalidArgumentError("kind", f"is no unknown of {joint!r}", value=kind, remedy=f"there are {kinds}")
 
     def _row(self, at: int) -> tuple[float, float, float]:
         value, half = float(self.values[at]), INTERVAL * float(self.intervals.deviation[at])
@@ -146,9 +142,7 @@ class Identification:
         return [self._name(entry) for entry in self.hidden.entries]
 
     def _name(self, entry: Unknown) -> str:
-        joint = None if entry.joint is None else self.robot.joint_names[self.joints[entry.joint]]
-        place = joint or entry.link
-        return entry.kind if place is None else f"{place}: {entry.kind}"
+        return ": ".join(filter(None, (self._place(entry), entry.kind)))
 
     def actuators(self) -> bp.Actuators:
         """Return the actuators that were found; joints that are not in the logs are ideal.
@@ -234,7 +228,7 @@ class Identification:
 
     def report(self) -> str:
         """Return values, intervals and errors as text."""
-        kinds = list(dict.fromkeys(entry.kind for entry in self._all() if entry.joint is not None))
+        kinds = list(dict.fromkeys(entry.kind for entry in self.unknowns.entries if entry.joint is not None))
         names = [self.robot.joint_names[joint] for joint in self.joints]
         cells = {(entry.kind, self._place(entry)): self._cell(at) for at, entry in enumerate(self.unknowns.entries)}
         rows = [["95 % intervals, SI units", *kinds]]
@@ -242,9 +236,8 @@ class Identification:
         widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
         lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
         lines += [""]
-        for entry in self._all():
-            if entry.joint is None:
-                lines.append(f"{self._name(entry)}: {cells.get((entry.kind, entry.link), 'not shown by these logs')}")
+        shared = [entry for entry in self.unknowns.entries if entry.joint is None]
+        lines += [f"{self._name(entry)}: {cells[entry.kind, entry.link]}" for entry in shared]
         if self.drive.compensate != "none":
             way = "through its motors" if self.drive.through else "apart from its motors"
             lines.append(f"the robot compensates {self.drive.compensate} {way}")

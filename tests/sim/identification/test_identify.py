@@ -149,7 +149,7 @@ READINGS = {
     "effort of all joints with the other sign": ("effort", lambda log: {"command": -log.command}),
     "effort in thousandths of SI units": ("effort", lambda log: {"command": 1e3 * log.command}),
     "qpos of shoulder and elbow exchanged": ("setpoint", lambda log: {"qpos": log.qpos[:, ::-1]}),
-    "setpoints in degrees": ("setpoint", lambda log: {"command": np.degrees(log.command)}),
+    "setpoints look like degrees": ("setpoint", lambda log: {"command": np.degrees(log.command)}),
 }
 
 
