@@ -79,7 +79,7 @@ def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
         envs = envs[np.linspace(0, len(envs) - 1, EXAMINED).astype(int)]
     run = _Run(rollout.for_envs(envs), robot)
     unexplained, is_first = run.unsettled.copy(), np.ones(len(envs), bool)
-    causes: dict[tuple[int, int | None, Links], list[_Place]] = defaultdict(list)
+    causes: dict[tuple[int, int | None, Links], list[_Location]] = defaultdict(list)
     times_first: dict[tuple[int, int | None, Links], int] = defaultdict(int)
     for rank, rule in enumerate(RULES):
         for place in [*rule.find(run, unexplained)]:
@@ -92,7 +92,7 @@ def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
     return Findings([run.finding(RULES[key[0]], causes[key], envs) for key in order])
 
 
-class _Place(NamedTuple):
+class _Location(NamedTuple):
     """Joint or links of an env that have a cause, since a time [s], with figures."""
 
     env: int
@@ -103,7 +103,7 @@ class _Place(NamedTuple):
 
 
 class _Run:
-    """Arrays of a run and figures of its end; ``envs`` are those of the rollout."""
+    """Arrays of a rollout, and figures of its end."""
 
     def __init__(self, rollout: Rollout, robot: RobotDescription) -> None:
         self.rollout, self.robot, self.info = rollout, robot, rollout.info
@@ -113,11 +113,11 @@ class _Run:
         start = self.info.start
         self.start: Float64 = np.asarray(self.qpos[0] if start is None else start, np.float64)
         self.failed: Bool = np.asarray(~rollout.ok.all(0))
-        own = self.info.own_command
-        self.is_pose = own is not None and self.info.tool is not None and own.size == 7
+        command = self.info.own_command
+        self.is_pose = command is not None and self.info.tool is not None and command.size == 7
         self.collides = self.info.collisions is not False
 
-    def finding(self, rule: Rule, places: list[_Place], envs: NDArray[np.intp]) -> Finding:
+    def finding(self, rule: Rule, places: list[_Location], envs: NDArray[np.intp]) -> Finding:
         """Return one finding for the same cause in several envs; ``envs`` are their numbers in the whole run."""
         places = sorted(places, key=lambda place: place.time)
         first = places[0]
@@ -227,7 +227,7 @@ class _Run:
 
     @cached_property
     def unexplained_effort(self) -> Float64:
-        """Effort at the end beside that against gravity."""
+        """Part of the effort at the end that does not carry gravity."""
         return np.abs(self.applied - self.load[0])
 
     def _moves_less(self, motion: Float64, share: float) -> Bool:
@@ -321,26 +321,26 @@ class _Run:
 
 # -- rules -----------------------------------------------------------------------------------------------------------
 
-Find = Callable[[_Run, Bool], Iterator[_Place]]
+Find = Callable[[_Run, Bool], Iterator[_Location]]
 """Function (run, joints without a cause (envs, dof)) that yields the places of a cause."""
 
 
 def _joints(test: Callable[[_Run], Bool], detail: Callable[[_Run, int, int], str] = _Run.figures) -> Find:
     """Return the function that finds the joints for which a ``test`` is true (envs, dof): the latest, the farthest."""
 
-    def find(run: _Run, unexplained: Bool) -> Iterator[_Place]:
+    def find(run: _Run, unexplained: Bool) -> Iterator[_Location]:
         places = np.argwhere(unexplained & ~run.failed[:, None] & test(run))
         delay, farthest = run.delay, np.abs(run.error[run.tail]).max(0)
         for env, joint in sorted(places.tolist(), key=lambda place: (-delay[*place], -farthest[*place])):
-            yield _Place(env, run.rest_time[env, joint], joint, detail=detail(run, env, joint))
+            yield _Location(env, run.rest_time[env, joint], joint, detail=detail(run, env, joint))
 
     return find
 
 
-def _envs(look: Callable[[_Run, int], Iterator[_Place]]) -> Find:
+def _envs(look: Callable[[_Run, int], Iterator[_Location]]) -> Find:
     """Return the function that looks at each env with unexplained joints."""
 
-    def find(run: _Run, unexplained: Bool) -> Iterator[_Place]:
+    def find(run: _Run, unexplained: Bool) -> Iterator[_Location]:
         for env in np.flatnonzero(unexplained.any(1)).tolist():
             yield from look(run, env)
 
@@ -350,19 +350,19 @@ def _envs(look: Callable[[_Run, int], Iterator[_Place]]) -> Find:
 def _faults(are_of_input: bool) -> Find:
     """Return the function that finds the failed envs whose fault is one of the input, or of the state."""
 
-    def look(run: _Run, env: int) -> Iterator[_Place]:
+    def look(run: _Run, env: int) -> Iterator[_Location]:
         fault = next((fault for fault in reversed(run.info.faults) if fault.env == env), None)
         cause = "state" if fault is None else fault.cause
         if run.failed[env] and are_of_input == (cause not in ("state", "speed")):
             time = run.rollout.time[np.argmin(run.rollout.ok[:, env])] if fault is None else fault.time
             names = run.robot.joint_names
             joint = names.index(fault.joint) if fault is not None and fault.joint in names else None
-            yield _Place(env, float(time), joint, detail=cause)
+            yield _Location(env, float(time), joint, detail=cause)
 
     return _envs(look)
 
 
-def _unstable(run: _Run, env: int) -> Iterator[_Place]:
+def _unstable(run: _Run, env: int) -> Iterator[_Location]:
     """Yield the joint that takes the largest part in a motion beyond the bound, where efforts or speeds show it."""
     report = run.stability(env)
     if report is None or report.robot_ratio < 1:
@@ -373,18 +373,18 @@ def _unstable(run: _Run, env: int) -> Iterator[_Place]:
     shaking = (speed > 3 * moved + 1e-2) | run.at_limit[env] | run.oscillates[env]
     if run.failed[env] or shaking[run.unsettled[env]].any():
         detail = f"{report.robot_ratio:.3g} times the bound"
-        yield _Place(env, float(rollout.time[0]), int(np.argmax(report.participation)), detail=detail)
+        yield _Location(env, float(rollout.time[0]), int(np.argmax(report.participation)), detail=detail)
 
 
-def _start_contacts(run: _Run, env: int) -> Iterator[_Place]:
+def _start_contacts(run: _Run, env: int) -> Iterator[_Location]:
     """Yield the pairs of links that overlap at the start, the deepest first."""
     if run.collides and run.info.start is not None:
         time = float(run.rollout.time[0] - run.rollout.tick)
         for links, distance in run.near(run.start[env], -OVERLAP).items():
-            yield _Place(env, time, links=links, detail=f"{-1e3 * distance:.3g} mm deep")
+            yield _Location(env, time, links=links, detail=f"{-1e3 * distance:.3g} mm deep")
 
 
-def _contacts(run: _Run, env: int) -> Iterator[_Place]:
+def _contacts(run: _Run, env: int) -> Iterator[_Location]:
     """Yield the pairs of links that a joint presses together at the end, the nearest first."""
     if not run.collides or run.goal is None or run.failed[env]:
         return
@@ -393,14 +393,14 @@ def _contacts(run: _Run, env: int) -> Iterator[_Place]:
         if joint is not None:
             tick = bisect_left(range(len(run.qpos)), True, key=lambda tick: links in run.near(run.qpos[tick, env]))
             detail = f"joint {run.robot.joint_names[joint]!r} pushes"
-            yield _Place(env, float(run.rollout.time[tick]), links=links, detail=detail)
+            yield _Location(env, float(run.rollout.time[tick]), links=links, detail=detail)
 
 
-def _out_of_reach(run: _Run, env: int) -> Iterator[_Place]:
+def _out_of_reach(run: _Run, env: int) -> Iterator[_Location]:
     if run.is_pose and run.goal is not None and not (run.solution.success[env] or run.failed[env]):
         away = 1e3 * float(run.solution.position_error[env])
         detail = f"the nearest is {away:.3g} mm away" if away > 1e3 * POSE_BAND else "its rotation is not reached"
-        yield _Place(env, run.rest_time[env].max(), links=(str(run.info.tool),), detail=detail)
+        yield _Location(env, run.rest_time[env].max(), links=(str(run.info.tool),), detail=detail)
 
 
 class Rule(NamedTuple):
@@ -452,8 +452,8 @@ def _lacks_integral_action(run: _Run) -> Bool:
 
 # Facts come before symptoms: a fault of the input, setpoints that cannot be reached, links that touch, gains beyond the
 # bound. Each of them explains errors of all joints. Then come the motion and the effort of each joint at its end, the
-# causes of an effort at its limit and of oscillations before those of a joint at rest, which they look like for a
-# moment. Among these, a force that the model does not explain is a cause only where the whole env is at rest.
+# causes of an effort at its limit and of oscillations before those of rest, since such a joint can rest for a moment.
+# Among these, a force that the model does not explain is a cause only where the whole env is at rest.
 RULES: tuple[Rule, ...] = (
     Rule(
         "setpoint-not-finite",
