@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
-from batchpid.errors import BatchPIDError, InvalidArgumentError
+from batchpid.errors import InvalidArgumentError
 from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 from batchpid.sim.robot.findings import Finding, Findings
-from batchpid.sim.robot.loop_stability import stability_report
 
 BAND = 0.02  # half width of the settling band, as a share of the move
 EXAMINED = 100  # envs at most
@@ -45,11 +44,6 @@ def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
     Every finding has the envs and the time [s] from which the joint hardly moved in the first of them, or at which that
     env failed. Only failures are found where setpoints are neither joint positions nor poses of a tool, and no more
     than :data:`EXAMINED` envs are examined.
-
-    Raises
-    ------
-    InvalidArgumentError
-        The robot has other joints than the run.
     """
     if robot.joint_names != rollout.info.joint_names:
         problem = f"{robot.name!r} has other joints than the run of {rollout.info.robot!r}"
@@ -77,6 +71,20 @@ def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
     return findings
 
 
+def _finding(run: _Run, rule: Rule, joint: int, rows: NDArray[np.intp], envs: NDArray[np.intp]) -> Finding:
+    """Return one finding for the same cause in ``rows`` of the examined ``envs``, with the detail of the first."""
+    times = run.rest_time[rows, joint]
+    rows = rows[np.argsort(times, kind="stable")]
+    first, name = rows[0], None
+    faults = [f"{fault.joint}: {fault.cause}" for fault in run.info.faults if fault.env == first]
+    detail = faults[-1] if faults else run.pressed[first]
+    if rule.names_joint:
+        name = run.robot.joint_names[joint]
+        detail = f"{run.error[-1, first, joint]:.2g} {run.robot.units[joint]} remain"
+    numbers = tuple(envs[rows].tolist())
+    return Finding("warning", rule.code, rule.text, rule.remedy, name, detail=detail, envs=numbers, time=times.min())
+
+
 class _Run:
     """Arrays of a run, and figures of its end (envs, dof)."""
 
@@ -85,12 +93,10 @@ class _Run:
         ticks = len(rollout.time)
         self.tail = slice(-min(ticks, max(3, round(TAIL * ticks))), None)
         self.qpos = rollout.qpos.astype(np.float64)
-        start = self.info.start
-        self.start: Float64 = np.asarray(self.qpos[0] if start is None else start, np.float64)
         self.failed: Bool = np.asarray(~rollout.ok.all(0))[:, None]
         tool_command = self.info.own_command
-        has_pose = tool_command is not None and self.info.tool is not None and tool_command.size == 7
-        self.is_pose = has_pose and robot.fixed_base
+        has_pose = tool_command is not None and tool_command.size == 7
+        self.is_pose = has_pose and self.info.tool is not None and robot.fixed_base
 
     @cached_property
     def solution(self) -> Any:
@@ -108,19 +114,16 @@ class _Run:
         is_known = self.info.own_command is None and self.info.control != "effort"
         return self.robot.coupled(self.rollout.setpoint[-1]) if is_known else self.qpos[-1]
 
-    def _short_way(self, error: Float64) -> Float64:
-        return np.where(self.robot.continuous, error - TURN * np.rint(error / TURN), error)
-
     @cached_property
     def error(self) -> Float64:
         """Last setpoint minus each position (ticks, envs, dof) [rad or m]."""
-        return self._short_way(self.goal - self.qpos)
+        error = self.goal - self.qpos
+        return np.where(self.robot.continuous, error - TURN * np.rint(error / TURN), error)
 
     @cached_property
     def band(self) -> Float64:
         """Half width of the settling band [rad or m]."""
-        move = self._short_way(self.goal - self.start)
-        return np.maximum(BAND * np.abs(move), absolute_band(self.robot))
+        return np.maximum(BAND * np.abs(self.error[0]), absolute_band(self.robot))
 
     @cached_property
     def unsettled(self) -> Bool:
@@ -135,7 +138,7 @@ class _Run:
         """Largest effort [N m or N]."""
         params = self.info.params
         limit = self.info.effort_limit if params is None or params.effort_max is None else params.effort_max
-        return np.broadcast_to(limit, self.start.shape)
+        return np.broadcast_to(limit, self.band.shape)
 
     @cached_property
     def effort(self) -> Float64:
@@ -148,11 +151,6 @@ class _Run:
         if params.kd is not None:
             drive = drive - params.kd * self.rollout.qvel
         return effort + np.clip(drive, -self.limit, self.limit)
-
-    @cached_property
-    def applied(self) -> Float64:
-        """Effort at the end, the median of the tail."""
-        return np.asarray(np.median(self.effort[self.tail], axis=0))
 
     @cached_property
     def load(self) -> Float64:
@@ -171,6 +169,12 @@ class _Run:
         return np.asarray(motion < np.maximum(0.05 * np.abs(self.error[-1]), 0.2 * self.band))
 
     @cached_property
+    def buzzes(self) -> Bool:
+        """Joints that are fast at the end and yet stay where they are, since their effort alternates."""
+        motion = np.median(np.abs(np.diff(self.qpos[self.tail], axis=0)), axis=0) / self.rollout.tick
+        return np.asarray(np.median(np.abs(self.rollout.qvel[self.tail]), axis=0) > 3 * motion + 1e-2)
+
+    @cached_property
     def rest_time(self) -> Float64:
         """Time from which each joint stays within its band around its last position, or at which its env failed [s]."""
         away = np.abs(self.qpos - self.qpos[-1]) > self.band
@@ -179,11 +183,8 @@ class _Run:
         return self.rollout.time[np.where(self.failed, np.argmin(self.rollout.ok, axis=0)[:, None], rest)]
 
     def _near(self, qpos: Float64, within: float) -> dict[str, float]:
-        """Return the distances [m] below ``within`` of pairs of links, and of links to the ground.
-
-        A robot on a floating base stands on the ground: there only pairs of links count.
-        """
-        ground = self.info.ground if self.robot.fixed_base else False
+        """Return the distances [m] below ``within`` of pairs of links, and of links to the ground."""
+        ground = self.info.ground if self.robot.fixed_base else False  # on which a floating base stands
         pairs = sorted(self.robot.dynamics(ground).contacts.near(qpos, within), key=itemgetter(2), reverse=True)
         return {f"{link} on {other or 'the ground'}": distance for link, other, distance in pairs}
 
@@ -209,125 +210,60 @@ class Rule(NamedTuple):
     code: str
     text: str
     remedy: str
-    test: Callable[[_Run], Any]
-    """Function that returns the joints that have it (envs, dof), or the envs (envs, 1)."""
-    names_joint: bool = True
-    """False for a cause of whole envs."""
+    test: Callable[[_Run], Any]  # the joints that have it (envs, dof), or the envs (envs, 1)
+    names_joint: bool = True  # False for a cause of whole envs
 
 
 def _is_beyond_limits(run: _Run) -> Bool:
     low, high = run.robot.lower - LIMIT_TOLERANCE, run.robot.upper + LIMIT_TOLERANCE
-    return ~run.robot.continuous & ((run.goal < low) | (run.goal > high) | (run.robot.lower == run.robot.upper))
-
-
-def _is_unstable(run: _Run) -> Bool:
-    """Return the joint with the largest part in a motion beyond the stability bound, of each env."""
-    info, unstable = run.info, np.zeros_like(run.unsettled)
-    if info.control != "pid" or info.params is None or info.timestep is None:
-        return unstable
-    for env in np.flatnonzero(~run.failed):
-        row = np.array([env])
-        motors = None if info.actuators is None else info.actuators.for_envs(row)
-        try:
-            report = stability_report(
-                run.robot, info.params.for_envs(row), run.qpos[-1, env], info.timestep, actuators=motors
-            )
-        except BatchPIDError:  # a mass matrix that is not positive definite
-            continue
-        if report.robot_ratio >= 1:
-            unstable[env, np.argmax(report.participation * run.unsettled[env])] = True
-    return unstable
+    return ~run.robot.continuous & ((run.goal < low) | (run.goal > high))
 
 
 def _oscillates(run: _Run) -> Bool:
-    """Return the joints that swing about their setpoint in the last half."""
+    """Return the joints that buzz, or swing about their setpoint in the last half."""
     wave, ends = run.error[len(run.error) // 2 :], run.error[run.tail]
     turns = np.count_nonzero(np.diff(np.sign(wave - wave.mean(0)), axis=0), axis=0)
     is_large = np.ptp(ends, axis=0) / 2 >= np.maximum(np.abs(ends.mean(0)), run.band / 2)
-    return np.asarray(is_large & (turns >= 3))
+    return np.asarray(run.buzzes | (is_large & (turns >= 3)))
 
 
 def _is_too_weak(run: _Run) -> Bool:
     at_limit = np.mean(np.abs(run.effort) >= 0.999 * run.limit, axis=0) > 0.5
     needed = np.abs(run.load).max(0) + run.robot.friction
-    return at_limit & (~run.is_at_rest | (needed >= 0.95 * run.limit))
+    return at_limit & ~run.buzzes & (~run.is_at_rest | (needed >= 0.95 * run.limit))
 
 
 def _is_blocked(run: _Run) -> Bool:
     """Return the joints whose effort neither gravity nor friction explains, in envs at rest."""
-    noise = 0.05 * (np.abs(run.applied) + np.abs(run.load[0]))
-    unexplained = np.abs(run.applied - run.load[0])
+    applied = np.median(run.effort[run.tail], axis=0)
+    noise = 0.05 * (np.abs(applied) + np.abs(run.load[0]))
+    unexplained = np.abs(applied - run.load[0])
     return run.is_at_rest.all(1, keepdims=True) & (unexplained > 1.2 * run.robot.friction + noise)
 
 
-# Facts come before symptoms: an env that failed, setpoints that cannot be reached, links that touch, gains beyond the
-# bound. Then come the motion and the effort of the joints: an effort at its limit in most of the run, oscillations, and
-# joints at rest, which they look like for a moment, and a force that the model does not explain before small gains.
+# Facts come before symptoms: an env that failed, setpoints that cannot be reached, links that touch. Then come the
+# effort and the motion in the run: a constant effort at its limit, oscillations, joints at rest, which they look like
+# for a moment. Of those, a force that the model does not explain comes before gains that are small.
 RULES: tuple[Rule, ...] = (
-    Rule(
-        "failed", "an input was not finite, or the state diverged", "correct the input or lower the gains",
-        lambda run: run.failed, names_joint=False,
-    ),
+    Rule("failed", "an input was not finite, or the state diverged", "correct the input or lower the gains",
+         lambda run: run.failed, names_joint=False),
     Rule("setpoint-limits", "the setpoint is outside the joint limits", "move it inside", _is_beyond_limits),
-    Rule(
-        "out-of-reach", "no pose within the joint limits brings the tool to the setpoint", "move it nearer",
-        lambda run: ~run.solution.success[:, None] if run.is_pose else False, names_joint=False,
-    ),
-    Rule(
-        "guard", "the guard holds the setpoint back", "move it inside the guard's limits, or give it more time",
-        lambda run: run.rollout.guarded[-1],
-    ),
-    Rule(
-        "touching", "links are pressed together, or against the ground",
-        "choose another start, setpoint or way, disable the pair in an .srdf, or use ground=False",
-        lambda run: np.array(run.pressed)[:, None] != "", names_joint=False,
-    ),
-    Rule(
-        "unstable", "the gains are beyond the stability bound of the sampled loop",
-        "use at most half of them, a derivative_filter_time, or robot.designed()", _is_unstable,
-    ),
-    Rule(
-        "effort-limit", "the effort is at its limit: gravity and friction need more, or the move more time",
-        "raise the effort limit, lighten the load, or run longer", _is_too_weak,
-    ),
-    Rule(
-        "oscillates", "oscillates: its loop is hardly damped, or motors and sensors are too late for its gains",
-        "raise its kd, lower its kp and ki, or use robot.designed()", _oscillates,
-    ),
-    Rule(
-        "blocked", "something outside the robot's model acts on it: an object, a payload, another force",
-        "look at the scene; for a constant load use gains with integral action", _is_blocked,
-    ),
-    Rule(
-        "gains", "rests beside the setpoint: its gains leave the error that balances gravity or friction",
-        "raise kp, ki or integral_limit, or compensate gravity and friction", lambda run: run.is_at_rest,
-    ),
-    Rule(
-        "slow", "still moves when the run ends: to its setpoint, or behind one that moves",
-        "run longer, hold the last setpoint, pass setpoint_rate, or raise the gains", lambda run: run.unsettled,
-    ),
+    Rule("out-of-reach", "no pose within the joint limits brings the tool to the setpoint", "move it nearer",
+         lambda run: ~run.solution.success[:, None] if run.is_pose else False, names_joint=False),
+    Rule("guard", "the guard holds the setpoint back", "move it inside the guard's limits, or give it more time",
+         lambda run: run.rollout.guarded[-1]),
+    Rule("touching", "links are pressed together, or against the ground",
+         "choose another start, setpoint or way, disable the pair in an .srdf, or use ground=False",
+         lambda run: np.array(run.pressed)[:, None] != "", names_joint=False),
+    Rule("effort-limit", "the effort is at its limit: gravity and friction need more, or the move more time",
+         "raise the effort limit, lighten the load, or run longer", _is_too_weak),
+    Rule("oscillates", "oscillates: gains are beyond the stability bound, hardly damped, or too high for the delays",
+         "use robot.designed(), or raise kd and lower kp and ki; robot.check(params=) tells which", _oscillates),
+    Rule("blocked", "something outside the robot's model acts on it: an object, a payload, another force",
+         "look at the scene; for a constant load use gains with integral action", _is_blocked),
+    Rule("gains", "rests beside the setpoint: its gains leave the error that balances gravity or friction",
+         "raise kp, ki or integral_limit, or compensate gravity and friction", lambda run: run.is_at_rest),
+    Rule("slow", "still moves when the run ends: to its setpoint, or behind one that moves",
+         "run longer, hold the last setpoint, pass setpoint_rate, or raise the gains", lambda run: run.unsettled),
 )  # fmt: skip
 """Every cause, in the order in which they are tested and listed."""
-
-
-def _detail(run: _Run, env: int, joint: int) -> str:
-    """Return the error of a joint at the end, with its effort."""
-    left = f"{run.error[-1, env, joint]:.2g} {run.robot.units[joint]} remain"
-    effort = f"{run.applied[env, joint]:.3g} of {run.limit[env, joint]:.3g} {run.robot.joints[joint].effort_unit}"
-    return f"{left}, with {effort}"
-
-
-def _detail_of_env(run: _Run, env: int) -> str:
-    """Return the last fault of an env, or the links that are pressed together."""
-    faults = [f"{fault.joint}: {fault.cause}" for fault in run.info.faults if fault.env == env]
-    return faults[-1] if faults else run.pressed[env]
-
-
-def _finding(run: _Run, rule: Rule, joint: int, rows: NDArray[np.intp], envs: NDArray[np.intp]) -> Finding:
-    """Return one finding for the same cause in ``rows`` of the examined ``envs``, that of the first in time."""
-    times = run.rest_time[rows, joint]
-    rows = rows[np.argsort(times, kind="stable")]
-    detail = _detail(run, rows[0], joint) if rule.names_joint else _detail_of_env(run, rows[0])
-    name = run.robot.joint_names[joint] if rule.names_joint else None
-    numbers = tuple(envs[rows].tolist())
-    return Finding("warning", rule.code, rule.text, rule.remedy, name, detail=detail, envs=numbers, time=times.min())
