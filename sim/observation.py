@@ -282,7 +282,7 @@ class RunInfo:
 
     def for_ticks(self, start: Rows | None, begin: float, end: float) -> RunInfo:
         """Return the info of the ticks between two times [s], where the first begins at the positions ``start``."""
-        span = TickRange(start, begin, end, tuple([each for each in self.redraws if each.time <= begin]))
+        span = TickRange(start, begin, end, tuple([redraw for redraw in self.redraws if redraw.time <= begin]))
         return self._followed(lambda rule, value: rule.for_ticks(value, span))
 
     def _followed(self, follow: Callable[[FieldRule, Any], Any]) -> RunInfo:
@@ -308,8 +308,7 @@ class TickRange(NamedTuple):
 class FieldRule(NamedTuple):
     """Effect of :meth:`Rollout.for_envs`, :meth:`Rollout.for_ticks` and :meth:`Rollout.join` on a field.
 
-    The first two leave None as it is.
-    ``join`` takes the values of all parts; without it the parts have to agree.
+    A field that is None stays None. ``join`` takes the values of all parts; without it they have to be equal.
     """
 
     for_envs: Callable[[Any, NDArray[np.int64]], Any] = lambda value, envs: value
@@ -334,7 +333,7 @@ def _episodes_at(episodes: NDArray[np.int64], span: TickRange) -> NDArray[np.int
 
 
 def _joined_rates(values: Sequence[bool | None]) -> bool | None:
-    """Return True if a part had rates, None if that is unknown of one."""
+    """Return True if a part had rates, None if a part does not say whether it had."""
     return True if True in values else None if None in values else False
 
 

@@ -49,7 +49,6 @@ GONE = (
     r"checkpoint_steps",
     r"ClusterWarning",
     r"compare_engines",
-    r"identification.confidence_region",
     r"control_toolbox\(",
     r"decoupling=",
     r"DriveChatter",

@@ -103,7 +103,7 @@ class _Location(NamedTuple):
 
 
 class _Run:
-    """Arrays of a run and figures of its end; ``envs`` are those of the rollout."""
+    """Arrays of a rollout, and figures of its end."""
 
     def __init__(self, rollout: Rollout, robot: RobotDescription) -> None:
         self.rollout, self.robot, self.info = rollout, robot, rollout.info
@@ -113,8 +113,8 @@ class _Run:
         start = self.info.start
         self.start: Float64 = np.asarray(self.qpos[0] if start is None else start, np.float64)
         self.failed: Bool = np.asarray(~rollout.ok.all(0))
-        own = self.info.own_command
-        self.is_pose = own is not None and self.info.tool is not None and own.size == 7
+        command = self.info.own_command
+        self.is_pose = command is not None and self.info.tool is not None and command.size == 7
         self.collides = self.info.collisions is not False
 
     def finding(self, rule: Rule, places: list[_Location], envs: NDArray[np.intp]) -> Finding:
@@ -227,7 +227,7 @@ class _Run:
 
     @cached_property
     def unexplained_effort(self) -> Float64:
-        """Effort at the end beside that against gravity."""
+        """Part of the effort at the end that does not carry gravity."""
         return np.abs(self.applied - self.load[0])
 
     def _moves_less(self, motion: Float64, share: float) -> Bool:
@@ -452,8 +452,8 @@ def _lacks_integral_action(run: _Run) -> Bool:
 
 # Facts come before symptoms: a fault of the input, setpoints that cannot be reached, links that touch, gains beyond the
 # bound. Each of them explains errors of all joints. Then come the motion and the effort of each joint at its end, the
-# causes of an effort at its limit and of oscillations before those of a joint at rest, which they look like for a
-# moment. Among these, a force that the model does not explain is a cause only where the whole env is at rest.
+# causes of an effort at its limit and of oscillations before those of rest, since such a joint can rest for a moment.
+# Among these, a force that the model does not explain is a cause only where the whole env is at rest.
 RULES: tuple[Rule, ...] = (
     Rule(
         "setpoint-not-finite",

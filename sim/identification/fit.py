@@ -31,9 +31,9 @@ SETTLE = 0.3
 HELD_OUT = 0.25
 """Share of each log, at its end, that is held out."""
 MOST_WINDOWS = 500
-"""Most windows that are fitted; of more, evenly spaced ones are."""
+"""Largest number of fitted windows; of more, evenly spaced ones are fitted."""
 MOST_NUMBERS = 2**24
-"""Most numbers of the derivatives; of more, evenly spaced rows are fitted."""
+"""Largest number of entries of the derivatives; of more, evenly spaced rows are fitted."""
 ENVS = 2048
 """Most simulations at once."""
 STEP = 1e-2
@@ -41,9 +41,9 @@ STEP = 1e-2
 STATE_STEPS = 1e-3, 1e-2
 """Changes of initial positions and velocities."""
 FARTHEST = 3.0
-"""Largest residual [rad or m], that of a simulation that diverges."""
+"""Bound of the residuals [rad or m], reached where a simulation diverges."""
 OUTLIER = 2.0
-"""Residual over its size from which it counts less."""
+"""Ratio of a residual to its size above which its weight in the loss decreases."""
 
 
 class Window(NamedTuple):
@@ -88,7 +88,7 @@ class Problem:
     windows: Sequence[Window]
     unknowns: Unknowns
     run: Callable[..., Any] = map
-    """``map``, or that of a pool of processes."""
+    """Function that runs tasks: ``map``, or ``map`` of a pool of processes."""
 
     def evaluate(self, point: Float64, steps: Float64 | None = None, free_states: bool = True) -> FitResiduals:
         """Return residuals at a point (unknowns,), and derivatives by ``steps`` (unknowns,); None: no derivatives.
@@ -142,18 +142,18 @@ class Problem:
 
         first = self.evaluate(start, np.full(len(start), STEP))
         size = self.size(first) if size is None else size
-        kept = {start.tobytes(): (first, self.system(first, start, size))}
+        systems = {start.tobytes(): (first, self.system(first, start, size))}
 
         def at(point: Float64) -> Any:
-            if point.tobytes() not in kept:
+            if point.tobytes() not in systems:
                 evaluation = self.evaluate(point, np.full(len(point), STEP))
-                kept.clear()
-                kept[point.tobytes()] = evaluation, self.system(evaluation, point, size)
+                systems.clear()
+                systems[point.tobytes()] = evaluation, self.system(evaluation, point, size)
                 if progress is not None:
                     progress()
-            return kept[point.tobytes()]
+            return systems[point.tobytes()]
 
-        found = least_squares(
+        optimum = least_squares(
             lambda point: at(point)[1][0],
             start,
             lambda point: at(point)[1][1],
@@ -165,8 +165,8 @@ class Problem:
             gtol=1e-8,
             max_nfev=evaluations,
         )
-        evaluation = at(found.x)[0]
-        return Solution(found.x, evaluation, self.size(evaluation), found.status > 0)
+        evaluation = at(optimum.x)[0]
+        return Solution(optimum.x, evaluation, self.size(evaluation), optimum.status > 0)
 
     def system(self, evaluation: FitResiduals, point: Float64, size: Float64) -> tuple[Float64, Float64]:
         """Return residuals and derivatives (n, unknowns) of the fitted rows over their ``size``, then of the prior."""
@@ -198,7 +198,7 @@ def _simulated(task: Any) -> list[Float64]:
 
 
 def _stacked(parts: Any) -> Any:
-    """Return the rows of several logs as one array; options that are no arrays are the same in all."""
+    """Return the rows of several logs as one array; other options are equal in all logs."""
     return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else parts[0]
 
 

@@ -7,8 +7,7 @@ part g of the rows is, to first order::
 
 (B. Efron, "The jackknife, the bootstrap and other resampling plans", SIAM 1982). The parts are the logs where there are
 five or more, else ten stretches of equal length, so that residuals that are correlated in time and errors of the model
-count. The variance is that of the jackknife, or s^2 H^-1 with the mean square s^2 of the residuals, whichever is
-larger.
+count. The variance is the larger of the jackknife's and s^2 H^-1, with the mean square s^2 of the residuals.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ INTERVAL = 2.0
 LEAST = 2.5e-3
 """Least standard deviation over the value: the fit ends at changes of a thousandth."""
 SHOWN = 0.7
-"""Standard deviation over that of the prior from which the logs show nothing of an unknown."""
+"""Ratio of the standard deviation to the prior's from which an unknown counts as not identified."""
 
 
 class Intervals(NamedTuple):

@@ -250,8 +250,12 @@ def _read_bag(robot: Robot, path: Path, reading: Reading) -> dict[str, Float64]:
     samples = {topic: defaultdict[str, list[tuple[int, float]]](list) for topic in topics}
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            chosen = [each for each in reader.connections if each.topic in topics and each.msgtype == JOINT_STATE]
-            present = sorted(each.topic for each in reader.connections if each.msgtype == JOINT_STATE)
+            chosen = [
+                connection
+                for connection in reader.connections
+                if connection.topic in topics and connection.msgtype == JOINT_STATE
+            ]
+            present = sorted(connection.topic for connection in reader.connections if connection.msgtype == JOINT_STATE)
             for connection, received, raw in reader.messages(connections=chosen) if chosen else ():
                 message: Any = reader.deserialize(raw, connection.msgtype)
                 stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec or received

@@ -305,13 +305,13 @@ def simulate(
     dynamics = plant.dynamics(rows.masses, q, v)
     dynamics.update()
     compensation = _Compensation(plant, drive, dynamics, q, v, rows.actuators.position_offset)
-    asked = None
+    efforts = None
     past = min(stretch.past for stretch in stretches)
     if drive.params is None and past:
         held = compensation.now() if drive.through else None
         earlier = np.stack([stretch.command[stretch.past - 1 :: -1][:past] for stretch in stretches], axis=1)
-        asked = np.tile(earlier, (1, count, 1)) + (0.0 if held is None else held)
-    control = Control(drive, rows, q, v, asked, plant.turns)
+        efforts = np.tile(earlier, (1, count, 1)) + (0.0 if held is None else held)
+    control = Control(drive, rows, q, v, efforts, plant.turns)
     if control.friction.coulomb is not None:
         control.state.friction.effort[...] = dynamics.force
     commands = _Commands(drive, rows, stretches)
@@ -419,7 +419,7 @@ def _trace(layout: Layout, *structures: Any) -> Trace:
 
 
 def _returned(state: StepState) -> StepState:
-    """Return what a program returns of a state: without histories, which it changes in place."""
+    """Return the leaves of a state that a program returns: without histories, which it changes in place."""
     motors = None if state.motors is None else state.motors._replace(command=None, sensor=None)
     return state._replace(motors=motors)
 
