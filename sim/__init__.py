@@ -1,4 +1,4 @@
-"""The SAPIEN multi-scene runner: load a URDF, run N of that robot under explicit joint control.
+"""Many robots in SAPIEN or MuJoCo: load a URDF or MJCF file, run N copies under explicit joint control.
 
 Importing it does not load SAPIEN; the first use of :class:`Runner` or of :meth:`Robot.dynamics` does.
 """

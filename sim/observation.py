@@ -215,6 +215,8 @@ class RunInfo:
     """True if setpoints were given with rates, and moved within the ticks; None if unknown, as after a kill."""
     params: PIDParams | None = None
     """PID parameters at the start."""
+    params_changed: bool = False
+    """True if they were changed in the run, or a snapshot was restored; known of a complete recording."""
     actuators: Actuators | None = None
     """Motors and sensors at the start, before draws of a randomization; None for ideal ones."""
     start: Rows | None = None
@@ -280,10 +282,10 @@ class RunInfo:
 
     def for_ticks(self, start: Rows | None, begin: float, end: float) -> RunInfo:
         """Return the info of the ticks between two times [s], where the first begins at the positions ``start``."""
-        span = Span(start, begin, end, tuple([each for each in self.redraws if each.time <= begin]))
+        span = TickRange(start, begin, end, tuple([redraw for redraw in self.redraws if redraw.time <= begin]))
         return self._followed(lambda rule, value: rule.for_ticks(value, span))
 
-    def _followed(self, follow: Callable[[Rule, Any], Any]) -> RunInfo:
+    def _followed(self, follow: Callable[[FieldRule, Any], Any]) -> RunInfo:
         values = {name: value for name, value in vars(self).items() if value is not None}
         return replace(self, **{name: follow(RULES[name], value) for name, value in values.items()})
 
@@ -292,7 +294,7 @@ class RunInfo:
         return f"RunInfo({self.robot}, {len(self.joint_names)} joints{control})"
 
 
-class Span(NamedTuple):
+class TickRange(NamedTuple):
     """Ticks of a run between two times [s]."""
 
     start: Rows | None
@@ -303,15 +305,14 @@ class Span(NamedTuple):
     """Redraws before these ticks."""
 
 
-class Rule(NamedTuple):
+class FieldRule(NamedTuple):
     """Effect of :meth:`Rollout.for_envs`, :meth:`Rollout.for_ticks` and :meth:`Rollout.join` on a field.
 
-    The first two leave None as it is.
-    ``join`` takes the values of all parts; without it the parts have to agree.
+    A field that is None stays None. ``join`` takes the values of all parts; without it they have to be equal.
     """
 
     for_envs: Callable[[Any, NDArray[np.int64]], Any] = lambda value, envs: value
-    for_ticks: Callable[[Any, Span], Any] = lambda value, span: value
+    for_ticks: Callable[[Any, TickRange], Any] = lambda value, span: value
     join: Callable[[Sequence[Any]], Any] | None = None
 
 
@@ -323,7 +324,7 @@ def _events_of(events: tuple[Any, ...], envs: NDArray[np.int64]) -> tuple[Any, .
     return tuple(renumbered)
 
 
-def _episodes_at(episodes: NDArray[np.int64], span: Span) -> NDArray[np.int64]:
+def _episodes_at(episodes: NDArray[np.int64], span: TickRange) -> NDArray[np.int64]:
     """Return stream and episode of each env at the start of ``span``."""
     episodes = episodes.copy()
     for redraw in span.earlier:
@@ -332,37 +333,38 @@ def _episodes_at(episodes: NDArray[np.int64], span: Span) -> NDArray[np.int64]:
 
 
 def _joined_rates(values: Sequence[bool | None]) -> bool | None:
-    """Return True if a part had rates, None if that is unknown of one."""
+    """Return True if a part had rates, None if a part does not say whether it had."""
     return True if True in values else None if None in values else False
 
 
 _FIRST = itemgetter(0)
-RULES: dict[str, Rule] = dict.fromkeys(
+RULES: dict[str, FieldRule] = dict.fromkeys(
     (
         *("robot", "joint_names", "units", "lower", "upper", "effort_limit", "urdf", "dissipation"),
         *("fixed_base", "timestep", "substeps", "control", "tool", "own_command", "compensate", "engine", "physics"),
         *("collisions", "ground", "contacts", "wrenches", "randomization", "options"),
     ),
-    Rule(),
+    FieldRule(),
 )
-RULES |= dict.fromkeys(("seed", "versions", "begun", "description"), Rule(join=_FIRST))
-RULES |= dict.fromkeys(("params", "actuators"), Rule(lambda value, envs: value.for_envs(envs), join=_FIRST))
+RULES |= dict.fromkeys(("seed", "versions", "begun", "description"), FieldRule(join=_FIRST))
+RULES |= dict.fromkeys(("params", "actuators"), FieldRule(lambda value, envs: value.for_envs(envs), join=_FIRST))
 RULES |= {
-    "start": Rule(lambda start, envs: start[envs], lambda start, span: span.start, _FIRST),
-    "draws": Rule(
+    "start": FieldRule(lambda start, envs: start[envs], lambda start, span: span.start, _FIRST),
+    "draws": FieldRule(
         lambda draws, envs: {name: rows[envs] for name, rows in draws.items()},
         lambda draws, span: None if span.earlier else draws,
         _FIRST,
     ),
-    "episodes": Rule(lambda episodes, envs: episodes[envs], _episodes_at, _FIRST),
-    "complete": Rule(join=all),
-    "rates": Rule(join=_joined_rates),
-    "faults": Rule(
+    "episodes": FieldRule(lambda episodes, envs: episodes[envs], _episodes_at, _FIRST),
+    "complete": FieldRule(join=all),
+    "params_changed": FieldRule(join=any),
+    "rates": FieldRule(join=_joined_rates),
+    "faults": FieldRule(
         _events_of,
         lambda faults, span: tuple([fault for fault in faults if fault.time <= span.end]),
         itemgetter(-1),  # faults of a runner include the earlier ones
     ),
-    "redraws": Rule(
+    "redraws": FieldRule(
         _events_of,
         lambda redraws, span: tuple([redraw for redraw in redraws if span.begin < redraw.time <= span.end]),
         lambda parts: tuple(dict.fromkeys([redraw for part in parts for redraw in part])),

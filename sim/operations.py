@@ -1,4 +1,4 @@
-"""Operations of a Runner: each says what the workers do with their loops, and what the state of the runner is then.
+"""Operations of a Runner: the change of each worker's loop, and the state of the runner after it.
 
 An operation holds checked arguments for all envs and changes nothing by itself. The runner sends it to the workers, and
 then replaces its state by the result of :meth:`Operation.committed`.
@@ -115,8 +115,8 @@ class Run(Operation):
                 table[: self.ticks, envs] = rows[:, envs]
 
     def encode(self, envs: slice) -> bytes:
-        given = tuple(map(is_not, self.command, repeat(None)))  # Command.given, without one more call in a tick
-        return pickle.dumps((self.ticks, self.substeps, given))
+        are_given = tuple(map(is_not, self.command, repeat(None)))  # Command.given, without one more call in a tick
+        return pickle.dumps((self.ticks, self.substeps, are_given))
 
     def apply(self, loop: Loop) -> float:
         return loop.run(self.ticks, self.substeps, self.command.given)

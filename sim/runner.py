@@ -558,8 +558,8 @@ class Runner(SingleOwner):
 
     def _tick(self, arrays: tuple[ArrayLike | None, ...], substeps: int | None) -> Run:
         """Return the operation for the arguments of :meth:`step`, checked."""
-        given = dict(zip(Command._fields, arrays, strict=True))
-        command = read_command(self.options, self._state, self._warnings.setpoint_limits, given)
+        inputs = dict(zip(Command._fields, arrays, strict=True))
+        command = read_command(self.options, self._state, self._warnings.setpoint_limits, inputs)
         count = self.substeps if substeps is None else checked_option("substeps", substeps)
         if self.recorder is not None and count != self.substeps:
             problem, remedy = f"is not the runner's {self.substeps}", "all ticks of a recording have the same length"

@@ -21,7 +21,7 @@ from batchpid.sim.robot.run_checks import SetpointCheck
 from batchpid.sim.runner_state import Motion, RunnerState
 
 _SHORTEST = 1e-9
-"""Smallest length of a quaternion: that of a shorter one has large rounding errors."""
+"""Smallest length of a quaternion: a shorter one has large rounding errors."""
 
 
 def read_command(

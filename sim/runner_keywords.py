@@ -147,9 +147,9 @@ class RunnerKeywords:
         Compensation, option("snapshot", "recording", flag="Passive force and known friction, added at every sim step.")
     ] = "gravity+coriolis+friction"
     """Compensation added to the effort at every sim step: the passive force (gravity, Coriolis and centrifugal forces)
-    and the known Coulomb friction on the way to the setpoint. ``"gravity+coriolis+friction"``, the default, or a part
-    of it; under control "effort" friction is not compensated. On a floating base the passive force is computed as if
-    the base were fixed: the weight of the base on the legs depends on their contacts, and the law carries it."""
+    and the known Coulomb friction in the direction of the setpoint. ``"gravity+coriolis+friction"``, the default, or a
+    part of it; under control "effort" friction is not compensated. On a floating base the passive force is computed as
+    if the base were fixed: the weight of the base on the legs depends on their contacts, and the law carries it."""
     engine: Annotated[
         EngineName,
         option(
@@ -167,11 +167,11 @@ class RunnerKeywords:
             snapshot="solver_settings",
             recording="physics_name",
             scene="solver",
-            flag="Solver settings: SAPIEN's, fewer iterations, or one, for motion without contact.",
+            flag="Solver settings: those of SAPIEN and MuJoCo, or fewer iterations.",
         ),
     ] = "accurate"
-    """Solver settings: ``"accurate"`` (the default: those of SAPIEN), ``"fast"``, ``"free"`` (for motion without
-    contact), a :class:`batchpid.sim.Physics` for SAPIEN, or a :class:`batchpid.sim.MujocoSolver` for MuJoCo."""
+    """Solver settings: ``"accurate"`` (the default: those of SAPIEN), ``"fast"`` (fewer iterations), a
+    :class:`batchpid.sim.Physics` for SAPIEN, or a :class:`batchpid.sim.MujocoSolver` for MuJoCo."""
     collisions: Annotated[
         bool,
         option("snapshot", "recording", "scene", flag="Robots have no collision shapes: faster, for free motion only."),

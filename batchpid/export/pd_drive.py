@@ -92,8 +92,13 @@ class Drive(Differences):
         self.add("non_finite", "inputs are not checked", params.non_finite is not None)
         if acts:
             weight = self.value("setpoint_weight_derivative")
-            given = params.setpoint_weight_derivative is not None
-            self.add("setpoint_weight_derivative", "acts on the target's velocity alone (c = 1)", given, weight)
+            has_derivative_weight = params.setpoint_weight_derivative is not None
+            self.add(
+                "setpoint_weight_derivative",
+                "acts on the target's velocity alone (c = 1)",
+                has_derivative_weight,
+                weight,
+            )
             self.lack("derivative_filter_time", "no filter", 0.0, "s")
             problem = "the derivative is the simulator's velocity, not a difference"
             self.add("measurement_rate", problem, params.measurement_rate is None)

@@ -13,6 +13,6 @@ def tutorial(joints: int, kp: Array = 0.0, ki: Array = 0.0, kd: Array = 0.0, **o
 
     The derivative acts on the error, and nothing is limited. SimplePID differs in two ways: it integrates before it
     computes its output, which adds ki dt to kp, and its first derivative starts from an error of 0, which kicks.
-    ``options`` are those of :func:`batchpid.make_params`.
+    ``options`` are further options of :func:`batchpid.make_params`.
     """
     return make_params(joints, kp, ki, kd, **{"setpoint_weight_derivative": 1.0, **options})

@@ -236,7 +236,7 @@ PyObject *search(PyObject *, PyObject *const *arguments, Py_ssize_t) {
 // Arrays of `move`: MOVE in task_space_extension.py; the first three are changed.
 enum Move { AT, RATE, RUB, INERTIA, PUSH, ADDED, MOST_RUB, KEEP, CREEP, LOWER_END, UPPER_END, MOVE };
 
-// Step joints with friction: sim/identification/plant.py.
+// Step joints with friction: sim/identification/simulator.py.
 FOR_EACH_PROCESSOR void write_move(std::int64_t rows, std::int64_t joints, double dt, long sweeps, Tables const &table) {
   auto const n = static_cast<std::size_t>(joints);
   std::vector<Lanes> columns[MOVE], room(n * n), free(n), weight(n), next(n);

@@ -32,7 +32,7 @@ P = TypeVar("P", bound=Path | None)
 class OutputFiles:
     """Output files of one run of a ``command``. With ``--force`` they replace files, but none that the command reads.
 
-    Every other flag whose value is the name of a file is one that the command reads.
+    The command reads the file that any other flag names.
     """
 
     def __init__(self, command: Any) -> None:
@@ -42,7 +42,7 @@ class OutputFiles:
         for name, value in vars(command).items():
             if name not in OUTPUTS:
                 values = value if isinstance(value, tuple) else (value,)
-                self._inputs += [each for each in values if isinstance(each, str | Path) and os.path.isfile(each)]
+                self._inputs += [path for path in values if isinstance(path, str | Path) and os.path.isfile(path)]
 
     def path(self, argument: str, path: P, suffixes: Collection[str]) -> P:
         """Return ``path`` after a check that a file may be written there; None is returned as None.
@@ -55,7 +55,7 @@ class OutputFiles:
         file_path(argument, path, suffixes)
         problem, remedy = None, "choose another file"
         exists = os.path.lexists(path)
-        if os.path.exists(path) and any(os.path.samefile(path, each) for each in self._inputs):
+        if os.path.exists(path) and any(os.path.samefile(path, source) for source in self._inputs):
             problem = "is a file to read"
         elif os.path.realpath(path) in self._outputs:
             problem = "is another output of this run"

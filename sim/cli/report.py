@@ -165,7 +165,7 @@ def evaluation_table(robot: Robot, evaluations: Iterable[Evaluation]) -> str:
             ]
         )
         names = {None, *np.array(robot.joint_names)[arm]}
-        if findings := [each for each in evaluation.rollout.findings(robot) if each.joint in names]:
+        if findings := [finding for finding in evaluation.rollout.findings(robot) if finding.joint in names]:
             causes += [f"\nNot settled under {evaluation.name} (each env makes one move):", *cause_lines(findings)]
     headers = ["gains", "settling", "following error", "overshoot", "final error", "chatter", "settled /\nin time"]
     return "\n".join([table(rows, headers, "lrrrrrr"), ABOUT_SETS, *causes])

@@ -20,7 +20,7 @@ from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tuning.gain_sets import gain_set
 
 if TYPE_CHECKING:
-    from batchpid.sim.setpoint_files import Setpoints
+    from batchpid.sim.recording.setpoint_files import Setpoints
 
 RUNNER = flags.runner_flags()
 
@@ -49,7 +49,7 @@ class RolloutCommand:
     setpoint_rate:JOINT ... and setpoint_acceleration:JOINT ... A row holds at its time, and rows are equally spaced: by
     a tick. The first is at 0, with the start pose of env 0, or at the end of the first tick."""
     rates: bool = True
-    """With --no-rates the setpoints of the trajectory have none, as in a recording that `batchpid identify` reads."""
+    """--no-rates: give robots no rates of the setpoints, for a recording that `batchpid identify` reads."""
     seconds: flags.Seconds = 2.0
     timestep: Annotated[float, flags.BOUNDS["timestep"]] = 1 / 2000
     """Time step of simulation and control [s]."""
@@ -146,8 +146,8 @@ class RolloutCommand:
         return 0 if self.trajectory is not None else exit_status(robot, rollout)
 
     def _read(self, robot: Robot, path: Path) -> Setpoints:
-        """Return the setpoints in a file, and print whence their rates are."""
-        from batchpid.sim.setpoint_files import read_setpoints
+        """Return the setpoints in a file, and print the source of their rates."""
+        from batchpid.sim.recording.setpoint_files import read_setpoints
 
         if self.control == "osc":
             remedy = "leave one of them out; a trajectory has joint setpoints"

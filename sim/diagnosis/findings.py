@@ -94,8 +94,8 @@ class _Run:
         self.tail = slice(-min(ticks, max(3, round(TAIL * ticks))), None)
         self.qpos = rollout.qpos.astype(np.float64)
         self.failed: Bool = np.asarray(~rollout.ok.all(0))[:, None]
-        tool_command = self.info.own_command
-        has_pose = tool_command is not None and tool_command.size == 7
+        command = self.info.own_command
+        has_pose = command is not None and command.size == 7
         self.is_pose = has_pose and self.info.tool is not None and robot.fixed_base
 
     @cached_property
@@ -242,8 +242,8 @@ def _is_blocked(run: _Run) -> Bool:
 
 
 # Facts come before symptoms: an env that failed, setpoints that cannot be reached, links that touch. Then come the
-# effort and the motion in the run: a constant effort at its limit, oscillations, joints at rest, which they look like
-# for a moment. Of those, a force that the model does not explain comes before gains that are small.
+# effort and the motion in the run: a constant effort at its limit, oscillations, joints at rest, since such a joint can
+# rest for a moment. Of those, a force that the model does not explain comes before gains that are small.
 RULES: tuple[Rule, ...] = (
     Rule("failed", "an input was not finite, or the state diverged", "correct the input or lower the gains",
          lambda run: run.failed, names_joint=False),

@@ -24,7 +24,7 @@ from batchpid.sim.identification.log import Log, LogWarning, checked
 from batchpid.sim.identification.logs import Reading, read_logs
 from batchpid.sim.identification.regression import STRENGTHS, Guess, Motion, Regression, better_reading, smooth
 from batchpid.sim.identification.result import Identification
-from batchpid.sim.identification.simulator import Drive, Plant
+from batchpid.sim.identification.simulator import LogControl, Plant
 from batchpid.sim.identification.unknowns import BASIC, EXTRAS, LAW, Unknowns
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
@@ -37,18 +37,18 @@ SHARE, SHAKEN = 0.01, 1.5
 BEYOND = 3.0
 """Effort over the robot's limit from which it looks like another unit."""
 FOLLOWS = 0.02
-"""Standard deviation of the positions, over that of the setpoints, up to which a joint is stuck, and gives a little."""
+"""Ratio of the standard deviation of positions to the setpoints', up to which a joint counts as stuck."""
 
 
 class Data(NamedTuple):
     """Logs of the joints that moved, and the robots and control that made them."""
 
     robot: Robot
-    """The robot, which rests where the joints that did not move are."""
+    """The robot, whose start pose has the positions of the joints that did not move."""
     logs: list[Log]
     motions: list[Motion]
     plants: list[Plant]
-    drives: list[Drive]
+    drives: list[LogControl]
     """Motion, plant and drive of each log."""
     still: list[str]
     """Names of the joints that did not move."""
@@ -73,10 +73,10 @@ def identify(
     Parameters
     ----------
     logs
-        Files (:mod:`batchpid.sim.identification.logs`), or logs that were read, which may have settings of their own.
+        Files (:mod:`batchpid.sim.identification.logs`), or logs from :func:`read_logs`, each with separate settings.
     params
         Params of the PID law that drove the robot, of all its joints or of those in the logs: the setpoints of the logs
-        are used. None: those of a recording, or the efforts.
+        are used. None: the params of a recording, or the logged efforts.
     compensate
         Forces that the robot compensates by itself, or "none", as for logs of the complete efforts. Default: as the
         recordings say, else "gravity+coriolis+friction".
@@ -123,10 +123,10 @@ def identify(
     with pool as executor:
         run = map if executor is None else executor.map
         problem = Problem(data.plants, data.drives, _windows(data), unknowns, run)
-        found = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
-    if not found.explains and (words := _better_reading(data)):
-        return replace(found, advice=f"the logs make more sense with {words}: correct the log or its options")
-    return found
+        solution = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
+    if not solution.explains and (words := _better_reading(data)):
+        return replace(solution, advice=f"the logs make more sense with {words}: correct the log or its options")
+    return solution
 
 
 def _read(
@@ -137,7 +137,7 @@ def _read(
     timestep: float | None,
     reading: Reading | None,
 ) -> Data:
-    """Return the inputs; the arguments are those of :func:`identify`."""
+    """Return the inputs for the arguments of :func:`identify`."""
     if find_spec("scipy") is None:
         raise MissingDependencyError("scipy", "identification", "tune")
     instance("robot", robot, Robot, "load one with Robot.load('panda') or a URDF path")
@@ -175,11 +175,13 @@ def _read(
     start[np.array(read[0].joints)[~moves]] = places[~moves]
     parts = [log.part(joints=moves) for log in read]
     resting = _resting(robot, start) if still else robot
-    own = [resting if log.settings.robot is None else _resting(log.settings.robot, start) for log in parts]
+    robots = [resting if log.settings.robot is None else _resting(log.settings.robot, start) for log in parts]
     plants = dict[Any, Plant]()
-    for log, each in zip(parts, own, strict=True):
-        plants.setdefault((id(log.settings.robot), log.settings.payload), Plant(each, log.joints, log.settings.payload))
-    drives = [Drive(dt, None if law is None else law.for_joints(moves), forces) for law in laws]
+    for log, at_rest in zip(parts, robots, strict=True):
+        plants.setdefault(
+            (id(log.settings.robot), log.settings.payload), Plant(at_rest, log.joints, log.settings.payload)
+        )
+    drives = [LogControl(dt, None if law is None else law.for_joints(moves), forces) for law in laws]
     chosen = [plants[id(log.settings.robot), log.settings.payload] for log in parts]
     return Data(resting, parts, [smooth(log, dt) for log in parts], chosen, drives, still)
 
@@ -191,13 +193,13 @@ def _resting(robot: Robot, start: Float64) -> Robot:
 
 def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
     """Return the params that drove a log; raise InvalidArgumentError if a recording contradicts them."""
-    known = None if log.params is None else _of_joints(log.params, robot, log)
+    recorded_params = None if log.params is None else _of_joints(log.params, robot, log)
     law = params if log.settings.params is None else _of_joints(log.settings.params, robot, log)
-    if known is None or law is None:
-        return known if law is None else law
+    if recorded_params is None or law is None:
+        return recorded_params if law is None else law
     for name in ("kp", "ki", "kd"):
         recorded, present = (
-            np.zeros(1) if gain is None else gain for gain in (getattr(known, name), getattr(law, name))
+            np.zeros(1) if gain is None else gain for gain in (getattr(recorded_params, name), getattr(law, name))
         )
         if not np.allclose(recorded, present, rtol=1e-6):
             problem = f"contradict {log.source}, which was recorded with another {name}"
@@ -239,13 +241,13 @@ def _moves(robot: Robot, logs: list[Log]) -> Any:
     least = np.clip(SHARE * spread.max(), 1e-9, [STILL[robot.units[joint]] for joint in joints])
     moves = spread > np.maximum(least, SHAKEN * noise)
     if logs[0].kind == "setpoint":
-        asked = np.concatenate([log.command for log in logs]).std(0)
-        degrees = moves & (asked > 30 * spread) & (asked < 90 * spread)
+        commanded = np.concatenate([log.command for log in logs]).std(0)
+        degrees = moves & (commanded > 30 * spread) & (commanded < 90 * spread)
         if degrees.any():
             name = robot.joint_names[joints[int(np.argmax(degrees))]]
             problem = f"have setpoints of joint {name!r} that move 57 times as far as its positions"
             raise InvalidArgumentError("logs", problem, remedy="setpoints look like degrees: give both in rad")
-        moves &= spread > FOLLOWS * asked
+        moves &= spread > FOLLOWS * commanded
     names = ", ".join(repr(robot.joint_names[joint]) for joint, moving in zip(joints, moves, strict=True) if not moving)
     if not moves.any():
         raise InvalidArgumentError("logs", f"show no motion of any joint ({names})", remedy="record a motion")

@@ -7,8 +7,7 @@ part g of the rows is, to first order::
 
 (B. Efron, "The jackknife, the bootstrap and other resampling plans", SIAM 1982). The parts are the logs where there are
 five or more, else ten stretches of equal length, so that residuals that are correlated in time and errors of the model
-count. The variance is that of the jackknife, or s^2 H^-1 with the mean square s^2 of the residuals, whichever is
-larger.
+count. The variance is the larger of the jackknife's and s^2 H^-1, with the mean square s^2 of the residuals.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.sim.identification.fit import OUTLIER, Evaluation, Problem, Solution
+from batchpid.sim.identification.fit import OUTLIER, FitResiduals, Problem, Solution
 from batchpid.sim.identification.unknowns import KINDS
 
 PARTS, LEAST_LOGS = 10, 5
@@ -28,7 +27,7 @@ INTERVAL = 2.0
 LEAST = 2.5e-3
 """Least standard deviation over the value: the fit ends at changes of a thousandth."""
 SHOWN = 0.7
-"""Standard deviation over that of the prior from which the logs show nothing of an unknown."""
+"""Ratio of the standard deviation to the prior's from which an unknown counts as not identified."""
 
 
 class Intervals(NamedTuple):
@@ -73,7 +72,9 @@ def intervals_of(problem: Problem, solution: Solution) -> Intervals:
     return Intervals(deviation, inverse / scale[:, None] / scale, shown)
 
 
-def _blocks(problem: Problem, evaluation: Evaluation, size: Float64, factors: Float64) -> list[tuple[Float64, Float64]]:
+def _blocks(
+    problem: Problem, evaluation: FitResiduals, size: Float64, factors: Float64
+) -> list[tuple[Float64, Float64]]:
     """Return derivatives (rows, unknowns) and residuals (rows,) of each part, weighted as by the loss."""
     tables = list[tuple[Float64, Float64, int]]()
     for window, residual, slope in zip(problem.windows, *evaluation, strict=True):

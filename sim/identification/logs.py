@@ -25,8 +25,8 @@ from batchpid.errors import MissingDependencyError
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked, interpolated
 from batchpid.sim.observation import Rollout
 from batchpid.sim.recording.recording_files import RecordingError, read_recording
+from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.setpoint_files import columns_by_joint, error, read_csv
 
 QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")
@@ -95,15 +95,7 @@ def read_logs(
 def _read(robot: Robot, path: Path, kind: CommandKind | None, reading: Reading) -> list[Log]:
     lines = None
     if path.suffix.lower() in BAGS or path.is_dir():
-        columns = _read_bag(path, reading)
-        joints = {name.partition(":")[2].removeprefix(reading.prefix) for name in columns if ":" in name}
-        if others := sorted(joints - {*robot.joint_names}):
-            if joints.isdisjoint(robot.joint_names):
-                remedy = f"the robot has {', '.join(robot.joint_names)}: give the prefix of the names, or another topic"
-                raise error(str(path), f"has none of the robot's joints, but {', '.join(others)}", remedy)
-            warn(f"{path}: {', '.join(others)}: no joint of the robot, left out", LogWarning)
-            names = [f":{reading.prefix}{joint}" for joint in robot.joint_names]
-            columns = {name: table for name, table in columns.items() if name == "time" or name.endswith((*names,))}
+        columns = _read_bag(robot, path, reading)
     elif file_path("log", path, (".csv", ".txt", *HDF5, *BAGS)).suffix.lower() in HDF5:
         named = _read_hdf5(path)
         if named is None:
@@ -132,6 +124,7 @@ def logs_of_rollout(
         "was made with setpoint rates": bool(info.rates) and recorded == "setpoint",
         "has setpoints that a guard changed": bool(np.any(rollout.guarded)),
         "was made with a randomization": bool(info.randomization),
+        "has params that were changed": info.params_changed and recorded == "setpoint",
         "has ticks of varied length": bool((changes > 1e-9 + 1e-6 * rollout.tick).any()),
         "has failed": not rollout.ok.all(),
     }
@@ -242,10 +235,11 @@ def _read_hdf5(path: Path) -> dict[str, Float64] | None:
         raise RecordingError(f"{path}: cannot be read as a log: {bad}") from bad
 
 
-def _read_bag(path: Path, reading: Reading) -> dict[str, Float64]:
-    """Return the columns of a bag by name, at the stamps of the measurements, in seconds since the first one.
+def _read_bag(robot: Robot, path: Path, reading: Reading) -> dict[str, Float64]:
+    """Return the columns of a bag by name, of the joints of ``robot``, in seconds since the first row.
 
-    Messages are merged by the names of joints: each joint has the samples of all messages that name it.
+    Messages are merged by the names of joints: each joint has the samples of all messages that name it. Rows are at the
+    stamps of the joint with most of them, as long as all joints are measured.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -256,8 +250,12 @@ def _read_bag(path: Path, reading: Reading) -> dict[str, Float64]:
     samples = {topic: defaultdict[str, list[tuple[int, float]]](list) for topic in topics}
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            chosen = [each for each in reader.connections if each.topic in topics and each.msgtype == JOINT_STATE]
-            present = sorted(each.topic for each in reader.connections if each.msgtype == JOINT_STATE)
+            chosen = [
+                connection
+                for connection in reader.connections
+                if connection.topic in topics and connection.msgtype == JOINT_STATE
+            ]
+            present = sorted(connection.topic for connection in reader.connections if connection.msgtype == JOINT_STATE)
             for connection, received, raw in reader.messages(connections=chosen) if chosen else ():
                 message: Any = reader.deserialize(raw, connection.msgtype)
                 stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec or received
@@ -271,11 +269,24 @@ def _read_bag(path: Path, reading: Reading) -> dict[str, Float64]:
         if not columns:
             remedy = f"use one of its topics of {JOINT_STATE}: {', '.join(present) or 'there are none'}"
             raise error(str(path), f"has no values in the topic {topic!r} of {JOINT_STATE}", remedy)
-    longest = max((rows for name, rows in samples[reading.topic].items() if name.startswith("qpos")), key=len)
-    first = min(stamp for stamp, _ in longest)
-    merged = {"time": np.unique([stamp - first for stamp, _ in longest]) / 1e9}
+    names = {f"{reading.prefix}{joint}" for joint in robot.joint_names}
+    joints = {name.partition(":")[2] for columns in samples.values() for name in columns}
+    others = ", ".join(joint.removeprefix(reading.prefix) for joint in sorted(joints - names))
+    stamps = [
+        [stamp for stamp, _ in rows]
+        for name, rows in samples[reading.topic].items()
+        if name in {f"qpos:{joint}" for joint in names}
+    ]
+    if not stamps:
+        remedy = f"the robot has {', '.join(robot.joint_names)}: give the prefix of the names, or another topic"
+        raise error(str(path), f"has no positions of the robot's joints, but {others or 'other values'}", remedy)
+    if others:
+        warn(f"{path}: {others}: no joint of the robot, left out", LogWarning)
+    first, last = max(map(min, stamps)), min(map(max, stamps))
+    merged = {"time": np.unique([stamp - first for stamp in max(stamps, key=len) if first <= stamp <= last]) / 1e9}
     for columns in samples.values():
         for name, rows in columns.items():
-            table = np.array(sorted((stamp - first, value) for stamp, value in rows))
-            merged[name] = interpolated(merged["time"], table[:, 0] / 1e9, table[:, 1:])[:, 0]
+            if name.partition(":")[2] in names:
+                table = np.array(sorted((stamp - first, value) for stamp, value in rows))
+                merged[name] = interpolated(merged["time"], table[:, 0] / 1e9, table[:, 1:])[:, 0]
     return merged

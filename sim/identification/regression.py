@@ -22,7 +22,7 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.motors.actuators import Actuators
 from batchpid.sim.identification.log import Log, interpolated
-from batchpid.sim.identification.simulator import Candidates, Control, Drive, Plant
+from batchpid.sim.identification.simulator import Control, LogControl, Plant, PlantCandidates
 
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
@@ -40,16 +40,16 @@ MOVES = 0.4
 WEIGHT = 0.02
 """Weight of the prior at strength 1, over the effort's size."""
 EVIDENCE = 0.7
-"""Decrease of the mean logarithm of the residual's square that counts for another reading of a log."""
+"""Least decrease of :attr:`Guess.unexplained` for another reading of a log to be reported."""
 WORST = -1.0
-"""Largest such logarithm of a reading that is named."""
+"""Largest :attr:`Guess.unexplained` of a reading that is reported."""
 ALIKE = 0.5
-"""Difference of costs that are as good as equal: the first reading is named."""
+"""Difference below which two readings count as equally good: the first one is reported."""
 TRIED = 10.0
 """Length of a log from which other readings are tried [s]."""
 LEAST_SHARE = 0.05
-"""Least share of a joint's effort that moves the links, for a strength to be found: the motor's inertia and friction
-take the rest, of which only ratios to the strength are known."""
+"""Share of a joint's effort that moves the links, below which its strength is not identifiable: the motor's inertia and
+friction take the rest, which determines their ratios to the strength only."""
 
 
 class Motion(NamedTuple):
@@ -68,9 +68,9 @@ class Guess(NamedTuple):
     values: dict[str, Float64]
     """Values (joints,) or (1,) by kind of unknown."""
     cost: float
-    """Mean over the joints of the logarithm of the residual's mean square, over that of all efforts."""
+    """Mean over the joints of log(mean square of the residual / mean square of all efforts)."""
     unexplained: float
-    """The same over that of the motors' efforts: above 0, these explain nothing."""
+    """Mean over the joints of log(mean square of the residual / mean square of the motors' efforts)."""
 
 
 def smooth(log: Log, timestep: float) -> Motion:
@@ -92,10 +92,10 @@ def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
     return sosfiltfilt(butter(4, cutoff, fs=1 / timestep, output="sos"), table, axis=0, padlen=pad)
 
 
-def better_reading(plant: Plant, drive: Drive, log: Log, names: Sequence[str]) -> str:
+def better_reading(plant: Plant, drive: LogControl, log: Log, names: Sequence[str]) -> str:
     """Return the reading of a log that explains its efforts far better than the present one, in words; "" for none.
 
-    Signs, exchanged joints, factors of units and times of the commands are tried. ``names`` are those of the joints.
+    Signs, exchanged joints, factors of units and times of the commands are tried. ``names`` are the joints' names.
     """
     first = log.part(log.time < log.time[0] + TRIED, log.command_time < log.time[0] + TRIED)
     present, costs = _cost(plant, drive, first), dict[str, float]()
@@ -106,7 +106,7 @@ def better_reading(plant: Plant, drive: Drive, log: Log, names: Sequence[str]) -
     return next(words for words, cost in costs.items() if cost < min(costs.values()) + ALIKE)
 
 
-def _cost(plant: Plant, drive: Drive, log: Log) -> float:
+def _cost(plant: Plant, drive: LogControl, log: Log) -> float:
     return Regression([plant], [drive], [log], [smooth(log, drive.timestep)]).best().unexplained
 
 
@@ -142,7 +142,7 @@ class Regression:
     """Efforts that motions of logs require, and efforts of the motors so far, for regressions at any delay."""
 
     def __init__(
-        self, plants: Sequence[Plant], drives: Sequence[Drive], logs: Sequence[Log], motions: Sequence[Motion]
+        self, plants: Sequence[Plant], drives: Sequence[LogControl], logs: Sequence[Log], motions: Sequence[Motion]
     ) -> None:
         dt = drives[0].timestep
         self._setpoints = drives[0].params is not None
@@ -153,15 +153,15 @@ class Regression:
             edge = min(round(EDGE / dt), len(motion.qpos) // 5)
             rows = np.arange(edge, len(motion.qpos) - edge, max(1, round(share)))
             required, held = _required(plant, drive, motion, rows)
-            asked = _efforts(plant, drive, motion)
+            commanded = _efforts(plant, drive, motion)
             if held is not None and drive.through:
-                asked = asked + held
+                commanded = commanded + held
             elif held is not None:
                 required = required - held[rows]
-            time = dt * np.arange(asked.shape[1])
+            time = dt * np.arange(commanded.shape[1])
             late = [
                 np.stack([interpolated(time[rows] - delay, time, effort) for delay in DELAYS])
-                for effort in (asked if self._setpoints else [lowpass(effort, cutoff, dt) for effort in asked])
+                for effort in (commanded if self._setpoints else [lowpass(effort, cutoff, dt) for effort in commanded])
             ]
             still = 0.01 * np.abs(motion.qvel).max(0) + 1e-9
             sign = lowpass(np.clip(motion.qvel / still, -1, 1), cutoff, dt)[rows]
@@ -230,7 +230,7 @@ def _bounded(matrix: Float64, target: Float64, is_strong: bool) -> tuple[Float64
     return values, target - matrix @ values
 
 
-def _required(plant: Plant, drive: Drive, motion: Motion, rows: Any) -> tuple[Float64, Float64 | None]:
+def _required(plant: Plant, drive: LogControl, motion: Motion, rows: Any) -> tuple[Float64, Float64 | None]:
     """Return the efforts (rows, joints) that a motion requires, and the compensation (steps, joints)."""
     q, v, a = (np.ascontiguousarray(table[rows]) for table in motion[:3])
     dynamics = plant.dynamics([()] * len(q), q, v)
@@ -244,12 +244,12 @@ def _required(plant: Plant, drive: Drive, motion: Motion, rows: Any) -> tuple[Fl
     return required, held.force
 
 
-def _efforts(plant: Plant, drive: Drive, motion: Motion) -> Float64:
-    """Return logged efforts (1, steps, joints), or those of the law along a motion (setpoint delays, steps, joints)."""
+def _efforts(plant: Plant, drive: LogControl, motion: Motion) -> Float64:
+    """Return logged efforts (1, steps, joints), or the law's along a motion (setpoint delays, steps, joints)."""
     if drive.params is None:
         return motion.command[None]
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)
-    ideal = Candidates(Actuators(), {}, SETPOINT_DELAYS, ((),) * count)
+    ideal = PlantCandidates(Actuators(), {}, SETPOINT_DELAYS, ((),) * count)
     first = np.tile(motion.qpos[0], (count, 1))
     control = Control(drive, ideal, first, np.tile(motion.qvel[0], (count, 1)), None, plant.turns)
     late = np.rint(SETPOINT_DELAYS / drive.timestep).astype(int)

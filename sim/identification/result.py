@@ -17,7 +17,7 @@ from batchpid.io import documents
 from batchpid.sim.identification.fit import STEP, Problem, Solution, Window
 from batchpid.sim.identification.intervals import INTERVAL, Intervals
 from batchpid.sim.identification.log import Log
-from batchpid.sim.identification.simulator import Drive
+from batchpid.sim.identification.simulator import LogControl
 from batchpid.sim.identification.unknowns import DESCRIBED, KINDS, Unknown, Unknowns
 from batchpid.sim.robot.actuator_checks import load_robot_actuators
 from batchpid.sim.robot.robot import Robot
@@ -46,7 +46,7 @@ class Identification:
     unknowns: Unknowns
     """Unknowns that the logs show."""
     hidden: Unknowns
-    """Unknowns of which the logs show nothing; they have the values of ideal motors."""
+    """Unknowns that the logs do not identify; they have the values of ideal motors."""
     values: Float64
     """Values of the unknowns (unknowns,)."""
     intervals: Intervals
@@ -63,7 +63,7 @@ class Identification:
     """Names of the logs."""
     still: tuple[str, ...]
     """Joints that did not move."""
-    drive: Drive
+    drive: LogControl
     problem: Problem
     point: Float64
 
@@ -109,7 +109,7 @@ class Identification:
         )
 
     def interval(self, kind: str, joint: int | str | None = None) -> tuple[float, float, float] | None:
-        """Return estimate, lower and upper end of the 95 % interval; None if the logs show nothing of it.
+        """Return estimate, lower and upper end of the 95 % interval; None if the logs do not identify it.
 
         ``kind`` is a name of :data:`batchpid.sim.identification.unknowns.KINDS`, ``joint`` the number of a joint among
         :attr:`joints`, the name of a link for "mass", None for "delay", "setpoint_delay" and "payload".
@@ -122,8 +122,8 @@ class Identification:
         kind = choice("kind", kind, list(KINDS))
         places = {(entry.kind, entry.joint if entry.link is None else entry.link): entry for entry in self._all()}
         if (kind, joint) not in places:
-            known = ", ".join(sorted({name for name, _ in places}))
-            raise InvalidArgumentError("joint", f"is no place of the unknown {kind!r}", value=joint, remedy=known)
+            names = ", ".join(sorted({name for name, _ in places}))
+            raise InvalidArgumentError("joint", f"is no place of the unknown {kind!r}", value=joint, remedy=names)
         entry = places[kind, joint]
         return None if entry not in self.unknowns.entries else self._row(self.unknowns.entries.index(entry))
 
@@ -142,7 +142,7 @@ class Identification:
 
     @property
     def not_identified(self) -> list[str]:
-        """Unknowns of which the logs show nothing, e.g. "elbow: strength"."""
+        """Unknowns that the logs do not identify, e.g. "elbow: strength"."""
         return [self._name(entry) for entry in self.hidden.entries]
 
     def _name(self, entry: Unknown) -> str:
@@ -151,7 +151,7 @@ class Identification:
         return entry.kind if place is None else f"{place}: {entry.kind}"
 
     def actuators(self) -> bp.Actuators:
-        """Return the actuators that were found; joints that are not in the logs are ideal.
+        """Return the identified actuators; joints that are not in the logs are ideal.
 
         Friction and damping are in addition to the robot's description.
         """
@@ -172,7 +172,7 @@ class Identification:
         return bp.make_actuators(self.robot.dof, **options, joint_names=self.robot.joint_names)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write :meth:`actuators` to a .yaml or .json file, with intervals, the region, and what is not of motors."""
+        """Write :meth:`actuators` to a .yaml or .json file, with intervals, errors and the confidence region."""
         document = self.document()
         names = [[entry.kind, self._place(entry)] for entry in self.unknowns.entries]
         rows = [[float(f"{value:.5f}") for value in row[: at + 1]] for at, row in enumerate(self.intervals.correlation)]
@@ -207,12 +207,12 @@ class Identification:
         }
 
     def corrected_urdf(self) -> str:
-        """Return the URDF of the robot with the masses that were found; the links of a body keep their shares.
+        """Return the URDF of the robot with the identified masses; the links of a body keep their shares of its mass.
 
         Raises
         ------
         InvalidArgumentError
-            The masses were no unknowns (extras=["mass"]).
+            Masses are not among the unknowns (extras=["mass"]).
         """
         pairs = zip(self.unknowns.entries, self.values.tolist(), strict=True)
         factors = {entry.link: value for entry, value in pairs if entry.link is not None}
@@ -221,7 +221,7 @@ class Identification:
         return to_urdf(self.robot, mass_factors=factors).text
 
     def gains(self) -> bp.PIDParams | None:
-        """Return the params of the law that was found, of the logged joints; None without unknowns of the law."""
+        """Return the params of the identified law, of the logged joints; None without unknowns of the law."""
         law = self.unknowns.candidates(self.values[None]).law
         if self.drive.params is None or law.keys().isdisjoint(("gain", "kd", "saturation")):
             return None
@@ -258,8 +258,8 @@ class Identification:
             if entry.joint is None:
                 lines.append(f"{self._name(entry)}: {cells.get((entry.kind, entry.link), 'not shown by these logs')}")
         if self.drive.compensate != "none":
-            way = "through its motors" if self.drive.through else "apart from its motors"
-            lines.append(f"the robot compensates {self.drive.compensate} {way}")
+            path = "through its motors" if self.drive.through else "apart from its motors"
+            lines.append(f"the robot compensates {self.drive.compensate} {path}")
         before, after = self.held_out_error
         free = float(np.sqrt((self.errors[2] ** 2).mean()))
         lines.append(
@@ -289,7 +289,7 @@ class Identification:
 def advice(problem: Problem, solution: Solution) -> str:
     """Return a sentence on the effect that would explain most of the remaining error of a fit, by its derivatives.
 
-    One further unknown at a time joins those of the fit.
+    Each further unknown is added alone to the unknowns of the fit.
     """
     unknowns = problem.unknowns
     plant = problem.plants[0]

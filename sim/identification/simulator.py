@@ -53,7 +53,7 @@ PAYLOAD = "payload at the tool"
 """Link at the place of the payload: the center of mass of the tool."""
 
 
-class Drive(NamedTuple):
+class LogControl(NamedTuple):
     """Control of the robot in a log."""
 
     timestep: float
@@ -66,7 +66,7 @@ class Drive(NamedTuple):
     """True if the compensation passes through the motors, as in a Runner; False if it is exact."""
 
 
-class Candidates(NamedTuple):
+class PlantCandidates(NamedTuple):
     """Motors, laws and robots of n candidates."""
 
     actuators: Actuators
@@ -79,12 +79,12 @@ class Candidates(NamedTuple):
     masses: tuple[tuple[tuple[str, float], ...], ...]
     """Factors of the masses of some links of each candidate, and the mass of its payload [kg] under PAYLOAD."""
 
-    def repeated(self, times: int) -> Candidates:
+    def repeated(self, times: int) -> PlantCandidates:
         """Return each candidate ``times`` times, one after the other."""
         tables = [{name: np.repeat(rows, times, axis=0) for name, rows in self.law.items()}]
         actuators = mapped(lambda leaf: leaf if len(leaf) == 1 else np.repeat(leaf, times, axis=0), self.actuators)
         masses = tuple(row for row in self.masses for _ in range(times))
-        return Candidates(actuators, tables[0], np.repeat(self.setpoint_delay, times), masses)
+        return PlantCandidates(actuators, tables[0], np.repeat(self.setpoint_delay, times), masses)
 
 
 class Stretch(NamedTuple):
@@ -134,7 +134,7 @@ class Plant:
         self.turns = free / TURN if free.any() else None
 
     def tree_of(self, masses: tuple[tuple[str, float], ...]) -> RigidTree:
-        """Return the tree with other masses, as in :attr:`Candidates.masses`."""
+        """Return the tree with other masses, as in :attr:`PlantCandidates.masses`."""
         if masses not in self._trees:
             tree = self._description
             mass, inertia = np.array(tree.mass), np.array(tree.inertia)
@@ -208,7 +208,13 @@ class Control:
     """Control, motors and friction of n robots; a native program where programs are used, with the same bits."""
 
     def __init__(
-        self, drive: Drive, candidates: Candidates, qpos: Float64, qvel: Float64, asked: Any, turns: Float64 | None
+        self,
+        drive: LogControl,
+        candidates: PlantCandidates,
+        qpos: Float64,
+        qvel: Float64,
+        asked: Any,
+        turns: Float64 | None,
     ) -> None:
         """Begin at ``qpos`` and ``qvel`` (n, joints).
 
@@ -283,7 +289,7 @@ class Control:
 
 
 def simulate(
-    plant: Plant, drive: Drive, candidates: Candidates, states: Float64, stretches: Sequence[Stretch]
+    plant: Plant, drive: LogControl, candidates: PlantCandidates, states: Float64, stretches: Sequence[Stretch]
 ) -> list[Float64]:
     """Return the positions (candidates, rows, joints) of all candidates at the rows of each stretch.
 
@@ -299,13 +305,13 @@ def simulate(
     dynamics = plant.dynamics(rows.masses, q, v)
     dynamics.update()
     compensation = _Compensation(plant, drive, dynamics, q, v, rows.actuators.position_offset)
-    asked = None
+    efforts = None
     past = min(stretch.past for stretch in stretches)
     if drive.params is None and past:
         held = compensation.now() if drive.through else None
         earlier = np.stack([stretch.command[stretch.past - 1 :: -1][:past] for stretch in stretches], axis=1)
-        asked = np.tile(earlier, (1, count, 1)) + (0.0 if held is None else held)
-    control = Control(drive, rows, q, v, asked, plant.turns)
+        efforts = np.tile(earlier, (1, count, 1)) + (0.0 if held is None else held)
+    control = Control(drive, rows, q, v, efforts, plant.turns)
     if control.friction.coulomb is not None:
         control.state.friction.effort[...] = dynamics.force
     commands = _Commands(drive, rows, stretches)
@@ -367,7 +373,7 @@ class _Compensation:
     """Forces that the robot compensates by its description, at the present measured poses."""
 
     def __init__(
-        self, plant: Plant, drive: Drive, dynamics: Dynamics, qpos: Float64, qvel: Float64, offset: Float64 | None
+        self, plant: Plant, drive: LogControl, dynamics: Dynamics, qpos: Float64, qvel: Float64, offset: Float64 | None
     ) -> None:
         self._dynamics: Dynamics | None = None
         self._qpos, self._measured, self._offset = qpos, qpos, offset
@@ -413,7 +419,7 @@ def _trace(layout: Layout, *structures: Any) -> Trace:
 
 
 def _returned(state: StepState) -> StepState:
-    """Return what a program returns of a state: without histories, which it changes in place."""
+    """Return the leaves of a state that a program returns: without histories, which it changes in place."""
     motors = None if state.motors is None else state.motors._replace(command=None, sensor=None)
     return state._replace(motors=motors)
 
@@ -440,7 +446,7 @@ def _padded(tables: Sequence[Float64]) -> Float64:
 class _Commands:
     """Commands of n robots at the sim steps, late by their delay of setpoints, computed in blocks of steps."""
 
-    def __init__(self, drive: Drive, rows: Candidates, stretches: Sequence[Stretch]) -> None:
+    def __init__(self, drive: LogControl, rows: PlantCandidates, stretches: Sequence[Stretch]) -> None:
         self._table = _padded([stretch.command[stretch.past :] for stretch in stretches])
         times = len(rows.setpoint_delay) // len(stretches)
         self._stretch = np.tile(np.arange(len(stretches)), times)

@@ -13,7 +13,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.motors.actuators import Actuators
-from batchpid.sim.identification.simulator import PAYLOAD, Candidates
+from batchpid.sim.identification.simulator import PAYLOAD, PlantCandidates
 from batchpid.sim.robot.robot import Robot
 
 FARTHEST = 7.0
@@ -197,7 +197,7 @@ class Unknowns:
             table[:, columns] = values[:, at : at + 1]
         return tables
 
-    def candidates(self, values: Float64) -> Candidates:
+    def candidates(self, values: Float64) -> PlantCandidates:
         """Return the candidates with ``values`` (n, unknowns)."""
         tables = self.tables(values)
         fields = {KINDS[name].field: table for name, table in tables.items() if KINDS[name].target == "motor"}
@@ -210,7 +210,7 @@ class Unknowns:
         masses = tuple(tuple((link, float(row[at])) for at, link in heavy.items()) for row in values)
         delay = tables["setpoint_delay"][:, 0] if "setpoint_delay" in tables else np.zeros(len(values))
         law = {name: table for name, table in tables.items() if KINDS[name].target == "law"}
-        return Candidates(Actuators(**fields, max_delay=longest), law, delay, masses)
+        return PlantCandidates(Actuators(**fields, max_delay=longest), law, delay, masses)
 
     def only(self, mask: Bool) -> Unknowns:
         """Return the unknowns of a mask (unknowns,); the others have their neutral value."""

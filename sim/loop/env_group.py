@@ -184,8 +184,8 @@ class EnvGroup:
     def run(self, ticks: Ticks, given: tuple[bool, ...], first: int, until: int, substeps: int, steps: int) -> int:
         """Run ticks of ``substeps`` sim steps from ``first`` on, at least one; observe them; return the next one.
 
-        It returns before ``until`` after a tick in which something happened. ``given`` says which commands are used,
-        and ``steps`` counts the sim steps before the first tick.
+        It returns before ``until`` after a tick with an event: a possible contact, or a failed env. ``given`` marks the
+        commands that are used, and ``steps`` is the number of sim steps before the first tick.
         """
         containment, command = self._containment, ticks[first].command.with_only(given)
         containment.failed, table = containment.suspended.copy(), None

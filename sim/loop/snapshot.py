@@ -1,11 +1,11 @@
 """Snapshots: the state of all envs, physics and controller, as arrays by name.
 
 A snapshot is a barrier. The engine has more state than positions and velocities: contact caches, warm starts, and the
-order in which it solves contacts. All of these depend on the past, and can be neither read nor written. So everyone who
-continues from a snapshot, in the process that took it or in another, does so with a new world in that state, and the
-results are bit-identical. The barrier itself changes the last bits.
+order in which it solves contacts. All of these depend on the past, and can be neither read nor written. So every
+continuation from a snapshot, in this process or in another, starts in a new world in that state, and the results are
+bit-identical. The barrier itself changes the last bits.
 
-A file is checked where a runner restores it: its arrays are compared with those of a fresh state of that runner.
+A file is checked where a runner restores it: its arrays are compared with a fresh state of that runner.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class EnvStates:
     def fresh(
         cls, num_envs: int, dof: int, *, stiction: bool, guard: bool, pushes: bool, **parts: dict[str, Rows]
     ) -> EnvStates:
-        """Return states whose values have no meaning, in the shapes and dtypes of ``num_envs`` envs of ``dof`` joints.
+        """Return states of zeros, in the shapes and dtypes of ``num_envs`` envs of ``dof`` joints.
 
         ``stiction``, ``guard`` and ``pushes`` tell whether the envs have Coulomb friction, a guard and pushes;
         ``parts`` are the states of controller, actuators and sensors.
@@ -111,7 +111,7 @@ class EnvStates:
         return EnvStates(**unflatten(vars(parts[0]), joined, "."))
 
     def check(self, fresh: EnvStates, command_size: int, engine_sizes: Sequence[int]) -> None:
-        """Compare the arrays with those of :meth:`fresh` states of the runner that restores these.
+        """Compare the arrays with :meth:`fresh` states of the runner that restores them.
 
         ``command_size`` is the size of a setpoint; ``engine_sizes`` (envs,) are the numbers of engine values.
 

@@ -36,13 +36,13 @@ def check_robot(randomization: Randomization, robot: Robot, mjcf: MjcfFile | Non
     if events and robot.fixed_base:
         remedy = "load it with fixed_base=False"
         raise InvalidArgumentError("push", f"needs a floating base, which {robot.name!r} does not have", remedy=remedy)
-    for name, each in (randomization.given | events).items():
+    for name, distribution in (randomization.given | events).items():
         if name.partition(".")[0] in GROUPS:
             continue  # check_params and prepared_actuators
         columns = elements(name, robot)
-        if name in _ZERO and any(part.operation == "scale" for *_, part in parts(name, each, columns)):
+        if name in _ZERO and any(part.operation == "scale" for *_, part in parts(name, distribution, columns)):
             raise InvalidArgumentError(name, "is 0, which cannot be scaled", remedy="use operation 'add'")
-        for rows in _extremes(name, each, columns, nominal_values(name, robot, mjcf)[None]):
+        for rows in _extremes(name, distribution, columns, nominal_values(name, robot, mjcf)[None]):
             FIELDS[name].checked(name, rows[0], columns, kind="entry")
     if randomization.damping is not None and robot.dissipation != "urdf":
         problem, remedy = "cannot be drawn: the engine sets it with this dissipation", "load with dissipation='urdf'"
@@ -66,11 +66,11 @@ def check_params(randomization: Randomization, params: bp.PIDParams, robot: Robo
     Raises InvalidArgumentError if a leaf is off, or a draw may be out of its range.
     """
     leaves = {name: leaf for name, leaf in params._asdict().items() if leaf is not None and not isinstance(leaf, tuple)}
-    for name, each in randomization.params.items():
+    for name, distribution in randomization.params.items():
         if name not in leaves:
             problem, remedy = "is off in the params, or none of their numbers", f"draw one of {', '.join(leaves)}"
             raise InvalidArgumentError(f"params.{name}", problem, remedy=remedy)
-        for rows in _extremes(f"params.{name}", each, robot.joint_names, leaves[name]):
+        for rows in _extremes(f"params.{name}", distribution, robot.joint_names, leaves[name]):
             params._replace(**{name: rows}).check(params.num_envs, robot.joint_names)
 
 

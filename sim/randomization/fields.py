@@ -58,9 +58,9 @@ def nominal_values(name: str, robot: Robot, mjcf: MjcfFile | None = None) -> Flo
     """
     if name == "link_mass":
         return np.array([robot.link_masses[link].mass for link in elements(name, robot)])
-    known = {"friction": robot.friction, "damping": robot.damping, "gravity": np.array([0.0, 0.0, -9.81])}
-    known |= {"ground_friction": np.array([CONTACT_FRICTION if mjcf is None else mjcf.friction])}
-    return known.get(name, np.zeros(len(elements(name, robot))))
+    nominal = {"friction": robot.friction, "damping": robot.damping, "gravity": np.array([0.0, 0.0, -9.81])}
+    nominal |= {"ground_friction": np.array([CONTACT_FRICTION if mjcf is None else mjcf.friction])}
+    return nominal.get(name, np.zeros(len(elements(name, robot))))
 
 
 def mapping(name: str, value: object) -> Mapping[str, Any]:

@@ -81,8 +81,8 @@ class Randomization:
     ground_friction: Annotated[Distribution | None, Bounds("1", group="robot")] = None
     """Coefficient of sliding friction of the ground and of all shapes of the robot; nominal 0.3.
 
-    In the scene of an MJCF file it is nominally that of the file's ground, and the robot's shapes change by the same
-    factor."""
+    In the scene of an MJCF file the nominal value is the friction of the file's ground, and the robot's shapes change
+    by the same factor."""
     gravity: Annotated[Field | None, Bounds("m/s^2", low=-math.inf, group="robot")] = None
     """Gravity along the axes x, y and z of the world [m/s^2]; nominal 0, 0 and -9.81. The compensation has the nominal
     one."""
@@ -122,7 +122,7 @@ class Randomization:
     @property
     def events(self) -> dict[str, Field]:
         """Given fields of events during an episode, by name."""
-        return {name: each for name in EVENTS if (each := getattr(self, name)) is not None}
+        return {name: distribution for name in EVENTS if (distribution := getattr(self, name)) is not None}
 
     @property
     def changes_robot(self) -> bool:

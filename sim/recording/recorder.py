@@ -10,7 +10,7 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -80,6 +80,7 @@ class Recorder(SingleOwner):
         self._last_write = time.monotonic()
         self._redraws: list[Redraw] = []
         self._rates = False  # whether a recorded tick had rates
+        self._params_changed = False
         self._error: Exception | None = None
         self._is_closed = False
         runner.recorder = self
@@ -96,7 +97,7 @@ class Recorder(SingleOwner):
             cause = " ".join(str(self._error).split())  # HDF5 writes several lines
             raise RecordingError(f"{self.path}: cannot be written: {cause}") from self._error
         if self._info is None:
-            self._episodes = self._runner.episodes
+            self._episodes, self._params = self._runner.episodes, self._runner.params
             self._info = replace(self._runner.info, seed=self._seed, complete=False)
 
     def append(self, time_: float, command: Command, observation: Observation) -> None:
@@ -105,6 +106,7 @@ class Recorder(SingleOwner):
         for env in np.flatnonzero((episodes != self._episodes).any(1)).tolist():
             self._redraws.append(Redraw(time_, env, *episodes[env].tolist()))
         self._episodes = episodes
+        self._params_changed |= self._runner.params is not self._params
         self._rates |= command.setpoint_rate is not None
         feedforward = None if command.feedforward is None else np.array(command.feedforward)
         inputs = {"time": np.array(time_), "setpoint": np.array(command.setpoint), "feedforward": feedforward}
@@ -147,9 +149,10 @@ class Recorder(SingleOwner):
         self._write()
         if self._file:  # not closed yet
             runner = self._runner
-            info = replace(info, faults=runner.faults, redraws=tuple(self._redraws), rates=self._rates)
-            values = files.attributes(info)
-            self._file.attrs.update({name: values[name] for name in ("complete", "faults", "redraws", "rates")})
+            events: dict[str, Any] = {"faults": runner.faults, "redraws": tuple(self._redraws), "rates": self._rates}
+            events["params_changed"] = self._params_changed
+            values = files.attributes(replace(info, **events))
+            self._file.attrs.update({name: values[name] for name in ("complete", *events)})
             self._file.close()
 
     def _write(self) -> None:

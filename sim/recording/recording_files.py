@@ -84,7 +84,7 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
     """Read a recording: complete, cut short by a kill, or one that is still being written.
 
     ``info.complete`` of the result says whether the run came to its end. Nothing in the file is executed; SECURITY.md
-    says what a file of a stranger can do.
+    lists the risks of files from strangers.
 
     Parameters
     ----------
@@ -121,8 +121,8 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
                 arrays["feedforward"] = None
     except Exception as error:  # a damaged file can make HDF5 raise anything
         raise RecordingError(f"{path}: cannot be read as a recording: {error or type(error).__name__}") from error
-    own = {name: arrays.pop(name) for name in ("time", "setpoint", "feedforward")}
-    return Rollout(**own, observation=Observation(**arrays), tick=tick * every, info=info)
+    inputs = {name: arrays.pop(name) for name in ("time", "setpoint", "feedforward")}
+    return Rollout(**inputs, observation=Observation(**arrays), tick=tick * every, info=info)
 
 
 def _read_rows(dataset: h5py.Dataset, rows: slice, shape: tuple[int, ...], quantity: Quantity) -> Rows:
@@ -138,7 +138,7 @@ def check_path(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
     Raises
     ------
     InvalidArgumentError
-        Its suffix is none of :data:`HDF5`, or the file exists and ``overwrite`` is False.
+        Its suffix is not in :data:`HDF5`, or the file exists and ``overwrite`` is False.
     """
     path = file_path("path", path, HDF5)
     if os.path.lexists(path) and not overwrite:

@@ -201,14 +201,14 @@ class RobotDescription(Urdf):
     def target(self) -> Float64:
         """Pose (dof,) [rad or m] for a first move, within the limits.
 
-        It is that of the bundled settings, else a quarter of the way from the start to the farther limit of each joint,
+        The target of the bundled settings, else a quarter of the way from the start to the farther limit of each joint,
         at most 0.5 rad or m.
         """
         if self.settings is not None:
             return self.settings.target.copy()
         above, below = self.upper - self.start, self.lower - self.start
-        way = np.where(above >= -below, above, below)
-        return self.coupled(self.start + np.clip(0.25 * way, -0.5, 0.5))
+        distance = np.where(above >= -below, above, below)
+        return self.coupled(self.start + np.clip(0.25 * distance, -0.5, 0.5))
 
     def params(self, **options: Any) -> bp.PIDParams:
         """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's values filled in.

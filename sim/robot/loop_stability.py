@@ -29,7 +29,7 @@ class StabilityReport(NamedTuple):
     """Share of the stability range that the gains use at one pose.
 
     ``robot_ratio``: 1 is the bound; ``participation`` (dof,): share of each joint in the mode that is the first to
-    become unstable, that of its leader for a follower.
+    become unstable; a follower has its leader's.
     """
 
     robot_ratio: float
@@ -84,8 +84,8 @@ def _loop(
     if actuators is None:  # the law knows the plant
         return loop | {"mass_matrix": eye[None]}
     # The law knows the damping, too, as part of its matrix.
-    known = known_joints(robot)
-    model = matrix(known.armature) + timestep * eye * coupling.reduced_damping(robot.damping + known.viscous)
+    joints = known_joints(robot)
+    model = matrix(joints.armature) + timestep * eye * coupling.reduced_damping(robot.damping + joints.viscous)
     plant = matrix(motors.armature) + timestep * eye * damping[:, None]
     return loop | {"mass_matrix": plant, "model": strength[..., None] * model}
 
@@ -134,8 +134,8 @@ class StabilityWarning(UserWarning):
     """The gains pass the stability bound of the sampled PID loop, see :mod:`batchpid.sim.robot.loop_stability`.
 
     The bound holds at the start pose, and counts delays, lag, strength, armature and viscous friction of the actuators.
-    Noise and limits of efforts are not in it: beyond it, a joint with limits oscillates instead of diverging. With
-    ``dissipation="sapien"``, which adds friction that is not in the formula, there is no warning.
+    It does not count noise and effort limits: beyond the bound, a joint with limits oscillates instead of diverging.
+    There is no warning with ``dissipation="sapien"``, which adds friction that the formula lacks.
     """
 
 

@@ -116,8 +116,8 @@ def edges_of(root: etree._Element) -> list[Edge]:
 
 
 def _merged_joints(edges: Sequence[Edge], separate: Separate) -> set[str]:
-    """Return the fixed joints to merge: all except those of ``separate`` links, and those whose merge would change the
-    order of joints below them.
+    """Return the fixed joints to merge: all but the joints of ``separate`` links, and joints whose merge would change
+    the order of joints below them.
     """
     wanted = [edge.name for edge in edges if edge.moves]
     carriers: set[str] = set()  # links with a joint that moves below them

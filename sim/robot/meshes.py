@@ -114,8 +114,11 @@ def _has_its_numbers(data: bytes) -> bool:
         if array.get("count") != str(size):
             return False
     ends = (
-        (int(each.get("count", "0")) * int(each.get("stride", "1")) + int(each.get("offset", "0")), each.get("source"))
-        for each in root.iterfind("{*}library_geometries//{*}accessor")
+        (
+            int(accessor.get("count", "0")) * int(accessor.get("stride", "1")) + int(accessor.get("offset", "0")),
+            accessor.get("source"),
+        )
+        for accessor in root.iterfind("{*}library_geometries//{*}accessor")
     )
     return all(0 <= end <= sizes.get(source, -1) for end, source in ends)
 

@@ -145,11 +145,11 @@ class FileDefaults:
 
 @dataclass(frozen=True)
 class MjcfFile:
-    """MJCF file that MuJoCo simulates itself, with all that it holds besides the robot.
+    """MJCF file that MuJoCo simulates itself, with everything in it besides the robot.
 
     ``is_whole`` says whether all of it is compiled (:func:`batchpid.sim.robot.mjcf.mjcf_compiler.attempt`), and
-    ``content`` is the digest of the files. ``bodies`` are the names of all bodies, ``falling`` those of bodies on free
-    joints that are not the robot's. ``loops`` are the equality constraints that close loops of the robot's links.
+    ``content`` is the digest of the files. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on
+    free joints other than the robot's. ``loops`` are the equality constraints that close loops of the robot's links.
     ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of the world can collide, unless
     the root is fixed to the origin in place of its free joint. ``friction`` is the coefficient of its ground, the first
     of these planes.

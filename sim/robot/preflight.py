@@ -87,7 +87,7 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
 
 
 def _contacts(robot: RobotDescription, start: NDArray[np.float64]) -> Iterator[Finding]:
-    """Yield what is odd about contacts at the start pose."""
+    """Yield findings about contacts at the start pose."""
     if left_over := robot.self_contact.left_over:
         text = f"{len(left_over)} pairs that should not collide do, since PhysX's filter cannot hold them all"
         yield Finding("note", "pairs-left-over", text, "disable fewer pairs in the .srdf")
@@ -112,7 +112,7 @@ def _poses(robot: RobotDescription, what: str, qpos: NDArray[np.float64]) -> Ite
 
 
 def _joints(robot: RobotDescription) -> Iterator[Finding]:
-    ranged = {each.joint for each in robot.repairs if each.remedy == GIVE_RANGE}  # their repairs say so
+    ranged = {repair.joint for repair in robot.repairs if repair.remedy == GIVE_RANGE}  # their repairs say so
     for joint, friction, suggested in zip(robot.joints, robot.friction, robot.design_effort_limit, strict=True):
         name, mimic = joint.name, joint.mimic
         if friction >= joint.effort_limit > 0:

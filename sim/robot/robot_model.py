@@ -80,7 +80,7 @@ class RobotModel:
         feet = [jacobians(link, point) for link, point in self.contacts.feet(joints)]
         follow = np.zeros((6, tree.dof))
         if feet:
-            of_joints, of_base = (np.concatenate([each[:3] for each in part]) for part in zip(*feet, strict=True))
+            of_joints, of_base = (np.concatenate([foot[:3] for foot in part]) for part in zip(*feet, strict=True))
             follow = -np.linalg.pinv(of_base, rcond=1e-3) @ of_joints
         matrix = np.zeros((tree.dof, tree.dof))
         for at, link in enumerate(tree.links):

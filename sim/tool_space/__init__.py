@@ -1,1 +1,1 @@
-"""Poses of a tool as setpoints: by operational-space control, or by inverse kinematics and joint control."""
+"""Operational-space control of a tool in the Runner."""

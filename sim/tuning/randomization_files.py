@@ -24,9 +24,9 @@ def load_randomization(path: str | Path, robot: Robot, seed: int = 0) -> Randomi
         It is not a randomization, or does not fit the robot.
     """
     path = file_path("randomize", path)
-    known = documents.read(path)
+    document = documents.read(path)
     with documents.named(str(path)):
-        randomization = Randomization.from_dict({"seed": seed, **known} if isinstance(known, dict) else known)
+        randomization = Randomization.from_dict({"seed": seed, **document} if isinstance(document, dict) else document)
         check_robot(randomization, robot)
     return randomization
 
@@ -40,5 +40,5 @@ def at_the_joints(randomization: Randomization | None) -> Randomization | None:
     """Return ``randomization`` with only the actuator fields that affect PhysX's drives: friction and inertia."""
     if randomization is None:
         return None
-    fields = {name: each for name, each in randomization.actuators.items() if name in DRIVEN}
+    fields = {name: distribution for name, distribution in randomization.actuators.items() if name in DRIVEN}
     return replace(randomization, actuators=fields)

@@ -164,8 +164,8 @@ def tune(
             scene = SEARCH_SCENE
 
     def candidates(moves: Moves, headroom: float) -> Candidates:
-        known: Document = {"headroom": headroom, "varied": is_varied and motors is None, "motors": motors}
-        return Candidates(robot, gain_units, per_joint, moves, seconds, weights, **known)
+        options: Document = {"headroom": headroom, "varied": is_varied and motors is None, "motors": motors}
+        return Candidates(robot, gain_units, per_joint, moves, seconds, weights, **options)
 
     searched = candidates(moves, 1.0 if is_varied else HEADROOM)
     start = searched.params(np.zeros((1, searched.dimension)))
@@ -233,15 +233,15 @@ def _evolve(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MissedContactWarning)  # bad gains may leave the way of a move
         for generation in bar:
-            asked = np.array([optimizer.ask() for _ in range(population)])
+            samples = np.array([optimizer.ask() for _ in range(population)])
             if generation == 0:
-                asked[: len(firsts)] = firsts
-            costs = candidates.costs(runner, asked)
+                samples[: len(firsts)] = firsts
+            costs = candidates.costs(runner, samples)
             if generation == 0 and designs is not None:
-                optimizer = optimizer_at(asked[int(np.argmin(costs))])
+                optimizer = optimizer_at(samples[int(np.argmin(costs))])
             else:
-                optimizer.tell(list(zip(asked, costs.tolist(), strict=True)))
-            points.append(asked)
+                optimizer.tell(list(zip(samples, costs.tolist(), strict=True)))
+            points.append(samples)
             history.append(tuple(costs.tolist()))
             if hasattr(bar, "set_postfix"):
                 bar.set_postfix(cost=f"{np.min(history):.4f}", start=f"{history[0][0]:.4f}")

@@ -1,4 +1,4 @@
-"""Contacts that robots without collision shapes would have had, as the caller learns of them."""
+"""Log of the contacts that robots without collision shapes would have had."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class MissedContactLog:
         self._steps = np.zeros(num_envs, np.int64)
 
     def with_contacts(self, arrays: Arrays) -> MissedContactLog:
-        """Return a log with the contacts of ``arrays`` that this one does not know."""
+        """Return a log with the contacts of ``arrays`` that are not in this one."""
         steps = arrays.fault.missed_contact
         new = np.flatnonzero((steps != 0) & (steps != self._steps)).tolist()
         if not new:

@@ -28,7 +28,7 @@ NODE_STEPS = 25_000
 
 
 class Machine(NamedTuple):
-    """Machine of a cluster, and the workers that it can have."""
+    """Machine of a cluster, and the largest number of workers on it."""
 
     node_id: str
     address: str
@@ -146,7 +146,7 @@ class Cluster:
         self.machines[index] = min(candidates, key=lambda one: (self._losses[one.node_id], nodes[one.node_id]))
 
     def _machines(self) -> list[Machine]:
-        """Return the machines, those with most CPUs first."""
+        """Return the machines, in descending order of CPUs."""
         least, machines = self.options.cpus_per_node, []
         for node in self.ray.nodes():
             cpus = int(node["Resources"].get("CPU", 0))

@@ -22,7 +22,7 @@ class Request(ABC):
     ticks = 0
     """Ticks of the arrays that hold observations afterwards; 0: the observation does not change."""
     substeps = 10
-    """Sim steps of each tick, or those that take about as long as the request."""
+    """Sim steps of each tick, or the number of sim steps that take as long as the request."""
     patience = 0.0
     """Further time that the request may take [s]."""
     counts_ticks = False
@@ -60,15 +60,15 @@ class Request(ABC):
 
 @dataclass(frozen=True)
 class Start:
-    """All that the loop of one worker is built from."""
+    """Inputs from which a worker builds its loop."""
 
     index: int
-    """Of the worker."""
+    """Number of the worker."""
     envs: slice
     """Rows in the arrays of the pool."""
     options: RunnerOptions
     params: bp.PIDParams
-    """Of these envs."""
+    """Params of these envs."""
     first_env: int = 0
     """Number of the pool's first env within the runner; each node of a cluster has a pool for some of the envs."""
 

@@ -3,7 +3,7 @@
 A worker process is a fresh Python, which does not import the caller's ``__main__``: it works from notebooks and from
 scripts without a main guard. It shares with the caller a socket and a block of memory, both by file descriptor, and a
 pipe. When the worker dies, the caller sees the socket close; when the caller dies, the pipe closes, and the kernel
-kills the worker. Ctrl-C reaches the caller alone, since a worker has a session of its own.
+kills the worker. Ctrl-C reaches the caller alone, since a worker is in another session.
 """
 
 from __future__ import annotations

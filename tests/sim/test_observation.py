@@ -85,7 +85,8 @@ def test_every_field_of_a_rollout_is_joined_or_has_to_be_the_same(name, rollout)
             Rollout.join(parts)
         return
     joined = getattr(Rollout.join(parts).info, name)
-    expected = getattr(changed if name in ("rates", "faults", "redraws", "complete") else parts[0].info, name)
+    events = ("rates", "faults", "redraws", "complete", "params_changed")
+    expected = getattr(changed if name in events else parts[0].info, name)
     assert joined is expected or np.array_equal(joined, expected)
 
 

@@ -84,8 +84,8 @@ def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[NDArray[np.float64],
 
     A way is a joint; a floating base adds its displacement and its rotation. The bounds hold within a range of joint
     positions (2, dof), which is returned, too. A body's shapes and children are balls around points of the body; the
-    ball of a child has all that moves with it, at any pose. A way that moves both bodies of a pair, or neither, does
-    not change their distance.
+    ball of a child contains everything that moves with it, at any pose. A way that moves both bodies of a pair, or
+    neither, does not change their distance.
     """
     model, dof = robot.model, len(robot.qvel)
     travel = np.tile([[-np.inf], [np.inf]], (1, dof))
@@ -102,15 +102,15 @@ def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[NDArray[np.float64],
         if joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
             moved[body, dof:], arms[dof + 1] = True, farthest
         elif joint >= 0:
-            way = int(np.flatnonzero(robot.qvel == model.jnt_dofadr[joint])[0])
-            moved[body, way] = True
+            column = int(np.flatnonzero(robot.qvel == model.jnt_dofadr[joint])[0])
+            moved[body, column] = True
             if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
                 across = np.cross(points, model.jnt_axis[joint])
-                arms[way] = (np.linalg.norm(across, axis=1) + radii).max(initial=0.0)
+                arms[column] = (np.linalg.norm(across, axis=1) + radii).max(initial=0.0)
             else:
                 if model.jnt_limited[joint]:
-                    travel[:, way] = model.jnt_range[joint] + (-_BEYOND, _BEYOND)
-                slide = float(np.abs(travel[:, way]).max())
+                    travel[:, column] = model.jnt_range[joint] + (-_BEYOND, _BEYOND)
+                slide = float(np.abs(travel[:, column]).max())
         balls[model.body_parentid[body]].append((model.body_pos[body], slide + farthest))
     for body in range(1, model.nbody):
         moved[body] |= moved[model.body_parentid[body]]
@@ -129,9 +129,9 @@ def places() -> tuple[int, ...] | None:
     after = ctypes.string_at(model._address, _BEGINNING)
     flags = [place for place in range(_BEGINNING) if before[place] != after[place]]
     addresses = [getattr(model, name).ctypes.data for name in _POINTERS]
-    found = [(8 * np.flatnonzero(np.frombuffer(after, np.uint64) == address)).tolist() for address in addresses]
-    is_clear = len(flags) == 1 and flags[0] % 4 == 0 and all(len(each) == 1 for each in found)
-    return (flags[0], *(each[0] for each in found)) if is_clear else None
+    offsets = [(8 * np.flatnonzero(np.frombuffer(after, np.uint64) == address)).tolist() for address in addresses]
+    is_clear = len(flags) == 1 and flags[0] % 4 == 0 and all(len(words) == 1 for words in offsets)
+    return (flags[0], *(words[0] for words in offsets)) if is_clear else None
 
 
 class GroupClearance:
@@ -148,8 +148,8 @@ class GroupClearance:
         ways = dof + 2 * floats
         addresses = {
             "models": [model._address for model in models],
-            "places": [each.geom_xpos.ctypes.data for each in data],
-            "turns": [each.geom_xmat.ctypes.data for each in data],
+            "places": [scene.geom_xpos.ctypes.data for scene in data],
+            "turns": [scene.geom_xmat.ctypes.data for scene in data],
         }
         arrays: Arrays = {name: np.array(rows, np.uint64) for name, rows in addresses.items()}
         arrays |= tables | {name: np.zeros((robots, ways)) for name in ("moved", "rate")}

@@ -77,8 +77,8 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
         body.name = names.bodies[body.id]
         body.gravcomp *= body.id not in robot
         body.sleep = mujoco.mjtSleepPolicy.mjSLEEP_AUTO  # no body sleeps
-    for each in [each for kind in REMOVED for each in getattr(scene, kind)]:
-        scene.delete(each)
+    for element in [part for kind in REMOVED for part in getattr(scene, kind)]:
+        scene.delete(element)
     root, start = "", _start(model)
     for joint in scene.joints:
         if joint.type != mujoco.mjtJoint.mjJNT_FREE or joint.parent.id not in robot:
@@ -108,12 +108,12 @@ def check_links(spec: SceneSpec, file: MjcfFile, links: Iterable[str]) -> None:
 
 
 def set_ground(scene: MjSpec, ground: bool) -> None:
-    """Switch contacts with the planes of the world on or off. A scene without planes gets one at height 0 for on."""
+    """Switch contacts with the planes of the world on or off. For on, a scene without planes gets one at height 0."""
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     planes = [each for each in scene.worldbody.geoms if each.type == plane and (each.contype or each.conaffinity)]
     if ground and not planes:
         added, plain = scene.worldbody.add_geom(type=plane, size=[0, 0, 1]), mujoco.MjSpec().worldbody.add_geom()
-        for name in _OF_CONTACTS:  # not those of the file's default class
+        for name in _OF_CONTACTS:  # the file's default class would apply otherwise
             setattr(added, name, getattr(plain, name))
         added.contype = added.conaffinity = _EVERYTHING
     for each in [] if ground else planes:

@@ -110,8 +110,8 @@ def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> Mjcf
 def content_of(path: Path) -> str:
     """Return the digest of an MJCF file and of all files that it names: included models, meshes, height fields, ...
 
-    MuJoCo looks for a file beside the file that names it, or in a folder of its ``<compiler>``. A file without any of
-    these is left out: if MuJoCo needs it, the compilation fails.
+    MuJoCo looks for a file in the folder of the file that names it, or in a folder of its ``<compiler>``. A missing
+    file is left out: if MuJoCo needs it, the compilation fails.
     """
     names, folders, models = set[str](), set[Path](), [path]
     for model in models:

@@ -67,12 +67,10 @@ def test_a_mesh_that_cannot_be_read_is_named(batchpid, tmp_path):
     assert not Robot.load(path).has_ground
     status, _, err = batchpid("view", path, *SHORT, "--time-limit", 0.1)
     assert status == 0
-    assert err.splitlines() == [
-        "batchpid: warning: link 'base' ('no.stl'): mesh not found: it is not drawn; put the file next to the URDF, "
-        "or pass package_dirs=[...] to Robot.load (--package-dirs)",
-        "batchpid: warning: link 'arm' ('<b>.stl'): mesh cannot be read (a git-lfs pointer instead of the mesh: run "
-        "git lfs pull): collision shapes are drawn instead; repair the file",
-    ]
+    missing, broken = err.splitlines()
+    assert "link 'base' ('no.stl'): mesh cannot be read (not found): it is not drawn" in missing
+    assert "link 'arm' ('<b>.stl'): mesh cannot be read" in broken
+    assert "collision shapes are drawn instead" in broken
 
 
 def test_a_port_in_use_is_named_with_the_next(batchpid):

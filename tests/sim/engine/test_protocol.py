@@ -58,6 +58,8 @@ def test_an_engine_has_the_members_of_each_protocol(name):
 class DoubleIntegrators:
     """Pack whose joints have unit inertia: q'' = u, by the semi-implicit Euler method."""
 
+    state_is_complete = True
+
     def __init__(self, spec, size, first_env):
         self.spec, self.size, self.first_env, self.dof = spec, size, first_env, len(spec.joints)
         self.qf = np.zeros((size, self.dof))

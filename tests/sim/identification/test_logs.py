@@ -7,7 +7,7 @@ import pytest
 from arms import gains, load, motion, run
 
 import batchpid as bp
-from batchpid.sim import Randomization, Runner, Uniform, write_recording
+from batchpid.sim import Randomization, Recorder, Runner, Uniform, write_recording
 from batchpid.sim.identification import LogWarning, Reading, logs_of_rollout, read_logs
 from batchpid.sim.identification.log import checked
 
@@ -184,6 +184,17 @@ def test_runs_that_a_fit_cannot_simulate_are_refused(robot, problem):
         logs_of_rollout(robot, rollout)
 
 
+def test_a_recording_of_changed_params_is_refused(robot, tmp_path):
+    path = tmp_path / "run.h5"
+    with Runner(robot, 1, params=gains(), workers=0, engine="mujoco") as runner, Recorder(path, runner):
+        for row in motion(0.5):
+            runner.step(row)
+            runner.params = gains().replace(kp=0.5 * gains().kp)
+        runner.params = gains()
+    with pytest.raises(bp.InvalidArgumentError, match="params that were changed"):
+        read_logs(robot, [path])
+
+
 def bag(path, messages):
     """Write messages (topic, time [s], values by joint) of states, positions and efforts alike."""
     from rosbags.rosbag2 import StoragePlugin, Writer
@@ -211,7 +222,9 @@ def test_messages_of_a_bag_are_merged_by_joint(robot, tmp_path):
         states = {"elbow": np.sin(time), "shoulder": np.cos(time)}
         if row % 3:
             states = dict(reversed(states.items()))
-        messages += [("/joint_states", time, states), ("/joint_states", time, {"finger": 0.0})]
+        messages += [("/joint_states", time, states)]
+    # Another device has more rows, and begins and ends at other times.
+    messages += [("/joint_states", time, {"finger": 0.0}) for time in np.arange(-1, TIME[-1] + 1, 0.004)]
     with pytest.warns(LogWarning, match="finger: no joint of the robot"):
         (log,) = read_logs(robot, [bag(tmp_path / "bag", messages)])
     np.testing.assert_allclose(log.qpos, np.stack([np.cos(TIME), np.sin(TIME)], axis=1), atol=1e-9)
@@ -228,7 +241,7 @@ def test_messages_of_a_bag_are_merged_by_joint(robot, tmp_path):
     ]
     path = bag(tmp_path / "apart", apart)
     (log,) = read_logs(robot, [path], "setpoint", reading=Reading(command_topic="/commands"))
-    np.testing.assert_allclose(log.qpos[1:], np.sin(TIME[1:, None]) * np.ones(2), atol=1e-5)
+    np.testing.assert_allclose(log.qpos, np.sin(TIME[1:, None]) * np.ones(2), atol=1e-5)
     with pytest.raises(bp.InvalidArgumentError, match=r"no values in the topic '/states'.*: /commands, /joint_states"):
         read_logs(robot, [path], reading=Reading(topic="/states"))
     (tmp_path / "damaged.mcap").write_bytes(b"nothing")

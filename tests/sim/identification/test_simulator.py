@@ -8,7 +8,7 @@ from arms import DT, FALLING, STEPS, TRUTH, gains, load, motion, run
 
 import batchpid as bp
 from batchpid.sim import Robot
-from batchpid.sim.identification.simulator import PAYLOAD, Candidates, Drive, Plant, Stretch, simulate
+from batchpid.sim.identification.simulator import PAYLOAD, LogControl, Plant, PlantCandidates, Stretch, simulate
 
 MOTORS = {
     "ideal": dict.fromkeys(TRUTH),
@@ -18,12 +18,12 @@ MOTORS = {
 }
 
 
-def candidates(count=1, law=None, delay=0.0, masses=(), **actuators) -> Candidates:
+def candidates(count=1, law=None, delay=0.0, masses=(), **actuators) -> PlantCandidates:
     """Return equal candidates."""
     made = bp.make_actuators(2, **{name: value for name, value in actuators.items() if value is not None})
     spread = {name: np.repeat(leaf, count, axis=0) for name, leaf in made._asdict().items() if leaf is not None}
     spread |= {} if made.max_delay is None else {"max_delay": made.max_delay}
-    return Candidates(bp.Actuators(**spread), law or {}, np.full(count, delay), (tuple(masses),) * count)
+    return PlantCandidates(bp.Actuators(**spread), law or {}, np.full(count, delay), (tuple(masses),) * count)
 
 
 def stretch_of(commands, start) -> Stretch:
@@ -33,7 +33,7 @@ def stretch_of(commands, start) -> Stretch:
     return Stretch(start, np.zeros(2), table, 0, None, ends, np.zeros(len(ends)))
 
 
-def simulated(robot: Robot, commands, drive: Drive, made: Candidates, start) -> np.ndarray:
+def simulated(robot: Robot, commands, drive: LogControl, made: PlantCandidates, start) -> np.ndarray:
     (table,) = simulate(Plant(robot, (0, 1)), drive, made, np.zeros((1, 2, 2)), [stretch_of(commands, start)])
     return table[0]
 
@@ -45,7 +45,7 @@ def test_a_log_of_setpoints_is_simulated_as_by_the_runner(tmp_path, monkeypatch,
     monkeypatch.setenv("BATCHPID_NATIVE", native)
     robot, setpoints = load(tmp_path), motion(0.5)
     rollout = run(robot, setpoints, compensate=compensate, actuators=MOTORS[kind])
-    drive = Drive(DT, gains(), compensate)
+    drive = LogControl(DT, gains(), compensate)
     offset = np.array(MOTORS[kind].get("position_offset", 0.0))  # the log has the measured positions
     table = simulated(robot, setpoints, drive, candidates(**(TRUTH | MOTORS[kind])), setpoints[0] + offset)
     np.testing.assert_allclose(table - offset, rollout.qpos[:, 0], atol=1e-4)
@@ -57,13 +57,13 @@ def test_a_log_of_efforts_is_simulated_as_by_the_runner(tmp_path, kind):
     commands = 3.0 * motion(0.5)
     rollout = run(robot, commands, "effort", actuators=MOTORS[kind])
     made, offset = candidates(**(TRUTH | MOTORS[kind])), np.array(MOTORS[kind].get("position_offset", 0.0))
-    table = simulated(robot, commands, Drive(DT, None, "none"), made, FALLING + offset)
+    table = simulated(robot, commands, LogControl(DT, None, "none"), made, FALLING + offset)
     np.testing.assert_allclose(table - offset, rollout.qpos[:, 0], atol=1e-4)
 
 
 def test_delays_and_rate_limits_of_setpoints_are_those_of_late_rows_and_a_guard(tmp_path):
     robot, setpoints = load(tmp_path), motion(0.5)
-    drive = Drive(DT, gains(), "none")
+    drive = LogControl(DT, gains(), "none")
     late = np.vstack([setpoints[:1]] * 4 + [setpoints[:-4]])
     expected = simulated(robot, late, drive, candidates(**TRUTH), setpoints[0])
     table = simulated(robot, setpoints, drive, candidates(delay=4 * STEPS * DT, **TRUTH), setpoints[0])
@@ -79,7 +79,7 @@ def test_masses_are_those_of_another_description(tmp_path):
     text = (tmp_path / "arm.urdf").read_text()
     heavy = text.replace('mass value="1"', 'mass value="1.5"').replace('ixx="0.01"', 'ixx="0.015"')
     heavy = heavy.replace('iyy="0.01"', 'iyy="0.015"').replace('izz="0.002"', 'izz="0.003"')
-    drive = Drive(DT, gains(), "none")
+    drive = LogControl(DT, gains(), "none")
     table = simulated(robot, setpoints, drive, candidates(masses=[("fore", 1.5)], **TRUTH), setpoints[0])
     other = load(tmp_path, heavy)
     np.testing.assert_allclose(table, simulated(other, setpoints, drive, candidates(**TRUTH), setpoints[0]), atol=1e-9)
@@ -89,7 +89,7 @@ def test_masses_are_those_of_another_description(tmp_path):
 
 def test_candidates_and_stretches_do_not_affect_each_other(tmp_path):
     robot, setpoints = load(tmp_path), motion(0.5)
-    plant, drive = Plant(robot, (0, 1)), Drive(DT, gains(), "gravity+coriolis")
+    plant, drive = Plant(robot, (0, 1)), LogControl(DT, gains(), "gravity+coriolis")
     stretches = [stretch_of(setpoints, setpoints[0]), stretch_of(setpoints[20:60], setpoints[20])]
     made = candidates(3, **TRUTH)
     made = made._replace(actuators=made.actuators._replace(strength=np.array([[1.0, 1.0], [0.9, 0.9], [0.5, 1.2]])))
