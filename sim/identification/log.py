@@ -17,8 +17,8 @@ import batchpid as bp
 from batchpid.arrays.array_types import Float64, Rows
 from batchpid.arrays.elementwise import TURN
 from batchpid.checks.warn import warn
+from batchpid.sim.recording.setpoint_files import error
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.setpoint_files import error
 
 CommandKind = Literal["setpoint", "effort"]
 BEYOND = {"rad": 0.3, "m": 0.05}
