@@ -476,10 +476,10 @@ class Rollout:
         return f"Rollout({ticks} ticks {end}, {envs} envs, {dof} joints, {_failed_envs(self.ok)})"
 
     def findings(self, robot: Any = None) -> Any:
-        """Return the causes for which joints do not settle, the most likely first; an empty list if all settle.
+        """Return the causes for which joints do not settle; an empty list if all settle.
 
         Each is a :class:`batchpid.sim.Finding` with ``code``, ``text``, ``remedy``, ``envs``, ``time`` [s], and a joint
-        or a link.
+        or a detail.
 
         Parameters
         ----------

@@ -46,7 +46,7 @@ class ExciteCommand:
         from batchpid.io.files import write_atomically
         from batchpid.sim.cli.report import table
         from batchpid.sim.identification.excitation import excite
-        from batchpid.sim.setpoint_files import setpoint_csv
+        from batchpid.sim.recording.setpoint_files import setpoint_csv
 
         out = self.out or FOLDER / f"{Path(self.robot).stem}.excite.csv"
         out = OutputFiles(self).path("out", out, (".csv",))

@@ -20,7 +20,7 @@ from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tuning.gain_sets import gain_set
 
 if TYPE_CHECKING:
-    from batchpid.sim.setpoint_files import Setpoints
+    from batchpid.sim.recording.setpoint_files import Setpoints
 
 RUNNER = flags.runner_flags()
 
@@ -147,7 +147,7 @@ class RolloutCommand:
 
     def _read(self, robot: Robot, path: Path) -> Setpoints:
         """Return the setpoints in a file, and print the source of their rates."""
-        from batchpid.sim.setpoint_files import read_setpoints
+        from batchpid.sim.recording.setpoint_files import read_setpoints
 
         if self.control == "osc":
             remedy = "leave one of them out; a trajectory has joint setpoints"

@@ -1,1 +1,1 @@
-"""Rollouts in HDF5 files."""
+"""Rollouts in HDF5 files, and setpoints in CSV files."""

@@ -26,7 +26,7 @@ import batchpid as bp
 from batchpid.errors import BatchPIDError
 from batchpid.sim import Robot, Runner, Snapshot
 from batchpid.sim.identification import read_logs
-from batchpid.sim.setpoint_files import read_setpoints
+from batchpid.sim.recording.setpoint_files import read_setpoints
 from batchpid.sim.tuning import load_randomization, random_moves
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of unusual values
