@@ -69,6 +69,7 @@ GONE = (
     r"identification/(plant|columns|held_out|problem)\b",
     r"integral-limit",
     r"integrate_first",
+    r"is_feasible",
     r"jitted_law",
     r"law in XLA \(float",
     r"link_reach",

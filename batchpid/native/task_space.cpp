@@ -233,55 +233,40 @@ PyObject *search(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   Py_RETURN_NONE;
 }
 
-// Arrays of `move`: MOVE in task_space_extension.py; the first three are changed.
-enum Move { AT, RATE, RUB, INERTIA, PUSH, ADDED, MOST_RUB, KEEP, CREEP, LOWER_END, UPPER_END, MOVE };
+// Arrays of `move`: MOVE in task_space_extension.py; the first two are changed.
+enum Move { AT, RATE, INERTIA, PUSH, ADDED, LOWER_END, UPPER_END, MOVE };
 
-// Step joints with friction: sim/identification/simulator.py.
-FOR_EACH_PROCESSOR void write_move(std::int64_t rows, std::int64_t joints, double dt, long sweeps, Tables const &table) {
+// Step joints: sim/identification/simulator.py.
+FOR_EACH_PROCESSOR void write_move(std::int64_t rows, std::int64_t joints, double dt, Tables const &table) {
   auto const n = static_cast<std::size_t>(joints);
-  std::vector<Lanes> columns[MOVE], room(n * n), free(n), weight(n), next(n);
+  std::vector<Lanes> columns[MOVE], room(n * n);
   for (int i = 0; i < MOVE; ++i) columns[i].resize(i == INERTIA ? n * n : n);
   std::vector<Lanes> &inverse = columns[INERTIA];
-  auto const moved = [&](std::int64_t j, std::vector<Lanes> const &effort) {
-    return dt * along(&inverse[j * joints], effort.data(), joints);
-  };
-  auto &[q, v, f, matrix, push, added, limit, keep, creep, low, high] = columns;
+  auto &[q, v, matrix, push, added, low, high] = columns;
   for (std::int64_t first = 0; first < rows; first += WIDTH) {
     for (int i = 0; i < MOVE; ++i) table[i].load(first, columns[i].data());
     for (std::int64_t j = 0; j < joints; ++j) matrix[j * joints + j] += added[j];
     invert(joints, inverse.data(), room.data());
     for (std::int64_t j = 0; j < joints; ++j) {
-      free[j] = v[j] + moved(j, push);
-      weight[j] = 1.0 / (dt * inverse[j * joints + j] + creep[j]);
-    }
-    for (long sweep = 0; sweep < sweeps; ++sweep) {
-      for (std::int64_t j = 0; j < joints; ++j) {
-        next[j] = f[j] + weight[j] * (free[j] - moved(j, f) - keep[0] * v[j] - creep[j] * f[j]);
-        next[j] = at_most(at_least(next[j], -limit[j]), limit[j]);
-      }
-      std::swap(f, next);
-    }
-    for (std::int64_t j = 0; j < joints; ++j) {
-      v[j] = free[j] - moved(j, f);
+      v[j] += dt * along(&inverse[j * joints], push.data(), joints);
       Lanes const end = q[j] + dt * v[j];
       v[j] = zero_outside(v[j], low[j], end, high[j]);
       q[j] = at_most(at_least(end, low[j]), high[j]);
     }
-    for (int i : {AT, RATE, RUB}) table[i].store(first, columns[i].data());
+    for (int i : {AT, RATE}) table[i].store(first, columns[i].data());
   }
 }
 
-// move(rows, joints, dt, sweeps, *arrays)
+// move(rows, joints, dt, *arrays)
 PyObject *move(PyObject *, PyObject *const *arguments, Py_ssize_t) {
   std::int64_t const rows = PyLong_AsLong(arguments[0]), joints = PyLong_AsLong(arguments[1]);
   double const dt = PyFloat_AsDouble(arguments[2]);
-  long const sweeps = PyLong_AsLong(arguments[3]);
   if (PyErr_Occurred()) return nullptr;
   Tables table;
-  std::int64_t const all = joints * joints, others[] = {all, joints, joints, joints, 1, joints, joints, joints};
-  if (!table.open_all(arguments + 4, {joints, joints, joints}, rows, 0)) return nullptr;
-  if (!table.open_all(arguments + 4 + INERTIA, others, rows, MOVE)) return nullptr;
-  write_move(rows, joints, dt, sweeps, table);
+  std::int64_t const others[] = {joints * joints, joints, joints, joints, joints};
+  if (!table.open_all(arguments + 3, {joints, joints}, rows, 0)) return nullptr;
+  if (!table.open_all(arguments + 3 + INERTIA, others, rows, MOVE)) return nullptr;
+  write_move(rows, joints, dt, table);
   Py_RETURN_NONE;
 }
 

@@ -26,11 +26,8 @@ LAW = (
 """Arrays of ``law``: dynamics, inputs and state, coefficients, and results from the effort on."""
 SEARCH = ("goal", "tool", "lower", "upper", "tolerances", "qpos", "errors", "steps")
 """Arrays of ``search`` in pose_search.h; those after the tolerances are results. ``qpos`` holds the starts first."""
-MOVE = (
-    *("qpos", "qvel", "friction", "matrix", "effort", "added"),
-    *("limit", "keep", "creep", "low", "high"),
-)
-"""Arrays of ``move``; the first three are changed."""
+MOVE = ("qpos", "qvel", "matrix", "effort", "added", "low", "high")
+"""Arrays of ``move``; the first two are changed."""
 
 RIGID_BODIES = ("batchpid/native/lanes.h", "batchpid/native/rigid_body.h", "batchpid/native/task_space_extension.py")
 _NAMES = ("task_space.cpp", "extension.h", "mobility.h", "osc_law.h", "pose_search.h", "tables.h", "tool.h")

@@ -123,18 +123,6 @@ def search(
     return found
 
 
-def move(dt: float, sweeps: int, *arrays: Float64) -> bool:
-    """Step joints with friction by ``dt`` [s], in place; return False where native code is not used.
-
-    ``arrays`` are the contiguous arrays of :data:`batchpid.native.task_space_extension.MOVE`, (rows, columns) or
-    (1, columns); those that change are (rows, joints).
-    """
-    if (native := in_use()) is None:
-        return False
-    native.move(*arrays[0].shape, dt, sweeps, *arrays)
-    return True
-
-
 def tool(own: _NativeTree, index: int, point: Array) -> Float64:
     """Return the frames (1 | rows, 12) of a link in its body, with the origin at a ``point`` (3,) or (..., 3)."""
     tool = own.tools[index]

@@ -9,7 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from batchpid.sim.identification.excitation import excite, is_feasible
+    from batchpid.sim.identification.excitation import excite
     from batchpid.sim.identification.identification import identify
     from batchpid.sim.identification.log import Log, LogSettings, LogWarning
     from batchpid.sim.identification.logs import Reading, logs_of_rollout, read_logs
@@ -23,13 +23,12 @@ __all__ = [
     "draw_motors",
     "excite",
     "identify",
-    "is_feasible",
     "logs_of_rollout",
     "read_logs",
 ]
 
 _MODULES = {
-    "excitation": ("excite", "is_feasible"),
+    "excitation": ("excite",),
     "identification": ("identify",),
     "log": ("Log", "LogSettings", "LogWarning"),
     "logs": ("Reading", "logs_of_rollout", "read_logs"),

@@ -112,14 +112,6 @@ def excite(
     return best[1]
 
 
-def is_feasible(robot: Robot, motion: Trajectory) -> bool:
-    """Return whether a motion keeps within the limits of position, velocity and effort, and free of contact.
-
-    Joints that stay still throughout may need more effort than their limit.
-    """
-    return _obstacle(robot, motion) is None
-
-
 class _Obstacle(NamedTuple):
     """Reason for which a motion is not possible, and the joints that have to move less; none if that does not help."""
 
@@ -141,47 +133,24 @@ def _obstacle(robot: Robot, motion: Trajectory) -> _Obstacle | None:
     moves = np.ptp(motion.position, axis=0) > 0
     excess = np.where(moves, np.abs(effort) - robot.design_effort_limit, 0.0)
     if (excess > 0).any():
-        joint, limit = int(excess.max(0).argmax()), robot.design_effort_limit
-        needed = robot.holding_efforts(position[:1])[0]
-        weak = np.flatnonzero(moves & (np.abs(needed) + robot.friction > limit))
-        if weak.size:
-            joint = int(weak[0])
-            load = f"gravity and friction take {abs(needed[joint]) + robot.friction[joint]:.3g} of {limit[joint]:.3g}"
-            return _Obstacle(
-                f"joint {robot.joint_names[joint]!r} is too weak: {load} {robot.joints[joint].effort_unit}"
-            )
-        text = f"joint {robot.joint_names[joint]!r} is too weak to move"
+        text = f"joint {robot.joint_names[int(excess.max(0).argmax())]!r} is too weak to move"
         return _Obstacle(text, tuple(np.flatnonzero((excess > 0).any(0)).tolist()))
     return _contact(robot, position)
 
 
 def _contact(robot: Robot, position: Float64) -> _Obstacle | None:
     """Return the first pair of links that come too near each other at poses (n, dof), compared with the first one."""
-    dynamics = robot.dynamics()
-
-    def apart(qpos: Float64, within: float = CLEARANCE) -> dict[tuple[str, str], float]:
-        found: dict[tuple[str, str], float] = {}
-        for first, second, distance in dynamics.contacts.near(qpos, within):
-            found[first, second] = min(distance, found.get((first, second), np.inf))
-        return found
-
-    center = position[0]
-    allowed = {pair: max(0.0, 0.5 * distance) for pair, distance in apart(center).items()}
-    first = np.linspace(0, len(position) - 1, _COARSE).astype(int)
-    for row in (*first, *range(len(position))):
-        qpos = position[row]
-        for pair, distance in apart(qpos).items():
-            if distance >= allowed.get(pair, CLEARANCE):
-                continue
-            names = " and ".join(repr(name) for name in pair if name) + (" and the ground" if not pair[1] else "")
-            text, gains = f"{names} touch", {}
-            for joint in sorted(_between(robot, pair)):
-                back = qpos.copy()
-                back[joint] = center[joint]
-                gains[joint] = apart(robot.coupled(back), 2 * CLEARANCE).get(pair, 2 * CLEARANCE) - distance
-            if row == 0 or not gains or max(gains.values()) <= 0:
-                return _Obstacle(text, () if row == 0 else tuple(gains))
-            return _Obstacle(text, tuple(joint for joint, gain in gains.items() if gain > 0.3 * max(gains.values())))
+    contacts = robot.dynamics().contacts
+    allowed = dict[tuple[str, str], float]()
+    for first, second, distance in contacts.near(position[0], CLEARANCE):
+        allowed[first, second] = min(max(0.0, 0.5 * distance), allowed.get((first, second), CLEARANCE))
+    coarse = np.linspace(0, len(position) - 1, _COARSE).astype(int)
+    for row in (*coarse, *range(len(position))):
+        for first, second, distance in contacts.near(position[row], CLEARANCE):
+            if distance < allowed.get((first, second), CLEARANCE):
+                names = " and ".join(repr(name) for name in (first, second) if name)
+                text = f"{names} touch" if second else f"{names} and the ground touch"
+                return _Obstacle(text, tuple(_between(robot, (first, second))) if row else ())
     return None
 
 

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext
 from dataclasses import replace
 from importlib.util import find_spec
-from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,7 +62,6 @@ def identify(
     extras: Sequence[str] = (),
     reading: Reading | None = None,
     evaluations: int = 30,
-    workers: int = 0,
     progress: Callable[[], Any] | None = None,
 ) -> Identification:
     """Find the motors of ``robot`` from logs of its motion.
@@ -92,8 +88,6 @@ def identify(
         Units and names in the files.
     evaluations
         Largest number of evaluations of the fit.
-    workers
-        Number of processes, 0 for this one.
     progress
         Called after each evaluation.
 
@@ -117,16 +111,11 @@ def identify(
     if {*LAW}.isdisjoint(extras) and _is_odd(data, guess) and (words := _better_reading(data)):
         raise InvalidArgumentError("logs", f"make sense with {words}", remedy="correct the log or its options")
     unknowns = _unknowns(data, guess, [*extras], flag("payload", payload))
-    pool: Any = nullcontext()
-    if integer("workers", workers, 0, 1000) > 1:
-        pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-    with pool as executor:
-        run = map if executor is None else executor.map
-        problem = Problem(data.plants, data.drives, _windows(data), unknowns, run)
-        solution = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
-    if not solution.explains and (words := _better_reading(data)):
-        return replace(solution, advice=f"the logs make more sense with {words}: correct the log or its options")
-    return solution
+    problem = Problem(data.plants, data.drives, _windows(data), unknowns)
+    found = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
+    if not found.explains and (words := _better_reading(data)):
+        return replace(found, advice=f"the logs make more sense with {words}: correct the log or its options")
+    return found
 
 
 def _read(
@@ -193,15 +182,13 @@ def _resting(robot: Robot, start: Float64) -> Robot:
 
 def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
     """Return the params that drove a log; raise InvalidArgumentError if a recording contradicts them."""
-    recorded_params = None if log.params is None else _of_joints(log.params, robot, log)
-    law = params if log.settings.params is None else _of_joints(log.settings.params, robot, log)
-    if recorded_params is None or law is None:
-        return recorded_params if law is None else law
+    chosen = params if log.settings.params is None else log.settings.params
+    recorded, law = (None if one is None else _of_joints(one, robot, log) for one in (log.params, chosen))
+    if recorded is None or law is None:
+        return recorded if law is None else law
     for name in ("kp", "ki", "kd"):
-        recorded, present = (
-            np.zeros(1) if gain is None else gain for gain in (getattr(recorded_params, name), getattr(law, name))
-        )
-        if not np.allclose(recorded, present, rtol=1e-6):
+        pair = [0.0 if gain is None else gain for gain in (getattr(recorded, name), getattr(law, name))]
+        if not np.allclose(*pair, rtol=1e-6):
             problem = f"contradict {log.source}, which was recorded with another {name}"
             raise InvalidArgumentError("params", problem, remedy="leave them out: a recording has its own")
     return law

@@ -27,8 +27,6 @@ MIN_ROWS, MIN_SECONDS = 50, 0.2
 """Least number of rows and length [s] of a stretch."""
 GAP, PERIODS = 0.1, 5.0
 """Least length of a gap, in seconds and in median periods of the rows; the longer one applies."""
-SPEEDING = 4.0
-"""Typical speed over the joint's velocity limit from which positions may be in degrees."""
 CLEAR = np.pi / 2
 """Largest change from row to row, apart from whole turns, at which the number of turns is certain [rad]."""
 
@@ -185,8 +183,11 @@ def _check_finite(robot: Robot, log: Log, places: list[str]) -> None:
             continue
         index, joint = (int(n) for n in np.argwhere(~np.isfinite(table))[0])
         column = "time" if quantity == "time" else f"{quantity}:{robot.joint_names[log.joints[joint]]}"
-        place = places[index] if index < len(places) else f"command {index + 1}"
-        raise error(log.source, f"{place}, column {column!r} is empty or not finite", "remove the row")
+        raise error(
+            log.source,
+            f"{places[min(index, len(places) - 1)]}, column {column!r} is empty or not finite",
+            "remove the row",
+        )
 
 
 def _unwrapped(robot: Robot, log: Log, places: list[str]) -> Log:
@@ -228,7 +229,3 @@ def _check_unit(robot: Robot, log: Log, joint: int, column: Float64, places: lis
         index = int(np.argmax(beyond))
         problem = f"{places[index]}, column 'qpos:{name}' is far beyond the joint's limits, {low:g} to {high:g}"
         raise error(log.source, problem, f"{remedy}; a joint that turns freely is of type continuous", column[index])
-    speeds = np.abs(np.diff(column)) / np.diff(log.time)
-    typical, limit = np.sqrt((np.minimum(speeds, np.quantile(speeds, 0.95)) ** 2).mean()), robot.velocity_limit[joint]
-    if limit > 0 and typical > SPEEDING * limit and unit == "rad":
-        raise error(log.source, f"joint {name!r} moves at {typical:.3g} rad/s, its limit is {limit:.3g}", remedy)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,10 +51,6 @@ class Reading(NamedTuple):
     """Topic of the commands in a ROS bag; None: the measured efforts are used."""
     prefix: str = ""
     """Prefix of the joints' names in a file, which the robot's do not have."""
-    sign: Mapping[str, float] | None = None
-    """Factors, 1 or -1, of all columns of some joints."""
-    scale: Mapping[str, float] | None = None
-    """Factors of the efforts of some joints, such as N m per A."""
 
 
 def read_logs(
@@ -184,8 +180,10 @@ def _build(robot: Robot, source: str, columns: dict[str, Float64], kind: Command
             if joint not in by[quantity]:
                 remedy = "give all columns of a joint or none; a joint that is left out rests at the robot's start pose"
                 raise error(f"{source}: column {quantity}:{joint}", "is missing", remedy)
-        factors = [_factor(robot, quantity, joint, reading) for joint in names]
-        tables[quantity] = np.stack([by[quantity][joint] for joint in names], axis=1) * factors
+        tables[quantity] = np.stack([by[quantity][joint] for joint in names], axis=1)
+        if reading.degrees and quantity in ("qpos", "setpoint"):
+            turns = [robot.units[robot.joint_names.index(joint)] == "rad" for joint in names]
+            tables[quantity] *= np.where(turns, np.pi / 180, 1.0)
     joints = tuple(robot.joint_names.index(joint) for joint in names)
     forward = tables.get("feedforward")
     return Log(
@@ -200,15 +198,6 @@ def _build(robot: Robot, source: str, columns: dict[str, Float64], kind: Command
         feedforward=forward,
         measured=measured and kind == "effort",
     )
-
-
-def _factor(robot: Robot, quantity: str, joint: str, reading: Reading) -> float:
-    """Return the factor of a column to SI units and to the robot's sign."""
-    factor = (reading.sign or {}).get(joint, 1.0)
-    if quantity in ("effort", "feedforward"):
-        return factor * (reading.scale or {}).get(joint, 1.0)
-    turns = robot.units[robot.joint_names.index(joint)] == "rad"
-    return float(np.radians(factor)) if reading.degrees and turns else factor
 
 
 def _read_hdf5(path: Path) -> dict[str, Float64] | None:

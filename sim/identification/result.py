@@ -11,7 +11,7 @@ import numpy as np
 
 import batchpid as bp
 from batchpid.arrays.array_types import Document, Float64
-from batchpid.checks.validate import choice, integer
+from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
 from batchpid.io import documents
 from batchpid.sim.identification.fit import STEP, Problem, Solution, Window
@@ -119,16 +119,12 @@ class Identification:
         InvalidArgumentError
             There is no such unknown.
         """
-        kind = choice("kind", kind, list(KINDS))
-        places = {(entry.kind, entry.joint if entry.link is None else entry.link): entry for entry in self._all()}
-        if (kind, joint) not in places:
-            names = ", ".join(sorted({name for name, _ in places}))
-            raise InvalidArgumentError("joint", f"is no place of the unknown {kind!r}", value=joint, remedy=names)
-        entry = places[kind, joint]
-        return None if entry not in self.unknowns.entries else self._row(self.unknowns.entries.index(entry))
-
-    def _all(self) -> tuple[Unknown, ...]:
-        return self.unknowns.entries + self.hidden.entries
+        entries = self.unknowns.entries + self.hidden.entries
+        for at, entry in enumerate(entries):
+            if (entry.kind, entry.joint if entry.link is None else entry.link) == (kind, joint):
+                return self._row(at) if at < len(self.values) else None
+        kinds = ", ".join(sorted({entry.kind for entry in entries}))
+        raise InvalidArgumentError("kind", f"is no unknown of {joint!r}", value=kind, remedy=f"there are {kinds}")
 
     def _row(self, at: int) -> tuple[float, float, float]:
         value, half = float(self.values[at]), INTERVAL * float(self.intervals.deviation[at])
@@ -146,29 +142,15 @@ class Identification:
         return [self._name(entry) for entry in self.hidden.entries]
 
     def _name(self, entry: Unknown) -> str:
-        joint = None if entry.joint is None else self.robot.joint_names[self.joints[entry.joint]]
-        place = joint or entry.link
-        return entry.kind if place is None else f"{place}: {entry.kind}"
+        return ": ".join(filter(None, (self._place(entry), entry.kind)))
 
     def actuators(self) -> bp.Actuators:
         """Return the identified actuators; joints that are not in the logs are ideal.
 
         Friction and damping are in addition to the robot's description.
         """
-        tables = self.unknowns.tables(self.values[None])
-        options = dict[str, Any]()
-        for name, table in tables.items():
-            kind = KINDS[name]
-            if kind.target != "motor":
-                continue
-            column = np.full(self.robot.dof, kind.neutral)
-            described = getattr(self.robot, DESCRIBED[name])[list(self.joints)] if name in DESCRIBED else 0.0
-            column[list(self.joints)] = np.maximum(table[0] - described, 0.0) if name in DESCRIBED else table[0]
-            if name == "delay":
-                column[:] = table[0, 0]
-            options[kind.field] = column
-        if "static" in options:
-            options["static"] = options["static"] + options.get("coulomb", 0.0)
+        columns = _columns(self.unknowns, self.values[None])
+        options: dict[str, Any] = {name: column[0] for name, column in columns.items()}
         return bp.make_actuators(self.robot.dof, **options, joint_names=self.robot.joint_names)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -246,7 +228,7 @@ class Identification:
 
     def report(self) -> str:
         """Return values, intervals and errors as text."""
-        kinds = list(dict.fromkeys(entry.kind for entry in self._all() if entry.joint is not None))
+        kinds = list(dict.fromkeys(entry.kind for entry in self.unknowns.entries if entry.joint is not None))
         names = [self.robot.joint_names[joint] for joint in self.joints]
         cells = {(entry.kind, self._place(entry)): self._cell(at) for at, entry in enumerate(self.unknowns.entries)}
         rows = [["95 % intervals, SI units", *kinds]]
@@ -254,9 +236,8 @@ class Identification:
         widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
         lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
         lines += [""]
-        for entry in self._all():
-            if entry.joint is None:
-                lines.append(f"{self._name(entry)}: {cells.get((entry.kind, entry.link), 'not shown by these logs')}")
+        shared = [entry for entry in self.unknowns.entries if entry.joint is None]
+        lines += [f"{self._name(entry)}: {cells[entry.kind, entry.link]}" for entry in shared]
         if self.drive.compensate != "none":
             path = "through its motors" if self.drive.through else "apart from its motors"
             lines.append(f"the robot compensates {self.drive.compensate} {path}")
@@ -284,6 +265,25 @@ class Identification:
             return f"< {high:.2g}"
         digits = int(np.clip(np.ceil(np.log10(abs(value) / half)) + 1, 1, 6)) if value and half else 3
         return f"{value:.{digits}g} ± {half:.1g}"
+
+
+def _columns(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
+    """Return the fields of actuators (n, dof) with ``values`` (n, unknowns), without the description's part."""
+    robot, joints, columns = unknowns.robot, list(unknowns.joints), dict[str, Float64]()
+    for name, table in unknowns.tables(values).items():
+        kind = KINDS[name]
+        if kind.target != "motor":
+            continue
+        if kind.positive:
+            described = getattr(robot, DESCRIBED[name])[joints] if name in DESCRIBED else 0.0
+            table = np.maximum(table - described, 1e-3 * kind.neutral)
+        column = columns[kind.field] = np.full((len(values), robot.dof), kind.neutral)
+        column[:, joints] = table
+        if kind.per == "robot":
+            column[:] = table[:, :1]
+    if "static" in columns:
+        columns["static"] += columns.get("coulomb", 0.0)
+    return columns
 
 
 def advice(problem: Problem, solution: Solution) -> str:
@@ -363,23 +363,15 @@ def draw_motors(path: str | os.PathLike[str], robot: Robot, count: int, seed: in
         correlation = np.zeros((len(names), len(names)))
         for at, row in enumerate(rows):
             correlation[at, : at + 1] = correlation[: at + 1, at] = row
-        kinds = [(KINDS[kind], kind, None if place is None else place) for kind, place in names]
-        numbers = [robot.joint_names.index(place) if kind.per == "joint" else None for kind, _, place in kinds]
+        entries = tuple(
+            Unknown(kind, robot.joint_names.index(place) if KINDS[kind].per == "joint" else None, 0.0, 1.0)
+            for kind, place in names
+        )
         values, vectors = np.linalg.eigh(correlation)
         z = np.random.default_rng(seed).normal(size=(count, len(names)))
         points = estimate + deviation * (z @ (vectors * np.sqrt(np.maximum(values, 0.0))).T)
     except (KeyError, IndexError, TypeError, ValueError) as bad:
         remedy = "write the file with `batchpid identify` of this robot"
         raise InvalidArgumentError(source, f"is missing or cannot be read ({bad})", remedy=remedy) from None
-    columns: dict[str, Float64] = {}
-    for (kind, name, _), joint, drawn in zip(kinds, numbers, points.T, strict=True):
-        if kind.target != "motor":
-            continue
-        leaf = getattr(nominal, kind.field)
-        table = columns.setdefault(kind.field, np.full((count, robot.dof), kind.neutral if leaf is None else leaf))
-        described = getattr(robot, DESCRIBED[name])[joint] if name in DESCRIBED else 0.0
-        drawn = np.maximum(drawn - described, 1e-3 if name == "strength" else 0.0) if kind.positive else drawn
-        table[:, slice(None) if joint is None else joint] = drawn[:, None] if joint is None else drawn
-    if "static" in columns:
-        columns["static"] = columns["static"] + columns.get("coulomb", 0.0)
+    columns = _columns(Unknowns(robot, tuple(range(robot.dof)), entries), points)
     return nominal.replace(**columns)

@@ -322,9 +322,7 @@ def simulate(
     armature = 0.0 if rows.actuators.armature is None else rows.actuators.armature
     viscous = 0.0 if control.friction.viscous is None else control.friction.viscous
     armature = np.zeros_like(q) + armature
-    added, friction = armature + dt * viscous, np.zeros_like(q)
-    none = np.zeros((1, q.shape[1]))  # the friction of control_step takes the place of that of ``move``
-    constants = added, none, np.zeros((1, 1)), none, plant.low, plant.high
+    added = armature + dt * viscous
     native, steps = native_rows.in_use(), max(stretch.steps for stretch in stretches)
     eye, shape = np.eye(q.shape[1]), (count, many, q.shape[1])
     places, speeds = q.reshape(shape), v.reshape(shape)
@@ -350,9 +348,8 @@ def simulate(
                 forward = np.tile(forwards[step], (count, 1))
                 passive = forward if passive is None else passive + forward
             effort = control.advance(commands.at(step), q, v, passive)
-            arrays = q, v, friction, dynamics.matrix, effort - force, *constants
             if native is not None:
-                native.move(*q.shape, dt, 1, *arrays)
+                native.move(*q.shape, dt, q, v, dynamics.matrix, effort - force, added, plant.low, plant.high)
             else:
                 inertia = dynamics.matrix + added[:, :, None] * eye
                 v += dt * np.linalg.solve(inertia, (effort - force)[..., None])[..., 0]

@@ -113,7 +113,7 @@ def test_the_integral_removes_the_error_of_an_uncompensated_drive(run, tmp_path)
 @pytest.mark.parametrize("kind", ["torque", "servo", "velocity", "mit"])
 def test_the_motor_of_each_kind_of_controller_is_identified(run, tmp_path, kind):
     (line,) = [each for each in run("real_logs.py", "--out", str(tmp_path)).splitlines() if f"{kind}." in each]
-    words = [*line.split()[1:], "--workers", "0", "--out", str(tmp_path / "motors.yaml")]
+    words = [*line.split()[1:], "--out", str(tmp_path / "motors.yaml")]
     assert not main(words)
     module = runpy.run_path(str(EXAMPLES / "real_logs.py"))
     found = bp.load_actuators(tmp_path / "motors.yaml", ("hinge",))[0]

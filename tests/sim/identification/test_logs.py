@@ -48,18 +48,14 @@ def test_columns_are_found_by_name_in_the_order_of_the_robot(robot, tmp_path):
     np.testing.assert_array_equal(other.command, log.command)
 
 
-def test_units_signs_and_names_are_options(robot, tmp_path):
+def test_units_and_names_are_options(robot, tmp_path):
     (plain,) = read(robot, tmp_path, table("effort"))
     columns = {name.replace(":", ":arm_"): values for name, values in table("effort").items()}
     columns = {"time_ms": 1e3 * columns.pop("time")} | columns
     for name in columns:
         if name.startswith("qpos"):
             columns[name] = np.degrees(columns[name])
-        if name.endswith("elbow"):
-            columns[name] = -columns[name]
-        if name == "effort:arm_shoulder":
-            columns[name] = columns[name] / 3
-    reading = {"degrees": True, "prefix": "arm_", "sign": {"elbow": -1}, "scale": {"shoulder": 3.0}, "hold": True}
+    reading = {"degrees": True, "prefix": "arm_", "hold": True}
     (log,) = read(robot, tmp_path, columns, **reading)
     assert log.held
     for name in ("time", "qpos", "command"):
