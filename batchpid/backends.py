@@ -32,7 +32,9 @@ class NumPyBackend:
     """
 
     def __init__(self, dt: float, terms: bool, threads: int | None = None) -> None:
-        self.dt, self.terms, self.threads = dt, terms, threads
+        self.dt = dt
+        self.terms = terms
+        self.threads = threads
         self.native = not obstacle()
         """Whether the native extension computes the law, which then writes over the arrays of the state."""
 

@@ -136,7 +136,9 @@ class BatchPID:
             raise InvalidArgumentError("params", problem, remedy="build them with that dtype, or a new BatchPID")
         params = frozen(params)
         self._engine.prepare(params, self._shape)
-        self._params, self._stale, self._fast = params, self._state is not None, declined
+        self._params = params
+        self._stale = self._state is not None
+        self._fast = declined
 
     @property
     def state(self) -> PIDState | None:

@@ -35,8 +35,13 @@ class InvalidArgumentError(BatchPIDError, ValueError):
         env: int | None = None,
         value: Any = None,
     ) -> None:
-        self.argument, self.problem, self.remedy = argument, problem, remedy
-        self.joint, self.entry, self.env, self.value = joint, entry, env, value
+        self.argument = argument
+        self.problem = problem
+        self.remedy = remedy
+        self.joint = joint
+        self.entry = entry
+        self.env = env
+        self.value = value
         places = {"joint": joint, "entry": entry, "env": env}
         where = "".join(f", {kind} {place!r}" for kind, place in places.items() if place is not None)
         got = "" if value is None else f" (got {_SHORT.repr(value)})"
@@ -86,7 +91,9 @@ class MissingDependencyError(BatchPIDError, ImportError):
     """A package is missing or too old; the message names the extra that installs it, if one does."""
 
     def __init__(self, package: str, purpose: str, extra: str | None = None) -> None:
-        self.package, self.purpose, self.extra = package, purpose, extra
+        self.package = package
+        self.purpose = purpose
+        self.extra = extra
         wanted = package if extra is None else f"batchpid[{extra}]"
         super().__init__(f"{purpose} needs the package {package!r}; install it with: pip install '{wanted}'")
 

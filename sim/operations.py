@@ -64,7 +64,10 @@ class Reset(Operation):
         base: tuple[ArrayLike | None, ArrayLike | None],
     ) -> Self:
         """Return the operation for arguments of :meth:`batchpid.sim.Runner.reset`."""
-        robot, num_envs, randomization, draws = options.robot, options.num_envs, options.randomization, state.draws
+        robot = options.robot
+        num_envs = options.num_envs
+        randomization = options.randomization
+        draws = state.draws
         qpos = joint_rows(options, "qpos", robot.start if pose[0] is None else pose[0])
         qvel = joint_rows(options, "qvel", 0.0 if pose[1] is None else pose[1])
         chosen = np.ones(num_envs, bool) if mask is None else env_mask("mask", mask, num_envs)
@@ -126,7 +129,9 @@ class Run(Operation):
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
         setpoint, rate, *_ = self.command
-        faults, contacts, motion = state.faults, state.contacts, state.motion
+        faults = state.faults
+        contacts = state.contacts
+        motion = state.motion
         count = outcome.num_ticks
         are_ok = np.logical_and.reduce(outcome.ticks.arrays.observation.ok[:count], axis=None)
         if not are_ok or contacts is not None:
@@ -258,7 +263,9 @@ def restored(options: RunnerOptions, state: RunnerState, snapshot: Snapshot, siz
 
     ``sizes`` are the numbers of values in the engine's state of each env.
     """
-    robot, randomization, draws = options.robot, options.randomization, NOTHING
+    robot = options.robot
+    randomization = options.randomization
+    draws = NOTHING
     present = snapshot_of(options, state, snapshot.states)
     snapshot.check_options(present.about)
     snapshot.check_tables(present.tables())

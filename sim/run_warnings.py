@@ -18,7 +18,9 @@ class RunWarnings:
     """Checks of one runner that warn, most of them once."""
 
     def __init__(self, options: RunnerOptions) -> None:
-        robot, timestep, control = options.robot, options.timestep, options.control
+        robot = options.robot
+        timestep = options.timestep
+        control = options.control
         self.limits = SetpointCheck(robot)
         """Check of start poses, and of setpoints, against the limits of the joints."""
         self.setpoint_limits = self.limits if options.sets_positions and options.guard is None else None

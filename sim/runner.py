@@ -97,7 +97,9 @@ class Runner(SingleOwner):
             warn(f"SAPIEN is not installed: the engine is {DEFAULT_ENGINE!r}", UserWarning)
         self.options = checked = RunnerOptions(*arguments, **options)
         """Options, checked."""
-        self.robot, self.num_envs, self.control = checked.robot, checked.num_envs, checked.control
+        self.robot = checked.robot
+        self.num_envs = checked.num_envs
+        self.control = checked.control
         self.timestep, self.substeps = checked.timestep, checked.substeps
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
@@ -136,7 +138,9 @@ class Runner(SingleOwner):
         self._warnings.check_controller()
 
     def __repr__(self) -> str:
-        options, workers, nodes = self.options, len(self.pids), len(self.nodes)
+        options = self.options
+        workers = len(self.pids)
+        nodes = len(self.nodes)
         where = "closed" if self.closed else f"{workers} workers" if workers else "in this process"
         further = "".join(f", {name} {value}" for name, value in options.switched.items())
         where = f"{nodes} nodes" if nodes else where
@@ -295,7 +299,9 @@ class Runner(SingleOwner):
         }
         options, ticks = self.options, count_ticks(self.options, setpoints)
         command = read_command(options, self._state, self._warnings.setpoint_limits, given, ticks)
-        robot, tick, done = options.robot, options.substeps * options.timestep, 0
+        robot = options.robot
+        tick = options.substeps * options.timestep
+        done = 0
         seen = empty_observation(ticks, self.num_envs, robot.dof, observed=options.observed)
         times = (self._state.steps + options.substeps * np.arange(1.0, ticks + 1)) * options.timestep
         info = replace(self.info, rates=command.setpoint_rate is not None)
@@ -425,7 +431,9 @@ class Runner(SingleOwner):
     @property
     def info(self) -> RunInfo:
         """Robot, options and origin of a run that starts now."""
-        start, state, options = self.observe().qpos, self._state, self.options
+        start = self.observe().qpos
+        state = self._state
+        options = self.options
         draws = None if options.randomization is None else state.draws
         return options.robot.run_info(
             **options.values_for("recording"),
@@ -592,7 +600,9 @@ class Runner(SingleOwner):
         Ctrl-C does not interrupt it between the request and the new state. The runner is closed if the workers cannot
         complete the request, or if a second Ctrl-C ends it.
         """
-        call, pool, is_sent = self._call, self._pool, operation is self._sent
+        call = self._call
+        pool = self._pool
+        is_sent = operation is self._sent
         run = operation if isinstance(operation, Run) else None
         is_due = self.recorder is not None or self._state.steps_since_checkpoint >= CHECKPOINT_STEPS
         if is_due and run is not None and not is_sent:

@@ -36,7 +36,9 @@ class RunnerState(NamedTuple):
     @classmethod
     def first(cls, options: RunnerOptions) -> RunnerState:
         """Return the state before the first reset, which places all envs."""
-        robot, own, count = options.robot, options.own_command, options.num_envs
+        robot = options.robot
+        own = options.own_command
+        count = options.num_envs
         draws = NOTHING
         if options.randomization is not None:
             draws = options.randomization.first(robot, count, options.first_env)

@@ -118,7 +118,11 @@ class Header:
             if list(tree.joint_names) != list(labels):
                 problem = f"has the joints {', '.join(tree.joint_names)}, not {', '.join(labels)}"
                 raise InvalidArgumentError("tree", problem, remedy="pass joint_names=, in the tree's order")
-        self.params, self.dt, self.guard, self.tree, self.labels = params, float(dt), guard, tree, labels
+        self.params = params
+        self.dt = float(dt)
+        self.guard = guard
+        self.tree = tree
+        self.labels = labels
         self.names = Dialect(prefix, np.dtype(params.dtype), joints)
         rates = [each for each in RATES if each in chosen]
         matrix = [] if params.gain_units is None else ["mass_matrix"]
@@ -188,7 +192,10 @@ class Header:
 
     def _frame(self, code: str, body: str) -> str:
         """Return the whole header around the code of a step."""
-        p, t, n, given = self.names.prefix, self.names.type, self.names.size, self.given
+        p = self.names.prefix
+        t = self.names.type
+        n = self.names.size
+        given = self.given
         units = {
             "setpoint": "r [rad or m]",
             "measurement": "y [rad or m]",

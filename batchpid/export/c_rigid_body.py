@@ -15,7 +15,11 @@ from batchpid.task_space.rigid_tree import RigidTree
 
 def rigid_body(c: Dialect, tree: RigidTree) -> str:
     """Return the functions ``PREFIX_mass_matrix``, ``PREFIX_bias`` and ``PREFIX_gravity`` of a tree."""
-    bodies, p, t, n, f = tree.bodies, c.prefix, c.type, c.size, c.suffix
+    bodies = tree.bodies
+    p = c.prefix
+    t = c.type
+    n = c.size
+    f = c.suffix
     # A joint's rotation is linear in 1, sin q and 1 - cos q, so that three constant matrices a joint are enough.
     rotations = {"turn": bodies.at_zero, "sine": bodies.sine, "cosine": bodies.cosine}
     poses = "".join(c.table(f"k_{name}", leaf[:, :, :3].reshape(-1, 9)) for name, leaf in rotations.items())

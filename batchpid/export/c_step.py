@@ -179,7 +179,10 @@ def _operands(name: str) -> int:
 
 def helpers(c: Dialect, body: str) -> Iterator[str]:
     """Yield the helper functions that the body of a step calls."""
-    p, t, n, f = c.prefix, c.type, c.size, c.suffix
+    p = c.prefix
+    t = c.type
+    n = c.size
+    f = c.suffix
     across = f"{p}_row_minimum(" in body
     for name, sign in (("max", ">"), ("min", "<")):
         if f"{p}_{name}(" in body or (across and name == "min"):

@@ -180,7 +180,9 @@ def _compare_anti_windup(law: Differences) -> None:
     law.add("integral_max", "0 at least in the target", high < 0, high)
     if law.params.ki is None:
         return
-    strategy, integrates, limited = np.array(strategies(law.params)), law.value("ki") > 0, _limited(law)
+    strategy = np.array(strategies(law.params))
+    integrates = law.value("ki") > 0
+    limited = _limited(law)
     back = strategy == "back_calculation"
     excluded = (law.value("effort_min", -math.inf) > 0) | (law.value("effort_max", math.inf) < 0)
     problem = "conditional integration takes the sign of the whole effort, wrong where the limits exclude 0"

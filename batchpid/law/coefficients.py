@@ -65,7 +65,10 @@ def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coe
     unless dt is positive and finite; an array of JAX is not checked.
     """
     dt = checked_dt(dt, instance("params", params, PIDParams, "build them with make_params").dtype)
-    c, c_given, share, implicit = params.setpoint_weight_derivative, None, None, params.discretization is not None
+    c = params.setpoint_weight_derivative
+    c_given = None
+    share = None
+    implicit = params.discretization is not None
     if implicit:
         c, c_given, share = implicit_gains(params, dt)[-3:]
         params = as_explicit(params, dt)

@@ -126,7 +126,9 @@ def _to_effort(
     k: Coefficients, old: PIDState, new: PIDState, a: Array, mass_matrix: Array, feedforward: Array
 ) -> tuple[PIDState, Any, Any]:
     """Return the state, the effort of the acceleration ``a`` within the limits of ``k``, and without them."""
-    xp, low, high = namespace(*k, a, mass_matrix), k.effort_min, k.effort_max
+    xp = namespace(*k, a, mass_matrix)
+    low = k.effort_min
+    high = k.effort_max
     wanted = matrix_vector(mass_matrix, a)
     passive = 0.0 if feedforward is None else feedforward
     effort = unsaturated = wanted + passive

@@ -62,7 +62,11 @@ class ImplicitGains(NamedTuple):
 
 def implicit_gains(params: PIDParams, dt: Array) -> ImplicitGains:
     """Return the gains kp*, ki*, kd*, b* and c*, and 1 / D, of implicit ``params`` at ``dt`` [s]."""
-    kp, ki, kd, b, c = params.kp, params.ki, params.kd, params.setpoint_weight, params.setpoint_weight_derivative
+    kp = params.kp
+    ki = params.ki
+    kd = params.kd
+    b = params.setpoint_weight
+    c = params.setpoint_weight_derivative
     xp = namespace(kp, ki, kd, b, c, dt)
     ki_dt = 0.0 if ki is None else ki * dt
     stiffness, damping = kp + 2 * ki_dt, kd + dt * (kp + ki_dt)

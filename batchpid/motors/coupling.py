@@ -76,10 +76,15 @@ class Coupling(NamedTuple):
 
         Raises ValueError if a joint follows itself, through others or directly.
         """
-        leaders, multipliers, offsets = np.arange(joints), np.ones(joints), np.zeros(joints)
+        leaders = np.arange(joints)
+        multipliers = np.ones(joints)
+        offsets = np.zeros(joints)
         direct = {follower.joint: follower for follower in followers}
         for joint in direct:
-            multiplier, offset, leader, passed = 1.0, 0.0, joint, set[int]()
+            multiplier = 1.0
+            offset = 0.0
+            leader = joint
+            passed = set[int]()
             while leader in direct:
                 if leader in passed:
                     raise ValueError(f"joint {joint} follows itself")

@@ -54,7 +54,9 @@ class Envelope(NamedTuple):
 def envelope(actuators: Actuators) -> Envelope:
     """Return the envelope of the efforts that the motors of ``actuators`` deliver."""
     xp = namespace(*actuators)
-    stall, points, efforts = actuators.saturation_effort, actuators.limit_positions, actuators.limit_efforts
+    stall = actuators.saturation_effort
+    points = actuators.limit_positions
+    efforts = actuators.limit_efforts
     k = Envelope(limit=actuators.effort_limit)
     if k.limit is not None:
         k = k._replace(least=-k.limit)
@@ -77,7 +79,9 @@ def command_envelope(actuators: Actuators) -> Envelope:
 
     Where s = 0 it is wide: no command matters.
     """
-    k, strength, bias = envelope(actuators), actuators.strength, actuators.bias
+    k = envelope(actuators)
+    strength = actuators.strength
+    bias = actuators.bias
     if strength is None and bias is None:
         return k
     divisor: Array = 1.0 if strength is None else namespace(strength).maximum(strength, tiny_of(strength.dtype))

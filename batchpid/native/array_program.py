@@ -63,7 +63,9 @@ class ArrayProgram:
         dtype: DType = np.float64,
         threads: int | None = None,
     ) -> None:
-        self.shape, self.dtype, self.masks = shape, np.dtype(dtype), trace.masks
+        self.shape = shape
+        self.dtype = np.dtype(dtype)
+        self.masks = trace.masks
         given = [np.ascontiguousarray(each, dtype) for each in (*constants, *trace.literals)]
         if trace.prelude is not None:
             rows = max((each.shape[0] for each in given if each.ndim == 2), default=1)

@@ -47,7 +47,9 @@ class CompiledLaw:
     """:func:`batchpid.advance` for coefficients ``k`` (1 | envs, joints), on arrays of their dtype."""
 
     def __init__(self, k: Coefficients, num_envs: int, terms: bool, threads: int | None) -> None:
-        self._k, self._terms, self._threads = k, terms, threads
+        self._k = k
+        self._terms = terms
+        self._threads = threads
         self._shape = num_envs, k.kp.shape[1]
         self._programs: dict[tuple[bool, ...], tuple[ArrayProgram, tuple[int, ...]]] = {}
 

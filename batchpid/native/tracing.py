@@ -48,7 +48,9 @@ def trace(function: Callable[..., Any], constants: int, inputs: int, dtype: DTyp
     needed = {*results, *(operand for _, operands, _ in operations for operand in operands)}
     literals = {symbol: number for number, symbol in namespace.literals.values() if symbol in needed}
     first = [*given[:constants], *literals]
-    fixed, early, late = set(first), list[_Operation](), list[_Operation]()
+    fixed = set(first)
+    early = list[_Operation]()
+    late = list[_Operation]()
     for each in operations:
         is_early = fixed.issuperset(each[1])
         (early if is_early else late).append(each)
@@ -123,7 +125,10 @@ def _assembled(
     """
     places = {symbol: place for place, symbol in enumerate(order)}
     last_use = {operand: at for at, (_, operands, _) in enumerate(operations) for operand in operands}
-    registers, free, rows, kept = len(order), list[int](), list[list[int]](), {*order, *results}
+    registers = len(order)
+    free = list[int]()
+    rows = list[list[int]]()
+    kept = {*order, *results}
     for at, (name, operands, result) in enumerate(operations):
         if name == "push":
             places[result] = places[operands[0]]

@@ -71,8 +71,12 @@ def wxyz_of(turn: Any) -> Array:
     xp = namespace(turn)
     (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = ([turn[..., i, j] for j in range(3)] for i in range(3))
     squares = [1 + r00 + r11 + r22, 1 + r00 - r11 - r22, 1 - r00 + r11 - r22, 1 - r00 - r11 + r22]
-    wx, wy, wz = r21 - r12, r02 - r20, r10 - r01
-    xy, xz, yz = r10 + r01, r02 + r20, r21 + r12
+    wx = r21 - r12
+    wy = r02 - r20
+    wz = r10 - r01
+    xy = r10 + r01
+    xz = r02 + r20
+    yz = r21 + r12
     rows = [
         [squares[0], wx, wy, wz],
         [wx, squares[1], xy, xz],

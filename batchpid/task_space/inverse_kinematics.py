@@ -138,7 +138,9 @@ class _Search:
     """Searches for the poses of one tool."""
 
     def __init__(self, tree: RigidTree, index: int, point: Float64 | None, tolerance: Float64, iterations: int) -> None:
-        self._tree, self._index, self._point = tree, index, point
+        self._tree = tree
+        self._index = index
+        self._point = point
         self._tolerance, self._iterations = tolerance, iterations
         self._chain = tree.chain(tree.links[index])
         self._limits: tuple[Float64, Float64] = np.asarray(tree.lower), np.asarray(tree.upper)

@@ -60,7 +60,9 @@ def kinematics(
     native = in_use() if type(qpos) is np.ndarray and (point is None or isinstance(point, np.ndarray)) else None
     if native is None or not (tree.fixed_base or _DYNAMICS.isdisjoint(wanted)):
         return None
-    dof, leading, rows = tree.dof, qpos.shape[:-1], math.prod(qpos.shape[:-1])
+    dof = tree.dof
+    leading = qpos.shape[:-1]
+    rows = math.prod(qpos.shape[:-1])
     found = empty(wanted, leading, dof)
     inputs = [None if x is None else x.reshape(rows, dof) for x in (qpos, qvel)]
     call(native.kinematics, *_arguments(native, tree, found, inputs, index, point))

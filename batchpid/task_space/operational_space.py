@@ -220,7 +220,10 @@ def posture_acceleration(
 
 def _saturated(p: Projections, low: Array, high: Array) -> tuple[Array, ...]:
     """Return the efforts after and before saturation, s1 and s2, all (envs, dof)."""
-    xp, base, task, null = namespace(*p, low, high), p.base, p.task, p.posture
+    xp = namespace(*p, low, high)
+    base = p.base
+    task = p.task
+    null = p.posture
     least, most = -math.inf if low is None else low, math.inf if high is None else high
     able = (base >= least) & (base <= most)
 
@@ -267,7 +270,9 @@ def track(
     InvalidArgumentError
         The params are of another type, or have no integral.
     """
-    k, mass, bias = discretise(params, dt), dynamics.mass_matrix, dynamics.bias
+    k = discretise(params, dt)
+    mass = dynamics.mass_matrix
+    bias = dynamics.bias
     if params.integral_gain is None:
         problem = "is off, so no integral can carry the effort over"
         raise InvalidArgumentError("params.integral_gain", problem, remedy="give integral_gain; 0 is allowed")

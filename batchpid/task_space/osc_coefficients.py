@@ -73,11 +73,15 @@ def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
     instance("params", params, OSCParams, MAKE_PARAMS)
     check_time_step("dt", dt)
     xp = namespace(*params, dt)
-    kp, kd, ki = params.stiffness, params.damping, params.integral_gain
+    kp = params.stiffness
+    kd = params.damping
+    ki = params.integral_gain
     posture_kp, posture_kd = params.posture_stiffness, params.posture_damping
     limit_kp, margin = params.limit_stiffness, params.limit_margin
     limit_kd = None if limit_kp is None else 2 * xp.sqrt(limit_kp)
-    c, share, ki_dt2 = kd, xp.ones_like(kp), None
+    c = kd
+    share = xp.ones_like(kp)
+    ki_dt2 = None
     if params.discretization is not None:
         stiffness = kp if ki is None else kp + dt * ki
         share = 1 / (1 + dt * kd + dt * dt * stiffness)

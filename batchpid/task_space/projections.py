@@ -50,7 +50,9 @@ def projections(
     ``springs`` (envs, dof) is the part a_s of a_n, all of it if None.
     """
     xp = namespace(*k, *d, a, a_n, wrench, feedforward)
-    j, m, chain = d.jacobian, d.mass_matrix, d.chain
+    j = d.jacobian
+    m = d.mass_matrix
+    chain = d.chain
     eye = xp.eye(m.shape[-1], dtype=m.dtype)
     m_cc = xp.where((chain[:, None] * chain) > 0, m, eye)  # the other joints apart, with unit inertia
     y = whitened(m_cc, xp.concatenate([xp.swapaxes(j, -1, -2), eye + xp.zeros_like(m)], axis=-1))

@@ -210,7 +210,9 @@ class RigidTree:
 
         The others are fixed at ``qpos`` (dof,) [rad or m].
         """
-        position, wxyz, types = self.position.copy(), self.wxyz.copy(), np.array(self.joint_types, object)
+        position = self.position.copy()
+        wxyz = self.wxyz.copy()
+        types = np.array(self.joint_types, object)
         above = np.flatnonzero(types != "fixed")
         for link, q in zip(above[~moves], np.asarray(qpos)[~moves], strict=True):
             turn = matrix_of(wxyz[link])
@@ -274,7 +276,9 @@ class RigidTree:
 
     @cached_property
     def _structure(self) -> tuple[tuple[int, ...], tuple[int, ...], Bodies]:
-        body, parents, links_of = list[int](), list[int](), list[list[int]]()
+        body = list[int]()
+        parents = list[int]()
+        links_of = list[list[int]]()
         frames = np.zeros((len(self.links), 3, 4))
         local = np.zeros((4, self.dof, 3, 4))  # at_zero, sine, cosine, slide
         moves, slides = np.zeros((self.dof, self.dof)), np.zeros((self.dof, 1))
@@ -345,16 +349,22 @@ class RigidTree:
             mass, center, tensor = np.split(rows[0, body], [1, 4])
             own = SpatialInertia(float(mass[0]), center, tensor.reshape(3, 3))
             rows[:, body] = inertia_rows(spatial_matrix(own) + matrices)
-        mass, center, tensor = rows[..., :1], rows[..., 1:4], rows[..., 4:].reshape(*rows.shape[:-1], 3, 3)
+        mass = rows[..., :1]
+        center = rows[..., 1:4]
+        tensor = rows[..., 4:].reshape(*rows.shape[:-1], 3, 3)
         base = {"base_mass": mass[:, -1], "base_center": center[:, -1], "base_tensor": tensor[:, -1]}
         return self.bodies._replace(mass=mass[:, :-1], center=center[:, :-1], tensor=tensor[:, :-1], **base)
 
     def _inertias(self, links_of: list[list[int]], frames: Float64) -> tuple[Float64, Float64, Float64]:
         """Return mass, center of mass and inertia tensor of the bodies with these links, in their frames."""
         count = len(links_of)
-        masses, centers, tensors = np.zeros((count, 1)), np.zeros((count, 3)), np.zeros((count, 3, 3))
+        masses = np.zeros((count, 1))
+        centers = np.zeros((count, 3))
+        tensors = np.zeros((count, 3, 3))
         for joint, links in enumerate(links_of):
-            turn, shift, mass = frames[links, :, :3], frames[links, :, 3], self.mass[links]
+            turn = frames[links, :, :3]
+            shift = frames[links, :, 3]
+            mass = self.mass[links]
             at = shift + (turn @ self.center[links][..., None])[..., 0]
             masses[joint] = mass.sum()
             centers[joint] = mass @ at / mass.sum() if mass.sum() else at[0]

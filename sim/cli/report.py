@@ -87,7 +87,9 @@ def run_figures(robot: Robot, rollout: Rollout) -> Document:
 
 def run_report(runner: Runner, rollout: Rollout, wall: float) -> str:
     """Return the report of a ``rollout`` of ``runner`` that took ``wall`` seconds."""
-    robot, seconds, count = runner.robot, rollout.tick * len(rollout.time), rollout.num_envs
+    robot = runner.robot
+    seconds = rollout.tick * len(rollout.time)
+    count = rollout.num_envs
     names, units, columns = run_columns(robot, rollout)
     shown = {name: COLUMNS[name] for name in COLUMNS if name in columns}
     rows = [
@@ -147,7 +149,9 @@ def exit_status(robot: Robot, rollout: Rollout) -> int:
 
 def evaluation_table(robot: Robot, evaluations: Iterable[Evaluation]) -> str:
     """Return a table with one row per evaluation: median and worst over the arm's joints and all moves."""
-    arm, rows, causes = arm_joints(robot), [], list[str]()
+    arm = arm_joints(robot)
+    rows = []
+    causes = list[str]()
     for evaluation in evaluations:
         metrics, error = evaluation.metrics, evaluation.following_error
         settling, count = metrics.settling_time[:, arm], len(evaluation.moves.start)

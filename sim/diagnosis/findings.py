@@ -92,7 +92,9 @@ class _Run:
     """Arrays of a run, and figures of its end (envs, dof)."""
 
     def __init__(self, rollout: Rollout, robot: RobotDescription) -> None:
-        self.rollout, self.robot, self.info = rollout, robot, rollout.info
+        self.rollout = rollout
+        self.robot = robot
+        self.info = rollout.info
         ticks = len(rollout.time)
         self.tail = slice(-min(ticks, max(3, round(TAIL * ticks))), None)
         self.qpos = rollout.qpos.astype(np.float64)

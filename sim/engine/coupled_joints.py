@@ -65,7 +65,9 @@ class ConstraintEfforts:
         asked: NDArray[np.float32] | None = None,
     ) -> None:
         joints, followers = len(coupling.leader), coupling.followers
-        self._coupling, self._followers, self._jacobian = coupling, followers, coupling.jacobian
+        self._coupling = coupling
+        self._followers = followers
+        self._jacobian = coupling.jacobian
         self.wraps, self.unwrapped = wraps, np.zeros((robots, joints))
         self._rate_gain, self._position_gain = RATE_GAIN / timestep, POSITION_GAIN / timestep**2
         self._response = np.zeros((robots, len(followers), joints))

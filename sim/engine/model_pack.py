@@ -39,7 +39,10 @@ class ModelPack(SingleOwner):
         links: Sequence[str],
         natively: bool,
     ) -> None:
-        self.spec, self.size, self.first_env, self.steps_natively = spec, size, first_env, natively
+        self.spec = spec
+        self.size = size
+        self.first_env = first_env
+        self.steps_natively = natively
         self.dof, self._variation = len(spec.joints), variation or Variation()
         self._masses = VariedMasses(spec, size, self._variation, carrier, links)
         self._suspended: NDArray[np.bool_] = np.zeros(size, bool)

@@ -28,7 +28,9 @@ class NativeModel:
     """Model of the robots of ``spec``, on a base of this kind of :data:`BASES`."""
 
     def __init__(self, spec: SceneSpec, base: str = "fixed") -> None:
-        self._spec, self._base, self._native = spec, base, native.extension("_gateway")
+        self._spec = spec
+        self._base = base
+        self._native = native.extension("_gateway")
         self._inertias: Float64 | None = None
 
     @cached_property

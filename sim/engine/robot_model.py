@@ -26,7 +26,9 @@ def passive_force(
     ``base`` (n, 6) are gravity and the rate at which the base turns, in its own axes, of one that floats, or with a
     tree on a fixed base of one that is held where it is. The gravity part of a floating base is 0.
     """
-    zero, turning, bodies = np.zeros_like(np.asarray(qpos, np.float64)), None, None
+    zero = np.zeros_like(np.asarray(qpos, np.float64))
+    turning = None
+    bodies = None
     if base is not None:
         turning = base[:, 3:]
         bodies = tree.bodies._replace(gravity=base[:, None, :3])

@@ -93,12 +93,16 @@ class ReachVectorEnv(RobotVectorEnv):
     def spaces(self) -> tuple[spaces.Box, spaces.Box]:
         """Return the spaces for the joint limits, or the bounds of the command."""
         self._joints = joints = JointSpace(self.robot)
-        self.joint_names, self.low, self.high = joints.names, joints.low, joints.high
+        self.joint_names = joints.names
+        self.low = joints.low
+        self.high = joints.high
         span = self.high - self.low
         self._span = np.where(span > LIMIT_TOLERANCE, span, np.inf)
         self._margin = np.where(joints.continuous, 0.0, MARGIN * span)
         spec = self._spec
-        self.action_names, self._setpoint_low, self._setpoint_high = self.joint_names, self.low, self.high
+        self.action_names = self.joint_names
+        self._setpoint_low = self.low
+        self._setpoint_high = self.high
         if spec is not None:
             self.action_names = spec.names
             self._setpoint_low, self._setpoint_high = _finite_bounds(spec)

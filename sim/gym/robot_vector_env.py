@@ -287,7 +287,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if rate is not None:
             rate = np.where(begins[:, None], 0.0, self._returned("rate", rate, self._setpoint.shape, np.float64))
         self.runner.send(setpoint, setpoint_rate=rate)
-        self.action, self._setpoint, self._is_stepping = action, setpoint, True
+        self.action = action
+        self._setpoint = setpoint
+        self._is_stepping = True
 
     def step_wait(self) -> tuple[Float32, Float64, Bool, Bool, Document]:
         """Wait for the step that :meth:`step_async` began; return what :meth:`step` returns.

@@ -38,7 +38,9 @@ CLEARANCE = 0.01
 """Least distance from contact [m]; half of the distance at the center for links that are nearer there."""
 _EDGE = 0.1
 _DRAWS = 20
-_ROUNDS, _SHRINK, _LEAST = 60, 0.7, 0.04
+_ROUNDS = 60
+_SHRINK = 0.7
+_LEAST = 0.04
 """Number of motions about a center, factor of an amplitude from one to the next, and its least share."""
 _ENOUGH = 0.5  # mean share of the amplitudes with which no other center is tried
 _COARSE = 40  # poses that are tested first
@@ -187,7 +189,9 @@ def _chirp(
     robot: Robot, center: Float64, share: Float64, time: Float64, lowest: float, highest: float, phase: Float64
 ) -> Trajectory:
     """Return the chirp about ``center`` with amplitudes of ``share`` (dof,) of the possible ones."""
-    dt, total, dof = float(time[0]), float(time[-1]), robot.dof
+    dt = float(time[0])
+    total = float(time[-1])
+    dof = robot.dof
     room = np.minimum(robot.upper - center, center - robot.lower) * (1 - _EDGE)
     reach = np.minimum(room, [REACH[unit] for unit in robot.units])
     velocity = np.minimum(robot.velocity_limit, [FREE_VELOCITY[unit] for unit in robot.units]) * VELOCITY_SHARE

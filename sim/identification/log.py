@@ -192,7 +192,9 @@ def _check_finite(robot: Robot, log: Log, places: list[str]) -> None:
 
 def _unwrapped(robot: Robot, log: Log, places: list[str]) -> Log:
     """Return ``log``, without gaps, with continuous positions, and setpoints on the turns closest to them."""
-    qpos, command, wrapped = log.qpos.copy(), log.command.copy(), list[str]()
+    qpos = log.qpos.copy()
+    command = log.command.copy()
+    wrapped = list[str]()
     for number, joint in enumerate(log.joints):
         name, column = robot.joint_names[joint], qpos[:, number]
         turns = np.zeros(len(column) - 1)

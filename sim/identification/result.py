@@ -269,7 +269,9 @@ class Identification:
 
 def _columns(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
     """Return the fields of actuators (n, dof) with ``values`` (n, unknowns), without the description's part."""
-    robot, joints, columns = unknowns.robot, list(unknowns.joints), dict[str, Float64]()
+    robot = unknowns.robot
+    joints = list(unknowns.joints)
+    columns = dict[str, Float64]()
     for name, table in unknowns.tables(values).items():
         kind = KINDS[name]
         if kind.target != "motor":
@@ -312,7 +314,9 @@ def advice(problem: Problem, solution: Solution) -> str:
     weight[-len(further) :] = 0.1 * np.array([entry.spread for entry in further])  # each may change by a factor
     residual, matrix = weight * residual, weight[:, None] * matrix
     strengths = [at for at, entry in enumerate(unknowns.entries) if entry.kind == "strength"]
-    gains, changes, distances = list[float](), list[float](), list[float]()
+    gains = list[float]()
+    changes = list[float]()
+    distances = list[float]()
     for number in range(len(further)):
         columns = [*range(count), count + number]
         change, *_ = np.linalg.lstsq(matrix[:, columns], -residual, rcond=1e-10)

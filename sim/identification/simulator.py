@@ -120,7 +120,10 @@ class Plant:
             Follower(number[joint], number[coupling.leader[joint]], coupling.multiplier[joint], coupling.offset[joint])
             for joint in np.flatnonzero(moves & ~coupling.independent)
         ]
-        self._robot, self._moves, self._followers, self._payload = robot, moves, followers, payload
+        self._robot = robot
+        self._moves = moves
+        self._followers = followers
+        self._payload = payload
         self._description = _with_payload(tree, robot.rigid_tree)
         self._trees = dict[Any, RigidTree]()
         self.tree = self.tree_of(())
@@ -175,7 +178,10 @@ class Dynamics:
 
     def _part(self, tree: RigidTree, qpos: Float64, qvel: Float64, rows: slice) -> Any:
         """Return a function that updates ``rows`` of the results."""
-        q, v, columns, names = qpos[rows], qvel[rows], self._plant.columns, ("mass_matrix", "bias")
+        q = qpos[rows]
+        v = qvel[rows]
+        columns = self._plant.columns
+        names = ("mass_matrix", "bias")
         if columns is not None:
             q, v = np.zeros((len(q), tree.dof)), np.zeros((len(q), tree.dof))
         native = native_rows.bound(tree, names, q, v, 0)
@@ -220,7 +226,9 @@ class Control:
 
         ``asked`` are the efforts asked for so far, the latest first (samples, n, joints), or None.
         """
-        dt, count, actuators = drive.timestep, len(qpos), candidates.actuators
+        dt = drive.timestep
+        count = len(qpos)
+        actuators = candidates.actuators
         self.friction = added_friction(Friction(), actuators)
         k = law = None
         state = StepState(None)
@@ -296,7 +304,9 @@ def simulate(
     ``states`` (candidates, 2, joints) are added to positions and velocities at the starts. A simulation that diverges
     ends at inf.
     """
-    many, count, dt = len(stretches), len(states), drive.timestep
+    many = len(stretches)
+    count = len(states)
+    dt = drive.timestep
     rows, offset = candidates.repeated(many), candidates.actuators.position_offset
     starts = np.array([[stretch.qpos, stretch.qvel] for stretch in stretches])
     q, v = (np.concatenate(starts[:, side] + states[:, None, side]) for side in (0, 1))
@@ -373,7 +383,9 @@ class _Compensation:
         self, plant: Plant, drive: LogControl, dynamics: Dynamics, qpos: Float64, qvel: Float64, offset: Float64 | None
     ) -> None:
         self._dynamics: Dynamics | None = None
-        self._qpos, self._measured, self._offset = qpos, qpos, offset
+        self._qpos = qpos
+        self._measured = qpos
+        self._offset = offset
         self._updates = offset is not None or drive.compensate != "gravity+coriolis" or any(dynamics.masses)
         if drive.compensate == "none":
             return

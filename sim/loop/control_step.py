@@ -171,12 +171,16 @@ def _guard(layout: Layout, constants: Constants, values: Values) -> Values:
 
     A given acceleration is 0 where the guard changes the setpoint.
     """
-    state, command, coupling = values.state.guard, values.command, constants.coupling
+    state = values.state.guard
+    command = values.command
+    coupling = constants.coupling
     if state is None:
         return values
     xp = namespace(command.setpoint)
     state, changed = guard_model.advance(constants.guard, state, command.setpoint, constants.timestep)
-    setpoint, rate, acceleration = state.setpoint, command.setpoint_rate, command.setpoint_acceleration
+    setpoint = state.setpoint
+    rate = command.setpoint_rate
+    acceleration = command.setpoint_acceleration
     if rate is not None:
         rate = xp.where(changed, state.rate, rate)
     if acceleration is not None:
@@ -217,7 +221,9 @@ def _law(layout: Layout, constants: Constants, values: Values) -> Values:
 
 def _pid(layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]) -> Values:
     """qf = sat(PID(setpoint, qpos) + feedforward)."""
-    seen, state, law = values.seen, values.state, layout.law
+    seen = values.seen
+    state = values.state
+    law = layout.law
     assert law is not None
     viscous = None if constants.damping is None else constants.coupling.efforts(constants.damping * seen.qvel)
     setpoint, rate, acceleration, _ = values.command

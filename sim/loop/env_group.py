@@ -59,7 +59,10 @@ class EnvGroup:
         options: RunnerOptions,
         controller: OwnController | None = None,
     ) -> None:
-        self.pack, self.envs, self._options, self._controller = pack, envs, options, controller
+        self.pack = pack
+        self.envs = envs
+        self._options = options
+        self._controller = controller
         self.draws: Draws | None = None
         """Draws of the randomization for these envs; a reset, or new params, put them into effect."""
         self._params = self._acting_params = params  # before and after the randomization
@@ -89,7 +92,9 @@ class EnvGroup:
 
     def _prepare(self) -> None:
         """Make constants and executor for the present robots, params and actuators."""
-        options, pack, motors = self._options, self.pack, self._state.motors
+        options = self._options
+        pack = self.pack
+        motors = self._state.motors
         constants = make_constants(options, pack, self._acting_params, self._actuators, motors)
         layout = make_layout(options, self._acting_params, self._actuators)
         layout = with_model(options, pack, layout, constants, self._controller)
@@ -126,7 +131,9 @@ class EnvGroup:
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Change gains, limits and times in flight; the controller's state carries on."""
-        state, before, constants = self._take_state(), self._acting_params, self._constants
+        state = self._take_state()
+        before = self._acting_params
+        constants = self._constants
         self._params, self._acting_params = params, acting_params(self._options, params, self.draws)
         self._prepare()
         if not PIDLaw.of(before).uses_mass_matrix:
@@ -237,7 +244,9 @@ class EnvGroup:
         """Run sim steps and handle an event; return the first tick that is not observed, and its steps done."""
         with np.errstate(all="ignore"):  # overflow and invalid values become faults
             ran = self._executor.run(self._state, self._measured, command, span, table)
-            self._state, self._measured, rows = ran.state, ran.measured, self._executor.rows
+            self._state = ran.state
+            self._measured = ran.measured
+            rows = self._executor.rows
             self._steps += (ran.tick - span.tick) * span.steps
             if ran.done == span.steps:
                 self._motor[...] = rows(ran.outputs.motor)
@@ -294,7 +303,9 @@ class EnvGroup:
     def adopt(self, params: bp.PIDParams, actuators: bp.Actuators | None, draws: Draws) -> None:
         """Take the params, actuators and draws of a snapshot; :meth:`write` puts them into effect."""
         self._drops_actuators = actuators is None and self._own_actuators is not None
-        self.draws, self._params, self._own_actuators = draws, params, actuators
+        self.draws = draws
+        self._params = params
+        self._own_actuators = actuators
         self._acting_params = acting_params(self._options, params, draws)
 
     def write(self, pack: EnginePack, states: EnvStates) -> None:
@@ -387,7 +398,9 @@ class EnvGroup:
 
     def _place(self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64) -> None:
         """Place the envs of ``mask`` (M,), and restart their control."""
-        rows, pack, state = np.flatnonzero(mask), self.pack, self._take_state()
+        rows = np.flatnonzero(mask)
+        pack = self.pack
+        state = self._take_state()
         base = None if pack.spec.fixed_base else self._containment.start_base[rows]
         pack.write_state(rows.tolist(), qpos[rows], qvel[rows], base)
         pack.suspend(self._containment.suspended)

@@ -70,7 +70,10 @@ class NativeTicks:
         controller: Any,
         force: CompiledModel | None,
     ) -> None:
-        self._pack, self._layout, self._constants, self._controller = pack, layout, constants, controller
+        self._pack = pack
+        self._layout = layout
+        self._constants = constants
+        self._controller = controller
         self._force, self._noise = force, layout.model.noise
         self._native = native.extension("_gateway")
         self._control: Any = None
@@ -218,7 +221,9 @@ class NativeTicks:
         return state._replace(law=law, age=None, motors=motors)
 
     def _transfers_of(self, own: Table) -> ctypes.Array[interface.Transfer]:
-        outputs, seen, transfers = self.outputs, own.arrays.observation, list[interface.Transfer]()
+        outputs = self.outputs
+        seen = own.arrays.observation
+        transfers = list[interface.Transfer]()
 
         def add(kind: str, table: Rows, row: Rows, stride: int | None = None) -> None:
             dtype = {"read": np.float64, "write_floats": np.float32}.get(kind, row.dtype)
@@ -265,7 +270,9 @@ class NativeTicks:
         before = values.outputs
         masks = [name for name, value in before._asdict().items() if value is not None and value.dtype == bool]
         values = values._replace(outputs=before._replace(**dict.fromkeys(masks)))  # programs take no masks
-        constants, inputs, state = mapped(_split, self._constants), leaves(values), leaves(values.state)
+        constants = mapped(_split, self._constants)
+        inputs = leaves(values)
+        state = leaves(values.state)
         layout, histories = self._layout._replace(model=Model()), tuple(array.ndim == 3 for array in state)
         traced = _trace(tuple(stages), is_last, layout, histories, structure(constants), structure(values))
         outputs = [np.zeros(self._shape, bool if is_mask else np.float64) for is_mask in traced.program.masks]

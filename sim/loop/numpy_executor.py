@@ -63,7 +63,9 @@ class NumPyExecutor:
     """Executor of control steps in NumPy, for the robots of ``pack``; ``layout`` has its model functions."""
 
     def __init__(self, options: RunnerOptions, pack: EnginePack, layout: Layout, constants: Constants) -> None:
-        self._pack, self._layout, self._constants = pack, layout, constants
+        self._pack = pack
+        self._layout = layout
+        self._constants = constants
         self._gravity, self._coriolis = passive_forces(options)
         self._speed_limit = options.speed_limit
         self._controller = None if isinstance(options.control, str) else options.control
@@ -87,7 +89,9 @@ class NumPyExecutor:
 
     def run(self, state: StepState, measured: Measured, command: Command, span: Span, table: Any = None) -> Ran:
         """Run the sim steps of a tick, or until an env may have failed."""
-        constants, end, target = self._spread, span.steps, (None, None)
+        constants = self._spread
+        end = span.steps
+        target = (None, None)
 
         def write_targets(values: Values) -> Values:
             nonlocal target
@@ -196,7 +200,9 @@ class NoiseBlocks:
         if state.key is not self._key or not 0 <= at < BLOCK:
             steps = state.step + np.arange(BLOCK, dtype=np.uint32)[:, None]
             self._block = measurement_noise(k, state.key, steps, np.zeros_like(like), np)
-            self._key, self._first, at = state.key, int(state.step[0]), 0
+            self._key = state.key
+            self._first = int(state.step[0])
+            at = 0
         position, velocity = self._block
         return None if position is None else position[at:], None if velocity is None else velocity[at:]
 

@@ -46,7 +46,9 @@ def make_constants(
     ``params`` and ``actuators`` include the draws of the randomization. ``motors`` is the state of actuators that
     change efforts or measurements; None without such actuators.
     """
-    scene, robot, guard = pack.spec, options.robot, None
+    scene = pack.spec
+    robot = options.robot
+    guard = None
     known = None if robot.actuators is None else known_joints(robot)
     law, damping = PIDLaw.of(params), np.array([joint.damping for joint in scene.joints])
     damping = damping if known is None else damping + known.viscous

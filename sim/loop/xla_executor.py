@@ -71,7 +71,9 @@ class XLAExecutor:
         constants: Constants,
         controller: OwnController | None,
     ) -> None:
-        self._pack, self._options, self._layout = pack, options, layout._replace(model=Model())
+        self._pack = pack
+        self._options = options
+        self._layout = layout._replace(model=Model())
         self._gravity, self._coriolis = passive_forces(options)
         self._controller = controller
         self._speed_limit = None if options.speed_limit is None else np.asarray(options.speed_limit)
@@ -87,7 +89,9 @@ class XLAExecutor:
             return mapped(lambda array: padded(np.broadcast_to(array, (pack.size, pack.dof))), part)
 
         limits = (None, None) if law is not None else spread(constants.limits)
-        k, friction, timestep = spread(constants.k), spread(constants.friction), np.float64(constants.timestep)
+        k = spread(constants.k)
+        friction = spread(constants.friction)
+        timestep = np.float64(constants.timestep)
         arrays = constants._replace(timestep=timestep, k=k, limits=limits, friction=friction)
         rows = (pack.size, pack.dof)
         with own_settings("float64"):

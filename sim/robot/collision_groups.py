@@ -91,7 +91,9 @@ def link_groups(
 
 def _cliques(bodies: Sequence[str], ignored: Collection[Pair], free: Collection[Pair]) -> list[list[str]]:
     """Return cliques of the graph of edges ``ignored`` and ``free`` that together hold every edge of ``ignored``."""
-    uncovered, allowed, cliques = set(ignored), {*ignored, *free}, []
+    uncovered = set(ignored)
+    allowed = {*ignored, *free}
+    cliques = []
     for pair in combinations(bodies, 2):
         if frozenset(pair) in uncovered:
             clique = list(pair)

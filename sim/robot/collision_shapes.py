@@ -83,7 +83,9 @@ def link_shapes(urdf: str, separate: Separate = ()) -> dict[str, list[LinkShape]
 
 def _read(element: etree._Element, link: str) -> LinkShape:
     """Return the shape of a ``<collision>``, in the frame of its link."""
-    where, origin, shape = f"link {link!r}", element.find("origin"), element.find("geometry/*")
+    where = f"link {link!r}"
+    origin = element.find("origin")
+    shape = element.find("geometry/*")
     position = np.array(numbers(origin, "xyz", "0 0 0", where))
     wxyz = from_rpy(numbers(origin, "rpy", "0 0 0", where))
     if shape.tag == "box":

@@ -165,9 +165,13 @@ def _stability(
         text = f"the implicit law diverges where the model has {inertia}, or more"
         yield Finding("note", "near-unstable", text, "lower its kp and kd if the model may be as far off")
         return
-    severity, code, effect = "note", "near-unstable", "it may diverge in other poses"
+    severity = "note"
+    code = "near-unstable"
+    effect = "it may diverge in other poses"
     if report.robot_ratio >= 1:
-        severity, code, effect = "warning", "unstable", report.effect
+        severity = "warning"
+        code = "unstable"
+        effect = report.effect
     joint, ratio = robot.joint_names[int(np.argmax(report.participation))], f"{report.robot_ratio:.3g}"
     text = f"the sampled PID loop is at {ratio} times its stability bound, mostly of joint {joint!r}, at the start pose"
     other = "" if report.late else implicit_remedy(params)

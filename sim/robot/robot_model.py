@@ -38,7 +38,11 @@ class RobotModel:
     def __init__(
         self, tree: RigidTree, coupling: Coupling, urdf: str, ignored: frozenset[frozenset[str]], ground: bool
     ) -> None:
-        self.tree, self._coupling, self._urdf, self._ignored, self._ground = tree, coupling, urdf, ignored, ground
+        self.tree = tree
+        self._coupling = coupling
+        self._urdf = urdf
+        self._ignored = ignored
+        self._ground = ground
 
     def __reduce__(self) -> Any:  # a controller that keeps it can be sent to worker processes
         return RobotModel, (self.tree, self._coupling, self._urdf, self._ignored, self._ground)

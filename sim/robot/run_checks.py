@@ -93,7 +93,9 @@ class MovingSetpointCheck:
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Find the lags of these gains."""
-        self._lag, b, ki = None, params.setpoint_weight, params.ki
+        self._lag = None
+        b = params.setpoint_weight
+        ki = params.ki
         if b is None or ki is None or self.found is not None:
             return
         lag = np.max(params.kp * (1 - b) / np.where(ki > 0, ki, np.inf), axis=0)

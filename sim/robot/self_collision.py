@@ -77,7 +77,10 @@ def read_srdf(path: Path, links: Iterable[str]) -> Srdf:
     Pairs that name a link twice or an unknown link are left out, as in MoveIt, with a finding. Raises RobotError for
     what :func:`batchpid.sim.robot.xml.parse_xml` refuses.
     """
-    known, disabled, enabled, findings = set(links), list[DisabledPair](), set[frozenset[str]](), list[Finding]()
+    known = set(links)
+    disabled = list[DisabledPair]()
+    enabled = set[frozenset[str]]()
+    findings = list[Finding]()
     for element in parse_xml(path).iterchildren("disable_collisions", "enable_collisions"):
         pair = element.get("link1", ""), element.get("link2", "")
         if len(known.intersection(pair)) != 2:

@@ -105,7 +105,9 @@ def link_masses(robot: Urdf) -> dict[str, LinkMass]:
     Raises RobotError for a mesh that cannot be read.
     """
     repaired = {each.link for each in robot.repairs if each.code == "inertia"}
-    inertias, shapes, masses = simulated(robot.urdf).inertias, own_shapes(robot.urdf), {}
+    inertias = simulated(robot.urdf).inertias
+    shapes = own_shapes(robot.urdf)
+    masses = {}
     for link in robot.links:
         if (given := inertias.get(link.name)) is None:
             masses[link.name] = LinkMass(0.0, "none", 0.0, 0.0)

@@ -245,7 +245,9 @@ class OperationalSpace:
         found = native_law.friction(arrays, coulomb, band)
         if found is not None:
             return found
-        error, j, others = pose_error(setpoint[:, :7], dynamics.pose), dynamics.jacobian, posture - qpos
+        error = pose_error(setpoint[:, :7], dynamics.pose)
+        j = dynamics.jacobian
+        others = posture - qpos
         ahead = error if twist is None else error + LOOKAHEAD * twist
         rows, eye = namespace(j).swapaxes(j, -1, -2), 1e-4 * namespace(j).eye(6)
         moved = gram(j, solve(gram(rows, rows) + eye.astype(j.dtype), ahead[..., None]))[..., 0]

@@ -105,7 +105,10 @@ class Candidates:
         varied: bool,
         motors: bp.Actuators | None = None,
     ) -> None:
-        self.robot, self.seconds, self.weights, self.headroom = robot, seconds, weights, headroom
+        self.robot = robot
+        self.seconds = seconds
+        self.weights = weights
+        self.headroom = headroom
         self._varied = varied
         self.designed = robot.designed(gain_units)
         joints = int(robot.independent.sum())
@@ -165,7 +168,9 @@ class Candidates:
 
     def costs(self, runner: Runner, points: Float64) -> Float64:
         """Run each of ``points`` (n, dimension) on its :meth:`runner`, and return the costs (n,)."""
-        count, w, params = len(points), self.weights, self.params(points)
+        count = len(points)
+        w = self.weights
+        params = self.params(points)
         limits = {name: getattr(params, name) for name in ("effort_min", "effort_max")}
         limited = params.replace(**{name: self.headroom * limit for name, limit in limits.items() if limit is not None})
         with warnings.catch_warnings():

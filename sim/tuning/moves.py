@@ -42,7 +42,10 @@ FREE_VELOCITY = {"rad": 2.0, "m": 0.3}
 _PEAK_VELOCITY = 15 / 8  # of the minimum-jerk motion in unit time
 _LINE = 24
 """Points of a move's line."""
-_EASY, _ROUNDS, _TRIED, _CHANGED = 0.6, 80, 8, 0.3
+_EASY = 0.6
+_ROUNDS = 80
+_TRIED = 8
+_CHANGED = 0.3
 _STUCK = 0.9
 """Share of poses in which a joint cannot move by its effort limit, above which no move moves it."""
 _CLEARANCE, _ROOMY = 1e-3, 1e-2  # m

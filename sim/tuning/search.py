@@ -227,7 +227,9 @@ def _evolve(
 
     start = np.zeros(candidates.dimension)
     firsts = np.array([start] if designs is None else [start, *designs])[:population]
-    optimizer, points, history = optimizer_at(start), list[Float64](), list[tuple[float, ...]]()
+    optimizer = optimizer_at(start)
+    points = list[Float64]()
+    history = list[tuple[float, ...]]()
     began = time.monotonic()
     bar = (progress or (lambda items: items))(range(generations))
     with warnings.catch_warnings():

@@ -28,7 +28,9 @@ from batchpid.task_space.rotations import rotate
 
 LIGHT = np.array([0.5, 0.2, 0.85]) / np.linalg.norm([0.5, 0.2, 0.85])
 """Direction to the light."""
-_FLOOR, _GRID, _BACKGROUND = "#bdc6d3", "#d5dae2", "#f4f6f9"
+_FLOOR = "#bdc6d3"
+_GRID = "#d5dae2"
+_BACKGROUND = "#f4f6f9"
 _NEAREST = 0.05
 """Distance from the camera below which nothing is drawn [m]."""
 _NEARER = 0.85

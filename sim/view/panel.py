@@ -143,7 +143,9 @@ class Panel:
                 # Four digits: the box next to a slider holds no more.
                 value = float(f"{getattr(live.params, gain)[0, self.joint]:.4g}")
                 largest = 4 * max(value, float(getattr(first, gain)[0, self.joint])) or 1.0
-                slider.max, slider.step, slider.value = largest, largest / 1000, value
+                slider.max = largest
+                slider.step = largest / 1000
+                slider.value = value
 
         def change(gain: str, value: float) -> None:
             live.set_gain(gain, self.joint, value)

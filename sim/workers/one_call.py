@@ -45,7 +45,9 @@ class OneCall:
         if self._user or process != self._owner:
             raise self._refusal(me, process)
         # No function is called since the check, so no other thread and no signal handler can run in between.
-        self._user, self._handler, self._is_held = me, None, False
+        self._user = me
+        self._handler = None
+        self._is_held = False
         if me == self._main and _signal.getsignal(SIGINT) is not None:  # None: it is not one of Python
             try:
                 self._handler = _signal.signal(SIGINT, self._on_interrupt)
@@ -55,7 +57,9 @@ class OneCall:
 
     def end(self) -> None:
         """End the call; then call the handler of a SIGINT that was held back."""
-        self._user, self.waits, handler = 0, False, self._handler
+        self._user = 0
+        self.waits = False
+        handler = self._handler
         if handler is not None:
             _signal.signal(SIGINT, handler)
             if self._is_held:

@@ -82,7 +82,9 @@ class WorkerPool(SingleOwner):
         """Messages about replaced workers, for warnings."""
         if options.cluster is not None:
             cluster = Cluster(options.cluster, num_envs)
-            slices, widest, most_steps = cluster.slices, cluster.widest, NODE_STEPS
+            slices = cluster.slices
+            widest = cluster.widest
+            most_steps = NODE_STEPS
         else:
             slices = split_in_shares(num_envs, [1] * max(1, min(count or 0, num_envs)))
             widest, most_steps = -(-num_envs // len(slices)), _MAX_STEPS
@@ -157,7 +159,9 @@ class WorkerPool(SingleOwner):
 
         It waits for one worker after another: to wake up for the first would take the core of one that still runs.
         """
-        request, results, failures = self._request, [], []
+        request = self._request
+        results = []
+        failures = []
         try:
             for worker in self.workers:
                 try:

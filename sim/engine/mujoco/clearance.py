@@ -143,7 +143,9 @@ class GroupClearance:
     """
 
     def __init__(self, tables: Arrays, kinematics: int, models: Sequence[Any], data: Sequence[Any], dof: int) -> None:
-        robots, pairs, bodies = len(data), len(tables["pairs"]), models[0].nbody
+        robots = len(data)
+        pairs = len(tables["pairs"])
+        bodies = models[0].nbody
         floats = bool((models[0].jnt_type == mujoco.mjtJoint.mjJNT_FREE).any())
         ways = dof + 2 * floats
         addresses = {

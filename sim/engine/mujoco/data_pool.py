@@ -47,7 +47,10 @@ class DataPool:
     """
 
     def __init__(self, robot: RobotMj) -> None:
-        self.robot, self.model, self._data, self._taken = robot, copy.copy(robot.model), list[Any](), list[Any]()
+        self.robot = robot
+        self.model = copy.copy(robot.model)
+        self._data = list[Any]()
+        self._taken = list[Any]()
         self._user: User | None = None
         self._initial = np.empty(mujoco.mj_stateSize(robot.model, STATE))
         (data,) = self._new(1)

@@ -61,7 +61,9 @@ class MujocoLinkSensors:
         while (lower := ~np.isin(owners, [*bodies.values()])).any():
             owners[lower] = model.body_parentid[owners[lower]]
         self._rows: Sequence[Any] = [np.flatnonzero(np.equal(owners, bodies[link])) for link in contact_bodies(spec)]
-        self._contacts, self._wrenches, self.size = len(owners), len(spec.wrenches or ()), int(model.nsensordata)
+        self._contacts = len(owners)
+        self._wrenches = len(spec.wrenches or ())
+        self.size = int(model.nsensordata)
 
     def quantities(self, values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
         """Return the quantities of :meth:`batchpid.sim.engine.protocol.EnginePack.take_sensed` for values (M, size)."""

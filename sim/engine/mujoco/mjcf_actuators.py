@@ -53,7 +53,9 @@ class MjcfActuators:
     """
 
     def __init__(self, drive: Drive, independent: NDArray[np.bool_], is_law: bool, guard: Guard | None) -> None:
-        self._drive, self._independent, self.is_law = drive, independent, is_law
+        self._drive = drive
+        self._independent = independent
+        self.is_law = is_law
         limit = drive.motor("effort_limit", math.inf)
         low, high = drive.value("effort_min", -math.inf), drive.value("effort_max", math.inf)
         self.effort_range = np.array([np.maximum(low, -limit), np.minimum(high, limit)]).T
@@ -96,7 +98,9 @@ class MjcfActuators:
 
     def _gains(self, joint: int) -> dict[str, float]:
         """Return gains, and limits of the setpoint's rate and of the integral of the error; 0 for none."""
-        drive, limit, rate = self._drive, self._drive.integral_limit[joint], self._rate[joint]
+        drive = self._drive
+        limit = self._drive.integral_limit[joint]
+        rate = self._rate[joint]
         kp, ki, kv = (float(drive.value(name)[joint]) for name in ("kp", "ki", "kd"))
         ki = ki if limit > 0 else 0.0
         imax = limit / ki if ki and math.isfinite(limit) else 0.0
@@ -125,7 +129,9 @@ class MjcfActuators:
 
     def compare(self, continuous: Bool) -> None:
         """Add the differences of the actuators; ``continuous`` is a mask of the joints."""
-        drive, line, lags = self._drive, self._has_line, self._lag > 0
+        drive = self._drive
+        line = self._has_line
+        lags = self._lag > 0
         written = {"armature", "viscous", "coulomb", "command_delay", "saturation_effort", "lag"}
         if self.is_law:
             drive.compare_integral(self._is_dcmotor)

@@ -151,7 +151,9 @@ def _set_joints(
 
 def _start(model: MjModel, robot: RobotDescription, motors: MjcfActuators) -> dict[str, str]:
     """Return the keyframe "home": the start pose as positions and setpoints."""
-    qpos, ctrl, act = model.qpos0.copy(), np.zeros(model.nu), np.zeros(model.na)
+    qpos = model.qpos0.copy()
+    ctrl = np.zeros(model.nu)
+    act = np.zeros(model.na)
     if not robot.fixed_base:
         qpos[:7] = base_start(robot, robot.start, robot.has_ground)
     for at, name in enumerate(robot.joint_names):

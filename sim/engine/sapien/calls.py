@@ -65,7 +65,11 @@ class PythonCalls:
 
     def close(self) -> None:
         """Drop the references to robots and systems, so that they can be freed."""
-        self._get_qpos, self._get_qvel, self._passive_force, self._set_qf, self._steps = [], [], [], [], []
+        self._get_qpos = []
+        self._get_qvel = []
+        self._passive_force = []
+        self._set_qf = []
+        self._steps = []
 
 
 _ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
@@ -181,7 +185,9 @@ class SapienStep(NativeStep):
         sense: Callable[[], None] | None = None,
     ) -> None:
         assert isinstance(calls, NativeCalls)
-        self._stepped, self._calls, self._sense = stepped, calls, sense
+        self._stepped = stepped
+        self._calls = calls
+        self._sense = sense
         arrays: dict[str, Rows] = {"qf": calls.qf, "skip": calls.skip}
         if joints is not None:
             arrays["joints"] = np.array([pointer(joint, "joint") for joint in joints], np.uint64)

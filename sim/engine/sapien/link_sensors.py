@@ -22,7 +22,9 @@ class LinkSensors:
     """Sums of the sensors of ``spec`` over sim steps. ``robots`` and ``systems`` are a pack's own lists."""
 
     def __init__(self, spec: SceneSpec, robots: list[Any], systems: list[Any]) -> None:
-        self._robots, self._systems, self._spec = robots, systems, spec
+        self._robots = robots
+        self._systems = systems
+        self._spec = spec
         bodies, links = place_links(spec.urdf, spec.separate), [link.name for link in robots[0].links]
         self._contacts = [links.index(bodies[link].link) for link in spec.contacts or ()]
         self._wrenches = [links.index(link) for link in spec.wrenches or ()]

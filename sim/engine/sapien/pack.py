@@ -387,7 +387,10 @@ class Pack(ModelPack):
                 joint.set_drive_velocity_target(target)
 
     def close(self) -> None:
-        self.robots, self.systems, self._contents, self._scenes = [], [], [], []
+        self.robots = []
+        self.systems = []
+        self._contents = []
+        self._scenes = []
         self._bind()
 
 

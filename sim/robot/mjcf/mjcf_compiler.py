@@ -109,8 +109,12 @@ def _strip(spec: Any, path: Path, fixed_base: bool) -> tuple[tuple[str, ...], tu
         if drawn_only and not weighs:
             spec.delete(geom)
         elif geom.meshname in absent:  # something may refer to it
-            geom.type, geom.size, geom.meshname = mujoco.mjtGeom.mjGEOM_SPHERE, [1e-3, 0, 0], ""
-            geom.contype, geom.conaffinity, geom.mass = 0, 0, 0.0
+            geom.type = mujoco.mjtGeom.mjGEOM_SPHERE
+            geom.size = [1e-3, 0, 0]
+            geom.meshname = ""
+            geom.contype = 0
+            geom.conaffinity = 0
+            geom.mass = 0.0
             for pair in [each for each in spec.pairs if geom.name in (each.geomname1, each.geomname2) and geom.name]:
                 spec.delete(pair)
         elif geom.meshname:
@@ -175,7 +179,9 @@ class Names:
     """
 
     def __init__(self, model: MjModel) -> None:
-        self._types, self._bodies, self._roots = model.jnt_type, model.jnt_bodyid, model.body_rootid
+        self._types = model.jnt_type
+        self._bodies = model.jnt_bodyid
+        self._roots = model.body_rootid
         self._left_out: set[int] = set()
         given = [model.body(body).name for body in range(1, model.nbody)]
         self._links, self._joints = {"world", *given}, {model.joint(joint).name for joint in range(model.njnt)}

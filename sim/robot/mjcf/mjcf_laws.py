@@ -17,9 +17,13 @@ import numpy as np
 
 from batchpid.arrays.array_types import MjModel
 
-_POSITION, _VOLTAGE, _NO_INPUT = 1, 8, 16
+_POSITION = 1
+_VOLTAGE = 8
+_NO_INPUT = 16
 """Inputs of an actuator: bits of ``mjtCtrlInput`` (3.12 and later)."""
-_GAIN, _BIAS, _DYN = mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtDyn
+_GAIN = mujoco.mjtGain
+_BIAS = mujoco.mjtBias
+_DYN = mujoco.mjtDyn
 
 
 class Servo(NamedTuple):

@@ -113,7 +113,9 @@ def content_of(path: Path) -> str:
     MuJoCo looks for a file in the folder of the file that names it, or in a folder of its ``<compiler>``. A missing
     file is left out: if MuJoCo needs it, the compilation fails.
     """
-    names, folders, models = set[str](), set[Path](), [path]
+    names = set[str]()
+    folders = set[Path]()
+    models = [path]
     for model in models:
         folders.add(model.parent)
         for element in parse_xml(model).iter():

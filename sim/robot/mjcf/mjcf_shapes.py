@@ -75,7 +75,9 @@ class ShapeWriter:
     """Writer of a body's geoms as the ``<collision>`` elements of its link."""
 
     def __init__(self, model: MjModel, names: Names, findings: list[Finding]) -> None:
-        self._model, self._names, self._findings = model, names, findings
+        self._model = model
+        self._names = names
+        self._findings = findings
         self._files: dict[int, Path] = {}  # by number of the mesh
 
     def write(self, body: int, link: etree._Element, anchor: NDArray[np.float64]) -> bool:

@@ -43,7 +43,10 @@ class Tree:
     """
 
     def __init__(self, model: MjModel, names: Names, path: Path, fixed_base: bool, findings: list[Finding]) -> None:
-        self._model, self._names, self._path, self._findings = model, names, path, findings
+        self._model = model
+        self._names = names
+        self._path = path
+        self._findings = findings
         self._shapes = ShapeWriter(model, names, findings)
         self._anchors = {0: np.zeros(3)}  # origin of each body's link, in the frame of the body
         self.root = etree.Element("robot")
@@ -125,7 +128,9 @@ class Tree:
         if parent is not None and not joints:
             self._joint(self._names.new_joint(f"{name}_fixed"), "fixed", parent, name, place, turn)
         for joint in joints:
-            own, axis, rest = self._names.joints[joint], model.jnt_axis[joint], model.qpos0[model.jnt_qposadr[joint]]
+            own = self._names.joints[joint]
+            axis = model.jnt_axis[joint]
+            rest = model.qpos0[model.jnt_qposadr[joint]]
             if self._names.is_slide(joint):
                 kind, anchor, place = "prismatic", np.zeros(3), place - rest * rotate(turn, axis)
             else:
@@ -138,13 +143,17 @@ class Tree:
                 self._link(link)
             element = self._joint(own, kind, str(parent), link, place, turn)
             self._write_motion(element, joint, motors, couplings)
-            parent, place, turn = link, -anchor, _NO_TURN
+            parent = link
+            place = -anchor
+            turn = _NO_TURN
         self._anchors[body] = anchor
         self._write_content(body, name, self._link(name))
 
     def _write_motion(self, element: etree._Element, joint: int, motors: Motors, couplings: Couplings) -> None:
         """Write axis, limits, friction and damping, and coupling of a joint."""
-        model, name, dof = self._model, self._names.joints[joint], self._model.jnt_dofadr[joint]
+        model = self._model
+        name = self._names.joints[joint]
+        dof = self._model.jnt_dofadr[joint]
         etree.SubElement(element, "axis", xyz=text_of(model.jnt_axis[joint]))
         lower, upper = model.jnt_range[joint].tolist() if model.jnt_limited[joint] else (-np.inf, np.inf)
         limit = etree.SubElement(element, "limit", lower=repr(lower), upper=repr(upper))
@@ -168,7 +177,9 @@ class Tree:
         if mass == 0:
             if body not in self.solid:
                 return
-            mass, tensor, center = NO_MASS, 1e-3 * NO_MASS * np.eye(3), np.zeros(3)
+            mass = NO_MASS
+            tensor = 1e-3 * NO_MASS * np.eye(3)
+            center = np.zeros(3)
         inertial = etree.SubElement(link, "inertial")
         etree.SubElement(inertial, "origin", xyz=text_of(center))
         etree.SubElement(inertial, "mass", value=repr(mass))
