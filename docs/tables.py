@@ -65,7 +65,7 @@ def options() -> str:
     defaults, bounds = {each.name: each.default for each in fields(RunnerKeywords)}, declared(RunnerKeywords, Field)
     rows = [("option", "range", "default", "kept in", "flag", "meaning"), ("---",) * 6]
     for (name,), text in attributes(RunnerKeywords):
-        kept, flag = OPTIONS[name].kept, f"`--{name}`" if OPTIONS[name].flag else ""
+        kept, flag = OPTIONS[name].kept, f"`--{'no-' * (defaults[name] is True)}{name}`" if OPTIONS[name].flag else ""
         default = "" if defaults[name] in (MISSING, DEFAULT_ENGINE) else f"`{defaults[name]}`"
         range_ = bound(bounds[name]) if name in bounds else ""
         rows.append((f"`{name}`", range_, default, ", ".join(kept), flag, first_sentence(text)))

@@ -222,7 +222,7 @@ class RunnerOptions(RunnerKeywords):
     @property
     def switched(self) -> dict[str, bool]:
         """Options of type bool that are not at their default, by name."""
-        switches = {each.name: each.default for each in fields(self) if isinstance(each.default, bool)}
+        switches = {entry.name: entry.default for entry in fields(self) if isinstance(entry.default, bool)}
         return {name: not default for name, default in switches.items() if getattr(self, name) != default}
 
     @property
@@ -360,7 +360,7 @@ class RunnerOptions(RunnerKeywords):
         - "recording": fields of :class:`batchpid.sim.RunInfo`, and in its field "options" the values without a field;
         - "scene": fields of :class:`batchpid.sim.engine.scene_spec.SceneSpec`.
         """
-        kept = {name: each.kept[place] for name, each in OPTIONS.items() if place in each.kept}
+        kept = {name: entry.kept[place] for name, entry in OPTIONS.items() if place in entry.kept}
         values = {name: getattr(self, source or name) for name, source in kept.items()}
         if place == "recording" and (further := sorted(values.keys() - RunInfo.__annotations__)):
             values["options"] = {name: values.pop(name) for name in further}
@@ -368,7 +368,7 @@ class RunnerOptions(RunnerKeywords):
 
     def describe(self) -> Document:
         """Return robot and options that two runners must share to restore each other's snapshots, as plain values."""
-        robot, own = self.robot, self.own_command
+        robot, command = self.robot, self.own_command
         return {
             **robot.describe(),
             "joints": list(robot.joint_names),
@@ -376,7 +376,7 @@ class RunnerOptions(RunnerKeywords):
             "ignored_pairs": digest(robot.ignored_pairs),
             "robot_actuators": digest(known_joints(robot)),
             "controller": self.versioned_control,
-            "command": None if own is None else list(own.names),
+            "command": None if command is None else list(command.names),
         }
 
     @property
@@ -422,9 +422,9 @@ class RunnerOptions(RunnerKeywords):
 
 def _control(value: object, robot: Robot, tool: Any) -> Any:
     """Return a control, checked; "osc" becomes the controller of the link ``tool``."""
-    own = callable(value) and callable(getattr(value, "init", None))
-    name = None if own else choice("control", value, (*get_args(ControlMode), "osc"))
-    if own:
+    is_controller = callable(value) and callable(getattr(value, "init", None))
+    name = None if is_controller else choice("control", value, (*get_args(ControlMode), "osc"))
+    if is_controller:
         own_command(value)  # raises for an invalid command
     if tool is not None:
         tool = instance("tool", tool, str, "name a link of the robot")

@@ -74,7 +74,10 @@ class CompareCommand:
                 print(motion_difference(robot, first, second))
         if json is not None:
             arrays = "metrics chatter settling_limit following_error"
-            figures = {each.name: {name: getattr(each, name) for name in arrays.split()} for each in evaluations}
+            figures = {
+                evaluation.name: {name: getattr(evaluation, name) for name in arrays.split()}
+                for evaluation in evaluations
+            }
             write_figures(json, {"joints": robot.joint_names, "moves": evaluations[0].moves.names, "gains": figures})
             print(f"\nfigures: {json}")
         if picture is not None:

@@ -83,7 +83,7 @@ class ExportCommand:
         out = self.out or FOLDER / f"{Path(self.robot).stem}{FILES[self.to]}"
         out = OutputFiles(self).path("out", out, (Path(FILES[self.to]).suffix,))
         known = {name for names in USED.values() for name in names}
-        unused = [each.name for each in fields(self) if each.name in known.difference(USED[self.to])]
+        unused = [entry.name for entry in fields(self) if entry.name in known.difference(USED[self.to])]
         flags.refuse(self, unused, f"has no effect with --to {self.to}")
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         if self.to == "urdf":
@@ -108,8 +108,8 @@ class ExportCommand:
             raise InvalidArgumentError("to", "; ".join(differences), value=self.to, remedy="leave out --strict")
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, _with_differences(exported, COMMENTS.get(self.to, "# {}")))
-        for each in differences:
-            print(f"differs: {each}")
+        for difference in differences:
+            print(f"differs: {difference}")
         print(f"written: {out}: {content}")
 
     def _exported(self, robot: Robot, params: bp.PIDParams) -> Exported:
@@ -146,7 +146,9 @@ class ExportCommand:
 
 def _with_differences(exported: Exported, comment: str) -> str:
     """Return the text, with a comment for each difference that it does not hold yet."""
-    sentences = [" ".join(each.split()).replace("--", "- -").replace("*/", "* /") for each in exported.differences]
+    sentences = [
+        " ".join(difference.split()).replace("--", "- -").replace("*/", "* /") for difference in exported.differences
+    ]
     lines = "".join(f"{comment.format(f'differs: {each}')}\n" for each in sentences if each not in exported.text)
     declaration, end, rest = exported.text.partition("?>\n") if exported.text.startswith("<?xml") else ("", "", "")
     return f"{declaration}{end}{lines}{rest}" if end else f"{lines}{exported.text}"

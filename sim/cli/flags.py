@@ -45,13 +45,13 @@ def chosen(command: Any, names: str) -> Document:
 
 def refuse(command: Any, names: Iterable[str], problem: str) -> None:
     """Raise InvalidArgumentError for the first flag among ``names`` that is not at its default."""
-    defaults = {each.name: each.default for each in fields(command)}
+    defaults = {entry.name: entry.default for entry in fields(command)}
     for name in names:
         if (value := getattr(command, name)) != defaults[name]:
             raise InvalidArgumentError(name, problem, value=value, remedy="leave it out")
 
 
-FLAGS = {each.name: each.default for each in fields(RunnerKeywords) if OPTIONS[each.name].flag}
+FLAGS = {entry.name: entry.default for entry in fields(RunnerKeywords) if OPTIONS[entry.name].flag}
 """Options that have a flag, with their defaults."""
 SCENE_FLAGS = tuple(name for name in FLAGS if "scene" in OPTIONS[name].kept and name != "engine")
 """Options that change the scenes in an engine."""
@@ -72,7 +72,7 @@ def _kind(name: str) -> Kind:
     kind = Literal["on", "off"] | None if name in _SWITCHES else get_args(KINDS[name])[0]
     if get_origin(kind) not in (Union, UnionType):
         return kind
-    return Union[tuple(each for each in get_args(kind) if each in _PLAIN or get_origin(each) is Literal)]  # noqa: UP007
+    return Union[tuple(option for option in get_args(kind) if option in _PLAIN or get_origin(option) is Literal)]  # noqa: UP007
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,9 @@ class RunnerFlags:
 
     def options(self) -> Document:
         """Return the options as arguments of a Runner; switches that are left out are left to it."""
-        values = {each.name: getattr(self, each.name) for each in fields(self)}
-        given = {name: values.pop(name) for name in _SWITCHES if name in values}
-        return values | {name: value == "on" for name, value in given.items() if value is not None}
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        switches = {name: values.pop(name) for name in _SWITCHES if name in values}
+        return values | {name: value == "on" for name, value in switches.items() if value is not None}
 
 
 def runner_flags(*names: str) -> type[RunnerFlags]:

@@ -91,7 +91,7 @@ class IdentifyCommand:
         picture = outputs.path("picture", self.picture or beside(out, "fit"), plots.FORMATS)
         robot = Robot.load(self.robot, **vars(self.meshes))
         evaluations = iter(bar("identifying", bar_format=AT_MOST)(range(45)))
-        found = identify(
+        result = identify(
             robot,
             self.logs,
             None if self.gains is None else _gains(robot, self.gains),
@@ -100,23 +100,23 @@ class IdentifyCommand:
             progress=lambda: next(evaluations, None),
             **flags.chosen(self, "compensate timestep extras workers"),
         )
-        print(found.report())
-        if not (found.explains or self.force):
+        print(result.report())
+        if not (result.explains or self.force):
             problem = "are explained to less than half of the error of ideal motors, and no file is written"
-            raise InvalidArgumentError("logs", problem, remedy=f"{found.advice}; --force writes the file nevertheless")
-        found.save(out)
+            raise InvalidArgumentError("logs", problem, remedy=f"{result.advice}; --force writes the file nevertheless")
+        result.save(out)
         print(f"\nwritten: {out}")
-        if (gains := found.gains()) is not None:
+        if (gains := result.gains()) is not None:
             path = beside(out, "gains").with_suffix(".yaml")
-            bp.save_params(path, gains, [robot.joint_names[joint] for joint in found.joints])
+            bp.save_params(path, gains, [robot.joint_names[joint] for joint in result.joints])
             print(f"gains that were found, for --gains: {path}")
         if details is not None:
-            write_figures(details, found.document())
+            write_figures(details, result.document())
             print(f"written: {details}")
         if corrected is not None:
-            write_atomically(corrected, found.corrected_urdf())
+            write_atomically(corrected, result.corrected_urdf())
             print(f"written: {corrected}")
-        print(f"picture: {plots.save(found.figure(), picture)}")
+        print(f"picture: {plots.save(result.figure(), picture)}")
 
 
 def _gains(robot: Robot, name: str) -> bp.PIDParams:

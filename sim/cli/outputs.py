@@ -79,9 +79,9 @@ def write_figures(path: Path, figures: Any) -> None:
 def _plain(value: Any) -> Any:
     value = value._asdict() if hasattr(value, "_asdict") else value.tolist() if hasattr(value, "tolist") else value
     if isinstance(value, Mapping):
-        return {name: _plain(each) for name, each in value.items()}
+        return {name: _plain(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
+        return [_plain(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -114,5 +114,5 @@ def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
 
 def close_bars() -> None:
     """Remove all bars, so that a message gets a separate line; an error may have left some."""
-    for each in list(_bars):
-        each.close()
+    for open_bar in list(_bars):
+        open_bar.close()

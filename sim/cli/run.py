@@ -98,8 +98,8 @@ def read_run(path: Path, robot: str | None, meshes: MeshOptions, usage: str) -> 
     name, description = rollout.info.robot, rollout.info.urdf
     if robot is not None:
         return rollout, Robot.load(robot, **vars(meshes))
-    found = Robot.load(name, **vars(meshes)) if name in Robot.bundled() else None
-    if found is None or description not in (None, found.urdf):
-        problem = "is not bundled" if found is None else "is another one than the bundled robot of that name"
+    bundled = Robot.load(name, **vars(meshes)) if name in Robot.bundled() else None
+    if bundled is None or description not in (None, bundled.urdf):
+        problem = "is not bundled" if bundled is None else "is another one than the bundled robot of that name"
         raise InvalidArgumentError("robot", f"{name!r} of the recording {problem}", remedy=f"name its URDF: {usage}")
-    return rollout, found
+    return rollout, bundled

@@ -76,11 +76,14 @@ def _finding(run: _Run, rule: Rule, joint: int, rows: NDArray[np.intp], envs: ND
     times = run.rest_time[rows, joint]
     rows = rows[np.argsort(times, kind="stable")]
     first, name = rows[0], None
-    faults = [f"{fault.joint}: {fault.cause}" for fault in run.info.faults if fault.env == first]
-    detail = faults[-1] if faults else run.pressed[first]
     if rule.names_joint:
         name = run.robot.joint_names[joint]
         detail = f"{run.error[-1, first, joint]:.2g} {run.robot.units[joint]} remain"
+    elif run.failed[first]:
+        faults = [f"{fault.joint}: {fault.cause}" for fault in run.info.faults if fault.env == first]
+        detail = "".join(faults[-1:])
+    else:
+        detail = run.pressed[first]
     numbers = tuple(envs[rows].tolist())
     return Finding("warning", rule.code, rule.text, rule.remedy, name, detail=detail, envs=numbers, time=times.min())
 
@@ -241,9 +244,9 @@ def _is_blocked(run: _Run) -> Bool:
     return run.is_at_rest.all(1, keepdims=True) & (unexplained > 1.2 * run.robot.friction + noise)
 
 
-# Facts come before symptoms: an env that failed, setpoints that cannot be reached, links that touch. Then come the
-# effort and the motion in the run: a constant effort at its limit, oscillations, joints at rest, since such a joint can
-# rest for a moment. Of those, a force that the model does not explain comes before gains that are small.
+# Facts come before symptoms: an env that failed, setpoints that cannot be reached, links that touch. An effort at its
+# limit and oscillations come before rest, since such a joint can rest for a moment. A force that the model does not
+# explain comes before gains that are small, which would explain any error at rest.
 RULES: tuple[Rule, ...] = (
     Rule("failed", "an input was not finite, or the state diverged", "correct the input or lower the gains",
          lambda run: run.failed, names_joint=False),

@@ -198,8 +198,8 @@ def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | 
     if recorded is None or law is None:
         return recorded if law is None else law
     for name in ("kp", "ki", "kd"):
-        pair = [0.0 if gain is None else gain for gain in (getattr(recorded, name), getattr(law, name))]
-        if not np.allclose(*pair, rtol=1e-6):
+        before, now = (0.0 if gain is None else gain for gain in (getattr(recorded, name), getattr(law, name)))
+        if not np.allclose(before, now, rtol=1e-6):
             problem = f"contradict {log.source}, which was recorded with another {name}"
             raise InvalidArgumentError("params", problem, remedy="leave them out: a recording has its own")
     return law

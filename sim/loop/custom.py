@@ -65,8 +65,8 @@ class OwnController:
 
         Raises InvalidArgumentError if the controller returned an effort or a state of a wrong shape or dtype.
         """
-        own = (read_only(np.array(rows)) for rows in inputs)  # the controller may keep them, but not write to them
-        new, wanted, *limited = self._called(unflatten(self._structure, state), *own)
+        copies = (read_only(np.array(rows)) for rows in inputs)  # the controller may keep them, but not write to them
+        new, wanted, *limited = self._called(unflatten(self._structure, state), *copies)
         leaves = _like(state, flatten(new, read=np.array))
         effort = np.array(wanted, np.float64)
         _check_effort(effort, inputs[1])

@@ -110,8 +110,8 @@ class NativeTicks:
             seen=self.measured,
             noise=noise,
         )
-        stages = [(each, _NATIVE.get(each.name)) for each in control_step.STAGES]
-        stages = [(each, kind) for each, kind in stages if kind is None or kind.applies(self)]
+        stages = [(stage, _NATIVE.get(stage.name)) for stage in control_step.STAGES]
+        stages = [(stage, kind) for stage, kind in stages if kind is None or kind.applies(self)]
         left_over, waiting = sum(kind is None for _, kind in stages), list[SimStage]()
         for stage, kind in stages:
             if kind is None:
@@ -165,10 +165,10 @@ class NativeTicks:
         complete or not observed, its sim steps that are done, and the last status. An event that needs Python stops
         the ticks: a status that is not 0, and with ``whole`` a command or velocities that are not finite.
         """
-        given, status = (self._calls, self._address, step.prepare()), _NO_NOISE
+        arguments, status = (self._calls, self._address, step.prepare()), _NO_NOISE
         while status == _NO_NOISE:
             drawn, before = self._give_noise() if self._is_noisy else -1, (tick, begin)
-            tick, begin, status = self._native.ticks(*given, tick, begin, until, steps, drawn, whole)
+            tick, begin, status = self._native.ticks(*arguments, tick, begin, until, steps, drawn, whole)
             if self._counted is not None:
                 self._counted[...] += (tick - before[0]) * steps + begin - before[1]
         return tick, begin, status
@@ -203,9 +203,9 @@ class NativeTicks:
         for name, array in arrays.items():
             if array is None:
                 continue
-            wanted = np.dtype(_TYPES.get(name, np.float64))
-            if array.dtype != wanted or not array.flags.c_contiguous:
-                raise ValueError(f"{name} is not a contiguous array of {wanted}")
+            expected = np.dtype(_TYPES.get(name, np.float64))
+            if array.dtype != expected or not array.flags.c_contiguous:
+                raise ValueError(f"{name} is not a contiguous array of {expected}")
             setattr(self._tick, name, array.ctypes.data)
             self._kept.append(array)
 
@@ -263,7 +263,7 @@ class NativeTicks:
         State is changed in place. Other results have arrays of their own.
         """
         before = values.outputs
-        masks = [name for name, each in before._asdict().items() if each is not None and each.dtype == bool]
+        masks = [name for name, value in before._asdict().items() if value is not None and value.dtype == bool]
         values = values._replace(outputs=before._replace(**dict.fromkeys(masks)))  # programs take no masks
         constants, inputs, state = mapped(_split, self._constants), leaves(values), leaves(values.state)
         layout, histories = self._layout._replace(model=Model()), tuple(array.ndim == 3 for array in state)
@@ -387,7 +387,7 @@ class _Traced(NamedTuple):
 def moves_drives(layout: Layout, constants: Constants, command: Command) -> bool:
     """Return whether the targets of the engine's drives move within a tick."""
     moving = constants.driven, constants.guard, constants.turns, command.setpoint_rate
-    return layout.control == "drive" and any(each is not None for each in moving)
+    return layout.control == "drive" and any(value is not None for value in moving)
 
 
 @lru_cache(maxsize=64)
@@ -401,7 +401,7 @@ def _trace(
     outputs.
     """
     first, count = len(leaves(constants)), len(leaves(given))
-    found: list[Any] = []
+    result_parts: list[Any] = []
 
     def function(*symbols: Symbol) -> list[Any]:
         each = iter(symbols)
@@ -412,23 +412,23 @@ def _trace(
         if is_last:
             nothing = Measured(None, None, None)
             values = Values(values.state, Command(None), nothing, values.step, nothing, outputs=values.outputs)
-        known = {symbol: number for number, symbol in enumerate(symbols[first:])}
+        numbers = {symbol: number for number, symbol in enumerate(symbols[first:])}
         results, places = list[Any](), list[_Place]()
-        own = set(map(id, leaves(values.outputs)))
+        returned = set(map(id, leaves(values.outputs)))
         for at, leaf in enumerate(leaves(values)):
-            is_state, number = at < len(histories), known.get(leaf)
+            is_state, number = at < len(histories), numbers.get(leaf)
             if is_state and (number == at or histories[at]):
                 places.append(_Place(False, at))
-            elif number is not None and not is_state and id(leaf) not in own:
+            elif number is not None and not is_state and id(leaf) not in returned:
                 places.append(_Place(False, number))
             else:
                 places.append(_Place(True, len(results)))
                 results.append(leaf)
-        found[:] = structure(values), tuple(places)
+        result_parts[:] = structure(values), tuple(places)
         return results
 
     program = trace(function, first, count)
-    return _Traced(program, *found)
+    return _Traced(program, *result_parts)
 
 
 def _copied(state: StepState) -> StepState:

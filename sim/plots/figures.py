@@ -73,9 +73,9 @@ def step_responses(
         The robot has no such joint.
     """
     run = _blank_failed(rollout)
-    own = None if run.info.sets_positions else run.info.own_command
-    figure, blocks = _figure(run, joints, rows=2, title=title, command=own)
-    own_blocks = blocks[len(blocks) - own.size :] if own is not None else []
+    command = None if run.info.sets_positions else run.info.own_command
+    figure, blocks = _figure(run, joints, rows=2, title=title, command=command)
+    own_blocks = blocks[len(blocks) - command.size :] if command is not None else []
     pose = None if run.tool_pose is None else _like_setpoints(run.tool_pose, rollout.setpoint[..., 3:7])
     for entry, (axes,) in own_blocks:
         values = rollout.setpoint[..., entry]
@@ -205,11 +205,11 @@ def _like_setpoints(pose: Array, wxyz: Array) -> Any:
 
 def _joint_indices(run: Rollout, joints: Joints) -> list[int]:
     names = run.info.joint_names
-    known: dict[int | str, int] = {key: index for index, name in enumerate(names) for key in (name, index)}
+    indices: dict[int | str, int] = {key: index for index, name in enumerate(names) for key in (name, index)}
     for joint in joints or ():
-        if joint not in known:
+        if joint not in indices:
             raise InvalidArgumentError("joints", "no such joint", value=joint, remedy=f"use {', '.join(names)}")
-    return [known[joint] for joint in joints or names]
+    return [indices[joint] for joint in joints or names]
 
 
 def _figure(
@@ -254,9 +254,9 @@ def _figure(
 
 
 def _fan_entries(run: Rollout, mark: int | None) -> list[Line2D]:
-    each = Line2D([], [], color=drawing.ENV, alpha=0.6, lw=0.8, label=f"each of {run.num_envs} envs")
+    line = Line2D([], [], color=drawing.ENV, alpha=0.6, lw=0.8, label=f"each of {run.num_envs} envs")
     marked = [] if mark is None else [Line2D([], [], color=drawing.MARKED, lw=1.2, label=f"env {mark}")]
-    return [each, *marked, _MEDIAN]
+    return [line, *marked, _MEDIAN]
 
 
 def _legend(figure: Figure, handles: list[Any]) -> None:
@@ -290,7 +290,7 @@ def fit_errors(fits: Sequence[FitErrors], names: Sequence[str], units: Sequence[
     rows = math.ceil(len(names) / columns)
     figure = Picture(figsize=(4.2 * columns, 0.8 + 2.0 * rows), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True)
-    kept = [fit.time[~fit.fitted] for fit in fits]
+    held_out = [fit.time[~fit.fitted] for fit in fits]
     for number, axes in enumerate(grid.flat):
         if number >= len(names):
             axes.set_axis_off()
@@ -303,7 +303,7 @@ def fit_errors(fits: Sequence[FitErrors], names: Sequence[str], units: Sequence[
                 axes.semilogy(
                     fit.time[::every], error[::every], color=colour, lw=0.8, label=label if index == 0 else None
                 )
-        for times in kept:
+        for times in held_out:
             if len(times):
                 axes.axvspan(times[0], times[-1], color=drawing.SETPOINT, alpha=0.15, lw=0)
         axes.set_title(names[number], fontsize=drawing.SMALL)

@@ -114,10 +114,10 @@ class Randomization:
     @property
     def given(self) -> dict[str, Field]:
         """Given fields by name; fields of a group as "group.name"."""
-        known = {name: getattr(self, name) for name in (*PHYSICAL, *START)}
+        values = {name: getattr(self, name) for name in (*PHYSICAL, *START)}
         for group in GROUPS:
-            known |= {f"{group}.{name}": each for name, each in getattr(self, group).items()}
-        return {name: each for name, each in known.items() if each is not None}
+            values |= {f"{group}.{name}": value for name, value in getattr(self, group).items()}
+        return {name: value for name, value in values.items() if value is not None}
 
     @property
     def events(self) -> dict[str, Field]:
@@ -138,7 +138,10 @@ class Randomization:
     def draw(self, robot: Robot, episodes: Rows) -> Draws:
         """Return the draws for envs with these streams and episodes (envs, 2)."""
         episodes = episodes.astype(np.int64)
-        return Draws(episodes, {name: self._draw(name, each, robot, episodes) for name, each in self.given.items()})
+        return Draws(
+            episodes,
+            {name: self._draw(name, distribution, robot, episodes) for name, distribution in self.given.items()},
+        )
 
     def _draw(self, name: str, each: Field, robot: Robot, episodes: NDArray[np.int64], number: Any = 0) -> Float64:
         """Return draws of a field (envs, elements), NaN where nothing is drawn; see :func:`generators`."""
@@ -236,11 +239,11 @@ class Randomization:
 
     def to_dict(self) -> Document:
         """Return the given fields as plain values, for :meth:`from_dict`."""
-        known = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {name: _plain(value) for name, value in known.items() if value is not None and value != {}}
+        document = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {name: _plain(value) for name, value in document.items() if value is not None and value != {}}
 
     @classmethod
-    def from_dict(cls, known: Mapping[str, Any]) -> Randomization:
+    def from_dict(cls, document: Mapping[str, Any]) -> Randomization:
         """Return the randomization of :meth:`to_dict`, or of a file: ``{"payload": {"uniform": [0, 0.5]}, ...}``.
 
         Raises
@@ -248,13 +251,13 @@ class Randomization:
         InvalidArgumentError
             It is not a randomization, or has an unknown field.
         """
-        known = mapping("randomization", known)
-        names = [each.name for each in fields(cls)]
-        values = {choice("randomization", name, names): value for name, value in known.items()}
+        document = mapping("randomization", document)
+        names = [entry.name for entry in fields(cls)]
+        values = {choice("randomization", name, names): value for name, value in document.items()}
         values |= {name: read_field(name, values[name]) for name in FIELDS.keys() & values.keys()}
         for group in GROUPS:
-            given = mapping(group, values.get(group, {}))
-            values[group] = {name: read_field(f"{group}.{name}", value) for name, value in given.items()}
+            group_values = mapping(group, values.get(group, {}))
+            values[group] = {name: read_field(f"{group}.{name}", value) for name, value in group_values.items()}
         return cls(**values)
 
 

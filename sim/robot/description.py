@@ -129,13 +129,13 @@ class RobotDescription(Urdf):
 
         They are the URDF's, or :func:`batchpid.sim.robot.description.suggested_effort_limit` where it gives none.
         """
-        given = self.effort_limit
-        if np.isfinite(given).all():
-            return read_only(given)
+        limits = self.effort_limit
+        if np.isfinite(limits).all():
+            return read_only(limits)
         qpos = self.sample(POSES)
         mass_matrix = self.coupling.mass_matrix(self.dynamics().mass_matrix(qpos))
         suggested = suggested_effort_limit(self.holding_efforts(qpos), mass_matrix, self.friction, self.damping)
-        return read_only(np.where(np.isfinite(given), given, suggested))
+        return read_only(np.where(np.isfinite(limits), limits, suggested))
 
     @property
     def velocity_limit(self) -> Float64:
@@ -239,8 +239,8 @@ class RobotDescription(Urdf):
             *("joint_names", "units", "lower", "upper", "effort_limit"),
             *("urdf", "dissipation", "fixed_base"),
         )
-        known = {name: getattr(self, name) for name in shared}
-        return RunInfo(robot=self.name, description=self, **known, **options)
+        values = {name: getattr(self, name) for name in shared}
+        return RunInfo(robot=self.name, description=self, **values, **options)
 
     def sample(self, count: int, seed: int = 0) -> Float64:
         """Return seeded poses (count, dof), uniform within the limits and half a turn of the start; followers match."""

@@ -42,7 +42,7 @@ def repair(root: etree._Element, path: Path) -> list[Finding]:
 
     Raises RobotError if the file is a xacro that was not expanded, or has no joint.
     """
-    found = [*_elements(root), *_attributes(root)]
+    findings = [*_elements(root), *_attributes(root)]
     _refuse_xacro(root, path)
     if root.find("joint") is None:
         remedy = "a xacro has to be expanded first: xacro FILE.xacro > FILE.urdf"
@@ -50,14 +50,14 @@ def repair(root: etree._Element, path: Path) -> list[Finding]:
     if root.get("name") is None:
         root.set("name", path.stem)
         text = f"<robot> has no name: called {path.stem!r}, after the file"
-        found.append(Finding("note", "repeated-name", text, "give <robot name=>"))
-    found += [*_links(root), *_joints(root), *_tree(root)]
+        findings.append(Finding("note", "repeated-name", text, "give <robot name=>"))
+    findings += [*_links(root), *_joints(root), *_tree(root)]
     for joint in root.findall("joint"):
-        found += joint_repair.repair(joint, root)
-    found += joint_repair.mimics(root)
+        findings += joint_repair.repair(joint, root)
+    findings += joint_repair.mimics(root)
     for link in root.findall("link"):
-        found += link_repair.repair(link)
-    return found
+        findings += link_repair.repair(link)
+    return findings
 
 
 def _elements(root: etree._Element) -> Iterator[Finding]:
@@ -119,7 +119,7 @@ def _without_commas(text: str, counts: Sequence[int]) -> str | None:
     if len((separated := text.replace(",", " ")).split()) in counts:
         return separated
     words = text.split()
-    decimal = len(words) in counts and all("," not in each or _DECIMAL_COMMA.fullmatch(each) for each in words)
+    decimal = len(words) in counts and all("," not in word or _DECIMAL_COMMA.fullmatch(word) for word in words)
     return text.replace(",", ".") if decimal else None
 
 
@@ -137,8 +137,8 @@ def _links(root: etree._Element) -> Iterator[Finding]:
     for link in root.findall("link"):
         if (name := link.get("name")) in seen:
             text = "no joint can refer to a link without name" if name is None else "this name is used twice"
-            kept = "left out" if name is None else "the first link is kept, the other left out"
-            yield finding_of(link, "warning", "repeated-name", f"{text}: {kept}", "give every link a name to itself")
+            effect = "left out" if name is None else "the first link is kept, the other left out"
+            yield finding_of(link, "warning", "repeated-name", f"{text}: {effect}", "give every link a name to itself")
             root.remove(link)
         seen.add(name)
 
@@ -146,7 +146,7 @@ def _links(root: etree._Element) -> Iterator[Finding]:
 def _joints(root: etree._Element) -> Iterator[Finding]:
     """Name joints that have no name or a repeated one; remove copies of joints."""
     seen: dict[str, tuple[str | None, str | None]] = {}
-    given = {joint.get("name") for joint in root.findall("joint")}
+    names = {joint.get("name") for joint in root.findall("joint")}
     for joint in root.findall("joint"):
         name, ends = joint.get("name"), ends_of(joint)
         if name is not None and seen.get(name) == ends:
@@ -155,7 +155,7 @@ def _joints(root: etree._Element) -> Iterator[Finding]:
             continue
         base = new = name or "{}_to_{}".format(*ends)
         number = 2
-        while new in seen or (new != name and new in given):
+        while new in seen or (new != name and new in names):
             new, number = f"{base}_{number}", number + 1
         if new != name:
             joint.set("name", new)

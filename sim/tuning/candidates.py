@@ -244,13 +244,13 @@ def gains_of_poles(p: float, w: float) -> Float64:
 
 def first_gains(delay: float) -> list[Float64]:
     """Return (ki, kp, kd) per unit of inertia of the candidates for a loop with ``delay`` [s], the likeliest first."""
-    found = []
+    designs = []
     for share in SHARES:
         for speed in SPEEDS:
             p = min(speed / SETTLE_SECONDS, _fastest(delay))
             w = min(_fastest(delay, p), FASTEST * p)
-            found.append(gains_of_poles(p, p + share * max(w - p, 0.0)))
-    return found
+            designs.append(gains_of_poles(p, p + share * max(w - p, 0.0)))
+    return designs
 
 
 def _fastest(delay: float, p: float | None = None) -> float:

@@ -30,5 +30,5 @@ class Weights:
     motions of the setpoint; 0: steps alone."""
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            number(each.name, getattr(self, each.name), 0.0, 1e6, "weight")
+        for entry in fields(self):
+            number(entry.name, getattr(self, entry.name), 0.0, 1e6, "weight")

@@ -79,13 +79,13 @@ class Evaluation(NamedTuple):
 
     def shortfalls(self, joints: NDArray[np.bool_]) -> list[str]:
         """Return the :meth:`demands` that ``joints`` (dof,) miss, worst first."""
-        found = []
+        drawbacks = []
         for demand, excess in self.demands(joints).items():
             for move, joint in np.argwhere(excess > 1):
                 where = f"move {self.moves.names[move]!r}, joint {self.rollout.info.joint_names[joint]!r}"
                 text = f"{demand} of {where}: {excess[move, joint]:.2f} x limit"
-                found.append((float(excess[move, joint]), text))
-        return [text for _, text in sorted(found, reverse=True)]
+                drawbacks.append((float(excess[move, joint]), text))
+        return [text for _, text in sorted(drawbacks, reverse=True)]
 
     def drawback(self, other: Evaluation, joints: NDArray[np.bool_]) -> str | None:
         """Return the criterion by which these gains are worse than ``other``, with both figures, or None.
@@ -99,8 +99,10 @@ class Evaluation(NamedTuple):
             (index, criterion) for index, criterion in enumerate(CRITERIA) if ranks[0][index] != ranks[1][index]
         )
         figures = [
-            each.shortfalls(joints)[0] if criterion == CRITERIA[-1] else f"{rank[index]} of {len(each.moves.start)}"
-            for each, rank in zip((self, other), ranks, strict=True)
+            evaluation.shortfalls(joints)[0]
+            if criterion == CRITERIA[-1]
+            else f"{rank[index]} of {len(evaluation.moves.start)}"
+            for evaluation, rank in zip((self, other), ranks, strict=True)
         ]
         return f"{criterion}: {self.name} {figures[0]}, {other.name} {figures[1]}"
 
@@ -117,8 +119,11 @@ def step_response_metrics(robot: Robot, rollout: Rollout, start: Rows, *, with_e
     Followers have the metrics of their leaders. Without ``with_effort`` the metrics of efforts are undefined (NaN), as
     under control "drive".
     """
-    if (own := rollout.info.own_command) is not None:
-        problem, remedy = f"has setpoints of {', '.join(own.names)}, not of joints", "pass a run with joint setpoints"
+    if (command := rollout.info.own_command) is not None:
+        problem, remedy = (
+            f"has setpoints of {', '.join(command.names)}, not of joints",
+            "pass a run with joint setpoints",
+        )
         raise InvalidArgumentError("rollout", problem, remedy=remedy)
     metrics = step_metrics(
         rollout.tick,

@@ -183,8 +183,8 @@ def easy_pose(robot: Robot, dynamics: RobotModel, poses: Float64) -> tuple[Float
         tried = robot.coupled(np.where(changed, center + spread * (poses - center), center))
         share = shares(tried).max(1)
         for index in np.argsort(share, kind="stable")[:_TRIED]:
-            if (found := cost(tried[index], float(share[index]))) < least:
-                center, least = tried[index], found
+            if (move_cost := cost(tried[index], float(share[index]))) < least:
+                center, least = tried[index], move_cost
                 break
     return center, movable
 

@@ -203,7 +203,7 @@ def pickled(message: Any, options: RunnerOptions) -> bytes:
         return cloudpickle.dumps(message)
     except Exception as error:
         raise InvalidArgumentError(
-            next((each.name for each in fields(options) if _refuses(getattr(options, each.name))), "options"),
+            next((entry.name for entry in fields(options) if _refuses(getattr(options, entry.name))), "options"),
             f"cannot be sent to a worker process: {error}",
             remedy="let it hold nothing that cannot be pickled, or pass workers=0",
         ) from error

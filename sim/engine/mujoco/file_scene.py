@@ -93,9 +93,9 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
     _set_pairs(scene, spec.ignored, {*robot.values()})
     number = {name: joint for joint, name in names.joints.items()}
     dofs = model.jnt_dofadr[[number[joint.name] for joint in spec.joints]]
-    own = np.array([_of_followers(table[dofs], spec) for table in (model.dof_armature, model.dof_damping)])
+    terms = np.array([_of_followers(table[dofs], spec) for table in (model.dof_armature, model.dof_damping)])
     bodies, frames = _frames(model, robot, spec)
-    return FileScene(scene, bodies, frames, root, own)
+    return FileScene(scene, bodies, frames, root, terms)
 
 
 def check_links(spec: SceneSpec, file: MjcfFile, links: Iterable[str]) -> None:
@@ -110,14 +110,18 @@ def check_links(spec: SceneSpec, file: MjcfFile, links: Iterable[str]) -> None:
 def set_ground(scene: MjSpec, ground: bool) -> None:
     """Switch contacts with the planes of the world on or off. For on, a scene without planes gets one at height 0."""
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    planes = [each for each in scene.worldbody.geoms if each.type == plane and (each.contype or each.conaffinity)]
+    planes = [
+        plane_shape
+        for plane_shape in scene.worldbody.geoms
+        if plane_shape.type == plane and (plane_shape.contype or plane_shape.conaffinity)
+    ]
     if ground and not planes:
         added, plain = scene.worldbody.add_geom(type=plane, size=[0, 0, 1]), mujoco.MjSpec().worldbody.add_geom()
         for name in _OF_CONTACTS:  # the file's default class would apply otherwise
             setattr(added, name, getattr(plain, name))
         added.contype = added.conaffinity = _EVERYTHING
-    for each in [] if ground else planes:
-        each.contype, each.conaffinity = 0, 0
+    for plane_shape in [] if ground else planes:
+        plane_shape.contype, plane_shape.conaffinity = 0, 0
 
 
 def _start(model: MjModel) -> Document:
@@ -129,9 +133,9 @@ def _start(model: MjModel) -> Document:
 
 def _set_pairs(scene: MjSpec, ignored: Iterable[tuple[str, str]], robot: set[str]) -> None:
     """Exclude exactly those pairs of the robot's bodies that do not collide."""
-    for each in list(scene.excludes):
-        if {each.bodyname1, each.bodyname2} <= robot:
-            scene.delete(each)
+    for exclude in list(scene.excludes):
+        if {exclude.bodyname1, exclude.bodyname2} <= robot:
+            scene.delete(exclude)
     for first, second in ignored:
         if {first, second} <= robot:
             scene.add_exclude(bodyname1=first, bodyname2=second)

@@ -57,13 +57,15 @@ def functions() -> dict[str, int] | None:
     """Return the addresses of functions and clock by field; None if this version of MuJoCo lacks one of them."""
     try:
         library = ctypes.CDLL(str(mujoco_library()))
-        found = {field: ctypes.cast(getattr(library, name), ctypes.c_void_p).value for field, name in FUNCTIONS.items()}
-        found["clock"] = ctypes.addressof(ctypes.c_void_p.in_dll(library, CLOCK))
+        addresses = {
+            field: ctypes.cast(getattr(library, name), ctypes.c_void_p).value for field, name in FUNCTIONS.items()
+        }
+        addresses["clock"] = ctypes.addressof(ctypes.c_void_p.in_dll(library, CLOCK))
         data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
         has_addresses = bool(data._address and data.model._address)
     except (ValueError, OSError, AttributeError):
         return None
-    return {field: address or 0 for field, address in found.items()} if has_addresses else None
+    return {field: address or 0 for field, address in addresses.items()} if has_addresses else None
 
 
 class MujocoStep(NativeStep):
@@ -112,8 +114,8 @@ class MujocoStep(NativeStep):
         clearance = None if shapes is None else GroupClearance(shapes, kinematics, models, data, qf.shape[1])
         tables = {
             "models": [model._address for model in models],
-            "data": [each._address for each in data],
-            **{field: [getattr(each, name).ctypes.data for each in data] for field, name in FIELDS.items()},
+            "data": [scene._address for scene in data],
+            **{field: [getattr(scene, name).ctypes.data for scene in data] for field, name in FIELDS.items()},
         }
         arrays: dict[str, Rows] = {name: np.array(rows, np.uint64) for name, rows in tables.items()}
         arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64), "qf": qf}
