@@ -59,6 +59,8 @@ class IdentifyCommand:
     extras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = ()
     """Further unknowns: load_friction, stribeck, offset, mass (of each link); with --gains also gain (a factor of gains
     that are not known), kd, saturation and slew (the limit of the goal's rate)."""
+    workers: Annotated[int, Field(low=0, high=1000)] = 0
+    """Number of processes, 0 for none besides this one. The result does not depend on it."""
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
     out: flags.OptionalPath = None
     """Actuators file to write: .yaml or .json. Default: out/ROBOT.actuators.yaml."""
@@ -96,7 +98,7 @@ class IdentifyCommand:
             payload=not self.no_payload,
             reading=Reading(**flags.chosen(self, "hold degrees topic command_topic prefix")),
             progress=lambda: next(evaluations, None),
-            **flags.chosen(self, "compensate timestep extras"),
+            **flags.chosen(self, "compensate timestep extras workers"),
         )
         print(result.report())
         if not (result.explains or self.force):

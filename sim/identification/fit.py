@@ -87,6 +87,8 @@ class Problem:
     """Plant and drive of each log."""
     windows: Sequence[Window]
     unknowns: Unknowns
+    run: Callable[..., Any] = map
+    """``map``, or that of a pool of processes."""
 
     def evaluate(self, point: Float64, steps: Float64 | None = None, free_states: bool = True) -> FitResiduals:
         """Return residuals at a point (unknowns,), and derivatives by ``steps`` (unknowns,); None: no derivatives.
@@ -103,7 +105,8 @@ class Problem:
         states = np.concatenate([np.zeros((1 + len(changes), 2, joints)), shifts])
         candidates = self.unknowns.candidates(self.unknowns.values(points))
         groups = self._groups(len(points))
-        tables = [table for group in groups for table in self._simulated(group, candidates, states)]
+        tasks = [self._task(group, candidates, states) for group in groups]
+        tables = [table for group in self.run(_simulated, tasks) for table in group]
         residuals: list[Any] = [None] * len(self.windows)
         slopes: list[Any] = [None] * len(self.windows)
         for number, table in zip([number for group in groups for number in group], tables, strict=True):
@@ -113,15 +116,15 @@ class Problem:
             residuals[number], slopes[number] = _projected(residual, slope, change[..., len(changes) :])
         return FitResiduals(residuals, slopes)
 
-    def _simulated(self, group: list[int], candidates: PlantCandidates, states: Float64) -> list[Float64]:
-        """Return the positions (candidates, rows, joints) in each window of a group."""
+    def _task(self, group: list[int], candidates: PlantCandidates, states: Float64) -> Any:
+        """Return the arguments of :func:`simulate` for a group of windows."""
         logs = [self.windows[number].log for number in group]
         drive = self.drives[logs[0]]
         if drive.params is not None:
             laws = [self.drives[log].params for log in logs]
             drive = drive._replace(params=bp.PIDParams(*map(_stacked, zip(*laws, strict=True))))
         stretches = [self.windows[number].stretch for number in group]
-        return simulate(self.plants[logs[0]], drive, candidates, states, stretches)
+        return self.plants[logs[0]], drive, candidates, states, stretches
 
     def _groups(self, candidates: int) -> list[list[int]]:
         """Return the numbers of windows that are simulated at once."""
@@ -188,6 +191,10 @@ class Problem:
         residuals = self.evaluate(point, None, free_states).residuals
         rows = [residual[mask(window)] for window, residual in zip(self.windows, residuals, strict=True)]
         return np.sqrt((np.concatenate(rows) ** 2).mean(0))
+
+
+def _simulated(task: Any) -> list[Float64]:
+    return simulate(*task)
 
 
 def _stacked(parts: Any) -> Any:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 from importlib.util import find_spec
+from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,6 +65,7 @@ def identify(
     extras: Sequence[str] = (),
     reading: Reading | None = None,
     evaluations: int = 30,
+    workers: int = 0,
     progress: Callable[[], Any] | None = None,
 ) -> Identification:
     """Find the motors of ``robot`` from logs of its motion.
@@ -88,6 +92,8 @@ def identify(
         Units and names in the files.
     evaluations
         Largest number of evaluations of the fit.
+    workers
+        Number of processes, 0 for this one.
     progress
         Called after each evaluation.
 
@@ -111,8 +117,13 @@ def identify(
     if {*LAW}.isdisjoint(extras) and _is_odd(data, guess) and (words := _better_reading(data)):
         raise InvalidArgumentError("logs", f"make sense with {words}", remedy="correct the log or its options")
     unknowns = _unknowns(data, guess, [*extras], flag("payload", payload))
-    problem = Problem(data.plants, data.drives, _windows(data), unknowns)
-    found = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
+    pool: Any = nullcontext()
+    if integer("workers", workers, 0, 1000) > 1:
+        pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+    with pool as executor:
+        run = map if executor is None else executor.map
+        problem = Problem(data.plants, data.drives, _windows(data), unknowns, run)
+        found = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
     if not found.explains and (words := _better_reading(data)):
         return replace(found, advice=f"the logs make more sense with {words}: correct the log or its options")
     return found
@@ -187,8 +198,8 @@ def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | 
     if recorded is None or law is None:
         return recorded if law is None else law
     for name in ("kp", "ki", "kd"):
-        pair = [0.0 if gain is None else gain for gain in (getattr(recorded, name), getattr(law, name))]
-        if not np.allclose(*pair, rtol=1e-6):
+        before, now = (0.0 if gain is None else gain for gain in (getattr(recorded, name), getattr(law, name)))
+        if not np.allclose(before, now, rtol=1e-6):
             problem = f"contradict {log.source}, which was recorded with another {name}"
             raise InvalidArgumentError("params", problem, remedy="leave them out: a recording has its own")
     return law

@@ -65,6 +65,12 @@ def test_motors_are_found_from_efforts(robot, effort_log):
     assert found.held_out_error[1] < 0.05 * found.held_out_error[0]
 
 
+def test_the_number_of_workers_does_not_change_the_result(robot, effort_log):
+    short = effort_log.part(slice(0, 200), slice(0, 200))
+    both = [identify(robot, [short], payload=False, evaluations=2, workers=workers) for workers in (0, 2)]
+    np.testing.assert_allclose(both[0].values, both[1].values, rtol=1e-6)
+
+
 @pytest.mark.parametrize("compensate", [pytest.param("gravity", marks=pytest.mark.slow), "gravity+coriolis+friction"])
 def test_a_compensation_through_the_motors_is_part_of_the_model(robot, compensate):
     log = log_of(robot, run(robot, motion(), compensate=compensate), NOISE)
