@@ -312,6 +312,7 @@ def simulate(
     q, v = (np.concatenate(starts[:, side] + states[:, None, side]) for side in (0, 1))
     if rows.actuators.position_offset is not None:
         q -= rows.actuators.position_offset
+    # State of the robots: dynamics, compensation, the efforts before the first row, control.
     dynamics = plant.dynamics(rows.masses, q, v)
     dynamics.update()
     compensation = _Compensation(plant, drive, dynamics, q, v, rows.actuators.position_offset)
@@ -324,11 +325,13 @@ def simulate(
     control = Control(drive, rows, q, v, efforts, plant.turns)
     if control.friction.coulomb is not None:
         control.state.friction.effort[...] = dynamics.force
+    # Inputs of each step.
     commands = _Commands(drive, rows, stretches)
     forwards = None
     if any(stretch.feedforward is not None for stretch in stretches):
         tables = [np.zeros_like(s.command) if s.feedforward is None else s.feedforward for s in stretches]
         forwards = _padded([table[s.past :] for table, s in zip(tables, stretches, strict=True)])
+    # Inertias that are added to the mass matrix; damping is implicit.
     armature = 0.0 if rows.actuators.armature is None else rows.actuators.armature
     viscous = 0.0 if control.friction.viscous is None else control.friction.viscous
     armature = np.zeros_like(q) + armature
@@ -337,6 +340,7 @@ def simulate(
     eye, shape = np.eye(q.shape[1]), (count, many, q.shape[1])
     places, speeds = q.reshape(shape), v.reshape(shape)
     out = [np.empty((count, len(stretch.step), q.shape[1])) for stretch in stretches]
+    # Rows of the logs that follow each step.
     events = defaultdict[int, list[tuple[int, int]]](list)
     for number, stretch in enumerate(stretches):
         for row, step in enumerate(stretch.step):
@@ -369,6 +373,7 @@ def simulate(
             for number, row in events.get(step, ()):
                 late = stretches[number].before[row]
                 out[number][:, row] = places[:, number] - late * speeds[:, number]
+    # Joints that diverged end at inf; the others are measured with their offset.
     diverged |= ~(np.abs(q) < DIVERGED).all(1)
     for number, table in enumerate(out):
         table += 0.0 if offset is None else offset[:, None]
