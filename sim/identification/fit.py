@@ -88,7 +88,7 @@ class Problem:
     windows: Sequence[Window]
     unknowns: Unknowns
     run: Callable[..., Any] = map
-    """``map``, or that of a pool of processes."""
+    """Map over the logs: ``map``, or ``Pool.map`` of worker processes."""
 
     def evaluate(self, point: Float64, steps: Float64 | None = None, free_states: bool = True) -> FitResiduals:
         """Return residuals at a point (unknowns,), and derivatives by ``steps`` (unknowns,); None: no derivatives.
