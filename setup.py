@@ -1,4 +1,5 @@
-"""Build of the extensions, which are optional unless BATCHPID_REQUIRE_NATIVE=1; all else is in pyproject.toml.
+"""Build of the extensions, which are optional unless BATCHPID_REQUIRE_NATIVE=1; all else is in
+pyproject.toml.
 
 With BATCHPID_NATIVE=0 none is built.
 """
@@ -14,9 +15,14 @@ from setuptools.errors import BaseError, CCompilerError
 
 ROOT = Path(__file__).parent
 REQUIRED = os.environ.get("BATCHPID_REQUIRE_NATIVE", "0")
-"""Environment variable: "1" makes an extension that cannot be built an error, as for wheels that are published."""
+"""Environment variable: "1" makes an extension that cannot be built an error, as for wheels that
+are published.
+"""
 if REQUIRED not in ("0", "1"):
-    sys.exit(f"batchpid: BATCHPID_REQUIRE_NATIVE is {REQUIRED!r}; set it to 1, or to 0 for a build without a compiler")
+    sys.exit(
+        f"batchpid: BATCHPID_REQUIRE_NATIVE is {REQUIRED!r}; set it to 1, or to 0 for a build"
+        " without a compiler"
+    )
 MODULES = (
     "batchpid.native.extensions",
     "batchpid.native.operations",
@@ -43,14 +49,19 @@ def built(extension):
         include_dirs=["."],
         extra_compile_args=list(extension.flags),
         language="c++",
-        define_macros=[("Py_LIMITED_API", "0x030B0000"), ("BATCHPID_SOURCES", f'"{" ".join(extension.digests())}"')],
+        define_macros=[
+            ("Py_LIMITED_API", "0x030B0000"),
+            ("BATCHPID_SOURCES", f'"{" ".join(extension.digests())}"'),
+        ],
         py_limited_api=True,
         optional=REQUIRED == "0",  # without a compiler batchpid works as well, only slower
     )
 
 
 class Build(build_ext):
-    """Build of all extensions at once, which names one that fails, and the remedy, if extensions are required."""
+    """Build of all extensions at once, which names one that fails, and the remedy, if extensions
+    are required.
+    """
 
     def finalize_options(self):
         """Use all cores by default."""
@@ -64,7 +75,10 @@ class Build(build_ext):
         except (BaseError, CCompilerError, OSError) as error:
             if REQUIRED == "0":
                 raise
-            remedy = "install a C++17 compiler, or unset BATCHPID_REQUIRE_NATIVE to build without native code"
+            remedy = (
+                "install a C++17 compiler, or unset BATCHPID_REQUIRE_NATIVE to build without native"
+                " code"
+            )
             sys.exit(f"batchpid: the extension {ext.name} cannot be built: {error}; {remedy}")
 
 
@@ -73,6 +87,8 @@ extensions = [extension for module in modules[1:] for extension in module.EXTENS
 setup(
     cmdclass={"build_ext": Build},
     # The longest to compile come first.
-    ext_modules=[built(extension) for extension in sorted(extensions, key=lambda each: -len(each.files))],
+    ext_modules=[
+        built(extension) for extension in sorted(extensions, key=lambda each: -len(each.files))
+    ],
     options={"bdist_wheel": {"py_limited_api": "cp311"}},
 )

@@ -6,21 +6,25 @@ Params say how to control, a state is carried from step to step, and every array
     import numpy as np
 
     params = bp.make_params(joints=9, kp=40, ki=5, kd=2, effort_limit=87, anti_windup="conditional")
-    pid = bp.BatchPID(params, num_envs=64, dt=1 / 2000)  # keeps the state; backend="jax" for the same law, jitted
-    effort = pid(np.ones((64, 9)), np.zeros((64, 9)))  # setpoint, measurement
+    pid = bp.BatchPID(params, num_envs=64, dt=1 / 2000)  # keeps the state; backend="jax" for the
+    same law, jitted effort = pid(np.ones((64, 9)), np.zeros((64, 9)))  # setpoint, measurement
 
-- Control: :class:`BatchPID`, or the pure functions :func:`init`, :func:`step`, :func:`reset` and :func:`track`, which
-  take and return a :class:`PIDState`; :func:`discretise` and :func:`advance` for loops with constant params;
-  :func:`step_terms` returns all terms of the effort, as :func:`advance` does.
-- Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.gains.presets` for the tutorial's;
-  :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`, :func:`load_about`.
-- Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`, :func:`spectral_radius`.
+- Control: :class:`BatchPID`, or the pure functions :func:`init`, :func:`step`, :func:`reset` and
+  :func:`track`, which take and return a :class:`PIDState`; :func:`discretise` and :func:`advance`
+  for loops with constant params; :func:`step_terms` returns all terms of the effort, as
+  :func:`advance` does.
+- Params: :func:`make_params`, ``params.replace(...)``; :mod:`batchpid.gains.presets` for the
+  tutorial's; :func:`save_params`, :func:`load_params`, :func:`dumps_params`, :func:`loads_params`,
+  :func:`load_about`.
+- Gains: :func:`design_gains` from a robot's inertia; :func:`stability_bound`,
+  :func:`spectral_radius`.
 - A simulator's drive with integral action: :func:`drive_target`.
 - Limits of setpoints: :func:`make_guard` and :mod:`batchpid.motors.guard`.
 - Real motors and sensors: :func:`make_actuators` and :mod:`batchpid.motors`.
 - Control of a tool: :mod:`batchpid.task_space`.
-- In modules: setpoints in :mod:`batchpid.trajectories`, figures of merit in :mod:`batchpid.metrics`, gains per unit of
-  inertia in :mod:`batchpid.law.computed_torque`, errors in :mod:`batchpid.errors`.
+- In modules: setpoints in :mod:`batchpid.trajectories`, figures of merit in
+  :mod:`batchpid.metrics`, gains per unit of inertia in :mod:`batchpid.law.computed_torque`, errors
+  in :mod:`batchpid.errors`.
 
 Requires NumPy alone; JAX, PyYAML and ruckig are imported on first use.
 """
@@ -31,7 +35,13 @@ from batchpid.errors import BatchPIDError, InvalidArgumentError, MissingDependen
 from batchpid.gains import presets
 from batchpid.gains.design import design_gains
 from batchpid.gains.stability import spectral_radius, stability_bound
-from batchpid.io.params_files import dumps_params, load_about, load_params, loads_params, save_params
+from batchpid.io.params_files import (
+    dumps_params,
+    load_about,
+    load_params,
+    loads_params,
+    save_params,
+)
 from batchpid.law.bumpless import track
 from batchpid.law.coefficients import Coefficients, discretise
 from batchpid.law.params import PIDParams, make_params

@@ -17,7 +17,9 @@ from batchpid.native.availability import obstacle
 from batchpid.native.compiled import CompiledLaw
 
 LARGE = 2**18
-"""Number of envs from which JAX's CPU backend steps block by block: it maps larger buffers again at every call."""
+"""Number of envs from which JAX's CPU backend steps block by block: it maps larger buffers again at
+every call.
+"""
 
 
 def declined(*_: Any) -> Any:
@@ -26,7 +28,8 @@ def declined(*_: Any) -> Any:
 
 
 class NumPyBackend:
-    """The law on NumPy's arrays: by the native extension where there is one, else by NumPy, with the same bytes.
+    """The law on NumPy's arrays: by the native extension where there is one, else by NumPy, with
+    the same bytes.
 
     Its coefficients are computed once; for NumPy they are spread over all envs.
     """
@@ -36,13 +39,19 @@ class NumPyBackend:
         self.terms = terms
         self.threads = threads
         self.native = not obstacle()
-        """Whether the native extension computes the law, which then writes over the arrays of the state."""
+        """Whether the native extension computes the law, which then writes over the arrays of the
+        state.
+        """
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
         """Take params for (envs, joints) ``shape``."""
         self.params, self.shape = params, shape
         self.coefficients = discretise(params, self.dt, 1 if self.native else shape[0])
-        self._law = CompiledLaw(self.coefficients, shape[0], self.terms, self.threads) if self.native else None
+        self._law = (
+            CompiledLaw(self.coefficients, shape[0], self.terms, self.threads)
+            if self.native
+            else None
+        )
 
     def __getstate__(self) -> Document:
         return {**self.__dict__, "_law": None}
@@ -61,11 +70,15 @@ class NumPyBackend:
         """Return ``function(params, *inputs, **named)``: init, reset or track of the law."""
         return function(self.params, *inputs, **named)
 
-    def step(self, state: PIDState, out: Any, *inputs: Any) -> tuple[PIDState, Any, Terms | None, Callable[..., Any]]:
-        """Return the new state, the effort, the terms if they are kept, and a fast call of the next steps.
+    def step(
+        self, state: PIDState, out: Any, *inputs: Any
+    ) -> tuple[PIDState, Any, Terms | None, Callable[..., Any]]:
+        """Return the new state, the effort, the terms if they are kept, and a fast call of the next
+        steps.
 
-        The effort is ``out``, if that is not None. The fast call takes ``out`` and the inputs and returns the effort,
-        or NotImplemented. It may be used while the state is the new one and nobody else holds its arrays.
+        The effort is ``out``, if that is not None. The fast call takes ``out`` and the inputs and
+        returns the effort, or NotImplemented. It may be used while the state is the new one and
+        nobody else holds its arrays.
         """
         if self._law is not None:
             state, effort, shown, fast = self._law.step(state, inputs, out)
@@ -78,7 +91,8 @@ class NumPyBackend:
 
 
 class JAXBackend:
-    """The law compiled by JAX: once per structure of params and inputs, with the state's buffers donated.
+    """The law compiled by JAX: once per structure of params and inputs, with the state's buffers
+    donated.
 
     A call costs JAX some 4 us per array, so the params that all envs share travel as one.
     """
@@ -94,13 +108,19 @@ class JAXBackend:
         self.jax, self.terms = jax, terms
         self.dtype: Any = None
         self._compiled: dict[Any, Any] = {}
-        self._spare: PIDState | None = None  # the state before the last, whose buffers may be overwritten
+        self._spare: PIDState | None = (
+            None  # the state before the last, whose buffers may be overwritten
+        )
 
-        def step(params: PIDParams, state: PIDState, *inputs: Any) -> tuple[PIDState, Any, Terms | None]:
+        def step(
+            params: PIDParams, state: PIDState, *inputs: Any
+        ) -> tuple[PIDState, Any, Terms | None]:
             new, found = pid.advance(discretise(params, dt), state, *inputs)
             return new, found.effort, found.filled() if terms else None
 
-        def step_in_blocks(params: PIDParams, spare: PIDState, state: PIDState, *inputs: Any) -> Array:
+        def step_in_blocks(
+            params: PIDParams, spare: PIDState, state: PIDState, *inputs: Any
+        ) -> Array:
             out = (spare, jax.numpy.zeros_like(inputs[1]))
             return blocks.advance_in_blocks(discretise(params, dt), state, *inputs, out=out)
 
@@ -108,7 +128,9 @@ class JAXBackend:
         self._step_in_blocks = self._compile(step_in_blocks, donate_argnums=3)
 
     def _compile(self, function: Any, **options: Any) -> Any:
-        """Return a function of params and more, compiled as one of packed params: layout, shared, own."""
+        """Return a function of params and more, compiled as one of packed params: layout, shared,
+        own.
+        """
 
         def packed(layout: Any, shared: Any, own: Any, *inputs: Any, **named: Any) -> Any:
             tree, is_shared = layout
@@ -116,7 +138,9 @@ class JAXBackend:
             leaves = [next(shared if one else own) for one in is_shared]
             return function(self.jax.tree.unflatten(tree, leaves), *inputs, **named)
 
-        return self.jax.jit(packed, static_argnums=0, static_argnames=("dt", "keep_integral"), **options)
+        return self.jax.jit(
+            packed, static_argnums=0, static_argnames=("dt", "keep_integral"), **options
+        )
 
     def prepare(self, params: PIDParams, shape: tuple[int, int]) -> None:
         """Take params for (envs, joints) ``shape``."""
@@ -125,7 +149,9 @@ class JAXBackend:
         is_shared = tuple(leaf.shape[0] == 1 for leaf in leaves)
         with own_settings(self.dtype):
             shared = [np.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if one]
-            own = [jnp.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if not one]
+            own = [
+                jnp.asarray(leaf) for leaf, one in zip(leaves, is_shared, strict=True) if not one
+            ]
             stacked = np.stack(shared) if shared else np.empty((0, 1, shape[1]), params.dtype)
             self.packed = ((tree, is_shared), jnp.asarray(stacked), own)
         self.dtype, self._spare = self.packed[1].dtype, None
@@ -149,11 +175,17 @@ class JAXBackend:
     def step(
         self, state: PIDState, out: None, r: Array, y: Array, *rates: Array
     ) -> tuple[PIDState, Any, Terms | None, Callable[..., Any]]:
-        """Return the new state, the effort, the terms if they are kept, and no fast call; ``out`` is None."""
+        """Return the new state, the effort, the terms if they are kept, and no fast call; ``out``
+        is None.
+        """
         with own_settings(self.dtype):
             if y.shape[0] < LARGE or self.terms or not self._on_one_cpu(y):
                 return *self._step(*self.packed, state, r, y, *rates), declined
-            spare = self.jax.tree.map(self.jax.numpy.zeros_like, state) if self._spare is None else self._spare
+            spare = (
+                self.jax.tree.map(self.jax.numpy.zeros_like, state)
+                if self._spare is None
+                else self._spare
+            )
             new, effort = self._step_in_blocks(*self.packed, spare, state, r, y, *rates)
         self._spare = state
         return new, effort, None, declined

@@ -11,7 +11,15 @@ from batchpid.arrays.array_types import Array, Document
 from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
 from batchpid.backends import JAXBackend, NumPyBackend, declined
-from batchpid.checks.validate import choice, env_mask, instance, integer, names, read_array, time_step
+from batchpid.checks.validate import (
+    choice,
+    env_mask,
+    instance,
+    integer,
+    names,
+    read_array,
+    time_step,
+)
 from batchpid.errors import InvalidArgumentError
 from batchpid.law import bumpless, pid
 from batchpid.law.input_checks import check_alone
@@ -26,7 +34,8 @@ MOST_THREADS = 1024
 class BatchPID:
     """PID controller of (num_envs, joints) loops that keeps its state between calls.
 
-    It starts from the first measurement. Efforts are arrays of the backend, in the params' dtype, and new in each call.
+    It starts from the first measurement. Efforts are arrays of the backend, in the params' dtype,
+    and new in each call.
 
     Parameters
     ----------
@@ -37,16 +46,16 @@ class BatchPID:
     dt
         Time between calls [s].
     backend
-        "numpy": computed by the native extension where that was built, with the bytes of NumPy but without its
-        floating-point warnings. Or "jax": compiled once, with the state's buffers donated from call to call, and on a
-        CPU block by block where the batch is large.
+        "numpy": computed by the native extension where that was built, with the bytes of NumPy but
+        without its floating-point warnings. Or "jax": compiled once, with the state's buffers
+        donated from call to call, and on a CPU block by block where the batch is large.
     terms
         Keep the :class:`batchpid.Terms` of the last call, at the cost of computing them.
     joint_names
         Used in error messages.
     threads
-        Largest number of threads of the native extension, which uses them for large batches; None: the cores that this
-        process may use. The result does not depend on it.
+        Largest number of threads of the native extension, which uses them for large batches; None:
+        the cores that this process may use. The result does not depend on it.
 
     Raises
     ------
@@ -69,7 +78,9 @@ class BatchPID:
     ) -> None:
         self._backend, self._dt = choice("backend", backend, BACKENDS), time_step("dt", dt)
         self._shape = (integer("num_envs", num_envs, 1, MOST_ENVS), _checked(params).num_joints)
-        self._names = None if joint_names is None else names("joint_names", joint_names, self.num_joints)
+        self._names = (
+            None if joint_names is None else names("joint_names", joint_names, self.num_joints)
+        )
         threads = None if threads is None else integer("threads", threads, 1, MOST_THREADS)
         self._engine = BACKENDS[self._backend](self._dt, terms, threads)
         self._state: PIDState | None = None
@@ -84,7 +95,10 @@ class BatchPID:
         started = "not started" if self._state is None else "started"
         envs, joints = self._shape
         backend = f"{self._backend!r}{' (native)' * self.native}"
-        return f"BatchPID({envs} envs, {joints} joints, dt {self._dt:g} s, backend {backend}, {started})"
+        return (
+            f"BatchPID({envs} envs, {joints} joints, dt {self._dt:g} s, backend {backend},"
+            f" {started})"
+        )
 
     def __getstate__(self) -> Document:
         self._fast, self._lent = declined, True  # a shallow copy holds the same arrays
@@ -119,8 +133,8 @@ class BatchPID:
     def params(self) -> PIDParams:
         """Params of the law. Assign others at any time: they are checked, and the state is kept.
 
-        A change of ki, limits or times makes no bump, since the integral is an effort. A change of kp or kd does,
-        unless :meth:`track` follows it with the last effort.
+        A change of ki, limits or times makes no bump, since the integral is an effort. A change of
+        kp or kd does, unless :meth:`track` follows it with the last effort.
         """
         return self._params
 
@@ -133,7 +147,9 @@ class BatchPID:
         check_alone(params._replace(measurement_rate=None), None)
         if params.dtype != self._params.dtype:
             problem = f"are {params.dtype}, the controller's {self._params.dtype}"
-            raise InvalidArgumentError("params", problem, remedy="build them with that dtype, or a new BatchPID")
+            raise InvalidArgumentError(
+                "params", problem, remedy="build them with that dtype, or a new BatchPID"
+            )
         params = frozen(params)
         self._engine.prepare(params, self._shape)
         self._params = params
@@ -142,7 +158,9 @@ class BatchPID:
 
     @property
     def state(self) -> PIDState | None:
-        """State of the law, read-only; None before the first measurement. With JAX it is valid until the next call."""
+        """State of the law, read-only; None before the first measurement. With JAX it is valid
+        until the next call.
+        """
         self._fast, self._lent = declined, True
         return None if self._state is None else PIDState(*map(read_only, self._state))
 
@@ -150,7 +168,9 @@ class BatchPID:
     def terms(self) -> Terms | None:
         """Terms of the last call, read-only; None before the first."""
         if not self._engine.terms:
-            raise InvalidArgumentError("terms", "are not kept", remedy="build the BatchPID with terms=True")
+            raise InvalidArgumentError(
+                "terms", "are not kept", remedy="build the BatchPID with terms=True"
+            )
         return None if self._terms is None else Terms(*map(read_only, self._terms))
 
     def __call__(
@@ -165,33 +185,48 @@ class BatchPID:
     ) -> Array:
         """Return the effort (envs, joints) [N m or N]; arguments as in :func:`batchpid.step`.
 
-        ``measurement`` is (envs, joints); the others may be anything that broadcasts to that. ``out`` is an array to
-        write the effort to and to return, of the params' dtype: with many envs, the pages of a new one cost more than
-        the law. It may be one of the inputs. Where a shape is wrong, InvalidArgumentError is raised and the state is
-        unchanged.
+        ``measurement`` is (envs, joints); the others may be anything that broadcasts to that.
+        ``out`` is an array to write the effort to and to return, of the params' dtype: with many
+        envs, the pages of a new one cost more than the law. It may be one of the inputs. Where a
+        shape is wrong, InvalidArgumentError is raised and the state is unchanged.
         """
         if measurement_rate is None:
             check_alone(self._params, None)
-        effort = self._fast(out, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
+        effort = self._fast(
+            out, setpoint, measurement, measurement_rate, setpoint_rate, feedforward
+        )
         if effort is not NotImplemented:
             return effort
-        r, y = self._array("setpoint", setpoint), self._array("measurement", measurement, exact=True)
-        rest = self._optional(measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward)
+        r, y = (
+            self._array("setpoint", setpoint),
+            self._array("measurement", measurement, exact=True),
+        )
+        rest = self._optional(
+            measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward
+        )
         if out is not None:
             self._check_out(out)
         state = self._started(y)
         if self._lent and self._engine.native:
             state = PIDState(*(None if leaf is None else leaf.copy() for leaf in state))
-        self._state, effort, self._terms, self._fast = self._engine.step(state, out, r, y, *rest.values())
+        self._state, effort, self._terms, self._fast = self._engine.step(
+            state, out, r, y, *rest.values()
+        )
         self._lent = False
         return effort
 
     def reset(self, measurement: Array, mask: Array = None, *, keep_integral: bool = False) -> None:
-        """Restart the envs of ``mask`` (envs,) bool, or all, from ``measurement`` (envs, joints)."""
+        """Restart the envs of ``mask`` (envs,) bool, or all, from ``measurement`` (envs,
+        joints).
+        """
         y = self._array("measurement", measurement, exact=True)
-        mask = np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
+        mask = (
+            np.ones(self.num_envs, bool) if mask is None else env_mask("mask", mask, self.num_envs)
+        )
         self._fast = declined
-        self._state = self._engine.call(pid.reset, self._started(y), y, mask, keep_integral=bool(keep_integral))
+        self._state = self._engine.call(
+            pid.reset, self._started(y), y, mask, keep_integral=bool(keep_integral)
+        )
 
     def track(
         self,
@@ -202,18 +237,26 @@ class BatchPID:
         setpoint_rate: Array = None,
         feedforward: Array = None,
     ) -> None:
-        """Make the next call on these same inputs return ``effort``: bumpless, as :func:`batchpid.track`."""
+        """Make the next call on these same inputs return ``effort``: bumpless, as
+        :func:`batchpid.track`.
+        """
         r, y, u = (
             self._array("setpoint", setpoint),
             self._array("measurement", measurement, exact=True),
             self._array("effort", effort),
         )
-        rest = self._optional(measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward)
+        rest = self._optional(
+            measurement_rate=measurement_rate, setpoint_rate=setpoint_rate, feedforward=feedforward
+        )
         self._fast = declined
-        self._state = self._engine.call(bumpless.track, self._started(y), r, y, u, dt=self._dt, **rest)
+        self._state = self._engine.call(
+            bumpless.track, self._started(y), r, y, u, dt=self._dt, **rest
+        )
 
     def _started(self, y: Array) -> PIDState:
-        """Return the state, begun at the first measurement, with every leaf that the params need."""
+        """Return the state, begun at the first measurement, with every leaf that the params
+        need.
+        """
         if self._state is None:
             return self._engine.call(pid.init, y)
         if self._stale:
@@ -221,10 +264,16 @@ class BatchPID:
         return self._state
 
     def _optional(self, **values: Array) -> Document:
-        return {name: None if value is None else self._array(name, value) for name, value in values.items()}
+        return {
+            name: None if value is None else self._array(name, value)
+            for name, value in values.items()
+        }
 
     def _check_out(self, out: Any) -> None:
-        dtype, remedy = self._params.dtype, "leave it out, or give np.empty((num_envs, joints), params.dtype)"
+        dtype, remedy = (
+            self._params.dtype,
+            "leave it out, or give np.empty((num_envs, joints), params.dtype)",
+        )
         if self._backend != "numpy":
             problem, remedy = f"is not for backend {self._backend!r}", "leave it out"
         elif not isinstance(out, np.ndarray):
@@ -238,7 +287,9 @@ class BatchPID:
         raise InvalidArgumentError("out", problem, remedy=remedy)
 
     def _array(self, name: str, value: Any, exact: bool = False) -> Array:
-        """Return ``value`` as an array of the backend that broadcasts to (envs, joints), or is ``exact``-ly that."""
+        """Return ``value`` as an array of the backend that broadcasts to (envs, joints), or is
+        ``exact``-ly that.
+        """
         if isinstance(value, np.ndarray) or not hasattr(value, "dtype"):
             value = read_array(name, value)
         try:
@@ -252,10 +303,14 @@ class BatchPID:
             problem = f"has shape {array.shape}, not {self._shape}"
             raise InvalidArgumentError(name, problem, remedy="give (num_envs, joints)")
         envs, joints = self._shape
-        if array.ndim <= 2 and all(n in (1, m) for n, m in zip(array.shape[::-1], (joints, envs), strict=False)):
+        if array.ndim <= 2 and all(
+            n in (1, m) for n, m in zip(array.shape[::-1], (joints, envs), strict=False)
+        ):
             return array.reshape((1,) * (2 - array.ndim) + array.shape)
         problem = f"has shape {array.shape}, which does not broadcast to {self._shape}"
-        raise InvalidArgumentError(name, problem, remedy="give one value, one per joint, or one per env and joint")
+        raise InvalidArgumentError(
+            name, problem, remedy="give one value, one per joint, or one per env and joint"
+        )
 
 
 def _checked(params: Any) -> PIDParams:

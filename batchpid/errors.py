@@ -20,8 +20,9 @@ class BatchPIDError(Exception):
 class InvalidArgumentError(BatchPIDError, ValueError):
     """An argument has a wrong type, shape, dtype, range or a non-finite entry.
 
-    Raised before anything is changed. ``argument``, ``joint``, ``entry``, ``env``, ``value`` and ``remedy`` hold the
-    facts of the message, for programs; ``entry`` is the name in an array whose columns are not joints.
+    Raised before anything is changed. ``argument``, ``joint``, ``entry``, ``env``, ``value`` and
+    ``remedy`` hold the facts of the message, for programs; ``entry`` is the name in an array whose
+    columns are not joints.
     """
 
     def __init__(
@@ -43,7 +44,9 @@ class InvalidArgumentError(BatchPIDError, ValueError):
         self.env = env
         self.value = value
         places = {"joint": joint, "entry": entry, "env": env}
-        where = "".join(f", {kind} {place!r}" for kind, place in places.items() if place is not None)
+        where = "".join(
+            f", {kind} {place!r}" for kind, place in places.items() if place is not None
+        )
         got = "" if value is None else f" (got {_SHORT.repr(value)})"
         super().__init__(f"{argument}{where}: {problem}{got}; {remedy}")
 
@@ -55,24 +58,31 @@ class InvalidArgumentError(BatchPIDError, ValueError):
 class ControllerError(InvalidArgumentError):
     """The caller's own controller raised, or returned an unusable state or effort, in a sim step.
 
-    It closes the runner. ``step`` counts sim steps within the tick, or, in an error returned by :meth:`at`, since the
-    start of the runner. The controller's own error, if there is one, is the ``__cause__``; an error from a worker
-    process has the traceback as a note.
+    It closes the runner. ``step`` counts sim steps within the tick, or, in an error returned by
+    :meth:`at`, since the start of the runner. The controller's own error, if there is one, is the
+    ``__cause__``; an error from a worker process has the traceback as a note.
     """
 
     def __init__(self, name: str, error: Exception, step: int) -> None:
         if isinstance(error, InvalidArgumentError):
             problem, remedy = error.problem, error.remedy
         else:
-            problem, remedy = f"{name} raised {type(error).__name__}: {error}", "correct the controller"
+            problem, remedy = (
+                f"{name} raised {type(error).__name__}: {error}",
+                "correct the controller",
+            )
         super().__init__("control", problem, remedy=remedy)
         self.step = step
 
     def at(self, step: int, timestep: float) -> ControllerError:
-        """Return the error with a message that says when it happened: at ``step`` since the start of the runner."""
+        """Return the error with a message that says when it happened: at ``step`` since the start
+        of the runner.
+        """
         when = f"in sim step {step} ({step * timestep:g} s)"
         problem = InvalidArgumentError(
-            "control", f"{self.problem}, {when}", remedy=f"{self.remedy}, and make a new Runner: this one is closed"
+            "control",
+            f"{self.problem}, {when}",
+            remedy=f"{self.remedy}, and make a new Runner: this one is closed",
         )
         error = ControllerError("", problem, step)
         error.__cause__ = self.__cause__
@@ -80,7 +90,9 @@ class ControllerError(InvalidArgumentError):
 
 
 class RobotError(BatchPIDError, ValueError):
-    """A robot description cannot be used; the message names the file, the element and the remedy."""
+    """A robot description cannot be used; the message names the file, the element and the
+    remedy.
+    """
 
 
 class RobotNotFoundError(RobotError, FileNotFoundError):
@@ -88,14 +100,18 @@ class RobotNotFoundError(RobotError, FileNotFoundError):
 
 
 class MissingDependencyError(BatchPIDError, ImportError):
-    """A package is missing or too old; the message names the extra that installs it, if one does."""
+    """A package is missing or too old; the message names the extra that installs it, if one
+    does.
+    """
 
     def __init__(self, package: str, purpose: str, extra: str | None = None) -> None:
         self.package = package
         self.purpose = purpose
         self.extra = extra
         wanted = package if extra is None else f"batchpid[{extra}]"
-        super().__init__(f"{purpose} needs the package {package!r}; install it with: pip install '{wanted}'")
+        super().__init__(
+            f"{purpose} needs the package {package!r}; install it with: pip install '{wanted}'"
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (type(self), (self.package, self.purpose, self.extra))
@@ -118,4 +134,6 @@ class NotCopyableError(BatchPIDError, TypeError):
 
 
 class InUseError(BatchPIDError, RuntimeError):
-    """The object is in use: by another thread, a signal handler, or the process from which this one was forked."""
+    """The object is in use: by another thread, a signal handler, or the process from which this one
+    was forked.
+    """

@@ -11,10 +11,10 @@ With setpoint r, start y0, move A = r - y0 and error e = r - y, per env and join
     effort variation     sum |u_k - u_{k-1}|: chatter of the actuator
     saturation share     of the samples
 
-Rise time, overshoot and settling time as in K. J. Astrom and R. M. Murray, Feedback Systems (Princeton, 2nd ed.),
-section 6.3; ITAE after D. Graham and R. C. Lathrop, "The synthesis of optimum transient response", Trans. AIEE 72
-(1953); total variation of the effort after S. Skogestad, "Simple analytic rules for model reduction and PID
-controller tuning", J. Process Control 13 (2003).
+Rise time, overshoot and settling time as in K. J. Astrom and R. M. Murray, Feedback Systems
+(Princeton, 2nd ed.), section 6.3; ITAE after D. Graham and R. C. Lathrop, "The synthesis of optimum
+transient response", Trans. AIEE 72 (1953); total variation of the effort after S. Skogestad,
+"Simple analytic rules for model reduction and PID controller tuning", J. Process Control 13 (2003).
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ from batchpid.errors import InvalidArgumentError
 class StepMetrics(NamedTuple):
     """Figures of merit of a step response, each (envs, joints); lower is better.
 
-    A time that is not reached, and every figure of a joint that was not finite throughout, is inf. An undefined
-    figure (rise time and overshoot of a joint that hardly moves, effort figures without efforts) is NaN.
+    A time that is not reached, and every figure of a joint that was not finite throughout, is inf.
+    An undefined figure (rise time and overshoot of a joint that hardly moves, effort figures
+    without efforts) is NaN.
     """
 
     rise_time: Float64
@@ -64,7 +65,8 @@ class StepMetrics(NamedTuple):
         return array_summary(self, "envs", "joints")
 
     def over_envs(self, statistic: Callable[[Float64], Any]) -> StepMetrics:
-        """Return each figure reduced over envs to (joints,) by ``statistic``, a function of one joint's figures.
+        """Return each figure reduced over envs to (joints,) by ``statistic``, a function of one
+        joint's figures.
 
         Undefined figures (NaN) are left out; a joint that has no other stays NaN.
         """
@@ -103,10 +105,11 @@ def step_metrics(
     Parameters
     ----------
     dt
-        Time between samples [s]. The step is at 0: at the first sample, or with ``start`` one dt before it.
+        Time between samples [s]. The step is at 0: at the first sample, or with ``start`` one dt
+        before it.
     setpoint
-        (joints,), (envs, joints) or (ticks, envs, joints) [rad or m]; the last row is where the move ends, the
-        errors of IAE and ITAE are to each row's own.
+        (joints,), (envs, joints) or (ticks, envs, joints) [rad or m]; the last row is where the
+        move ends, the errors of IAE and ITAE are to each row's own.
     measurement
         (ticks, envs, joints) [rad or m].
     start
@@ -116,8 +119,9 @@ def step_metrics(
     band
         Half width of the settling band, as a fraction of the move.
     absolute_band
-        Its least half width [rad or m], a number or (joints,). Rise time and overshoot are undefined for moves smaller
-        than absolute_band / band, where they would compare noise with noise.
+        Its least half width [rad or m], a number or (joints,). Rise time and overshoot are
+        undefined for moves smaller than absolute_band / band, where they would compare noise with
+        noise.
     tail
         Last share of the record, over which the steady-state error is taken.
     continuous
@@ -134,14 +138,18 @@ def step_metrics(
         raise InvalidArgumentError("measurement", problem, remedy="pass a rollout's qpos")
     number("band", band, 1e-9, 1.0, "fraction of the move")
     number("tail", tail, 1e-9, 1.0, "share of the record")
-    r, floor = broadcast("setpoint", setpoint, y.shape), broadcast("absolute_band", absolute_band, y.shape[1:])
+    r, floor = (
+        broadcast("setpoint", setpoint, y.shape),
+        broadcast("absolute_band", absolute_band, y.shape[1:]),
+    )
     u = None if effort is None else broadcast("effort", effort, y.shape)
     limited = None if saturated is None else read_array("saturated", saturated, "b")
     if start is not None:
         y = np.concatenate([broadcast("start", start, y.shape[1:])[None], y])
         r = np.concatenate([r[:1], r])
     t = time_step("dt", dt) * np.arange(len(y), dtype=np.float64)
-    # A joint with a NaN gets figures of inf, by judged() below: it must lose every comparison, not drop out of it.
+    # A joint with a NaN gets figures of inf, by judged() below: it must lose every comparison, not
+    # drop out of it.
     finite = np.isfinite(y).all(0) & np.isfinite(r).all(0)
     y, r = np.where(finite, y, 0.0), np.where(finite, r, 0.0)
     if continuous is not None:
@@ -151,7 +159,8 @@ def step_metrics(
     size, direction = np.abs(move), np.where(move < 0, -1.0, 1.0)
     error, final_error = r - y, r[-1] - y
     tolerance: Float64 = np.maximum(band * size, floor)
-    # For a joint that hardly moves, rise and overshoot would measure noise; its deviation is still reported.
+    # For a joint that hardly moves, rise and overshoot would measure noise; its deviation is still
+    # reported.
     moves = size >= floor / band
     beyond = np.where(moves, np.max(-final_error * direction, 0), np.max(np.abs(final_error), 0))
     beyond = np.maximum(beyond, 0.0)
@@ -180,7 +189,9 @@ def step_metrics(
 
 
 def _first_crossing(t: Float64, progress: Float64, level: float) -> Float64:
-    """Return when ``progress`` (ticks, envs, joints) first reaches ``level``, between samples by a line; else inf."""
+    """Return when ``progress`` (ticks, envs, joints) first reaches ``level``, between samples by a
+    line; else inf.
+    """
     reached = progress >= level
     k = np.maximum(np.argmax(reached, 0), 1)
     before, after = _row(progress, k - 1), _row(progress, k)
@@ -189,7 +200,9 @@ def _first_crossing(t: Float64, progress: Float64, level: float) -> Float64:
 
 
 def _settling_time(t: Float64, error: Float64, tolerance: Float64) -> Float64:
-    """Return when ``error`` last enters the band, between samples by a line; inf if it ends outside."""
+    """Return when ``error`` last enters the band, between samples by a line; inf if it ends
+    outside.
+    """
     outside = np.abs(error) > tolerance
     last = len(t) - 1 - np.argmax(outside[::-1], 0)
     k = np.minimum(last, len(t) - 2)

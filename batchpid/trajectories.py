@@ -1,4 +1,5 @@
-r"""Setpoints that a robot can follow: point-to-point moves of many envs at once, sampled at the control ticks.
+r"""Setpoints that a robot can follow: point-to-point moves of many envs at once, sampled at the
+control ticks.
 
 A move from x0 to x1 is x(t) = x0 + (x1 - x0) s(t), with s from 0 to 1::
 
@@ -6,9 +7,10 @@ A move from x0 to x1 is x(t) = x0 + (x1 - x0) s(t), with s from 0 to 1::
     trapezoidal     s'' = +a, 0, -a                                         the fastest within v and a
     jerk limited    s''' = +j, 0, -j                                        the fastest within v, a and j
 
-The first is T. Flash and N. Hogan, The coordination of arm movements, J. Neurosci. 5(7), 1985; the second B. Siciliano
-et al., Robotics: Modelling, Planning and Control (2009), section 4.2; the third is computed by the ``ruckig`` library
-(L. Berscheid and T. Kroeger, Jerk-limited real-time trajectory generation, RSS 2021).
+The first is T. Flash and N. Hogan, The coordination of arm movements, J. Neurosci. 5(7), 1985; the
+second B. Siciliano et al., Robotics: Modelling, Planning and Control (2009), section 4.2; the third
+is computed by the ``ruckig`` library (L. Berscheid and T. Kroeger, Jerk-limited real-time
+trajectory generation, RSS 2021).
 """
 
 from __future__ import annotations
@@ -31,10 +33,12 @@ _NO_WAY = 1e-100  # [rad or m]: below this a quotient by the distance would over
 
 
 class Trajectory(NamedTuple):
-    """Setpoints by tick: ``time`` (ticks,) [s], the others (ticks, ..., joints) in rad or m, and per s and s^2.
+    """Setpoints by tick: ``time`` (ticks,) [s], the others (ticks, ..., joints) in rad or m, and
+    per s and s^2.
 
     Row k is for tick k and holds the target at the end of the tick, ``time[k]`` = (k + 1) dt. So
-    ``runner.rollout(t.position, setpoint_rates=t.velocity)`` follows it, and the last row is the target itself.
+    ``runner.rollout(t.position, setpoint_rates=t.velocity)`` follows it, and the last row is the
+    target itself.
     """
 
     time: Float64
@@ -60,16 +64,24 @@ class Trajectory(NamedTuple):
         """
         dt = self.time[0]
         if other.position.shape[1:] != self.position.shape[1:]:
-            problem = f"moves {other.position.shape[1:]} (..., joints), not {self.position.shape[1:]}"
+            problem = (
+                f"moves {other.position.shape[1:]} (..., joints), not {self.position.shape[1:]}"
+            )
             raise InvalidArgumentError("other", problem, remedy="give both the same shape")
         if not math.isclose(other.time[0], dt, rel_tol=1e-9):
             remedy = f"use dt={dt:g} in both"
-            raise InvalidArgumentError("other", "has another tick", value=float(other.time[0]), remedy=remedy)
+            raise InvalidArgumentError(
+                "other", "has another tick", value=float(other.time[0]), remedy=remedy
+            )
         time = dt * np.arange(1, self.ticks + other.ticks + 1)
-        return Trajectory(time, *(np.concatenate(pair) for pair in zip(self[1:], other[1:], strict=True)))
+        return Trajectory(
+            time, *(np.concatenate(pair) for pair in zip(self[1:], other[1:], strict=True))
+        )
 
     def hold(self, duration: float) -> Trajectory:
-        """Return this trajectory with its last position held for ``duration`` [s], rounded up to whole ticks."""
+        """Return this trajectory with its last position held for ``duration`` [s], rounded up to
+        whole ticks.
+        """
         ticks = _count(positive("duration", duration, "s"), self.time[0])
         still = np.broadcast_to(self.position[-1], (ticks, *self.position.shape[1:]))
         rest = np.zeros_like(still)
@@ -94,15 +106,18 @@ def minimum_jerk(
     dt
         Time of a tick [s].
     duration
-        T [s]: a number, (envs, 1) or (envs, joints); a joint that arrives before others holds its target.
+        T [s]: a number, (envs, 1) or (envs, joints); a joint that arrives before others holds its
+        target.
     max_velocity, max_acceleration
-        Instead of ``duration``: limits > 0 of every joint, (joints,) or (envs, joints). Each env takes the shortest T
-        that respects them on all of its joints; an infinite limit does not apply.
+        Instead of ``duration``: limits > 0 of every joint, (joints,) or (envs, joints). Each env
+        takes the shortest T that respects them on all of its joints; an infinite limit does not
+        apply.
 
     Raises
     ------
     InvalidArgumentError
-        Naming the argument and joint; also where neither a duration nor a finite limit is given, or both are.
+        Naming the argument and joint; also where neither a duration nor a finite limit is given, or
+        both are.
     """
     x0, way = _move(start, target)
     if (duration is None) == (max_velocity is None and max_acceleration is None):
@@ -111,12 +126,27 @@ def minimum_jerk(
     if duration is not None:
         total = _limits("duration", duration, way)
     else:
-        v = _limits("max_velocity", math.inf if max_velocity is None else max_velocity, way, finite=False)
-        a = _limits("max_acceleration", math.inf if max_acceleration is None else max_acceleration, way, finite=False)
+        v = _limits(
+            "max_velocity", math.inf if max_velocity is None else max_velocity, way, finite=False
+        )
+        a = _limits(
+            "max_acceleration",
+            math.inf if max_acceleration is None else max_acceleration,
+            way,
+            finite=False,
+        )
         limited = np.isfinite(np.minimum(v, a))
-        entries("max_velocity", v, limited, "and max_acceleration are both infinite", remedy="limit one of them")
+        entries(
+            "max_velocity",
+            v,
+            limited,
+            "and max_acceleration are both infinite",
+            remedy="limit one of them",
+        )
         distance = np.abs(way)
-        needed = np.maximum(_PEAK_VELOCITY * distance / v, np.sqrt(_PEAK_ACCELERATION * distance / a))
+        needed = np.maximum(
+            _PEAK_VELOCITY * distance / v, np.sqrt(_PEAK_ACCELERATION * distance / a)
+        )
         total = np.broadcast_to(needed.max(-1, keepdims=True), way.shape)
     time = _ticks(dt, total)
     safe = np.maximum(total, dt)  # a move within one tick is done at its end
@@ -143,12 +173,17 @@ def trapezoidal(
     start, target, dt
         As in :func:`minimum_jerk`, and so the errors.
     max_velocity, max_acceleration
-        Limits > 0, a number, (joints,) or (envs, joints) [rad/s, rad/s^2 or m/s, m/s^2]. Infinite: no velocity limit.
+        Limits > 0, a number, (joints,) or (envs, joints) [rad/s, rad/s^2 or m/s, m/s^2]. Infinite:
+        no velocity limit.
     synchronise
-        All joints of an env start and arrive together, on a straight line; else each goes as fast as it may.
+        All joints of an env start and arrive together, on a straight line; else each goes as fast
+        as it may.
     """
     x0, way = _move(start, target)
-    v, a = _limits("max_velocity", max_velocity, way, finite=False), _limits("max_acceleration", max_acceleration, way)
+    v, a = (
+        _limits("max_velocity", max_velocity, way, finite=False),
+        _limits("max_acceleration", max_acceleration, way),
+    )
     distance = np.abs(way)
     moves = distance > _NO_WAY
     # Limits of s itself: the joints' limits, per metre or radian of the way.
@@ -158,13 +193,19 @@ def trapezoidal(
         vs, as_ = (np.broadcast_to(limit.min(-1, keepdims=True), way.shape) for limit in (vs, as_))
         moves = np.broadcast_to(moves.any(-1, keepdims=True), way.shape)
     as_ = np.where(moves, as_, 1.0)
-    peak = np.minimum(np.where(moves, vs, 1.0), np.sqrt(as_))  # a short move never reaches its cruising velocity
+    peak = np.minimum(
+        np.where(moves, vs, 1.0), np.sqrt(as_)
+    )  # a short move never reaches its cruising velocity
     ramp = peak / as_
     total = np.where(moves, 1 / peak + ramp, 0.0)
     time = _ticks(dt, total)
     t = np.minimum(time[(...,) + (None,) * way.ndim], total)
     left = total - t
-    s = np.where(t < ramp, as_ * t**2 / 2, np.where(left < ramp, 1 - as_ * left**2 / 2, peak * (t - ramp / 2)))
+    s = np.where(
+        t < ramp,
+        as_ * t**2 / 2,
+        np.where(left < ramp, 1 - as_ * left**2 / 2, peak * (t - ramp / 2)),
+    )
     rate = np.minimum(np.minimum(as_ * t, as_ * left), peak)
     acceleration = np.where(t < ramp, as_, np.where(left < ramp, -as_, 0.0))
     return _trajectory(time, x0, way, s, rate, acceleration, done=left <= _ROUNDING * total)
@@ -181,17 +222,19 @@ def jerk_limited(
     start_velocity: ArrayLike = 0.0,
     start_acceleration: ArrayLike = 0.0,
 ) -> Trajectory:
-    """Return the fastest move to rest at ``target`` within limits of velocity, acceleration and jerk, by ``ruckig``.
+    """Return the fastest move to rest at ``target`` within limits of velocity, acceleration and
+    jerk, by ``ruckig``.
 
-    The joints of an env arrive together; the move may begin in motion. Shapes as in :func:`trapezoidal`; every limit
-    is finite.
+    The joints of an env arrive together; the move may begin in motion. Shapes as in
+    :func:`trapezoidal`; every limit is finite.
 
     Raises
     ------
     MissingDependencyError
         Without the ``ruckig`` package.
     InvalidArgumentError
-        Naming the argument and joint; also where ruckig finds no such move, e.g. from beyond a limit.
+        Naming the argument and joint; also where ruckig finds no such move, e.g. from beyond a
+        limit.
     """
     try:
         import ruckig
@@ -202,7 +245,9 @@ def jerk_limited(
         "current_position": x0,
         "target_position": x0 + way,
         "current_velocity": _limits("start_velocity", start_velocity, way, low=-math.inf),
-        "current_acceleration": _limits("start_acceleration", start_acceleration, way, low=-math.inf),
+        "current_acceleration": _limits(
+            "start_acceleration", start_acceleration, way, low=-math.inf
+        ),
         "max_velocity": _limits("max_velocity", max_velocity, way),
         "max_acceleration": _limits("max_acceleration", max_acceleration, way),
         "max_jerk": _limits("max_jerk", max_jerk, way),
@@ -219,11 +264,15 @@ def jerk_limited(
             planner.calculate(inputs, plan)
         except ruckig.RuckigError:
             remedy = "begin within the limits, or widen them"
-            raise InvalidArgumentError("start", "allows no jerk-limited move", env=env, remedy=remedy) from None
+            raise InvalidArgumentError(
+                "start", "allows no jerk-limited move", env=env, remedy=remedy
+            ) from None
         plans.append(plan)
     durations = np.array([plan.duration for plan in plans])
     time = _ticks(dt, durations)
-    table = np.array([[plan.at_time(min(t, plan.duration)) for plan in plans] for t in time.tolist()])
+    table = np.array(
+        [[plan.at_time(min(t, plan.duration)) for plan in plans] for t in time.tolist()]
+    )
     arrived = time[:, None, None] >= (1 - _ROUNDING) * durations[:, None]
     position, velocity, acceleration = (
         np.where(arrived, rest, table[:, :, k]).reshape(len(time), *way.shape)
@@ -233,16 +282,26 @@ def jerk_limited(
 
 
 def _trajectory(
-    time: Float64, x0: Float64, way: Float64, s: Float64, rate: Float64, acceleration: Float64, done: Any
+    time: Float64,
+    x0: Float64,
+    way: Float64,
+    s: Float64,
+    rate: Float64,
+    acceleration: Float64,
+    done: Any,
 ) -> Trajectory:
-    """Return x0 + way s and its derivatives; exactly the target, at rest, where the move is done."""
+    """Return x0 + way s and its derivatives; exactly the target, at rest, where the move is
+    done.
+    """
     position, velocity = np.where(done, x0 + way, x0 + way * s), np.where(done, 0.0, way * rate)
     return Trajectory(time, position, velocity, np.where(done, 0.0, way * acceleration))
 
 
 def _move(start: ArrayLike, target: ArrayLike) -> tuple[Float64, Float64]:
     """Return the start and the way (..., joints) of a move."""
-    shapes = [read_array(name, value).shape for name, value in (("start", start), ("target", target))]
+    shapes = [
+        read_array(name, value).shape for name, value in (("start", start), ("target", target))
+    ]
     try:
         shape = np.broadcast_shapes(*shapes)
     except ValueError:
@@ -251,17 +310,24 @@ def _move(start: ArrayLike, target: ArrayLike) -> tuple[Float64, Float64]:
         problem = f"has shape {shapes[1]} and start {shapes[0]}"
         remedy = "give each as (joints,) or (envs, joints), with the same joints"
         raise InvalidArgumentError("target", problem, remedy=remedy)
-    x0, x1 = (at_least(n, broadcast(n, x, shape), -math.inf) for n, x in (("start", start), ("target", target)))
+    x0, x1 = (
+        at_least(n, broadcast(n, x, shape), -math.inf)
+        for n, x in (("start", start), ("target", target))
+    )
     return x0, x1 - x0
 
 
-def _limits(name: str, value: ArrayLike, way: Float64, finite: bool = True, low: float = 0.0) -> Float64:
+def _limits(
+    name: str, value: ArrayLike, way: Float64, finite: bool = True, low: float = 0.0
+) -> Float64:
     """Return ``value`` > ``low``, shaped as ``way``."""
     return at_least(name, broadcast(name, value, way.shape), low, above=True, infinite=not finite)
 
 
 def _ticks(dt: float, total: Float64) -> Float64:
-    """Return the times of the ticks' ends up to the longest of the durations ``total``, at least one."""
+    """Return the times of the ticks' ends up to the longest of the durations ``total``, at least
+    one.
+    """
     return time_step("dt", dt) * np.arange(1, _count(float(total.max()), dt) + 1, dtype=np.float64)
 
 

@@ -22,7 +22,8 @@ from batchpid.sim.workers.worker import ONE_THREAD
 TUTORIALS = ("tutorial", "tutorial, a process a core")
 """The tutorial's loop as written: one robot in one process, and one in each of the processes."""
 ENGINES = {
-    # PhysX's drive without control and gravity: (whether each sim step visits all robots in turn, with collisions)
+    # PhysX's drive without control and gravity: (whether each sim step visits all robots in turn,
+    # with collisions)
     "bare engine": (True, True),
     "bare engine, robot by robot": (False, True),  # each for a tick while it is in the cache
     "bare engine, no shapes": (False, False),
@@ -30,7 +31,9 @@ ENGINES = {
 
 
 def make_baselines(workload: Workload) -> dict[str, Case]:
-    """Return every baseline, by name. All use the same processes, each of which steps a share of the envs."""
+    """Return every baseline, by name. All use the same processes, each of which steps a share of
+    the envs.
+    """
     count = workload.processes
     bounds = [workload.num_envs * index // count for index in range(count + 1)]
     context, cores = multiprocessing.get_context("spawn"), pinned_cores(count)
@@ -77,14 +80,20 @@ def make_baselines(workload: Workload) -> dict[str, Case]:
 
 
 def single_threaded() -> AbstractContextManager[Any]:
-    """Return a context in which new processes have a BLAS of one thread, as the Runner's workers have."""
+    """Return a context in which new processes have a BLAS of one thread, as the Runner's workers
+    have.
+    """
     return mock.patch.dict(os.environ, ONE_THREAD)
 
 
 def _serve(connection: Connection, workload: Workload, share: int) -> None:
-    """Receive the names of cases: reset each case, then run a round of it, until the connection is closed."""
+    """Receive the names of cases: reset each case, then run a round of it, until the connection is
+    closed.
+    """
     cases: dict[str, TutorialLoop | DriveLoop] = {}
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller ends at Ctrl-C, and closes the connection
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # the caller ends at Ctrl-C, and closes the connection
     gc.disable()
     try:
         while True:
@@ -104,10 +113,12 @@ def _serve(connection: Connection, workload: Workload, share: int) -> None:
 
 
 class DriveLoop:
-    """Robots of ``workload`` under PhysX's drive, from ``start`` to ``target`` (dof,) [rad or m], without control.
+    """Robots of ``workload`` under PhysX's drive, from ``start`` to ``target`` (dof,) [rad or m],
+    without control.
 
-    They have no gravity, so that the drive reaches the target, as the PID does. ``in_turn``: each sim step visits all
-    robots; otherwise each robot makes the sim steps of a tick before the next one does.
+    They have no gravity, so that the drive reaches the target, as the PID does. ``in_turn``: each
+    sim step visits all robots; otherwise each robot makes the sim steps of a tick before the next
+    one does.
     """
 
     def __init__(
@@ -123,7 +134,11 @@ class DriveLoop:
         self._start, self._at_once = start, 1 if in_turn else workload.substeps
         self._packs = [Pack(spec, 1) for _ in range(num_envs)]
         for pack in self._packs:
-            pack.write_drive(np.array(settings.drive_stiffness), np.array(settings.drive_damping), np.array(np.inf))
+            pack.write_drive(
+                np.array(settings.drive_stiffness),
+                np.array(settings.drive_damping),
+                np.array(np.inf),
+            )
             pack.write_drive_target(np.tile(target, (pack.size, 1)))
         self.reset()
 

@@ -1,8 +1,9 @@
 """Fixtures of the benchmarks: the size of a run, and the summary of comparisons at its end.
 
-With ``--benchmark-disable`` (``make test``) the benchmarks, and the checks of ``make bench-check``, run once on the
-tiny workload ``SMOKE``, and floors of ratios are ignored: such a smoke run shows that the benchmarks work. Of a
-benchmark with several robots, presets or numbers of envs it runs the panda, "accurate", and the largest number.
+With ``--benchmark-disable`` (``make test``) the benchmarks, and the checks of ``make bench-check``,
+run once on the tiny workload ``SMOKE``, and floors of ratios are ignored: such a smoke run shows
+that the benchmarks work. Of a benchmark with several robots, presets or numbers of envs it runs the
+panda, "accurate", and the largest number.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from pytest_benchmark.stats import Stats
 
 
 class Size(NamedTuple):
-    """Upper bounds on the workload of a run; a benchmark uses the smaller of the bound and its own value."""
+    """Upper bounds on the workload of a run; a benchmark uses the smaller of the bound and its own
+    value.
+    """
 
     envs: float = math.inf
     rows: float = math.inf
@@ -59,13 +62,17 @@ def pytest_configure(config: pytest.Config) -> None:
     config.stash[COMPARISONS] = []
     if is_smoke(config):
         os.environ["NUMBA_DISABLE_JIT"] = "1"  # compilation would take most of the time
-    if config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.getoption("benchmark_only"):
+    if config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.getoption(
+        "benchmark_only"
+    ):
         config.option.benchmark_disable = True  # "pytest" alone is a run of the tests
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Select the tests marked ``check``, too, in a smoke run, and one workload of each benchmark."""
+    """Select the tests marked ``check``, too, in a smoke run, and one workload of each
+    benchmark.
+    """
     if not is_smoke(config):
         return
     benchmarks = [item for item in items if item.path.is_relative_to(Path(__file__).parent)]
@@ -108,7 +115,9 @@ def quick_smoke(most: Size) -> Iterator[None]:
 
 @pytest.fixture
 def benchmark(benchmark: Any) -> Any:
-    """pytest-benchmark's fixture; in a smoke run, its ``pedantic`` records the time of the only round, too."""
+    """pytest-benchmark's fixture; in a smoke run, its ``pedantic`` records the time of the only
+    round, too.
+    """
     if benchmark.disabled:
         stats, pedantic = Stats(), benchmark.pedantic
 
@@ -127,7 +136,9 @@ def benchmark(benchmark: Any) -> Any:
 
 @pytest.fixture
 def report(benchmark: Any) -> Callable[[list[float]], None]:
-    """Function that replaces the times of the rounds by times per env step [s]: OPS becomes env-steps per second."""
+    """Function that replaces the times of the rounds by times per env step [s]: OPS becomes
+    env-steps per second.
+    """
 
     def replace(seconds: list[float]) -> None:
         stats = benchmark.stats.stats
@@ -139,7 +150,9 @@ def report(benchmark: Any) -> Callable[[list[float]], None]:
 
 @pytest.fixture
 def compare(pytestconfig: pytest.Config, most: Size) -> Callable[..., None]:
-    """Function that records a comparison for the summary, and fails if its ratio is below ``least``."""
+    """Function that records a comparison for the summary, and fails if its ratio is below
+    ``least``.
+    """
 
     def note(setup: str, case: str, over: str, ratio: float, least: float | None = None) -> None:
         assert math.isfinite(ratio)
@@ -157,7 +170,9 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
     found = config.stash[COMPARISONS]
     if is_smoke(config) or not found:
         return
-    terminalreporter.section("compared: speed of the first over that of the others, in the same run")
+    terminalreporter.section(
+        "compared: speed of the first over that of the others, in the same run"
+    )
     for setup, case in dict.fromkeys((each.setup, each.case) for each in found):
         terminalreporter.write_line(f"{setup}: {case} over")
         for each in found:

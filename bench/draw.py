@@ -1,7 +1,8 @@
-"""Draw the picture of docs/performance.md, and write its first tables: ``python bench/draw.py [FOLDER]``.
+"""Draw the picture of docs/performance.md, and write its first tables: ``python bench/draw.py
+[FOLDER]``.
 
-FOLDER holds the measurements of ``make figures``; they go into docs/performance.json first. Without it everything is
-drawn from that file.
+FOLDER holds the measurements of ``make figures``; they go into docs/performance.json first. Without
+it everything is drawn from that file.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def draw_speed(figures: dict[str, Any]) -> Figure:
     draw_phases(right, figures["cases"])
     machine = figures["machine"]
     figure.suptitle(
-        f"64 Pandas under PID, gravity and Coriolis compensation at every sim step of 0.5 ms, on "
+        "64 Pandas under PID, gravity and Coriolis compensation at every sim step of 0.5 ms, on "
         f"{machine['cores']} cores ({machine['processor']}, SAPIEN {machine['sapien']})",
         fontsize=10,
     )
@@ -105,10 +106,14 @@ def draw_cases(axes: Axes, cases: dict[str, Any]) -> None:
     """Draw the speed of the cases of :data:`DRAWN`, the fastest first."""
     rates = [(cases[name]["rates"][case] / 1e3, label) for label, (name, case) in DRAWN.items()]
     for row, (rate, label) in enumerate(sorted(rates)):
-        axes.barh(row, rate, height=0.7, color=OURS if label.startswith("batchpid") else OTHER, lw=0)
+        axes.barh(
+            row, rate, height=0.7, color=OURS if label.startswith("batchpid") else OTHER, lw=0
+        )
         axes.text(rate, row, f" {rate:.0f}", va="center", fontsize=8.5)
     axes.set_yticks(range(len(rates)), [label for _, label in sorted(rates)])
-    axes.set_title("thousand sim steps per second, of all robots together", fontsize=9.5, loc="left")
+    axes.set_title(
+        "thousand sim steps per second, of all robots together", fontsize=9.5, loc="left"
+    )
     tidy(axes, "x")
 
 
@@ -118,7 +123,15 @@ def draw_phases(axes: Axes, cases: dict[str, Any]) -> None:
         left = 0.0
         for phase, (colour, meaning) in PHASES.items():
             spent = cases[name]["phases"][phase]
-            axes.barh(row, spent, left=left, height=0.6, color=colour, lw=0, label=meaning if row == 0 else None)
+            axes.barh(
+                row,
+                spent,
+                left=left,
+                height=0.6,
+                color=colour,
+                lw=0,
+                label=meaning if row == 0 else None,
+            )
             left += spent
         axes.text(0.3, row + 0.42, label, fontsize=8.5, va="center")
     axes.set_yticks([])
@@ -139,29 +152,44 @@ def tidy(axes: Axes, grid: str) -> None:
 def machine(about: dict[str, Any]) -> str:
     """Return the machine and the versions, in a line."""
     packages = ", ".join(
-        f"{name} {about[name]}" for name in ("sapien", "numpy", "mujoco", "gymnasium") if name in about
+        f"{name} {about[name]}"
+        for name in ("sapien", "numpy", "mujoco", "gymnasium")
+        if name in about
     )
-    return f"Measured on {about['cores']} cores of {about['processor']}, Python {about['python']}, {packages}."
+    return (
+        f"Measured on {about['cores']} cores of {about['processor']}, Python {about['python']},"
+        f" {packages}."
+    )
 
 
 def cases_table(cases: dict[str, Any]) -> str:
-    """Return the table of rates, and of the closed loop over each, also per process where that is another ratio."""
+    """Return the table of rates, and of the closed loop over each, also per process where that is
+    another ratio.
+    """
 
     def cell(figures: dict[str, Any], case: str) -> str:
         if case not in figures["rates"]:
             return ""
         ratio = figures["ratios"][case]
         alike = figures.get("per_process", {}).get(case, ratio)
-        both = f"{ratio:.2f}" if abs(alike - ratio) < 0.01 else f"{ratio:.2f}; {alike:.2f} per process"
+        both = (
+            f"{ratio:.2f}" if abs(alike - ratio) < 0.01 else f"{ratio:.2f}; {alike:.2f} per process"
+        )
         return f"{figures['rates'][case] / 1e3:.1f} ({both})"
 
-    rows = [[case, *(cell(cases[name], case) for name in SETUPS)] for case in cases["panda-accurate"]["rates"]]
+    rows = [
+        [case, *(cell(cases[name], case) for name in SETUPS)]
+        for case in cases["panda-accurate"]["rates"]
+    ]
     return markdown(["thousand env-steps/s (closed loop / case)", *SETUPS.values()], rows)
 
 
 def phases_table(cases: dict[str, Any]) -> str:
     """Return the table of microseconds per env step of each phase."""
-    rows = [[label, *(f"{cases[name]['phases'][phase]:.2f}" for phase in PHASES)] for name, label in SETUPS.items()]
+    rows = [
+        [label, *(f"{cases[name]['phases'][phase]:.2f}" for phase in PHASES)]
+        for name, label in SETUPS.items()
+    ]
     return markdown(["µs per env step in a worker", *PHASES], rows)
 
 

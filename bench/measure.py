@@ -2,9 +2,10 @@
 
     python bench/measure.py panda --physics fast [--peers] [--xla] [--json FILE]
 
-Every case moves the same robots from ``start`` to ``target`` with the tutorial's gains and, in SAPIEN, with SAPIEN's
-friction and damping. So the cases differ in the way of stepping and not in the motion. Baselines run in separate worker
-processes, as many as the runner has. docs/performance.md describes the cases.
+Every case moves the same robots from ``start`` to ``target`` with the tutorial's gains and, in
+SAPIEN, with SAPIEN's friction and damping. So the cases differ in the way of stepping and not in
+the motion. Baselines run in separate worker processes, as many as the runner has.
+docs/performance.md describes the cases.
 """
 
 from __future__ import annotations
@@ -65,8 +66,8 @@ PHASES = {
 
 @dataclass(frozen=True)
 class Result:
-    """Figures of one case: env-steps per second of every round, final positions of the first env (dof,), and number of
-    stepping processes.
+    """Figures of one case: env-steps per second of every round, final positions of the first env
+    (dof,), and number of stepping processes.
     """
 
     rates: tuple[float, ...]
@@ -80,7 +81,9 @@ class Result:
 
     def over(self, other: Result) -> float:
         """Return this rate divided by the other's: the median of the ratios within each round."""
-        return statistics.median(ours / theirs for ours, theirs in zip(self.rates, other.rates, strict=True))
+        return statistics.median(
+            ours / theirs for ours, theirs in zip(self.rates, other.rates, strict=True)
+        )
 
 
 def make_loop(workload: Workload, name: str) -> Case:
@@ -100,11 +103,14 @@ def make_loop(workload: Workload, name: str) -> Case:
         return final
 
     env_steps = workload.num_envs * workload.steps
-    return Case(env_steps, lambda: runner.reset(workload.start), run, runner.close, workload.processes)
+    return Case(
+        env_steps, lambda: runner.reset(workload.start), run, runner.close, workload.processes
+    )
 
 
 def measure_rates(workload: Workload, names: Iterable[str] = CASES) -> dict[str, Result]:
-    """Measure the cases ``names`` ``workload.rounds`` times in turn, so that their rounds are paired.
+    """Measure the cases ``names`` ``workload.rounds`` times in turn, so that their rounds are
+    paired.
 
     Raises RuntimeError if the robots of a case did not move or ended far from the target.
     """
@@ -113,7 +119,11 @@ def measure_rates(workload: Workload, names: Iterable[str] = CASES) -> dict[str,
     with ExitStack() as stack:
         cases = {name: make(workload) for name, (_, make) in PEERS.items() if name in seconds}
         cases |= make_baselines(workload)
-        cases |= {name: make_loop(workload, name) for name in LOOPS | XLA_LOOPS | MUJOCO_LOOPS if name in seconds}
+        cases |= {
+            name: make_loop(workload, name)
+            for name in LOOPS | XLA_LOOPS | MUJOCO_LOOPS
+            if name in seconds
+        }
         for case in cases.values():
             stack.callback(case.close)
         for name in XLA_LOOPS.keys() & cases.keys():
@@ -125,7 +135,11 @@ def measure_rates(workload: Workload, names: Iterable[str] = CASES) -> dict[str,
     for name, place in final.items():
         workload.check_motion(name, place)
     return {
-        name: Result(tuple(cases[name].env_steps / took for took in rounds), final[name], cases[name].processes)
+        name: Result(
+            tuple(cases[name].env_steps / took for took in rounds),
+            final[name],
+            cases[name].processes,
+        )
         for name, rounds in seconds.items()
     }
 
@@ -133,17 +147,20 @@ def measure_rates(workload: Workload, names: Iterable[str] = CASES) -> dict[str,
 def measure_phases(workload: Workload) -> dict[str, float]:
     """Return the microseconds per env step that each phase of the closed loop takes in a worker.
 
-    Measured in this process with a worker's share of the envs. The control step runs in NumPy, with native calls into
-    the engine if available, because the phases of a native tick cannot be separated. "control" is everything except
-    calls into the engine; it takes a fraction of that time in a native tick. The clock calls add about one percent.
-    "waiting" is the mean time of a tick of :meth:`Runner.step` beyond the work of a worker.
+    Measured in this process with a worker's share of the envs. The control step runs in NumPy, with
+    native calls into the engine if available, because the phases of a native tick cannot be
+    separated. "control" is everything except calls into the engine; it takes a fraction of that
+    time in a native tick. The clock calls add about one percent. "waiting" is the mean time of a
+    tick of :meth:`Runner.step` beyond the work of a worker.
     """
     share = max(1, workload.num_envs // workload.processes)
     robot = workload.simulated_robot()
     shared = SharedArrays(Arrays.layout(1, share, robot.dof))
     options = RunnerOptions(robot, share, physics=workload.physics)
     loop = Loop(options, robot.params(), slice(0, share), Arrays.from_fields(shared.arrays))
-    loop.reset(np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, robot.dof)))
+    loop.reset(
+        np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, robot.dof))
+    )
     loop.ticks[0].command.setpoint[...] = workload.target
     spent = dict.fromkeys(("read", "control", "passive", "write", "step", "waiting"), 0.0)
     for group in loop.groups:
@@ -190,10 +207,11 @@ def _waiting(workload: Workload) -> float:
 
 @dataclass(frozen=True)
 class Options:
-    """Measure the speed of the closed loop and its phases, of the tutorial's loop and of the bare engine.
+    """Measure the speed of the closed loop and its phases, of the tutorial's loop and of the bare
+    engine.
 
-    Rates are medians over the rounds. Ratios are medians of the rounds' ratios, of all processes together and per
-    process.
+    Rates are medians over the rounds. Ratios are medians of the rounds' ratios, of all processes
+    together and per process.
     """
 
     robot: tyro.conf.Positional[Literal["panda", "jaco2"]] = "panda"
@@ -204,7 +222,9 @@ class Options:
     ticks: int = 100
     rounds: int = 5
     peers: bool = False
-    """Measure MuJoCo, with the closed loop and alone, and Gymnasium's AsyncVectorEnv, too, where installed."""
+    """Measure MuJoCo, with the closed loop and alone, and Gymnasium's AsyncVectorEnv, too, where
+    installed.
+    """
     xla: bool = False
     """Measure the closed loop in XLA, too."""
     json: Path | None = None
@@ -223,14 +243,20 @@ def main(options: Options) -> None:
         rounds=options.rounds,
     )
     peers = installed_peers() if options.peers else []
-    names = [*CASES, *(XLA_LOOPS if options.xla else ()), *(MUJOCO_LOOPS if "mujoco" in peers else ()), *peers]
+    names = [
+        *CASES,
+        *(XLA_LOOPS if options.xla else ()),
+        *(MUJOCO_LOOPS if "mujoco" in peers else ()),
+        *peers,
+    ]
     results = measure_rates(workload, names)
     ratios = {case: results[OURS].over(result) for case, result in results.items()}
     figures = {
         "rates": {case: round(result.rate) for case, result in results.items()},
         "ratios": {case: round(ratio, 3) for case, ratio in ratios.items()},
         "per_process": {
-            case: round(ratios[case] * result.processes / workload.processes, 3) for case, result in results.items()
+            case: round(ratios[case] * result.processes / workload.processes, 3)
+            for case, result in results.items()
         },
         "phases": {phase: round(us, 2) for phase, us in measure_phases(workload).items()},
     }
@@ -243,7 +269,9 @@ def main(options: Options) -> None:
     ]
     print(table(rows, ["case", "thousand env-steps/s", f"{OURS} / case", "per process"], "lrrr"))
     print("\nmicroseconds per env step in a worker:")
-    print(table([[OURS, *map(str, figures["phases"].values())]], ["", *figures["phases"]], "lrrrrrr"))
+    print(
+        table([[OURS, *map(str, figures["phases"].values())]], ["", *figures["phases"]], "lrrrrrr")
+    )
     if options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(options.json, json.dumps({"machine": machine()} | figures) + "\n")

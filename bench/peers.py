@@ -13,11 +13,18 @@ from workload import TIMESTEP, Case, Workload
 
 
 def _async_vector(workload: Workload, count: int) -> Case:
-    """Return Gymnasium's AsyncVectorEnv around the tutorial's loop, with one process for each of ``count`` envs."""
+    """Return Gymnasium's AsyncVectorEnv around the tutorial's loop, with one process for each of
+    ``count`` envs.
+    """
     import gymnasium
 
-    # Fork the processes from one that has loaded the packages; otherwise many of them would take a minute to start.
-    packages = ["gymnasium", "batchpid.sim.engine.sapien.user_content", "sapien.wrapper.urdf_loader"]
+    # Fork the processes from one that has loaded the packages; otherwise many of them would take a
+    # minute to start.
+    packages = [
+        "gymnasium",
+        "batchpid.sim.engine.sapien.user_content",
+        "sapien.wrapper.urdf_loader",
+    ]
     multiprocessing.set_forkserver_preload(packages)
     make_envs = [lambda: _tutorial_env(workload)] * count
     with single_threaded():
@@ -33,7 +40,9 @@ def _async_vector(workload: Workload, count: int) -> Case:
 
 
 def _tutorial_env(workload: Workload) -> Any:
-    """Return the tutorial's loop as an env. The action is the target; a step is ``workload.substeps`` sim steps."""
+    """Return the tutorial's loop as an env. The action is the target; a step is
+    ``workload.substeps`` sim steps.
+    """
     import gymnasium
 
     class TutorialEnv(gymnasium.Env):
@@ -43,7 +52,9 @@ def _tutorial_env(workload: Workload) -> Any:
             self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
             self.action_space = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float64)
 
-        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        def reset(
+            self, *, seed: int | None = None, options: Any = None
+        ) -> tuple[Any, dict[str, Any]]:
             super().reset(seed=seed)
             self._loop.reset()
             return self._loop.robot.get_qpos(), {}
@@ -58,9 +69,9 @@ def _tutorial_env(workload: Workload) -> Any:
 def _mujoco_batch(workload: Workload) -> Case:
     """Return ``mujoco.batch`` on the same URDF, with one thread for each worker.
 
-    MuJoCo's actuator ``pid`` drives the joints with the same kp, ki and kd. Gravity is compensated body by body. The
-    sum of both stays within the URDF's effort limits. The scene has a ground. The solver is Newton, and the integrator
-    "implicitfast", which MuJoCo's documentation recommends.
+    MuJoCo's actuator ``pid`` drives the joints with the same kp, ki and kd. Gravity is compensated
+    body by body. The sum of both stays within the URDF's effort limits. The scene has a ground. The
+    solver is Newton, and the integrator "implicitfast", which MuJoCo's documentation recommends.
     """
     import mujoco
     import mujoco.batch
@@ -74,7 +85,9 @@ def _mujoco_batch(workload: Workload) -> Case:
         body.gravcomp = 1
     for joint in spec.joints:
         joint.actgravcomp = True  # the effort limits, which MuJoCo reads from the URDF, include it
-    for name, kp, ki, kd in zip(robot.joint_names, settings.kp, settings.ki, settings.kd, strict=True):
+    for name, kp, ki, kd in zip(
+        robot.joint_names, settings.kp, settings.ki, settings.kd, strict=True
+    ):
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_pid(kp=kp, ki=ki, kv=kd, ctrlspec=mujoco.mjtCtrlInput.mjINPUT_POS)
     model, kind = spec.compile(), mujoco.mjtState.mjSTATE_INTEGRATION
@@ -82,7 +95,9 @@ def _mujoco_batch(workload: Workload) -> Case:
     data, start = mujoco.MjData(model), np.empty(mujoco.mj_stateSize(model, kind))
     data.qpos[columns], data.ctrl[:] = workload.start, workload.target
     mujoco.mj_getState(model, data, start, kind)
-    batch = mujoco.batch.Batch(model, workload.num_envs, nthread=workload.processes, persistent=True)
+    batch = mujoco.batch.Batch(
+        model, workload.num_envs, nthread=workload.processes, persistent=True
+    )
 
     def reset() -> None:
         batch.state[:] = start
@@ -97,12 +112,22 @@ def _mujoco_batch(workload: Workload) -> Case:
 
 PEERS = {
     # name: (package, constructor of the case)
-    "gymnasium, an env a core": ("gymnasium", lambda workload: _async_vector(workload, workload.processes)),
-    "gymnasium, all envs": ("gymnasium", lambda workload: _async_vector(workload, workload.num_envs)),
+    "gymnasium, an env a core": (
+        "gymnasium",
+        lambda workload: _async_vector(workload, workload.processes),
+    ),
+    "gymnasium, all envs": (
+        "gymnasium",
+        lambda workload: _async_vector(workload, workload.num_envs),
+    ),
     "mujoco": ("mujoco", _mujoco_batch),
 }
 
 
 def installed_peers() -> list[str]:
     """Return the names of the peers whose package is installed."""
-    return [name for name, (package, _) in PEERS.items() if importlib.util.find_spec(package) is not None]
+    return [
+        name
+        for name, (package, _) in PEERS.items()
+        if importlib.util.find_spec(package) is not None
+    ]

@@ -1,8 +1,10 @@
-"""How far many robots get: each is loaded, built and moved under designed gains, in a separate process.
+"""How far many robots get: each is loaded, built and moved under designed gains, in a separate
+process.
 
-``python bench/survey.py PATH ... [--engine mujoco] [--moves 8]`` prints a table in Markdown of robots' files, and of
-all *.urdf in folders. A move has settled if every joint stays within 2 % of it and ends within 1e-3 rad (or m) of the
-setpoint. A robot that crashes the engine, or takes more than 300 s, ends only its own process.
+``python bench/survey.py PATH ... [--engine mujoco] [--moves 8]`` prints a table in Markdown of
+robots' files, and of all *.urdf in folders. A move has settled if every joint stays within 2 % of
+it and ends within 1e-3 rad (or m) of the setpoint. A robot that crashes the engine, or takes more
+than 300 s, ends only its own process.
 """
 
 from __future__ import annotations
@@ -22,7 +24,14 @@ from batchpid.errors import BatchPIDError
 from batchpid.sim import Robot
 from batchpid.sim.tuning import evaluate_gains, random_moves
 
-HEADERS = ("robot", "joints", "settled", "largest error", "overshoot", "findings, or what went wrong")
+HEADERS = (
+    "robot",
+    "joints",
+    "settled",
+    "largest error",
+    "overshoot",
+    "findings, or what went wrong",
+)
 SECONDS, LIMIT = 2.0, 300.0
 """Simulated time of a move, and wall-clock time of a robot [s]."""
 
@@ -78,7 +87,11 @@ def main() -> None:
         except subprocess.TimeoutExpired:
             return [path.name, *["-"] * 4, f"takes more than {LIMIT:g} s"]
         if done.returncode:
-            return [path.name, *["-"] * 4, f"the process ended with status {done.returncode}: {done.stderr[-200:]}"]
+            return [
+                path.name,
+                *["-"] * 4,
+                f"the process ended with status {done.returncode}: {done.stderr[-200:]}",
+            ]
         row: list[str] = json.loads(done.stdout.splitlines()[-1])
         return row
 

@@ -1,4 +1,6 @@
-"""Cost of the effects of motors and sensors: of all together, and of those that are off, for the 16 envs of a group."""
+"""Cost of the effects of motors and sensors: of all together, and of those that are off, for the 16
+envs of a group.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,8 @@ CASES = {
 
 
 def speeds_over_ideal(physics, most, rounds):
-    """Return the speed of each case relative to actuators=None: the median of rounds in which all take turns.
+    """Return the speed of each case relative to actuators=None: the median of rounds in which all
+    take turns.
 
     Processor time of this process, in which the robots are: another program disturbs it less.
     """
@@ -65,9 +68,14 @@ def speeds_over_ideal(physics, most, rounds):
                 began = time.process_time()
                 qpos = runners[name].rollout(setpoints).qpos[-1]
                 took[name] = time.process_time() - began
-                assert np.abs(qpos - workload.start)[:, workload.moving].max(1).min() > 0.02, "the robots did not move"
+                assert np.abs(qpos - workload.start)[:, workload.moving].max(1).min() > 0.02, (
+                    "the robots did not move"
+                )
             seconds.append(took)
-    return {name: statistics.median(took["ideal"] / took[name] for took in seconds[1:]) for name in CASES}
+    return {
+        name: statistics.median(took["ideal"] / took[name] for took in seconds[1:])
+        for name in CASES
+    }
 
 
 @pytest.mark.benchmark(group="actuators")
@@ -82,7 +90,9 @@ def test_all_effects(benchmark, most):
     def run():
         state = start
         for _ in range(steps):
-            state, measured, rate = advance_measurement(k, state, qpos, qvel, noise(k, state, qpos), stages)
+            state, measured, rate = advance_measurement(
+                k, state, qpos, qvel, noise(k, state, qpos), stages
+            )
             limits = stages.limits(k, measured, rate)
             state, delivered = advance_effort(k, state, effort, qpos, qvel, stages)
         return measured, delivered, limits

@@ -1,7 +1,9 @@
-"""Time of one step of the exported C header, compiled with -O2: a panda's seven joints, and all nine.
+"""Time of one step of the exported C header, compiled with -O2: a panda's seven joints, and all
+nine.
 
-It is processor time. "pid" has gains in effort units, "tuned" the bundled gains per mass matrix, which is given; "mass
-matrix" and "bias" are the exported rigid-body functions. A round is a run of the compiled program.
+It is processor time. "pid" has gains in effort units, "tuned" the bundled gains per mass matrix,
+which is given; "mass matrix" and "bias" are the exported rigid-body functions. A round is a run of
+the compiled program.
 """
 
 import shutil
@@ -46,19 +48,33 @@ CALLS = {
 
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler")
-@pytest.mark.parametrize(("call", "joints"), [("pid", 7), ("tuned", 9), ("mass matrix", 9), ("bias", 9)])
+@pytest.mark.parametrize(
+    ("call", "joints"), [("pid", 7), ("tuned", 9), ("mass matrix", 9), ("bias", 9)]
+)
 def test_step(benchmark, most, tmp_path, call, joints):
     robot = Robot.load("panda")
     tree = robot.kinematic_tree() if joints == robot.dof else None
     params = robot.tuned() if call == "tuned" else robot.designed("effort")
     params, names = params.for_joints(slice(joints)), robot.joint_names[:joints]
     if call == "pid":
-        params = params.replace(effort_rate_limit=1000.0, derivative_filter_time=0.002, anti_windup="conditional")
+        params = params.replace(
+            effort_rate_limit=1000.0, derivative_filter_time=0.002, anti_windup="conditional"
+        )
     params = params.replace(measurement_rate="measured")
     write_atomically(tmp_path / "pid.h", to_c(params, 1e-3, joint_names=names, tree=tree).text)
     write_atomically(tmp_path / "main.c", MAIN.replace("CALL", CALLS[call]))
     steps = 500_000 if most.floors else 1000
-    words = ["cc", "-std=gnu99", "-O2", "-ffp-contract=off", f"-DSTEPS={steps}", "main.c", "-o", "main", "-lm"]
+    words = [
+        "cc",
+        "-std=gnu99",
+        "-O2",
+        "-ffp-contract=off",
+        f"-DSTEPS={steps}",
+        "main.c",
+        "-o",
+        "main",
+        "-lm",
+    ]
     subprocess.run(words, cwd=tmp_path, check=True)
     times = []
 

@@ -1,8 +1,10 @@
-"""Performance checks: ratios of speeds that must not fall below their floors. ``make bench-check`` runs them.
+"""Performance checks: ratios of speeds that must not fall below their floors. ``make bench-check``
+runs them.
 
-A ratio compares two ways of stepping the same robots in one run, so it depends little on the machine; a run is repeated
-before a check fails, because something else may have used the cores. To compare absolute times with an earlier run of
-the same machine, use pytest-benchmark's ``--benchmark-save`` and ``--benchmark-compare-fail`` (docs/performance.md).
+A ratio compares two ways of stepping the same robots in one run, so it depends little on the
+machine; a run is repeated before a check fails, because something else may have used the cores. To
+compare absolute times with an earlier run of the same machine, use pytest-benchmark's
+``--benchmark-save`` and ``--benchmark-compare-fail`` (docs/performance.md).
 """
 
 from __future__ import annotations
@@ -34,13 +36,21 @@ class Floor(NamedTuple):
 
 FLOORS = [
     Floor(
-        OURS, "bare engine, robot by robot", 0.76, 0.68, "control and calls may take a quarter; of a fast step a third"
+        OURS,
+        "bare engine, robot by robot",
+        0.76,
+        0.68,
+        "control and calls may take a quarter; of a fast step a third",
     ),
     Floor(OURS, "tutorial", 2.4, 3.4, "gain of a user of SAPIEN's tutorial, on 2 cores"),
     Floor(OURS, PYTHON, 1.0, 1.05, "purpose of the native extension"),
     Floor(OURS, BY_TICKS, 0.9, 0.9, "a rollout is not slower than its ticks one by one"),
     Floor(
-        "closed loop, policy network", OURS, 0.8, 0.7, "a small network at every sim step costs less than the engine"
+        "closed loop, policy network",
+        OURS,
+        0.8,
+        0.7,
+        "a small network at every sim step costs less than the engine",
     ),
     Floor("closed loop, no shapes", OURS, 1.08, 1.25, "purpose of collisions=False"),
 ]
@@ -61,13 +71,22 @@ ACTUATOR_FLOORS = {
 
 @pytest.fixture
 def check(most):
-    """Function that fails unless one of a few runs of ``measure`` has every ratio at its floor or above."""
+    """Function that fails unless one of a few runs of ``measure`` has every ratio at its floor or
+    above.
+    """
 
     def check(label, measure):
         for _ in range(ATTEMPTS):
             found = measure()
-            print(f"\n{label}: " + ", ".join(f"{ratio:.3f} ({floor}) {name}" for name, (ratio, floor) in found.items()))
-            short = {name: both for name, both in found.items() if most.floors and both[0] < both[1]}
+            print(
+                f"\n{label}: "
+                + ", ".join(
+                    f"{ratio:.3f} ({floor}) {name}" for name, (ratio, floor) in found.items()
+                )
+            )
+            short = {
+                name: both for name, both in found.items() if most.floors and both[0] < both[1]
+            }
             if not short:
                 return
         pytest.fail(f"{label}: (ratio, floor) in the last of {ATTEMPTS} runs: {short}")
@@ -84,10 +103,15 @@ def test_ratios_keep_their_floors(check, most, name, physics):
 
     def measure():
         envs, workers, rounds = min(48, most.envs), min(2, most.workers), min(3, most.rounds)
-        workload = Workload(Robot.load(name), envs, workers, physics, ticks=60 if most.floors else 50, rounds=rounds)
+        workload = Workload(
+            Robot.load(name), envs, workers, physics, ticks=60 if most.floors else 50, rounds=rounds
+        )
         results = measure_rates(workload, names=names)
         return {
-            f"{floor.case} / {floor.over}": (results[floor.case].over(results[floor.over]), getattr(floor, physics))
+            f"{floor.case} / {floor.over}": (
+                results[floor.case].over(results[floor.over]),
+                getattr(floor, physics),
+            )
             for floor in floors
         }
 
@@ -103,7 +127,10 @@ def test_few_robots_keep_their_floors(check, most, name, physics):
         for count in COUNTS:
             seconds = few_robots(name, count, physics, most, rounds=3)
             ratio = statistics.median(theirs / ours for ours, theirs in seconds)
-            found[f"{count} in this process / tutorial"] = ratio, FEW_FLOORS[count][physics == "fast"]
+            found[f"{count} in this process / tutorial"] = (
+                ratio,
+                FEW_FLOORS[count][physics == "fast"],
+            )
         return found
 
     check(f"{name}, {physics}", measure)

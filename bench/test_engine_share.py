@@ -1,7 +1,9 @@
-"""Speed of the closed loop relative to the bare engine, in this process: the engine's share of the time.
+"""Speed of the closed loop relative to the bare engine, in this process: the engine's share of the
+time.
 
-Pandas under their default gains (mass matrix) and the URDF's friction, held at several poses. The bare engine steps the
-same robots at the same poses under PhysX's drives, robot by robot. Processor times: other programs disturb them less.
+Pandas under their default gains (mass matrix) and the URDF's friction, held at several poses. The
+bare engine steps the same robots at the same poses under PhysX's drives, robot by robot. Processor
+times: other programs disturb them less.
 """
 
 from __future__ import annotations
@@ -20,12 +22,16 @@ ENVS, TICKS, ROUNDS, POSES = 32, 10, 5, 6
 
 
 def engine_share(pose, physics, most):
-    """Return the speed of the closed loop relative to the bare engine at one pose, for each round."""
+    """Return the speed of the closed loop relative to the bare engine at one pose, for each
+    round.
+    """
     envs, ticks, rounds = min(ENVS, most.envs), min(TICKS, most.ticks), min(ROUNDS, most.rounds)
     workload = Workload(Robot.load("panda"), envs, workers=0, physics=physics, ticks=ticks)
     bare, found = DriveLoop(workload, envs, pose, pose + 0.01), []
     setpoints = np.broadcast_to(pose, (ticks, envs, len(pose)))
-    with Runner(workload.robot, envs, workers=0, physics=physics, substeps=workload.substeps) as runner:
+    with Runner(
+        workload.robot, envs, workers=0, physics=physics, substeps=workload.substeps
+    ) as runner:
         for _ in range(rounds + 1):
             runner.reset(qpos=pose + 0.01)
             began = time.process_time()
@@ -47,5 +53,10 @@ def test_engine_share(benchmark, compare, most, physics):
         lambda: [statistics.median(engine_share(pose, physics, most)) for pose in poses], rounds=1
     )
     benchmark.extra_info["share"] = [round(ratio, 3) for ratio in ratios]
-    compare(f"panda, {physics}, {POSES} poses", "closed loop, default gains", "bare engine", statistics.median(ratios))
+    compare(
+        f"panda, {physics}, {POSES} poses",
+        "closed loop, default gains",
+        "bare engine",
+        statistics.median(ratios),
+    )
     print("\n" + ", ".join(f"{ratio:.3f}" for ratio in ratios))

@@ -1,4 +1,5 @@
-"""MuJoCo as an engine: speed over SAPIEN's, and over MuJoCo alone, in one process in turn; memory and build time.
+"""MuJoCo as an engine: speed over SAPIEN's, and over MuJoCo alone, in one process in turn; memory
+and build time.
 
 Processor time: another program disturbs it less.
 """
@@ -40,9 +41,13 @@ def seconds_per_env_step(runner: Runner, workload: Workload, ticks: int) -> floa
 
 
 def bare_engine(robot: Robot, num_envs: int, ticks: int) -> float:
-    """Return the processor time of an env step of ``mujoco.batch`` alone, of the same robots under fixed efforts."""
+    """Return the processor time of an env step of ``mujoco.batch`` alone, of the same robots under
+    fixed efforts.
+    """
     options: dict[str, Any] = {"ground": robot.has_ground, "engine": "mujoco"}
-    spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options)
+    spec = SceneSpec(
+        robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
+    )
     built = robot_model(spec)
     batch = mujoco_batch.Batch(built.model, num_envs, nthread=1, persistent=True)
     qpos = batch.bind("qpos")
@@ -83,14 +88,20 @@ def test_speed_over_sapien(benchmark, report, compare, most, name, num_envs, gai
 
     rows = benchmark.pedantic(measure, rounds=1)
     report([row[2] for row in rows])
-    for column, other in ((0, "SAPIEN accurate"), (1, "SAPIEN fast"), (3, "mujoco.batch without control")):
+    for column, other in (
+        (0, "SAPIEN accurate"),
+        (1, "SAPIEN fast"),
+        (3, "mujoco.batch without control"),
+    ):
         ratio = statistics.median(row[column] / row[2] for row in rows)
         benchmark.extra_info[f"over {other}"] = round(ratio, 3)
         compare(f"{name}, {gains} gains", f"MuJoCo, {num_envs} envs", other, ratio)
 
 
 def build_many(num_envs: int) -> tuple[float, float]:
-    """Return the seconds to build ``num_envs`` pandas, and the memory of each [bytes], after a first step of all."""
+    """Return the seconds to build ``num_envs`` pandas, and the memory of each [bytes], after a
+    first step of all.
+    """
     robot = Robot.load("panda")
     with Runner(robot, 1, engine="mujoco", workers=0) as runner:
         runner.reset()  # the model is compiled once
@@ -117,5 +128,8 @@ def test_thousands_of_envs(benchmark, report, most):
 
     seconds, memory = benchmark.pedantic(build, rounds=1)
     report([seconds])
-    benchmark.extra_info |= {"build_seconds": round(seconds, 3), "kB_per_env": round(memory / 1e3, 2)}
+    benchmark.extra_info |= {
+        "build_seconds": round(seconds, 3),
+        "kB_per_env": round(memory / 1e3, 2),
+    }
     print(f"\n{num_envs} pandas: built in {seconds:.2f} s, {memory / 1e3:.1f} kB for each")

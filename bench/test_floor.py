@@ -1,8 +1,10 @@
-"""Robots that stand on the floor: the closed loop in MuJoCo over ``mujoco.batch`` without control, in the same motion.
+"""Robots that stand on the floor: the closed loop in MuJoCo over ``mujoco.batch`` without control,
+in the same motion.
 
-The peer steps the same compiled model from the same state, and gets the efforts that the closed loop applied at each
-sim step. Robots of the package example-robot-data are measured where it is installed, or where the variable
-EXAMPLE_ROBOT_DATA names its folder ``robots``; a quadruped of boxes always is. Processor time, in one process.
+The peer steps the same compiled model from the same state, and gets the efforts that the closed
+loop applied at each sim step. Robots of the package example-robot-data are measured where it is
+installed, or where the variable EXAMPLE_ROBOT_DATA names its folder ``robots``; a quadruped of
+boxes always is. Processor time, in one process.
 """
 
 from __future__ import annotations
@@ -58,12 +60,16 @@ def load(name: str, folder: Path) -> Robot:
         path.write_text(quadruped())
         return Robot.load(path, fixed_base=False)
     package = importlib.util.find_spec("example_robot_data")
-    installed = [Path(package.origin).parents[4] / "share/example-robot-data/robots"] if package else []
+    installed = (
+        [Path(package.origin).parents[4] / "share/example-robot-data/robots"] if package else []
+    )
     given = [Path(place) for place in (os.environ.get("EXAMPLE_ROBOT_DATA"),) if place]
     paths = [place / FILES[name] for place in (*given, *installed)]
     found = next((path for path in paths if path.is_file()), None)
     if found is None:
-        pytest.skip(f"{FILES[name]} is not found: install example-robot-data, or set EXAMPLE_ROBOT_DATA")
+        pytest.skip(
+            f"{FILES[name]} is not found: install example-robot-data, or set EXAMPLE_ROBOT_DATA"
+        )
     return Robot.load(found, fixed_base=False)
 
 
@@ -87,16 +93,28 @@ def closed_loop(runner: Runner, table: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def efforts_of(robot: Robot, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose of the base at the start (7,), and the efforts (steps, dof) of the closed loop."""
+    """Return the pose of the base at the start (7,), and the efforts (steps, dof) of the closed
+    loop.
+    """
     with Runner(robot, 1, params=gains(robot), workers=0, engine="mujoco", substeps=1) as runner:
         start = runner.reset().base_pose[0].astype(np.float64)
-        return start, runner.rollout(np.repeat(table, SUBSTEPS, axis=0)).effort[:, 0].astype(np.float64)
+        return start, runner.rollout(np.repeat(table, SUBSTEPS, axis=0)).effort[:, 0].astype(
+            np.float64
+        )
 
 
-def bare_engine(robot: Robot, num_envs: int, start: np.ndarray, efforts: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return what :func:`closed_loop` returns, of ``mujoco.batch`` under ``efforts`` (steps, dof)."""
+def bare_engine(
+    robot: Robot, num_envs: int, start: np.ndarray, efforts: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Return what :func:`closed_loop` returns, of ``mujoco.batch`` under ``efforts`` (steps,
+    dof).
+    """
     options = {"fixed_base": False, "engine": "mujoco"}
-    built = robot_model(SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options))
+    built = robot_model(
+        SceneSpec(
+            robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
+        )
+    )
     batch = mujoco_batch.Batch(built.model, num_envs, nthread=1, persistent=True)
     qpos, applied = batch.bind("qpos"), batch.bind("qfrc_applied")
     qpos[:, :7], qpos[:, built.qpos] = start, robot.start
@@ -110,13 +128,19 @@ def bare_engine(robot: Robot, num_envs: int, start: np.ndarray, efforts: np.ndar
 @pytest.mark.parametrize("name", [*FILES, "boxes"])
 def test_standing_robots(benchmark, report, compare, most, name, tmp_path):
     benchmark.group = "on the floor, in one process"
-    robot, num_envs, rounds = load(name, tmp_path), min(NUM_ENVS, most.envs), min(ROUNDS, most.rounds)
+    robot, num_envs, rounds = (
+        load(name, tmp_path),
+        min(NUM_ENVS, most.envs),
+        min(ROUNDS, most.rounds),
+    )
     table = setpoints(robot, SUBSTEPS * min(TICKS, most.ticks))
     start, efforts = efforts_of(robot, table)
 
     def measure():
         rows = []
-        with Runner(robot, num_envs, params=gains(robot), workers=0, engine="mujoco", substeps=SUBSTEPS) as runner:
+        with Runner(
+            robot, num_envs, params=gains(robot), workers=0, engine="mujoco", substeps=SUBSTEPS
+        ) as runner:
             for _ in range(rounds + 1):
                 (ours, moved), (bare, theirs) = (
                     closed_loop(runner, table),

@@ -13,7 +13,9 @@ NUM_ENVS, TICKS = 64, 12
 
 
 def test_env_keeps_nine_tenths_of_the_runners_rate(benchmark, compare, most):
-    """64 pandas, 40 sim steps per action. Blocks of both alternate, so that a busy machine slows both equally."""
+    """64 pandas, 40 sim steps per action. Blocks of both alternate, so that a busy machine slows
+    both equally.
+    """
     options = {} if most.workers else {"workers": 0}
     env = ReachVectorEnv(min(NUM_ENVS, most.envs), max_episode_steps=None, **options)
     first, _ = env.reset(seed=0)

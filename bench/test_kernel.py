@@ -1,14 +1,17 @@
-"""Speed of the law alone, for 1 to 2^20 envs of 9 joints, against other kernels and the machine's bandwidth.
+"""Speed of the law alone, for 1 to 2^20 envs of 9 joints, against other kernels and the machine's
+bandwidth.
 
-The law has P, I, filtered D, feedforward, effort limits and back-calculation, in float32. The necessary bytes of a step
-are each input read once and each output written once: setpoint, measurement, feedforward, integral, last measurement
-and filtered rate in; effort, integral, measurement and filtered rate out; 10 arrays of envs x joints. Bandwidth is
-their size over the best time of a step. ``of triad`` is its share of the bandwidth of a[i] = b[i] + s c[i] over arrays
-of the same size, counted as 3 arrays and measured in the same test on all cores (numba), or of a copy on the GPU where
-JAX has one. Compilation is never timed. "native", "numpy" and "jax" are :class:`batchpid.BatchPID`, the first two with
-and without the extension; efforts of "native" are written into kept arrays (``out=``). "jax in blocks" is
-:func:`batchpid.law.blocks.advance_in_blocks` under shard_map with a device for each core, whose efforts overwrite the
-efforts of the step before last.
+The law has P, I, filtered D, feedforward, effort limits and back-calculation, in float32. The
+necessary bytes of a step are each input read once and each output written once: setpoint,
+measurement, feedforward, integral, last measurement and filtered rate in; effort, integral,
+measurement and filtered rate out; 10 arrays of envs x joints. Bandwidth is their size over the best
+time of a step. ``of triad`` is its share of the bandwidth of a[i] = b[i] + s c[i] over arrays of
+the same size, counted as 3 arrays and measured in the same test on all cores (numba), or of a copy
+on the GPU where JAX has one. Compilation is never timed. "native", "numpy" and "jax" are
+:class:`batchpid.BatchPID`, the first two with and without the extension; efforts of "native" are
+written into kept arrays (``out=``). "jax in blocks" is
+:func:`batchpid.law.blocks.advance_in_blocks` under shard_map with a device for each core, whose
+efforts overwrite the efforts of the step before last.
 """
 
 import os
@@ -52,7 +55,9 @@ def inputs(num_envs, dtype=np.float32):
 
 @pytest.fixture(scope="module", autouse=True)
 def devices(most):
-    """One JAX device per core. A smoke run shares its process with other tests and keeps the devices there are."""
+    """One JAX device per core. A smoke run shares its process with other tests and keeps the
+    devices there are.
+    """
     if most.floors:
         jax.config.update("jax_num_cpu_devices", os.cpu_count())
 
@@ -81,7 +86,9 @@ def _triad(a, b, c, s):
 
 @pytest.fixture(scope="module")
 def machine_bandwidth(best):
-    """Function that returns bytes per second of the triad (CPU, all cores) or of a copy (GPU), cached by size."""
+    """Function that returns bytes per second of the triad (CPU, all cores) or of a copy (GPU),
+    cached by size.
+    """
 
     @cache
     def machine_bandwidth(num_envs):
@@ -101,7 +108,9 @@ def machine_bandwidth(best):
 
 
 @numba.njit(parallel=True)
-def _by_hand(kp, ki, kd, low, high, decay, intake, per_dt, dt, back, r, y, ff, integral, last, rate, effort):
+def _by_hand(
+    kp, ki, kd, low, high, decay, intake, per_dt, dt, back, r, y, ff, integral, last, rate, effort
+):
     for i in numba.prange(r.shape[0]):
         for j in range(r.shape[1]):
             e = r[i, j] - y[i, j]
@@ -113,7 +122,9 @@ def _by_hand(kp, ki, kd, low, high, decay, intake, per_dt, dt, back, r, y, ff, i
 
 
 def native_step(num_envs, dtype=np.float32, threads=None):
-    """Return a call of BatchPID by the native extension, which writes over the efforts of the call before last."""
+    """Return a call of BatchPID by the native extension, which writes over the efforts of the call
+    before last.
+    """
     r, y0, y1, ff = inputs(num_envs, dtype)
     pid, turn = bp.BatchPID(PARAMS.replace(dtype=dtype), num_envs, DT, threads=threads), [y0, y1]
     outs = [np.empty_like(r), np.empty_like(r)]
@@ -153,7 +164,9 @@ def jax_step(num_envs):
 
 
 def jax_step_in_blocks(num_envs):
-    """Return a call with a share of the envs on each device; outputs overwrite the outputs of the call before last."""
+    """Return a call with a share of the envs on each device; outputs overwrite the outputs of the
+    call before last.
+    """
     mesh = jax.make_mesh((jax.device_count(),), ("envs",), axis_types=(jax.sharding.AxisType.Auto,))
     by_env = jax.P("envs")
     r, y0, y1, ff = (jax.device_put(x, jax.NamedSharding(mesh, by_env)) for x in inputs(num_envs))
@@ -163,7 +176,11 @@ def jax_step_in_blocks(num_envs):
         return advance_in_blocks(k, state, r, y, None, None, ff, out=out)
 
     sharded = jax.shard_map(
-        step, mesh=mesh, in_specs=(by_env, jax.P(), *[by_env] * 4), out_specs=by_env, check_vma=False
+        step,
+        mesh=mesh,
+        in_specs=(by_env, jax.P(), *[by_env] * 4),
+        out_specs=by_env,
+        check_vma=False,
     )
     step = jax.jit(sharded, donate_argnums=0)
     params = jax.tree.map(jnp.asarray, PARAMS)
@@ -187,7 +204,10 @@ def numba_step(num_envs):
         np.asarray(x, np.float32).ravel()
         for x in (k.kp, PARAMS.ki, k.kd, k.effort_min, k.effort_max, k.decay, k.intake)
     ]
-    scalars, back = (np.float32(k.per_dt), np.float32(DT)), np.asarray(k.tracking, np.float32).ravel()
+    scalars, back = (
+        (np.float32(k.per_dt), np.float32(DT)),
+        np.asarray(k.tracking, np.float32).ravel(),
+    )
     state = [np.zeros_like(r), y1.copy(), np.zeros_like(r)]
     effort, turn = np.empty_like(r), [y0, y1]
 
@@ -269,7 +289,11 @@ def test_step(benchmark, compare, most, best, machine_bandwidth, found, kernel, 
         "triad GB/s": round(bandwidth / 1e9, 1),
         "device": str(jax.devices()[0]) if kernel.startswith("jax") else f"{os.cpu_count()} CPUs",
     }
-    others = {over: figures for (envs, over), figures in found.items() if envs == num_envs and over != kernel}
+    others = {
+        over: figures
+        for (envs, over), figures in found.items()
+        if envs == num_envs and over != kernel
+    }
     for over, (effort, seconds) in others.items():
         np.testing.assert_allclose(first, effort, rtol=1e-3, atol=1e-2)
         compare(f"law, {num_envs} envs", kernel, over, seconds / least)
@@ -279,7 +303,9 @@ def test_step(benchmark, compare, most, best, machine_bandwidth, found, kernel, 
 @pytest.mark.parametrize(("num_envs", "threads"), [(64, 1), (4096, 1), (2**20, 1), (2**20, 2)])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_native_against_numpy_and_memory(benchmark, compare, most, dtype, num_envs, threads):
-    """Least times of rounds in turn: the law by the extension and by NumPy, and the triad on as many threads."""
+    """Least times of rounds in turn: the law by the extension and by NumPy, and the triad on as
+    many threads.
+    """
     num_envs, threads = min(num_envs, most.rows), min(threads, numba.config.NUMBA_NUM_THREADS)
     a, b, c = np.ones((3, num_envs * JOINTS), dtype)
     calls = {
@@ -309,7 +335,9 @@ def test_native_against_numpy_and_memory(benchmark, compare, most, dtype, num_en
     assert calls["native"]().tobytes() == calls["numpy"]().tobytes()
     least = {name: min(each) for name, each in times.items()}
     bound = ARRAYS / 3 * least["triad"]
-    benchmark.extra_info |= {f"us, {name}": round(1e6 * seconds, 2) for name, seconds in least.items()}
+    benchmark.extra_info |= {
+        f"us, {name}": round(1e6 * seconds, 2) for name, seconds in least.items()
+    }
     setup = f"law, {num_envs} envs, {np.dtype(dtype)}, {threads} threads"
     compare(setup, "native", "numpy", least["numpy"] / least["native"])
     compare(setup, "native", "bound by the triad's memory traffic", bound / least["native"])
@@ -327,7 +355,9 @@ def test_scalar_loop(benchmark, most, kernel, num_envs):
 
 @pytest.mark.parametrize("kernel", ["jax", "jax in blocks"])
 def test_against_the_scalar_loop_in_one_run(benchmark, compare, most, best, kernel):
-    """JAX at 2^20 x 9 takes less than a tenth of the time of the tutorial's scalar loop, per env."""
+    """JAX at 2^20 x 9 takes less than a tenth of the time of the tutorial's scalar loop, per
+    env.
+    """
     few, many = min(4096, most.rows), min(2**20, most.rows)
     slow = best(SCALARS["tutorial"](few)) / few
     benchmark.pedantic(KERNELS[kernel](many), rounds=min(5, most.rounds), warmup_rounds=2)
@@ -339,7 +369,11 @@ def test_against_the_scalar_loop_in_one_run(benchmark, compare, most, best, kern
 @pytest.mark.parametrize("num_envs", [64, 4096])
 def test_scan(benchmark, most, num_envs):
     """Time per step of jax.lax.scan over a closed loop: the law on a double integrator."""
-    num_envs, steps, params = min(num_envs, most.rows), 2000 if most.floors else 500, jax.tree.map(jnp.asarray, PARAMS)
+    num_envs, steps, params = (
+        min(num_envs, most.rows),
+        2000 if most.floors else 500,
+        jax.tree.map(jnp.asarray, PARAMS),
+    )
     r, y, _, ff = (jnp.asarray(x) for x in inputs(num_envs))
 
     @jax.jit
@@ -350,7 +384,9 @@ def test_scan(benchmark, most, num_envs):
             v = v + effort * DT
             return (state, y + v * DT, v), None
 
-        return jax.lax.scan(body, (bp.init(params, y), y, jnp.zeros_like(y)), None, length=steps)[0][1]
+        return jax.lax.scan(body, (bp.init(params, y), y, jnp.zeros_like(y)), None, length=steps)[
+            0
+        ][1]
 
     assert np.abs(run(params, y) - y).max() > 0.01, "the loop moved"
     benchmark.pedantic(lambda: run(params, y).block_until_ready(), rounds=min(5, most.rounds))
@@ -359,7 +395,9 @@ def test_scan(benchmark, most, num_envs):
 
 @pytest.mark.parametrize("kernel", ["numpy", "jax"])
 def test_settled_filters_cost_the_same(benchmark, compare, most, kernel):
-    """Steps after 10,000 at rest, with decayed filters, cost no more than fresh ones; blocks of both alternate."""
+    """Steps after 10,000 at rest, with decayed filters, cost no more than fresh ones; blocks of
+    both alternate.
+    """
     y = np.zeros((64, JOINTS), np.float32)
     r = np.zeros_like(y)
     pids = {name: bp.BatchPID(PARAMS, 64, DT, kernel) for name in ("moving", "settled")}

@@ -1,7 +1,8 @@
-"""A panda with a cube in an MJCF scene: closed loop over ``mujoco.batch`` without control, in the same motion.
+"""A panda with a cube in an MJCF scene: closed loop over ``mujoco.batch`` without control, in the
+same motion.
 
-``mujoco.batch`` gets the efforts of our loop at every sim step. Both step the file's model, in turn in one process.
-Processor time: another program disturbs it less.
+``mujoco.batch`` gets the efforts of our loop at every sim step. Both step the file's model, in turn
+in one process. Processor time: another program disturbs it less.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
 
 TICKS, ROUNDS, SUBSTEPS, NUM_ENVS = 20, 5, 20, 64
-CUBE = '<body name="cube" pos=".5 0 .03"><freejoint/><geom type="box" size=".03 .03 .03" density="400"/></body>'
+CUBE = (
+    '<body name="cube" pos=".5 0 .03"><freejoint/><geom type="box" size=".03 .03 .03"'
+    ' density="400"/></body>'
+)
 
 
 def panda_with_a_cube(folder: Path) -> Robot:
@@ -40,10 +44,16 @@ def panda_with_a_cube(folder: Path) -> Robot:
 
 
 def step_alone(robot: Robot, efforts: NDArray[Any]) -> tuple[float, NDArray[Any]]:
-    """Return the processor time of an env step of ``mujoco.batch`` under efforts (steps, envs, dof), and the end."""
+    """Return the processor time of an env step of ``mujoco.batch`` under efforts (steps, envs,
+    dof), and the end.
+    """
     options: dict[str, Any] = {"mjcf": robot.mjcf, "ground": robot.has_ground, "engine": "mujoco"}
     options |= {"fixed_base": robot.fixed_base}
-    built = robot_model(SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options))
+    built = robot_model(
+        SceneSpec(
+            robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
+        )
+    )
     steps, num_envs, _ = efforts.shape
     batch = mujoco_batch.Batch(built.model, num_envs, nthread=1, persistent=True)
     qpos, applied, seconds = batch.bind("qpos"), batch.bind("qfrc_applied"), 0.0
@@ -56,10 +66,16 @@ def step_alone(robot: Robot, efforts: NDArray[Any]) -> tuple[float, NDArray[Any]
     return seconds / (steps * num_envs), qpos[:, built.qpos].copy()
 
 
-def run_scene(robot: Robot, setpoints: NDArray[Any], substeps: int, **options: Any) -> tuple[float, Any]:
-    """Return the processor time of an env step of our loop under setpoints (ticks, envs, dof), and the rollout."""
+def run_scene(
+    robot: Robot, setpoints: NDArray[Any], substeps: int, **options: Any
+) -> tuple[float, Any]:
+    """Return the processor time of an env step of our loop under setpoints (ticks, envs, dof), and
+    the rollout.
+    """
     ticks, num_envs, _ = setpoints.shape
-    with Runner(robot, num_envs, engine="mujoco", workers=0, substeps=substeps, **options) as runner:
+    with Runner(
+        robot, num_envs, engine="mujoco", workers=0, substeps=substeps, **options
+    ) as runner:
         runner.reset()
         began = time.process_time()
         rollout = runner.rollout(setpoints)
@@ -88,4 +104,9 @@ def test_panda_with_a_cube(benchmark, report, compare, most, tmp_path):
     report([ours for ours, _ in rows])
     ratio = statistics.median(alone / ours for ours, alone in rows)
     benchmark.extra_info["over mujoco.batch without control"] = round(ratio, 3)
-    compare("panda and cube, designed gains", f"MuJoCo, {num_envs} envs", "mujoco.batch without control", ratio)
+    compare(
+        "panda and cube, designed gains",
+        f"MuJoCo, {num_envs} envs",
+        "mujoco.batch without control",
+        ratio,
+    )

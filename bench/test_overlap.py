@@ -1,7 +1,7 @@
 """Step and policy at once: halves of the envs in turns by send and recv, over step and then policy.
 
-The policy takes as long as half a tick. It waits, as for an accelerator, while the workers have two cores; or it
-computes on one core of two, while each runner has one worker.
+The policy takes as long as half a tick. It waits, as for an accelerator, while the workers have two
+cores; or it computes on one core of two, while each runner has one worker.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ def seconds_of(act, *arguments) -> float:
 
 @pytest.mark.check
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
-@pytest.mark.parametrize(("policy", "workers"), [(sleep, 2), (compute, 1)], ids=["waits", "computes"])
+@pytest.mark.parametrize(
+    ("policy", "workers"), [(sleep, 2), (compute, 1)], ids=["waits", "computes"]
+)
 def test_step_and_policy_at_once_are_faster_than_one_after_the_other(most, policy, workers):
     envs, workers, ticks = min(ENVS, most.envs), min(workers, most.workers), min(TICKS, most.ticks)
     with ExitStack() as stack:
@@ -68,9 +70,14 @@ def test_step_and_policy_at_once_are_faster_than_one_after_the_other(most, polic
                 one_by_one = seconds_of(in_turn, whole, policy, tick / 2, ticks)
                 ratios.append(one_by_one / seconds_of(at_once, halves, policy, tick / 2, ticks))
             found = float(np.median(ratios))
-            print(f"\ntick {1e3 * tick:.1f} ms: {found:.2f} times the throughput, rounds {np.round(ratios, 2)}")
+            print(
+                f"\ntick {1e3 * tick:.1f} ms: {found:.2f} times the throughput, rounds"
+                f" {np.round(ratios, 2)}"
+            )
             for runner in (whole, *halves):
-                assert (np.abs(runner.observe().qpos - runner.robot.start).max(1) > 0.05).all(), "they did not move"
+                assert (np.abs(runner.observe().qpos - runner.robot.start).max(1) > 0.05).all(), (
+                    "they did not move"
+                )
             if found >= FLOOR or not most.floors:
                 return
     pytest.fail(f"{found:.2f} times the throughput of step and then policy, floor {FLOOR}")

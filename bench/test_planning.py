@@ -1,4 +1,6 @@
-"""Plans by rollouts of 64 copies of one state: their rate, and the time that the slowest of a hundred takes."""
+"""Plans by rollouts of 64 copies of one state: their rate, and the time that the slowest of a
+hundred takes.
+"""
 
 import time
 
@@ -9,7 +11,11 @@ import batchpid as bp
 from batchpid.sim import Robot, Runner
 
 SAMPLES, TICKS, PLANS = 64, 30, 100
-IMPLICIT = {"gain_units": "mass_matrix", "discretization": "implicit", "measurement_rate": "measured"}
+IMPLICIT = {
+    "gain_units": "mass_matrix",
+    "discretization": "implicit",
+    "measurement_rate": "measured",
+}
 CASES = {
     # time step: sim steps in a tick of 0.01 s, options of the gains, least plans per second
     "1/2000 s": (1 / 2000, 20, {"gain_units": "mass_matrix", "measurement_rate": "measured"}, 12.0),
@@ -53,7 +59,9 @@ def test_plans(benchmark, most, case):
             assert np.ptp(qpos, axis=0).max() > 0.05, "the robots did not move"
             plant.step(setpoints[0, 0])
 
-        benchmark.pedantic(plan, rounds=int(min(PLANS, most.rounds)), warmup_rounds=int(min(5, most.rounds)))
+        benchmark.pedantic(
+            plan, rounds=int(min(PLANS, most.rounds)), warmup_rounds=int(min(5, most.rounds))
+        )
     times = np.sum([*parts.values()], axis=0)
     benchmark.extra_info["plans per second"] = round(float(1 / np.median(times)), 1)
     benchmark.extra_info["goal"] = goal

@@ -1,4 +1,5 @@
-"""Cost of setpoints that move within the tick: rollouts with rates against the same without, by processor time.
+"""Cost of setpoints that move within the tick: rollouts with rates against the same without, by
+processor time.
 
 The rates are 0, so that both runs make the same motion, and they alternate in one process.
 """
@@ -34,7 +35,9 @@ def test_rates_cost_little(benchmark, report, compare, most, engine):
     def measure():
         cases = {}, {"setpoint_rates": np.zeros_like(setpoints)}
         with Runner(robot, num_envs, engine=engine, workers=0) as runner:
-            return [[seconds_per_env_step(runner, **case) for case in cases] for _ in range(rounds + 1)][-rounds:]
+            return [
+                [seconds_per_env_step(runner, **case) for case in cases] for _ in range(rounds + 1)
+            ][-rounds:]
 
     rows = benchmark.pedantic(measure, rounds=1)
     report([rated for _, rated in rows])

@@ -13,7 +13,9 @@ from workload import Workload
 from batchpid.sim import Robot, Runner
 
 FEW, MANY, MOST = 64, 1024, 2048
-pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")  # the tutorial's gains on the jaco2
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::batchpid.sim.StabilityWarning"
+)  # the tutorial's gains on the jaco2
 
 
 @pytest.fixture(params=["panda", "jaco2"])
@@ -57,7 +59,9 @@ def test_memory_and_build(benchmark, make_runner, workload, most):
         with make_runner(num_envs) as runner:
             seconds[num_envs].append(time.perf_counter() - began)
             step_once(runner, workload)
-            memory[num_envs].append(resident(runner.pids) + runner.num_envs * shared_bytes(workload))
+            memory[num_envs].append(
+                resident(runner.pids) + runner.num_envs * shared_bytes(workload)
+            )
 
     def build_few_and_many():
         build(few)
@@ -80,7 +84,9 @@ def sizes(most, many):
 
 
 def shared_bytes(workload):
-    """Return the parent's bytes of one env in the shared arrays: 3 doubles, 3 floats, a flag per joint; 4 words."""
+    """Return the parent's bytes of one env in the shared arrays: 3 doubles, 3 floats, a flag per
+    joint; 4 words.
+    """
     return workload.robot.dof * (3 * 8 + 3 * 4 + 1) + 4 * 8
 
 
@@ -105,7 +111,9 @@ def test_start(benchmark, make_runner, workload, most):
 
 
 def test_cost_of_many_envs(benchmark, compare, make_runner, workload, most):
-    """Cost of an env step with 2048 envs over that with 64, in turn on two runners of two workers."""
+    """Cost of an env step with 2048 envs over that with 64, in turn on two runners of two
+    workers.
+    """
     benchmark.group = "resources"
     ratios, (fewest, largest) = [], sizes(most, MOST)
     with make_runner(fewest) as few, make_runner(largest) as many:
@@ -127,11 +135,18 @@ def test_cost_of_many_envs(benchmark, compare, make_runner, workload, most):
         obs = many.observe()
     assert obs.ok.all()
     benchmark.extra_info["cost_2048_over_64"] = round(median(ratios), 3)
-    compare(f"{workload.robot.name}, speed of an env step", f"{largest} envs", f"{fewest} envs", 1 / median(ratios))
+    compare(
+        f"{workload.robot.name}, speed of an env step",
+        f"{largest} envs",
+        f"{fewest} envs",
+        1 / median(ratios),
+    )
 
 
 def test_tick(benchmark, make_runner, workload, most):
-    """Time of a tick of one sim step beyond the work of the slower worker: a policy at 2 kHz in the parent."""
+    """Time of a tick of one sim step beyond the work of the slower worker: a policy at 2 kHz in the
+    parent.
+    """
     benchmark.group = "resources"
     over = []
     with make_runner(min(64, most.envs), substeps=1) as runner:

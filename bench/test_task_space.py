@@ -1,10 +1,12 @@
-"""Cost of operational-space control and of inverse kinematics of a panda: native rows against NumPy.
+"""Cost of operational-space control and of inverse kinematics of a panda: native rows against
+NumPy.
 
-"regular" rows are at a pose where the inverse of the mobility is Cholesky's, "bounded" rows near a straight arm, where
-each needs its eigenvalues. ``step`` is the law with the dynamics of a tree, in one call; its parts are timed as
-separate calls. Searches start 0.3 rad away from a solution.
+"regular" rows are at a pose where the inverse of the mobility is Cholesky's, "bounded" rows near a
+straight arm, where each needs its eigenvalues. ``step`` is the law with the dynamics of a tree, in
+one call; its parts are timed as separate calls. Searches start 0.3 rad away from a solution.
 
-The closed loop under control "osc" is compared with that under joint PID in one process in turn, by processor time.
+The closed loop under control "osc" is compared with that under joint PID in one process in turn, by
+processor time.
 """
 
 from __future__ import annotations
@@ -49,14 +51,25 @@ def test_osc_step(benchmark, compare, most, num_envs, pose):
     if native_rows.in_use() is None:
         pytest.skip("there is no extension")
     robot = Robot.load("panda")
-    tree, rows, rng = robot.kinematic_tree(), int(min(num_envs, most.rows)), np.random.default_rng(0)
+    tree, rows, rng = (
+        robot.kinematic_tree(),
+        int(min(num_envs, most.rows)),
+        np.random.default_rng(0),
+    )
     qpos = POSES[pose] + 0.01 * rng.normal(size=(rows, tree.dof))
     qvel = 0.1 * rng.normal(size=qpos.shape)
     options = {"effort_limit": robot.effort_limit, "smallest_eigenvalue": SMALLEST_EIGENVALUE[pose]}
     params = ts.make_osc_params(tree, **options)
     k = ts.discretise(params, 1 / 2000)
-    state, goal = ts.init(params, qpos), ts.link_poses(tree, qpos, [LINK])[:, 0] + [0.05, 0, 0, 0, 0, 0, 0]
-    d, tool, inputs = ts.task_dynamics(tree, qpos, qvel, LINK), ts.Tool(tree, LINK), ts.OSCInputs(goal, qpos, qvel)
+    state, goal = (
+        ts.init(params, qpos),
+        ts.link_poses(tree, qpos, [LINK])[:, 0] + [0.05, 0, 0, 0, 0, 0, 0],
+    )
+    d, tool, inputs = (
+        ts.task_dynamics(tree, qpos, qvel, LINK),
+        ts.Tool(tree, LINK),
+        ts.OSCInputs(goal, qpos, qvel),
+    )
 
     def step():
         return ts.osc(k, state, tool, inputs)
@@ -83,9 +96,16 @@ def test_osc_step(benchmark, compare, most, num_envs, pose):
 def test_search(benchmark, compare, most, num_envs):
     if native_rows.in_use() is None:
         pytest.skip("there is no extension")
-    tree, rows, rng = Robot.load("panda").kinematic_tree(), int(min(num_envs, most.rows)), np.random.default_rng(0)
+    tree, rows, rng = (
+        Robot.load("panda").kinematic_tree(),
+        int(min(num_envs, most.rows)),
+        np.random.default_rng(0),
+    )
     qpos = rng.uniform(tree.lower, tree.upper, (rows, tree.dof))
-    goal, way = ts.link_poses(tree, qpos, [LINK])[:, 0], tree.chain(LINK) * rng.normal(size=qpos.shape)
+    goal, way = (
+        ts.link_poses(tree, qpos, [LINK])[:, 0],
+        tree.chain(LINK) * rng.normal(size=qpos.shape),
+    )
     start = qpos + 0.3 * way / np.linalg.norm(way, axis=1, keepdims=True)
 
     def search():
@@ -114,7 +134,10 @@ def test_closed_loop(benchmark, report, compare, most, engine, num_envs):
     ticks, rounds = int(min(40 if num_envs == 1 else 20, most.ticks)), int(min(7, most.rounds))
     work = Workload(robot, num_envs, workers=0, ticks=ticks)
     goal = ts.link_poses(robot.kinematic_tree(), work.target[None], [LINK])[0, 0]
-    osc, options = OperationalSpace(robot, LINK, posture=work.target), {"engine": engine, "workers": 0}
+    osc, options = (
+        OperationalSpace(robot, LINK, posture=work.target),
+        {"engine": engine, "workers": 0},
+    )
 
     def seconds_per_env_step(runner, setpoint):
         runner.reset(work.start)
@@ -122,7 +145,9 @@ def test_closed_loop(benchmark, report, compare, most, engine, num_envs):
         began = time.process_time()
         qpos = runner.rollout(setpoints).qpos[-1]
         seconds = time.process_time() - began
-        assert (np.abs(qpos - work.start)[:, work.moving].max(1) > 0.05).all(), "the robots did not move"
+        assert (np.abs(qpos - work.start)[:, work.moving].max(1) > 0.05).all(), (
+            "the robots did not move"
+        )
         return seconds / (work.steps * num_envs)
 
     def measure():
@@ -132,11 +157,17 @@ def test_closed_loop(benchmark, report, compare, most, engine, num_envs):
             Runner(robot, num_envs, params=robot.params(), **options) as tutorial,
         ):
             cases = (tool, goal), (tuned, work.target), (tutorial, work.target)
-            return [[seconds_per_env_step(*case) for case in cases] for _ in range(rounds + 1)][-rounds:]
+            return [[seconds_per_env_step(*case) for case in cases] for _ in range(rounds + 1)][
+                -rounds:
+            ]
 
     rows = benchmark.pedantic(measure, rounds=1)
     report([row[0] for row in rows])
-    least = None if num_envs == 1 else 0.86  # 0.9 of the measured median, 0.96: room for a machine that is not idle
+    least = (
+        None if num_envs == 1 else 0.86
+    )  # 0.9 of the measured median, 0.96: room for a machine that is not idle
     for column, gains in ((1, "tuned"), (2, "tutorial")):
         ratio = statistics.median(row[column] / row[0] for row in rows)
-        compare(f"{engine}, {num_envs} envs", "osc", f"joint PID, {gains} gains", ratio, least=least)
+        compare(
+            f"{engine}, {num_envs} envs", "osc", f"joint PID, {gains} gains", ratio, least=least
+        )

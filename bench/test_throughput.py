@@ -1,4 +1,5 @@
-"""Rates of the closed loop, the tutorial's loop, the bare engine and third-party peers, measured in turn.
+"""Rates of the closed loop, the tutorial's loop, the bare engine and third-party peers, measured in
+turn.
 
 measure.py prints the same.
 """
@@ -17,7 +18,9 @@ ENVS, TICKS, ROUNDS = 32, 50, 3  # two groups of envs
 @pytest.mark.parametrize("physics", ["accurate", "fast"])
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_cases(benchmark, report, compare, most, name, physics):
-    """Env-steps per second of the closed loop over those of every case; XLA, MuJoCo and peers with "accurate" only."""
+    """Env-steps per second of the closed loop over those of every case; XLA, MuJoCo and peers with
+    "accurate" only.
+    """
     benchmark.group = f"{name}, {physics}"
     envs, workers, rounds = min(ENVS, most.envs), min(2, most.workers), min(ROUNDS, most.rounds)
     workload = Workload(Robot.load(name), envs, workers, physics, ticks=TICKS, rounds=rounds)

@@ -1,7 +1,9 @@
-"""SAPIEN's tutorial "Drive Robot with PID Controller", as written: reference of tests, baseline of the benchmarks.
+"""SAPIEN's tutorial "Drive Robot with PID Controller", as written: reference of tests, baseline of
+the benchmarks.
 
-It has one robot in one scene, one Python object per joint, and one call after another. Only the parts that need a
-display are left out. The objects are SAPIEN's, with its default settings. The Runner does not use this module.
+It has one robot in one scene, one Python object per joint, and one call after another. Only the
+parts that need a display are left out. The objects are SAPIEN's, with its default settings. The
+Runner does not use this module.
 """
 
 from __future__ import annotations
@@ -16,7 +18,9 @@ from batchpid.sim.engine.sapien.user_content import HeadlessScene
 
 
 class SimplePID:
-    """u = kp e + ki I + kd (e - e') / dt, with I += e dt before, and e' = 0 at the start, hence a first kick."""
+    """u = kp e + ki I + kd (e - e') / dt, with I += e dt before, and e' = 0 at the start, hence a
+    first kick.
+    """
 
     def __init__(self, kp: float = 0.0, ki: float = 0.0, kd: float = 0.0) -> None:
         self.kp, self.ki, self.kd = kp, ki, kd
@@ -31,10 +35,11 @@ class SimplePID:
 
 
 class TutorialLoop:
-    """Scene and loop of the tutorial for one bundled robot, with SAPIEN's default friction and damping.
+    """Scene and loop of the tutorial for one bundled robot, with SAPIEN's default friction and
+    damping.
 
-    ``external_pid`` and ``internal_drive`` are the tutorial's two switches. ``target`` and ``start`` are (dof,) [rad or
-    m]; by default the start is the one in the robot's settings.
+    ``external_pid`` and ``internal_drive`` are the tutorial's two switches. ``target`` and
+    ``start`` are (dof,) [rad or m]; by default the start is the one in the robot's settings.
     """
 
     def __init__(
@@ -56,12 +61,16 @@ class TutorialLoop:
             file.write(robot.urdf)
             file.flush()
             self.robot: Any = loader.load(file.name)
-        self._gains = list(zip(settings.kp, settings.ki, settings.kd, strict=True)) if external_pid else []
+        self._gains = (
+            list(zip(settings.kp, settings.ki, settings.kd, strict=True)) if external_pid else []
+        )
         self._start, self.target = settings.start if start is None else start, target
         self.reset()
         if internal_drive:
             for joint, position in zip(self.robot.get_active_joints(), target, strict=True):
-                joint.set_drive_property(stiffness=settings.drive_stiffness, damping=settings.drive_damping)
+                joint.set_drive_property(
+                    stiffness=settings.drive_stiffness, damping=settings.drive_damping
+                )
                 joint.set_drive_target(position)
 
     def reset(self) -> None:
@@ -75,7 +84,9 @@ class TutorialLoop:
         qf = self.robot.compute_passive_force(gravity=True, coriolis_and_centrifugal=True)
         if self.pids:
             errors, dt = self.target - self.robot.get_qpos(), self.scene.get_timestep()
-            qf = qf + np.array([pid.compute(error, dt) for pid, error in zip(self.pids, errors, strict=True)])
+            qf = qf + np.array(
+                [pid.compute(error, dt) for pid, error in zip(self.pids, errors, strict=True)]
+            )
         self.robot.set_qf(qf)
         self.scene.step()
 

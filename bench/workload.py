@@ -1,4 +1,6 @@
-"""Workload of the benchmarks: robots and motion, the same in every case; and the interface of a case."""
+"""Workload of the benchmarks: robots and motion, the same in every case; and the interface of a
+case.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +20,16 @@ TIMESTEP = 1 / 2000
 DISTANCE = 0.3
 """Distance of the start from the target, per joint [rad]."""
 MOVED = 0.01
-"""Least motion in a round of each joint that starts away from its target [rad]: SAPIEN's friction slows some."""
+"""Least motion in a round of each joint that starts away from its target [rad]: SAPIEN's friction
+slows some.
+"""
 
 
 @dataclass(frozen=True)
 class Workload:
-    """Bundled robots that move from ``start`` to ``target`` in ``ticks`` of ``substeps`` sim steps, in ``rounds``."""
+    """Bundled robots that move from ``start`` to ``target`` in ``ticks`` of ``substeps`` sim steps,
+    in ``rounds``.
+    """
 
     robot: Robot
     num_envs: int = 64
@@ -40,7 +46,9 @@ class Workload:
 
     @property
     def start(self) -> np.ndarray:
-        """Start of every case (dof,) [rad or m]: ``DISTANCE`` below the target, on joints whose limits allow it."""
+        """Start of every case (dof,) [rad or m]: ``DISTANCE`` below the target, on joints whose
+        limits allow it.
+        """
         away = self.target - DISTANCE
         roomy = (self.robot.upper - self.robot.lower > 1.0) & (away > self.robot.lower)
         return np.where(roomy, away, self.target)
@@ -61,29 +69,51 @@ class Workload:
         return max(self.workers, 1)
 
     def simulated_robot(self, engine: str = "sapien") -> Robot:
-        """Return the robot: in SAPIEN with SAPIEN's own friction and damping, as in the tutorial's loop."""
+        """Return the robot: in SAPIEN with SAPIEN's own friction and damping, as in the tutorial's
+        loop.
+        """
         return Robot.load(self.robot.path, dissipation="sapien" if engine == "sapien" else "urdf")
 
     def weightless_scene(self, collisions: bool = True) -> SceneSpec:
-        """Return the scene in SAPIEN without gravity: a drive reaches the target without compensation."""
+        """Return the scene in SAPIEN without gravity: a drive reaches the target without
+        compensation.
+        """
         robot = self.simulated_robot()
-        options: dict[str, Any] = {"dissipation": robot.dissipation, "collisions": collisions, "ground": collisions}
-        spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, TIMESTEP, PHYSICS[self.physics], **options)
+        options: dict[str, Any] = {
+            "dissipation": robot.dissipation,
+            "collisions": collisions,
+            "ground": collisions,
+        }
+        spec = SceneSpec(
+            robot.urdf,
+            robot.ignored_pairs,
+            robot.joints,
+            TIMESTEP,
+            PHYSICS[self.physics],
+            **options,
+        )
         return replace(spec, gravity=(0.0, 0.0, 0.0))
 
     def runner(self, **options: Any) -> Runner:
         """Return a runner of the robots with the tutorial's gains."""
         robot = self.simulated_robot(options.get("engine", "sapien"))
-        ours = {"physics": self.physics, "substeps": self.substeps, "timestep": TIMESTEP, "workers": self.workers}
+        ours = {
+            "physics": self.physics,
+            "substeps": self.substeps,
+            "timestep": TIMESTEP,
+            "workers": self.workers,
+        }
         return Runner(robot, self.num_envs, params=robot.params(), **ours | options)
 
     def check_motion(self, case: str, final: np.ndarray) -> None:
-        """Raise RuntimeError unless the robot at ``final`` (dof,) has moved from the start towards the target."""
+        """Raise RuntimeError unless the robot at ``final`` (dof,) has moved from the start towards
+        the target.
+        """
         moved, left = (np.abs(final - place)[self.moving] for place in (self.start, self.target))
         if not np.isfinite(final).all() or moved.min() < MOVED or left.max() > DISTANCE:
             raise RuntimeError(
-                f"case {case!r}: the robots did not move as they should (moved {moved.round(3)}, left "
-                f"{left.round(3)}); its speed would mean nothing: run more ticks"
+                f"case {case!r}: the robots did not move as they should (moved {moved.round(3)},"
+                f" left {left.round(3)}); its speed would mean nothing: run more ticks"
             )
 
 
@@ -103,7 +133,9 @@ class Case(NamedTuple):
 
 
 def run_round(case: Case) -> tuple[float, np.ndarray]:
-    """Run one round of ``case``; return the seconds of stepping and the final positions of the first env (dof,)."""
+    """Run one round of ``case``; return the seconds of stepping and the final positions of the
+    first env (dof,).
+    """
     case.reset()
     began = time.perf_counter()
     final = case.run()

@@ -20,13 +20,21 @@ _ROLE = re.compile(r":(?:attr|class|data|exc|func|meth|mod):<code>[~!]?([^<]+)</
 def on_files(files: Any, config: Any) -> Any:
     """Add the pages in OUTSIDE to the files of the site."""
     for name in OUTSIDE:
-        files.append(File.generated(config, name, abs_src_path=str(Path(__file__).parents[1] / name)))
+        files.append(
+            File.generated(config, name, abs_src_path=str(Path(__file__).parents[1] / name))
+        )
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Return the page with links to and from the pages in OUTSIDE rewritten for the site, whose root is docs/."""
-    return markdown.replace("](docs/", "](") if page.file.src_uri in OUTSIDE else _LINK.sub(r"](\1\2", markdown)
+    """Return the page with links to and from the pages in OUTSIDE rewritten for the site, whose
+    root is docs/.
+    """
+    return (
+        markdown.replace("](docs/", "](")
+        if page.file.src_uri in OUTSIDE
+        else _LINK.sub(r"](\1\2", markdown)
+    )
 
 
 def on_page_content(html: str, **_: Any) -> str:

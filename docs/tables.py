@@ -1,6 +1,7 @@
 """Write the tables of fields in the guides: ``python docs/tables.py``.
 
-Names, units, bounds and the values for off come from the tables in the code, meanings from the docstrings there.
+Names, units, bounds and the values for off come from the tables in the code, meanings from the
+docstrings there.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ DOCS = Path(__file__).parent
 
 
 def numpydoc(function: Any) -> Iterator[tuple[list[str], str]]:
-    """Yield the names and the description of each entry under Parameters of a function's docstring."""
+    """Yield the names and the description of each entry under Parameters of a function's
+    docstring.
+    """
     parameters = re.split(r"\n\w+\n-+\n", inspect.getdoc(function) or "")[1]
     for names, text in re.findall(r"^(\S.*)\n((?:    .*\n?)+)", parameters, re.M):
         yield names.split(", "), text
@@ -61,11 +64,19 @@ def first_sentence(text: str) -> str:
 
 
 def options() -> str:
-    """Return the table of the Runner's options, with their defaults and the places that keep them."""
-    defaults, bounds = {each.name: each.default for each in fields(RunnerKeywords)}, declared(RunnerKeywords, Field)
+    """Return the table of the Runner's options, with their defaults and the places that keep
+    them.
+    """
+    defaults, bounds = (
+        {each.name: each.default for each in fields(RunnerKeywords)},
+        declared(RunnerKeywords, Field),
+    )
     rows = [("option", "range", "default", "kept in", "flag", "meaning"), ("---",) * 6]
     for (name,), text in attributes(RunnerKeywords):
-        kept, flag = OPTIONS[name].kept, f"`--{'no-' * (defaults[name] is True)}{name}`" if OPTIONS[name].flag else ""
+        kept, flag = (
+            OPTIONS[name].kept,
+            f"`--{'no-' * (defaults[name] is True)}{name}`" if OPTIONS[name].flag else "",
+        )
         default = "" if defaults[name] in (MISSING, DEFAULT_ENGINE) else f"`{defaults[name]}`"
         range_ = bound(bounds[name]) if name in bounds else ""
         rows.append((f"`{name}`", range_, default, ", ".join(kept), flag, first_sentence(text)))
@@ -85,7 +96,10 @@ def shown(neutral: Any) -> str:
 
 
 def table(
-    entries: Iterator[tuple[list[str], str]], fields: Mapping[str, Field], without: tuple[str, ...], off: bool = True
+    entries: Iterator[tuple[list[str], str]],
+    fields: Mapping[str, Field],
+    without: tuple[str, ...],
+    off: bool = True,
 ) -> str:
     """Return a table in Markdown, with a column for the values that are ``off``."""
     given = [cells(names, text, fields) for names, text in entries if names[0] not in without]
@@ -113,7 +127,9 @@ def pages() -> dict[Path, str]:
     for (page, name), rows in tables().items():
         path = DOCS / page
         marked = re.compile(rf"(<!-- {name}: made by docs/tables.py -->\n).*?(<!-- end -->)", re.S)
-        text, count = marked.subn(lambda match, rows=rows: f"{match[1]}{rows}\n{match[2]}", path.read_text())
+        text, count = marked.subn(
+            lambda match, rows=rows: f"{match[1]}{rows}\n{match[2]}", path.read_text()
+        )
         assert count == 1, (page, name)
         texts[path] = text
     return texts

@@ -1,7 +1,8 @@
-"""One robot under many gains, in chunks: a recording for each, and after a kill the same command goes on.
+"""One robot under many gains, in chunks: a recording for each, and after a kill the same command
+goes on.
 
-``python examples/chunks.py --num-envs 256 --folder gains`` moves a panda under 256 proportional gains. A recording is
-written as a whole or not at all, so one that exists is complete.
+``python examples/chunks.py --num-envs 256 --folder gains`` moves a panda under 256 proportional
+gains. A recording is written as a whole or not at all, so one that exists is complete.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ import tyro
 from batchpid.sim import Robot, Rollout, Runner, read_recording, write_recording
 
 
-def main(num_envs: int = 256, chunk: int = 64, seconds: float = 1.0, folder: Path = Path("out/gains")) -> list[Rollout]:
+def main(
+    num_envs: int = 256, chunk: int = 64, seconds: float = 1.0, folder: Path = Path("out/gains")
+) -> list[Rollout]:
     """Run the chunks that have no file yet, and return the rollouts of all."""
     robot = Robot.load("panda")
     kp = np.geomspace(20.0, 200.0, num_envs)

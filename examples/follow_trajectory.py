@@ -1,9 +1,11 @@
-"""Follow a trajectory: to the tutorial's pose and back along a step, a trapezoid, minimum jerk, or limited jerk.
+"""Follow a trajectory: to the tutorial's pose and back along a step, a trapezoid, minimum jerk, or
+limited jerk.
 
     python examples/follow_trajectory.py
 
-Each robot of the batch follows another profile over the same path, under the default gains. The runner gets rates and
-accelerations of the setpoint: the errors that remain show how hard a profile is to follow.
+Each robot of the batch follows another profile over the same path, under the default gains. The
+runner gets rates and accelerations of the setpoint: the errors that remain show how hard a profile
+is to follow.
 """
 
 import numpy as np
@@ -20,7 +22,9 @@ def profiles(start, target, velocity, acceleration) -> dict[str, Trajectory]:
     limits = {"max_velocity": velocity, "max_acceleration": acceleration}
     moves = {"trapezoidal": trapezoidal(start, target, DT, **limits)}
     try:
-        moves["jerk limited"] = jerk_limited(start, target, DT, **limits, max_jerk=10 * acceleration)
+        moves["jerk limited"] = jerk_limited(
+            start, target, DT, **limits, max_jerk=10 * acceleration
+        )
     except MissingDependencyError as error:
         print(error)
     moves["minimum jerk"] = minimum_jerk(start, target, DT, **limits)
@@ -44,12 +48,15 @@ def main():
         rollout = runner.rollout(position, setpoint_rates=rate, setpoint_accelerations=acceleration)
     arm = slice(0, 7)
     error = np.abs(rollout.qpos - rollout.setpoint)[:, :, arm]
-    print(f"{'profile':14} {'arrives':>9} {'worst error':>12} {'final error':>12} {'peak effort':>12}")
+    print(
+        f"{'profile':14} {'arrives':>9} {'worst error':>12} {'final error':>12} {'peak effort':>12}"
+    )
     for env, (name, move) in enumerate(moves.items()):
         arrival = move.time[np.argmax((move.position == move.position[-1]).all(-1))]
         print(
-            f"{name:14} {arrival:7.2f} s {1e3 * error[:, env].max():7.2f} mrad {1e3 * error[-1, env].max():7.3f} mrad "
-            f"{np.abs(rollout.effort[:, env, arm]).max():8.1f} N m"
+            f"{name:14} {arrival:7.2f} s {1e3 * error[:, env].max():7.2f} mrad"
+            f" {1e3 * error[-1, env].max():7.3f} mrad"
+            f" {np.abs(rollout.effort[:, env, arm]).max():8.1f} N m"
         )
 
 

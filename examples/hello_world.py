@@ -2,7 +2,8 @@
 
     python examples/hello_world.py
 
-``build(scene, env)`` is SAPIEN code as in its tutorial. The scenes are headless: visuals and lights are ignored.
+``build(scene, env)`` is SAPIEN code as in its tutorial. The scenes are headless: visuals and lights
+are ignored.
 """
 
 import numpy as np
@@ -34,7 +35,10 @@ def main(num_envs=4):
         for tick in range(51):
             if tick % 5 == 0:
                 heights = runner.poses()[:, 0, 2] - HALF
-                print(f"{tick * runner.substeps * runner.timestep:8.2f}   " + "  ".join(f"{z:6.3f}" for z in heights))
+                print(
+                    f"{tick * runner.substeps * runner.timestep:8.2f}   "
+                    + "  ".join(f"{z:6.3f}" for z in heights)
+                )
             obs = runner.step(robot.start)
         moved = np.abs(obs.qpos - robot.start).max()
         print(f"the robots moved by {moved:.1e} rad at most")

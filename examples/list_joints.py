@@ -21,9 +21,10 @@ def main(robot: tyro.conf.Positional[str] = "panda", stiffness: float = 0.0) -> 
     for joint in loaded.all_joints:
         drive = stiffness if joint.moves else 0.0
         print(
-            f"name: {joint.name}  type: {joint.type}  damping: {joint.damping:g}  stiffness: {drive:g}  "
-            f"friction: {joint.friction:g}  limits: [{joint.lower:g}, {joint.upper:g}] {joint.unit}  "
-            f"effort: {joint.effort_limit:g}  child link: {joint.child_link}  parent link: {joint.parent_link}"
+            f"name: {joint.name}  type: {joint.type}  damping: {joint.damping:g}  stiffness:"
+            f" {drive:g}  friction: {joint.friction:g}  limits: [{joint.lower:g}, {joint.upper:g}]"
+            f" {joint.unit}  effort: {joint.effort_limit:g}  child link: {joint.child_link}  parent"
+            f" link: {joint.parent_link}"
         )
     print("active joints:", ", ".join(loaded.joint_names))
     with Runner(loaded, 1, workers=0, control="effort") as runner:

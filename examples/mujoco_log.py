@@ -1,11 +1,12 @@
-"""Make a log for ``batchpid identify`` in MuJoCo: the same URDF, with known actuators, delay and encoder noise.
+"""Make a log for ``batchpid identify`` in MuJoCo: the same URDF, with known actuators, delay and
+encoder noise.
 
     python examples/mujoco_log.py panda --seconds 10 --out panda.log.csv
 
-It needs the package ``mujoco``. Joints have reflected inertia, viscous and Coulomb friction; of the effort that the PID
-law asks for, a share arrives, late. MuJoCo compensates gravity and Coriolis forces, as robots do that are commanded
-without them. The true values are printed, and written to an actuators file next to the log, for comparison with the
-result of ``identify``.
+It needs the package ``mujoco``. Joints have reflected inertia, viscous and Coulomb friction; of the
+effort that the PID law asks for, a share arrives, late. MuJoCo compensates gravity and Coriolis
+forces, as robots do that are commanded without them. The true values are printed, and written to an
+actuators file next to the log, for comparison with the result of ``identify``.
 """
 
 from __future__ import annotations
@@ -74,7 +75,8 @@ def simulate(
     every
         Keep every n-th time step.
     compensate, through
-        Whether the robot compensates the forces that it has without payload, and whether through its motors.
+        Whether the robot compensates the forces that it has without payload, and whether through
+        its motors.
     moving
         Number of joints that move; the others are locked at 0. Default: all.
     seed
@@ -90,11 +92,16 @@ def simulate(
     mujoco.mj_setConst(model, data)
     order = [int(model.joint(name).qposadr[0]) for name in names]
     data.qpos[order] = motion.position[0, :count]
-    gains = bp.PIDParams(*(leaf[:, :count] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params))
+    gains = bp.PIDParams(
+        *(leaf[:, :count] if getattr(leaf, "ndim", 0) == 2 else leaf for leaf in params)
+    )
     gains = gains._replace(measurement_rate=None)  # the law gets positions alone
     controller = bp.BatchPID(gains, 1, dt=timestep, joint_names=names)
     time = timestep * np.arange(round(motion.time[-1] / timestep))
-    setpoints = np.stack([np.interp(time, motion.time - motion.time[0], q) for q in motion.position.T[:count]], axis=1)
+    setpoints = np.stack(
+        [np.interp(time, motion.time - motion.time[0], q) for q in motion.position.T[:count]],
+        axis=1,
+    )
     strength, bias = truth.strength[:count], truth.bias[:count]
     whole, part = divmod(truth.delay / timestep, 1.0)
     asked = np.zeros((len(time), count))
@@ -109,12 +116,17 @@ def simulate(
         asked[step] = controller(setpoint, measured[None])[0] + through * passive
         if step % every == 0:
             rows.append(np.stack([setpoint, asked[step], measured, data.qvel[order]]))
-        late, later = (asked[step - n] if step >= n else np.zeros(count) for n in (int(whole), int(whole) + 1))
+        late, later = (
+            asked[step - n] if step >= n else np.zeros(count) for n in (int(whole), int(whole) + 1)
+        )
         delivered = strength * ((1 - part) * late + part * later) + bias
         data.qfrc_applied[order] = delivered + (not through) * passive
         mujoco.mj_step(model, data)
     columns = np.array(rows).transpose(1, 0, 2)
-    return {"time": time[::every], **dict(zip(("setpoint", "effort", "qpos", "qvel"), columns, strict=True))}
+    return {
+        "time": time[::every],
+        **dict(zip(("setpoint", "effort", "qpos", "qvel"), columns, strict=True)),
+    }
 
 
 def _model(robot: Robot, truth: Truth, names: tuple[str, ...], timestep: float) -> Any:
@@ -129,7 +141,10 @@ def _model(robot: Robot, truth: Truth, names: tuple[str, ...], timestep: float) 
         if name not in names:
             spec.delete(joint)
             continue
-        joint.armature, joint.frictionloss = float(truth.armature[index]), float(truth.friction[index])
+        joint.armature, joint.frictionloss = (
+            float(truth.armature[index]),
+            float(truth.friction[index]),
+        )
         damping = float(truth.damping[index])
         joint.damping = damping if np.ndim(joint.damping) == 0 else [damping, 0, 0]
     for geom in spec.geoms:
@@ -140,7 +155,12 @@ def _model(robot: Robot, truth: Truth, names: tuple[str, ...], timestep: float) 
     return model
 
 
-def write(robot: Robot, log: dict[str, Any], path: Path, quantities: tuple[str, ...] = ("setpoint", "qpos")) -> None:
+def write(
+    robot: Robot,
+    log: dict[str, Any],
+    path: Path,
+    quantities: tuple[str, ...] = ("setpoint", "qpos"),
+) -> None:
     """Write the columns of ``quantities`` as CSV."""
     joints = robot.joint_names[: log["qpos"].shape[1]]
     names = ["time", *(f"{quantity}:{name}" for quantity in quantities for name in joints)]
@@ -149,7 +169,9 @@ def write(robot: Robot, log: dict[str, Any], path: Path, quantities: tuple[str, 
 
 
 def as_actuators(robot: Robot, truth: Truth) -> bp.Actuators:
-    """Return the actuators that an identification should find; their friction adds to the robot's."""
+    """Return the actuators that an identification should find; their friction adds to the
+    robot's.
+    """
     return bp.make_actuators(
         robot.dof,
         command_delay=truth.delay,
@@ -168,13 +190,19 @@ def table(robot: Robot, truth: Truth) -> str:
     width = max(map(len, robot.joint_names))
     lines = [" ".join([f"{'truth, SI units':{width}}", *(f"{kind:>10}" for kind in kinds)])]
     for joint, name in enumerate(robot.joint_names):
-        lines.append(" ".join([f"{name:{width}}", *(f"{getattr(truth, kind)[joint]:10.4g}" for kind in kinds)]))
+        lines.append(
+            " ".join(
+                [f"{name:{width}}", *(f"{getattr(truth, kind)[joint]:10.4g}" for kind in kinds)]
+            )
+        )
     return "\n".join([*lines, f"delay of the commands: {1e3 * truth.delay:.4g} ms"])
 
 
 def main() -> None:
     """Run the example."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("robot", nargs="?", default="panda")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=0)
@@ -184,10 +212,14 @@ def main() -> None:
     params, truth = robot.designed("effort"), plausible(robot, options.seed)
     log = simulate(robot, truth, excite(robot, options.seconds), params, seed=options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    gains, actuators = (options.out.with_suffix(suffix) for suffix in (".params.yaml", ".truth.yaml"))
+    gains, actuators = (
+        options.out.with_suffix(suffix) for suffix in (".params.yaml", ".truth.yaml")
+    )
     write(robot, log, options.out)
     bp.save_params(gains, params, robot.joint_names)
-    bp.save_actuators(actuators, as_actuators(robot, truth), robot.joint_names, {"truth_of": options.out.name})
+    bp.save_actuators(
+        actuators, as_actuators(robot, truth), robot.joint_names, {"truth_of": options.out.name}
+    )
     print(table(robot, truth))
     print(f"\nwritten: {options.out}, {gains}, {actuators}")
     print(f"next: batchpid identify {options.robot} {options.out} --gains {gains}")

@@ -1,9 +1,10 @@
-"""Plan with the simulated robot: a panda reaches around a ball, by rollouts of 64 copies of its present state.
+"""Plan with the simulated robot: a panda reaches around a ball, by rollouts of 64 copies of its
+present state.
 
     python examples/plan_reach.py [--no-motors] [--delay 0.03] [--film reach.mp4]
 
-Predictive sampling: every 50 ms, 64 splines of setpoints run for 0.3 s, and the robot follows the best one. The copies
-have the delay of the robot's motors; with --no-motors they have ideal ones.
+Predictive sampling: every 50 ms, 64 splines of setpoints run for 0.3 s, and the robot follows the
+best one. The copies have the delay of the robot's motors; with --no-motors they have ideal ones.
 """
 
 import time
@@ -22,7 +23,12 @@ from batchpid.sim.view.film import write_film
 START = np.array([-0.7, 0.3, 0.0, -2.0, 0.0, 2.3, 0.8, 0.02, 0.02])
 GOAL = np.array([0.7, *START[1:]])
 BALL, RADIUS = np.array([0.56, -0.02, 0.38]), 0.12  # in the way of the hand [m]
-LINKS = {"panda_link6": 0.08, "panda_link7": 0.07, "panda_hand": 0.07, "panda_leftfinger": 0.03}  # radius [m]
+LINKS = {
+    "panda_link6": 0.08,
+    "panda_link7": 0.07,
+    "panda_hand": 0.07,
+    "panda_leftfinger": 0.03,
+}  # radius [m]
 TICKS, EXECUTED = 30, 5  # ticks of 10 ms in a rollout, and until the next plan
 KNOTS = np.array([0, 10, 20, 30])  # ticks
 SPREAD = np.array([0.3, 0.3, 0.1, 0.3, 0.1, 0.1, 0.0, 0.0, 0.0])  # of the knots [rad, m]
@@ -45,16 +51,24 @@ class Options:
 
 
 def clearance(tree, qpos):
-    """Return the least distance of spheres around the links to the ball [m]; negative where they touch."""
+    """Return the least distance of spheres around the links to the ball [m]; negative where they
+    touch.
+    """
     places = ts.link_poses(tree, qpos, list(LINKS))[..., :3]
     return (np.linalg.norm(places - BALL, axis=-1) - list(LINKS.values())).min(-1) - RADIUS
 
 
 class Planner:
-    """Finds setpoints (ticks, dof) by rollouts; its first candidate is the rest of the last plan."""
+    """Finds setpoints (ticks, dof) by rollouts; its first candidate is the rest of the last
+    plan.
+    """
 
     def __init__(self, robot, options, params, actuators):
-        self.tree, self.samples, self.motors = robot.kinematic_tree(), options.samples, options.motors
+        self.tree, self.samples, self.motors = (
+            robot.kinematic_tree(),
+            options.samples,
+            options.motors,
+        )
         self.runner = Runner(
             robot,
             options.samples,
@@ -96,7 +110,10 @@ def main(options):
     params = bp.design_gains(robot, bandwidth_hz=5.0, **gains)
     actuators = bp.make_actuators(robot.dof, command_delay=options.delay)
     planner, seconds, parts = Planner(robot, options, params, actuators), [], []
-    with planner.runner, Runner(robot, 1, params=params, actuators=actuators, engine="mujoco", workers=0) as plant:
+    with (
+        planner.runner,
+        Runner(robot, 1, params=params, actuators=actuators, engine="mujoco", workers=0) as plant,
+    ):
         plant.reset(START)
         for _ in range(round(options.seconds / 0.01 / EXECUTED)):
             began = time.perf_counter()

@@ -1,8 +1,9 @@
 """Proximal policy optimization in JAX, for ``train_reach.py`` and ``train_walk.py``.
 
-The algorithm is that of J. Schulman et al., arXiv:1707.06347, with the usual details: generalized advantage estimation,
-normalized observations, orthogonal weights, a clipped gradient, and a learning rate that falls to 0. The robots step in
-worker processes, policy and updates run in this one.
+The algorithm is that of J. Schulman et al., arXiv:1707.06347, with the usual details: generalized
+advantage estimation, normalized observations, orthogonal weights, a clipped gradient, and a
+learning rate that falls to 0. The robots step in worker processes, policy and updates run in this
+one.
 """
 
 from collections import deque, namedtuple
@@ -44,25 +45,39 @@ class Normalizer(NamedTuple):
     count: int
 
     def updated(self, rows):
-        """Return the statistics with more ``rows`` (T. F. Chan, G. H. Golub and R. J. LeVeque, 1983)."""
+        """Return the statistics with more ``rows`` (T. F. Chan, G. H. Golub and R. J. LeVeque,
+        1983).
+        """
         count, shift = self.count + len(rows), rows.mean(0) - self.mean
-        squares = self.variance * self.count + rows.var(0) * len(rows) + shift**2 * self.count * len(rows) / count
+        squares = (
+            self.variance * self.count
+            + rows.var(0) * len(rows)
+            + shift**2 * self.count * len(rows) / count
+        )
         return Normalizer(self.mean + shift * len(rows) / count, squares / count, count)
 
     def __call__(self, rows):
         """Return ``rows`` with zero mean and unit variance, clipped to 10."""
-        return np.clip((rows - self.mean) / np.sqrt(self.variance + 1e-8), -10, 10).astype(np.float32)
+        return np.clip((rows - self.mean) / np.sqrt(self.variance + 1e-8), -10, 10).astype(
+            np.float32
+        )
 
 
-# Transitions (steps, envs, ...). ``valid`` is False where an env begins an episode: the action has no effect there.
+# Transitions (steps, envs, ...). ``valid`` is False where an env begins an episode: the action has
+# no effect there.
 Batch = namedtuple("Batch", "observation action log_prob value reward terminated done valid")
 
 
 def init_mlp(key, sizes, scale):
-    """Return the layers (weights, biases) of a perceptron; ``scale`` applies to the weights of the last layer."""
+    """Return the layers (weights, biases) of a perceptron; ``scale`` applies to the weights of the
+    last layer.
+    """
     scales = [2**0.5] * (len(sizes) - 2) + [scale]
     layers = zip(jax.random.split(key, len(scales)), pairwise(sizes), scales, strict=True)
-    return [(jax.nn.initializers.orthogonal(scale)(key, shape), jnp.zeros(shape[1])) for key, shape, scale in layers]
+    return [
+        (jax.nn.initializers.orthogonal(scale)(key, shape), jnp.zeros(shape[1]))
+        for key, shape, scale in layers
+    ]
 
 
 def mlp(layers, x):
@@ -111,12 +126,16 @@ def advantages(batch, last_value, config):
 
 
 def loss(agent, batch, advantage, config):
-    """Return PPO's loss: the clipped objective of the policy, and half the squared error of the value."""
+    """Return PPO's loss: the clipped objective of the policy, and half the squared error of the
+    value.
+    """
     weight = batch.valid / batch.valid.sum()
     centered = advantage - (weight * advantage).sum()
     scaled = centered / (jnp.sqrt((weight * centered**2).sum()) + 1e-8)
     ratio = jnp.exp(log_prob(agent, batch.observation, batch.action) - batch.log_prob)
-    objective = jnp.minimum(ratio * scaled, jnp.clip(ratio, 1 - config.clip, 1 + config.clip) * scaled)
+    objective = jnp.minimum(
+        ratio * scaled, jnp.clip(ratio, 1 - config.clip, 1 + config.clip) * scaled
+    )
     error = mlp(agent["critic"], batch.observation)[..., 0] - (batch.value + advantage)
     return (weight * (0.5 * error**2 - objective)).sum()
 
@@ -130,26 +149,38 @@ def update(agent, optimizer_state, batch, last_value, key, optimizer, config):
 
     def minibatch(carry, rows):
         agent, state = carry
-        gradient = jax.grad(loss)(agent, *jax.tree.map(lambda table: table[rows], (batch, advantage)), config)
+        gradient = jax.grad(loss)(
+            agent, *jax.tree.map(lambda table: table[rows], (batch, advantage)), config
+        )
         change, state = optimizer.update(gradient, state)
         return (optax.apply_updates(agent, change), state), None
 
-    orders = [jax.random.permutation(key, len(advantage)) for key in jax.random.split(key, config.epochs)]
-    rows = jnp.concatenate([order[: config.minibatches * count].reshape(-1, count) for order in orders])
+    orders = [
+        jax.random.permutation(key, len(advantage)) for key in jax.random.split(key, config.epochs)
+    ]
+    rows = jnp.concatenate(
+        [order[: config.minibatches * count].reshape(-1, count) for order in orders]
+    )
     return jax.lax.scan(minibatch, (agent, optimizer_state), rows)[0]
 
 
 def train(envs, config, scores, features=lambda observation: observation, shaping=None):
-    """Return the policy without exploration, and the learning curve: rows of env steps, seconds and means of scores.
+    """Return the policy without exploration, and the learning curve: rows of env steps, seconds and
+    means of scores.
 
-    ``scores`` names entries of the info, whose values at the ends of episodes are shown. ``features`` maps observations
-    to inputs of the agent; ``shaping(before, after)`` maps two observations to an addition to the reward (envs,).
+    ``scores`` names entries of the info, whose values at the ends of episodes are shown.
+    ``features`` maps observations to inputs of the agent; ``shaping(before, after)`` maps two
+    observations to an addition to the reward (envs,).
     """
     key, init_key = jax.random.split(jax.random.key(config.seed))
     raw, _ = envs.reset(seed=config.seed)
     normalizer = Normalizer(features(raw).mean(0), features(raw).var(0), len(raw))
-    agent = init_agent(init_key, len(normalizer.mean), envs.single_action_space.shape[0], config.log_std)
-    rate = optax.linear_schedule(config.learning_rate, 0.0, config.updates * config.epochs * config.minibatches)
+    agent = init_agent(
+        init_key, len(normalizer.mean), envs.single_action_space.shape[0], config.log_std
+    )
+    rate = optax.linear_schedule(
+        config.learning_rate, 0.0, config.updates * config.epochs * config.minibatches
+    )
     optimizer = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(rate, eps=1e-5))
     optimizer_state, curve, episodes = optimizer.init(agent), [], deque(maxlen=config.num_envs)
     valid, begun = np.ones(config.num_envs, bool), perf_counter()
@@ -163,16 +194,22 @@ def train(envs, config, scores, features=lambda observation: observation, shapin
             if shaping is not None:
                 reward += shaping(before, raw)
             reward, done = np.float32((1 - config.discount) * reward), terminated | truncated
-            transitions.append(Batch(observation, action, probability, value, reward, terminated, done, valid))
+            transitions.append(
+                Batch(observation, action, probability, value, reward, terminated, done, valid)
+            )
             episodes.extend(zip(*(info[name][done] for name in scores), strict=True))
             valid = ~done
         batch = Batch(*map(np.stack, zip(*transitions, strict=True)))
         last_value = mlp(agent["critic"], normalizer(features(raw)))[:, 0]
         key, update_key = jax.random.split(key)
-        agent, optimizer_state = update(agent, optimizer_state, batch, last_value, update_key, optimizer, config)
+        agent, optimizer_state = update(
+            agent, optimizer_state, batch, last_value, update_key, optimizer, config
+        )
         means = np.mean(episodes, axis=0) if episodes else np.full(len(scores), np.nan)
         curve.append((number * config.steps * config.num_envs, perf_counter() - begun, *means))
         if number % 10 == 0:
-            told = "   ".join(f"{name} {mean:.3f}" for name, mean in zip(scores, means, strict=True))
+            told = "   ".join(
+                f"{name} {mean:.3f}" for name, mean in zip(scores, means, strict=True)
+            )
             print(f"{curve[-1][0]:9,} steps {curve[-1][1]:6.1f} s   {told}", flush=True)
     return lambda raw: np.asarray(mlp(agent["actor"], normalizer(features(raw)))), np.array(curve)

@@ -1,4 +1,5 @@
-"""Task of Gymnasium: N pandas push a box on the ground to a random place. SAPIEN builds the box, as user content.
+"""Task of Gymnasium: N pandas push a box on the ground to a random place. SAPIEN builds the box, as
+user content.
 
     python examples/push.py
 
@@ -24,14 +25,26 @@ def build_box(scene, env):
 
 
 class PushVectorEnv(ToolReachVectorEnv):
-    """N pandas, each with a box to push to a goal on the ground. The hand moves in a horizontal plane.
+    """N pandas, each with a box to push to a goal on the ground. The hand moves in a horizontal
+    plane.
 
-    - Observation: qpos, qvel, position of the hand (3), pose of the box (7), goal of the box (2) [m].
-    - Reward: minus the distance of the box to its goal, minus a tenth of that of the hand to the box [m], plus 1 at the
-      goal.
+    - Observation: qpos, qvel, position of the hand (3), pose of the box (7), goal of the box (2)
+      [m].
+    - Reward: minus the distance of the box to its goal, minus a tenth of that of the hand to the
+      box [m], plus 1 at the goal.
     """
 
-    posture = (0.0, 0.298, 0.0, -2.744, 0.0, 3.042, 0.785, 0.01, 0.01)  # fingertips 1.6 cm above the ground
+    posture = (
+        0.0,
+        0.298,
+        0.0,
+        -2.744,
+        0.0,
+        3.042,
+        0.785,
+        0.01,
+        0.01,
+    )  # fingertips 1.6 cm above the ground
     ahead = (0.1, 0.0, 0.0)
     workspace = (0.15, 0.15, 0.0)
 
@@ -51,7 +64,9 @@ class PushVectorEnv(ToolReachVectorEnv):
 
     def observe(self, observed):
         boxes = self.runner.poses()[:, 0]
-        return np.concatenate([observed.qpos, observed.qvel, observed.tool_pose[:, :3], boxes, self.goal], axis=1)
+        return np.concatenate(
+            [observed.qpos, observed.qvel, observed.tool_pose[:, :3], boxes, self.goal], axis=1
+        )
 
     def reward(self, observation, success):
         to_box = np.linalg.norm(observation[:, -12:-10] - observation[:, -9:-7], axis=1)

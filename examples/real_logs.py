@@ -1,10 +1,12 @@
-"""Make logs as real robots leave them, one for each kind of controller, and print the commands that identify them.
+"""Make logs as real robots leave them, one for each kind of controller, and print the commands that
+identify them.
 
     python examples/real_logs.py --out out/real
 
-A bar hangs on a hinge in four robots, with the same motor: under torques, as a hobby servo that is driven by a voltage,
-under a velocity loop that logs neither setpoints nor torques but currents, and under a drive in MIT mode, whose law
-adds a feedforward. docs/sim-to-real.md says why the command is what it is.
+A bar hangs on a hinge in four robots, with the same motor: under torques, as a hobby servo that is
+driven by a voltage, under a velocity loop that logs neither setpoints nor torques but currents, and
+under a drive in MIT mode, whose law adds a feedforward. docs/sim-to-real.md says why the command is
+what it is.
 """
 
 from __future__ import annotations
@@ -36,13 +38,29 @@ def wave(seconds: float) -> np.ndarray:
     return (0.9 * np.sin(4 * time + 5 * np.sin(0.8 * time)) * np.minimum(time, 1))[:, None]
 
 
-def move(robot: Robot, kind: str, commands: np.ndarray, params: bp.PIDParams | None, forward: np.ndarray | None = None):
-    """Return times, measured positions, and the efforts that acted before each (rows, 1), under ``commands``."""
+def move(
+    robot: Robot,
+    kind: str,
+    commands: np.ndarray,
+    params: bp.PIDParams | None,
+    forward: np.ndarray | None = None,
+):
+    """Return times, measured positions, and the efforts that acted before each (rows, 1), under
+    ``commands``.
+    """
     motor = bp.make_actuators(1, strength=STRENGTH[kind], **MOTOR)
-    options = {"control": "effort" if params is None else "pid", "params": params, "actuators": motor}
-    with Runner(robot, 1, workers=0, timestep=DT, substeps=1, compensate="none", **options) as runner:
+    options = {
+        "control": "effort" if params is None else "pid",
+        "params": params,
+        "actuators": motor,
+    }
+    with Runner(
+        robot, 1, workers=0, timestep=DT, substeps=1, compensate="none", **options
+    ) as runner:
         begin = runner.reset(np.zeros((1, 1)))
-        rollout = runner.rollout(commands[:, None], feedforwards=None if forward is None else forward[:, None])
+        rollout = runner.rollout(
+            commands[:, None], feedforwards=None if forward is None else forward[:, None]
+        )
     qpos, effort = (
         np.concatenate([first, later[:, 0]])[:-1]
         for first, later in ((begin.qpos, rollout.qpos), (begin.effort, rollout.effort))
@@ -60,7 +78,9 @@ def torque(robot: Robot, out: Path, seconds: float) -> list[str]:
 
 
 def servo(robot: Robot, out: Path, seconds: float) -> list[str]:
-    """Write goals and positions of a servo whose gain is in volts per rad, and whose limit is the supply of 12 V."""
+    """Write goals and positions of a servo whose gain is in volts per rad, and whose limit is the
+    supply of 12 V.
+    """
     params = bp.make_params(1, kp=30.0, effort_limit=12.0, anti_windup="none")
     bp.save_params(out / "servo.yaml", params, robot.joint_names)
     time, qpos, _ = move(robot, "servo", wave(seconds), params)
@@ -73,7 +93,11 @@ def velocity(robot: Robot, out: Path, seconds: float) -> list[str]:
     """Write positions, and currents times the drive gain, at 500 Hz."""
     params = bp.make_params(1, kp=60.0, kd=3.0, effort_limit=12.0)
     time, qpos, effort = move(robot, "velocity", wave(seconds), params)
-    _write(out / "velocity.csv", time=time[::2], **{"measured_effort:hinge": effort[::2], "qpos:hinge": qpos[::2]})
+    _write(
+        out / "velocity.csv",
+        time=time[::2],
+        **{"measured_effort:hinge": effort[::2], "qpos:hinge": qpos[::2]},
+    )
     return ["--compensate", "none"]
 
 

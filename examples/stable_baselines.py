@@ -1,4 +1,5 @@
-"""PPO of Stable-Baselines3 on a few steps of batchpid/Reach-v0, by an adapter: ``python examples/stable_baselines.py``.
+"""PPO of Stable-Baselines3 on a few steps of batchpid/Reach-v0, by an adapter: ``python
+examples/stable_baselines.py``.
 
 It needs ``pip install stable-baselines3``.
 """
@@ -10,9 +11,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 
 class TaskVecEnv(VecEnv):
-    """A task with ``autoreset_mode="SameStep"`` as a ``VecEnv``: an env is reset within the step that ends its episode.
+    """A task with ``autoreset_mode="SameStep"`` as a ``VecEnv``: an env is reset within the step
+    that ends its episode.
 
-    The observation is then the first of the next episode, and the last one is ``infos[env]["terminal_observation"]``.
+    The observation is then the first of the next episode, and the last one is
+    ``infos[env]["terminal_observation"]``.
     """
 
     def __init__(self, envs):
@@ -33,7 +36,9 @@ class TaskVecEnv(VecEnv):
     def step_wait(self):
         observation, reward, terminated, truncated, info = self.envs.step_wait()
         ends = terminated | truncated
-        infos = [self._of_env(info["final_info"] if end else info, env) for env, end in enumerate(ends)]
+        infos = [
+            self._of_env(info["final_info"] if end else info, env) for env, end in enumerate(ends)
+        ]
         for env, end in enumerate(ends):
             infos[env]["TimeLimit.truncated"] = bool(truncated[env] and not terminated[env])
             if end:
@@ -57,13 +62,19 @@ class TaskVecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
     def _of_env(self, info, env):
-        entries = {key: rows[env].item() for key, rows in info.items() if key[0] != "_" and key[:6] != "final_"}
+        entries = {
+            key: rows[env].item()
+            for key, rows in info.items()
+            if key[0] != "_" and key[:6] != "final_"
+        }
         return entries | {"is_success": entries["success"]}
 
 
 if __name__ == "__main__":
     options = {"actions": "increment", "autoreset_mode": "SameStep", "workers": 0}
-    envs = TaskVecEnv(gymnasium.make_vec("batchpid.sim.gym:batchpid/Reach-v0", num_envs=4, **options))
+    envs = TaskVecEnv(
+        gymnasium.make_vec("batchpid.sim.gym:batchpid/Reach-v0", num_envs=4, **options)
+    )
     model = PPO("MlpPolicy", envs, n_steps=16, batch_size=64).learn(128)
     print(f"trained for {model.num_timesteps} steps")
     envs.close()

@@ -1,9 +1,11 @@
-"""Steady-state errors of PhysX's drive and of the PID, with and without compensation of gravity and Coriolis forces.
+"""Steady-state errors of PhysX's drive and of the PID, with and without compensation of gravity and
+Coriolis forces.
 
     python examples/steady_state.py --picture steady-state.png
 
-A drive's effort is proportional to its error, so it keeps an error against gravity; compensation removes the load as
-far as the model is right. The integral of a PID removes the error without a model.
+A drive's effort is proportional to its error, so it keeps an error against gravity; compensation
+removes the load as far as the model is right. The integral of a PID removes the error without a
+model.
 """
 
 from pathlib import Path
@@ -27,7 +29,9 @@ FLOOR = 1e-6  # [rad]: resolution of float32 positions
 def final_errors(robot: Robot, control: str, compensate: str, seconds: float) -> np.ndarray:
     """Return |setpoint - qpos| of every joint (dof,) after ``seconds`` at the tutorial's target."""
     gains = robot.tuned() if control == "pid" else None
-    with Runner(robot, 1, control=control, compensate=compensate, workers=0, params=gains) as runner:
+    with Runner(
+        robot, 1, control=control, compensate=compensate, workers=0, params=gains
+    ) as runner:
         ticks = round(seconds / (runner.substeps * runner.timestep))
         rollout = runner.rollout(np.broadcast_to(robot.target, (ticks, robot.dof)))
     return np.abs(rollout.qpos[-1, 0] - robot.target)
@@ -41,7 +45,9 @@ def draw(errors: dict[str, np.ndarray], names: list[str], title: str) -> Figure:
     axes.axvspan(FLOOR / 10, FLOOR, color="#f1f3f6", lw=0)
     axes.text(FLOOR * 0.63, -0.8, "0 ± 1e-6", ha="center", va="center", fontsize=7, color="#6b7280")
     shifts = np.linspace(-0.24, 0.24, len(VARIANTS))  # so that no mark hides another
-    for (*_, label, colour, filled), error, shift in zip(VARIANTS, errors.values(), shifts, strict=True):
+    for (*_, label, colour, filled), error, shift in zip(
+        VARIANTS, errors.values(), shifts, strict=True
+    ):
         face = colour if filled else "white"
         at_least = np.maximum(error, FLOOR * 0.63)
         axes.plot(at_least, rows + shift, "o", ms=5, mec=colour, mfc=face, mew=1.2, label=label)
@@ -61,7 +67,9 @@ def draw(errors: dict[str, np.ndarray], names: list[str], title: str) -> Figure:
 
 
 def main(
-    robot: tyro.conf.Positional[str] = "panda", seconds: float = 12.0, picture: Path = Path("out/steady-state.png")
+    robot: tyro.conf.Positional[str] = "panda",
+    seconds: float = 12.0,
+    picture: Path = Path("out/steady-state.png"),
 ) -> None:
     """Run the four variants, print their final errors and draw them.
 
@@ -78,7 +86,9 @@ def main(
     for control, compensate, label, *_ in VARIANTS:
         errors[label] = final_errors(loaded, control, compensate, seconds)[arm]
         print(f"{label:32}", *(f"{error:9.1e}" for error in errors[label]))
-    title = f"Steady-state error: {loaded.name}, {seconds:g} s after a step to the tutorial's target"
+    title = (
+        f"Steady-state error: {loaded.name}, {seconds:g} s after a step to the tutorial's target"
+    )
     print("picture:", plots.save(draw(errors, names, title), picture))
 
 

@@ -13,14 +13,27 @@ from batchpid.sim.gym import RobotVectorEnv
 
 
 class ToolReachVectorEnv(RobotVectorEnv):
-    """N pandas, each with a place to reach. An action in [-1, 1] is the place of the hand in a box, the workspace.
+    """N pandas, each with a place to reach. An action in [-1, 1] is the place of the hand in a box,
+    the workspace.
 
-    - Observation: qpos, qvel, position of the hand (3), goal (3) [m]. The hand keeps its orientation.
-    - Reward: minus the distance to the goal [m], plus 1 at the goal, that is within ``tolerance`` [m].
+    - Observation: qpos, qvel, position of the hand (3), goal (3) [m]. The hand keeps its
+      orientation.
+    - Reward: minus the distance to the goal [m], plus 1 at the goal, that is within ``tolerance``
+      [m].
     - Info: "distance" [m].
     """
 
-    posture = (0.0, -0.255, 0.0, -2.437, 0.0, 2.182, 0.786, 0.02, 0.02)  # the hand down, at (0.45, 0, 0.4) m
+    posture = (
+        0.0,
+        -0.255,
+        0.0,
+        -2.437,
+        0.0,
+        2.182,
+        0.786,
+        0.02,
+        0.02,
+    )  # the hand down, at (0.45, 0, 0.4) m
     ahead = (0.0, 0.0, 0.0)  # center of the workspace, from the hand in the posture [m]
     workspace = (0.15, 0.15, 0.15)  # from the center to the sides [m]
 
@@ -36,7 +49,9 @@ class ToolReachVectorEnv(RobotVectorEnv):
         return {"control": control}
 
     def spaces(self):
-        return spaces.Box(-100.0, 100.0, (2 * self.robot.dof + 6,)), spaces.Box(-1.0, 1.0, (3,), np.float32)
+        return spaces.Box(-100.0, 100.0, (2 * self.robot.dof + 6,)), spaces.Box(
+            -1.0, 1.0, (3,), np.float32
+        )
 
     def draw(self, env, random):
         self.goal[env] = self.center + self.workspace * random.uniform(-1.0, 1.0, 3)
@@ -48,7 +63,9 @@ class ToolReachVectorEnv(RobotVectorEnv):
         return np.concatenate([place, np.tile(self.home[3:], (len(place), 1))], axis=1)
 
     def observe(self, observed):
-        return np.concatenate([observed.qpos, observed.qvel, observed.tool_pose[:, :3], self.goal], axis=1)
+        return np.concatenate(
+            [observed.qpos, observed.qvel, observed.tool_pose[:, :3], self.goal], axis=1
+        )
 
     def success(self, observation):
         return self.distance(observation) <= self.tolerance
@@ -69,5 +86,8 @@ if __name__ == "__main__":
     action = (envs.goal - envs.center) / envs.workspace
     for _ in range(50):
         *_, info = envs.step(action)
-    print(f"{info['success'].sum()} of 4 hands are at their goals, within {1e3 * info['distance'].max():.1f} mm")
+    print(
+        f"{info['success'].sum()} of 4 hands are at their goals, within"
+        f" {1e3 * info['distance'].max():.1f} mm"
+    )
     envs.close()

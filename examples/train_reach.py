@@ -1,9 +1,10 @@
-"""PPO in JAX on batchpid/Reach-v0: one policy moves a robot to random joint poses by changes of its setpoints.
+"""PPO in JAX on batchpid/Reach-v0: one policy moves a robot to random joint poses by changes of its
+setpoints.
 
     python examples/train_reach.py --picture train_reach.png
 
-The algorithm is in ``ppo.py``. The robots step in worker processes, policy and updates run in this one.
-docs/training.md explains the choices.
+The algorithm is in ``ppo.py``. The robots step in worker processes, policy and updates run in this
+one. docs/training.md explains the choices.
 """
 
 import warnings
@@ -33,17 +34,27 @@ class Config(ppo.Config):
 
 
 def make_envs(config):
-    """Return a vector env with gains that follow the setpoint: critically damped at 30 rad/s in every pose."""
+    """Return a vector env with gains that follow the setpoint: critically damped at 30 rad/s in
+    every pose.
+    """
     robot = Robot.load(config.robot)
-    params = robot.params(kp=900.0, kd=60.0, ki=0.0, gain_units="mass_matrix", measurement_rate="measured")
+    params = robot.params(
+        kp=900.0, kd=60.0, ki=0.0, gain_units="mass_matrix", measurement_rate="measured"
+    )
     options = {"params": params, "workers": config.workers, "collisions": False}
-    warnings.simplefilter("ignore", MissedContactWarning)  # any pose within the limits may be a goal
+    warnings.simplefilter(
+        "ignore", MissedContactWarning
+    )  # any pose within the limits may be a goal
     task = {"robot": robot, "actions": "increment", "max_episode_steps": config.episode}
-    return gymnasium.make_vec("batchpid.sim.gym:batchpid/Reach-v0", config.num_envs, **task, **options)
+    return gymnasium.make_vec(
+        "batchpid.sim.gym:batchpid/Reach-v0", config.num_envs, **task, **options
+    )
 
 
 def features(observation):
-    """Return the inputs of the agent (envs, 4 joints): velocity, error, its size, and the error on a fine scale."""
+    """Return the inputs of the agent (envs, 4 joints): velocity, error, its size, and the error on
+    a fine scale.
+    """
     qpos, qvel, goal = np.split(observation, 3, axis=1)
     error = goal - qpos
     return np.concatenate([qvel, error, np.abs(error), np.tanh(error / FINE)], axis=1)
@@ -57,12 +68,18 @@ def potential(envs, observation):
 
 
 def shaping(envs, config):
-    """Return the shaping by a potential, which keeps the best policy (A. Y. Ng, 1999), for two observations."""
-    return lambda before, after: config.shaping * (config.discount * potential(envs, after) - potential(envs, before))
+    """Return the shaping by a potential, which keeps the best policy (A. Y. Ng, 1999), for two
+    observations.
+    """
+    return lambda before, after: (
+        config.shaping * (config.discount * potential(envs, after) - potential(envs, before))
+    )
 
 
 def evaluate(envs, act, config):
-    """Return success and error (envs,) at the end of one episode in each env, without exploration."""
+    """Return success and error (envs,) at the end of one episode in each env, without
+    exploration.
+    """
     raw, _ = envs.reset(seed=config.seed + 1_000_000)  # other goals than in the training
     for _ in range(config.episode):
         raw, *_, info = envs.step(act(raw))
@@ -90,7 +107,10 @@ def main(config: Config):
     act, curve = ppo.train(envs, config, SCORES, features, shaping(envs, config))
     success, error = evaluate(envs, act, config)
     envs.close()
-    print(f"without exploration {success.mean():.1%} of {len(success)} episodes end at the goal,", end=" ")
+    print(
+        f"without exploration {success.mean():.1%} of {len(success)} episodes end at the goal,",
+        end=" ",
+    )
     print(f"the worst joint within {np.median(error):.4f} rad (median)")
     if config.picture is not None:
         print("picture:", plots.save(draw(curve, config), config.picture))

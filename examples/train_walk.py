@@ -1,9 +1,10 @@
-"""PPO in JAX on the task in ``walk.py``: one policy walks forward at a commanded speed with the bundled quadruped.
+"""PPO in JAX on the task in ``walk.py``: one policy walks forward at a commanded speed with the
+bundled quadruped.
 
     python examples/train_walk.py --picture train_walk.png
 
-The algorithm is in ``ppo.py``. The policy sets the joints' setpoints 50 times a second; a PID of each joint follows
-them at 500 Hz, in MuJoCo. docs/training.md explains the choices.
+The algorithm is in ``ppo.py``. The policy sets the joints' setpoints 50 times a second; a PID of
+each joint follows them at 500 Hz, in MuJoCo. docs/training.md explains the choices.
 """
 
 from contextlib import nullcontext
@@ -44,12 +45,19 @@ class Config(ppo.Config):
 def make_envs(config, num_envs, episode):
     """Return robots that are to walk forward."""
     task = {"commands": [[config.speed, 0.0, 0.0]] * 2, "max_episode_steps": episode}
-    options = {"workers": config.workers, "engine": "mujoco", "physics": "fast", "timestep": config.timestep}
+    options = {
+        "workers": config.workers,
+        "engine": "mujoco",
+        "physics": "fast",
+        "timestep": config.timestep,
+    }
     return WalkVectorEnv(num_envs, **task, **options)
 
 
 def evaluate(act, config):
-    """Return mean forward speed and mean speed along x [m/s], and whether it fell (envs,), without exploration."""
+    """Return mean forward speed and mean speed along x [m/s], and whether it fell (envs,), without
+    exploration.
+    """
     envs = make_envs(config, config.evaluated, None)
     raw, _ = envs.reset(seed=config.seed + 1_000_000)  # other starts than in the training
     steps, runner = round(config.time / envs.unwrapped.step_seconds), envs.unwrapped.runner
@@ -69,7 +77,9 @@ def draw(curve, config):
     axes.set_title(f"PPO on a quadruped that walks, seed {config.seed}", fontsize=11)
     axes.axhline(config.speed, color="black", lw=0.8, ls="--", label="command")
     axes.plot(steps, speed, color="#15803d", label="forward, at the end of episodes")
-    axes.plot(steps, distance / (config.episode / 50), color="#c2570c", label="along x, mean of episodes")
+    axes.plot(
+        steps, distance / (config.episode / 50), color="#c2570c", label="along x, mean of episodes"
+    )
     axes.set(xlabel="env steps", ylabel="speed [m/s]")
     axes.legend(frameon=False)
     axes.grid(alpha=0.3)
@@ -87,7 +97,10 @@ def main(config: Config):
     told = f"{walks.mean():.1%} of {len(walks)} robots walk for {config.time:g} s"
     print(f"without exploration {told}, {fell.mean():.1%} fall")
     for name, speed in (("forward", forward), ("along x", along)):
-        print(f"speed {name}: {speed.mean():.3f} m/s on average, {speed.min():.3f} to {speed.max():.3f}")
+        print(
+            f"speed {name}: {speed.mean():.3f} m/s on average, {speed.min():.3f} to"
+            f" {speed.max():.3f}"
+        )
     if config.picture is not None:
         print("picture:", plots.save(draw(curve, config), config.picture))
 

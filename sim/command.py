@@ -1,4 +1,6 @@
-"""Description of a command: names, units and bounds of the setpoint that a control takes for each env."""
+"""Description of a command: names, units and bounds of the setpoint that a control takes for each
+env.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,8 @@ WRENCH_UNITS = FORCE_UNITS | {"tx": "N m", "ty": "N m", "tz": "N m"}
 class CommandSpec:
     """Names, units and bounds of the numbers in a setpoint of one env.
 
-    A :class:`batchpid.sim.Controller` whose setpoints are not one number per joint has a spec as its attribute
-    ``command``. Two specs are equal if their names and units are equal.
+    A :class:`batchpid.sim.Controller` whose setpoints are not one number per joint has a spec as
+    its attribute ``command``. Two specs are equal if their names and units are equal.
 
     Raises
     ------
@@ -42,7 +44,9 @@ class CommandSpec:
     """Unit of each entry; default "", unknown."""
     _: KW_ONLY
     lower: ArrayLike = field(default=-math.inf, compare=False)
-    """Lower bounds (size,), for action spaces of :mod:`batchpid.sim.gym`; a Runner does not apply them."""
+    """Lower bounds (size,), for action spaces of :mod:`batchpid.sim.gym`; a Runner does not apply
+    them.
+    """
     upper: ArrayLike = field(default=math.inf, compare=False)
     """Upper bounds (size,)."""
     neutral: ArrayLike | None = field(default=None, compare=False)
@@ -51,11 +55,15 @@ class CommandSpec:
     def __post_init__(self) -> None:
         names = _texts("names", self.names)
         if not names or "" in names or len(set(names)) < len(names):
-            raise InvalidArgumentError("names", "must be different words", value=names, remedy="name every entry once")
+            raise InvalidArgumentError(
+                "names", "must be different words", value=names, remedy="name every entry once"
+            )
         units = _texts("units", self.units) or ("",) * len(names)
         if len(units) != len(names):
             problem = f"has {len(units)} units for {len(names)} names"
-            raise InvalidArgumentError("units", problem, value=units, remedy="give one unit for each name")
+            raise InvalidArgumentError(
+                "units", problem, value=units, remedy="give one unit for each name"
+            )
 
         def numbers(argument: str, value: ArrayLike, finite: bool = False) -> Any:
             return array(argument, value, (1, len(names)), names, finite=finite, kind="entry")[0]
@@ -78,11 +86,15 @@ class CommandSpec:
     @property
     def labels(self) -> tuple[str, ...]:
         """Names with units, such as "x [m]"."""
-        return tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, self.units, strict=True))
+        return tuple(
+            f"{name} [{unit}]" if unit else name
+            for name, unit in zip(self.names, self.units, strict=True)
+        )
 
 
 def joint_command(joint_names: Sequence[str], units: Sequence[str], control: object) -> CommandSpec:
-    """Return the default command of a control: joint efforts under control "effort", else joint positions.
+    """Return the default command of a control: joint efforts under control "effort", else joint
+    positions.
 
     ``units`` are the units of the joint positions, "rad" or "m".
     """
@@ -116,6 +128,9 @@ def _texts(argument: str, value: object) -> tuple[str, ...]:
     sequence = isinstance(value, Sequence) and not isinstance(value, str)
     if not sequence or not all(isinstance(text, str) for text in value):  # type: ignore[attr-defined]
         raise InvalidArgumentError(
-            argument, "must be a sequence of texts", value=value, remedy="pass a tuple such as ('x', 'y')"
+            argument,
+            "must be a sequence of texts",
+            value=value,
+            remedy="pass a tuple such as ('x', 'y')",
         )
     return tuple(value)  # type: ignore[arg-type]

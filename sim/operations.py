@@ -1,7 +1,7 @@
 """Operations of a Runner: the change of each worker's loop, and the state of the runner after it.
 
-An operation holds checked arguments for all envs and changes nothing by itself. The runner sends it to the workers, and
-then replaces its state by the result of :meth:`Operation.committed`.
+An operation holds checked arguments for all envs and changes nothing by itself. The runner sends it
+to the workers, and then replaces its state by the result of :meth:`Operation.committed`.
 """
 
 from __future__ import annotations
@@ -37,13 +37,17 @@ class Operation(Request):
     """Base of all operations, which are frozen dataclasses."""
 
     def committed(self, state: RunnerState, outcome: Outcome) -> RunnerState:
-        """Return the state after the operation, from the state before it and the outcome in the workers."""
+        """Return the state after the operation, from the state before it and the outcome in the
+        workers.
+        """
         return state
 
 
 @dataclass(frozen=True)
 class Reset(Operation):
-    """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), floating bases at ``base`` (envs, 13)."""
+    """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), floating bases at
+    ``base`` (envs, 13).
+    """
 
     mask: Bool
     qpos: Float64
@@ -76,7 +80,9 @@ class Reset(Operation):
             draws = randomization.redraw(robot, draws, chosen, seed, options.first_env)
             qpos, qvel = randomization.start(qpos, qvel, draws, robot)
         elif seed is not None:
-            raise InvalidArgumentError("seed", "has no effect without a randomization", remedy="leave it out")
+            raise InvalidArgumentError(
+                "seed", "has no effect without a randomization", remedy="leave it out"
+            )
         qpos, qvel = robot.coupling.positions(qpos), robot.coupling.rates(qvel)
         return cls(chosen, qpos, qvel, draws, base_rows(options, *base, qpos, chosen))
 
@@ -95,7 +101,9 @@ class Reset(Operation):
 
 @dataclass(frozen=True)
 class Run(Operation):
-    """Run ``ticks`` of ``substeps`` sim steps under ``command`` (ticks, envs, ...), which travels in the arrays."""
+    """Run ``ticks`` of ``substeps`` sim steps under ``command`` (ticks, envs, ...), which travels
+    in the arrays.
+    """
 
     ticks: int = field()  # without the default of the base class
     substeps: int = field()
@@ -104,8 +112,14 @@ class Run(Operation):
 
     @classmethod
     def after(cls, state: RunnerState, command: Command, substeps: int, timestep: float) -> Self:
-        """Return the operation for ticks of sim steps of ``timestep`` [s] that follow on ``state``."""
-        if command.setpoint_rate is not None and state.motion is not None and state.params.gain_units is not None:
+        """Return the operation for ticks of sim steps of ``timestep`` [s] that follow on
+        ``state``.
+        """
+        if (
+            command.setpoint_rate is not None
+            and state.motion is not None
+            and state.params.gain_units is not None
+        ):
             command = accelerated(command, state.motion, substeps * timestep)
         return cls(len(command.setpoint), substeps, command)
 
@@ -118,7 +132,9 @@ class Run(Operation):
                 table[: self.ticks, envs] = rows[:, envs]
 
     def encode(self, envs: slice) -> bytes:
-        are_given = tuple(map(is_not, self.command, repeat(None)))  # Command.given, without one more call in a tick
+        are_given = tuple(
+            map(is_not, self.command, repeat(None))
+        )  # Command.given, without one more call in a tick
         return pickle.dumps((self.ticks, self.substeps, are_given))
 
     def apply(self, loop: Loop) -> float:
@@ -212,7 +228,9 @@ class Restore(Operation):
             actuators=snapshot.actuators,
             draws=self.draws,
             faults=state.faults.restored(snapshot.states.containment["step"]),
-            motion=None if snapshot.motion is None else (snapshot.motion[:, 0], snapshot.motion[:, 1]),
+            motion=(
+                None if snapshot.motion is None else (snapshot.motion[:, 0], snapshot.motion[:, 1])
+            ),
             steps=snapshot.steps,
             steps_since_checkpoint=0,
         )
@@ -233,7 +251,9 @@ class ReadStateSizes(Operation):
 
 @dataclass(frozen=True)
 class ReadPoses(Operation):
-    """Read the poses of the entities that ``build`` returned, or of the bodies ``names`` of a file."""
+    """Read the poses of the entities that ``build`` returned, or of the bodies ``names`` of a
+    file.
+    """
 
     names: tuple[str, ...] | None = None
     changes_loop = False
@@ -249,16 +269,22 @@ class ReadPoses(Operation):
 
 
 def snapshot_of(options: RunnerOptions, state: RunnerState, states: EnvStates) -> Snapshot:
-    """Return the snapshot of a runner in ``state``, with the ``states`` of its envs that the workers have read."""
+    """Return the snapshot of a runner in ``state``, with the ``states`` of its envs that the
+    workers have read.
+    """
     motion = None
     if state.motion is not None:
         last, rate = state.motion
         motion = np.stack([last, np.zeros_like(last) if rate is None else rate], axis=1)
     episodes = None if options.randomization is None else state.draws.episodes.copy()
-    return Snapshot(options.describe(), state.steps, state.params, states, state.actuators, episodes, motion)
+    return Snapshot(
+        options.describe(), state.steps, state.params, states, state.actuators, episodes, motion
+    )
 
 
-def restored(options: RunnerOptions, state: RunnerState, snapshot: Snapshot, sizes: list[int]) -> Restore:
+def restored(
+    options: RunnerOptions, state: RunnerState, snapshot: Snapshot, sizes: list[int]
+) -> Restore:
     """Return the operation that restores a snapshot in a runner in ``state``, checked and copied.
 
     ``sizes`` are the numbers of values in the engine's state of each env.
@@ -270,7 +296,9 @@ def restored(options: RunnerOptions, state: RunnerState, snapshot: Snapshot, siz
     snapshot.check_options(present.about)
     snapshot.check_tables(present.tables())
     params = options.check_params(snapshot.params)
-    acting = actuators = options.check_actuators(IDEAL if snapshot.actuators is None else snapshot.actuators)
+    acting = actuators = options.check_actuators(
+        IDEAL if snapshot.actuators is None else snapshot.actuators
+    )
     if randomization is not None and snapshot.episodes is not None:
         draws = randomization.draw(robot, snapshot.episodes)
         acting = randomization.randomized_actuators(actuators, draws, robot)

@@ -1,8 +1,9 @@
-"""Options of a runner, checked: one definition for :class:`batchpid.sim.Runner`, its loops, snapshots and recordings.
+"""Options of a runner, checked: one definition for :class:`batchpid.sim.Runner`, its loops,
+snapshots and recordings.
 
-Longer than 350 lines because the checks of options that depend on the robot or on each other are here. A new option is
-a field of :class:`batchpid.sim.RunnerKeywords`; one that changes scenes is a field of
-:class:`batchpid.sim.engine.scene_spec.SceneSpec`, too. CONTRIBUTING.md lists all steps.
+Longer than 350 lines because the checks of options that depend on the robot or on each other are
+here. A new option is a field of :class:`batchpid.sim.RunnerKeywords`; one that changes scenes is a
+field of :class:`batchpid.sim.engine.scene_spec.SceneSpec`, too. CONTRIBUTING.md lists all steps.
 """
 
 from __future__ import annotations
@@ -44,7 +45,14 @@ from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
-from batchpid.sim.runner_keywords import OPTIONS, Controller, ControlMode, Place, RunnerKeywords, checked_option
+from batchpid.sim.runner_keywords import (
+    OPTIONS,
+    Controller,
+    ControlMode,
+    Place,
+    RunnerKeywords,
+    checked_option,
+)
 from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
 
 IDEAL = bp.Actuators()
@@ -52,10 +60,12 @@ IDEAL = bp.Actuators()
 
 
 class RunnerOptions(RunnerKeywords):
-    """Options of a :class:`batchpid.sim.Runner`, checked, copied, and with a value for each default. Immutable.
+    """Options of a :class:`batchpid.sim.Runner`, checked, copied, and with a value for each
+    default. Immutable.
 
-    Arguments and attributes are the same as in :class:`RunnerKeywords`; the attributes below have a narrower type.
-    ``workers`` is None on a cluster, ``tool`` unless setpoints are poses, and ``actuators`` if every effect is off.
+    Arguments and attributes are the same as in :class:`RunnerKeywords`; the attributes below have a
+    narrower type. ``workers`` is None on a cluster, ``tool`` unless setpoints are poses, and
+    ``actuators`` if every effect is off.
 
     Raises
     ------
@@ -75,12 +85,17 @@ class RunnerOptions(RunnerKeywords):
     def __post_init__(self) -> None:
         super().__post_init__()
         own, given = vars(self), dict(vars(self))
-        robot = instance("robot", self.robot, Robot, "load one with Robot.load('panda') or a URDF path")
+        robot = instance(
+            "robot", self.robot, Robot, "load one with Robot.load('panda') or a URDF path"
+        )
         own["control"] = _control(self.control, robot, given["tool"])
         if given["ground"] is None:
             own["ground"] = self.collisions and self._has_ground
         if isinstance(self.control, OperationalSpace):
-            own["control"], own["tool"] = self.control.in_runner(self.timestep, self.compensate), self.control.link
+            own["control"], own["tool"] = (
+                self.control.in_runner(self.timestep, self.compensate),
+                self.control.link,
+            )
         own["workers"], own["cluster"] = _places(self.workers, given["cluster"])
         self._check_engine()
         if self.build is not None and not callable(self.build):
@@ -92,15 +107,25 @@ class RunnerOptions(RunnerKeywords):
             own["speed_limit"] = read_only(limit.copy())
         if self.randomization is not None:
             remedy = "pass e.g. Randomization(payload=Uniform(0, 1))"
-            check_robot(instance("randomization", self.randomization, Randomization, remedy), robot, self.mjcf)
+            check_robot(
+                instance("randomization", self.randomization, Randomization, remedy),
+                robot,
+                self.mjcf,
+            )
             self._check_world(self.randomization)
         self._check_tree()
-        own["guard"] = fit_guard(given["guard"], robot.joints, self.num_envs, self.control_name, self.sets_positions)
+        own["guard"] = fit_guard(
+            given["guard"], robot.joints, self.num_envs, self.control_name, self.sets_positions
+        )
         if self.backend == "jax":
             self._check_program()
         own["actuators"] = self.check_actuators(given["actuators"])
         self._check_collisions()
-        params = default_params(robot, self.control, self.loops) if given["params"] is None else given["params"]
+        params = (
+            default_params(robot, self.control, self.loops)
+            if given["params"] is None
+            else given["params"]
+        )
         own["params"] = self.check_params(params)
         for name in ("contacts", "wrenches"):
             own[name] = self._sensed_links(name, given[name])
@@ -120,7 +145,9 @@ class RunnerOptions(RunnerKeywords):
                 require(engine, capability, argument)
 
     def _check_program(self) -> None:
-        """Raise InvalidArgumentError for an option that the program of backend "jax" does not have."""
+        """Raise InvalidArgumentError for an option that the program of backend "jax" does not
+        have.
+        """
         require_jax()
         engine, robot = self.load_engine(), self.robot
         whole = "coriolis" in self.compensate or "partial_force" in engine.capabilities
@@ -132,8 +159,16 @@ class RunnerOptions(RunnerKeywords):
             ("backend", reason, f"is 'jax'; {reason}"),
             ("control", self.control == "drive", "'drive' has no law to compile"),
             ("robot", not robot.coupling.is_identity, "has coupled joints"),
-            ("robot", not robot.fixed_base and robot.friction.any(), "has a floating base, and joints with friction"),
-            ("compensate", "gravity" in self.compensate and not reads_force, "needs a passive force of NumPy"),
+            (
+                "robot",
+                not robot.fixed_base and robot.friction.any(),
+                "has a floating base, and joints with friction",
+            ),
+            (
+                "compensate",
+                "gravity" in self.compensate and not reads_force,
+                "needs a passive force of NumPy",
+            ),
             ("randomization", self.randomization is not None, "is given"),
             ("guard", self.guard is not None, "is given"),
             ("robot", robot.actuators is not None, "has actuators"),
@@ -143,9 +178,14 @@ class RunnerOptions(RunnerKeywords):
                 raise _not_in_program(argument, problem)
 
     def _check_tree(self) -> None:
-        """Raise InvalidArgumentError for options that need a kinematic tree, if the robot has closed loops."""
+        """Raise InvalidArgumentError for options that need a kinematic tree, if the robot has
+        closed loops.
+        """
         if self.loops and isinstance(self.control, OperationalSpace):
-            problem = f"needs a kinematic tree, and {', '.join(self.loops)} of the file closes a loop of links"
+            problem = (
+                f"needs a kinematic tree, and {', '.join(self.loops)} of the file closes a loop of"
+                " links"
+            )
             remedy = "control the joints, or remove the equality constraint"
             raise InvalidArgumentError("control", problem, value=self.control, remedy=remedy)
 
@@ -168,21 +208,35 @@ class RunnerOptions(RunnerKeywords):
         if self.collisions:
             return
         if self.mjcf is not None and self.mjcf.falling:
-            problem = f"are False, and nothing holds the bodies {', '.join(self.mjcf.falling)} of the file"
+            problem = (
+                f"are False, and nothing holds the bodies {', '.join(self.mjcf.falling)} of the"
+                " file"
+            )
             raise InvalidArgumentError("collisions", problem, remedy="leave it out")
         if self.ground:
-            problem, remedy = "is True, and collisions are False", "leave it out: nothing can touch a ground"
+            problem, remedy = (
+                "is True, and collisions are False",
+                "leave it out: nothing can touch a ground",
+            )
             raise InvalidArgumentError("ground", problem, remedy=remedy)
         if not self.robot.fixed_base:
             problem = f"are False, and nothing holds the floating base of {self.robot.name!r}"
-            raise InvalidArgumentError("collisions", problem, remedy="load the robot with fixed_base=True")
+            raise InvalidArgumentError(
+                "collisions", problem, remedy="load the robot with fixed_base=True"
+            )
 
     def _check_world(self, randomization: Randomization) -> None:
-        """Raise InvalidArgumentError for draws of the world that this runner's scenes do not take."""
+        """Raise InvalidArgumentError for draws of the world that this runner's scenes do not
+        take.
+        """
         if randomization.ground_friction is not None and not self.collisions:
-            raise InvalidArgumentError("ground_friction", "has no effect without collisions", remedy="leave it out")
+            raise InvalidArgumentError(
+                "ground_friction", "has no effect without collisions", remedy="leave it out"
+            )
         if randomization.gravity is not None and self.build is not None:
-            problem = "cannot change in scenes with content of build: SAPIEN's systems keep their gravity"
+            problem = (
+                "cannot change in scenes with content of build: SAPIEN's systems keep their gravity"
+            )
             raise InvalidArgumentError("gravity", problem, remedy="leave out one of them")
 
     def _sensed_links(self, option: str, given: Any) -> tuple[str, ...] | None:
@@ -194,10 +248,14 @@ class RunnerOptions(RunnerKeywords):
         if not (links := () if given is None else tuple(names(option, given))):
             return None
         if option == "contacts" and not self.collisions:
-            raise InvalidArgumentError(option, "need collisions, which are off", remedy="leave out collisions=False")
+            raise InvalidArgumentError(
+                option, "need collisions, which are off", remedy="leave out collisions=False"
+            )
         if self.engine_name == "sapien" and robot.dissipation == "sapien":
             problem = "need a robot without SAPIEN's link damping, which acts like a contact"
-            raise InvalidArgumentError(option, problem, remedy="load the robot with dissipation='urdf'")
+            raise InvalidArgumentError(
+                option, problem, remedy="load the robot with dissipation='urdf'"
+            )
         bodies = place_links(robot.urdf, links if option == "wrenches" else ())
         root = next(at.link for at in bodies.values())
         for link in links:
@@ -206,29 +264,45 @@ class RunnerOptions(RunnerKeywords):
                 raise InvalidArgumentError(option, f"names an unknown link {link!r}", remedy=remedy)
             if bodies[link].link == root and (option == "wrenches" or robot.fixed_base):
                 problem = f"names {link!r}, which no joint moves"
-                raise InvalidArgumentError(option, problem, remedy="name a link further along the robot")
+                raise InvalidArgumentError(
+                    option, problem, remedy="name a link further along the robot"
+                )
         return links
 
     @cached_property
     def observed(self) -> dict[str, Quantity]:
         """Quantities that the loop observes."""
-        return observed_by_loop(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
+        return observed_by_loop(
+            self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches
+        )
 
     @property
     def misses_contacts(self) -> bool:
-        """True if robots have no collision shapes, and contacts that they would have had are reported."""
+        """True if robots have no collision shapes, and contacts that they would have had are
+        reported.
+        """
         return not self.collisions
 
     @property
     def switched(self) -> dict[str, bool]:
         """Options of type bool that are not at their default, by name."""
-        switches = {entry.name: entry.default for entry in fields(self) if isinstance(entry.default, bool)}
-        return {name: not default for name, default in switches.items() if getattr(self, name) != default}
+        switches = {
+            entry.name: entry.default for entry in fields(self) if isinstance(entry.default, bool)
+        }
+        return {
+            name: not default
+            for name, default in switches.items()
+            if getattr(self, name) != default
+        }
 
     @property
     def solver(self) -> Physics | MujocoSolver:
         """Solver settings for the option ``physics``."""
-        return self.load_engine().physics[self.physics] if isinstance(self.physics, str) else self.physics
+        return (
+            self.load_engine().physics[self.physics]
+            if isinstance(self.physics, str)
+            else self.physics
+        )
 
     def load_engine(self) -> Engine:
         """Return the physics engine of the robots, with its packages imported.
@@ -260,7 +334,9 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def command(self) -> CommandSpec:
         """Names and units of the setpoint's entries."""
-        return self.own_command or joint_command(self.robot.joint_names, self.robot.units, self.control)
+        return self.own_command or joint_command(
+            self.robot.joint_names, self.robot.units, self.control
+        )
 
     @cached_property
     def command_columns(self) -> tuple[tuple[AxisKind, tuple[str, ...]], ...]:
@@ -271,17 +347,27 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def command_coupling(self) -> Coupling | None:
         """Coupling of the joints that setpoints are for; None where there is none."""
-        return self.robot.coupling if self.sets_positions and not self.robot.independent.all() else None
+        return (
+            self.robot.coupling
+            if self.sets_positions and not self.robot.independent.all()
+            else None
+        )
 
     @property
     def tool_pose(self) -> Callable[[Rows], NDArray[np.float32]] | None:
-        """Function from positions (..., dof) to poses of the tool (..., 7); None where setpoints are not poses."""
+        """Function from positions (..., dof) to poses of the tool (..., 7); None where setpoints
+        are not poses.
+        """
         return self.control.tool_pose if isinstance(self.control, OperationalSpace) else None
 
     def has_stiction(self, actuators: bp.Actuators | None) -> bool:
         """Return whether joints with ``actuators`` have Coulomb friction that the loop models."""
         added = actuators is not None and added_friction(Friction(), actuators).coulomb is not None
-        return bool(self.robot.friction.any()) or added or getattr(self.randomization, "friction", None) is not None
+        return (
+            bool(self.robot.friction.any())
+            or added
+            or getattr(self.randomization, "friction", None) is not None
+        )
 
     @property
     def has_pushes(self) -> bool:
@@ -289,7 +375,8 @@ class RunnerOptions(RunnerKeywords):
         return self.randomization is not None and self.randomization.push is not None
 
     def check_params(self, params: bp.PIDParams) -> bp.PIDParams:
-        """Return ``params``, as a read-only copy, if they fit the robot, the number of envs and the control.
+        """Return ``params``, as a read-only copy, if they fit the robot, the number of envs and the
+        control.
 
         Raises
         ------
@@ -304,7 +391,10 @@ class RunnerOptions(RunnerKeywords):
                 remedy="use control 'pid', or params with gain_units 'effort'",
             )
         if isinstance(params.gain_units, PerMassMatrix) and self.loops:
-            problem = f"are 'mass_matrix', which needs a kinematic tree: {', '.join(self.loops)} closes a loop of links"
+            problem = (
+                f"are 'mass_matrix', which needs a kinematic tree: {', '.join(self.loops)} closes a"
+                " loop of links"
+            )
             raise InvalidArgumentError("gain_units", problem, remedy='use robot.designed("effort")')
         check_gain_units(params)
         if self.control == "drive":
@@ -326,10 +416,11 @@ class RunnerOptions(RunnerKeywords):
         return frozen(params)
 
     def check_actuators(self, actuators: bp.Actuators | None) -> bp.Actuators | None:
-        """Return ``actuators`` as :func:`batchpid.sim.robot.actuator_checks.fit_actuators` does; None if every effect
-        is off.
+        """Return ``actuators`` as :func:`batchpid.sim.robot.actuator_checks.fit_actuators` does;
+        None if every effect is off.
 
-        None selects the robot's own actuators; control "drive" uses only their friction and armature.
+        None selects the robot's own actuators; control "drive" uses only their friction and
+        armature.
 
         Raises
         ------
@@ -339,7 +430,9 @@ class RunnerOptions(RunnerKeywords):
         if actuators is None:
             actuators = self.robot.actuators or IDEAL
             actuators = actuators.joint_side() if self.control == "drive" else actuators
-        fitted: bp.Actuators | None = fit_actuators(actuators, self.robot, self.num_envs, self.control)
+        fitted: bp.Actuators | None = fit_actuators(
+            actuators, self.robot, self.num_envs, self.control
+        )
         fitted = None if fitted is None or fitted.is_ideal else fitted
         if self.randomization is not None:
             fitted = prepared_actuators(self.randomization, fitted, self.robot, self.control)
@@ -348,7 +441,9 @@ class RunnerOptions(RunnerKeywords):
         return None if fitted is None else frozen(fitted)
 
     def with_values(self, **values: Any) -> RunnerOptions:
-        """Return a copy with other ``values``, as the attributes hold them: they are not checked."""
+        """Return a copy with other ``values``, as the attributes hold them: they are not
+        checked.
+        """
         changed = copy.copy(self)
         vars(changed).update(values)
         return changed
@@ -357,7 +452,8 @@ class RunnerOptions(RunnerKeywords):
         """Return the options that are marked with ``place``, by name.
 
         - "snapshot": values that two runners must share to restore each other's snapshots;
-        - "recording": fields of :class:`batchpid.sim.RunInfo`, and in its field "options" the values without a field;
+        - "recording": fields of :class:`batchpid.sim.RunInfo`, and in its field "options" the
+          values without a field;
         - "scene": fields of :class:`batchpid.sim.engine.scene_spec.SceneSpec`.
         """
         kept = {name: entry.kept[place] for name, entry in OPTIONS.items() if place in entry.kept}
@@ -367,7 +463,9 @@ class RunnerOptions(RunnerKeywords):
         return values
 
     def describe(self) -> Document:
-        """Return robot and options that two runners must share to restore each other's snapshots, as plain values."""
+        """Return robot and options that two runners must share to restore each other's snapshots,
+        as plain values.
+        """
         robot, command = self.robot, self.own_command
         return {
             **robot.describe(),
@@ -429,7 +527,9 @@ def _control(value: object, robot: Robot, tool: Any) -> Any:
     if tool is not None:
         tool = instance("tool", tool, str, "name a link of the robot")
     if tool is not None and name != "osc" and tool != getattr(value, "link", None):
-        raise InvalidArgumentError("tool", "is for control 'osc'", value=tool, remedy="leave it out")
+        raise InvalidArgumentError(
+            "tool", "is for control 'osc'", value=tool, remedy="leave it out"
+        )
     if not robot.fixed_base and name == "osc":
         problem = f"'osc' needs a fixed base, which {robot.name!r} does not have"
         remedy = "load the robot with fixed_base=True, or control its joints"
@@ -440,16 +540,26 @@ def _control(value: object, robot: Robot, tool: Any) -> Any:
         return OperationalSpace(robot, default_tool(robot) if tool is None else tool)
     except InvalidArgumentError as error:
         named = "tool" if error.argument == "link" else error.argument
-        raise InvalidArgumentError(named, error.problem, value=error.value, remedy=error.remedy) from None
+        raise InvalidArgumentError(
+            named, error.problem, value=error.value, remedy=error.remedy
+        ) from None
 
 
 def _plain(value: object) -> object:
     """Return the value of an option in JSON's types."""
-    return value.tolist() if isinstance(value, np.ndarray) else list(value) if isinstance(value, tuple) else value
+    return (
+        value.tolist()
+        if isinstance(value, np.ndarray)
+        else list(value)
+        if isinstance(value, tuple)
+        else value
+    )
 
 
 def _versioned_name(value: object) -> str | None:
-    """Return the class of an object, or the name of a function, with its ``version``; None for a text or None."""
+    """Return the class of an object, or the name of a function, with its ``version``; None for a
+    text or None.
+    """
     if value is None or isinstance(value, str):
         return None
     name = getattr(value, "__qualname__", type(value).__qualname__)
@@ -457,7 +567,9 @@ def _versioned_name(value: object) -> str | None:
 
 
 def worker_count(workers: int | None) -> int:
-    """Return the number of worker processes for the option ``workers``; None selects one per available core."""
+    """Return the number of worker processes for the option ``workers``; None selects one per
+    available core.
+    """
     return len(os.sched_getaffinity(0)) if workers is None else checked_option("workers", workers)
 
 
@@ -465,7 +577,9 @@ def _places(workers: Any, cluster: Any) -> tuple[int | None, Ray | None]:
     """Return the options ``workers`` and ``cluster``, checked; one of them is None."""
     if cluster is None:
         return worker_count(workers), None
-    cluster = instance("cluster", Ray() if cluster == "ray" else cluster, Ray, "pass 'ray' or Ray(...)")
+    cluster = instance(
+        "cluster", Ray() if cluster == "ray" else cluster, Ray, "pass 'ray' or Ray(...)"
+    )
     if workers is not None:
         remedy = "pass cluster=Ray(cpus_per_node=...)"
         raise InvalidArgumentError("workers", "is not for a cluster", value=workers, remedy=remedy)
@@ -477,10 +591,11 @@ def default_params(
 ) -> bp.PIDParams:
     """Return the params of a runner that is given none.
 
-    - ``"pid"``: ``robot.tuned()`` where the robot ships them, else ``robot.designed()``, or with closed ``loops``
-      ``robot.designed("effort")``;
-    - ``"drive"``: the drive gains of a bundled robot's settings, else the gains of ``robot.designed("effort")`` without
-      ki, setpoint weight and filter, which a drive does not have: the integral would overshoot;
+    - ``"pid"``: ``robot.tuned()`` where the robot ships them, else ``robot.designed()``, or with
+      closed ``loops`` ``robot.designed("effort")``;
+    - ``"drive"``: the drive gains of a bundled robot's settings, else the gains of
+      ``robot.designed("effort")`` without ki, setpoint weight and filter, which a drive does not
+      have: the integral would overshoot;
     - ``"effort"``, and a :class:`Controller`: zero gains and the robot's effort limits.
 
     Raises
@@ -493,8 +608,12 @@ def default_params(
     settings = robot.settings
     if control == "drive":
         if settings is None:
-            return robot.designed("effort").replace(ki=0.0, setpoint_weight=None, derivative_filter_time=None)
-        return robot.params(kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None)
+            return robot.designed("effort").replace(
+                ki=0.0, setpoint_weight=None, derivative_filter_time=None
+            )
+        return robot.params(
+            kp=settings.drive_stiffness, ki=0.0, kd=settings.drive_damping, effort_limit=None
+        )
     return robot.tuned() if robot.has_tuned else robot.designed("effort" if loops else None)
 
 

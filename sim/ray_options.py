@@ -11,7 +11,8 @@ from batchpid.errors import InvalidArgumentError
 
 @dataclass(frozen=True, eq=False)
 class Ray:
-    """Ray cluster, for the option ``cluster`` of :class:`batchpid.sim.Runner`; ``"ray"`` means ``Ray()``.
+    """Ray cluster, for the option ``cluster`` of :class:`batchpid.sim.Runner`; ``"ray"`` means
+    ``Ray()``.
 
     Raises
     ------
@@ -20,25 +21,32 @@ class Ray:
     """
 
     address: str | None = None
-    """Address of the cluster, "HOST:PORT" as ``ray start`` prints it, or "local" for a new one of this machine alone,
-    which ends with this process. Default: the environment variable RAY_ADDRESS, else a cluster that runs on this
-    machine, else "local"."""
+    """Address of the cluster, "HOST:PORT" as ``ray start`` prints it, or "local" for a new one of
+    this machine alone, which ends with this process. Default: the environment variable RAY_ADDRESS,
+    else a cluster that runs on this machine, else "local".
+    """
     _: KW_ONLY
     nodes: int | None = None
     """Largest number of machines. Default: all that have enough CPUs."""
     cpus_per_node: int | None = None
-    """Workers on each machine, each on one CPU of Ray's count. Machines with fewer CPUs are not used. Default: all
-    CPUs that Ray counts."""
+    """Workers on each machine, each on one CPU of Ray's count. Machines with fewer CPUs are not
+    used. Default: all CPUs that Ray counts.
+    """
     runtime_env: Document | None = None
     """Ray's ``runtime_env`` of the processes on the machines, such as ``{"working_dir": "."}``."""
 
     def __post_init__(self) -> None:
-        if self.address is not None and (not isinstance(self.address, str) or "://" in self.address):
+        if self.address is not None and (
+            not isinstance(self.address, str) or "://" in self.address
+        ):
             raise InvalidArgumentError(
                 "address",
                 "must be HOST:PORT, 'auto' or 'local'",
                 value=self.address,
-                remedy="pass the address that ray start printed, on a machine that belongs to the cluster",
+                remedy=(
+                    "pass the address that ray start printed, on a machine that belongs to the"
+                    " cluster"
+                ),
             )
         for name in ("nodes", "cpus_per_node"):
             if getattr(self, name) is not None:

@@ -23,7 +23,9 @@ class RunWarnings:
         control = options.control
         self.limits = SetpointCheck(robot)
         """Check of start poses, and of setpoints, against the limits of the joints."""
-        self.setpoint_limits = self.limits if options.sets_positions and options.guard is None else None
+        self.setpoint_limits = (
+            self.limits if options.sets_positions and options.guard is None else None
+        )
         self.is_watching = False
         """False where :meth:`see` can find nothing in any tick."""
         self._control = control
@@ -48,15 +50,21 @@ class RunWarnings:
         self._update()
 
     def see(self, command: Command, num_ticks: int, seconds: float) -> None:
-        """Look at the first ticks of a command (ticks, envs, ...), of ``seconds`` each, and warn of what is found."""
+        """Look at the first ticks of a command (ticks, envs, ...), of ``seconds`` each, and warn of
+        what is found.
+        """
         if self._moving is not None:
-            self._moving.see(command.setpoint[:num_ticks], command.setpoint_rate is not None, seconds)
+            self._moving.see(
+                command.setpoint[:num_ticks], command.setpoint_rate is not None, seconds
+            )
             if self._moving.found is not None:
                 self._moving.warn()
                 self._update()
 
     def issue(self, faults: FaultLog, contacts: MissedContactLog | None, lost: list[str]) -> None:
-        """Warn of lost workers (the messages ``lost``, which are removed), faults and missed contacts."""
+        """Warn of lost workers (the messages ``lost``, which are removed), faults and missed
+        contacts.
+        """
         while lost:
             warn(lost.pop(), RecoveryWarning)
         if faults.faults and not self._has_warned_of_fault:

@@ -1,8 +1,10 @@
 """Runner: N robots in N headless scenes, stepped by worker processes under one batch controller.
 
-Each method makes an operation of its arguments (:mod:`batchpid.sim.operations`), and :meth:`Runner._execute` runs it.
+Each method makes an operation of its arguments (:mod:`batchpid.sim.operations`), and
+:meth:`Runner._execute` runs it.
 
-Longer than 350 lines because the public signatures and their documentation are spelled out for editors and readers.
+Longer than 350 lines because the public signatures and their documentation are spelled out for
+editors and readers.
 """
 
 from __future__ import annotations
@@ -47,7 +49,13 @@ from batchpid.sim.operations import (
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.run_warnings import RunWarnings
 from batchpid.sim.runner_arguments import count_ticks, read_command
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE, KINDS, OPTIONS, arguments_of, checked_option
+from batchpid.sim.runner_keywords import (
+    DEFAULT_ENGINE,
+    KINDS,
+    OPTIONS,
+    arguments_of,
+    checked_option,
+)
 from batchpid.sim.runner_state import RunnerState
 from batchpid.sim.workers.contact_log import MissedContact
 from batchpid.sim.workers.node import NodeInfo
@@ -67,14 +75,16 @@ class TickRecorder(Protocol):
         """Return, or raise, before the next tick begins: whether it can be recorded."""
 
     def append(self, time_: float, command: Command, observation: Observation) -> None:
-        """Record the state at ``time_`` [s] after a tick under ``command`` (envs, ...), which may change afterwards.
+        """Record the state at ``time_`` [s] after a tick under ``command`` (envs, ...), which may
+        change afterwards.
 
         It must return soon, and without an error: Ctrl-C waits for it.
         """
 
 
 class Runner(SingleOwner):
-    """N robots in N headless scenes of a physics engine, under explicit PID, drive or effort control.
+    """N robots in N headless scenes of a physics engine, under explicit PID, drive or effort
+    control.
 
     Parameters
     ----------
@@ -120,7 +130,9 @@ class Runner(SingleOwner):
         """Start the workers, and reset all envs."""
         state, options = self._state, self.options
         seed = None if options.randomization is None else 0
-        start = Reset.read(options, state, self._warnings.limits, (None, None), None, seed, (None, None))
+        start = Reset.read(
+            options, state, self._warnings.limits, (None, None), None, seed, (None, None)
+        )
         self._call.begin()
         try:
             self._call.waits = True
@@ -145,12 +157,14 @@ class Runner(SingleOwner):
         further = "".join(f", {name} {value}" for name, value in options.switched.items())
         where = f"{nodes} nodes" if nodes else where
         return (
-            f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control {options.control_name!r}, compensate "
-            f"{options.compensate!r},\n       physics {options.physics!r}{further}, timestep {self.timestep:g} s, "
-            f"{self.substeps} substeps, at {self.time:g} s)"
+            f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control"
+            f" {options.control_name!r}, compensate {options.compensate!r},\n       physics"
+            f" {options.physics!r}{further}, timestep {self.timestep:g} s, {self.substeps}"
+            f" substeps, at {self.time:g} s)"
         )
 
-    # -- commands ------------------------------------------------------------------------------------------------
+    # -- commands
+    # ----------------------------------------------------------------------------------------------
 
     def reset(
         self,
@@ -167,26 +181,27 @@ class Runner(SingleOwner):
         Parameters
         ----------
         qpos, qvel
-            (dof,) or (envs, dof) [rad or m, and per second]; default the robot's start pose, at rest. Followers are put
-            where their leaders have them.
+            (dof,) or (envs, dof) [rad or m, and per second]; default the robot's start pose, at
+            rest. Followers are put where their leaders have them.
         mask
             Envs to reset (envs,) bool; default all. The others are not affected.
         seed
-            Begin with the first episode of another stream of the randomization: an int s for stream s + k in env k, or
-            one for each env. Default: draw for the next episode of each env's stream.
+            Begin with the first episode of another stream of the randomization: an int s for stream
+            s + k in env k, or one for each env. Default: draw for the next episode of each env's
+            stream.
         base_pose
-            Pose of a floating base, its root link, (7,) or (envs, 7): position [m] and quaternion (w, x, y, z). Default
-            upright above the origin, with the lowest point of the robot's collision shapes on the ground; without a
-            ground at the origin.
+            Pose of a floating base, its root link, (7,) or (envs, 7): position [m] and quaternion
+            (w, x, y, z). Default upright above the origin, with the lowest point of the robot's
+            collision shapes on the ground; without a ground at the origin.
         base_twist
-            Velocity of that link's origin and its angular velocity, along the axes of the world, (6,) or (envs, 6)
-            [m/s, rad/s]; default 0.
+            Velocity of that link's origin and its angular velocity, along the axes of the world,
+            (6,) or (envs, 6) [m/s, rad/s]; default 0.
 
         Raises
         ------
         CallOrderError
-            The observation of a tick that was sent has not been received, as for :meth:`step`, :meth:`rollout` and
-            :meth:`restore`.
+            The observation of a tick that was sent has not been received, as for :meth:`step`,
+            :meth:`rollout` and :meth:`restore`.
         """
         self._ready("reset")
         limits, base = self._warnings.limits, (base_pose, base_twist)
@@ -207,22 +222,26 @@ class Runner(SingleOwner):
         Parameters
         ----------
         setpoint
-            (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N]. A follower's
-            value (:attr:`batchpid.sim.Robot.coupling`) is replaced by the coupling's value for the leader's setpoint;
-            an effort acts on the leader. A :class:`batchpid.sim.Controller` that defines its command takes (size,) or
-            (envs, size): :attr:`command`.
+            (dof,) or (envs, dof) [rad or m]; under control "effort" the joint effort [N m or N]. A
+            follower's value (:attr:`batchpid.sim.Robot.coupling`) is replaced by the coupling's
+            value for the leader's setpoint; an effort acts on the leader. A
+            :class:`batchpid.sim.Controller` that defines its command takes (size,) or (envs, size):
+            :attr:`command`.
         setpoint_rate
-            Rate of the setpoint [rad/s or m/s], same shapes, with which the setpoint moves within the tick. Both hold
-            at the tick's end: the setpoint of a sim step that begins t before it is ``setpoint - t setpoint_rate``. The
-            law damps the velocity error instead of the velocity, and follows this motion with full weight. Controls
-            other than "pid" and "drive" ignore it.
+            Rate of the setpoint [rad/s or m/s], same shapes, with which the setpoint moves within
+            the tick. Both hold at the tick's end: the setpoint of a sim step that begins t before
+            it is ``setpoint - t setpoint_rate``. The law damps the velocity error instead of the
+            velocity, and follows this motion with full weight. Controls other than "pid" and
+            "drive" ignore it.
         setpoint_acceleration
-            Acceleration of the setpoint [rad/s^2 or m/s^2], same shapes, besides its rate: a law with gains per unit of
-            inertia adds it to the acceleration that it commands. Other gains take ``feedforward``. Default 0. Where the
-            setpoints confirm that the rate is the one at the tick's end, as in a smooth trajectory, its change over the
-            tick is taken instead, which is the mean acceleration.
+            Acceleration of the setpoint [rad/s^2 or m/s^2], same shapes, besides its rate: a law
+            with gains per unit of inertia adds it to the acceleration that it commands. Other gains
+            take ``feedforward``. Default 0. Where the setpoints confirm that the rate is the one at
+            the tick's end, as in a smooth trajectory, its change over the tick is taken instead,
+            which is the mean acceleration.
         feedforward
-            Joint effort (dof,) or (envs, dof) [N m or N] added to the passive force before saturation.
+            Joint effort (dof,) or (envs, dof) [N m or N] added to the passive force before
+            saturation.
         substeps
             Sim steps of this tick; default the runner's.
         """
@@ -243,9 +262,9 @@ class Runner(SingleOwner):
     ) -> None:
         """Begin a tick and return, while the workers run it; :meth:`recv` returns its observation.
 
-        The two are bit-identical to one :meth:`step`, and take its arguments. Other calls in between, and attributes
-        such as :attr:`time`, first wait for the tick to end. Calls that change the observation raise CallOrderError.
-        With ``workers=0`` the tick runs in this call.
+        The two are bit-identical to one :meth:`step`, and take its arguments. Other calls in
+        between, and attributes such as :attr:`time`, first wait for the tick to end. Calls that
+        change the observation raise CallOrderError. With ``workers=0`` the tick runs in this call.
 
         Raises
         ------
@@ -284,7 +303,8 @@ class Runner(SingleOwner):
         Parameters
         ----------
         setpoints
-            (ticks, envs, dof), or (ticks, dof) for all envs [rad or m]; for another command (ticks, envs, size).
+            (ticks, envs, dof), or (ticks, dof) for all envs [rad or m]; for another command (ticks,
+            envs, size).
         setpoint_rates, setpoint_accelerations, feedforwards
             Also with the ticks first: see :meth:`step`.
         progress
@@ -303,7 +323,9 @@ class Runner(SingleOwner):
         tick = options.substeps * options.timestep
         done = 0
         seen = empty_observation(ticks, self.num_envs, robot.dof, observed=options.observed)
-        times = (self._state.steps + options.substeps * np.arange(1.0, ticks + 1)) * options.timestep
+        times = (
+            self._state.steps + options.substeps * np.arange(1.0, ticks + 1)
+        ) * options.timestep
         info = replace(self.info, rates=command.setpoint_rate is not None)
         shown = iter(range(ticks) if progress is None else progress(range(ticks)))
         for number in range(ticks):  # not over ``shown``, which may yield anything
@@ -314,7 +336,9 @@ class Runner(SingleOwner):
                 rows = command.map(itemgetter(part))
                 self._execute(Run.after(self._state, rows, options.substeps, options.timestep))
                 for name in options.observed:
-                    getattr(seen, name)[part] = getattr(self._pool.arrays.observation, name)[: done - number]
+                    getattr(seen, name)[part] = getattr(self._pool.arrays.observation, name)[
+                        : done - number
+                    ]
         next(shown, None)  # the end
         if options.tool_pose is not None:
             seen = seen._replace(tool_pose=options.tool_pose(seen.qpos))
@@ -328,7 +352,8 @@ class Runner(SingleOwner):
         return self._pool.present.observation.copied(self._tool_pose)
 
     def poses(self) -> NDArray[np.float32]:
-        """Return the poses of the entities that ``build`` returned (envs, entities, 7): x, y, z [m], w, x, y, z.
+        """Return the poses of the entities that ``build`` returned (envs, entities, 7): x, y, z
+        [m], w, x, y, z.
 
         Raises
         ------
@@ -339,7 +364,9 @@ class Runner(SingleOwner):
         rows = self._read(ReadPoses())
         counts = [len(row) for row in rows]
         if not rows or len(set(counts)) > 1:
-            problem = f"returned {sorted(set(counts))} entities, by env" if rows else "was not given"
+            problem = (
+                f"returned {sorted(set(counts))} entities, by env" if rows else "was not given"
+            )
             remedy = "let build(scene, env) return as many entities for every env"
             raise InvalidArgumentError("build", problem, remedy=remedy)
         return np.stack(rows)
@@ -347,8 +374,8 @@ class Runner(SingleOwner):
     def bodies(self, names: Sequence[str]) -> NDArray[np.float64]:
         """Return the poses of bodies of an MJCF file (envs, names, 7), in the engine "mujoco".
 
-        They are the positions [m] and quaternions (w, x, y, z) of MuJoCo's body frames in the world: of objects, which
-        the file has besides the robot, and of the robot's own bodies.
+        They are the positions [m] and quaternions (w, x, y, z) of MuJoCo's body frames in the
+        world: of objects, which the file has besides the robot, and of the robot's own bodies.
 
         Raises
         ------
@@ -357,14 +384,19 @@ class Runner(SingleOwner):
         """
         self._ready()
         if self.options.mjcf is None:
-            problem, remedy = "are those of an MJCF file in the engine 'mujoco'", "use robot.kinematic_tree() for links"
+            problem, remedy = (
+                "are those of an MJCF file in the engine 'mujoco'",
+                "use robot.kinematic_tree() for links",
+            )
             raise InvalidArgumentError("names", problem, remedy=remedy)
         chosen = tuple([choice("names", name, self.options.mjcf.bodies) for name in names])
         return np.stack(self._read(ReadPoses(chosen)))
 
     @property
     def params(self) -> bp.PIDParams:
-        """PID parameters; assign new ones to change gains, limits or times in flight (bumpless in the integral)."""
+        """PID parameters; assign new ones to change gains, limits or times in flight (bumpless in
+        the integral).
+        """
         return self._settled().params
 
     @params.setter
@@ -377,9 +409,11 @@ class Runner(SingleOwner):
 
     @property
     def actuators(self) -> bp.Actuators | None:
-        """Actuators, None for ideal ones; assign others to change them in flight. Delays keep their histories.
+        """Actuators, None for ideal ones; assign others to change them in flight. Delays keep their
+        histories.
 
-        As in the option, assign None for the robot's own actuators, and ``bp.Actuators()`` for ideal ones.
+        As in the option, assign None for the robot's own actuators, and ``bp.Actuators()`` for
+        ideal ones.
         """
         return self._settled().actuators
 
@@ -392,7 +426,8 @@ class Runner(SingleOwner):
     def snapshot(self) -> Snapshot:
         """Return the state of all envs, physics and controller, for :meth:`restore`.
 
-        It is a barrier: this runner, too, goes on as if restored from it, so that both are bit-identical from here on.
+        It is a barrier: this runner, too, goes on as if restored from it, so that both are
+        bit-identical from here on.
         """
         self._ready()
         return self._take_snapshot()
@@ -405,13 +440,14 @@ class Runner(SingleOwner):
         - ``workers``, ``cluster`` and ``timeout``, which change no result;
         - ``substeps`` and ``on_invalid_input``, which apply to the commands that follow.
 
-        A controller of the caller's own counts by its class, ``build`` by its name, and both by their attribute
-        ``version``, if they have one.
+        A controller of the caller's own counts by its class, ``build`` by its name, and both by
+        their attribute ``version``, if they have one.
 
         Raises
         ------
         InvalidArgumentError
-            It is of another robot, number of envs, timestep, control, ...; the message names the options.
+            It is of another robot, number of envs, timestep, control, ...; the message names the
+            options.
         """
         self._ready("restore")
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
@@ -426,7 +462,8 @@ class Runner(SingleOwner):
         if self._sent is not None and not self.closed:
             self._execute(self._sent)
 
-    # -- properties ------------------------------------------------------------------------------------------------
+    # -- properties
+    # ----------------------------------------------------------------------------------------------
 
     @property
     def info(self) -> RunInfo:
@@ -444,7 +481,11 @@ class Runner(SingleOwner):
             versions=dict(self._versions),
             begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
             faults=state.faults.faults,
-            draws=None if draws is None else {name: rows.copy() for name, rows in draws.values.items()},
+            draws=(
+                None
+                if draws is None
+                else {name: rows.copy() for name, rows in draws.values.items()}
+            ),
             episodes=None if draws is None else draws.episodes.copy(),
         )
 
@@ -464,23 +505,31 @@ class Runner(SingleOwner):
 
     @property
     def missed_contacts(self) -> tuple[MissedContact, ...]:
-        """First contact that each robot without shapes would have had since its reset; latest last."""
+        """First contact that each robot without shapes would have had since its reset; latest
+        last.
+        """
         contacts = self._settled().contacts
         return () if contacts is None else tuple(contacts.contacts)
 
     @property
     def draws(self) -> dict[str, NDArray[np.float64]]:
-        """Draws of the randomization for the present episodes, by field: (envs, joints or links), as copies."""
+        """Draws of the randomization for the present episodes, by field: (envs, joints or links),
+        as copies.
+        """
         return {name: rows.copy() for name, rows in self._settled().draws.values.items()}
 
     @property
     def episodes(self) -> NDArray[np.int64]:
-        """Stream and number of the present episode of each env (envs, 2); (0, 2) without a randomization."""
+        """Stream and number of the present episode of each env (envs, 2); (0, 2) without a
+        randomization.
+        """
         return self._settled().draws.episodes.copy()
 
     @property
     def backend(self) -> str:
-        """Library of the law, and kind of the calls into the engine, with the reason if they are not native."""
+        """Library of the law, and kind of the calls into the engine, with the reason if they are
+        not native.
+        """
         return describe(self.options)
 
     @property
@@ -490,7 +539,9 @@ class Runner(SingleOwner):
 
     @property
     def work_seconds(self) -> NDArray[np.float64]:
-        """Seconds of work of each worker in the last tick; after a rollout, the mean over the ticks of one request."""
+        """Seconds of work of each worker in the last tick; after a rollout, the mean over the ticks
+        of one request.
+        """
         seconds, ticks = self._settled().work
         return np.array(seconds) / ticks
 
@@ -512,7 +563,9 @@ class Runner(SingleOwner):
     def close(self) -> None:
         """End the workers and free the scenes. May be called again, as after an interrupt."""
         self._pool.closed = True
-        if not (self._call.in_use and self._pool.is_local):  # its scenes are in use until the call ends
+        if not (
+            self._call.in_use and self._pool.is_local
+        ):  # its scenes are in use until the call ends
             self._pool.close()
 
     @property
@@ -530,7 +583,8 @@ class Runner(SingleOwner):
         if hasattr(self, "_pool"):  # its options were right
             self.close()
 
-    # -- execution of commands -------------------------------------------------------------------------------------
+    # -- execution of commands
+    # -------------------------------------------------------------------------------------
 
     def _ready(self, call: str | None = None) -> None:
         """Complete a tick that was sent.
@@ -542,14 +596,18 @@ class Runner(SingleOwner):
         ClosedError
             The runner is closed.
         CallOrderError
-            The observation of a tick that was sent has not been received, and ``call`` would change it.
+            The observation of a tick that was sent has not been received, and ``call`` would change
+            it.
         InUseError
             Another call is in progress, or the runner belongs to another process.
         """
         if self._pool.closed:
             cause, reason = self._cause, ""
             if cause is not None:
-                reason = f", since a call failed ({(str(cause).splitlines() or [type(cause).__name__])[0]})"
+                reason = (
+                    ", since a call failed"
+                    f" ({(str(cause).splitlines() or [type(cause).__name__])[0]})"
+                )
             raise ClosedError(f"this Runner is closed{reason}; make a new one")
         self._call.check()
         if self._sent is not None:
@@ -559,7 +617,9 @@ class Runner(SingleOwner):
             raise CallOrderError(f"{call}: {problem}; call recv() first")
 
     def _settled(self) -> RunnerState:
-        """Return the state after the last command; during a call, and after the end, after the last completed one."""
+        """Return the state after the last command; during a call, and after the end, after the last
+        completed one.
+        """
         if self._sent is not None and not (self._call.in_use or self._pool.closed):
             self._execute(self._sent)
         return self._state
@@ -570,7 +630,10 @@ class Runner(SingleOwner):
         command = read_command(self.options, self._state, self._warnings.setpoint_limits, inputs)
         count = self.substeps if substeps is None else checked_option("substeps", substeps)
         if self.recorder is not None and count != self.substeps:
-            problem, remedy = f"is not the runner's {self.substeps}", "all ticks of a recording have the same length"
+            problem, remedy = (
+                f"is not the runner's {self.substeps}",
+                "all ticks of a recording have the same length",
+            )
             raise InvalidArgumentError("substeps", problem, value=count, remedy=remedy)
         return Run.after(self._state, command, count, self.timestep)
 
@@ -597,8 +660,8 @@ class Runner(SingleOwner):
     def _execute(self, operation: Operation) -> Outcome:
         """Execute an operation, or complete the one that was sent; then issue warnings.
 
-        Ctrl-C does not interrupt it between the request and the new state. The runner is closed if the workers cannot
-        complete the request, or if a second Ctrl-C ends it.
+        Ctrl-C does not interrupt it between the request and the new state. The runner is closed if
+        the workers cannot complete the request, or if a second Ctrl-C ends it.
         """
         call = self._call
         pool = self._pool
@@ -621,7 +684,11 @@ class Runner(SingleOwner):
             if is_sent:
                 self._sent, self._unreceived = (
                     None,
-                    None if outcome.failure else self._pool.present.observation.copied(self._tool_pose),
+                    (
+                        None
+                        if outcome.failure
+                        else self._pool.present.observation.copied(self._tool_pose)
+                    ),
                 )
             if outcome.failure is not None and operation.changes_loop:
                 self._fail(outcome.failure.error)
@@ -642,17 +709,25 @@ class Runner(SingleOwner):
         return outcome
 
     def _prepare_ticks(self) -> None:
-        """Take a checkpoint if one is due, and let the recorder keep the state before its first tick."""
+        """Take a checkpoint if one is due, and let the recorder keep the state before its first
+        tick.
+        """
         if self._state.steps_since_checkpoint >= CHECKPOINT_STEPS:
             self._take_snapshot()
         if self.recorder is not None:
             self.recorder.prepare()
 
-    def _record(self, recorder: TickRecorder, run: Run, before: RunnerState, outcome: Outcome) -> None:
+    def _record(
+        self, recorder: TickRecorder, run: Run, before: RunnerState, outcome: Outcome
+    ) -> None:
         """Pass completed ticks on to the recorder."""
         for number, arrays in enumerate(outcome.completed):
             time = (before.steps + (number + 1) * run.substeps) * self.timestep
-            recorder.append(time, run.command.map(itemgetter(number)), arrays.observation.copied(self._tool_pose))
+            recorder.append(
+                time,
+                run.command.map(itemgetter(number)),
+                arrays.observation.copied(self._tool_pose),
+            )
 
     def _fail(self, error: BaseException) -> None:
         """End the runner, which cannot complete a command."""
@@ -662,7 +737,9 @@ class Runner(SingleOwner):
         self._pool.closed = True
 
     def _take_snapshot(self) -> Snapshot:
-        """Return a snapshot, from which the runner goes on, and a replacement of a lost worker begins."""
+        """Return a snapshot, from which the runner goes on, and a replacement of a lost worker
+        begins.
+        """
         state = self._state
         snapshot = snapshot_of(self.options, state, self._read(TakeSnapshot()))
         self._pool.start_replay_from(Restore(snapshot, state.draws))
@@ -675,4 +752,6 @@ class Runner(SingleOwner):
 
 
 _PARAMETERS = signature(RunnerOptions).parameters.items()
-Runner.__signature__ = Signature([each.replace(annotation=get_args(KINDS[name])[0]) for name, each in _PARAMETERS])
+Runner.__signature__ = Signature(
+    [each.replace(annotation=get_args(KINDS[name])[0]) for name, each in _PARAMETERS]
+)

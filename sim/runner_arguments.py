@@ -1,4 +1,6 @@
-"""Arguments of a runner's methods, checked and copied: commands of ticks, and states to reset to."""
+"""Arguments of a runner's methods, checked and copied: commands of ticks, and states to reset
+to.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +35,9 @@ def read_command(
 ) -> Command:
     """Return the command (ticks, envs, ...) of one tick, or of ``ticks``, as a copy.
 
-    ``given`` has its arrays by the names of their arguments, in the order of :class:`Command`. Positions of followers
-    are computed from their leaders; the loop passes efforts on to the leaders. ``limits`` warns of setpoints.
+    ``given`` has its arrays by the names of their arguments, in the order of :class:`Command`.
+    Positions of followers are computed from their leaders; the loop passes efforts on to the
+    leaders. ``limits`` warns of setpoints.
     """
     _, _, acceleration, _ = given.values()
     if acceleration is not None:
@@ -61,24 +64,31 @@ def read_command(
 
 
 def accelerated(command: Command, motion: Motion, seconds: float) -> Command:
-    """Return ``command`` (ticks, envs, ...) with the mean accelerations in ticks of ``seconds`` with rates.
+    """Return ``command`` (ticks, envs, ...) with the mean accelerations in ticks of ``seconds``
+    with rates.
 
-    The mean is the change of the rate over the tick, from ``motion`` before the first. It is taken where the setpoints
-    confirm that rates (and given accelerations) are those at the tick's end, since they change by the mean of the old
-    and the new rate rather than by the new one, as increments do. Elsewhere the given acceleration is kept, or 0.
+    The mean is the change of the rate over the tick, from ``motion`` before the first. It is taken
+    where the setpoints confirm that rates (and given accelerations) are those at the tick's end,
+    since they change by the mean of the old and the new rate rather than by the new one, as
+    increments do. Elsewhere the given acceleration is kept, or 0.
     """
     setpoint, rate, given, _ = command
     before = [0.0 * rate[0] if rows is None else rows for rows in motion]
     with np.errstate(invalid="ignore"):  # non-finite rates become faults
         moved, change = (
-            np.diff(rows, axis=0, prepend=first[None]) for rows, first in zip((setpoint, rate), before, strict=True)
+            np.diff(rows, axis=0, prepend=first[None])
+            for rows, first in zip((setpoint, rate), before, strict=True)
         )
         ahead = moved - seconds * rate  # of increments 0, else minus half the change
         fits = np.abs(ahead + 0.5 * seconds * change) < 4 * np.abs(ahead)
-        if given is not None:  # with the jerk (given - mean) / (seconds / 2), where the rate is at its largest, too
+        if (
+            given is not None
+        ):  # with the jerk (given - mean) / (seconds / 2), where the rate is at its largest, too
             end = seconds**2 * given
             fits |= np.abs(ahead + end / 6 + seconds * change / 3) < np.abs(end) / 24
-    return command._replace(setpoint_acceleration=np.where(fits, change / seconds, 0.0 if given is None else given))
+    return command._replace(
+        setpoint_acceleration=np.where(fits, change / seconds, 0.0 if given is None else given)
+    )
 
 
 def count_ticks(options: RunnerOptions, setpoints: ArrayLike) -> int:
@@ -99,8 +109,13 @@ def _check_acceleration(params: bp.PIDParams, given: Mapping[str, ArrayLike | No
     """Raise InvalidArgumentError for an acceleration that the law does not take."""
     _, (rate, given_rate), (name, _), _ = given.items()
     if params.gain_units is None:
-        remedy = "give M(q) times it as feedforward, or use gains in accelerations, such as robot.designed()"
-        raise InvalidArgumentError(name, "is for gains in accelerations, and these are efforts", remedy=remedy)
+        remedy = (
+            "give M(q) times it as feedforward, or use gains in accelerations, such as"
+            " robot.designed()"
+        )
+        raise InvalidArgumentError(
+            name, "is for gains in accelerations, and these are efforts", remedy=remedy
+        )
     if given_rate is None:
         raise InvalidArgumentError(name, f"is given without {rate}", remedy=f"give {rate}, too")
 
@@ -108,16 +123,23 @@ def _check_acceleration(params: bp.PIDParams, given: Mapping[str, ArrayLike | No
 def joint_rows(options: RunnerOptions, name: str, value: ArrayLike) -> Float64:
     """Return positions or velocities (envs, dof) to reset to."""
     robot, is_finite = options.robot, options.on_invalid_input == "raise"
-    rows = array(name, value, (options.num_envs, robot.dof), robot.joint_names, finite=is_finite).copy()
+    rows = array(
+        name, value, (options.num_envs, robot.dof), robot.joint_names, finite=is_finite
+    ).copy()
     if is_finite:
         return within(name, rows, FARTHEST, robot.joint_names)
     return np.where(np.abs(rows) > FARTHEST, np.nan, rows)
 
 
 def base_rows(
-    options: RunnerOptions, pose: ArrayLike | None, twist: ArrayLike | None, qpos: NDArray[np.float64], mask: Bool
+    options: RunnerOptions,
+    pose: ArrayLike | None,
+    twist: ArrayLike | None,
+    qpos: NDArray[np.float64],
+    mask: Bool,
 ) -> Float64 | None:
-    """Return poses and twists (envs, 13) of floating bases to reset to, at joint positions ``qpos``.
+    """Return poses and twists (envs, 13) of floating bases to reset to, at joint positions
+    ``qpos``.
 
     By default a base is at rest at :func:`batchpid.sim.robot.robot_model.base_start`.
     """
@@ -126,7 +148,9 @@ def base_rows(
         for name, value in (("base_pose", pose), ("base_twist", twist)):
             if value is not None:
                 remedy = "leave it out, or load the robot with fixed_base=False"
-                raise InvalidArgumentError(name, "is for a floating base, and this one is fixed", remedy=remedy)
+                raise InvalidArgumentError(
+                    name, "is for a floating base, and this one is fixed", remedy=remedy
+                )
         return None
     rows = np.tile(ORIGIN, (num_envs, 1))
     if twist is not None:
@@ -135,12 +159,18 @@ def base_rows(
         rows[:, :7] = _base_entries("base_pose", pose, num_envs, tuple(POSE_UNITS))
         length = np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
         if (length < _SHORTEST).any():
-            problem = f"env {int(np.flatnonzero(length < _SHORTEST)[0])} has a quaternion of length 0"
-            raise InvalidArgumentError("base_pose", problem, remedy="give (w, x, y, z), (1, 0, 0, 0) upright")
+            problem = (
+                f"env {int(np.flatnonzero(length < _SHORTEST)[0])} has a quaternion of length 0"
+            )
+            raise InvalidArgumentError(
+                "base_pose", problem, remedy="give (w, x, y, z), (1, 0, 0, 0) upright"
+            )
         rows[:, 3:7] /= length
     else:
         starts: dict[bytes, Float64] = {}
-        ground = options.ground and options.mjcf is None  # an MJCF file may have a ground at another height
+        ground = (
+            options.ground and options.mjcf is None
+        )  # an MJCF file may have a ground at another height
         for env in np.flatnonzero(mask).tolist():
             key = qpos[env].tobytes()
             if key not in starts:
@@ -150,7 +180,11 @@ def base_rows(
 
 
 def _base_entries(name: str, value: ArrayLike, num_envs: int, columns: tuple[str, ...]) -> Float64:
-    """Return poses or twists (envs, entries), which must be as near as positions and velocities of joints."""
+    """Return poses or twists (envs, entries), which must be as near as positions and velocities of
+    joints.
+    """
     rows = array(name, value, (num_envs, len(columns)), columns, kind="entry")
-    entries(name, rows, np.abs(rows) <= FARTHEST, f"is beyond +-{FARTHEST:g}", columns, kind="entry")
+    entries(
+        name, rows, np.abs(rows) <= FARTHEST, f"is beyond +-{FARTHEST:g}", columns, kind="entry"
+    )
     return rows

@@ -18,7 +18,9 @@ Motion = tuple[Float64, Float64 | None]
 
 
 class RunnerState(NamedTuple):
-    """Everything about a runner that its commands change, apart from the workers. Replaced once by each command."""
+    """Everything about a runner that its commands change, apart from the workers. Replaced once by
+    each command.
+    """
 
     params: bp.PIDParams
     actuators: bp.Actuators | None
@@ -27,7 +29,9 @@ class RunnerState(NamedTuple):
     contacts: MissedContactLog | None
     """None if contacts are not watched: the robots have collision shapes."""
     motion: Motion | None
-    """Setpoint of the last tick and its rate, or position and velocity after a reset. None for other setpoints."""
+    """Setpoint of the last tick and its rate, or position and velocity after a reset. None for
+    other setpoints.
+    """
     steps: int = 0
     steps_since_checkpoint: int = 0
     work: tuple[tuple[float, ...], int] = ((), 1)
@@ -43,7 +47,10 @@ class RunnerState(NamedTuple):
         if options.randomization is not None:
             draws = options.randomization.first(robot, count, options.first_env)
         names = None if own is None else own.names
-        faults, contacts = FaultLog(count, robot.joint_names, options.timestep, options.on_fault, names), None
+        faults, contacts = (
+            FaultLog(count, robot.joint_names, options.timestep, options.on_fault, names),
+            None,
+        )
         if options.misses_contacts:
             nearest = lambda qpos: robot.dynamics().contacts.nearest_links(qpos)  # noqa: E731
             contacts = MissedContactLog(count, options.timestep, nearest)

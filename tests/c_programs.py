@@ -26,17 +26,26 @@ int main(void) {{
 """Mass matrix, bias and gravity of ``n`` joints of type ``t`` at states from stdin."""
 
 
-def compiled(folder: Path, text: str, *flags: str, compiler: str = COMPILERS[0] if COMPILERS else "") -> Path:
+def compiled(
+    folder: Path, text: str, *flags: str, compiler: str = COMPILERS[0] if COMPILERS else ""
+) -> Path:
     source, binary = folder / "law.c", folder / "law"
     source.write_text(text)
     subprocess.run([compiler, *STRICT, *flags, str(source), "-o", str(binary), "-lm"], check=True)
     return binary
 
 
-def law_program(header: str, inputs: list[tuple[str, int]], prefix: str, kind: str, joints: int) -> str:
-    """Return a program that reads steps from stdin and writes their efforts to stdout; step 60 is after a reset."""
+def law_program(
+    header: str, inputs: list[tuple[str, int]], prefix: str, kind: str, joints: int
+) -> str:
+    """Return a program that reads steps from stdin and writes their efforts to stdout; step 60 is
+    after a reset.
+    """
     arrays = "".join(f"  {kind} {name}[{size}];\n" for name, size in inputs)
-    reads = "".join(f"    if (fread({n}, sizeof({kind}), {size}, stdin) != {size}) return 0;\n" for n, size in inputs)
+    reads = "".join(
+        f"    if (fread({n}, sizeof({kind}), {size}, stdin) != {size}) return 0;\n"
+        for n, size in inputs
+    )
     arguments = ", ".join(name for name, _ in inputs)
     return f"""#include <stdio.h>
 #include <string.h>
@@ -56,12 +65,16 @@ int main(void) {{
 
 
 def efforts_in_c(folder, params, header, columns, *flags, prefix="batchpid", compiler=None):
-    """Return the efforts (steps, joints) that an exported header computes from ``columns`` (steps, ...)."""
+    """Return the efforts (steps, joints) that an exported header computes from ``columns`` (steps,
+    ...).
+    """
     kind = "float" if params.dtype == np.float32 else "double"
     sizes = [(name, column[0].size) for name, column in columns.items()]
     text = law_program(header, sizes, prefix, kind, params.num_joints)
     chosen = {} if compiler is None else {"compiler": compiler}
     binary = compiled(folder, text, *(flags or ("-std=c99", "-O2")), **chosen)
     rows = np.concatenate([column.reshape(len(column), -1) for column in columns.values()], axis=1)
-    ran = subprocess.run([binary], input=rows.astype(params.dtype).tobytes(), capture_output=True, check=True)
+    ran = subprocess.run(
+        [binary], input=rows.astype(params.dtype).tobytes(), capture_output=True, check=True
+    )
     return np.frombuffer(ran.stdout, params.dtype).reshape(-1, params.num_joints)

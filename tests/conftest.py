@@ -8,7 +8,9 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 # No deadline: the time of an example depends on the load of the machine.
-settings.register_profile("patient", settings.default, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "patient", settings.default, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("patient")
 
 # A background job of a script ignores SIGINT, and so would the programs that the tests start.
@@ -35,10 +37,14 @@ def quick_compilation() -> Iterator[None]:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Make most rows of tests with ``quick_rows`` slow, and give each slow test hours, to end only one that hangs."""
+    """Make most rows of tests with ``quick_rows`` slow, and give each slow test hours, to end only
+    one that hangs.
+    """
     rows: dict[tuple[str, int], list[pytest.Item]] = {}
     for item in items:
-        if (quick := item.get_closest_marker("quick_rows")) is not None and item.get_closest_marker("slow") is None:
+        if (quick := item.get_closest_marker("quick_rows")) is not None and item.get_closest_marker(
+            "slow"
+        ) is None:
             rows.setdefault((item.nodeid.partition("[")[0], quick.args[0]), []).append(item)
     for (_, count), found in rows.items():
         kept = {round(place) for place in np.linspace(0, len(found) - 1, count)}

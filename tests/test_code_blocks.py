@@ -1,10 +1,11 @@
 """Every code block of the pages runs; every command, link and make target in their text exists.
 
-Python blocks of a page share one namespace, in order, and run with few envs and ticks; where they choose no workers,
-those of other pages than the README run in this process. ``<!-- needs: NAME -->`` above a block names a package without
-which it is skipped. Commands of shell blocks run too, in a folder with ``arm.urdf``, ``arm.xml``, ``gains.yaml`` and
-``motors.yaml``; commands that would take minutes or wait for a person are cut short or only parsed, and so are commands
-within the text. C blocks compile next to the files that the commands of their page write.
+Python blocks of a page share one namespace, in order, and run with few envs and ticks; where they
+choose no workers, those of other pages than the README run in this process. ``<!-- needs: NAME
+-->`` above a block names a package without which it is skipped. Commands of shell blocks run too,
+in a folder with ``arm.urdf``, ``arm.xml``, ``gains.yaml`` and ``motors.yaml``; commands that would
+take minutes or wait for a person are cut short or only parsed, and so are commands within the text.
+C blocks compile next to the files that the commands of their page write.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ from batchpid.sim.cli import COMMANDS, main, parse
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md")])
 TEXTS = sorted({*PAGES, *ROOT.glob("*.md"), ROOT / "assets/README.md"})
-BLOCK = re.compile(r"(?:<!-- needs: (?P<needs>[\w., ]+) -->\n)?```(?P<language>\w*)\n(?P<code>.*?)```", re.DOTALL)
+BLOCK = re.compile(
+    r"(?:<!-- needs: (?P<needs>[\w., ]+) -->\n)?```(?P<language>\w*)\n(?P<code>.*?)```", re.DOTALL
+)
 SHORTER = {
     # command: flags that make it short
     "demo": ["--num-envs", "2", "--workers", "0", "--seconds", "0.1"],
@@ -53,7 +56,13 @@ ON_TWO_JOINTS = ("docs/sim-to-real.md",)  # a fit of all joints of the panda is 
 RARE = {
     # pages whose blocks seldom change and take seconds: slow
     "python": (
-        *("docs/sim-to-real.md", "docs/runner.md", "docs/controllers.md", "docs/view.md", "docs/task-space.md"),
+        *(
+            "docs/sim-to-real.md",
+            "docs/runner.md",
+            "docs/controllers.md",
+            "docs/view.md",
+            "docs/task-space.md",
+        ),
         *("docs/moving-setpoints.md", "docs/it-does-not-settle.md"),
     ),
     "sh": ("docs/two-engines.md", "docs/view.md", "docs/deploy.md", "docs/sim-to-real.md"),
@@ -89,7 +98,12 @@ def missing(match: re.Match) -> list[str]:
 def test_every_block_is_of_a_kind_that_is_run():
     for page in PAGES:
         for match in BLOCK.finditer(page.read_text()):
-            assert match["language"] in ("python", "sh", "c", "text"), f"{page.name}: {match[0][:60]}"
+            assert match["language"] in (
+                "python",
+                "sh",
+                "c",
+                "text",
+            ), f"{page.name}: {match[0][:60]}"
 
 
 @pytest.mark.parametrize("page", TEXTS, ids=name)
@@ -102,7 +116,9 @@ def test_every_link_has_a_target(page):
         path = page.parent / target
         assert path.exists(), target
         titles = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE) if anchor else []
-        assert not anchor or anchor in [re.sub(r"[^\w-]", "", title.lower().replace(" ", "-")) for title in titles]
+        assert not anchor or anchor in [
+            re.sub(r"[^\w-]", "", title.lower().replace(" ", "-")) for title in titles
+        ]
 
 
 def test_the_pictures_of_the_readme_are_light():
@@ -118,7 +134,9 @@ def test_every_make_target_in_the_text_exists():
 
 def test_every_page_is_in_the_index():
     index = (ROOT / "docs/README.md").read_text()
-    assert all(f"({page.name})" in index for page in ROOT.glob("docs/*.md") if page.name != "README.md")
+    assert all(
+        f"({page.name})" in index for page in ROOT.glob("docs/*.md") if page.name != "README.md"
+    )
 
 
 @pytest.mark.parametrize("page", pages_with("python"), ids=name)
@@ -145,7 +163,10 @@ def test_python_blocks_run(page, tmp_path, monkeypatch, capsys, request):
 def test_commands_in_the_text_have_flags_that_exist(page):
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
     arguments = [shlex.split(found) for found in re.findall(r"`batchpid (\w+ [^`]+)`", text)]
-    arguments += [["demo", *shlex.split(found)] for found in re.findall(r"`make demo ARGS=[\"'](.*)[\"']`", text)]
+    arguments += [
+        ["demo", *shlex.split(found)]
+        for found in re.findall(r"`make demo ARGS=[\"'](.*)[\"']`", text)
+    ]
     for words in arguments:
         parse(words)
 
@@ -161,7 +182,9 @@ def test_commands_run(page, tmp_path, monkeypatch, capsys):
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler")
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "c")], ids=name)
-def test_c_blocks_compile_with_the_files_that_the_commands_write(page, tmp_path, monkeypatch, capsys):
+def test_c_blocks_compile_with_the_files_that_the_commands_write(
+    page, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     for match in blocks(page, "sh", "c"):
         if match["language"] == "sh":
@@ -170,7 +193,14 @@ def test_c_blocks_compile_with_the_files_that_the_commands_write(page, tmp_path,
                     run(shlex.split(line, comments=True))
         else:
             (tmp_path / "block.c").write_text(match["code"])
-            flags = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-Wno-unused-function", "-fsyntax-only"]
+            flags = [
+                "-std=c99",
+                "-Wall",
+                "-Wextra",
+                "-Werror",
+                "-Wno-unused-function",
+                "-fsyntax-only",
+            ]
             subprocess.run(["cc", *flags, "block.c"], check=True)
 
 
@@ -181,7 +211,9 @@ def write_files() -> None:
     Path("arm.xml").write_text(MJCF)
     Path("payload.yaml").write_text("payload: {uniform: [0, 0.5]}")
     bp.save_params("gains.yaml", panda.params(), panda.joint_names)
-    bp.save_actuators("motors.yaml", bp.make_actuators(panda.dof, command_delay=0.005), panda.joint_names)
+    bp.save_actuators(
+        "motors.yaml", bp.make_actuators(panda.dof, command_delay=0.005), panda.joint_names
+    )
 
 
 def run(words: list[str]) -> None:
@@ -192,7 +224,11 @@ def run(words: list[str]) -> None:
         assert rest[0] == "install"
         extras = re.findall(r"\[(.*?)\]", rest[-1])
         project = (ROOT / "pyproject.toml").read_text()
-        assert all(re.search(rf"^{name} = \[", project, re.MULTILINE) for part in extras for name in part.split(","))
+        assert all(
+            re.search(rf"^{name} = \[", project, re.MULTILINE)
+            for part in extras
+            for name in part.split(",")
+        )
     elif program == "python":
         files = rest[2:] if rest[:2] == ["-m", "pytest"] else rest[:1]
         assert files, words

@@ -1,4 +1,6 @@
-"""The examples of other simulators in docs/controllers.md are short and complete, and do what the page says."""
+"""The examples of other simulators in docs/controllers.md are short and complete, and do what the
+page says.
+"""
 
 from __future__ import annotations
 

@@ -39,14 +39,21 @@ def test_every_package_is_shipped():
 
 
 def test_the_package_is_found_from_the_folder_above_the_checkout_too(tmp_path):
-    """There Python's path offers the checkout itself, if it is named batchpid, as a namespace package."""
+    """There Python's path offers the checkout itself, if it is named batchpid, as a namespace
+    package.
+    """
     if Path(batchpid.__file__).parents[1] != ROOT:
         pytest.skip("the package is not that of the checkout")
     (tmp_path / "batchpid").symlink_to(ROOT)
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    code = "import batchpid; from batchpid.sim import Robot; print(batchpid.__file__, batchpid.make_params)"
+    code = (
+        "import batchpid; from batchpid.sim import Robot; print(batchpid.__file__,"
+        " batchpid.make_params)"
+    )
     for folder in (tmp_path, Path("/")):
-        shown = subprocess.run([sys.executable, "-c", code], cwd=folder, env=clean, capture_output=True, text=True)
+        shown = subprocess.run(
+            [sys.executable, "-c", code], cwd=folder, env=clean, capture_output=True, text=True
+        )
         assert str(Path("batchpid", "__init__.py")) in shown.stdout, (folder, shown.stderr)
 
 
@@ -100,14 +107,18 @@ def test_the_command_checks_the_packages_before_it_imports_them():
     [
         pytest.param("0", 0, "", marks=pytest.mark.slow),
         ("1", 1, "cannot be built"),
-        pytest.param("yes", 1, "BATCHPID_REQUIRE_NATIVE is 'yes'; set it to 1", marks=pytest.mark.slow),
+        pytest.param(
+            "yes", 1, "BATCHPID_REQUIRE_NATIVE is 'yes'; set it to 1", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_failed_extension_ends_a_build_that_requires_it(required, status, message, tmp_path):
     folders = ["--build-lib", str(tmp_path / "lib"), "--build-temp", str(tmp_path / "temp")]
     build = [sys.executable, "-W", "ignore", "setup.py", "--quiet", "build_ext", *folders]
     compilers = {"CC": "/bin/false", "CXX": "/bin/false", REQUIRED: required}
-    done = subprocess.run(build, cwd=ROOT, env=os.environ | compilers, capture_output=True, text=True)
+    done = subprocess.run(
+        build, cwd=ROOT, env=os.environ | compilers, capture_output=True, text=True
+    )
     assert done.returncode == status
     assert message in done.stderr
     assert not list(tmp_path.rglob("*.so"))
@@ -138,10 +149,14 @@ def test_a_wheel_is_tried_for_the_text_that_the_command_prints(capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="the files of a checkout are those that git knows")
+@pytest.mark.skipif(
+    not (ROOT / ".git").exists(), reason="the files of a checkout are those that git knows"
+)
 def test_the_sdist_has_every_file_builds_and_passes_tests(tmp_path):
     """The tests of the distribution, of its native code and of a run."""
-    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
     files = {name for name in listed.split("\0") if name}
     for name in files:
         (copy := tmp_path / "checkout" / name).parent.mkdir(parents=True, exist_ok=True)
@@ -155,8 +170,15 @@ def test_the_sdist_has_every_file_builds_and_passes_tests(tmp_path):
     own = {".gitignore", ".pre-commit-config.yaml"}
     lacking = {name for name in files - links - own if not (sdist / name).exists()}
     assert {name for name in lacking if not (sdist / "batchpid" / name).exists()} == set()
-    subprocess.run([*setup, "build_ext", "--inplace"], cwd=sdist, env=os.environ | {REQUIRED: "1"}, check=True)
-    tests = ("tests/test_packaging.py", "tests/assets", "tests/batchpid/native", "tests/sim/test_conformance.py")
+    subprocess.run(
+        [*setup, "build_ext", "--inplace"], cwd=sdist, env=os.environ | {REQUIRED: "1"}, check=True
+    )
+    tests = (
+        "tests/test_packaging.py",
+        "tests/assets",
+        "tests/batchpid/native",
+        "tests/sim/test_conformance.py",
+    )
     environment = os.environ | {"PYTHONPATH": str(sdist)}
     subprocess.run([sys.executable, "-m", "pytest", *tests], cwd=sdist, env=environment, check=True)
 
@@ -182,7 +204,12 @@ with Runner(Robot.load("panda"), num_envs=2, workers=1) as runner:
     assert runner.step(runner.reset().qpos).ok.all()
 assert sim.joints() == 3
 """
-    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(site)}, check=True)
+    subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(site)},
+        check=True,
+    )
 
 
 def test_a_step_of_the_installation_is_one_line_and_shows_its_output_if_it_fails():

@@ -20,7 +20,10 @@ def test_it_has_at_most_700_words():
 def test_it_has_one_picture_one_program_and_two_commands():
     assert len(re.findall(r"!\[", README)) == 1
     assert re.findall(r"^```(\w+)$", README, re.MULTILINE) == ["sh", "python", "sh"]
-    assert all(len(block.splitlines()) == 1 for block in re.findall(r"```sh\n(.*?)\n```", README, re.DOTALL))
+    assert all(
+        len(block.splitlines()) == 1
+        for block in re.findall(r"```sh\n(.*?)\n```", README, re.DOTALL)
+    )
 
 
 @pytest.mark.parametrize(
@@ -32,5 +35,10 @@ def test_it_has_one_picture_one_program_and_two_commands():
     ],
 )
 def test_its_speeds_are_those_of_the_measurements(engine, case, rate):
-    measured = json.loads((ROOT / "docs/performance.json").read_text())["cases"][case]["rates"][rate]
-    assert f"\n| {engine} | {measured / 1e3:.0f} thousand | {measured * TIMESTEP / 64:.1f} |\n" in README
+    measured = json.loads((ROOT / "docs/performance.json").read_text())["cases"][case]["rates"][
+        rate
+    ]
+    assert (
+        f"\n| {engine} | {measured / 1e3:.0f} thousand | {measured * TIMESTEP / 64:.1f} |\n"
+        in README
+    )

@@ -1,4 +1,6 @@
-"""The pages that `make docs` builds: every public name is in the reference, and every link has a target."""
+"""The pages that `make docs` builds: every public name is in the reference, and every link has a
+target.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ PACKAGES = sorted(
 )
 PACKAGES = [package for package in PACKAGES if package not in INTERNAL]
 REFERENCE = {
-    name for page in (ROOT / "docs/api").glob("*.md") for name in re.findall(r"^::: (.*)$", page.read_text(), re.M)
+    name
+    for page in (ROOT / "docs/api").glob("*.md")
+    for name in re.findall(r"^::: (.*)$", page.read_text(), re.M)
 }
 
 
@@ -32,13 +36,20 @@ def test_the_packages_with_public_names_are_found():
 
 
 def places(package: str, name: str) -> set[str]:
-    """Return the entries of the reference that would show a public name: its own, its package's, or its module's."""
+    """Return the entries of the reference that would show a public name: its own, its package's, or
+    its module's.
+    """
     value = getattr(importlib.import_module(package), name)
     if isinstance(value, ModuleType):
         return {value.__name__}
     if not hasattr(value, "__qualname__"):  # a constant does not say where it is defined
-        shown = {each for each in REFERENCE if each.startswith(f"{package}.") and each in sys.modules}
-        return {package, *(each for each in shown if getattr(sys.modules[each], name, None) is value)}
+        shown = {
+            each for each in REFERENCE if each.startswith(f"{package}.") and each in sys.modules
+        }
+        return {
+            package,
+            *(each for each in shown if getattr(sys.modules[each], name, None) is value),
+        }
     return {f"{package}.{name}", package, value.__module__, f"{value.__module__}.{name}"}
 
 
@@ -59,7 +70,9 @@ def test_every_link_of_the_site_has_a_target(tmp_path, monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # Without the plugin that reads docstrings, which takes a quarter of a minute.
-        config = load_config(str(ROOT / "mkdocs.yml"), plugins=["search"], site_dir=str(tmp_path), strict=True)
+        config = load_config(
+            str(ROOT / "mkdocs.yml"), plugins=["search"], site_dir=str(tmp_path), strict=True
+        )
         build(config)
     pages = list(tmp_path.rglob("*.html"))
     assert len(pages) > 20
@@ -68,7 +81,8 @@ def test_every_link_of_the_site_has_a_target(tmp_path, monkeypatch):
         for page in pages
         if page.name != "404.html"
         for link in re.findall(r'(?:href|src)="([^"#?]+)', page.read_text())
-        if not re.match(r"\w+:|//|/|_mkdocstrings", link) and not (page.parent / unquote(link)).exists()
+        if not re.match(r"\w+:|//|/|_mkdocstrings", link)
+        and not (page.parent / unquote(link)).exists()
     }
     assert dead == set()
     assert 'href="SECURITY.html"' in (tmp_path / "view.html").read_text()
@@ -107,5 +121,7 @@ LONGER = {
 
 def test_no_page_is_too_long():
     pages = sorted((ROOT / "docs").rglob("*.md"))
-    lengths = {str(page.relative_to(ROOT / "docs")): len(page.read_text().splitlines()) for page in pages}
+    lengths = {
+        str(page.relative_to(ROOT / "docs")): len(page.read_text().splitlines()) for page in pages
+    }
     assert [name for name, lines in lengths.items() if lines > LONGER.get(name, 150)] == []

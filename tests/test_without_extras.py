@@ -1,4 +1,6 @@
-"""README and index followed without any extra: each command and program runs, or names the extra that it needs."""
+"""README and index followed without any extra: each command and program runs, or names the extra
+that it needs.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,9 @@ print(json.dumps(results))
 
 def modules_of_extras() -> list[str]:
     """Return the modules of all packages of the users' extras."""
-    packages = {Requirement(need).name for extra in FOR_USERS for need in EXTRAS[extra]} - {"batchpid"}
+    packages = {Requirement(need).name for extra in FOR_USERS for need in EXTRAS[extra]} - {
+        "batchpid"
+    }
     return sorted(MODULES.get(package, package) for package in packages)
 
 
@@ -68,7 +72,12 @@ def test_the_base_contains_no_package_of_an_extra():
 
 @pytest.mark.slow
 def test_each_command_and_program_runs_or_names_its_extra(tmp_path: Path):
-    lines = [words[1:] for page in (README, INDEX) for words in shell_lines(page) if words[0] == "batchpid"]
+    lines = [
+        words[1:]
+        for page in (README, INDEX)
+        for words in shell_lines(page)
+        if words[0] == "batchpid"
+    ]
     sizes = [[] if "--trajectory" in words else SIZES.get(words[0], []) for words in lines]
     commands = [[*words, *size] for words, size in zip(lines, sizes, strict=True)]
     commands.append(["rollout", "panda", "--backend", "jax", "--out", "jax.h5"])
@@ -80,7 +89,9 @@ def test_each_command_and_program_runs_or_names_its_extra(tmp_path: Path):
     assert len(commands) > 10
     assert len(programs) == 2
     given = json.dumps([modules_of_extras(), commands, programs])
-    done = subprocess.run([sys.executable, "-c", PROGRAM], input=given, cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], input=given, cwd=tmp_path, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     for words, status, errors in json.loads(done.stdout):
         extra = "jax" if "jax" in words else NEEDED.get(words[0])

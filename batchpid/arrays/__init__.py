@@ -1,1 +1,3 @@
-"""Operations on NumPy and JAX arrays: elementwise operations, leaves of named tuples, digests, representations."""
+"""Operations on NumPy and JAX arrays: elementwise operations, leaves of named tuples, digests,
+representations.
+"""

@@ -1,6 +1,7 @@
 """Choices of the law that carry no number, as tuples without fields.
 
-To JAX they are pytree nodes without leaves: static under every transform, and nothing has to be registered.
+To JAX they are pytree nodes without leaves: static under every transform, and nothing has to be
+registered.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from batchpid.arrays.array_types import Document
 
 
 class NamedChoice(NamedTuple):
-    """Base of choices. Equality depends on the type: as keys of a cache, plain empty tuples would all be equal."""
+    """Base of choices. Equality depends on the type: as keys of a cache, plain empty tuples would
+    all be equal.
+    """
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other)
@@ -24,7 +27,9 @@ class NamedChoice(NamedTuple):
 
 
 class Everywhere(NamedChoice):
-    """An option that may be chosen per joint and env is on for all of them, so no mask is needed."""
+    """An option that may be chosen per joint and env is on for all of them, so no mask is
+    needed.
+    """
 
 
 class ZeroEffort(NamedChoice):
@@ -36,7 +41,9 @@ class HoldEffort(NamedChoice):
 
 
 class MeasuredRate(NamedChoice):
-    """The derivative takes the measured velocity instead of the difference quotient of positions."""
+    """The derivative takes the measured velocity instead of the difference quotient of
+    positions.
+    """
 
 
 class PerMassMatrix(NamedChoice):

@@ -1,7 +1,8 @@
 """Digest of the content of values: equal for equal content, in any process and memory layout.
 
-It is a SHA-256 over the digests of a value's parts, each with its type, so that the bytes of different values differ.
-Values of unknown types are refused: their ``repr`` may omit content, or contain an address.
+It is a SHA-256 over the digests of a value's parts, each with its type, so that the bytes of
+different values differ. Values of unknown types are refused: their ``repr`` may omit content, or
+contain an address.
 """
 
 from __future__ import annotations
@@ -26,12 +27,15 @@ _WIDEST = {"f": 8, "c": 16}
 def digest(*values: Array) -> str:
     """Return the digest of ``values``, 64 hexadecimal digits.
 
-    Values may be None, bools, numbers, strings, bytes, arrays, and sequences, sets, mappings, named tuples and
-    dataclasses of these. Numbers of different types, and arrays of different dtypes, have different digests. Byte
-    order, strides, and the order of sets and mappings do not matter. Raises InvalidArgumentError for a value of another
-    type, or an array of objects; the message names its place, such as ``[0].kp``.
+    Values may be None, bools, numbers, strings, bytes, arrays, and sequences, sets, mappings, named
+    tuples and dataclasses of these. Numbers of different types, and arrays of different dtypes,
+    have different digests. Byte order, strides, and the order of sets and mappings do not matter.
+    Raises InvalidArgumentError for a value of another type, or an array of objects; the message
+    names its place, such as ``[0].kp``.
     """
-    return _of_parts("values", [_digest(value, f"[{index}]") for index, value in enumerate(values)]).hex()
+    return _of_parts(
+        "values", [_digest(value, f"[{index}]") for index, value in enumerate(values)]
+    ).hex()
 
 
 def _digest(value: Any, where: str) -> bytes:
@@ -49,20 +53,29 @@ def _digest(value: Any, where: str) -> bytes:
     if isinstance(value, tuple) and (names := getattr(kind, "_fields", None)) is not None:
         return _of_fields(kind, dict(zip(names, value, strict=True)), where)
     if is_dataclass(value) and not isinstance(value, type):
-        return _of_fields(kind, {each.name: getattr(value, each.name) for each in fields(value)}, where)
+        return _of_fields(
+            kind, {each.name: getattr(value, each.name) for each in fields(value)}, where
+        )
     if kind in (list, tuple):
-        return _of_parts("sequence", [_digest(part, f"{where}[{index}]") for index, part in enumerate(value)])
+        return _of_parts(
+            "sequence", [_digest(part, f"{where}[{index}]") for index, part in enumerate(value)]
+        )
     if kind in (set, frozenset):
         return _of_parts("set", sorted(_digest(part, where) for part in value))
     if isinstance(value, Mapping):
-        pairs = [(_digest(key, where), _digest(part, f"{where}[{key!r}]")) for key, part in value.items()]
+        pairs = [
+            (_digest(key, where), _digest(part, f"{where}[{key!r}]")) for key, part in value.items()
+        ]
         return _of_parts("mapping", [part for pair in sorted(pairs) for part in pair])
     if hasattr(value, "__array_namespace__"):
         return _of_array(np.asarray(value), where)
     raise InvalidArgumentError(
         f"values{where}",
         f"is a {kind.__module__}.{kind.__qualname__}, which has no digest",
-        remedy="pass numbers, strings and arrays, or sequences, mappings, named tuples and dataclasses of these",
+        remedy=(
+            "pass numbers, strings and arrays, or sequences, mappings, named tuples and dataclasses"
+            " of these"
+        ),
     )
 
 
@@ -81,7 +94,10 @@ def _of_array(array: Array, where: str) -> bytes:
 
 def _of_fields(kind: type, parts: Mapping[str, Any], where: str) -> bytes:
     name = _of_bytes("class", f"{kind.__module__}.{kind.__qualname__}".encode())
-    found = [(_of_bytes("field", key.encode()), _digest(part, f"{where}.{key}")) for key, part in parts.items()]
+    found = [
+        (_of_bytes("field", key.encode()), _digest(part, f"{where}.{key}"))
+        for key, part in parts.items()
+    ]
     return _of_parts("fields", [name, *(part for pair in found for part in pair)])
 
 
@@ -90,5 +106,7 @@ def _of_bytes(kind: str, content: bytes) -> bytes:
 
 
 def _of_parts(kind: str, parts: list[bytes]) -> bytes:
-    """Return the digest of digests, which all have the same length, so that no separator is needed."""
+    """Return the digest of digests, which all have the same length, so that no separator is
+    needed.
+    """
     return _of_bytes(kind, b"".join(parts))

@@ -33,15 +33,20 @@ def span(values: Array) -> str:
 def summary(name: str, parts: Iterable[str]) -> str:
     """Return ``name(part, part, ...)``, on as many lines as needed."""
     return "\n".join(
-        textwrap.wrap(f"{name}({', '.join(parts)})", WIDTH, subsequent_indent="    ", break_on_hyphens=False)
+        textwrap.wrap(
+            f"{name}({', '.join(parts)})", WIDTH, subsequent_indent="    ", break_on_hyphens=False
+        )
     )
 
 
 def array_summary(arrays: Any, *axes: str) -> str:
-    """Return the type of a named tuple, the sizes of the ``axes`` of its arrays, and the range of each."""
+    """Return the type of a named tuple, the sizes of the ``axes`` of its arrays, and the range of
+    each.
+    """
     leaves = {name: leaf for name, leaf in arrays._asdict().items() if leaf is not None}
     ranges = [
-        f"{name} {type(leaf).__name__ if isinstance(leaf, tuple) else span(leaf)}" for name, leaf in leaves.items()
+        f"{name} {type(leaf).__name__ if isinstance(leaf, tuple) else span(leaf)}"
+        for name, leaf in leaves.items()
     ]
     return summary(type(arrays).__name__, [*_sizes(arrays, axes), *ranges])
 
@@ -50,4 +55,7 @@ def _sizes(leaves: Iterable[Any], axes: tuple[str, ...]) -> list[str]:
     """Return the largest size of each axis with its name, as in ["64 envs", "9 joints"]."""
     shapes = [leaf.shape for leaf in leaves if len(getattr(leaf, "shape", ())) == len(axes)]
     sizes = (max(lengths) for lengths in zip(*shapes, strict=True))
-    return [f"{size} {axis if size != 1 else axis[:-1]}" for size, axis in zip(sizes, axes, strict=False)]
+    return [
+        f"{size} {axis if size != 1 else axis[:-1]}"
+        for size, axis in zip(sizes, axes, strict=False)
+    ]

@@ -18,7 +18,9 @@ _NUMPY_OR_NEUTRAL = frozenset({np.ndarray, NoneType, float, int, *CHOICE_TYPES})
 
 
 def namespace(*leaves: Array) -> Array:
-    """Return the array namespace in which all these leaves can be used: NumPy's, unless one belongs to another."""
+    """Return the array namespace in which all these leaves can be used: NumPy's, unless one belongs
+    to another.
+    """
     if not _NUMPY_OR_NEUTRAL.issuperset(map(type, leaves)):
         for leaf in leaves:
             if not isinstance(leaf, np.ndarray) and hasattr(leaf, "__array_namespace__"):
@@ -27,14 +29,22 @@ def namespace(*leaves: Array) -> Array:
 
 
 def in_dtype_of(params: Any, *arrays: Array) -> list[Any]:
-    """Return ``arrays`` in the dtype of the floats in ``params``, a named tuple; None stays None."""
-    like = next((leaf.dtype for leaf in params if getattr(leaf, "dtype", np.dtype(bool)).kind == "f"), None)
-    return [x if x is None or like is None or x.dtype == like else _as_dtype(x, like) for x in arrays]
+    """Return ``arrays`` in the dtype of the floats in ``params``, a named tuple; None stays
+    None.
+    """
+    like = next(
+        (leaf.dtype for leaf in params if getattr(leaf, "dtype", np.dtype(bool)).kind == "f"), None
+    )
+    return [
+        x if x is None or like is None or x.dtype == like else _as_dtype(x, like) for x in arrays
+    ]
 
 
 def _as_dtype(x: Array, dtype: DType) -> Array:
     xp = namespace(x)
-    return x.astype(xp.result_type(np.zeros((), dtype)))  # in JAX float32 instead of float64, unless that is enabled
+    return x.astype(
+        xp.result_type(np.zeros((), dtype))
+    )  # in JAX float32 instead of float64, unless that is enabled
 
 
 def clip(x: Array, low: Array, high: Array, xp: ArrayModule) -> Array:
@@ -44,7 +54,9 @@ def clip(x: Array, low: Array, high: Array, xp: ArrayModule) -> Array:
 
 
 def _recorded(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator: a trace (:mod:`batchpid.native.tracing`) records a call as the operation ``name``."""
+    """Return a decorator: a trace (:mod:`batchpid.native.tracing`) records a call as the operation
+    ``name``.
+    """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(function)
@@ -77,7 +89,9 @@ def take_columns(rows: Array, columns: Array) -> Array:
 
 @_recorded("push")
 def push_history(history: Array, *values: Array) -> Array:
-    """Return ``history`` (envs, samples, numbers) with ``values`` (envs, joints), side by side, as latest sample."""
+    """Return ``history`` (envs, samples, numbers) with ``values`` (envs, joints), side by side, as
+    latest sample.
+    """
     xp = namespace(history, *values)
     sample = values[0] if len(values) == 1 else xp.concatenate(values, axis=1)
     return xp.concatenate((sample[:, None], history[:, :-1]), axis=1)
@@ -90,33 +104,42 @@ def read_history(history: Array, places: Array) -> Array:
 
 
 def replace_envs(state: Any, fresh: Any, mask: Array) -> Array:
-    """Return ``state``, a named tuple of arrays (envs, ...), with the envs of ``mask`` (envs,) bool as in ``fresh``."""
+    """Return ``state``, a named tuple of arrays (envs, ...), with the envs of ``mask`` (envs,) bool
+    as in ``fresh``.
+    """
     xp = namespace(*state, mask)
     chosen = xp.asarray(mask)
 
     def choose(new: Array, old: Array) -> Array:
-        return None if old is None else xp.where(chosen.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+        return (
+            None if old is None else xp.where(chosen.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+        )
 
     return type(state)(*map(choose, fresh, state))
 
 
 def wrap(angle: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:
-    """Return an angle or a difference of angles, less its whole turns; ``turns_per_rad`` is 0 to keep them."""
+    """Return an angle or a difference of angles, less its whole turns; ``turns_per_rad`` is 0 to
+    keep them.
+    """
     return angle if turns_per_rad is None else angle - TURN * xp.rint(angle * turns_per_rad)
 
 
 def nearest_turn(angle: Array, near: Array, turns_per_rad: Array, xp: ArrayModule) -> Array:
-    """Return ``angle`` plus the whole turns that bring it within half a turn of ``near``; other arguments as in
-    :func:`wrap`.
+    """Return ``angle`` plus the whole turns that bring it within half a turn of ``near``; other
+    arguments as in :func:`wrap`.
     """
-    return angle if turns_per_rad is None else angle - TURN * xp.rint((angle - near) * turns_per_rad)
+    return (
+        angle if turns_per_rad is None else angle - TURN * xp.rint((angle - near) * turns_per_rad)
+    )
 
 
 def flush(x: Array, tiny: Array) -> Array:
-    """Return x rounded to a multiple of the last bit of ``tiny``, which leaves larger numbers unchanged.
+    """Return x rounded to a multiple of the last bit of ``tiny``, which leaves larger numbers
+    unchanged.
 
-    A decaying filter ends in denormal numbers, whose arithmetic is ten times slower. Adding and subtracting a tiny
-    number costs two additions and no branch.
+    A decaying filter ends in denormal numbers, whose arithmetic is ten times slower. Adding and
+    subtracting a tiny number costs two additions and no branch.
     """
     return (x + tiny) - tiny
 
@@ -125,6 +148,7 @@ def flush(x: Array, tiny: Array) -> Array:
 def tiny_of(dtype: DType) -> float:
     """Return the square root of the smallest normal number of ``dtype``.
 
-    Its last bit is far above the denormals, and the number itself far below the last bit of any relevant number.
+    Its last bit is far above the denormals, and the number itself far below the last bit of any
+    relevant number.
     """
     return float(np.sqrt(np.finfo(dtype).tiny))

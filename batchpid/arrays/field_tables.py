@@ -1,10 +1,12 @@
 """Declared fields: unit, bounds and neutral value of an option, in the annotation of its argument.
 
-Params, actuators, guards, params of operational-space control, randomizations and options of a runner declare each
-option once, as an annotated argument. The checks of options and leaves, the keys of files, the neutral values, the
-bounds of a randomization and the tables of the guides (docs/tables.py) come from these annotations::
+Params, actuators, guards, params of operational-space control, randomizations and options of a
+runner declare each option once, as an annotated argument. The checks of options and leaves, the
+keys of files, the neutral values, the bounds of a randomization and the tables of the guides
+(docs/tables.py) come from these annotations::
 
-    def make_guard(joints: int, *, rate: Annotated[Array, Field("rad/s or m/s", math.inf, above=True)] = None, ...)
+    def make_guard(joints: int, *, rate: Annotated[Array, Field("rad/s or m/s", math.inf,
+    above=True)] = None, ...)
 """
 
 from __future__ import annotations
@@ -12,12 +14,30 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import NoneType
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 
 from batchpid.arrays.array_types import Array, Kind
-from batchpid.checks.validate import AxisKind, at_least, choice, entries, flag, integer, is_traced, number
+from batchpid.checks.validate import (
+    AxisKind,
+    at_least,
+    choice,
+    entries,
+    flag,
+    integer,
+    is_traced,
+    number,
+)
 from batchpid.errors import InvalidArgumentError
 
 T = TypeVar("T")
@@ -47,21 +67,34 @@ class Field(NamedTuple):
         infinite: bool = False,
         kind: AxisKind = "joint",
     ) -> Any:
-        """Return ``values`` (..., envs, joints) after a check of the bounds; values that JAX traces are not checked.
+        """Return ``values`` (..., envs, joints) after a check of the bounds; values that JAX traces
+        are not checked.
 
-        Raises InvalidArgumentError if an entry is out of bounds, or infinite where neither ``infinite`` nor ``neutral``
-        allows it.
+        Raises InvalidArgumentError if an entry is out of bounds, or infinite where neither
+        ``infinite`` nor ``neutral`` allows it.
         """
         if not is_traced(values):
             infinite = infinite or math.isinf(self.neutral)
-            at_least(name, values, self.low, joint_names, above=self.above, infinite=infinite, kind=kind)
+            at_least(
+                name, values, self.low, joint_names, above=self.above, infinite=infinite, kind=kind
+            )
             remedy = f"use a number from {self.low:g} to {self.high:g} ({self.unit})"
-            entries(name, values, values <= self.high, "out of range", joint_names, kind=kind, remedy=remedy)
+            entries(
+                name,
+                values,
+                values <= self.high,
+                "out of range",
+                joint_names,
+                kind=kind,
+                remedy=remedy,
+            )
         return values
 
 
 def declared(owner: Callable[..., object], kind: type[T]) -> dict[str, T]:
-    """Return the metadata of type ``kind``, such as Field, in the annotations of a constructor or class, by name."""
+    """Return the metadata of type ``kind``, such as Field, in the annotations of a constructor or
+    class, by name.
+    """
     hints = get_type_hints(owner, include_extras=True).items()
     found = ((name, each) for name, hint in hints for each in getattr(hint, "__metadata__", ()))
     return {name: each for name, each in found if isinstance(each, kind)}
@@ -81,11 +114,13 @@ TABLES = ("limit_positions", "limit_efforts")
 
 
 def plain(name: str, kind: Kind, value: Any) -> Any:
-    """Return ``value`` as a bool, number or choice, if its declared type is one of these, or one of these and None.
+    """Return ``value`` as a bool, number or choice, if its declared type is one of these, or one of
+    these and None.
 
     A value of another declared type is returned unchanged and unchecked.
 
-    Raises InvalidArgumentError if a number is out of the bounds of its :class:`Field`, or the value has another type.
+    Raises InvalidArgumentError if a number is out of the bounds of its :class:`Field`, or the value
+    has another type.
     """
     kind, *metadata = get_args(kind) if get_origin(kind) is Annotated else (kind,)
     bounds = next((each for each in metadata if isinstance(each, Field)), FREE)
@@ -104,12 +139,17 @@ def plain(name: str, kind: Kind, value: Any) -> Any:
 
 
 def check_leaves(
-    owner: str, leaves: Any, fields: Mapping[str, Field], num_envs: int, joint_names: Sequence[str] | None
+    owner: str,
+    leaves: Any,
+    fields: Mapping[str, Field],
+    num_envs: int,
+    joint_names: Sequence[str] | None,
 ) -> None:
     """Check the leaves of a named tuple that may have been edited by hand.
 
-    Raises InvalidArgumentError if a leaf has a wrong shape, or values out of the bounds of ``fields``. A leaf has one
-    row or ``num_envs`` rows, and one column per joint. A leaf without a field may hold any numbers.
+    Raises InvalidArgumentError if a leaf has a wrong shape, or values out of the bounds of
+    ``fields``. A leaf has one row or ``num_envs`` rows, and one column per joint. A leaf without a
+    field may hold any numbers.
     """
     for name, leaf in leaves._asdict().items():
         if leaf is None or isinstance(leaf, tuple) or name in WHOLE:
@@ -117,7 +157,9 @@ def check_leaves(
         joints = leaves.num_joints if joint_names is None else len(joint_names)
         shape = leaf.shape[:2] if name in TABLES else leaf.shape
         if shape not in ((1, joints), (num_envs, joints)):
-            remedy = "give one row, or one row per env" + (f", of {', '.join(joint_names)}" if joint_names else "")
+            remedy = "give one row, or one row per env" + (
+                f", of {', '.join(joint_names)}" if joint_names else ""
+            )
             problem = f"has shape {leaf.shape}, not {(1, joints)} or {(num_envs, joints)}"
             raise InvalidArgumentError(f"{owner}.{name}", problem, remedy=remedy)
         if not is_traced(leaf):

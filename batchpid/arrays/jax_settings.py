@@ -1,9 +1,10 @@
 """Settings of JAX for the programs of batchpid, independent of the caller's settings.
 
-JAX's debugging settings apply to a thread or a process, and thus to the programs that batchpid compiles and calls, too.
-Some of them forbid operations of these programs: to take NumPy arrays as arguments, to broadcast (joints,) to (envs,
-joints), and to compute with the NaN of a failed env. The pure functions, such as :func:`batchpid.step`, run in the
-caller's own programs, under the caller's settings.
+JAX's debugging settings apply to a thread or a process, and thus to the programs that batchpid
+compiles and calls, too. Some of them forbid operations of these programs: to take NumPy arrays as
+arguments, to broadcast (joints,) to (envs, joints), and to compute with the NaN of a failed env.
+The pure functions, such as :func:`batchpid.step`, run in the caller's own programs, under the
+caller's settings.
 """
 
 from __future__ import annotations
@@ -38,9 +39,11 @@ def require_jax() -> None:
 
 @contextmanager
 def own_settings(dtype: DType = None) -> Iterator[None]:
-    """Run a block under the settings that batchpid needs, with ``dtype`` "float64" or "float32" for its arrays.
+    """Run a block under the settings that batchpid needs, with ``dtype`` "float64" or "float32" for
+    its arrays.
 
-    Settings with an accepted value are not touched: to enter a context for each takes longer than a small program.
+    Settings with an accepted value are not touched: to enter a context for each takes longer than a
+    small program.
     """
     import jax
 
@@ -50,7 +53,9 @@ def own_settings(dtype: DType = None) -> Iterator[None]:
         if getattr(config, name) not in values:
             others.append((getattr(jax, name.removeprefix("jax_")), values[0]))
     if dtype is not None and config.jax_enable_x64 != (wide := dtype == "float64"):
-        home: Any = jax if hasattr(jax, "enable_x64") else jax.experimental  # the latter before JAX 0.8
+        home: Any = (
+            jax if hasattr(jax, "enable_x64") else jax.experimental
+        )  # the latter before JAX 0.8
         others.append((home.enable_x64, wide))
     if not others:
         yield

@@ -1,7 +1,8 @@
-"""Leaves of params and actuators, from the options of their constructors: checked, broadcast and read-only.
+"""Leaves of params and actuators, from the options of their constructors: checked, broadcast and
+read-only.
 
-Inside jax.jit, jax.grad and jax.vmap the entries of an array are not known. Of such a traced array the shape is
-checked alone, and it stays a leaf even where it might turn out to be off.
+Inside jax.jit, jax.grad and jax.vmap the entries of an array are not known. Of such a traced array
+the shape is checked alone, and it stays a leaf even where it might turn out to be off.
 """
 
 from __future__ import annotations
@@ -28,19 +29,27 @@ Leaves = TypeVar("Leaves", bound=tuple[Any, ...])
 
 
 def frozen(leaves: Leaves) -> Leaves:
-    """Return a named tuple with read-only NumPy arrays, which later writes by the caller do not change.
+    """Return a named tuple with read-only NumPy arrays, which later writes by the caller do not
+    change.
 
-    Writeable arrays and views are copied. If all arrays are read-only, ``leaves`` itself is returned.
+    Writeable arrays and views are copied. If all arrays are read-only, ``leaves`` itself is
+    returned.
     """
     kept = [_read_only(np.array(leaf)) if _can_be_written(leaf) else leaf for leaf in leaves]
     return leaves if all(map(operator.is_, kept, leaves)) else type(leaves)(*kept)
 
 
 class LeafBuilder:
-    """Builder of the leaves of one :class:`batchpid.PIDParams` or the like, which agree in joints, envs and dtype."""
+    """Builder of the leaves of one :class:`batchpid.PIDParams` or the like, which agree in joints,
+    envs and dtype.
+    """
 
-    def __init__(self, joints: int, joint_names: Sequence[str] | None, dtype: DType, values: Iterable[Any]) -> None:
-        """Without a ``dtype``, use the dtype of the traced arrays among ``values``, else float64."""
+    def __init__(
+        self, joints: int, joint_names: Sequence[str] | None, dtype: DType, values: Iterable[Any]
+    ) -> None:
+        """Without a ``dtype``, use the dtype of the traced arrays among ``values``, else
+        float64.
+        """
         self.joints, self.num_envs = integer("joints", joints, 1, MOST_JOINTS), 1
         self.names = None if joint_names is None else names("joint_names", joint_names, self.joints)
         if dtype is None:
@@ -53,10 +62,14 @@ class LeafBuilder:
         except TypeError:
             self.dtype = np.dtype(object)
         if self.dtype not in (np.float32, np.float64):
-            raise InvalidArgumentError("dtype", "unknown dtype", value=str(dtype), remedy="use float32 or float64")
+            raise InvalidArgumentError(
+                "dtype", "unknown dtype", value=str(dtype), remedy="use float32 or float64"
+            )
 
     def array(self, name: str, value: Array, field: Field) -> Array:
-        """Return ``value`` as (1 | envs, joints) with every entry within the bounds of ``field``; None stays."""
+        """Return ``value`` as (1 | envs, joints) with every entry within the bounds of ``field``;
+        None stays.
+        """
         if value is None:
             return None
         with np.errstate(over="ignore"):
@@ -69,9 +82,11 @@ class LeafBuilder:
         return None if _is_everywhere(array, field.neutral) else self.freeze(array)
 
     def limits(self, **given: Array) -> Ends:
-        """Return the leaves of a lower and an upper limit, each None where it is infinite everywhere.
+        """Return the leaves of a lower and an upper limit, each None where it is infinite
+        everywhere.
 
-        ``given`` are the size of both, the lower and the upper end, by the names of their arguments.
+        ``given`` are the size of both, the lower and the upper end, by the names of their
+        arguments.
         """
         end = Field(neutral=math.inf, low=-math.inf)
         size, *ends = given
@@ -90,21 +105,29 @@ class LeafBuilder:
         return None if _is_everywhere(array, False) else self.freeze(array.astype(self.dtype))
 
     def strategies(self, value: Any) -> tuple[Any, Any, Any]:
-        """Return the masks of clamp, conditional and back-calculation, each None where no joint has it."""
+        """Return the masks of clamp, conditional and back-calculation, each None where no joint has
+        it.
+        """
         remedy = f"use one of {', '.join(map(repr, ANTI_WINDUP))}"
         try:
             array = np.asarray(value, dtype=object)
         except (TypeError, ValueError, RuntimeError) as error:
-            raise InvalidArgumentError("anti_windup", f"cannot be read as an array: {error}", remedy=remedy) from None
+            raise InvalidArgumentError(
+                "anti_windup", f"cannot be read as an array: {error}", remedy=remedy
+            ) from None
         array = self._by_env_and_joint("anti_windup", array)
-        known = np.vectorize(lambda one: isinstance(one, str) and one in ANTI_WINDUP, otypes=[bool])(array)
+        known = np.vectorize(
+            lambda one: isinstance(one, str) and one in ANTI_WINDUP, otypes=[bool]
+        )(array)
         entries("anti_windup", array, known, "unknown option", self.names, remedy=remedy)
         masks = (array == strategy for strategy in ANTI_WINDUP[1:])
         clamp, conditional, back = (mask if mask.any() else None for mask in masks)
         return clamp, conditional, back
 
     def clamped(self, clamp: Array, integral: Ends, effort: Ends) -> Ends:
-        """Return the integral's limits: for the strategy ``clamp`` without limits, the effort limits."""
+        """Return the integral's limits: for the strategy ``clamp`` without limits, the effort
+        limits.
+        """
         if clamp is None or any(end is not None for end in integral):
             return integral
         if all(end is None for end in effort):
@@ -120,7 +143,9 @@ class LeafBuilder:
         return low, high
 
     def tracking_time(self, value: Array, back: Array, kp: Array, ki: Array, kd: Array) -> Array:
-        """Return the leaf of back-calculation's time constant, inf where a joint is not ``back``."""
+        """Return the leaf of back-calculation's time constant, inf where a joint is not
+        ``back``.
+        """
         if back is None:
             if value is not None:
                 raise InvalidArgumentError(
@@ -148,7 +173,11 @@ class LeafBuilder:
         """Return a scalar, (joints,) or (envs, joints) as (1 | envs, joints)."""
         expected = f"(), ({self.joints},) or (envs, {self.joints})"
         rows = array[None] if array.ndim == 1 else array
-        if array.ndim <= 2 and array.size and (array.ndim == 0 or rows.shape[1] in (1, self.joints)):
+        if (
+            array.ndim <= 2
+            and array.size
+            and (array.ndim == 0 or rows.shape[1] in (1, self.joints))
+        ):
             envs = rows.shape[0] if rows.ndim else 1
             if envs == 1 or self.num_envs in (1, envs):
                 self.num_envs = max(self.num_envs, envs)
@@ -166,13 +195,16 @@ def checked_ends(given: Mapping[str, Array], joint_names: Sequence[str] | None) 
 
     ``given`` are the size of both, the lower and the upper end, by the names of their arguments.
 
-    Raises InvalidArgumentError if the size is given with an end, or the lower end exceeds the upper one.
+    Raises InvalidArgumentError if the size is given with an end, or the lower end exceeds the upper
+    one.
     """
     (name, size), (low_name, low), (high_name, high) = given.items()
     if size is not None:
         if low is not None or high is not None:
             problem = f"is given together with {low_name} or {high_name}"
-            raise InvalidArgumentError(name, problem, remedy="give the symmetric limit, or the two ends")
+            raise InvalidArgumentError(
+                name, problem, remedy="give the symmetric limit, or the two ends"
+            )
         return -size, size
     if low is not None and high is not None and not (is_traced(low) or is_traced(high)):
         ends = np.broadcast_arrays(low, high)
@@ -195,7 +227,9 @@ def _is_everywhere(array: Array, value: float) -> bool:
 
 
 def _rule_of_thumb(kp: Array, ki: Array, kd: Array) -> Array:
-    """Return Tt = sqrt(Ti Td) = sqrt(kd/ki), or Ti = kp/ki without kd; inf, no correction, where ki is 0."""
+    """Return Tt = sqrt(Ti Td) = sqrt(kd/ki), or Ti = kp/ki without kd; inf, no correction, where ki
+    is 0.
+    """
     xp = namespace(kp, ki, kd)
     if ki is None:
         return xp.full_like(kp, math.inf)

@@ -1,8 +1,10 @@
-"""Trees of arrays: nested tuples, lists and mappings. A leaf is an array, a traced symbol, or a placeholder (``...``).
+"""Trees of arrays: nested tuples, lists and mappings. A leaf is an array, a traced symbol, or a
+placeholder (``...``).
 
-Programs take the leaves of a tree of tuples in order: :func:`leaves`, :func:`mapped`, :func:`structure` and
-:func:`filled`. Numbers and other values are constants there, not leaves. Files and snapshots take all values by name:
-:func:`flatten` and :func:`unflatten`. None is a tree without leaves.
+Programs take the leaves of a tree of tuples in order: :func:`leaves`, :func:`mapped`,
+:func:`structure` and :func:`filled`. Numbers and other values are constants there, not leaves.
+Files and snapshots take all values by name: :func:`flatten` and :func:`unflatten`. None is a tree
+without leaves.
 """
 
 from __future__ import annotations
@@ -17,7 +19,9 @@ from batchpid.arrays.array_types import Array, Document, Pytree
 
 def is_leaf(tree: Pytree) -> bool:
     """Return whether ``tree`` is an array, a symbol, or a placeholder (``...``)."""
-    return tree is ... or (hasattr(tree, "__array_namespace__") and not isinstance(tree, np.generic))
+    return tree is ... or (
+        hasattr(tree, "__array_namespace__") and not isinstance(tree, np.generic)
+    )
 
 
 def leaves(tree: Pytree) -> list[Any]:
@@ -31,7 +35,11 @@ def mapped(function: Callable[[Any], Any], tree: Pytree) -> Any:
     """Return a tree of tuples with ``function`` applied to its leaves."""
     if is_leaf(tree):
         return function(tree)
-    return _rebuilt(tree, [mapped(function, part) for part in tree]) if isinstance(tree, tuple) and tree else tree
+    return (
+        _rebuilt(tree, [mapped(function, part) for part in tree])
+        if isinstance(tree, tuple) and tree
+        else tree
+    )
 
 
 def structure(tree: Pytree) -> Any:
@@ -40,15 +48,19 @@ def structure(tree: Pytree) -> Any:
 
 
 def filled(tree: Pytree, given: Iterator[Any]) -> Any:
-    """Return a :func:`structure` with its placeholders replaced by values of ``given``, in order."""
+    """Return a :func:`structure` with its placeholders replaced by values of ``given``, in
+    order.
+    """
     return mapped(lambda _: next(given), tree)
 
 
-def flatten(tree: Pytree, separator: str = "/", read: Callable[[Any], Array] = np.asarray, name: str = "") -> Document:
+def flatten(
+    tree: Pytree, separator: str = "/", read: Callable[[Any], Array] = np.asarray, name: str = ""
+) -> Document:
     """Return all values in a tree by name, converted to arrays by ``read``.
 
-    A name consists of the keys and fields on the way to the value, joined by ``separator``. A tree that is one value
-    has the name "state".
+    A name consists of the keys and fields on the way to the value, joined by ``separator``. A tree
+    that is one value has the name "state".
     """
     if tree is None:
         return {}
@@ -60,8 +72,12 @@ def flatten(tree: Pytree, separator: str = "/", read: Callable[[Any], Array] = n
     return named
 
 
-def unflatten(like: Pytree, named: Mapping[str, Array], separator: str = "/", name: str = "") -> Any:
-    """Return a tree with the structure of ``like`` from the arrays that :func:`flatten` returned."""
+def unflatten(
+    like: Pytree, named: Mapping[str, Array], separator: str = "/", name: str = ""
+) -> Any:
+    """Return a tree with the structure of ``like`` from the arrays that :func:`flatten`
+    returned.
+    """
     if like is None:
         return None
     if not isinstance(like, Mapping | tuple | list):

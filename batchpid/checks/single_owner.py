@@ -8,7 +8,9 @@ from batchpid.errors import NotCopyableError
 
 
 class SingleOwner:
-    """Base of objects that can be neither copied nor pickled: two would close each other's processes and files."""
+    """Base of objects that can be neither copied nor pickled: two would close each other's
+    processes and files.
+    """
 
     instead: ClassVar[str] = "make another one"
     """Alternative to a copy, for the error message."""
@@ -23,5 +25,6 @@ class SingleOwner:
         """
         name = type(self).__name__
         raise NotCopyableError(
-            f"a {name} can be neither copied nor pickled, since it owns processes, scenes or files; {self.instead}"
+            f"a {name} can be neither copied nor pickled, since it owns processes, scenes or files;"
+            f" {self.instead}"
         )

@@ -1,7 +1,7 @@
 """Checks of arguments; each error names the argument, the joint or env, the value and the remedy.
 
-Every function takes the argument's name and its value, returns the value in its canonical form, and raises
-:class:`batchpid.InvalidArgumentError` where the value is invalid.
+Every function takes the argument's name and its value, returns the value in its canonical form, and
+raises :class:`batchpid.InvalidArgumentError` where the value is invalid.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ AxisKind = Literal["joint", "entry"]
 def integer(argument: str, value: Any, low: int, high: int) -> int:
     """Return ``value`` as an int within [low, high]."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
-        raise InvalidArgumentError(argument, "must be a whole number", value=value, remedy="pass an int")
+        raise InvalidArgumentError(
+            argument, "must be a whole number", value=value, remedy="pass an int"
+        )
     if not low <= value <= high:
         raise InvalidArgumentError(
             argument, "out of range", value=int(value), remedy=f"use a number from {low} to {high}"
@@ -44,7 +46,9 @@ def number(argument: str, value: Any, low: float, high: float, unit: str) -> flo
     value = _scalar(argument, value, unit)
     if not low <= value <= high or math.isinf(value):  # NaN is in no range
         ends = f"from {low:g} to {high:g}" if math.isfinite(high) else f">= {low:g}"
-        raise InvalidArgumentError(argument, "out of range", value=value, remedy=f"use a number {ends} ({unit})")
+        raise InvalidArgumentError(
+            argument, "out of range", value=value, remedy=f"use a number {ends} ({unit})"
+        )
     return value
 
 
@@ -53,7 +57,10 @@ def positive(argument: str, value: Any, unit: str) -> float:
     value = _scalar(argument, value, unit)
     if not 0 < value < math.inf:
         raise InvalidArgumentError(
-            argument, "must be positive and finite", value=value, remedy=f"use a number > 0 ({unit})"
+            argument,
+            "must be positive and finite",
+            value=value,
+            remedy=f"use a number > 0 ({unit})",
         )
     return value
 
@@ -63,13 +70,17 @@ def time_step(argument: str, value: Any) -> float:
     value = positive(argument, value, "s")
     if value > LONGEST_STEP:
         problem = f"is longer than {LONGEST_STEP:g} s, and looks like a rate in Hz"
-        raise InvalidArgumentError(argument, problem, value=value, remedy=f"give {argument} in seconds, 1/{value:g}")
+        raise InvalidArgumentError(
+            argument, problem, value=value, remedy=f"give {argument} in seconds, 1/{value:g}"
+        )
     return value
 
 
 def check_time_step(argument: str, value: Any) -> None:
     """Check a time step that is not an array; the values of arrays are not read."""
-    if isinstance(value, float) and 0.0 < value <= LONGEST_STEP:  # at every sim step: without the checks' cost
+    if (
+        isinstance(value, float) and 0.0 < value <= LONGEST_STEP
+    ):  # at every sim step: without the checks' cost
         return
     if isinstance(value, np.generic) or not hasattr(value, "__array_namespace__"):
         time_step(argument, value)
@@ -80,7 +91,10 @@ def choice(argument: str, value: Any, known: Collection[S]) -> S:
     chosen: S = value
     if not isinstance(value, str) or value not in known:
         raise InvalidArgumentError(
-            argument, "unknown option", value=value, remedy=f"use one of {', '.join(map(repr, known))}"
+            argument,
+            "unknown option",
+            value=value,
+            remedy=f"use one of {', '.join(map(repr, known))}",
         )
     return chosen
 
@@ -88,7 +102,9 @@ def choice(argument: str, value: Any, known: Collection[S]) -> S:
 def flag(argument: str, value: Any) -> bool:
     """Return ``value`` as a bool."""
     if not isinstance(value, bool | np.bool_):
-        raise InvalidArgumentError(argument, "must be True or False", value=value, remedy="pass a bool")
+        raise InvalidArgumentError(
+            argument, "must be True or False", value=value, remedy="pass a bool"
+        )
     return bool(value)
 
 
@@ -96,7 +112,9 @@ def instance(argument: str, value: Any, kind: type[T], remedy: str) -> T:
     """Return ``value`` if it is a ``kind``."""
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIO" else "a"
-        raise InvalidArgumentError(argument, f"must be {article} {kind.__name__}", value=value, remedy=remedy)
+        raise InvalidArgumentError(
+            argument, f"must be {article} {kind.__name__}", value=value, remedy=remedy
+        )
     return value
 
 
@@ -104,24 +122,36 @@ def names(argument: str, value: Any, count: int | None = None) -> list[str]:
     """Return ``value`` as a list of different names, ``count`` of them if given."""
     sequence = isinstance(value, Sequence) and not isinstance(value, str)
     if not sequence or not all(isinstance(name, str) for name in value):
-        raise InvalidArgumentError(argument, "must be a list of names", value=value, remedy="pass a list of strings")
+        raise InvalidArgumentError(
+            argument, "must be a list of names", value=value, remedy="pass a list of strings"
+        )
     if count is not None and len(value) != count:
         raise InvalidArgumentError(
-            argument, f"has {len(value)} names, needs {count}", value=value, remedy="name every joint once"
+            argument,
+            f"has {len(value)} names, needs {count}",
+            value=value,
+            remedy="name every joint once",
         )
     if len(set(value)) != len(value):
-        raise InvalidArgumentError(argument, "repeats a name", value=value, remedy="name every joint once")
+        raise InvalidArgumentError(
+            argument, "repeats a name", value=value, remedy="name every joint once"
+        )
     return list(value)
 
 
 def file_path(argument: str, value: Any, suffixes: Collection[str] = ()) -> Path:
     """Return ``value`` as a path that ends in one of ``suffixes``, if any are given."""
     if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
-        raise InvalidArgumentError(argument, "must be a path", value=value, remedy="pass the file's name")
+        raise InvalidArgumentError(
+            argument, "must be a path", value=value, remedy="pass the file's name"
+        )
     path = Path(value)
     if suffixes and path.suffix.lower() not in suffixes:
         raise InvalidArgumentError(
-            argument, "unknown file format", value=str(path), remedy=f"end it in {' or '.join(suffixes)}"
+            argument,
+            "unknown file format",
+            value=str(path),
+            remedy=f"end it in {' or '.join(suffixes)}",
         )
     return path
 
@@ -136,12 +166,16 @@ def identifier(argument: str, value: Any) -> str:
 
 
 def is_traced(value: Any) -> bool:
-    """Return whether ``value`` is an array inside jax.jit, jax.grad or jax.vmap, whose entries cannot be checked."""
+    """Return whether ``value`` is an array inside jax.jit, jax.grad or jax.vmap, whose entries
+    cannot be checked.
+    """
     jax = sys.modules.get("jax")
     return jax is not None and isinstance(value, jax.core.Tracer)
 
 
-def read_array(argument: str, value: ArrayLike, kinds: str = "iuf", *, traced: bool = False) -> NDArray[Any]:
+def read_array(
+    argument: str, value: ArrayLike, kinds: str = "iuf", *, traced: bool = False
+) -> NDArray[Any]:
     """Return ``value`` as an array, of any shape, of a dtype whose kind is one of ``kinds``.
 
     With ``traced`` an array that JAX traces is returned as it came.
@@ -155,7 +189,9 @@ def read_array(argument: str, value: ArrayLike, kinds: str = "iuf", *, traced: b
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         what = "bools" if kinds == "b" else "numbers"
         raise InvalidArgumentError(
-            argument, f"cannot be read as an array of {what}: {error}", remedy=f"pass an array of {what}"
+            argument,
+            f"cannot be read as an array of {what}: {error}",
+            remedy=f"pass an array of {what}",
         ) from None
     return result
 
@@ -170,12 +206,16 @@ def broadcast(
     return _broadcast(argument, read_array(argument, value), shape, remedy)
 
 
-def _broadcast(argument: str, result: NDArray[Any], shape: tuple[int, ...], remedy: str) -> NDArray[np.float64]:
+def _broadcast(
+    argument: str, result: NDArray[Any], shape: tuple[int, ...], remedy: str
+) -> NDArray[np.float64]:
     result = result.astype(np.float64, copy=False)
     if result.shape == shape:
         return result
     try:
-        if len(shape) == 2 and result.ndim <= 2:  # a small copy is faster to make, and to read, than a view
+        if (
+            len(shape) == 2 and result.ndim <= 2
+        ):  # a small copy is faster to make, and to read, than a view
             rows = np.empty(shape)
             rows[...] = result
             return rows
@@ -194,23 +234,33 @@ def array(
     finite: bool = True,
     kind: AxisKind = "joint",
 ) -> NDArray[np.float64]:
-    """Return ``value`` as float64, broadcast to ``shape`` (..., envs, dof) where its trailing axes allow.
+    """Return ``value`` as float64, broadcast to ``shape`` (..., envs, dof) where its trailing axes
+    allow.
 
-    A scalar applies to all joints, (dof,) to all envs. All entries must be finite, unless ``finite`` is False.
-    ``names`` holds the name of each column. ``kind`` is the type of a column: a joint, or an entry of a command.
+    A scalar applies to all joints, (dof,) to all envs. All entries must be finite, unless
+    ``finite`` is False. ``names`` holds the name of each column. ``kind`` is the type of a column:
+    a joint, or an entry of a command.
     """
-    remedy = f"the last axis counts the {'joints' if kind == 'joint' else 'entries'} {', '.join(names)}"
+    remedy = (
+        f"the last axis counts the {'joints' if kind == 'joint' else 'entries'} {', '.join(names)}"
+    )
     is_read = type(value) is np.ndarray and value.dtype == np.float64  # nearly always
     result: NDArray[Any] = value if is_read else read_array(argument, value)  # type: ignore[assignment]
-    if result.ndim and result.shape[-1] != shape[-1]:  # one number for all joints is a scalar, not an array of one
-        raise InvalidArgumentError(argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy)
+    if (
+        result.ndim and result.shape[-1] != shape[-1]
+    ):  # one number for all joints is a scalar, not an array of one
+        raise InvalidArgumentError(
+            argument, f"has shape {result.shape}, not {shape} or {shape[-1:]}", remedy=remedy
+        )
     given = result.reshape(-1)
     if not is_read or result.shape != shape:
         result = _broadcast(argument, result, shape, remedy)
     # The sum of squares costs a third, and is finite for most; BLAS uses threads for a longer one.
     is_sound = given.size < 10_000 and math.isfinite(given.dot(given))
     if finite and not is_sound and not (good := np.isfinite(result)).all():
-        entries(argument, result, good, "is not finite", names, kind=kind, remedy="pass finite numbers")
+        entries(
+            argument, result, good, "is not finite", names, kind=kind, remedy="pass finite numbers"
+        )
     return result
 
 
@@ -224,10 +274,11 @@ def entries(
     kind: AxisKind = "joint",
     remedy: str = "correct that entry",
 ) -> None:
-    """Raise for the first entry of ``values`` (..., envs, joints), or (joints,), that is not ``good``.
+    """Raise for the first entry of ``values`` (..., envs, joints), or (joints,), that is not
+    ``good``.
 
-    The error names the joint, and the env where there are several; an entry of a scalar has neither. ``names`` and
-    ``kind`` as for :func:`array`.
+    The error names the joint, and the env where there are several; an entry of a scalar has
+    neither. ``names`` and ``kind`` as for :func:`array`.
     """
     if np.all(good):
         return
@@ -254,24 +305,48 @@ def at_least(
     infinite: bool = False,
     kind: AxisKind = "joint",
 ) -> NDArray[Any]:
-    """Return ``values`` (..., envs, joints) if every entry is >= ``low``, or > it, and finite unless ``infinite``."""
+    """Return ``values`` (..., envs, joints) if every entry is >= ``low``, or > it, and finite
+    unless ``infinite``.
+    """
     good = ((values > low) if above else (values >= low)) & (infinite | np.isfinite(values))
-    bounds = ["finite"] * (not infinite) + [f"{'>' if above else '>='} {low:g}"] * math.isfinite(low)
-    entries(argument, values, good, f"must be {' and '.join(bounds) or 'a number'}", joint_names, kind=kind)
+    bounds = ["finite"] * (not infinite) + [f"{'>' if above else '>='} {low:g}"] * math.isfinite(
+        low
+    )
+    entries(
+        argument,
+        values,
+        good,
+        f"must be {' and '.join(bounds) or 'a number'}",
+        joint_names,
+        kind=kind,
+    )
     return values
 
 
-def within(argument: str, rows: NDArray[np.float64], far: float, joint_names: Sequence[str]) -> NDArray[np.float64]:
+def within(
+    argument: str, rows: NDArray[np.float64], far: float, joint_names: Sequence[str]
+) -> NDArray[np.float64]:
     """Return ``rows`` (..., envs, dof) if no entry is beyond +-``far``; NaN passes."""
     near = ~(np.abs(rows) > far)
-    entries(argument, rows, near, f"is beyond +-{far:g}", joint_names, remedy="give what a robot can have")
+    entries(
+        argument,
+        rows,
+        near,
+        f"is beyond +-{far:g}",
+        joint_names,
+        remedy="give what a robot can have",
+    )
     return rows
 
 
-def joint_speeds(argument: str, value: ArrayLike, joint_names: Sequence[str]) -> NDArray[np.float64]:
+def joint_speeds(
+    argument: str, value: ArrayLike, joint_names: Sequence[str]
+) -> NDArray[np.float64]:
     """Return ``value`` as one positive number per joint (dof,)."""
     speeds = array(argument, value, (1, len(joint_names)), joint_names)[0].copy()
-    entries(argument, speeds, speeds > 0, "must be > 0", joint_names, remedy="leave it out for none")
+    entries(
+        argument, speeds, speeds > 0, "must be > 0", joint_names, remedy="leave it out for none"
+    )
     return speeds
 
 
@@ -280,7 +355,9 @@ def env_mask(argument: str, value: ArrayLike, num_envs: int) -> NDArray[np.bool_
     mask = read_array(argument, value, "b").copy()
     if mask.shape != (num_envs,):
         raise InvalidArgumentError(
-            argument, f"has shape {mask.shape}, needs ({num_envs},)", remedy="use e.g. mask = ~obs.ok"
+            argument,
+            f"has shape {mask.shape}, needs ({num_envs},)",
+            remedy="use e.g. mask = ~obs.ok",
         )
     return mask
 
@@ -290,7 +367,9 @@ R = TypeVar("R")
 
 
 def check_keywords(owner: str, given: Collection[str], known: Collection[str]) -> None:
-    """Raise InvalidArgumentError for the first name in ``given`` that is not among the ``known`` ones of ``owner``."""
+    """Raise InvalidArgumentError for the first name in ``given`` that is not among the ``known``
+    ones of ``owner``.
+    """
     for name in given:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1)
@@ -299,7 +378,9 @@ def check_keywords(owner: str, given: Collection[str], known: Collection[str]) -
 
 
 def known_keywords(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate ``function``, which is called with the ``**options`` of others, to check the names of its keywords."""
+    """Decorate ``function``, which is called with the ``**options`` of others, to check the names
+    of its keywords.
+    """
     known = tuple(inspect.signature(function).parameters)
 
     @functools.wraps(function)
@@ -311,8 +392,12 @@ def known_keywords(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _scalar(argument: str, value: Any, unit: str) -> float:
-    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.integer | np.floating):
-        raise InvalidArgumentError(argument, "must be a number", value=value, remedy=f"pass a float ({unit})")
+    if isinstance(value, bool | np.bool_) or not isinstance(
+        value, int | float | np.integer | np.floating
+    ):
+        raise InvalidArgumentError(
+            argument, "must be a number", value=value, remedy=f"pass a float ({unit})"
+        )
     try:
         return float(value)
     except OverflowError:

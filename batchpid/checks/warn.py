@@ -10,7 +10,9 @@ _INSIDE = ("batchpid.", "importlib.")
 
 
 def warn(message: str, category: type[Warning]) -> None:
-    """Issue a warning at the first line on the stack that is not in batchpid, nor in the machinery of imports."""
+    """Issue a warning at the first line on the stack that is not in batchpid, nor in the machinery
+    of imports.
+    """
     frame = sys._getframe(1)
     while frame.f_back is not None and _is_inside(frame):
         frame = frame.f_back

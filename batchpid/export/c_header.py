@@ -1,9 +1,11 @@
-"""The control law as a C99 header without dependencies, generated from the trace of :func:`batchpid.advance`.
+"""The control law as a C99 header without dependencies, generated from the trace of
+:func:`batchpid.advance`.
 
-The header holds the gains as constants, a struct for the state, and three functions: ``PREFIX_init``, ``PREFIX_reset``
-and ``PREFIX_step``. They allocate nothing and have no global state. Each operation is the same as in NumPy, in the
-same order, so that the efforts are bit-identical under ``-ffp-contract=off``, which forbids the compiler to fuse a
-multiplication and an addition. It also compiles as C++.
+The header holds the gains as constants, a struct for the state, and three functions:
+``PREFIX_init``, ``PREFIX_reset`` and ``PREFIX_step``. They allocate nothing and have no global
+state. Each operation is the same as in NumPy, in the same order, so that the efforts are
+bit-identical under ``-ffp-contract=off``, which forbids the compiler to fuse a multiplication and
+an addition. It also compiles as C++.
 """
 
 from __future__ import annotations
@@ -56,7 +58,8 @@ def to_c(
     Parameters
     ----------
     params
-        Of one env: (1, joints). Gains per "mass_matrix" add an argument ``mass_matrix`` (joints, joints), by rows.
+        Of one env: (1, joints). Gains per "mass_matrix" add an argument ``mass_matrix`` (joints,
+        joints), by rows.
     dt
         Time step of the control [s].
     joint_names
@@ -64,25 +67,27 @@ def to_c(
     guard
         Limits of the setpoint, applied before the law.
     inputs
-        Optional inputs of a step, of :data:`RATES`. Default: the feedforward, and the measured velocity if the params
-        ask for it.
+        Optional inputs of a step, of :data:`RATES`. Default: the feedforward, and the measured
+        velocity if the params ask for it.
     prefix
         Beginning of every name in the header, for several controllers in one program.
     tree
-        Of the robot (:meth:`batchpid.sim.Robot.kinematic_tree`): adds ``PREFIX_mass_matrix``, ``PREFIX_bias`` and
-        ``PREFIX_gravity``.
+        Of the robot (:meth:`batchpid.sim.Robot.kinematic_tree`): adds ``PREFIX_mass_matrix``,
+        ``PREFIX_bias`` and ``PREFIX_gravity``.
 
     Raises
     ------
     InvalidArgumentError
-        Params for several envs, options that exclude each other, names that C does not allow, or a tree with other
-        joints.
+        Params for several envs, options that exclude each other, names that C does not allow, or a
+        tree with other joints.
     """
     return Exported(Header(params, dt, joint_names, guard, inputs, prefix, tree).text())
 
 
 class Header:
-    """Text of a header, from the trace of one step. Parameters and errors are as in :func:`to_c`."""
+    """Text of a header, from the trace of one step. Parameters and errors are as in
+    :func:`to_c`.
+    """
 
     def __init__(
         self,
@@ -101,7 +106,9 @@ class Header:
         labels = unnamed if joint_names is None else names("joint_names", joint_names, joints)
         if not re.fullmatch(r"[A-Za-z_]\w*", prefix, re.ASCII):
             remedy = "use letters, digits and _"
-            raise InvalidArgumentError("prefix", "cannot be a name in C", value=prefix, remedy=remedy)
+            raise InvalidArgumentError(
+                "prefix", "cannot be a name in C", value=prefix, remedy=remedy
+            )
         params.check(1, labels)
         check_gain_units(params)
         if guard is not None:
@@ -112,12 +119,16 @@ class Header:
         chosen = {choice("inputs", each, RATES) for each in inputs}
         if measures and "measurement_rate" not in chosen:
             remedy = "add it, or use params.replace(measurement_rate='difference')"
-            raise InvalidArgumentError("inputs", "lack measurement_rate, which the params use", remedy=remedy)
+            raise InvalidArgumentError(
+                "inputs", "lack measurement_rate, which the params use", remedy=remedy
+            )
         if tree is not None:
             instance("tree", tree, RigidTree, "use robot.kinematic_tree()")
             if list(tree.joint_names) != list(labels):
                 problem = f"has the joints {', '.join(tree.joint_names)}, not {', '.join(labels)}"
-                raise InvalidArgumentError("tree", problem, remedy="pass joint_names=, in the tree's order")
+                raise InvalidArgumentError(
+                    "tree", problem, remedy="pass joint_names=, in the tree's order"
+                )
         self.params = params
         self.dt = float(dt)
         self.guard = guard
@@ -147,9 +158,14 @@ class Header:
 
         def step(*symbols: Symbol) -> list[Any]:
             rest = iter(symbols)
-            law, limit = ([next(rest) if isinstance(x, np.ndarray) else x for x in leaves] for leaves in (k, limits))
+            law, limit = (
+                [next(rest) if isinstance(x, np.ndarray) else x for x in leaves]
+                for leaves in (k, limits)
+            )
             state = {name: next(rest) for name in self.started}
-            new, effort = self._step(Coefficients(*law), Guard(*limit), state, dict(zip(given, rest, strict=True)))
+            new, effort = self._step(
+                Coefficients(*law), Guard(*limit), state, dict(zip(given, rest, strict=True))
+            )
             kept[:] = new
             return [*new.values(), effort]
 
@@ -164,7 +180,9 @@ class Header:
         tables = "".join(self.names.table(labels[at], constants[at][0]) for at in used)
         return self._frame(tables + body, body)
 
-    def _step(self, k: Coefficients, guard: Guard, state: Document, given: Document) -> tuple[Any, Any]:
+    def _step(
+        self, k: Coefficients, guard: Guard, state: Document, given: Document
+    ) -> tuple[Any, Any]:
         """Return the new state, by name, and the effort: the control step of one robot."""
         new: Document = {}
         setpoint, rate = given["setpoint"], given.get("setpoint_rate")
@@ -188,7 +206,9 @@ class Header:
 
     def extent(self, name: str) -> str:
         """Return the number of entries of an input."""
-        return f"{self.names.size} * {self.names.size}" if name == "mass_matrix" else self.names.size
+        return (
+            f"{self.names.size} * {self.names.size}" if name == "mass_matrix" else self.names.size
+        )
 
     def _frame(self, code: str, body: str) -> str:
         """Return the whole header around the code of a step."""
@@ -202,7 +222,9 @@ class Header:
             "mass_matrix": "M at about y [kg m^2 or kg], by rows",
             **RATES,
         }
-        arguments = "".join(f",\n    const {t} {name}[{self.extent(name)}] /* {units[name]} */" for name in given)
+        arguments = "".join(
+            f",\n    const {t} {name}[{self.extent(name)}] /* {units[name]} */" for name in given
+        )
         functions = "".join(helpers(self.names, body))
         functions += "" if self.tree is None else rigid_body(self.names, self.tree)
         passed = "".join(f", {name}" for name in given)
@@ -213,7 +235,9 @@ class Header:
             self._started({k: v for k, v in self.started.items() if k != "integral"}),
         )
         names = ["state", *given]
-        unused = "".join(f"  (void){name};\n" for name in names if not re.search(rf"\b{name}\b", body))
+        unused = "".join(
+            f"  (void){name};\n" for name in names if not re.search(rf"\b{name}\b", body)
+        )
         joints = (
             "".join(f" *   {at}: {label}\n" for at, label in enumerate(self.labels))
             .replace("*/", "* /")
@@ -278,12 +302,20 @@ class {p}_controller {{
         """Return the statements that start ``leaves`` of the state."""
         lines = []
         for name, leaf in leaves.items():
-            numbers = [None if math.isnan(each) else self.names.number(each) for each in leaf[0].tolist()]
+            numbers = [
+                None if math.isnan(each) else self.names.number(each) for each in leaf[0].tolist()
+            ]
             if len(set(numbers)) == 1:
                 lines.append(f"    state->{name}[j] = {numbers[0] or 'measurement[j]'};\n")
             else:
                 table = ", ".join(map(str, numbers))
-                lines.append(f"    static const {self.names.type} {name}[{self.names.size}] = {{{table}}};\n")
+                lines.append(
+                    f"    static const {self.names.type} {name}[{self.names.size}] = {{{table}}};\n"
+                )
                 lines.append(f"    state->{name}[j] = {name}[j];\n")
-        loop = f"  for (int j = 0; j < {self.names.size}; ++j) {{\n{''.join(lines)}  }}\n" if lines else ""
+        loop = (
+            f"  for (int j = 0; j < {self.names.size}; ++j) {{\n{''.join(lines)}  }}\n"
+            if lines
+            else ""
+        )
         return f"{loop}  (void)state;\n  (void)measurement;\n"

@@ -1,8 +1,10 @@
-"""Rigid-body functions of a robot in C: mass matrix, bias and gravity, with the robot's constants as tables.
+"""Rigid-body functions of a robot in C: mass matrix, bias and gravity, with the robot's constants
+as tables.
 
-The algorithms are the same as in :mod:`batchpid.task_space.tree_dynamics`: composite rigid bodies and recursive
-Newton-Euler, in the axes of the world and about its origin (R. Featherstone, Rigid Body Dynamics Algorithms, Springer,
-2008, sections 5.3 and 6.2). The sums of a joint run over its ancestors alone, so the last bits differ from NumPy's.
+The algorithms are the same as in :mod:`batchpid.task_space.tree_dynamics`: composite rigid bodies
+and recursive Newton-Euler, in the axes of the world and about its origin (R. Featherstone, Rigid
+Body Dynamics Algorithms, Springer, 2008, sections 5.3 and 6.2). The sums of a joint run over its
+ancestors alone, so the last bits differ from NumPy's.
 """
 
 from __future__ import annotations
@@ -14,22 +16,30 @@ from batchpid.task_space.rigid_tree import RigidTree
 
 
 def rigid_body(c: Dialect, tree: RigidTree) -> str:
-    """Return the functions ``PREFIX_mass_matrix``, ``PREFIX_bias`` and ``PREFIX_gravity`` of a tree."""
+    """Return the functions ``PREFIX_mass_matrix``, ``PREFIX_bias`` and ``PREFIX_gravity`` of a
+    tree.
+    """
     bodies = tree.bodies
     p = c.prefix
     t = c.type
     n = c.size
     f = c.suffix
-    # A joint's rotation is linear in 1, sin q and 1 - cos q, so that three constant matrices a joint are enough.
+    # A joint's rotation is linear in 1, sin q and 1 - cos q, so that three constant matrices a
+    # joint are enough.
     rotations = {"turn": bodies.at_zero, "sine": bodies.sine, "cosine": bodies.cosine}
-    poses = "".join(c.table(f"k_{name}", leaf[:, :, :3].reshape(-1, 9)) for name, leaf in rotations.items())
+    poses = "".join(
+        c.table(f"k_{name}", leaf[:, :, :3].reshape(-1, 9)) for name, leaf in rotations.items()
+    )
     poses += c.table("k_place", bodies.at_zero[..., 3]) + c.table("k_slide", bodies.slide[..., 3])
     poses += c.table("k_center", bodies.center)
-    poses += c.table("k_tensor", bodies.tensor.reshape(-1, 9)) + _integers(c, "slides", bodies.slides[:, 0])
+    poses += c.table("k_tensor", bodies.tensor.reshape(-1, 9)) + _integers(
+        c, "slides", bodies.slides[:, 0]
+    )
     above, masses = _integers(c, "above", tree.body_parents), c.table("k_mass", bodies.mass[:, 0])
     fall = ", ".join(map(c.number, bodies.gravity.tolist()))
-    # Everything is about the world's origin: sums over bodies then need no shift from one to the next.
-    # The mass matrix is that of composite bodies, the bias recursive Newton-Euler (Featherstone 2008, ch. 5 and 6).
+    # Everything is about the world's origin: sums over bodies then need no shift from one to the
+    # next. The mass matrix is that of composite bodies, the bias recursive Newton-Euler
+    # (Featherstone 2008, ch. 5 and 6).
     return f"""/* Bodies at a pose, in the axes of the world. */
 typedef struct {{
   {t} turn[{n}][9], place[{n}][3];      /* axes (rows of a matrix) and origin */
@@ -168,7 +178,9 @@ static inline void {p}_gravity(const {t} qpos[{n}], {t} bias[{n}]) {{
 
 
 def _folded_matrix(c: Dialect, tree: RigidTree) -> str:
-    """Return the lines that reduce ``matrix`` to the leaders of coupled joints: :meth:`Coupling.mass_matrix`."""
+    """Return the lines that reduce ``matrix`` to the leaders of coupled joints:
+    :meth:`Coupling.mass_matrix`.
+    """
     n = c.size
     lines = f"""  for (int j = 0; j < {n}; ++j) {{
     for (int i = 0; i < {n} && leader[j] != j; ++i) matrix[{n} * leader[j] + i] += multiplier[j] * matrix[{n} * j + i];
@@ -186,7 +198,9 @@ def _folded_matrix(c: Dialect, tree: RigidTree) -> str:
 
 
 def _folded_bias(c: Dialect, tree: RigidTree) -> str:
-    """Return the lines that reduce ``bias`` to the leaders of coupled joints: :meth:`Coupling.efforts`."""
+    """Return the lines that reduce ``bias`` to the leaders of coupled joints:
+    :meth:`Coupling.efforts`.
+    """
     lines = f"""  for (int j = 0; j < {c.size}; ++j) {{
     if (leader[j] == j) continue;
     bias[leader[j]] += multiplier[j] * bias[j];
@@ -197,10 +211,16 @@ def _folded_bias(c: Dialect, tree: RigidTree) -> str:
 
 
 def _folded(c: Dialect, tree: RigidTree, lines: str) -> str:
-    """Return ``lines`` after the tables of the coupling that they need; no lines without followers."""
+    """Return ``lines`` after the tables of the coupling that they need; no lines without
+    followers.
+    """
     if tree.coupling.is_identity:
         return ""
-    return _integers(c, "leader", tree.coupling.leader) + c.table("multiplier", tree.coupling.multiplier) + lines
+    return (
+        _integers(c, "leader", tree.coupling.leader)
+        + c.table("multiplier", tree.coupling.multiplier)
+        + lines
+    )
 
 
 def _integers(c: Dialect, name: str, values: object) -> str:

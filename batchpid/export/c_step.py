@@ -1,4 +1,6 @@
-"""Statements of a traced step in C: loops over the joints, and the operations across joints between them."""
+"""Statements of a traced step in C: loops over the joints, and the operations across joints between
+them.
+"""
 
 from __future__ import annotations
 
@@ -42,13 +44,17 @@ _EXPRESSIONS = {
     "subtract_multiply": "({0} - {1}) * {2}",
     "clip": "{p}_min({p}_max({0}, {1}), {2})",
 }
-"""Elementwise operations in C. A mask is 1 or 0. A NaN propagates through max and min, as in NumPy."""
+"""Elementwise operations in C. A mask is 1 or 0. A NaN propagates through max and min, as in
+NumPy.
+"""
 _ACROSS = ("row_minimum", "matrix_vector")
 """Operations that combine the joints."""
 
 
 class Dialect(NamedTuple):
-    """Names and numbers of a header: the beginning of its names, the type of its numbers, the number of joints."""
+    """Names and numbers of a header: the beginning of its names, the type of its numbers, the
+    number of joints.
+    """
 
     prefix: str
     dtype: np.dtype[Any]
@@ -82,11 +88,19 @@ class Dialect(NamedTuple):
         return f"  static const {self.type} {name}{size} = {self._braces(rows)};\n"
 
     def _braces(self, values: Array) -> str:
-        return "{" + ", ".join(self._braces(row) if row.ndim else self.number(float(row)) for row in values) + "}"
+        return (
+            "{"
+            + ", ".join(
+                self._braces(row) if row.ndim else self.number(float(row)) for row in values
+            )
+            + "}"
+        )
 
 
 class Value(NamedTuple):
-    """Value of the law for each joint: an expression for joint ``j``, and whether it is an array of temporaries."""
+    """Value of the law for each joint: an expression for joint ``j``, and whether it is an array of
+    temporaries.
+    """
 
     text: str
     array: str | None = None
@@ -96,18 +110,23 @@ class Value(NamedTuple):
 def statements(
     c: Dialect, traced: Trace, constants: list[Value], read: list[Value], results: list[str]
 ) -> Iterator[str]:
-    """Yield the statements of a step: loops over the joints, with the operations across joints between them."""
+    """Yield the statements of a step: loops over the joints, with the operations across joints
+    between them.
+    """
     operations, ends = _unrolled(traced, len(constants), len(read))
     values = dict(enumerate([*constants, *read]))
     starts = [0, *(at for at, each in enumerate(operations) if each[0] in _ACROSS), len(operations)]
-    loop_of = {each[1]: sum(start <= at for start in starts[1:]) for at, each in enumerate(operations)}
+    loop_of = {
+        each[1]: sum(start <= at for start in starts[1:]) for at, each in enumerate(operations)
+    }
     last = len(starts) - 2
     shared = (
         {  # temporaries that a later loop or an operation across joints reads
             operand
             for at, (name, _, operands) in enumerate(operations)
             for operand in operands
-            if operand in loop_of and (name in _ACROSS or loop_of[operand] < sum(start <= at for start in starts[1:]))
+            if operand in loop_of
+            and (name in _ACROSS or loop_of[operand] < sum(start <= at for start in starts[1:]))
         }
         | {end for end in ends if loop_of.get(end, last) < last}
     )
@@ -135,29 +154,43 @@ def statements(
 
 
 def _stores(c: Dialect, places: list[str], texts: list[str]) -> Iterator[str]:
-    """Yield the statements that write the results; the old state is read before it is overwritten."""
+    """Yield the statements that write the results; the old state is read before it is
+    overwritten.
+    """
     for at, (place, text) in enumerate(zip(places, texts, strict=True)):
         if text.startswith("state->") and text != place:
             texts[at] = f"old{at}"
             yield f"    const {c.type} old{at} = {text};\n"
-    yield from (f"    {place} = {text};\n" for place, text in zip(places, texts, strict=True) if place != text)
+    yield from (
+        f"    {place} = {text};\n"
+        for place, text in zip(places, texts, strict=True)
+        if place != text
+    )
 
 
 def _across(c: Dialect, name: str, out: str, operands: list[Value]) -> str:
     """Return the call of an operation across joints."""
-    return f"  {c.prefix}_{name}({', '.join(each.array or each.text for each in operands)}, {out});\n"
+    return (
+        f"  {c.prefix}_{name}({', '.join(each.array or each.text for each in operands)}, {out});\n"
+    )
 
 
-def _unrolled(traced: Trace, constants: int, read: int) -> tuple[list[tuple[str, int, list[int]]], list[int]]:
-    """Return the operations ``(name, value, operands)`` of a trace, each with a new value, and the values returned.
+def _unrolled(
+    traced: Trace, constants: int, read: int
+) -> tuple[list[tuple[str, int, list[int]]], list[int]]:
+    """Return the operations ``(name, value, operands)`` of a trace, each with a new value, and the
+    values returned.
 
-    The operations on constants come first. Values below ``constants + read`` are constants and inputs of a step.
+    The operations on constants come first. Values below ``constants + read`` are constants and
+    inputs of a step.
     """
     operations: list[tuple[str, int, list[int]]] = []
     following = iter(range(constants + read, 10**9))
 
     def unroll(part: Trace, at: list[int]) -> list[int]:
-        for code, out, *operands in np.frombuffer(part.operations, np.int32).reshape(-1, 5).tolist():
+        for code, out, *operands in (
+            np.frombuffer(part.operations, np.int32).reshape(-1, 5).tolist()
+        ):
             name, new = OPERATIONS[code], next(following)
             operations.append((name, new, [at[each] for each in operands[: _operands(name)]]))
             at[out] = new
@@ -173,7 +206,12 @@ def _unrolled(traced: Trace, constants: int, read: int) -> tuple[list[tuple[str,
 def _operands(name: str) -> int:
     """Return the number of operands of an operation."""
     return 1 + max(
-        map(int, re.findall(r"\{(\d)\}", _EXPRESSIONS.get(name, "{1}" if name == "matrix_vector" else "{0}")))
+        map(
+            int,
+            re.findall(
+                r"\{(\d)\}", _EXPRESSIONS.get(name, "{1}" if name == "matrix_vector" else "{0}")
+            ),
+        )
     )
 
 
@@ -186,7 +224,10 @@ def helpers(c: Dialect, body: str) -> Iterator[str]:
     across = f"{p}_row_minimum(" in body
     for name, sign in (("max", ">"), ("min", "<")):
         if f"{p}_{name}(" in body or (across and name == "min"):
-            yield f"static inline {t} {p}_{name}({t} a, {t} b) {{ return a {sign} b || a != a ? a : b; }}\n"
+            yield (
+                f"static inline {t} {p}_{name}({t} a, {t} b) {{ return a {sign} b || a != a ? a :"
+                " b; }\n"
+            )
     if across:
         yield f"""static inline void {p}_row_minimum(const {t} *a, {t} *out) {{
   {t} least = a[0];

@@ -1,4 +1,6 @@
-"""Results of exports, and the differences between the law and a target, with the figures of this law."""
+"""Results of exports, and the differences between the law and a target, with the figures of this
+law.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ def check_one_env(params: PIDParams) -> None:
 
 
 class Exported(NamedTuple):
-    """Text of a file for a target, and the differences of the target's law from :func:`batchpid.step`."""
+    """Text of a file for a target, and the differences of the target's law from
+    :func:`batchpid.step`.
+    """
 
     text: str
     differences: tuple[str, ...] = ()
@@ -35,11 +39,14 @@ class Exported(NamedTuple):
 class Differences(list[str]):
     """Sentences ``"option: difference"`` about params in effort units, for a target.
 
-    ``params`` are those given, of one env, converted to efforts at ``inertia`` if they were per unit of it, and to the
-    explicit law at ``dt`` if they were implicit; ``joints`` their names; ``dt`` the time step [s].
+    ``params`` are those given, of one env, converted to efforts at ``inertia`` if they were per
+    unit of it, and to the explicit law at ``dt`` if they were implicit; ``joints`` their names;
+    ``dt`` the time step [s].
     """
 
-    def __init__(self, params: PIDParams, joint_names: Sequence[str], dt: float, inertia: ArrayLike | None) -> None:
+    def __init__(
+        self, params: PIDParams, joint_names: Sequence[str], dt: float, inertia: ArrayLike | None
+    ) -> None:
         super().__init__()
         check_one_env(params)
         self.joints = names("joint_names", joint_names, params.num_joints)
@@ -54,9 +61,15 @@ class Differences(list[str]):
         if explicit is not params:
             with np.errstate(invalid="ignore"):
                 share = np.where(params.kp > 0, explicit.kp / params.kp, 1.0)[0]
-            text = f"gains of the explicit law at dt = {self.dt:g} s, for no other step: kp times {self.listed(share)}"
+            text = (
+                f"gains of the explicit law at dt = {self.dt:g} s, for no other step: kp times"
+                f" {self.listed(share)}"
+            )
             if params.ki is not None and np.any(params.ki > 0):
-                text += "; the integral takes the setpoint for the beginning of a step, a lead of dt times its rate"
+                text += (
+                    "; the integral takes the setpoint for the beginning of a step, a lead of dt"
+                    " times its rate"
+                )
             self.append(f"discretization: {text}")
         return explicit
 
@@ -67,17 +80,23 @@ class Differences(list[str]):
             return params
         if poses is None:
             remedy = "pass inertia=, the diagonal of the mass matrix, or gains in effort units"
-            raise InvalidArgumentError("inertia", "is missing for gains per mass_matrix", remedy=remedy)
+            raise InvalidArgumentError(
+                "inertia", "is missing for gains per mass_matrix", remedy=remedy
+            )
         scale = poses[0]
         leaves = {}
         for name in ("kp", "ki", "kd", "integral_min", "integral_max"):
             leaf = getattr(params, name)
             if leaf is not None:
                 leaves[name] = (leaf * scale).astype(params.dtype)
-        text = f"gains per mass_matrix are efforts at one inertia: {self.listed(scale)} kg m^2 or kg"
+        text = (
+            f"gains per mass_matrix are efforts at one inertia: {self.listed(scale)} kg m^2 or kg"
+        )
         ratio = poses / scale
         if len(ratio) > 1:
-            text += f"; in other poses the inertia is {ratio.min():.3g} to {ratio.max():.3g} times that"
+            text += (
+                f"; in other poses the inertia is {ratio.min():.3g} to {ratio.max():.3g} times that"
+            )
         self.append(f"gain_units: {text}, and joints disturb each other")
         return params._replace(gain_units=None, **leaves)
 
@@ -87,10 +106,14 @@ class Differences(list[str]):
         return np.full(len(self.joints), off) if leaf is None else np.asarray(leaf, np.float64)[0]
 
     def listed(self, values: ArrayLike, where: Any = True) -> str:
-        """Return one value for each joint of the mask ``where``, as text: one figure where all are the same."""
+        """Return one value for each joint of the mask ``where``, as text: one figure where all are
+        the same.
+        """
         chosen = np.broadcast_to(where, len(self.joints))
         texts = [
-            (joint, f"{x:.4g}") for joint, x, yes in zip(self.joints, np.asarray(values), chosen, strict=True) if yes
+            (joint, f"{x:.4g}")
+            for joint, x, yes in zip(self.joints, np.asarray(values), chosen, strict=True)
+            if yes
         ]
         if chosen.all() and len({text for _, text in texts}) == 1:
             return texts[0][1]
@@ -100,10 +123,16 @@ class Differences(list[str]):
         """Return the names of the joints in the mask ``where``, as text."""
         return ", ".join(joint for joint, yes in zip(self.joints, where, strict=True) if yes)
 
-    def add(self, option: str, problem: str, where: Any, values: Any = None, unit: str = "") -> None:
-        """Add a difference of ``option``, if any joint is in the mask ``where``, with this law's ``values`` there."""
+    def add(
+        self, option: str, problem: str, where: Any, values: Any = None, unit: str = ""
+    ) -> None:
+        """Add a difference of ``option``, if any joint is in the mask ``where``, with this law's
+        ``values`` there.
+        """
         if np.any(where):
-            figures = "" if values is None else f"; here {self.listed(values, where)} {unit}".rstrip()
+            figures = (
+                "" if values is None else f"; here {self.listed(values, where)} {unit}".rstrip()
+            )
             self.append(f"{option}: {problem}{figures}")
 
     def lack(self, option: str, problem: str, off: float, unit: str = "") -> None:
@@ -113,17 +142,27 @@ class Differences(list[str]):
 
     def opening(self, title: str) -> str:
         """Return the comments that open a file: its title, and the differences."""
-        lines = [f"{title}, generated by batchpid.", *(f"differs: {' '.join(each.split())}" for each in self)]
+        lines = [
+            f"{title}, generated by batchpid.",
+            *(f"differs: {' '.join(each.split())}" for each in self),
+        ]
         return "".join(f"# {line}\n" for line in lines)
 
 
 def strategies(params: PIDParams) -> list[str]:
-    """Return the anti-windup strategy of each joint of params of one env, by the names of make_params."""
-    return [str(each) for each in np.broadcast_to(params.options()["anti_windup"], (1, params.num_joints))[0]]
+    """Return the anti-windup strategy of each joint of params of one env, by the names of
+    make_params.
+    """
+    return [
+        str(each)
+        for each in np.broadcast_to(params.options()["anti_windup"], (1, params.num_joints))[0]
+    ]
 
 
 def plain(leaf: Array, joint: int) -> float:
-    """Return the number of a joint with the fewest digits that read back as the same number of its dtype."""
+    """Return the number of a joint with the fewest digits that read back as the same number of its
+    dtype.
+    """
     return float(str(leaf[0, joint]))
 
 

@@ -15,7 +15,9 @@ from batchpid.export.differences import Differences, strategies
 from batchpid.law.params import PIDParams
 from batchpid.motors.actuators import FIELDS, Actuators
 
-EFFECTS = {name: field for name, field in FIELDS.items() if name not in ("no_load_speed", "effort_limit")}
+EFFECTS = {
+    name: field for name, field in FIELDS.items() if name not in ("no_load_speed", "effort_limit")
+}
 """Effects of actuators that a target may lack."""
 _PROBLEMS = {
     "saturation_effort": "no torque-speed line",
@@ -37,7 +39,9 @@ class Drive(Differences):
     ) -> None:
         super().__init__(params, joint_names, dt, inertia)
         motors = Actuators() if actuators is None else actuators
-        self.actuators = instance("actuators", motors, Actuators, "build them with make_actuators()")
+        self.actuators = instance(
+            "actuators", motors, Actuators, "build them with make_actuators()"
+        )
         if motors.num_envs > 1 or motors.num_joints not in (None, len(self.joints)):
             problem = f"are of {motors.num_envs} envs and {motors.num_joints} joints"
             remedy = f"give those of one env and {len(self.joints)} joints"
@@ -59,9 +63,16 @@ class Drive(Differences):
         """Add the effects of the actuators that are on and not in ``has``."""
         for effect, field in EFFECTS.items():
             if effect not in has:
-                values, problem = self.motor(effect, field.neutral), _PROBLEMS.get(effect, "none in the target")
-                self.add(effect, problem, values != field.neutral, values, field.unit.removeprefix("1"))
-        self.add("position_limit", "no limit by position", self.actuators.limit_positions is not None)
+                values, problem = (
+                    self.motor(effect, field.neutral),
+                    _PROBLEMS.get(effect, "none in the target"),
+                )
+                self.add(
+                    effect, problem, values != field.neutral, values, field.unit.removeprefix("1")
+                )
+        self.add(
+            "position_limit", "no limit by position", self.actuators.limit_positions is not None
+        )
 
     def compare_integral(self, clamps: ArrayLike) -> None:
         """Add the differences of a target that limits its integral alone, symmetrically.
@@ -76,19 +87,35 @@ class Drive(Differences):
         rows = (
             ("anti_windup", "the integral goes on at the effort's limit, up to its own", winds),
             ("integral_limit", "the same in both directions", (-low != high) & clamps),
-            ("integral_limit", "passed by up to one step, ki dt |e|", np.isfinite(limits) & ~np.asarray(clamps)),
+            (
+                "integral_limit",
+                "passed by up to one step, ki dt |e|",
+                np.isfinite(limits) & ~np.asarray(clamps),
+            ),
         )
         for option, problem, where in rows:
             self.add(option, problem, integrates & where, limits, "N m or N")
 
     def _compare(self) -> None:
         params, acts = self.params, self.params.kd is not None
-        excluded = (self.value("integral_min", -math.inf) > 0) | (self.value("integral_max", math.inf) < 0)
-        self.add("integral_limit", "an integral whose limits exclude 0 begins at 0", excluded & (params.ki is not None))
-        self.lack("effort_rate_limit", "the change of the effort is not limited", math.inf, "N m/s or N/s")
-        self.lack("setpoint_weight", "P acts on the whole setpoint (b = 1), so steps overshoot more", 1.0)
+        excluded = (self.value("integral_min", -math.inf) > 0) | (
+            self.value("integral_max", math.inf) < 0
+        )
+        self.add(
+            "integral_limit",
+            "an integral whose limits exclude 0 begins at 0",
+            excluded & (params.ki is not None),
+        )
+        self.lack(
+            "effort_rate_limit", "the change of the effort is not limited", math.inf, "N m/s or N/s"
+        )
+        self.lack(
+            "setpoint_weight", "P acts on the whole setpoint (b = 1), so steps overshoot more", 1.0
+        )
         self.lack("deadband", "none: P acts on the whole error", 0.0, "rad or m")
-        self.add("continuous", "errors are not taken the short way round", params.continuous is not None)
+        self.add(
+            "continuous", "errors are not taken the short way round", params.continuous is not None
+        )
         self.add("non_finite", "inputs are not checked", params.non_finite is not None)
         if acts:
             weight = self.value("setpoint_weight_derivative")

@@ -1,7 +1,7 @@
 """Gains as parameters of ros2_control: joint_trajectory_controller on effort, or pid_controller.
 
-Both run control_toolbox's PID (ros-controls/control_toolbox 6, src/pid.cpp; ros2_controllers, their parameter files).
-With the error e and its rate e'::
+Both run control_toolbox's PID (ros-controls/control_toolbox 6, src/pid.cpp; ros2_controllers, their
+parameter files). With the error e and its rate e'::
 
     u      = p e + I + d e'
     effort = min(max(u, u_clamp_min), u_clamp_max) + ff_velocity_scale r' + desired effort
@@ -10,9 +10,9 @@ With the error e and its rate e'::
     I     <- I + dt i e unless clamped and e u > 0                     conditional_integration
     I     <- min(max(I, i_clamp_min), i_clamp_max)
 
-I stays where |e| <= error_deadband. The trajectory controller takes e' from the measured velocity and the trajectory's,
-the pid_controller with one interface from successive errors. A derivative weight c is
-ff_velocity_scale = d (c - 1), as kd (c r' - y') = kd (r' - y') + kd (c - 1) r'.
+I stays where |e| <= error_deadband. The trajectory controller takes e' from the measured velocity
+and the trajectory's, the pid_controller with one interface from successive errors. A derivative
+weight c is ff_velocity_scale = d (c - 1), as kd (c r' - y') = kd (r' - y') + kd (c - 1) r'.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ def to_ros2_control(
     name: str | None = None,
     inertia: ArrayLike | None = None,
 ) -> Exported:
-    """Return the YAML of a controller manager with one controller, and its differences from the law.
+    """Return the YAML of a controller manager with one controller, and its differences from the
+    law.
 
     Parameters
     ----------
@@ -80,18 +81,19 @@ def to_ros2_control(
     dt
         Time step of the controller manager [s]; its ``update_rate`` is a whole number of hertz.
     controller
-        ``"joint_trajectory_controller"``, or ``"pid_controller"``: with position and velocity for params with the
-        measured rate, else with the position alone.
+        ``"joint_trajectory_controller"``, or ``"pid_controller"``: with position and velocity for
+        params with the measured rate, else with the position alone.
     name
         Of the controller. Default: ``controller``.
     inertia
-        Diagonal of the mass matrix (joints,) or (poses, joints) [kg m^2 or kg]: gains per mass matrix are converted
-        at the first pose.
+        Diagonal of the mass matrix (joints,) or (poses, joints) [kg m^2 or kg]: gains per mass
+        matrix are converted at the first pose.
 
     Raises
     ------
     InvalidArgumentError
-        Params for several envs, gains per mass matrix without ``inertia``, or limits that the target refuses.
+        Params for several envs, gains per mass matrix without ``inertia``, or limits that the
+        target refuses.
     """
     choice("controller", controller, TYPES)
     law = Differences(params, joint_names, dt, inertia)
@@ -100,22 +102,40 @@ def to_ros2_control(
     gains = _gains(law, trajectory, two)
     rate = round(1 / law.dt)
     if rate < 1:
-        raise InvalidArgumentError("dt", "is more than a second", value=dt, remedy="use a rate of at least 1 Hz")
-    law.add("dtype", f"the target computes in float64, these params are {params.dtype}", params.dtype != np.float64)
+        raise InvalidArgumentError(
+            "dt", "is more than a second", value=dt, remedy="use a rate of at least 1 Hz"
+        )
+    law.add(
+        "dtype",
+        f"the target computes in float64, these params are {params.dtype}",
+        params.dtype != np.float64,
+    )
     _compare(law, two, trajectory)
     _compare_anti_windup(law)
     uneven = not math.isclose(rate * law.dt, 1.0, rel_tol=1e-9)
-    law.add("dt", f"the update rate is a whole number: {rate} Hz instead of {1 / law.dt:.6g} Hz", uneven)
+    law.add(
+        "dt", f"the update rate is a whole number: {rate} Hz instead of {1 / law.dt:.6g} Hz", uneven
+    )
 
     name = name or controller
     interfaces = ["position", "velocity"] if two else ["position"]
     body: Document
     if trajectory:
-        body = {"joints": law.joints, "command_interfaces": ["effort"], "state_interfaces": interfaces}
+        body = {
+            "joints": law.joints,
+            "command_interfaces": ["effort"],
+            "state_interfaces": interfaces,
+        }
     else:
-        body = {"dof_names": law.joints, "command_interface": "effort", "reference_and_state_interfaces": interfaces}
+        body = {
+            "dof_names": law.joints,
+            "command_interface": "effort",
+            "reference_and_state_interfaces": interfaces,
+        }
     document = {
-        "controller_manager": {"ros__parameters": {"update_rate": rate, name: {"type": TYPES[controller]}}},
+        "controller_manager": {
+            "ros__parameters": {"update_rate": rate, name: {"type": TYPES[controller]}}
+        },
         name: {"ros__parameters": {**body, "gains": gains}},
     }
     return Exported(f"{law.opening('PID gains')}{documents.render(document, 'yaml')}", tuple(law))
@@ -131,11 +151,18 @@ def _gains(law: Differences, trajectory: bool, two: bool) -> dict[str, Document]
                 entry[key] = plain(values, at)
         if entry["u_clamp_min"] >= entry["u_clamp_max"]:
             problem, value = "must be below effort_max for control_toolbox", entry["u_clamp_min"]
-            raise InvalidArgumentError("effort_min", problem, joint=joint, value=value, remedy="widen the limits")
-        entry["i_clamp_min"], entry["i_clamp_max"] = min(entry["i_clamp_min"], 0.0), max(entry["i_clamp_max"], 0.0)
+            raise InvalidArgumentError(
+                "effort_min", problem, joint=joint, value=value, remedy="widen the limits"
+            )
+        entry["i_clamp_min"], entry["i_clamp_max"] = (
+            min(entry["i_clamp_min"], 0.0),
+            max(entry["i_clamp_max"], 0.0),
+        )
         if strategy == "back_calculation":
             entry["tracking_time_constant"] = plain(params.tracking_time, at)
-        entry["antiwindup_strategy"] = "conditional_integration" if strategy == "conditional" else strategy
+        entry["antiwindup_strategy"] = (
+            "conditional_integration" if strategy == "conditional" else strategy
+        )
         if two:
             weight = params.setpoint_weight_derivative
             feedforward = "ff_velocity_scale" if trajectory else "feedforward_gain"
@@ -149,28 +176,49 @@ def _gains(law: Differences, trajectory: bool, two: bool) -> dict[str, Document]
 def _compare(law: Differences, two: bool, trajectory: bool) -> None:
     """Add the differences between the law and control_toolbox's, but for anti-windup."""
     acts, limited = law.value("kd") > 0, _limited(law)
-    problem = "u_clamp limits the PID alone, not its sum with a feedforward such as gravity compensation"
+    problem = (
+        "u_clamp limits the PID alone, not its sum with a feedforward such as gravity compensation"
+    )
     law.add("effort_limit", problem, limited)
-    law.lack("effort_rate_limit", "the change of the effort is not limited", math.inf, "N m/s or N/s")
-    law.lack("setpoint_weight", "P acts on the whole setpoint (b = 1), so steps overshoot more", 1.0)
+    law.lack(
+        "effort_rate_limit", "the change of the effort is not limited", math.inf, "N m/s or N/s"
+    )
+    law.lack(
+        "setpoint_weight", "P acts on the whole setpoint (b = 1), so steps overshoot more", 1.0
+    )
     # The weight of a given rate, or of a difference of setpoints.
     weight = law.value("setpoint_weight_derivative", 1.0 if two else 0.0)
     problem = "the derivative acts on the whole error (c = 1), so a step of the setpoint kicks it"
     if two:
-        problem = "a feedforward of the desired velocity, after u_clamp, which differences of setpoints do not enter"
+        problem = (
+            "a feedforward of the desired velocity, after u_clamp, which differences of setpoints"
+            " do not enter"
+        )
     law.add("setpoint_weight_derivative", problem, acts & (weight != 1), weight)
     filter_time = law.value("derivative_filter_time")
     law.add("derivative_filter_time", "no filter", acts & (filter_time > 0), filter_time, "s")
     differences = two and law.params.measurement_rate is None
-    law.add("measurement_rate", "the derivative is the measured velocity, not a difference", acts & differences)
+    law.add(
+        "measurement_rate",
+        "the derivative is the measured velocity, not a difference",
+        acts & differences,
+    )
     law.lack("deadband", "stops the integral alone, and P acts on the whole error", 0.0, "rad or m")
     finite = law.params.non_finite is None
-    law.add("non_finite", "the effort is NaN, or not written, after an input that is not finite", not finite)
+    law.add(
+        "non_finite",
+        "the effort is NaN, or not written, after an input that is not finite",
+        not finite,
+    )
     turns = law.value("continuous") > 0
     if trajectory:
         law.add("continuous", "taken from the type of the joint in robot_description", turns)
     elif not two:
-        law.add("continuous", "where the error wraps, the derivative has a spike of kd 2 pi / dt", turns & acts)
+        law.add(
+            "continuous",
+            "where the error wraps, the derivative has a spike of kd 2 pi / dt",
+            turns & acts,
+        )
 
 
 def _compare_anti_windup(law: Differences) -> None:
@@ -185,13 +233,22 @@ def _compare_anti_windup(law: Differences) -> None:
     limited = _limited(law)
     back = strategy == "back_calculation"
     excluded = (law.value("effort_min", -math.inf) > 0) | (law.value("effort_max", math.inf) < 0)
-    problem = "conditional integration takes the sign of the whole effort, wrong where the limits exclude 0"
+    problem = (
+        "conditional integration takes the sign of the whole effort, wrong where the limits"
+        " exclude 0"
+    )
     law.add("anti_windup", problem, (strategy == "conditional") & excluded)
     law.add("anti_windup", "without ki the integral does not track", back & ~integrates)
     problem = "back-calculation is left out in a step with an error of exactly 0"
     law.add("anti_windup", problem, limited & back & integrates)
     times = law.value("tracking_time", math.inf)
-    law.add("tracking_time", "shorter than dt, the integral over-corrects", back & (times < law.dt), times, "s")
+    law.add(
+        "tracking_time",
+        "shorter than dt, the integral over-corrects",
+        back & (times < law.dt),
+        times,
+        "s",
+    )
     rate_limited = np.isfinite(law.value("effort_rate_limit", math.inf))
     problem = "acts on u_clamp alone, not on a limit of the effort's rate"
     law.add("anti_windup", problem, rate_limited & (strategy != "none"))
@@ -199,4 +256,6 @@ def _compare_anti_windup(law: Differences) -> None:
 
 def _limited(law: Differences) -> Bool:
     """Return a mask of the joints with an effort limit."""
-    return np.isfinite(law.value("effort_min", -math.inf)) | np.isfinite(law.value("effort_max", math.inf))
+    return np.isfinite(law.value("effort_min", -math.inf)) | np.isfinite(
+        law.value("effort_max", math.inf)
+    )

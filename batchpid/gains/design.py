@@ -6,13 +6,15 @@ s^3 + (kd/I) s^2 + (kp/I) s + ki/I. With a bandwidth w, damping ratio zeta and i
     kp = I w^2        kd = 2 zeta w I - c        ki = kp / Ti
 
 where c is the joint's own viscous damping. By default zeta = sqrt(3)/2 and
-Ti = 3 sqrt(3) / w: then the three poles coincide at -w / sqrt(3), and a setpoint of small weight b, which acts through
-the integral, is reached without overshoot and without a jump of the effort, to 2 % within 13 / w.
+Ti = 3 sqrt(3) / w: then the three poles coincide at -w / sqrt(3), and a setpoint of small weight b,
+which acts through the integral, is reached without overshoot and without a jump of the effort, to 2
+% within 13 / w.
 
-Three limits shape the rest. An arm's inertia changes with its pose: I is the largest over the poses, since a joint
-lighter than designed for is only damped more. Two light joints nearly in line move against each other with much less
-inertia than either: the derivative's filter is as slow as the stability bound over all poses requires
-(:mod:`batchpid.gains.stability`). Where a filter that slow would reduce the damping, the bandwidth is reduced.
+Three limits shape the rest. An arm's inertia changes with its pose: I is the largest over the
+poses, since a joint lighter than designed for is only damped more. Two light joints nearly in line
+move against each other with much less inertia than either: the derivative's filter is as slow as
+the stability bound over all poses requires (:mod:`batchpid.gains.stability`). Where a filter that
+slow would reduce the damping, the bandwidth is reduced.
 """
 
 from __future__ import annotations
@@ -38,7 +40,9 @@ FILTER_SHARE = 0.3
 DAMPING_RATIO, INTEGRAL_TIME = math.sqrt(3) / 2, 3 * math.sqrt(3)
 """zeta, and Ti in units of 1 / w, of three equal poles."""
 OWN_SHARE = 0.2
-"""Least share of kd that stays, however much damping a joint has: in poses where it is heavy, that does less."""
+"""Least share of kd that stays, however much damping a joint has: in poses where it is heavy, that
+does less.
+"""
 BACK_OFF = 0.8
 """Factor by which the bandwidth is reduced, until the filter is fast enough."""
 
@@ -46,7 +50,8 @@ BACK_OFF = 0.8
 class Designable(Protocol):
     """Robot that :func:`design_gains` can work on, such as :class:`batchpid.sim.Robot`.
 
-    A ``design_effort_limit`` (dof,), if it has one, becomes the effort limit of the designed params.
+    A ``design_effort_limit`` (dof,), if it has one, becomes the effort limit of the designed
+    params.
     """
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
@@ -118,10 +123,11 @@ def design_gains(
     ----------
     robot
         A :class:`batchpid.sim.Robot`, or another :class:`Designable`. If it has a ``coupling``
-        (:mod:`batchpid.motors.coupling`), the gains are for the inertia that moves with each leader. Followers get the
-        same, which have no effect.
+        (:mod:`batchpid.motors.coupling`), the gains are for the inertia that moves with each
+        leader. Followers get the same, which have no effect.
     bandwidth_hz, damping_ratio
-        Of the closed loop, at the largest inertia. A step settles to 2 % in about 2 / bandwidth_hz seconds.
+        Of the closed loop, at the largest inertia. A step settles to 2 % in about 2 / bandwidth_hz
+        seconds.
     integral_time
         Ti [s]; default 3 sqrt(3) / w, inf for no integral.
     setpoint_weight
@@ -129,26 +135,26 @@ def design_gains(
     dt
         Control and simulation step [s].
     poses
-        (n, dof) over which the largest inertia is taken and stability is kept; default 200 seeded ones within the
-        limits.
+        (n, dof) over which the largest inertia is taken and stability is kept; default 200 seeded
+        ones within the limits.
     gain_units
         Unit of the gains: "effort", or per "mass_matrix" (:mod:`batchpid.law.computed_torque`).
     discretization
-        "explicit", or "implicit" for gains per "mass_matrix" (:mod:`batchpid.law.implicit`): stable at any ``dt``, so
-        that the bandwidth is kept and the derivative is not filtered.
+        "explicit", or "implicit" for gains per "mass_matrix" (:mod:`batchpid.law.implicit`): stable
+        at any ``dt``, so that the bandwidth is kept and the derivative is not filtered.
     margin
         Share of the stability range that may be used, in [0.001, 0.999].
     load
-        Least inertia that the joints are designed for, with gain_units "effort" (dof,) [kg m^2 or kg], such as that of
-        a base that legs carry.
+        Least inertia that the joints are designed for, with gain_units "effort" (dof,) [kg m^2 or
+        kg], such as that of a base that legs carry.
     options
         Options of ``robot.params``; they replace the designed ones.
 
     Raises
     ------
     InvalidArgumentError
-        A number out of range, an unknown unit, a load for gains not as "effort", an implicit law with gains not per
-        "mass_matrix", or a robot whose mass matrix is not positive definite.
+        A number out of range, an unknown unit, a load for gains not as "effort", an implicit law
+        with gains not per "mass_matrix", or a robot whose mass matrix is not positive definite.
     """
     bandwidth = positive("bandwidth_hz", bandwidth_hz, "Hz")
     positive("damping_ratio", damping_ratio, "zeta")
@@ -162,18 +168,29 @@ def design_gains(
     least = at_least("load", broadcast("load", load, robot.damping.shape), 0.0)
     if gain_units != "effort" and least.any():
         remedy = "leave it out: these gains are per mass matrix"
-        raise InvalidArgumentError("load", f"has no effect with gain_units {gain_units!r}", remedy=remedy)
+        raise InvalidArgumentError(
+            "load", f"has no effect with gain_units {gain_units!r}", remedy=remedy
+        )
     mass = robot.mass_matrix(robot.sample(200, seed=0) if poses is None else np.atleast_2d(poses))
     coupling = getattr(robot, "coupling", Coupling.of(mass.shape[-1]))
     mass, viscous = coupling.reduced(mass), coupling.reduced_damping(robot.damping)
     own = np.diagonal(mass, axis1=1, axis2=2)
     carried = np.maximum(own.max(0), coupling.reduced_damping(least))
     # The loop with the mass matrix has unit inertias, and compensates the joints' damping.
-    inertia, damping = (carried, viscous) if gain_units == "effort" else (np.ones_like(carried), 0.0)
+    inertia, damping = (
+        (carried, viscous) if gain_units == "effort" else (np.ones_like(carried), 0.0)
+    )
     while True:
-        gains = pid_from_inertia(inertia, bandwidth, damping_ratio, integral_time=integral_time, damping=damping)
-        filter_time = _filter_time(mass, gains, dt, viscous, gain_units, margin) if is_explicit else 0.0
-        if filter_time <= max(FILTER_SHARE / (2 * np.pi * bandwidth), FILTER_STEPS * dt) or bandwidth < 1e-3:
+        gains = pid_from_inertia(
+            inertia, bandwidth, damping_ratio, integral_time=integral_time, damping=damping
+        )
+        filter_time = (
+            _filter_time(mass, gains, dt, viscous, gain_units, margin) if is_explicit else 0.0
+        )
+        if (
+            filter_time <= max(FILTER_SHARE / (2 * np.pi * bandwidth), FILTER_STEPS * dt)
+            or bandwidth < 1e-3
+        ):
             break
         bandwidth *= BACK_OFF
     designed = {
@@ -190,15 +207,24 @@ def design_gains(
 
 
 def _filter_time(
-    mass: Float64, gains: dict[str, Float64], dt: float, damping: Float64, gain_units: str, margin: float
+    mass: Float64,
+    gains: dict[str, Float64],
+    dt: float,
+    damping: Float64,
+    gain_units: str,
+    margin: float,
 ) -> float:
-    """Return the shortest filter time from FILTER_STEPS on that keeps the ratio below ``margin`` at every pose."""
+    """Return the shortest filter time from FILTER_STEPS on that keeps the ratio below ``margin`` at
+    every pose.
+    """
     joints = mass.shape[1]
     if gain_units == "mass_matrix":  # u = M a: every joint is a unit inertia, coupled to no other
         mass, damping = np.eye(joints)[None], np.zeros(joints)
 
     def ratios(filter_time: float) -> Float64:
-        return stability_bound(mass, gains["kp"], gains["kd"], dt, filter_time=filter_time, damping=damping).ratio
+        return stability_bound(
+            mass, gains["kp"], gains["kd"], dt, filter_time=filter_time, damping=damping
+        ).ratio
 
     low = FILTER_STEPS * dt
     at_low = ratios(low)
@@ -207,7 +233,8 @@ def _filter_time(
     worst = np.argsort(at_low)[-10:]  # the critical pose is among these
     mass = mass[worst]
 
-    # The filter passes dt / (dt + 2 tau), so the ratio falls about as 1 / tau down to kp's own share of it.
+    # The filter passes dt / (dt + 2 tau), so the ratio falls about as 1 / tau down to kp's own
+    # share of it.
     high = low
     while ratios(high).max() > margin:
         high *= 2

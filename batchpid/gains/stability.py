@@ -1,33 +1,38 @@
 r"""Stability of a sampled PID loop on a chain of rigid bodies: in closed form, and exactly.
 
-The simulator holds the effort u over a step dt and integrates semi-implicitly. Around a pose, with the mass matrix M,
-implicit joint damping B, gains Kp, Kd and the derivative's filter time tau (all diagonal but M)::
+The simulator holds the effort u over a step dt and integrates semi-implicitly. Around a pose, with
+the mass matrix M, implicit joint damping B, gains Kp, Kd and the derivative's filter time tau (all
+diagonal but M)::
 
     (M + dt B) (v+ - v) = dt (u - B v),   q+ = q + dt v+,   u = -Kp q - Kd d,   d = (tau d' + q - q') / (tau + dt)
 
-Put q_k = x z^k and multiply by x^H: for tau = 0, m (z - 1)^2 + b (z - 1) z + p z + c (z - 1) = 0, where m, b, c and
-p are the positive numbers x^H M x, dt x^H B x, dt x^H Kd x and dt^2 x^H Kp x. Jury's criterion asks for
-2 c + p < 4 m + 2 b: the root that leaves the unit circle does so at z = -1, where neighbouring samples alternate. There
-the filter passes dt / (dt + 2 tau) of the rate. Over all x that is, by the largest eigenvalue of a symmetric matrix::
+Put q_k = x z^k and multiply by x^H: for tau = 0, m (z - 1)^2 + b (z - 1) z + p z + c (z - 1) = 0,
+where m, b, c and p are the positive numbers x^H M x, dt x^H B x, dt x^H Kd x and dt^2 x^H Kp x.
+Jury's criterion asks for 2 c + p < 4 m + 2 b: the root that leaves the unit circle does so at z =
+-1, where neighbouring samples alternate. There the filter passes dt / (dt + 2 tau) of the rate.
+Over all x that is, by the largest eigenvalue of a symmetric matrix::
 
     ratio = 1/2 lambda_max( (M + dt/2 B)^-1 (dt/(dt + 2 tau) dt Kd + 1/2 dt^2 Kp) ) < 1
 
-and ratio = 1 is the boundary, not only a bound on it. On one joint of inertia I without filter it says
-kd dt / I + kp dt^2 / (2 I) < 2. On a chain it is the *coupled* inertia that counts: with axes nearly in line (an arm
-stretched upright), joints that turn against each other move much less than the diagonal of M says.
+and ratio = 1 is the boundary, not only a bound on it. On one joint of inertia I without filter it
+says kd dt / I + kp dt^2 / (2 I) < 2. On a chain it is the *coupled* inertia that counts: with axes
+nearly in line (an arm stretched upright), joints that turn against each other move much less than
+the diagonal of M says.
 
-Where efforts or measurements are late, by a delay d and a first-order lag T, the loop becomes unstable at a lower
-frequency. With the plant G(z) and the law C(z) of the equations above, the loop and its limit are::
+Where efforts or measurements are late, by a delay d and a first-order lag T, the loop becomes
+unstable at a lower frequency. With the plant G(z) and the law C(z) of the equations above, the loop
+and its limit are::
 
     L(z) = G(z) D(z) C(z),     ratio = max |lambda|     over the eigenvalues lambda of L(e^iw) with phase -180 degrees
 
-because s times the gains are at the limit where s lambda = -1 (the generalised Nyquist criterion: A. G. J. MacFarlane
-and I. Postlethwaite, "The generalized Nyquist stability criterion and multivariable root loci", Int. J. Control 25,
-1977). The phase has to fall through -180 degrees there; if it begins below, no gains are stable and the ratio is
-infinite. A delay between two steps is interpolated, as :mod:`batchpid.motors.delay` does.
+because s times the gains are at the limit where s lambda = -1 (the generalised Nyquist criterion:
+A. G. J. MacFarlane and I. Postlethwaite, "The generalized Nyquist stability criterion and
+multivariable root loci", Int. J. Control 25, 1977). The phase has to fall through -180 degrees
+there; if it begins below, no gains are stable and the ratio is infinite. A delay between two steps
+is interpolated, as :mod:`batchpid.motors.delay` does.
 
-The integral, which is slow, is not in the ratio; :func:`spectral_radius` and :func:`oscillation` include it.
-E. I. Jury, Theory and Application of the z-Transform Method (Wiley, 1964).
+The integral, which is slow, is not in the ratio; :func:`spectral_radius` and :func:`oscillation`
+include it. E. I. Jury, Theory and Application of the z-Transform Method (Wiley, 1964).
 """
 
 from __future__ import annotations
@@ -42,8 +47,9 @@ from batchpid.checks.validate import at_least, broadcast, positive, read_array, 
 from batchpid.errors import InvalidArgumentError
 
 _FREQUENCIES = 100
-"""Number of frequencies below and above 1 / 4 of the highest at which a late loop is evaluated; between two of them the
-loci are interpolated."""
+"""Number of frequencies below and above 1 / 4 of the highest at which a late loop is evaluated;
+between two of them the loci are interpolated.
+"""
 _SLOWEST = 0.01
 """Lowest of them, over 1 / (delay + lag)."""
 
@@ -52,14 +58,17 @@ class StabilityBound(NamedTuple):
     """Share of the sampled loop's stability range that is used."""
 
     ratio: Float64
-    """(...): below 1 the loop is stable, above 1 it diverges; without delay and lag with alternating signs from step to
-    step."""
+    """(...): below 1 the loop is stable, above 1 it diverges; without delay and lag with
+    alternating signs from step to step.
+    """
     participation: Float64
     """(..., joints): share of each joint in the least stable mode; sums to 1."""
 
 
 class Oscillation(NamedTuple):
-    """Least damped oscillation of the sampled loop among those that last; of a loop without any the ratio is 1."""
+    """Least damped oscillation of the sampled loop among those that last; of a loop without any the
+    ratio is 1.
+    """
 
     damping_ratio: Float64
     """(...): zeta; after a period exp(-2 pi zeta / sqrt(1 - zeta^2)) of the amplitude is left."""
@@ -94,12 +103,14 @@ def stability_bound(
     filter_time
         Time constant of the derivative's first-order low-pass [s], shaped as kp.
     damping
-        Viscous damping of the joints, which the simulator integrates implicitly [N m s/rad or N s/m], shaped as kp.
+        Viscous damping of the joints, which the simulator integrates implicitly [N m s/rad or N
+        s/m], shaped as kp.
     delay, lag
-        Delay of efforts and measurements together, and time constant of the efforts' first-order lag [s], shaped as kp.
+        Delay of efforts and measurements together, and time constant of the efforts' first-order
+        lag [s], shaped as kp.
     model
-        Mass matrix by which the law multiplies its output, where that is an acceleration, shaped as ``mass_matrix``.
-        None: the output is an effort.
+        Mass matrix by which the law multiplies its output, where that is an acceleration, shaped as
+        ``mass_matrix``. None: the output is an effort.
 
     Raises
     ------
@@ -107,11 +118,20 @@ def stability_bound(
         A shape that does not fit, a mass matrix that is not positive definite, or a dt above 1 s.
     """
     m, p, c, tau, b, late, slow = _columns(
-        mass_matrix, dt, kp=kp, kd=kd, filter_time=filter_time, damping=damping, delay=delay, lag=lag
+        mass_matrix,
+        dt,
+        kp=kp,
+        kd=kd,
+        filter_time=filter_time,
+        damping=damping,
+        delay=delay,
+        lag=lag,
     )
     if model is not None or late.any() or slow.any():
         one = np.eye(m.shape[-1])
-        unit = broadcast("model", one if model is None else model, m.shape, "give it the shape of mass_matrix")
+        unit = broadcast(
+            "model", one if model is None else model, m.shape, "give it the shape of mass_matrix"
+        )
         return _late_bound(m, unit, [p, c, tau, b, late, slow], dt)
     passed = dt / (dt + 2 * tau)
     weight = np.sqrt(passed * dt * c + 0.5 * dt**2 * p)
@@ -121,7 +141,9 @@ def stability_bound(
 
 
 def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) -> StabilityBound:
-    """Return the bound of loops whose efforts are late; ``columns`` are those of :func:`_loop` (..., joints)."""
+    """Return the bound of loops whose efforts are late; ``columns`` are those of :func:`_loop`
+    (..., joints).
+    """
     ratio, participation = np.zeros(m.shape[:-2]), np.zeros(m.shape[:-1])
     for at in np.ndindex(*m.shape[:-2]):
         own = [column[at] for column in columns]
@@ -136,10 +158,12 @@ def _late_bound(m: Float64, unit: Float64, columns: list[Float64], dt: float) ->
 
 
 def _participation(loop: Rows, inertia: Rows, ratio: float) -> Float64:
-    """Return the share of each joint's motor (joints,) in the mode of ``loop`` that passes -180 degrees at ``ratio``.
+    """Return the share of each joint's motor (joints,) in the mode of ``loop`` that passes -180
+    degrees at ``ratio``.
 
-    It is the sensitivity of the mode's eigenvalue to a factor of the motor's effort: with right and left eigenvectors
-    x and y, and the effort ``inertia`` x of the motion, |y^H inertia^-1| |inertia x|. All arrays are (joints, joints).
+    It is the sensitivity of the mode's eigenvalue to a factor of the motor's effort: with right and
+    left eigenvectors x and y, and the effort ``inertia`` x of the motion, |y^H inertia^-1| |inertia
+    x|. All arrays are (joints, joints).
     """
     values, right = np.linalg.eig(loop)
     mode = int(np.argmin(np.abs(values + ratio)))
@@ -150,7 +174,8 @@ def _participation(loop: Rows, inertia: Rows, ratio: float) -> Float64:
 
 
 def _loop(z: Rows, m: Float64, unit: Float64, columns: list[Float64], dt: float) -> Rows:
-    """Return L (frequencies, joints, joints) of one loop at the points ``z`` (frequencies,) of the unit circle.
+    """Return L (frequencies, joints, joints) of one loop at the points ``z`` (frequencies,) of the
+    unit circle.
 
     ``columns`` are kp, kd, filter time, damping, delay and lag (joints,).
     """
@@ -167,14 +192,16 @@ def _loop(z: Rows, m: Float64, unit: Float64, columns: list[Float64], dt: float)
 
 
 def _crossing(z: Rows, values: Rows) -> tuple[float, int]:
-    """Return the largest modulus at which a locus falls through -180 degrees, and the number of its frequency.
+    """Return the largest modulus at which a locus falls through -180 degrees, and the number of its
+    frequency.
 
-    ``values`` (frequencies, joints) are the eigenvalues of L at ``z``. The loci begin below the negative real axis
-    where the loop is stable with small gains.
+    ``values`` (frequencies, joints) are the eigenvalues of L at ``z``. The loci begin below the
+    negative real axis where the loop is stable with small gains.
     """
     values = values.copy()
     values[-1] = values[-1].real  # at z = -1 it is real, but for rounding
-    # Each eigenvalue goes on from the nearest one at the frequency before, apart from the fall of all with frequency.
+    # Each eigenvalue goes on from the nearest one at the frequency before, apart from the fall of
+    # all with frequency.
     own = values * np.abs(z - 1)[:, None] ** 2
     nearest = np.abs(own[1:, :, None] - own[:-1, None, :]).argmin(2)
     now, then = np.take_along_axis(values[:-1], nearest, 1), values[1:]
@@ -202,11 +229,12 @@ def spectral_radius(
     filter_time: ArrayLike = 0.0,
     damping: ArrayLike = 0.0,
 ) -> Float64:
-    """Return the largest modulus (...) of the eigenvalues of the sampled PID loop: below 1 it is stable.
+    """Return the largest modulus (...) of the eigenvalues of the sampled PID loop: below 1 it is
+    stable.
 
-    They are the eigenvalues of the exact one-step matrix of the law, output first, and the plant, on the state
-    (q, q - q', I, d). Arguments are as in :func:`stability_bound`, and ``ki`` [N m/(rad s) or N/(m s)], shaped as
-    kp. Where ki is 0 its pole at 1 is left out.
+    They are the eigenvalues of the exact one-step matrix of the law, output first, and the plant,
+    on the state (q, q - q', I, d). Arguments are as in :func:`stability_bound`, and ``ki`` [N
+    m/(rad s) or N/(m s)], shaped as kp. Where ki is 0 its pole at 1 is left out.
     """
     values = np.linalg.eigvals(_one_step(mass_matrix, dt, kp, ki, kd, filter_time, damping))
     return np.abs(values).max(-1)
@@ -223,10 +251,12 @@ def oscillation(
     damping: ArrayLike = 0.0,
     lasting: float = 1.0,
 ) -> Oscillation:
-    """Return the least damped oscillation of the sampled PID loop that takes ``lasting`` [s] or longer to fall to 2 %.
+    """Return the least damped oscillation of the sampled PID loop that takes ``lasting`` [s] or
+    longer to fall to 2 %.
 
-    Modes that decay faster are not seen in a motion. The other arguments are as in :func:`spectral_radius`. With the
-    eigenvalue z of a mode, its continuous one is s = log(z) / dt, zeta = -Re s / |s|, and its frequency |Im s| / 2 pi.
+    Modes that decay faster are not seen in a motion. The other arguments are as in
+    :func:`spectral_radius`. With the eigenvalue z of a mode, its continuous one is s = log(z) / dt,
+    zeta = -Re s / |s|, and its frequency |Im s| / 2 pi.
     """
     values, vectors = np.linalg.eig(_one_step(mass_matrix, dt, kp, ki, kd, filter_time, damping))
     joints = values.shape[-1] // 4
@@ -238,7 +268,9 @@ def oscillation(
     found = np.take_along_axis(lasts, worst, -1)
     shape = np.take_along_axis(vectors, worst[..., None], -1)[..., :joints, 0]
     # Kinetic energy, apart from the coupling of joints.
-    energy = np.abs(shape) ** 2 * np.diagonal(read_array("mass_matrix", mass_matrix), axis1=-2, axis2=-1)
+    energy = np.abs(shape) ** 2 * np.diagonal(
+        read_array("mass_matrix", mass_matrix), axis1=-2, axis2=-1
+    )
     energy = np.where(found, energy, 1.0)
     frequency = np.abs(np.take_along_axis(s, worst, -1).imag) / (2 * np.pi)
     return Oscillation(
@@ -261,7 +293,12 @@ def _one_step(mass_matrix: ArrayLike, dt: float, *gains: ArrayLike) -> Float64:
     keep, take = tau / (tau + dt), dt / (tau + dt)
     # d = keep d' - take w / dt on the negated measurement, so u = -p q + I + c d; w = q - q'.
     rate = [zero, diagonal(-take / dt), zero, diagonal(keep)]
-    effort = [diagonal(-p), c[..., None] * rate[1], diagonal(np.where(i > 0, 1.0, 0.0)), c[..., None] * rate[3]]
+    effort = [
+        diagonal(-p),
+        c[..., None] * rate[1],
+        diagonal(np.where(i > 0, 1.0, 0.0)),
+        c[..., None] * rate[3],
+    ]
     implicit = np.linalg.inv(m + diagonal(dt * b))
     step = [dt**2 * (implicit @ column) for column in effort]
     step[1] = step[1] + implicit @ m
@@ -271,7 +308,9 @@ def _one_step(mass_matrix: ArrayLike, dt: float, *gains: ArrayLike) -> Float64:
 
 
 def _columns(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> tuple[Float64, ...]:
-    """Return the mass matrix and the columns as (..., joints, joints) and (..., joints), checked."""
+    """Return the mass matrix and the columns as (..., joints, joints) and (..., joints),
+    checked.
+    """
     time_step("dt", dt)
     m = read_array("mass_matrix", mass_matrix).astype(np.float64)
     if m.ndim < 2 or m.shape[-1] != m.shape[-2]:
@@ -280,4 +319,10 @@ def _columns(mass_matrix: ArrayLike, dt: float, **columns: ArrayLike) -> tuple[F
     if not np.isfinite(m).all() or np.linalg.eigvalsh(m).min(initial=np.inf) <= 0:
         remedy = "check the masses and inertias of the robot's links"
         raise InvalidArgumentError("mass_matrix", "is not positive definite", remedy=remedy)
-    return (m, *(at_least(name, broadcast(name, value, m.shape[:-1]), 0.0) for name, value in columns.items()))
+    return (
+        m,
+        *(
+            at_least(name, broadcast(name, value, m.shape[:-1]), 0.0)
+            for name, value in columns.items()
+        ),
+    )

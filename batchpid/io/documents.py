@@ -1,4 +1,6 @@
-"""Documents that people read and edit, as YAML or JSON: a head, and one entry per joint, by name."""
+"""Documents that people read and edit, as YAML or JSON: a head, and one entry per joint, by
+name.
+"""
 
 from __future__ import annotations
 
@@ -47,12 +49,16 @@ def read(path: str | os.PathLike[str]) -> Any:
         raise
     except OSError as error:
         problem = f"cannot be read: {error.strerror or error}"
-        raise InvalidArgumentError(str(path), problem, remedy="check its name and your rights") from None
+        raise InvalidArgumentError(
+            str(path), problem, remedy="check its name and your rights"
+        ) from None
     return parse(str(path), content, SUFFIXES[path.suffix.lower()])
 
 
 def write(path: str | os.PathLike[str], dump: Callable[[str], str]) -> None:
-    """Write the text of ``dump(format)`` to ``path``; an existing file is replaced as a whole or not at all."""
+    """Write the text of ``dump(format)`` to ``path``; an existing file is replaced as a whole or
+    not at all.
+    """
     path = file_path("path", path, SUFFIXES)
     write_atomically(path, dump(SUFFIXES[path.suffix.lower()]))
 
@@ -60,7 +66,9 @@ def write(path: str | os.PathLike[str], dump: Callable[[str], str]) -> None:
 def document(
     schema: Schema, options: Document, joint_names: Sequence[str], about: Mapping[str, Any] | None
 ) -> Document:
-    """Return the document of the ``options`` of a constructor: arrays (1 | envs, joints), or one for all joints."""
+    """Return the document of the ``options`` of a constructor: arrays (1 | envs, joints), or one
+    for all joints.
+    """
     head = {name: options.pop(name) for name in schema.head if name in options}
     joints = {
         joint: {name: plain(column[:, index]) for name, column in options.items()}
@@ -71,23 +79,37 @@ def document(
     return {"format": schema.format, **kept, **head, "joints": joints}
 
 
-def build(source: str, document: Any, schema: Schema, joints: Document, make: Callable[..., T], **options: Any) -> T:
-    """Return the result of the constructor ``make`` for a document's ``joints``, in their order, and its head.
+def build(
+    source: str,
+    document: Any,
+    schema: Schema,
+    joints: Document,
+    make: Callable[..., T],
+    **options: Any,
+) -> T:
+    """Return the result of the constructor ``make`` for a document's ``joints``, in their order,
+    and its head.
 
     Errors name the document and the key. ``options`` are further arguments.
     """
-    given = columns(source, joints, schema) | {name: document[name] for name in schema.head if name in document}
+    given = columns(source, joints, schema) | {
+        name: document[name] for name in schema.head if name in document
+    }
     with named(source):
         return make(len(joints), **given, **options, joint_names=list(joints))
 
 
 @contextmanager
 def named(source: str) -> Iterator[None]:
-    """Begin the messages of InvalidArgumentErrors from the block with ``source``, a file or a place in it."""
+    """Begin the messages of InvalidArgumentErrors from the block with ``source``, a file or a place
+    in it.
+    """
     try:
         yield
     except InvalidArgumentError as error:
-        facts = {name: getattr(error, name) for name in ("joint", "entry", "env", "value", "remedy")}
+        facts = {
+            name: getattr(error, name) for name in ("joint", "entry", "env", "value", "remedy")
+        }
         raise InvalidArgumentError(f"{source}: {error.argument}", error.problem, **facts) from None
 
 
@@ -103,7 +125,9 @@ def parse(source: str, text: str | bytes, format: str) -> Any:
         return _parse_json(text) if format == "json" else _parse_yaml(text)
     except Exception as error:  # a damaged text can make the parser raise anything
         said = " ".join(str(error).split())[:300] or type(error).__name__
-        raise InvalidArgumentError(source, f"cannot be read: {said}", remedy="correct the file") from None
+        raise InvalidArgumentError(
+            source, f"cannot be read: {said}", remedy="correct the file"
+        ) from None
 
 
 def render(document: Document, format: str) -> str:
@@ -126,17 +150,29 @@ def check(source: str, document: Any, schema: Schema) -> dict[str, Document]:
         raise error(source, "about", "must be a mapping", "use 'key: value', or leave it out")
     choice(f"{source}: dtype", document.get("dtype", "float64"), ("float32", "float64"))
     joints = document.get("joints")
-    if not isinstance(joints, dict) or not joints or not all(isinstance(name, str) for name in joints):
+    if (
+        not isinstance(joints, dict)
+        or not joints
+        or not all(isinstance(name, str) for name in joints)
+    ):
         raise error(source, "joints", "must map names to options", "name the joints")
     for name, options in joints.items():
         if not isinstance(options, dict):
-            raise error(source, "joints", "must map options to values", "give e.g. an empty mapping, {}", name)
+            raise error(
+                source,
+                "joints",
+                "must map options to values",
+                "give e.g. an empty mapping, {}",
+                name,
+            )
         for key in schema.required:
             if key not in options:
                 raise error(source, "joints", f"has no {key}", f"give '{key}: <number>'", name)
         for key, value in options.items():
             if key not in schema.fields:
-                raise error(source, key, "unknown option", f"use one of {', '.join(schema.fields)}", name)
+                raise error(
+                    source, key, "unknown option", f"use one of {', '.join(schema.fields)}", name
+                )
             neutral = schema.fields[key].neutral
             wanted: type = type(neutral)
             for entry in value if isinstance(value, list) and value else [value]:
@@ -160,31 +196,42 @@ def columns(source: str, joints: dict[str, Document], schema: Schema) -> Documen
         if not any(key in options for options in joints.values()):
             continue
         values = {name: options.get(key, field.neutral) for name, options in joints.items()}
-        lists = {name: value if isinstance(value, list) else [value] for name, value in values.items()}
+        lists = {
+            name: value if isinstance(value, list) else [value] for name, value in values.items()
+        }
         envs = max(map(len, lists.values()))
         for name, value in lists.items():
             if len(value) not in (1, envs):
-                raise error(source, key, f"has {len(value)} values, others {envs}", "give one per env", name)
+                raise error(
+                    source, key, f"has {len(value)} values, others {envs}", "give one per env", name
+                )
         dtype: DType = {float: float, bool: bool, str: object}[type(field.neutral)]
-        columns[key] = np.array([value * (envs // len(value)) for value in lists.values()], dtype=dtype).T
+        columns[key] = np.array(
+            [value * (envs // len(value)) for value in lists.values()], dtype=dtype
+        ).T
     return columns
 
 
-def error(source: str, key: str, problem: str, remedy: str, joint: str | None = None) -> InvalidArgumentError:
+def error(
+    source: str, key: str, problem: str, remedy: str, joint: str | None = None
+) -> InvalidArgumentError:
     """Return the error of a key of a document."""
     return InvalidArgumentError(f"{source}: {key}", problem, joint=joint, remedy=remedy)
 
 
 def plain(column: Any) -> Any:
     """Return a joint's option as one plain value, or a list of one per env."""
-    # The shortest digits that read back as the same number of its dtype: str(float32) has fewer than its float.
+    # The shortest digits that read back as the same number of its dtype: str(float32) has fewer
+    # than its float.
     values = [float(str(value)) if isinstance(value, np.floating) else value for value in column]
     values = [bool(value) if isinstance(value, np.bool_) else value for value in values]
     return values[0] if len(values) == 1 else values
 
 
 def _without_infinities(value: Any) -> Any:
-    """Return the document with infinities as the strings "inf" and "-inf": JSON has no number for them."""
+    """Return the document with infinities as the strings "inf" and "-inf": JSON has no number for
+    them.
+    """
     if isinstance(value, dict):
         return {key: _without_infinities(entry) for key, entry in value.items()}
     if isinstance(value, list):
@@ -205,7 +252,9 @@ def _parse_yaml(text: str) -> Any:
     import yaml  # here, since params in memory need NumPy alone
 
     class Loader(yaml.SafeLoader):
-        """SafeLoader without aliases, which can make a short file explode, and without keys given twice."""
+        """SafeLoader without aliases, which can make a short file explode, and without keys given
+        twice.
+        """
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):

@@ -15,8 +15,8 @@ from typing import BinaryIO
 def standard_streams_occupied() -> Iterator[None]:
     """Give files that are opened inside a number above 2.
 
-    The numbers 0 to 2 belong to the standard streams. In a program that has closed these, the next file would get such
-    a number, and printed text would go into it.
+    The numbers 0 to 2 belong to the standard streams. In a program that has closed these, the next
+    file would get such a number, and printed text would go into it.
     """
     with ExitStack() as files:
         number = 0
@@ -30,9 +30,10 @@ def standard_streams_occupied() -> Iterator[None]:
 def replacing(path: str | os.PathLike[str], overwrite: bool = True) -> Iterator[Path]:
     """Yield a path to write a file to, which then replaces the file at ``path``.
 
-    It is in the same folder and has the same suffix. After an exception, a crash or a kill the older file is unchanged;
-    a link stays a link. The caller's file is on the disk before it takes its place. Without ``overwrite`` a file that
-    exists by then stays. Raises OSError if the file cannot be written, FileExistsError for a file that stays.
+    It is in the same folder and has the same suffix. After an exception, a crash or a kill the
+    older file is unchanged; a link stays a link. The caller's file is on the disk before it takes
+    its place. Without ``overwrite`` a file that exists by then stays. Raises OSError if the file
+    cannot be written, FileExistsError for a file that stays.
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():  # a device, which root could replace
@@ -49,13 +50,17 @@ def replacing(path: str | os.PathLike[str], overwrite: bool = True) -> Iterator[
     except OSError as error:
         if error.errno is None or error.filename not in (None, str(temporary)):
             raise
-        raise OSError(error.errno, error.strerror, str(path)) from error  # named as the caller named it
+        raise OSError(
+            error.errno, error.strerror, str(path)
+        ) from error  # named as the caller named it
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def write_atomically(
-    path: str | os.PathLike[str], content: str | bytes | Callable[[BinaryIO], object], overwrite: bool = True
+    path: str | os.PathLike[str],
+    content: str | bytes | Callable[[BinaryIO], object],
+    overwrite: bool = True,
 ) -> None:
     """Write the file at ``path`` as a whole or not at all, as :func:`replacing` does.
 

@@ -10,7 +10,9 @@ PACKAGES = ("batchpid", "numpy", "sapien", "jax", "h5py", "cmaes", "mujoco", "gy
 
 
 def package_versions(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
-    """Return the versions of Python and of the installed ``packages``, by name; for batchpid, its ``__version__``."""
+    """Return the versions of Python and of the installed ``packages``, by name; for batchpid, its
+    ``__version__``.
+    """
     from importlib.metadata import PackageNotFoundError, version  # slow to import
 
     import batchpid

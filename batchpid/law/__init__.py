@@ -1,6 +1,12 @@
-"""The PID law: params, state, coefficients and one pure step; gains of accelerations with a robot's mass matrix."""
+"""The PID law: params, state, coefficients and one pure step; gains of accelerations with a robot's
+mass matrix.
+"""
 
-from batchpid.law.computed_torque import advance_with_mass_matrix, check_gain_units, convert_integral
+from batchpid.law.computed_torque import (
+    advance_with_mass_matrix,
+    check_gain_units,
+    convert_integral,
+)
 from batchpid.law.implicit import as_explicit
 
 __all__ = ["advance_with_mass_matrix", "as_explicit", "check_gain_units", "convert_integral"]

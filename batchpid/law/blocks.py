@@ -1,9 +1,9 @@
 """The law over a large batch on JAX's CPU backend, block by block.
 
-XLA compiles one kernel per output there, and each reads the inputs again: in a large batch from memory, into buffers
-that the system maps page by page. A block of a thousand rows stays in the cache between its kernels, and its results
-overwrite arrays that are no longer needed. Blocks are flat, so that rows of 9 joints fill the processor's vectors of 8
-or 16.
+XLA compiles one kernel per output there, and each reads the inputs again: in a large batch from
+memory, into buffers that the system maps page by page. A block of a thousand rows stays in the
+cache between its kernels, and its results overwrite arrays that are no longer needed. Blocks are
+flat, so that rows of 9 joints fill the processor's vectors of 8 or 16.
 """
 
 from __future__ import annotations
@@ -23,14 +23,19 @@ ROWS = 1024
 
 
 def advance_in_blocks(
-    k: Coefficients, state: PIDState, *inputs: Any, out: tuple[PIDState, Any] | None = None, rows: int = ROWS
+    k: Coefficients,
+    state: PIDState,
+    *inputs: Any,
+    out: tuple[PIDState, Any] | None = None,
+    rows: int = ROWS,
 ) -> tuple[PIDState, Any]:
     """Advance the law ``rows`` envs at a time, for jax.jit with ``out`` donated.
 
-    ``inputs`` are the inputs of :func:`batchpid.advance`, in order: setpoint, measurement and, optionally,
-    measurement_rate, setpoint_rate, feedforward. ``out`` is a state and an effort, (envs, joints) each, to overwrite,
-    such as the results of the step before last, but not ``state`` itself; None takes new ones. On several devices use
-    it under ``jax.shard_map``, each device with a part of the envs.
+    ``inputs`` are the inputs of :func:`batchpid.advance`, in order: setpoint, measurement and,
+    optionally, measurement_rate, setpoint_rate, feedforward. ``out`` is a state and an effort,
+    (envs, joints) each, to overwrite, such as the results of the step before last, but not
+    ``state`` itself; None takes new ones. On several devices use it under ``jax.shard_map``, each
+    device with a part of the envs.
     """
     measurement = inputs[1]
     envs, joints = measurement.shape
@@ -55,7 +60,9 @@ def advance_in_blocks(
 
         new, terms = advance(*jax.tree.map(cut, given))
         done = new, terms.effort
-        return jax.tree.map(lambda x, part: jax.lax.dynamic_update_slice_in_dim(x, part, start, 0), out, done)
+        return jax.tree.map(
+            lambda x, part: jax.lax.dynamic_update_slice_in_dim(x, part, start, 0), out, done
+        )
 
     given = jax.tree.map(flat, (k, state, *inputs))
     out = jax.lax.fori_loop(0, -(-envs // rows), step, jax.tree.map(flat, out))

@@ -1,4 +1,6 @@
-"""Bumpless transfer: from manual to automatic control, or from gains to other gains, without a jump of the effort."""
+"""Bumpless transfer: from manual to automatic control, or from gains to other gains, without a jump
+of the effort.
+"""
 
 from __future__ import annotations
 
@@ -24,17 +26,19 @@ def track(
     setpoint_rate: Array = None,
     feedforward: Array = None,
 ) -> PIDState:
-    """Return the state whose next step, on these same inputs, gives ``effort``: its integral makes up the difference.
+    """Return the state whose next step, on these same inputs, gives ``effort``: its integral makes
+    up the difference.
 
-    Call it at every step under manual control, or once before a change of kp or kd (with the new params and the last
-    effort). The derivative is taken as settled. An effort beyond the limits, or an integral beyond its own, cannot be
-    reproduced: the limits hold. ``dt`` is needed where the params are implicit.
+    Call it at every step under manual control, or once before a change of kp or kd (with the new
+    params and the last effort). The derivative is taken as settled. An effort beyond the limits, or
+    an integral beyond its own, cannot be reproduced: the limits hold. ``dt`` is needed where the
+    params are implicit.
 
     Raises
     ------
     InvalidArgumentError
-        If the params have no integral (ki is None), dt is missing where it is needed, a shape does not fit, or the
-        state lacks an array that the params need.
+        If the params have no integral (ki is None), dt is missing where it is needed, a shape does
+        not fit, or the state lacks an array that the params need.
     """
     measurement, setpoint, effort, measurement_rate, setpoint_rate, feedforward = checked_inputs(
         params,
@@ -50,7 +54,9 @@ def track(
     check_alone(params, measurement_rate)
     if params.ki is None:
         raise InvalidArgumentError(
-            "params.ki", "is off, so no integral can carry the effort over", remedy="give ki; 0 is allowed"
+            "params.ki",
+            "is off, so no integral can carry the effort over",
+            remedy="give ki; 0 is allowed",
         )
     if dt is None and params.discretization is not None:
         problem = "is needed where the params have discretization 'implicit'"
@@ -59,11 +65,14 @@ def track(
     k = discretise(params, 1.0 if dt is None else dt)
     zero = xp.zeros_like(measurement)
     error = wrapped_error(k, setpoint, measurement, xp)
-    (origin, _), (kept, _) = (origins(k, state, measurement, rate, xp) for rate in (setpoint_rate, None))
+    (origin, _), (kept, _) = (
+        origins(k, state, measurement, rate, xp) for rate in (setpoint_rate, None)
+    )
     rate = zero if measurement_rate is None else -measurement_rate
     if setpoint_rate is not None:
         rate = rate + weighted_rate(k, setpoint_rate)
-    # The law solved for its integral: I = u - P - D - feedforward, with the derivative filter settled on its input.
+    # The law solved for its integral: I = u - P - D - feedforward, with the derivative filter
+    # settled on its input.
     integral = effort - proportional(k, error, measurement, origin)
     integral = integral if k.kd is None else integral - k.kd * rate
     integral = integral if feedforward is None else integral - feedforward

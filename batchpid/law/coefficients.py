@@ -43,7 +43,9 @@ class Coefficients(NamedTuple):
     """Weight of a given setpoint acceleration in the implicit law; None: 1."""
     deadband: Array
     tracking: Array
-    """dt / Tt, at most 1. Above 1, a step would correct more than the whole excess, and oscillate."""
+    """dt / Tt, at most 1. Above 1, a step would correct more than the whole excess, and
+    oscillate.
+    """
     conditional: Any
     turns: Array
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
@@ -52,7 +54,9 @@ class Coefficients(NamedTuple):
     non_finite: Any
     measurement_rate: Array
     gain_units: Any
-    """Unit of gains that :mod:`batchpid.law.computed_torque` turns into efforts; the law alone refuses them."""
+    """Unit of gains that :mod:`batchpid.law.computed_torque` turns into efforts; the law alone
+    refuses them.
+    """
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")
@@ -61,8 +65,8 @@ class Coefficients(NamedTuple):
 def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coefficients:
     """Return the law's coefficients at ``dt`` [s], for :func:`batchpid.advance`.
 
-    With ``num_envs`` they have the shape of :func:`spread`. Raises InvalidArgumentError for params of another type, and
-    unless dt is positive and finite; an array of JAX is not checked.
+    With ``num_envs`` they have the shape of :func:`spread`. Raises InvalidArgumentError for params
+    of another type, and unless dt is positive and finite; an array of JAX is not checked.
     """
     dt = checked_dt(dt, instance("params", params, PIDParams, "build them with make_params").dtype)
     c = params.setpoint_weight_derivative
@@ -95,7 +99,11 @@ def discretise(params: PIDParams, dt: Array, num_envs: int | None = None) -> Coe
 
 
 def spread(k: Coefficients, num_envs: int) -> Coefficients:
-    """Return ``k`` with arrays of shape (num_envs, joints): NumPy then steps small batches twice as fast."""
+    """Return ``k`` with arrays of shape (num_envs, joints): NumPy then steps small batches twice as
+    fast.
+    """
     xp, dtype = namespace(*k), k.kp.dtype
     zeros, off = xp.zeros((num_envs, k.kp.shape[-1]), dtype), (type(None), tuple)
-    return Coefficients(*(leaf if isinstance(leaf, off) else zeros + xp.asarray(leaf, dtype=dtype) for leaf in k))
+    return Coefficients(
+        *(leaf if isinstance(leaf, off) else zeros + xp.asarray(leaf, dtype=dtype) for leaf in k)
+    )

@@ -1,29 +1,33 @@
-r"""Gains per unit of inertia: the law's output is an acceleration, and the robot's mass matrix M(q) makes it an effort.
+r"""Gains per unit of inertia: the law's output is an acceleration, and the robot's mass matrix M(q)
+makes it an effort.
 
-With kp = w^2 and kd = 2 zeta w, all joints of all robots respond in the same way, in every pose, and do not disturb
-each other: u = M(q) a + passive force, computed-torque control (M. W. Spong, S. Hutchinson and M. Vidyasagar, Robot
-Modeling and Control, 2nd ed., section 9.3).
+With kp = w^2 and kd = 2 zeta w, all joints of all robots respond in the same way, in every pose,
+and do not disturb each other: u = M(q) a + passive force, computed-torque control (M. W. Spong, S.
+Hutchinson and M. Vidyasagar, Robot Modeling and Control, 2nd ed., section 9.3).
 
-Where limits apply, clipping each joint of u alone would change the direction of the acceleration and couple the joints
-again. So a is scaled as a whole::
+Where limits apply, clipping each joint of u alone would change the direction of the acceleration
+and couple the joints again. So a is scaled as a whole::
 
     u = s M a + passive,   s = the largest in [0, 1] with all of u within its limits
 
-which keeps its direction (P. J. Campo and M. Morari, "Robust control of processes subject to saturation
-nonlinearities", Computers and Chemical Engineering 14, 1990). From rest the robot stays on the straight line to its
-setpoint, however tight the limits. A joint whose passive force alone exceeds its limit is clipped, and left out of s.
-While s < 1, conditional integration does not integrate further into the direction of a.
+which keeps its direction (P. J. Campo and M. Morari, "Robust control of processes subject to
+saturation nonlinearities", Computers and Chemical Engineering 14, 1990). From rest the robot stays
+on the straight line to its setpoint, however tight the limits. A joint whose passive force alone
+exceeds its limit is clipped, and left out of s. While s < 1, conditional integration does not
+integrate further into the direction of a.
 
 A limit of the effort's rate scales the change of the effort as a whole, for the same reason::
 
     effort = u' + z (u - u'),   z = the largest in [0, 1] with |z (u - u')| <= rate limit * dt in every joint
 
-with the last effort u'. Both efforts are within the limits, and so is each on the line between them. While z < 1,
-conditional integration does not integrate further into the direction of u - effort.
+with the last effort u'. Both efforts are within the limits, and so is each on the line between
+them. While z < 1, conditional integration does not integrate further into the direction of u -
+effort.
 
 A setpoint's acceleration r'' is added to the law's: u = M (a + r'') + passive force.
 
-The time step limits the gains per mass matrix, unless the law is implicit (:mod:`batchpid.law.implicit`).
+The time step limits the gains per mass matrix, unless the law is implicit
+(:mod:`batchpid.law.implicit`).
 """
 
 from __future__ import annotations
@@ -62,11 +66,15 @@ def advance_with_mass_matrix(
     feedforward
         Effort added to the effort of the law [N m or N]: passive force and more.
     """
-    mass_matrix, feedforward, setpoint_acceleration = in_dtype_of(k, mass_matrix, feedforward, setpoint_acceleration)
+    mass_matrix, feedforward, setpoint_acceleration = in_dtype_of(
+        k, mass_matrix, feedforward, setpoint_acceleration
+    )
     rates = measurement_rate, setpoint_rate, given_acceleration(k, setpoint_acceleration)
     new, terms = advance(_unlimited(k), state, setpoint, measurement, *rates)
     new, effort, unsaturated = _to_effort(k, state, new, terms.effort, mass_matrix, feedforward)
-    p, i, d, given = (x if isinstance(x, float) else matrix_vector(mass_matrix, x) for x in terms[:4])
+    p, i, d, given = (
+        x if isinstance(x, float) else matrix_vector(mass_matrix, x) for x in terms[:4]
+    )
     given = given if feedforward is None else given + feedforward
     return new, Terms(p, i, d, given, unsaturated, effort)
 
@@ -90,14 +98,19 @@ def check_gain_units(params: PIDParams) -> None:
     for option, remedy in instead.items():
         if isinstance(params.gain_units, PerMassMatrix) and getattr(params, option) is not None:
             problem = "is not available with gain_units 'mass_matrix'"
-            raise InvalidArgumentError(option, problem, remedy=f"use {remedy}, or gain_units 'effort'")
+            raise InvalidArgumentError(
+                option, problem, remedy=f"use {remedy}, or gain_units 'effort'"
+            )
 
 
-def convert_integral(state: PIDState, old: PIDParams, new: PIDParams, mass_matrix: Array) -> PIDState:
-    """Return ``state`` with the integral I in the unit that ``new`` has, for a bumpless change of gain_units.
+def convert_integral(
+    state: PIDState, old: PIDParams, new: PIDParams, mass_matrix: Array
+) -> PIDState:
+    """Return ``state`` with the integral I in the unit that ``new`` has, for a bumpless change of
+    gain_units.
 
-    I is an acceleration with gain_units "mass_matrix" and an effort otherwise: an effort becomes M^-1 I, an
-    acceleration M I. The integral limits of ``new`` hold.
+    I is an acceleration with gain_units "mass_matrix" and an effort otherwise: an effort becomes
+    M^-1 I, an acceleration M I. The integral limits of ``new`` hold.
 
     Parameters
     ----------
@@ -125,7 +138,9 @@ def _unlimited(k: Coefficients) -> Coefficients:
 def _to_effort(
     k: Coefficients, old: PIDState, new: PIDState, a: Array, mass_matrix: Array, feedforward: Array
 ) -> tuple[PIDState, Any, Any]:
-    """Return the state, the effort of the acceleration ``a`` within the limits of ``k``, and without them."""
+    """Return the state, the effort of the acceleration ``a`` within the limits of ``k``, and
+    without them.
+    """
     xp = namespace(*k, a, mass_matrix)
     low = k.effort_min
     high = k.effort_max
@@ -152,7 +167,9 @@ def _to_effort(
 
 
 def _towards(effort: Array, last: Array, step: Any, xp: ArrayModule) -> Array:
-    """Return the point nearest to ``effort`` on the line from ``last`` that no joint needs more than ``step`` for."""
+    """Return the point nearest to ``effort`` on the line from ``last`` that no joint needs more
+    than ``step`` for.
+    """
     change = effort - last
     size = xp.abs(change)
     late = size > step
@@ -163,7 +180,10 @@ def _towards(effort: Array, last: Array, step: Any, xp: ArrayModule) -> Array:
 
 def _share(wanted: Array, passive: Array, low: Array, high: Array, xp: ArrayModule) -> Array:
     """Return s (envs, 1): the share of ``wanted`` that fits between ``passive`` and the limits."""
-    above, below = (xp.inf if high is None else high - passive), (xp.inf if low is None else passive - low)
+    above, below = (
+        (xp.inf if high is None else high - passive),
+        (xp.inf if low is None else passive - low),
+    )
     room, size = xp.where(wanted > 0, above, below), xp.abs(wanted)
     limited = (size > room) & (room > 0)
     return row_minimum(xp.where(limited, room / xp.where(limited, size, 1.0), 1.0))

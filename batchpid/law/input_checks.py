@@ -1,4 +1,5 @@
-"""Checks of the arguments of the law's pure functions: types, shapes and dtypes, which JAX knows while it traces.
+"""Checks of the arguments of the law's pure functions: types, shapes and dtypes, which JAX knows
+while it traces.
 
 Of the values, only a time step is read.
 """
@@ -25,18 +26,25 @@ DRIVE_LACKS = {
     "deadband": None,
     "non_finite": "propagate",
 }
-"""Options that change P, D or the effort in a way that no target of a drive can, and their values for off."""
+"""Options that change P, D or the effort in a way that no target of a drive can, and their values
+for off.
+"""
 
 
-def checked_inputs(params: PIDParams, state: PIDState, measurement: Array, **inputs: Any) -> list[Any]:
-    """Return ``measurement`` and ``inputs`` as arrays in the params' dtype that broadcast with params and state.
+def checked_inputs(
+    params: PIDParams, state: PIDState, measurement: Array, **inputs: Any
+) -> list[Any]:
+    """Return ``measurement`` and ``inputs`` as arrays in the params' dtype that broadcast with
+    params and state.
 
     None stays None.
     """
     instance("params", params, PIDParams, "build them with make_params")
     instance("state", state, PIDState, "begin with init(params, measurement)")
     arrays = {"measurement": _as_array("measurement", measurement)}
-    arrays |= {name: None if value is None else _as_array(name, value) for name, value in inputs.items()}
+    arrays |= {
+        name: None if value is None else _as_array(name, value) for name, value in inputs.items()
+    }
     of_params = {leaf.shape for leaf in params if leaf is not None and not isinstance(leaf, tuple)}
     known = {"state": [leaf.shape for leaf in state if leaf is not None]}
     known |= {name: [array.shape] for name, array in arrays.items() if array is not None}
@@ -48,37 +56,55 @@ def checked_inputs(params: PIDParams, state: PIDState, measurement: Array, **inp
 
 
 def check_alone(law: Any, measurement_rate: Array) -> None:
-    """Raise InvalidArgumentError if params or coefficients need a mass matrix, or a measured rate that is not given."""
+    """Raise InvalidArgumentError if params or coefficients need a mass matrix, or a measured rate
+    that is not given.
+    """
     if law.gain_units is not None:
-        unit = next(name for name, each in CHOICES["gain_units"].items() if type(each) is type(law.gain_units))
+        unit = next(
+            name
+            for name, each in CHOICES["gain_units"].items()
+            if type(each) is type(law.gain_units)
+        )
         raise InvalidArgumentError(
             "params.gain_units",
-            "are accelerations: without the robot's mass matrix the law cannot turn them into efforts",
+            "are accelerations: without the robot's mass matrix the law cannot turn them into"
+            " efforts",
             value=unit,
-            remedy="use gains in efforts, such as robot.designed('effort'), or a batchpid.sim.Runner",
+            remedy=(
+                "use gains in efforts, such as robot.designed('effort'), or a batchpid.sim.Runner"
+            ),
         )
     if law.measurement_rate is not None and law.kd is not None and measurement_rate is None:
         raise InvalidArgumentError(
             "measurement_rate",
             "is missing: the params have measurement_rate='measured'",
-            remedy="pass the measured velocity, or use params.replace(measurement_rate='difference')",
+            remedy=(
+                "pass the measured velocity, or use params.replace(measurement_rate='difference')"
+            ),
         )
 
 
 def check_drive(params: PIDParams) -> None:
-    """Raise InvalidArgumentError for options of the law that a drive of stiffness kp and damping kd does not have."""
+    """Raise InvalidArgumentError for options of the law that a drive of stiffness kp and damping kd
+    does not have.
+    """
     lacking = {name: off for name, off in DRIVE_LACKS.items() if getattr(params, name) is not None}
     if lacking:
         others = ", ".join(f"{name}={off!r}" for name, off in lacking.items())
         raise InvalidArgumentError(
             f"params.{next(iter(lacking))}",
-            "is not available in a drive, whose effort is kp (target - y) - kd dy/dt within the effort limits",
+            "is not available in a drive, whose effort is kp (target - y) - kd dy/dt within the"
+            " effort limits",
             remedy=f"use params.replace({others}), or the law itself, as control 'pid' does",
         )
 
 
-def _check_shapes(shape: tuple[int, ...], joints: int, known: dict[str, list[tuple[int, ...]]]) -> None:
-    """Raise InvalidArgumentError for the first of ``known`` that does not broadcast with those before and ``shape``."""
+def _check_shapes(
+    shape: tuple[int, ...], joints: int, known: dict[str, list[tuple[int, ...]]]
+) -> None:
+    """Raise InvalidArgumentError for the first of ``known`` that does not broadcast with those
+    before and ``shape``.
+    """
     for name, shapes in known.items():
         try:
             shape = np.broadcast_shapes(shape, *shapes)
@@ -86,7 +112,10 @@ def _check_shapes(shape: tuple[int, ...], joints: int, known: dict[str, list[tup
         except ValueError:
             fits = False
         if not fits:
-            problem = f"has shape {shapes[0]}, which does not fit {shape} of the params and the inputs before it"
+            problem = (
+                f"has shape {shapes[0]}, which does not fit {shape} of the params and the inputs"
+                " before it"
+            )
             raise InvalidArgumentError(name, problem, remedy=f"give (envs, {joints})")
 
 
@@ -109,8 +138,13 @@ def checked_state(state: PIDState, needed: PIDState) -> PIDState:
     """Return ``state`` if it has every leaf that is ``needed``."""
     for name, leaf, need in zip(PIDState._fields, state, needed, strict=True):
         if need and leaf is None:
-            remedy = "begin with init(params, measurement), or take state.matched_to(init(params, measurement))"
-            raise InvalidArgumentError("state", f"has no {name}, which these params need", remedy=remedy)
+            remedy = (
+                "begin with init(params, measurement), or take state.matched_to(init(params,"
+                " measurement))"
+            )
+            raise InvalidArgumentError(
+                "state", f"has no {name}, which these params need", remedy=remedy
+            )
     return state
 
 
@@ -118,21 +152,28 @@ def checked_mask(mask: Array, state: PIDState) -> Array:
     """Return ``mask`` as bools, one for each env of ``state``."""
     array = _as_array("mask", mask, "b")
     if array.dtype.kind != "b":
-        raise InvalidArgumentError("mask", f"must be bools, not {array.dtype}", remedy="give one bool per env")
+        raise InvalidArgumentError(
+            "mask", f"must be bools, not {array.dtype}", remedy="give one bool per env"
+        )
     envs = np.broadcast_shapes(*(leaf.shape for leaf in state if leaf is not None))[:1]
     if array.ndim != 1 or (envs and array.shape != envs):
-        raise InvalidArgumentError("mask", f"has shape {array.shape}, needs {envs}", remedy="give one bool per env")
+        raise InvalidArgumentError(
+            "mask", f"has shape {array.shape}, needs {envs}", remedy="give one bool per env"
+        )
     return array
 
 
 def checked_dt(dt: Array, dtype: DType) -> Array:
-    """Return ``dt`` if it is positive and finite, a number as a float, and NumPy's array in the params' ``dtype``.
+    """Return ``dt`` if it is positive and finite, a number as a float, and NumPy's array in the
+    params' ``dtype``.
 
     A number of NumPy would give its own dtype to the efforts. Values of JAX's arrays are not read.
     """
     if isinstance(dt, np.ndarray) and dt.ndim:
         if dt.dtype.kind not in "iuf" or not ((dt > 0) & (dt < np.inf)).all():
-            raise InvalidArgumentError("dt", "must be positive and finite", value=dt, remedy="use numbers > 0 (s)")
+            raise InvalidArgumentError(
+                "dt", "must be positive and finite", value=dt, remedy="use numbers > 0 (s)"
+            )
         time_step("dt", float(dt.max(initial=0)))
         return dt.astype(dtype, copy=False)
     if isinstance(dt, np.ndarray | np.generic):
@@ -143,6 +184,8 @@ def checked_dt(dt: Array, dtype: DType) -> Array:
 def _as_array(name: str, value: Any, kinds: str = "iuf") -> Array:
     """Return ``value`` as an array of NumPy; arrays of JAX are returned unchanged."""
     is_own = type(value) is np.ndarray
-    if (is_own and value.dtype.kind in kinds) or (not is_own and hasattr(value, "__array_namespace__")):
+    if (is_own and value.dtype.kind in kinds) or (
+        not is_own and hasattr(value, "__array_namespace__")
+    ):
         return value
     return read_array(name, value, kinds)

@@ -1,9 +1,10 @@
 """The parameters of the control law: build, broadcast, validate.
 
-A :class:`PIDParams` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without registration. An option
-that is off is ``None``, which is not a leaf: NumPy skips it and ``jax.jit`` compiles a law without it. Choices without
-a number, such as the unit of the gains, are tuples without fields (:mod:`batchpid.arrays.choices`): part of the tree's
-structure, and so static under every JAX transform.
+A :class:`PIDParams` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without
+registration. An option that is off is ``None``, which is not a leaf: NumPy skips it and ``jax.jit``
+compiles a law without it. Choices without a number, such as the unit of the gains, are tuples
+without fields (:mod:`batchpid.arrays.choices`): part of the tree's structure, and so static under
+every JAX transform.
 """
 
 from __future__ import annotations
@@ -22,15 +23,23 @@ from batchpid.arrays.leaves import LeafBuilder
 from batchpid.checks.validate import is_traced, known_keywords
 from batchpid.errors import InvalidArgumentError
 
-PLAIN = "effort_rate_limit", "derivative_filter_time", "setpoint_weight", "setpoint_weight_derivative", "deadband"
+PLAIN = (
+    "effort_rate_limit",
+    "derivative_filter_time",
+    "setpoint_weight",
+    "setpoint_weight_derivative",
+    "deadband",
+)
 """Options that become a leaf without regard to others."""
 
 
 class PIDParams(NamedTuple):
-    """Parameters of the law. Every leaf is a float array, (1, joints) or (envs, joints); None is off.
+    """Parameters of the law. Every leaf is a float array, (1, joints) or (envs, joints); None is
+    off.
 
-    Build it with :func:`make_params`, change it with :meth:`replace`: both validate, and both take traced gains. The
-    fields have the meaning and the units of the options of :func:`make_params`; those with another form say so.
+    Build it with :func:`make_params`, change it with :meth:`replace`: both validate, and both take
+    traced gains. The fields have the meaning and the units of the options of :func:`make_params`;
+    those with another form say so.
     """
 
     kp: Array
@@ -48,13 +57,17 @@ class PIDParams(NamedTuple):
     tracking_time: Array = None
     """inf on a joint without back-calculation."""
     conditional: Any = None
-    """Conditional integration: Everywhere(), or 1.0 on the joints that have it, 0.0 on the others."""
+    """Conditional integration: Everywhere(), or 1.0 on the joints that have it, 0.0 on the
+    others.
+    """
     continuous: Array = None
     """1.0 on the joints whose position is an angle modulo 2 pi, 0.0 on the others."""
     non_finite: Any = None
     """ZeroEffort() or HoldEffort(); off: non-finite values propagate."""
     measurement_rate: Array = None
-    """MeasuredRate(): whoever runs the law on a robot gives it the measured rate; off: differences of measurements."""
+    """MeasuredRate(): whoever runs the law on a robot gives it the measured rate; off: differences
+    of measurements.
+    """
     gain_units: Any = None
     """PerMassMatrix(): whoever runs the law on a robot converts to efforts; off: efforts."""
     discretization: Any = None
@@ -77,7 +90,9 @@ class PIDParams(NamedTuple):
 
     def for_envs(self, envs: slice | Any) -> PIDParams:
         """Return the params of some envs (a slice or an index array); shared rows stay shared."""
-        return PIDParams(*(leaf[envs] if _is_array(leaf) and leaf.shape[0] > 1 else leaf for leaf in self))
+        return PIDParams(
+            *(leaf[envs] if _is_array(leaf) and leaf.shape[0] > 1 else leaf for leaf in self)
+        )
 
     def for_joints(self, joints: Any) -> PIDParams:
         """Return the params of some joints (an index array or a mask)."""
@@ -87,14 +102,18 @@ class PIDParams(NamedTuple):
         return array_summary(self, "envs", "joints")
 
     def options(self) -> Document:
-        """Return the options that are on, as arguments of :func:`make_params` that build these params again.
+        """Return the options that are on, as arguments of :func:`make_params` that build these
+        params again.
 
-        "clamp" shows as the integral limits that it sets. Where its leaves are traced, anti_windup is left out.
+        "clamp" shows as the integral limits that it sets. Where its leaves are traced, anti_windup
+        is left out.
         """
         options: Document = {}
         for name, leaf in zip(self._fields, self, strict=True):
             if name in CHOICES:
-                (options[name],) = (n for n, chosen in CHOICES[name].items() if type(chosen) is type(leaf))
+                (options[name],) = (
+                    n for n, chosen in CHOICES[name].items() if type(chosen) is type(leaf)
+                )
             elif _is_array(leaf) and name != "conditional":
                 options[name] = leaf if is_traced(leaf) else np.array(leaf)
         if self.continuous is not None:
@@ -105,7 +124,9 @@ class PIDParams(NamedTuple):
                 strategy = np.where(np.isfinite(self.tracking_time), "back_calculation", strategy)
             if self.conditional is not None:
                 everywhere = isinstance(self.conditional, Everywhere)
-                strategy = np.where(everywhere or np.asarray(self.conditional) > 0, "conditional", strategy)
+                strategy = np.where(
+                    everywhere or np.asarray(self.conditional) > 0, "conditional", strategy
+                )
             options["anti_windup"] = strategy
         return {**options, "dtype": np.dtype(self.dtype)}
 
@@ -121,15 +142,22 @@ class PIDParams(NamedTuple):
         if "anti_windup" in options or "anti_windup" not in known:
             known.pop("tracking_time", None)
         params = make_params(self.num_joints, **{**known, **options})
-        if "anti_windup" not in options and "anti_windup" not in known:  # traced: the leaves are kept
+        if (
+            "anti_windup" not in options and "anti_windup" not in known
+        ):  # traced: the leaves are kept
             kept = {"tracking_time": self.tracking_time, "conditional": self.conditional}
-            cast = {name: leaf.astype(params.dtype) if _is_array(leaf) else leaf for name, leaf in kept.items()}
+            cast = {
+                name: leaf.astype(params.dtype) if _is_array(leaf) else leaf
+                for name, leaf in kept.items()
+            }
             params = params._replace(**cast)
             params.check(params.num_envs)
         return params
 
     def check(self, num_envs: int, joint_names: Sequence[str] | None = None) -> None:
-        """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
+        """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits
+        by hand.
+        """
         check_leaves("params", self, FIELDS, num_envs, joint_names)
         for name, leaf in zip(self._fields, self, strict=True):
             if _is_array(leaf) and leaf.dtype != self.dtype:
@@ -167,12 +195,12 @@ def make_params(
 ) -> PIDParams:
     """Build validated :class:`PIDParams`; a number may be a scalar, (joints,) or (envs, joints).
 
-    ``None`` is off. A value that changes nothing anywhere (an infinite limit, a filter time of 0, a deadband of 0,
-    weights b = 1 and c = 0) is off too. A gain of 0 stays: it can be tuned, and an integral of gain 0 can carry
-    the bias of :func:`batchpid.track`.
+    ``None`` is off. A value that changes nothing anywhere (an infinite limit, a filter time of 0, a
+    deadband of 0, weights b = 1 and c = 0) is off too. A gain of 0 stays: it can be tuned, and an
+    integral of gain 0 can carry the bias of :func:`batchpid.track`.
 
-    Numbers may be traced by jax.jit, jax.grad or jax.vmap. Their shapes are checked, their values are not, and an
-    option that is traced is on.
+    Numbers may be traced by jax.jit, jax.grad or jax.vmap. Their shapes are checked, their values
+    are not, and an option that is traced is on.
 
     Parameters
     ----------
@@ -181,40 +209,48 @@ def make_params(
     kp, ki, kd
         Gains >= 0, in effort per position, per position and second, and per position/second.
     effort_limit, effort_min, effort_max
-        Limits of the *total* effort [N m or N]: ``effort_limit=x`` is ``effort_min=-x, effort_max=x``.
+        Limits of the *total* effort [N m or N]: ``effort_limit=x`` is ``effort_min=-x,
+        effort_max=x``.
     effort_rate_limit
-        Largest change of the effort per second, > 0. The first step may go this far from an effort of 0.
+        Largest change of the effort per second, > 0. The first step may go this far from an effort
+        of 0.
     integral_limit, integral_min, integral_max
         Limits of the integral term, in effort units.
     derivative_filter_time
         Time constant of the derivative's first-order low-pass [s]; 0: unfiltered.
     setpoint_weight, setpoint_weight_derivative
-        b and c: with setpoint r and measurement y, the proportional term acts on b r - y, with positions from the first
-        measurement, the derivative on c r - y.
+        b and c: with setpoint r and measurement y, the proportional term acts on b r - y, with
+        positions from the first measurement, the derivative on c r - y.
     deadband
-        Half width of the dead zone: within it P and I act on an error of 0, outside on the distance to the zone.
+        Half width of the dead zone: within it P and I act on an error of 0, outside on the distance
+        to the zone.
     anti_windup
-        "none", "clamp" (limit the integral, to the effort limits unless integral limits are given), "conditional"
-        (do not integrate further into saturation) or "back_calculation"; or a nested list of these of shape
-        (joints,) or (envs, joints).
+        "none", "clamp" (limit the integral, to the effort limits unless integral limits are given),
+        "conditional" (do not integrate further into saturation) or "back_calculation"; or a nested
+        list of these of shape (joints,) or (envs, joints).
     tracking_time
-        Time constant of back-calculation [s]; one below the time step corrects the whole excess in one step.
-        None: sqrt(kd/ki), or kp/ki without kd (K. J. Astrom and T. Hagglund, Advanced PID Control, 2006, sec. 3.5).
+        Time constant of back-calculation [s]; one below the time step corrects the whole excess in
+        one step. None: sqrt(kd/ki), or kp/ki without kd (K. J. Astrom and T. Hagglund, Advanced PID
+        Control, 2006, sec. 3.5).
     continuous
-        Bools: joints whose position is an angle modulo 2 pi [rad]; errors and differences take the short way round.
+        Bools: joints whose position is an angle modulo 2 pi [rad]; errors and differences take the
+            short way round.
     non_finite
-        What to do with a joint whose input is NaN or inf: "propagate" it (no check, no cost), or keep the state and
-        command "zero" effort, or "hold" the last effort.
+        What to do with a joint whose input is NaN or inf: "propagate" it (no check, no cost), or
+        keep the state and command "zero" effort, or "hold" the last effort.
     measurement_rate
-        Rate of the measurement that the derivative uses: "difference" of successive measurements, or "measured": the
-        velocity that :class:`batchpid.sim.Runner` reads from the simulator. The pure law refuses a call without it.
+        Rate of the measurement that the derivative uses: "difference" of successive measurements,
+        or "measured": the velocity that :class:`batchpid.sim.Runner` reads from the simulator. The
+        pure law refuses a call without it.
     gain_units
         "effort" per position, ...; or per "mass_matrix": gains of an acceleration, which
-        :class:`batchpid.sim.Runner` turns into an effort at the robot's pose (:mod:`batchpid.law.computed_torque`).
+        :class:`batchpid.sim.Runner` turns into an effort at the robot's pose
+        (:mod:`batchpid.law.computed_torque`).
     discretization
-        "explicit": P, I and D act on position and velocity at the beginning of the step, which is unstable at large
-        gains or time steps; "implicit": on those at its end (:mod:`batchpid.law.implicit`), stable at any time step.
-        It needs gain_units "mass_matrix" and no derivative_filter_time; without kd, kd is 0.
+        "explicit": P, I and D act on position and velocity at the beginning of the step, which is
+        unstable at large gains or time steps; "implicit": on those at its end
+        (:mod:`batchpid.law.implicit`), stable at any time step. It needs gain_units "mass_matrix"
+        and no derivative_filter_time; without kd, kd is 0.
     joint_names
         Used in error messages.
     dtype
@@ -225,20 +261,30 @@ def make_params(
     InvalidArgumentError
         Naming the option, joint, env and value.
     """
-    # The options of one kind are read from the tables of fields, by name; only limits and anti-windup belong together.
+    # The options of one kind are read from the tables of fields, by name; only limits and
+    # anti-windup belong together.
     given = locals()
     build = LeafBuilder(joints, joint_names, dtype, given.values())
     if kp is None:
-        raise InvalidArgumentError("kp", "is missing", remedy="give the proportional gain, 0 for none")
-    p, i, d = (build.array(name, gain, FIELDS[name]) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd)))
+        raise InvalidArgumentError(
+            "kp", "is missing", remedy="give the proportional gain, 0 for none"
+        )
+    p, i, d = (
+        build.array(name, gain, FIELDS[name]) for name, gain in (("kp", kp), ("ki", ki), ("kd", kd))
+    )
     options = {name: build.option(name, given[name], FIELDS[name]) for name in PLAIN}
     chosen = {name: build.choice(name, given[name]) for name in CHOICES}
     if chosen["discretization"] is not None:
         _check_implicit(chosen["gain_units"], options["derivative_filter_time"])
         d = build.array("kd", 0.0, FIELDS["kd"]) if d is None else d
-    effort_ends = build.limits(effort_limit=effort_limit, effort_min=effort_min, effort_max=effort_max)
-    integral_ends = build.limits(integral_limit=integral_limit, integral_min=integral_min, integral_max=integral_max)
-    # The joints may have different strategies: each becomes an array of the joints that use it, or None for none.
+    effort_ends = build.limits(
+        effort_limit=effort_limit, effort_min=effort_min, effort_max=effort_max
+    )
+    integral_ends = build.limits(
+        integral_limit=integral_limit, integral_min=integral_min, integral_max=integral_max
+    )
+    # The joints may have different strategies: each becomes an array of the joints that use it, or
+    # None for none.
     clamp, conditional, back = build.strategies(anti_windup)
     integral_ends = build.clamped(clamp, integral_ends, effort_ends)
     names = "kp", "ki", "kd", "effort_min", "effort_max", "integral_min", "integral_max"
@@ -246,7 +292,11 @@ def make_params(
     return PIDParams(
         **dict(zip(names, leaves, strict=True)),
         tracking_time=build.tracking_time(tracking_time, back, p, i, d),
-        conditional=Everywhere() if conditional is not None and conditional.all() else build.freeze(conditional),
+        conditional=(
+            Everywhere()
+            if conditional is not None and conditional.all()
+            else build.freeze(conditional)
+        ),
         continuous=build.mask("continuous", continuous),
         **options,
         **chosen,
@@ -266,8 +316,13 @@ def _check_implicit(gain_units: Any, filter_time: Array) -> None:
     """Raise InvalidArgumentError for options that the implicit law does not have."""
     if not isinstance(gain_units, PerMassMatrix):
         problem = "'implicit' predicts accelerations, which needs gain_units 'mass_matrix'"
-        raise InvalidArgumentError("discretization", problem, remedy="use these gain_units, or 'explicit'")
+        raise InvalidArgumentError(
+            "discretization", problem, remedy="use these gain_units, or 'explicit'"
+        )
     if filter_time is not None:
-        problem = "is not available with discretization 'implicit', which predicts with the unfiltered rate"
+        problem = (
+            "is not available with discretization 'implicit', which predicts with the unfiltered"
+            " rate"
+        )
         remedy = "leave it out or 0: the implicit law is stable without; or use 'explicit'"
         raise InvalidArgumentError("derivative_filter_time", problem, remedy=remedy)

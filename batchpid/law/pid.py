@@ -14,15 +14,17 @@ With setpoint r, measurement y and step dt, per env and joint::
     I     <- I + ki e dt   unless (u - effort) e > 0            conditional integration
     I     <- min(max(I, integral_min), integral_max)            clamp
 
-A prime is the value of the step before. I is in effort units, so a change of ki is bumpless. The effort is computed
-before I includes the present error. Saturation is on the total effort, which the motor delivers. After K. J. Astrom and
-T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and 13; conditional integration and the order of the two
-stages as in ros-controls/control_toolbox, src/pid.cpp. With discretization "implicit" the law is this one with other
-coefficients: :mod:`batchpid.law.implicit`.
+A prime is the value of the step before. I is in effort units, so a change of ki is bumpless. The
+effort is computed before I includes the present error. Saturation is on the total effort, which the
+motor delivers. After K. J. Astrom and T. Hagglund, Advanced PID Control (ISA, 2006), chapters 3 and
+13; conditional integration and the order of the two stages as in ros-controls/control_toolbox,
+src/pid.cpp. With discretization "implicit" the law is this one with other coefficients:
+:mod:`batchpid.law.implicit`.
 
-The moving origin is our own addition. With r = o + s, P = kp (o + b s - y): o, the motion that a rate describes, is
-followed with full weight, and the rest s, a step, is approached with weight b. Without a rate all motion counts as
-steps, and a moving setpoint is followed with a lag of kp (1 - b) / ki.
+The moving origin is our own addition. With r = o + s, P = kp (o + b s - y): o, the motion that a
+rate describes, is followed with full weight, and the rest s, a step, is approached with weight b.
+Without a rate all motion counts as steps, and a moving setpoint is followed with a lag of kp (1 -
+b) / ki.
 """
 
 from __future__ import annotations
@@ -31,9 +33,24 @@ from typing import Any
 
 from batchpid.arrays.array_types import Array, ArrayModule
 from batchpid.arrays.choices import Everywhere, HoldEffort
-from batchpid.arrays.elementwise import clip, flush, in_dtype_of, namespace, nearest_turn, replace_envs, wrap
+from batchpid.arrays.elementwise import (
+    clip,
+    flush,
+    in_dtype_of,
+    namespace,
+    nearest_turn,
+    replace_envs,
+    wrap,
+)
 from batchpid.law.coefficients import Coefficients, discretise
-from batchpid.law.input_checks import check_alone, check_drive, checked_inputs, checked_mask, checked_state, needs
+from batchpid.law.input_checks import (
+    check_alone,
+    check_drive,
+    checked_inputs,
+    checked_mask,
+    checked_state,
+    needs,
+)
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState, Terms
 
@@ -41,7 +58,8 @@ from batchpid.law.state import PIDState, Terms
 def init(params: PIDParams, measurement: Array) -> PIDState:
     """Return the state before the first step.
 
-    Derivative and setpoint weighting start from ``measurement`` (envs, joints) [rad or m]: the first step has no kick.
+    Derivative and setpoint weighting start from ``measurement`` (envs, joints) [rad or m]: the
+    first step has no kick.
 
     Raises InvalidArgumentError if the measurement has another number of joints than the params.
     """
@@ -57,7 +75,9 @@ def init(params: PIDParams, measurement: Array) -> PIDState:
     state = PIDState(**leaves)
     if params.ki is None:
         return state
-    return state._replace(integral=clip(state.integral, params.integral_min, params.integral_max, xp))
+    return state._replace(
+        integral=clip(state.integral, params.integral_min, params.integral_max, xp)
+    )
 
 
 def step(
@@ -73,8 +93,8 @@ def step(
 ) -> tuple[PIDState, Any]:
     """Advance the law by ``dt`` seconds; return the state and the effort.
 
-    Arrays are (envs, joints), or (1, joints) for all envs, and taken in the params' dtype, which state and effort have;
-    none is written to.
+    Arrays are (envs, joints), or (1, joints) for all envs, and taken in the params' dtype, which
+    state and effort have; none is written to.
 
     Parameters
     ----------
@@ -85,32 +105,50 @@ def step(
     measurement_rate
         dy/dt, if measured [rad/s or m/s]; None: the difference quotient of the measurement.
     setpoint_rate
-        dr/dt at the time of the setpoint, if known. It moves the origin o, and enters the derivative with weight c, or
-        1 if c is off. None: the difference quotient of the setpoint, or 0 if c is off.
+        dr/dt at the time of the setpoint, if known. It moves the origin o, and enters the
+        derivative with weight c, or 1 if c is off. None: the difference quotient of the setpoint,
+        or 0 if c is off.
     feedforward
         Effort added before saturation [N m or N]: passive force, acceleration feedforward, ...
 
     Raises
     ------
     InvalidArgumentError
-        If dt is not positive, or above 1 s, a shape does not fit, the state lacks an array that the params need, or the
-        params have gain_units other than "effort" or ask for a measured rate that is not given.
+        If dt is not positive, or above 1 s, a shape does not fit, the state lacks an array that the
+        params need, or the params have gain_units other than "effort" or ask for a measured rate
+        that is not given.
     """
-    inputs = {"measurement_rate": measurement_rate, "setpoint_rate": setpoint_rate, "feedforward": feedforward}
+    inputs = {
+        "measurement_rate": measurement_rate,
+        "setpoint_rate": setpoint_rate,
+        "feedforward": feedforward,
+    }
     state, terms = _step(params, state, setpoint, measurement, dt, **inputs)
     return state, terms.effort
 
 
 def step_terms(
-    params: PIDParams, state: PIDState, setpoint: Array, measurement: Array, dt: Array, **inputs: Any
+    params: PIDParams,
+    state: PIDState,
+    setpoint: Array,
+    measurement: Array,
+    dt: Array,
+    **inputs: Any,
 ) -> tuple[PIDState, Terms]:
-    """Advance the law as :func:`step`, with the same arguments; return the state and all terms, effort included."""
+    """Advance the law as :func:`step`, with the same arguments; return the state and all terms,
+    effort included.
+    """
     state, terms = _step(params, state, setpoint, measurement, dt, **inputs)
     return state, terms.filled()
 
 
 def _step(
-    params: PIDParams, state: PIDState, setpoint: Array, measurement: Array, dt: Array, **inputs: Any
+    params: PIDParams,
+    state: PIDState,
+    setpoint: Array,
+    measurement: Array,
+    dt: Array,
+    **inputs: Any,
 ) -> tuple[PIDState, Terms]:
     """Check the arguments of a step and advance the law."""
     r, y, inputs = _checked(params, state, setpoint, measurement, inputs)
@@ -118,9 +156,15 @@ def _step(
 
 
 def _checked(
-    params: PIDParams, state: PIDState, setpoint: Array, measurement: Array, inputs: dict[str, Array]
+    params: PIDParams,
+    state: PIDState,
+    setpoint: Array,
+    measurement: Array,
+    inputs: dict[str, Array],
 ) -> tuple[Array, Array, dict[str, Array]]:
-    """Return setpoint, measurement and inputs of a step as arrays that fit the params and the state."""
+    """Return setpoint, measurement and inputs of a step as arrays that fit the params and the
+    state.
+    """
     y, r, *rest = checked_inputs(params, state, measurement, setpoint=setpoint, **inputs)
     checked_state(state, needs(params))
     return r, y, dict(zip(inputs, rest, strict=True))
@@ -135,22 +179,28 @@ def advance(
     setpoint_rate: Array = None,
     feedforward: Array = None,
 ) -> tuple[PIDState, Terms]:
-    """Advance the law with given coefficients, for loops with constant params; return the state and the terms.
+    """Advance the law with given coefficients, for loops with constant params; return the state and
+    the terms.
 
-    It takes the arguments of :func:`step`, as arrays. A term may be an array of the caller: :meth:`Terms.filled`.
+    It takes the arguments of :func:`step`, as arrays. A term may be an array of the caller:
+    :meth:`Terms.filled`.
 
-    Raises InvalidArgumentError if the coefficients are of gain_units other than "effort", or need a measured rate that
-    is not given. Gains per mass matrix: :mod:`batchpid.law.computed_torque`.
+    Raises InvalidArgumentError if the coefficients are of gain_units other than "effort", or need a
+    measured rate that is not given. Gains per mass matrix: :mod:`batchpid.law.computed_torque`.
     """
     check_alone(k, measurement_rate)
     xp = namespace(*k, *state, setpoint, measurement, measurement_rate, setpoint_rate, feedforward)
-    r, y, r_rate, y_rate, ff = in_dtype_of(k, setpoint, measurement, setpoint_rate, measurement_rate, feedforward)
+    r, y, r_rate, y_rate, ff = in_dtype_of(
+        k, setpoint, measurement, setpoint_rate, measurement_rate, feedforward
+    )
     finite = None
     if k.non_finite is not None:
         finite = xp.isfinite(r) & xp.isfinite(y)
         for optional in (r_rate, y_rate, ff):
             finite = finite if optional is None else finite & xp.isfinite(optional)
-        r, y, r_rate, y_rate, ff = (None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff))
+        r, y, r_rate, y_rate, ff = (
+            None if x is None else xp.where(finite, x, 0) for x in (r, y, r_rate, y_rate, ff)
+        )
 
     error = wrapped_error(k, r, y, xp)
     origin, moved_origin = origins(k, state, y, r_rate, xp)
@@ -167,12 +217,18 @@ def advance(
 
     d, derivative = 0.0, None
     if k.kd is not None:
-        rate = -y_rate if y_rate is not None else wrap(state.measurement - y, k.turns, xp) * k.per_dt
+        rate = (
+            -y_rate if y_rate is not None else wrap(state.measurement - y, k.turns, xp) * k.per_dt
+        )
         if r_rate is not None:
             rate = rate + weighted_rate(k, r_rate)
         elif k.c is not None:
-            rate = rate + k.c * state.setpoint_seen * wrap(r - state.setpoint, k.turns, xp) * k.per_dt
-        derivative = rate if k.decay is None else flush(k.decay * state.derivative + k.intake * rate, k.tiny)
+            rate = (
+                rate + k.c * state.setpoint_seen * wrap(r - state.setpoint, k.turns, xp) * k.per_dt
+            )
+        derivative = (
+            rate if k.decay is None else flush(k.decay * state.derivative + k.intake * rate, k.tiny)
+        )
         d = k.kd * derivative
         u = u + d
     if ff is not None:
@@ -195,7 +251,9 @@ def advance(
 
     new = PIDState(
         integral=integral,
-        measurement=None if state.measurement is None else y.copy(),  # the caller may reuse its buffer
+        measurement=(
+            None if state.measurement is None else y.copy()
+        ),  # the caller may reuse its buffer
         derivative=None if state.derivative is None else derivative,
         setpoint=None if state.setpoint is None else r + xp.zeros_like(y),
         setpoint_seen=None if state.setpoint_seen is None else xp.ones_like(y),
@@ -203,19 +261,32 @@ def advance(
         origin=moved_origin,
     )
     if finite is not None:
-        new = PIDState(*(None if n is None else xp.where(finite, n, o) for n, o in zip(new, state, strict=True)))
-        effort = xp.where(finite, effort, state.effort if isinstance(k.non_finite, HoldEffort) else 0)
+        new = PIDState(
+            *(
+                None if n is None else xp.where(finite, n, o)
+                for n, o in zip(new, state, strict=True)
+            )
+        )
+        effort = xp.where(
+            finite, effort, state.effort if isinstance(k.non_finite, HoldEffort) else 0
+        )
         u = xp.where(finite, u, effort)  # no limit has changed that
     return new, Terms(p, i, d, 0.0 if ff is None else ff, u, effort, finite=finite)
 
 
 def reset(
-    params: PIDParams, state: PIDState, measurement: Array, mask: Array, *, keep_integral: bool = False
+    params: PIDParams,
+    state: PIDState,
+    measurement: Array,
+    mask: Array,
+    *,
+    keep_integral: bool = False,
 ) -> PIDState:
-    """Return the state with the envs of ``mask`` (envs,) bool restarted from ``measurement`` (envs, joints).
+    """Return the state with the envs of ``mask`` (envs,) bool restarted from ``measurement`` (envs,
+    joints).
 
-    ``keep_integral`` keeps their integral term, e.g. a learnt load. Raises InvalidArgumentError if a shape does not
-    fit, or the mask is not of bools.
+    ``keep_integral`` keeps their integral term, e.g. a learnt load. Raises InvalidArgumentError if
+    a shape does not fit, or the mask is not of bools.
     """
     (measurement,) = checked_inputs(params, state, measurement)
     mask = checked_mask(mask, state)
@@ -237,10 +308,14 @@ def weighted_rate(k: Coefficients, r_rate: Array) -> Array:
     return r_rate if weight is None else weight * r_rate
 
 
-def origins(k: Coefficients, state: PIDState, y: Array, r_rate: Array, xp: ArrayModule) -> tuple[Array, Array]:
-    """Return the origins of setpoint weighting for this step and the next, moved by the whole turns that y jumped.
+def origins(
+    k: Coefficients, state: PIDState, y: Array, r_rate: Array, xp: ArrayModule
+) -> tuple[Array, Array]:
+    """Return the origins of setpoint weighting for this step and the next, moved by the whole turns
+    that y jumped.
 
-    A given rate moves it. The implicit law takes the setpoint, and so its origin, at the end of the step.
+    A given rate moves it. The implicit law takes the setpoint, and so its origin, at the end of the
+    step.
     """
     origin = state.origin
     if origin is not None and k.turns is not None:
@@ -258,23 +333,30 @@ def proportional(k: Coefficients, error: Array, y: Array, origin: Array) -> Arra
 
 
 def drive_target(
-    params: PIDParams, state: PIDState, setpoint: Array, measurement: Array, dt: Array, **inputs: Any
+    params: PIDParams,
+    state: PIDState,
+    setpoint: Array,
+    measurement: Array,
+    dt: Array,
+    **inputs: Any,
 ) -> tuple[PIDState, Any]:
-    """Return ``(state, target)``: the position target that makes a PD drive of stiffness kp act as a PID::
+    """Return ``(state, target)``: the position target that makes a PD drive of stiffness kp act as
+    a PID::
 
         target = setpoint + I / kp          so that kp (target - y) - kd dy/dt = P + I + D
 
-    The drive (SAPIEN's ``set_drive_property(stiffness=kp, damping=kd)``) integrates P and D implicitly and is as
-    stable as without I. I evolves as in :func:`batchpid.step`, whose effort predicts the drive's effort:
-    ``effort_min`` and ``effort_max`` are the drive's force limit, and anti-windup works against it. Where kp is 0 the
-    target is the setpoint.
+    The drive (SAPIEN's ``set_drive_property(stiffness=kp, damping=kd)``) integrates P and D
+    implicitly and is as stable as without I. I evolves as in :func:`batchpid.step`, whose effort
+    predicts the drive's effort: ``effort_min`` and ``effort_max`` are the drive's force limit, and
+    anti-windup works against it. Where kp is 0 the target is the setpoint.
 
-    Arrays and the optional ``inputs`` measurement_rate, setpoint_rate and feedforward (an effort added to
-    the drive's, inside the same limit) are as in :func:`batchpid.step`. The idea is from the SAPIEN authors' answer
-    in haosulab/SAPIEN#178.
+    Arrays and the optional ``inputs`` measurement_rate, setpoint_rate and feedforward (an effort
+    added to the drive's, inside the same limit) are as in :func:`batchpid.step`. The idea is from
+    the SAPIEN authors' answer in haosulab/SAPIEN#178.
 
-    Raises InvalidArgumentError as :func:`batchpid.step`, and for options that a drive does not have: setpoint weights,
-    a filter of the derivative, a dead zone, a limit of the effort's rate, and a policy for non-finite inputs.
+    Raises InvalidArgumentError as :func:`batchpid.step`, and for options that a drive does not
+    have: setpoint weights, a filter of the derivative, a dead zone, a limit of the effort's rate,
+    and a policy for non-finite inputs.
     """
     r, y, inputs = _checked(params, state, setpoint, measurement, inputs)
     check_drive(params)
@@ -284,7 +366,8 @@ def drive_target(
 def advance_drive(
     k: Coefficients, state: PIDState, setpoint: Array, measurement: Array, **inputs: Any
 ) -> tuple[PIDState, Any]:
-    """Return ``(state, target)`` with given coefficients, for loops with constant params; else as :func:`drive_target`.
+    """Return ``(state, target)`` with given coefficients, for loops with constant params; else as
+    :func:`drive_target`.
 
     It takes the arguments of :func:`advance`.
     """

@@ -39,7 +39,9 @@ class PIDState(NamedTuple):
         return {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
 
     def matched_to(self, fresh: PIDState) -> PIDState:
-        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the others dropped."""
+        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the
+        others dropped.
+        """
         both = zip(self, fresh, strict=True)
         return PIDState(*(new if new is None or old is None else old for old, new in both))
 
@@ -47,7 +49,8 @@ class PIDState(NamedTuple):
 class Terms(NamedTuple):
     """Terms of the law in one step, each (envs, joints); 0 for a term that is off.
 
-    :func:`batchpid.advance` leaves out what :meth:`filled` computes: 0.0 is a term that is off, and None a mask.
+    :func:`batchpid.advance` leaves out what :meth:`filled` computes: 0.0 is a term that is off, and
+    None a mask.
     """
 
     p: Array
@@ -71,7 +74,9 @@ class Terms(NamedTuple):
         """Return all terms as new arrays (envs, joints), but for the effort."""
         xp, finite = namespace(*self), self.finite
         zero = xp.zeros_like(self.effort)
-        p, i, d, given, whole = (zero + x if finite is None else xp.where(finite, x, zero) for x in self[:5])
+        p, i, d, given, whole = (
+            zero + x if finite is None else xp.where(finite, x, zero) for x in self[:5]
+        )
         finite = xp.isfinite(self.unsaturated) if finite is None else finite
         return Terms(p, i, d, given, whole, self.effort, self.effort != self.unsaturated, finite)
 

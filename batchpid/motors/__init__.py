@@ -1,6 +1,8 @@
-"""Actuators and sensors between the controller and the joints: delay, lag, envelope, strength, resolution.
+"""Actuators and sensors between the controller and the joints: delay, lag, envelope, strength,
+resolution.
 
-Build parameters with :func:`make_actuators`; thread a state through :func:`deliver` and :func:`measure`::
+Build parameters with :func:`make_actuators`; thread a state through :func:`deliver` and
+:func:`measure`::
 
     actuators = bp.make_actuators(joints=7, command_delay=0.005, strength=0.9)
     state = bp.motors.init(actuators, qpos, dt)
@@ -24,7 +26,12 @@ from batchpid.motors.actuator_dynamics import (
     measure,
     measurement_noise,
 )
-from batchpid.motors.actuator_files import dumps_actuators, load_actuators, loads_actuators, save_actuators
+from batchpid.motors.actuator_files import (
+    dumps_actuators,
+    load_actuators,
+    loads_actuators,
+    save_actuators,
+)
 from batchpid.motors.actuator_state import ActuatorState
 from batchpid.motors.actuators import DRIVEN, JOINT_SIDE, Actuators, check_actuators, make_actuators
 from batchpid.motors.coupling import Coupling, Follower

@@ -1,7 +1,8 @@
-r"""From the effort asked for to the effort delivered, and from the joint's state to its measurement.
+r"""From the effort asked for to the effort delivered, and from the joint's state to its
+measurement.
 
-Pure functions on (envs, joints), for NumPy and JAX. At each step, with the joint's position q and velocity v, and the
-effort u that the controller asks for::
+Pure functions on (envs, joints), for NumPy and JAX. At each step, with the joint's position q and
+velocity v, and the effort u that the controller asks for::
 
     x      = q + min(max(x' - q, -B/2), B/2)               backlash: the sensor is dragged along
     v_x    = v, 0 within the play
@@ -15,14 +16,15 @@ effort u that the controller asks for::
 A command u is delivered unclipped, where nothing is late, if (low - b) / s <= u <= (high - b) / s:
 :func:`command_limits`.
 
-A prime is the value of the step before. The play is the backlash hysteresis (G. Tao and P. Kokotovic, Adaptive Control
-of Systems with Actuator and Sensor Nonlinearities, Wiley, 1996, chapter 2). Friction and armature are the simulator's:
-see :mod:`batchpid.motors.friction`.
+A prime is the value of the step before. The play is the backlash hysteresis (G. Tao and P.
+Kokotovic, Adaptive Control of Systems with Actuator and Sensor Nonlinearities, Wiley, 1996, chapter
+2). Friction and armature are the simulator's: see :mod:`batchpid.motors.friction`.
 
-A new effect is, in :mod:`batchpid.motors.actuators`, an argument of ``make_actuators`` with its ``Field`` and an entry
-in the docstring, and a field of :class:`Actuators` of the same name. Here it is a field of :class:`MotorCoefficients`,
-a value in :func:`discretise`, and a term in ``_delivered`` (motor), ``_play`` or ``_encode`` (sensor). An effect that
-changes the limits of commands has a term in :func:`command_limits`, too. Terms may use the operations of
+A new effect is, in :mod:`batchpid.motors.actuators`, an argument of ``make_actuators`` with its
+``Field`` and an entry in the docstring, and a field of :class:`Actuators` of the same name. Here it
+is a field of :class:`MotorCoefficients`, a value in :func:`discretise`, and a term in
+``_delivered`` (motor), ``_play`` or ``_encode`` (sensor). An effect that changes the limits of
+commands has a term in :func:`command_limits`, too. Terms may use the operations of
 :mod:`batchpid.native.operations` only, so that they also run in JAX and in native code.
 """
 
@@ -47,7 +49,9 @@ _ONE = np.uint32(1)
 
 
 class MotorCoefficients(NamedTuple):
-    """:class:`Actuators` at one time step, in the symbols of :mod:`batchpid.motors.actuator_dynamics`; None is off."""
+    """:class:`Actuators` at one time step, in the symbols of
+    :mod:`batchpid.motors.actuator_dynamics`; None is off.
+    """
 
     command: delay.Delay | None = None
     position_delay: delay.Delay | None = None
@@ -73,7 +77,9 @@ class MotorCoefficients(NamedTuple):
 
     def __repr__(self) -> str:
         delays = {"command": None, "position_delay": None, "velocity_delay": None}
-        return array_summary(self._replace(**delays, envelope=None, commands=None), "envs", "joints")
+        return array_summary(
+            self._replace(**delays, envelope=None, commands=None), "envs", "joints"
+        )
 
 
 def init(
@@ -87,23 +93,28 @@ def init(
     episode: Any = 0,
     samples: int | None = None,
 ) -> ActuatorState:
-    """Return the state of actuators that have been at rest: with ``qpos`` measured and ``effort`` asked so far.
+    """Return the state of actuators that have been at rest: with ``qpos`` measured and ``effort``
+    asked so far.
 
     Parameters
     ----------
     qpos, qvel, effort
-        Position [rad or m], velocity and effort [N m or N] (envs, joints) so far; velocity and effort are 0 by default.
+        Position [rad or m], velocity and effort [N m or N] (envs, joints) so far; velocity and
+        effort are 0 by default.
     dt
         Time step [s].
     envs, episode
-        Number of each env, default 0, 1, ..., and of its episode (envs,): the noise depends on both.
+        Number of each env, default 0, 1, ..., and of its episode (envs,): the noise depends on
+        both.
     samples
-        Length of the histories, at least 2; None: as long as ``max_delay`` needs. Needed where that is traced by JAX.
+        Length of the histories, at least 2; None: as long as ``max_delay`` needs. Needed where that
+        is traced by JAX.
 
     Raises
     ------
     InvalidArgumentError
-        dt is not positive, or above 1 s; ``max_delay`` is traced and ``samples`` is missing, or it needs too many.
+        dt is not positive, or above 1 s; ``max_delay`` is traced and ``samples`` is missing, or it
+        needs too many.
     """
     check_time_step("dt", dt)
     qpos, qvel, effort = in_dtype_of(actuators, qpos, qvel, effort)
@@ -129,23 +140,34 @@ def init(
     if actuators.lag is None:
         return state
     k = discretise(actuators, state, dt)
-    return state._replace(effort=clip(_motor(k, asked), *limits(k.envelope, position, velocity), xp) + zeros)
+    return state._replace(
+        effort=clip(_motor(k, asked), *limits(k.envelope, position, velocity), xp) + zeros
+    )
 
 
-def discretise(actuators: Actuators, state: ActuatorState, dt: Array, num_envs: int | None = None) -> MotorCoefficients:
-    """Return the coefficients at ``dt`` [s], for :func:`advance_effort` and :func:`advance_measurement`.
+def discretise(
+    actuators: Actuators, state: ActuatorState, dt: Array, num_envs: int | None = None
+) -> MotorCoefficients:
+    """Return the coefficients at ``dt`` [s], for :func:`advance_effort` and
+    :func:`advance_measurement`.
 
-    With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches faster. Raises
-    InvalidArgumentError if dt is a number that is not positive, or above 1 s.
+    With ``num_envs`` each is spread to (num_envs, joints), which lets NumPy step small batches
+    faster. Raises InvalidArgumentError if dt is a number that is not positive, or above 1 s.
     """
     check_time_step("dt", dt)
     a, xp = actuators, namespace(*actuators)
     position = velocity = None
     if a.sensor_delay is not None:
         begins = 0, a.sensor_delay.shape[1]
-        position, velocity = (delay.discretise(a.sensor_delay, dt, state.sensor, begin) for begin in begins)
+        position, velocity = (
+            delay.discretise(a.sensor_delay, dt, state.sensor, begin) for begin in begins
+        )
     k = MotorCoefficients(
-        command=None if a.command_delay is None else delay.discretise(a.command_delay, dt, state.command),
+        command=(
+            None
+            if a.command_delay is None
+            else delay.discretise(a.command_delay, dt, state.command)
+        ),
         position_delay=position,
         velocity_delay=velocity,
         envelope=envelope(a),
@@ -177,10 +199,11 @@ def discretise(actuators: Actuators, state: ActuatorState, dt: Array, num_envs: 
 def deliver(
     actuators: Actuators, state: ActuatorState, effort: Array, qpos: Array, qvel: Array, dt: Array
 ) -> tuple[ActuatorState, Any]:
-    """Advance the motors by ``dt`` seconds; return ``(state, effort)``, the effort delivered [N m or N].
+    """Advance the motors by ``dt`` seconds; return ``(state, effort)``, the effort delivered [N m
+    or N].
 
-    ``effort`` is that asked for [N m or N], ``qpos`` and ``qvel`` are the joints' true positions [rad or m] and
-    velocities, all (envs, joints); none is written to.
+    ``effort`` is that asked for [N m or N], ``qpos`` and ``qvel`` are the joints' true positions
+    [rad or m] and velocities, all (envs, joints); none is written to.
     """
     inputs = in_dtype_of(actuators, effort, qpos, qvel)
     return advance_effort(discretise(actuators, state, dt), state, *inputs)
@@ -189,15 +212,20 @@ def deliver(
 def measure(
     actuators: Actuators, state: ActuatorState, qpos: Array, qvel: Array, dt: Array
 ) -> tuple[ActuatorState, Any, Any]:
-    """Advance the sensors by ``dt`` seconds; return ``(state, qpos, qvel)`` as measured (envs, joints).
+    """Advance the sensors by ``dt`` seconds; return ``(state, qpos, qvel)`` as measured (envs,
+    joints).
 
     ``qpos`` and ``qvel`` are the true positions [rad or m] and velocities; none is written to.
     """
-    return advance_measurement(discretise(actuators, state, dt), state, *in_dtype_of(actuators, qpos, qvel))
+    return advance_measurement(
+        discretise(actuators, state, dt), state, *in_dtype_of(actuators, qpos, qvel)
+    )
 
 
 class Stages(NamedTuple):
-    """Elementwise parts of a step, functions of coefficients and arrays (envs, joints); a loop may compile them."""
+    """Elementwise parts of a step, functions of coefficients and arrays (envs, joints); a loop may
+    compile them.
+    """
 
     delivered: Callable[..., tuple[Any]]
     """Effort of the step before, effort asked for, position and velocity -> effort delivered."""
@@ -215,8 +243,12 @@ def _motor(k: MotorCoefficients, effort: Array) -> Array:
     return effort if k.bias is None else effort + k.bias
 
 
-def _delivered(k: MotorCoefficients, behind: Any, effort: Array, qpos: Array, qvel: Array) -> tuple[Array]:
-    """Return s u + b within the envelope, after the lag; ``behind`` is the effort of the step before, None without."""
+def _delivered(
+    k: MotorCoefficients, behind: Any, effort: Array, qpos: Array, qvel: Array
+) -> tuple[Array]:
+    """Return s u + b within the envelope, after the lag; ``behind`` is the effort of the step
+    before, None without.
+    """
     xp = namespace(effort, qpos, qvel)
     low, high = limits(k.envelope, qpos, qvel)
     motor = clip(_motor(k, effort), low, high, xp)
@@ -226,23 +258,29 @@ def _delivered(k: MotorCoefficients, behind: Any, effort: Array, qpos: Array, qv
 
 
 def command_limits(k: MotorCoefficients, qpos: Array, qvel: Array) -> tuple[Array, Array]:
-    """Return the least and the largest effort to ask for that the motor does not clip at ``qpos`` and ``qvel``.
+    """Return the least and the largest effort to ask for that the motor does not clip at ``qpos``
+    and ``qvel``.
 
-    They are those for the saturation and anti-windup of a law. Delay and lag do not enter: they are dynamics, and as a
-    difference from the effort asked for they would leak into the integral. None: no limit.
+    They are those for the saturation and anti-windup of a law. Delay and lag do not enter: they are
+    dynamics, and as a difference from the effort asked for they would leak into the integral. None:
+    no limit.
     """
     return limits(k.commands, qpos, qvel)
 
 
 def _play(k: MotorCoefficients, encoder: Array, qpos: Array, qvel: Array) -> tuple[Array, Array]:
-    """Return position and velocity behind the backlash; ``encoder`` is the position of the step before."""
+    """Return position and velocity behind the backlash; ``encoder`` is the position of the step
+    before.
+    """
     xp = namespace(qpos, qvel)
     behind = wrap(encoder - qpos, k.turns, xp)
     offset = clip(behind, -k.play, k.play, xp)
     return qpos + offset, qvel * (offset != behind).astype(qvel.dtype)
 
 
-def _encode(k: MotorCoefficients, qpos: Array, qvel: Array, position: Array, velocity: Array) -> tuple[Array, Array]:
+def _encode(
+    k: MotorCoefficients, qpos: Array, qvel: Array, position: Array, velocity: Array
+) -> tuple[Array, Array]:
     """Return position and velocity as encoded: with offset and noise, in steps of the resolution.
 
     ``position`` and ``velocity`` are the noise, or None.
@@ -263,9 +301,16 @@ STAGES = Stages(_delivered, command_limits, _play, _encode)
 
 
 def advance_effort(
-    k: MotorCoefficients, state: ActuatorState, effort: Array, qpos: Array, qvel: Array, stages: Stages = STAGES
+    k: MotorCoefficients,
+    state: ActuatorState,
+    effort: Array,
+    qpos: Array,
+    qvel: Array,
+    stages: Stages = STAGES,
 ) -> tuple[ActuatorState, Any]:
-    """Advance the motors with given coefficients, for loops with constant actuators; otherwise as :func:`deliver`."""
+    """Advance the motors with given coefficients, for loops with constant actuators; otherwise as
+    :func:`deliver`.
+    """
     xp = namespace(effort, qpos, qvel)
     command, behind = state.command, state.effort
     if k.command is not None:
@@ -283,7 +328,8 @@ def advance_measurement(
     drawn: tuple[Array, Array] | None = None,
     stages: Stages = STAGES,
 ) -> tuple[ActuatorState, Any, Any]:
-    """Advance the sensors with given coefficients, for loops with constant actuators; otherwise as :func:`measure`.
+    """Advance the sensors with given coefficients, for loops with constant actuators; otherwise as
+    :func:`measure`.
 
     ``drawn`` is the :func:`measurement_noise` at ``state.step``, if it is known already.
     """
@@ -294,7 +340,10 @@ def advance_measurement(
         qpos = encoder
     if k.position_delay is not None and k.velocity_delay is not None:
         sensor = push_history(sensor, qpos, qvel)
-        qpos, qvel = delay.read(sensor, k.position_delay, k.turns, xp), delay.read(sensor, k.velocity_delay, None, xp)
+        qpos, qvel = (
+            delay.read(sensor, k.position_delay, k.turns, xp),
+            delay.read(sensor, k.velocity_delay, None, xp),
+        )
     if key is not None:
         drawn = measurement_noise(k, key, step, qpos, xp) if drawn is None else drawn
         step = step + _ONE
@@ -302,17 +351,24 @@ def advance_measurement(
     return ActuatorState(command, effort, sensor, encoder, key, step), qpos, qvel
 
 
-def measurement_noise(k: MotorCoefficients, key: Any, step: Any, like: Any, xp: ArrayModule) -> tuple[Array, Array]:
-    """Return the noise of positions and of velocities (..., envs, joints) at ``step`` (..., envs); None for none.
+def measurement_noise(
+    k: MotorCoefficients, key: Any, step: Any, like: Any, xp: ArrayModule
+) -> tuple[Array, Array]:
+    """Return the noise of positions and of velocities (..., envs, joints) at ``step`` (..., envs);
+    None for none.
 
     ``key`` is the key of the state, and ``like`` an array (envs, joints) of the same dtype.
     """
     both = noise.normals(key, step, like.shape[1], like.dtype, xp)
     deviations = k.position_noise, k.velocity_noise
-    position, velocity = (None if sigma is None else sigma * z for sigma, z in zip(deviations, both, strict=True))
+    position, velocity = (
+        None if sigma is None else sigma * z for sigma, z in zip(deviations, both, strict=True)
+    )
     return position, velocity
 
 
 def _step(resolution: Array, xp: ArrayModule) -> Array:
-    """Return the step of a sensor; 2^-60, which is below the last bit that matters, without a resolution."""
+    """Return the step of a sensor; 2^-60, which is below the last bit that matters, without a
+    resolution.
+    """
     return None if resolution is None else xp.where(resolution > 0, resolution, 2.0**-60)

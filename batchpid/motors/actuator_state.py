@@ -9,14 +9,18 @@ from batchpid.arrays.display import array_summary
 
 
 class ActuatorState(NamedTuple):
-    """State of actuators and sensors; None where no effect needs it. Every array has the envs as its first axis."""
+    """State of actuators and sensors; None where no effect needs it. Every array has the envs as
+    its first axis.
+    """
 
     command: Array = None
     """Efforts asked for, latest first (envs, samples, joints) [N m or N]."""
     effort: Array = None
     """Effort behind the lag (envs, joints) [N m or N]."""
     sensor: Array = None
-    """Positions that the sensor was at, and its velocities, latest first (envs, samples, 2 joints)."""
+    """Positions that the sensor was at, and its velocities, latest first (envs, samples, 2
+    joints).
+    """
     encoder: Array = None
     """Position of the sensor's side of the play (envs, joints) [rad or m]."""
     key: Any = None
@@ -32,9 +36,11 @@ class ActuatorState(NamedTuple):
         return {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
 
     def matched_to(self, fresh: ActuatorState) -> ActuatorState:
-        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the others dropped.
+        """Return this state with exactly the leaves of ``fresh``: missing ones from there, the
+        others dropped.
 
-        A history that is longer there is continued by its oldest sample. The key is taken from ``fresh``.
+        A history that is longer there is continued by its oldest sample. The key is taken from
+        ``fresh``.
         """
         both = zip(self, fresh, strict=True)
         matched = (new if new is None or old is None else _resized(old, new) for old, new in both)

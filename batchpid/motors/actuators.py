@@ -1,9 +1,10 @@
 """Parameters of actuators and sensors: build, broadcast, validate.
 
-:class:`Actuators` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without registration. An effect
-that is off is ``None``: it is not a leaf and costs nothing.
+:class:`Actuators` is a ``NamedTuple`` of float arrays, hence a pytree that JAX knows without
+registration. An effect that is off is ``None``: it is not a leaf and costs nothing.
 
-Every effect is declared once, by an argument of :func:`make_actuators` with its unit, bounds and group.
+Every effect is declared once, by an argument of :func:`make_actuators` with its unit, bounds and
+group.
 """
 
 from __future__ import annotations
@@ -28,10 +29,11 @@ TABLE = {"limit_efforts": Field("N m or N", math.inf)}
 
 
 class Actuators(NamedTuple):
-    """Parameters of actuators and sensors. Every leaf is a float array, (1, joints) or (envs, joints); None is off.
+    """Parameters of actuators and sensors. Every leaf is a float array, (1, joints) or (envs,
+    joints); None is off.
 
-    Build it with :func:`make_actuators`, change it with :meth:`replace`: both validate. The fields have the meaning
-    and the units of the options of :func:`make_actuators`.
+    Build it with :func:`make_actuators`, change it with :meth:`replace`: both validate. The fields
+    have the meaning and the units of the options of :func:`make_actuators`.
     """
 
     command_delay: Array = None
@@ -88,23 +90,38 @@ class Actuators(NamedTuple):
     @property
     def is_ideal(self) -> bool:
         """True if every effect is off."""
-        return not (self.measures or self.delivers) and all(leaf is None for leaf in self.joint_side())
+        return not (self.measures or self.delivers) and all(
+            leaf is None for leaf in self.joint_side()
+        )
 
     def for_envs(self, envs: slice | Any) -> Actuators:
-        """Return the actuators of some envs (a slice or an index array); shared rows stay shared."""
-        return Actuators(*(leaf if leaf is None or leaf.shape[0] == 1 else leaf[envs] for leaf in self))
+        """Return the actuators of some envs (a slice or an index array); shared rows stay
+        shared.
+        """
+        return Actuators(
+            *(leaf if leaf is None or leaf.shape[0] == 1 else leaf[envs] for leaf in self)
+        )
 
     def for_joints(self, joints: Any) -> Actuators:
         """Return the actuators of some joints (an index array or a mask)."""
         leaves = self._asdict().items()
-        return Actuators(**{name: leaf if leaf is None or name in WHOLE else leaf[:, joints] for name, leaf in leaves})
+        return Actuators(
+            **{
+                name: leaf if leaf is None or name in WHOLE else leaf[:, joints]
+                for name, leaf in leaves
+            }
+        )
 
     def joint_side(self) -> Actuators:
-        """Return the friction and reflected inertia alone, which also joints of ideal motors and sensors have."""
+        """Return the friction and reflected inertia alone, which also joints of ideal motors and
+        sensors have.
+        """
         return Actuators(**{name: getattr(self, name) for name in JOINT_SIDE})
 
     def options(self) -> Document:
-        """Return the effects that are on, as arguments of :func:`make_actuators` that build these actuators again."""
+        """Return the effects that are on, as arguments of :func:`make_actuators` that build these
+        actuators again.
+        """
         options = {name: leaf for name, leaf in self._asdict().items() if leaf is not None}
         if self.continuous is not None:
             options["continuous"] = self.continuous > 0
@@ -134,9 +151,18 @@ class Actuators(NamedTuple):
         return make_actuators(**{"joints": self.num_joints, **known, **options})
 
     def __repr__(self) -> str:
-        on = {name: leaf for name, leaf in self._asdict().items() if leaf is not None and name != "seed"}
-        sizes = [f"{self.num_envs} envs"] * (self.num_envs > 1) + [f"{self.num_joints} joints"] * bool(on)
-        return summary("Actuators", [*sizes, *(f"{name.replace('_', ' ')} {span(leaf)}" for name, leaf in on.items())])
+        on = {
+            name: leaf
+            for name, leaf in self._asdict().items()
+            if leaf is not None and name != "seed"
+        }
+        sizes = [f"{self.num_envs} envs"] * (self.num_envs > 1) + [
+            f"{self.num_joints} joints"
+        ] * bool(on)
+        return summary(
+            "Actuators",
+            [*sizes, *(f"{name.replace('_', ' ')} {span(leaf)}" for name, leaf in on.items())],
+        )
 
 
 @known_keywords
@@ -147,8 +173,12 @@ def make_actuators(
     lag: Annotated[Array, Field("s", group="motor")] = None,
     strength: Annotated[Array, Field("1", 1.0, group="motor")] = None,
     bias: Annotated[Array, Field("N m or N", low=-math.inf, group="motor")] = None,
-    saturation_effort: Annotated[Array, Field("N m or N", math.inf, above=True, group="motor")] = None,
-    no_load_speed: Annotated[Array, Field("rad/s or m/s", math.inf, above=True, group="motor")] = None,
+    saturation_effort: Annotated[
+        Array, Field("N m or N", math.inf, above=True, group="motor")
+    ] = None,
+    no_load_speed: Annotated[
+        Array, Field("rad/s or m/s", math.inf, above=True, group="motor")
+    ] = None,
     effort_limit: Annotated[Array, Field("N m or N", math.inf, group="motor")] = None,
     position_limit: tuple[Array, Array] | None = None,
     coulomb: Annotated[Array, Field("N m or N", group="joint")] = None,
@@ -172,16 +202,17 @@ def make_actuators(
 ) -> Actuators:
     """Build validated :class:`Actuators`; a number may be a scalar, (joints,) or (envs, joints).
 
-    ``None`` is off, and so is a value that changes nothing anywhere. Numbers may be traced by JAX; their shapes are
-    checked, their values are not.
+    ``None`` is off, and so is a value that changes nothing anywhere. Numbers may be traced by JAX;
+    their shapes are checked, their values are not.
 
     Parameters
     ----------
     joints
         Number of joints.
     command_delay, sensor_delay
-        Age of the command that the motor follows, and of the position and velocity that the controller sees, from 0 to
-        1 [s]. Any real number: values between two samples are interpolated.
+        Age of the command that the motor follows, and of the position and velocity that the
+        controller sees, from 0 to 1 [s]. Any real number: values between two samples are
+        interpolated.
     lag
         Time constant T >= 0 of the effort's first-order lag [s].
     strength
@@ -189,22 +220,23 @@ def make_actuators(
     bias
         Effort added by the motor [N m or N].
     saturation_effort, no_load_speed
-        Effort at stall, > 0 [N m or N], and speed without load, > 0 [rad/s or m/s], of the line between them: the
-        torque-speed envelope (:mod:`batchpid.motors.envelope`). Given together.
+        Effort at stall, > 0 [N m or N], and speed without load, > 0 [rad/s or m/s], of the line
+        between them: the torque-speed envelope (:mod:`batchpid.motors.envelope`). Given together.
     effort_limit
         Largest effort that the motor delivers, >= 0 [N m or N].
     position_limit
-        Limit that depends on the position: positions [rad or m], ascending, and efforts >= 0 there [N m or N], both
-        (points,), (joints, points) or (envs, joints, points). Linear between the points, constant outside.
+        Limit that depends on the position: positions [rad or m], ascending, and efforts >= 0 there
+        [N m or N], both (points,), (joints, points) or (envs, joints, points). Linear between the
+        points, constant outside.
     coulomb, viscous
-        Friction >= 0 of the joint [N m or N; N m s/rad or N s/m], in addition to the description's, by the model
-        of :mod:`batchpid.motors.friction`.
+        Friction >= 0 of the joint [N m or N; N m s/rad or N s/m], in addition to the description's,
+        by the model of :mod:`batchpid.motors.friction`.
     static
-        Friction that holds the joint at rest, where that is more than while it moves [N m or N]: >= ``coulomb``, also
-        in addition to the description's. 0: as much as while it moves.
+        Friction that holds the joint at rest, where that is more than while it moves [N m or N]: >=
+        ``coulomb``, also in addition to the description's. 0: as much as while it moves.
     stribeck
-        Speed >= 0 at which the friction of a joint that slides has fallen half way from ``static`` to ``coulomb``
-        [rad/s or m/s]. 0: it has fallen as soon as the joint slides.
+        Speed >= 0 at which the friction of a joint that slides has fallen half way from ``static``
+        to ``coulomb`` [rad/s or m/s]. 0: it has fallen as soon as the joint slides.
     load_friction
         Friction that grows with the load, as in gears: from 0 to 1, over the motor's effort.
     armature
@@ -220,8 +252,9 @@ def make_actuators(
     seed
         Seed of the noise, from 0 to 2^64 - 1.
     max_delay
-        Length of the histories that delayed signals have [s]; None: the largest delay of all envs. A longer one is
-        needed where delays are to grow in flight: a delay beyond the history returns its oldest sample.
+        Length of the histories that delayed signals have [s]; None: the largest delay of all envs.
+        A longer one is needed where delays are to grow in flight: a delay beyond the history
+        returns its oldest sample.
     continuous
         Bools: joints whose position is an angle modulo 2 pi [rad].
     joint_names
@@ -236,22 +269,43 @@ def make_actuators(
     """
     given = locals()
     build = LeafBuilder(joints, joint_names, dtype, given.values())
-    leaves: Document = {name: build.option(name, given[name], field) for name, field in FIELDS.items()}
-    longest = MAX_DELAY if max_delay is None else number("max_delay", max_delay, 0.0, MAX_DELAY, "seconds")
-    delays = [(name, delay) for name in ("command_delay", "sensor_delay") if (delay := leaves[name]) is not None]
+    leaves: Document = {
+        name: build.option(name, given[name], field) for name, field in FIELDS.items()
+    }
+    longest = (
+        MAX_DELAY
+        if max_delay is None
+        else number("max_delay", max_delay, 0.0, MAX_DELAY, "seconds")
+    )
+    delays = [
+        (name, delay)
+        for name in ("command_delay", "sensor_delay")
+        if (delay := leaves[name]) is not None
+    ]
     for name, delay in delays:
         if not is_traced(delay) and (delay > longest).any():
             remedy = f"use a number from 0 to {longest:g} (seconds)"
-            raise InvalidArgumentError(name, "out of range", value=float(delay.max()), remedy=remedy)
+            raise InvalidArgumentError(
+                name, "out of range", value=float(delay.max()), remedy=remedy
+            )
     if max_delay is None and not any(is_traced(delay) for _, delay in delays):
         longest = max((float(delay.max()) for _, delay in delays), default=0.0)
     if (leaves["saturation_effort"] is None) != (leaves["no_load_speed"] is None):
         missing = "no_load_speed" if leaves["no_load_speed"] is None else "saturation_effort"
-        raise InvalidArgumentError(missing, "is missing", remedy="give both ends of the torque-speed line, or none")
+        raise InvalidArgumentError(
+            missing, "is missing", remedy="give both ends of the torque-speed line, or none"
+        )
     if (static := leaves["static"]) is not None and not is_traced(static):
         coulomb = 0.0 if leaves["coulomb"] is None else leaves["coulomb"]
         good = is_traced(coulomb) or (static >= coulomb) | (static == 0)
-        entries("static", static, good, "is less than coulomb", joint_names, remedy="give at least coulomb, or 0")
+        entries(
+            "static",
+            static,
+            good,
+            "is less than coulomb",
+            joint_names,
+            remedy="give at least coulomb, or 0",
+        )
     if leaves["stribeck"] is not None and static is None:
         if given["static"] is None:
             raise InvalidArgumentError(
@@ -276,29 +330,44 @@ FIELDS = declared(make_actuators, Field)
 MOTOR_SIDE = in_group(FIELDS, "motor")
 """Effects between the effort asked for and the effort delivered."""
 JOINT_SIDE = in_group(FIELDS, "joint")
-"""Effects on the joint instead of the signals: :class:`batchpid.sim.Runner` simulates them in the robot's joints."""
+"""Effects on the joint instead of the signals: :class:`batchpid.sim.Runner` simulates them in the
+robot's joints.
+"""
 DRIVEN = tuple(name for name in JOINT_SIDE if name != "load_friction")
-"""Effects on joints under the engine's drives, whose effort is unknown; friction by load needs the effort."""
+"""Effects on joints under the engine's drives, whose effort is unknown; friction by load needs the
+effort.
+"""
 SENSOR_SIDE = in_group(FIELDS, "sensor")
 """Effects between the joint's state and its measurement."""
 
 
 def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Array, Array]:
-    """Return the positions and efforts of a limit that depends on the position (1 | envs, joints, points)."""
+    """Return the positions and efforts of a limit that depends on the position (1 | envs, joints,
+    points).
+    """
     if table is None:
         return None, None
-    remedy = "give positions and efforts (points,), (joints, points) or (envs, joints, points), with two points or more"
+    remedy = (
+        "give positions and efforts (points,), (joints, points) or (envs, joints, points), with two"
+        " points or more"
+    )
     if not isinstance(table, tuple | list | np.ndarray) or len(table) != 2:
         raise InvalidArgumentError("position_limit", "must be a pair", value=table, remedy=remedy)
     rows = [read_array("position_limit", each).astype(build.dtype) for each in table]
     for each in rows:
-        if each.ndim not in (1, 2, 3) or each.shape[-1] < 2 or (each.ndim > 1 and each.shape[-2] != build.joints):
+        if (
+            each.ndim not in (1, 2, 3)
+            or each.shape[-1] < 2
+            or (each.ndim > 1 and each.shape[-2] != build.joints)
+        ):
             raise InvalidArgumentError("position_limit", f"has shape {each.shape}", remedy=remedy)
     if rows[0].shape[-1] != rows[1].shape[-1]:
         problem = f"has {rows[0].shape[-1]} positions and {rows[1].shape[-1]} efforts"
         raise InvalidArgumentError("position_limit", problem, remedy=remedy)
     shape = (1, build.joints, rows[0].shape[-1])
-    positions, efforts = (np.broadcast_to(each, np.broadcast_shapes(each.shape, shape)) for each in rows)
+    positions, efforts = (
+        np.broadcast_to(each, np.broadcast_shapes(each.shape, shape)) for each in rows
+    )
     rising = np.isfinite(positions)
     rising[..., 1:] &= positions[..., 1:] >= positions[..., :-1]
     good = (efforts >= 0) & (np.isfinite(efforts) | np.isinf(efforts).all(2, keepdims=True))
@@ -306,9 +375,15 @@ def _table(build: LeafBuilder, table: tuple[Any, Any] | None) -> tuple[Array, Ar
     for each, right, problem in zip((positions, efforts), (rising, good), problems, strict=True):
         first = np.take_along_axis(each, right.argmin(2, keepdims=True), 2)[..., 0]
         entries("position_limit", first, right.all(2), problem, build.names)
-    return (None, None) if np.isinf(efforts).all() else (build.freeze(positions), build.freeze(efforts))
+    return (
+        (None, None)
+        if np.isinf(efforts).all()
+        else (build.freeze(positions), build.freeze(efforts))
+    )
 
 
 def check_actuators(actuators: Actuators, num_envs: int, joint_names: Sequence[str]) -> None:
-    """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by hand."""
+    """Raise InvalidArgumentError unless every leaf is right for (num_envs, joints): for edits by
+    hand.
+    """
     check_leaves("actuators", actuators, FIELDS | TABLE, num_envs, joint_names)

@@ -1,12 +1,13 @@
-r"""Coupling of joints: followers, such as the mimic joints of a gripper, that move with their leaders.
+r"""Coupling of joints: followers, such as the mimic joints of a gripper, that move with their
+leaders.
 
-A follower i has the position q_i = m_i q_l + o_i, where l is its leader, so that the robot moves only as its
-independent joints q_r do::
+A follower i has the position q_i = m_i q_l + o_i, where l is its leader, so that the robot moves
+only as its independent joints q_r do::
 
     q = G q_r + o        q' = G q_r'        u_r = G^T u        M_r = G^T M G
 
-R. Featherstone, Rigid Body Dynamics Algorithms (Springer, 2008), section 3.2. An effort on a follower acts through the
-coupling on its leader, multiplied by m_i.
+R. Featherstone, Rigid Body Dynamics Algorithms (Springer, 2008), section 3.2. An effort on a
+follower acts through the coupling on its leader, multiplied by m_i.
 """
 
 from __future__ import annotations
@@ -53,14 +54,17 @@ def _of_followers(method: Callable[[Coupling, Any], Any]) -> Callable[[Coupling,
 
 
 class Coupling(NamedTuple):
-    """Coupling of a robot's joints; the identity if no joint follows. Arrays are (joints,), and read-only.
+    """Coupling of a robot's joints; the identity if no joint follows. Arrays are (joints,), and
+    read-only.
 
-    Methods take and return arrays (..., joints) unless said otherwise, of NumPy or JAX, or symbols of a trace. For
-    the identity they return their argument.
+    Methods take and return arrays (..., joints) unless said otherwise, of NumPy or JAX, or symbols
+    of a trace. For the identity they return their argument.
     """
 
     leader: Array
-    """Index of the independent joint that each joint moves with: its own index if it is independent."""
+    """Index of the independent joint that each joint moves with: its own index if it is
+    independent.
+    """
     multiplier: Array
     """Multiplier in ``q = multiplier * q[leader] + offset``: 1 for an independent joint."""
     offset: Array
@@ -72,7 +76,8 @@ class Coupling(NamedTuple):
 
     @classmethod
     def of(cls, joints: int, followers: Sequence[Follower] = ()) -> Coupling:
-        """Return the coupling of ``followers``, one entry for each; a chain of followers ends at its last leader.
+        """Return the coupling of ``followers``, one entry for each; a chain of followers ends at
+        its last leader.
 
         Raises ValueError if a joint follows itself, through others or directly.
         """
@@ -93,13 +98,19 @@ class Coupling(NamedTuple):
                 multiplier, offset = multiplier * factor, offset + multiplier * shift
             leaders[joint], multipliers[joint], offsets[joint] = leader, multiplier, offset
         independent = np.array([joint not in direct for joint in range(joints)], bool)
-        of_leader = [[each for each in sorted(direct) if leaders[each] == joint] for joint in range(joints)]
+        of_leader = [
+            [each for each in sorted(direct) if leaders[each] == joint] for joint in range(joints)
+        ]
         shares = list[Share]()
         for number in range(max(map(len, of_leader), default=0)):
             exists = np.array([len(each) > number for each in of_leader])
             chosen = np.array([each[number] if len(each) > number else 0 for each in of_leader])
-            shares.append(Share(*map(read_only, (exists, chosen, np.where(exists, multipliers[chosen], 0.0)))))
-        leaders, multipliers, offsets, independent = map(read_only, (leaders, multipliers, offsets, independent))
+            shares.append(
+                Share(*map(read_only, (exists, chosen, np.where(exists, multipliers[chosen], 0.0))))
+            )
+        leaders, multipliers, offsets, independent = map(
+            read_only, (leaders, multipliers, offsets, independent)
+        )
         return cls(leaders, multipliers, offsets, independent, tuple(shares))
 
     @property
@@ -138,7 +149,9 @@ class Coupling(NamedTuple):
 
     @_of_followers
     def efforts(self, effort: Array) -> Array:
-        """Return the efforts G^T u on the independent joints for u = ``effort``; zero for followers."""
+        """Return the efforts G^T u on the independent joints for u = ``effort``; zero for
+        followers.
+        """
         xp, acting = namespace(effort), self.of_independent(effort)
         for share in self.shares:  # the order of the sum is the same for any number of rows
             added = share.multiplier * take_columns(effort, share.joint)
@@ -157,27 +170,37 @@ class Coupling(NamedTuple):
 
     @_of_followers
     def of_all(self, figures: Any) -> Array:
-        """Return ``figures`` (..., independent) for all joints (..., joints); followers have their leaders' values."""
+        """Return ``figures`` (..., independent) for all joints (..., joints); followers have their
+        leaders' values.
+        """
         return figures[..., (np.cumsum(self.independent) - 1)[self.leader]]
 
     @_of_followers
     def mass_matrix(self, matrix: Array) -> Array:
-        """Return G^T M G for M (..., joints, joints) in the rows and columns of the independent joints.
+        """Return G^T M G for M (..., joints, joints) in the rows and columns of the independent
+        joints.
 
-        Rows and columns of followers are rows and columns of the identity. ``fold`` in rigid_body.h is the same.
+        Rows and columns of followers are rows and columns of the identity. ``fold`` in rigid_body.h
+        is the same.
         """
         xp = namespace(matrix)
         rows = xp.swapaxes(self.efforts(xp.swapaxes(matrix, -1, -2)), -1, -2)
-        return self.efforts(rows) + xp.diag(xp.where(self.independent, 0.0, 1.0).astype(matrix.dtype))
+        return self.efforts(rows) + xp.diag(
+            xp.where(self.independent, 0.0, 1.0).astype(matrix.dtype)
+        )
 
     @_of_followers
     def reduced(self, matrix: Array) -> Array:
-        """Return M_r = G^T M G (..., independent, independent) of a mass matrix M (..., joints, joints)."""
+        """Return M_r = G^T M G (..., independent, independent) of a mass matrix M (..., joints,
+        joints).
+        """
         return self.mass_matrix(matrix)[..., self.independent, :][..., self.independent]
 
     @_of_followers
     def reduced_damping(self, damping: Array) -> Array:
-        """Return the diagonal of G^T B G (independent,) for viscous damping B = diag(damping) (joints,)."""
+        """Return the diagonal of G^T B G (independent,) for viscous damping B = diag(damping)
+        (joints,).
+        """
         return self.matrix.T**2 @ damping
 
     def native(self) -> dict[str, Rows]:
@@ -187,5 +210,8 @@ class Coupling(NamedTuple):
         return {"leader": self.leader.astype(np.int32), "multiplier": np.array(self.multiplier)}
 
     def __repr__(self) -> str:
-        laws = [f"q{i} = {self.multiplier[i]:g} q{self.leader[i]} + {self.offset[i]:g}" for i in self.followers]
+        laws = [
+            f"q{i} = {self.multiplier[i]:g} q{self.leader[i]} + {self.offset[i]:g}"
+            for i in self.followers
+        ]
         return f"Coupling({len(self.leader)} joints: {', '.join(laws) or 'no followers'})"

@@ -4,9 +4,10 @@ With samples x_k at t = k dt, and a delay d = (n + f) dt with whole n and 0 <= f
 
     y_k = (1 - f) x_{k-n} + f x_{k-n-1}
 
-A sine of angular frequency w is delayed by d exactly at f = 0, and by d to second order in w dt otherwise, with its
-amplitude lowered by at most the factor cos(w dt / 2) (T. I. Laakso et al., "Splitting the unit delay", IEEE Signal
-Processing Magazine 13, 1996: linear interpolation is the Lagrange filter of order 1).
+A sine of angular frequency w is delayed by d exactly at f = 0, and by d to second order in w dt
+otherwise, with its amplitude lowered by at most the factor cos(w dt / 2) (T. I. Laakso et al.,
+"Splitting the unit delay", IEEE Signal Processing Magazine 13, 1996: linear interpolation is the
+Lagrange filter of order 1).
 """
 
 from __future__ import annotations
@@ -35,19 +36,25 @@ class Delay(NamedTuple):
 def samples_of(longest: Array, dt: float) -> int:
     """Return the samples that a history needs for delays up to ``longest`` (1, 1) [s].
 
-    Raises InvalidArgumentError if it is traced by JAX, so that its size is not known, or it needs too many samples.
+    Raises InvalidArgumentError if it is traced by JAX, so that its size is not known, or it needs
+    too many samples.
     """
     if is_traced(longest) or is_traced(dt):
-        raise InvalidArgumentError("max_delay", "is traced, so that it is not known", remedy="pass samples= to init")
+        raise InvalidArgumentError(
+            "max_delay", "is traced, so that it is not known", remedy="pass samples= to init"
+        )
     count = math.floor(float(longest[0, 0]) / dt + _NEAR) + 2
     if count > MOST_SAMPLES:
         remedy = f"use a longer time step, or delays of at most {(MOST_SAMPLES - 2) * dt:g} s"
-        raise InvalidArgumentError("max_delay", f"needs {count} samples", value=float(longest[0, 0]), remedy=remedy)
+        raise InvalidArgumentError(
+            "max_delay", f"needs {count} samples", value=float(longest[0, 0]), remedy=remedy
+        )
     return count
 
 
 def discretise(delay: Array, dt: Array, history: Array, begin: int = 0) -> Delay:
-    """Return ``delay`` (1 | envs, joints) [s] at ``dt`` [s] for ``history`` (envs, samples, numbers), its longest.
+    """Return ``delay`` (1 | envs, joints) [s] at ``dt`` [s] for ``history`` (envs, samples,
+    numbers), its longest.
 
     The joints' values are those from number ``begin`` of a sample on.
     """
@@ -73,7 +80,9 @@ def start(value: Any, samples: int) -> Array:
 
 
 def read(history: Array, k: Delay, turns: Array, xp: ArrayModule) -> Array:
-    """Return the delayed value (envs, joints); ``turns`` is 1 / (2 pi) where it is an angle, 0 elsewhere, or None."""
+    """Return the delayed value (envs, joints); ``turns`` is 1 / (2 pi) where it is an angle, 0
+    elsewhere, or None.
+    """
     later = read_history(history, k.index[0])
     if k.fraction is None:
         return later

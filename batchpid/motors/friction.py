@@ -1,38 +1,43 @@
-r"""Coulomb friction with stiction, and viscous damping: pure functions on (envs, joints), for NumPy and JAX.
+r"""Coulomb friction with stiction, and viscous damping: pure functions on (envs, joints), for NumPy
+and JAX.
 
-With the motor's effort tau, the load h (gravity and more), the mass matrix M, viscous damping B and Coulomb friction F,
-a joint moves by M dv/dt = tau - h - B v - f, with f = F sgn(v) while it moves and any |f| <= F that holds it at rest.
-In steps of dt both are taken at the end of the step (backward Euler), which is stable at any ratio of B dt and F dt to
-the inertia (R. Kikuuwe et al., "Fixed-step friction simulation: from classical Coulomb model to modern continuous
-models", IROS 2005)::
+With the motor's effort tau, the load h (gravity and more), the mass matrix M, viscous damping B and
+Coulomb friction F, a joint moves by M dv/dt = tau - h - B v - f, with f = F sgn(v) while it moves
+and any |f| <= F that holds it at rest. In steps of dt both are taken at the end of the step
+(backward Euler), which is stable at any ratio of B dt and F dt to the inertia (R. Kikuuwe et al.,
+"Fixed-step friction simulation: from classical Coulomb model to modern continuous models", IROS
+2005)::
 
     M (v+ - v) = dt (tau - h - B v+ - f),      f in F Sgn(v+)
 
-- Viscous: (M + dt B) (v+ - v) = dt (tau - h - f - B v). The simulator adds the armature dt B to its joints, and
-  -B v is part of the effort: exact for the whole robot, without its mass matrix.
-- Coulomb: u = tau - f is the effort in [tau - F, tau + F] that brings v+ nearest to 0. With u' and v' of the
-  step before, the load as it was then, and the share w of a change of velocity that damping leaves, the velocity under
-  an unchanged u' is predicted as v + w (v - v'), and::
+- Viscous: (M + dt B) (v+ - v) = dt (tau - h - f - B v). The simulator adds the armature dt B to its
+  joints, and -B v is part of the effort: exact for the whole robot, without its mass matrix.
+- Coulomb: u = tau - f is the effort in [tau - F, tau + F] that brings v+ nearest to 0. With u' and
+  v' of the step before, the load as it was then, and the share w of a change of velocity that
+  damping leaves, the velocity under an unchanged u' is predicted as v + w (v - v'), and::
 
     u = min(max(u' - K (v + w (v - v')), tau - F), tau + F)             K = J / dt,  w = 1 - dt B / J
 
-  J = 1 / ((M + dt B)^-1)_jj is the inertia that the joint shows. At rest u becomes the load h, for any tau within
-  F of it, and the joint stays. In velocities integrated over time K is a spring of stiffness K / dt that yields at F:
-  elastic, then plastic, so that a load below F never makes it creep, unlike LuGre's (P. Dupont, V. Hayward,
-  B. Armstrong and F. Altpeter, "Single state elastoplastic friction models", IEEE Transactions on Automatic Control 47,
-  2002). The yield by clipping is the return mapping of J. C. Simo and T. J. R. Hughes, Computational Inelasticity
+  J = 1 / ((M + dt B)^-1)_jj is the inertia that the joint shows. At rest u becomes the load h, for
+  any tau within F of it, and the joint stays. In velocities integrated over time K is a spring of
+  stiffness K / dt that yields at F: elastic, then plastic, so that a load below F never makes it
+  creep, unlike LuGre's (P. Dupont, V. Hayward, B. Armstrong and F. Altpeter, "Single state
+  elastoplastic friction models", IEEE Transactions on Automatic Control 47, 2002). The yield by
+  clipping is the return mapping of J. C. Simo and T. J. R. Hughes, Computational Inelasticity
   (1998), section 1.4.
 
-With a static friction F_s > F the bound is F_s until the joint yields. While it slides, the bound falls with the speed
-from F_s to F. It is half way at the Stribeck velocity v_s; if v_s is 0, it is F at once (D. P. Hess and A. Soom,
-"Friction at a lubricated line contact operating at oscillating sliding velocities", Journal of Tribology 112, 1990). In
-gears friction grows with the transmitted effort, here the effort of the motor::
+With a static friction F_s > F the bound is F_s until the joint yields. While it slides, the bound
+falls with the speed from F_s to F. It is half way at the Stribeck velocity v_s; if v_s is 0, it is
+F at once (D. P. Hess and A. Soom, "Friction at a lubricated line contact operating at oscillating
+sliding velocities", Journal of Tribology 112, 1990). In gears friction grows with the transmitted
+effort, here the effort of the motor::
 
     bound = F + (F_s - F) / (1 + (v / v_s)^2) + mu |tau|
 
-With K = J / dt one joint stops in one step (deadbeat), and up to 4/3 of that is stable. Coupled joints share it: with
-the correlations C_ij = A_ij / sqrt(A_ii A_jj) of A = (M + dt B)^-1, J_j = 1 / (A_jj sum_i |C_ij|) keeps the eigenvalues
-of A J within [0, 1], by Gershgorin's theorem. SHARE of K is left for inertias that change between two refreshes.
+With K = J / dt one joint stops in one step (deadbeat), and up to 4/3 of that is stable. Coupled
+joints share it: with the correlations C_ij = A_ij / sqrt(A_ii A_jj) of A = (M + dt B)^-1, J_j = 1 /
+(A_jj sum_i |C_ij|) keeps the eigenvalues of A J within [0, 1], by Gershgorin's theorem. SHARE of K
+is left for inertias that change between two refreshes.
 """
 
 from __future__ import annotations
@@ -66,7 +71,9 @@ class Friction(NamedTuple):
 
     @property
     def most(self) -> Array:
-        """Array that is positive for joints with friction other than viscous; None without such joints."""
+        """Array that is positive for joints with friction other than viscous; None without such
+        joints.
+        """
         parts = [leaf for leaf in (self.coulomb, self.static, self.load) if leaf is not None]
         return sum(parts[1:], parts[0]) if parts else None
 
@@ -79,7 +86,9 @@ class FrictionState(NamedTuple):
     velocity: Array = None
     """v of the last step [rad/s or m/s]."""
     gain: Array = None
-    """K (1 + w - dt^2 k / J), with the stiffness k of an implicit drive; the factor of v [N m s/rad or N s/m]."""
+    """K (1 + w - dt^2 k / J), with the stiffness k of an implicit drive; the factor of v [N m s/rad
+    or N s/m].
+    """
     memory: Array = None
     """K w: the factor of v' [N m s/rad or N s/m]."""
     sliding: Array = None
@@ -98,29 +107,37 @@ def init(
     damping: Array = 0.0,
     stiffness: Array = 0.0,
 ) -> FrictionState:
-    """Return the state of joints that move at ``velocity`` (envs, joints), without Coulomb friction so far.
+    """Return the state of joints that move at ``velocity`` (envs, joints), without Coulomb friction
+    so far.
 
     Parameters
     ----------
     load
-        Effort that holds the joints, h (envs, joints) [N m or N]; an estimate is as good, but for the first step.
+        Effort that holds the joints, h (envs, joints) [N m or N]; an estimate is as good, but for
+        the first step.
     mass_matrix, dt, damping, stiffness
         As in :func:`refresh`.
     """
     check_time_step("dt", dt)
     if friction.coulomb is None:
         return FrictionState()
-    return with_sliding(friction, refresh(friction, started(velocity, load), mass_matrix, dt, damping, stiffness))
+    return with_sliding(
+        friction, refresh(friction, started(velocity, load), mass_matrix, dt, damping, stiffness)
+    )
 
 
 def started(velocity: Array, load: Array) -> FrictionState:
-    """Return the state of :func:`init` before :func:`refresh` sets K and w, and :func:`with_sliding` the sliding."""
+    """Return the state of :func:`init` before :func:`refresh` sets K and w, and
+    :func:`with_sliding` the sliding.
+    """
     zero = namespace(velocity, load).zeros_like(velocity)
     return FrictionState(load + zero, velocity + zero, zero, zero, zero)
 
 
 def with_sliding(friction: Friction, state: FrictionState) -> FrictionState:
-    """Return the state of joints at rest or in motion: a joint slides where friction at rest is less than K |v|."""
+    """Return the state of joints at rest or in motion: a joint slides where friction at rest is
+    less than K |v|.
+    """
     if friction.static is None:
         return state
     needed = abs((state.gain - state.memory) * state.velocity)
@@ -138,8 +155,8 @@ def refresh(
 ) -> FrictionState:
     """Return ``state`` with K and w at ``mass_matrix`` (envs, joints, joints) [kg m^2 or kg].
 
-    ``damping`` and ``stiffness`` (envs, joints) or (1, joints) belong to a drive that the simulator integrates
-    implicitly [N m s/rad, N m/rad].
+    ``damping`` and ``stiffness`` (envs, joints) or (1, joints) belong to a drive that the simulator
+    integrates implicitly [N m s/rad, N m/rad].
     """
     check_time_step("dt", dt)
     if friction.coulomb is None:
@@ -159,10 +176,14 @@ def refresh(
     return state._replace(gain=k * (1 + w - dt**2 * stiffness * mobility), memory=k * w)
 
 
-def advance(friction: Friction, state: FrictionState, effort: Array, velocity: Array) -> tuple[FrictionState, Any]:
-    """Advance the model by one step; return the state and the effort to apply (envs, joints) [N m or N].
+def advance(
+    friction: Friction, state: FrictionState, effort: Array, velocity: Array
+) -> tuple[FrictionState, Any]:
+    """Advance the model by one step; return the state and the effort to apply (envs, joints) [N m
+    or N].
 
-    The joints' armature has to be dt B. ``effort`` is the motors' effort at ``velocity``. Inputs are not modified.
+    The joints' armature has to be dt B. ``effort`` is the motors' effort at ``velocity``. Inputs
+    are not modified.
     """
     total = effort
     if friction.coulomb is not None:
@@ -179,7 +200,8 @@ def advance(friction: Friction, state: FrictionState, effort: Array, velocity: A
 
 
 def bound_of(friction: Friction, sliding: Array, effort: Array, velocity: Array) -> Array:
-    """Return the largest friction other than viscous (envs, joints) [N m or N] under the motors' ``effort``.
+    """Return the largest friction other than viscous (envs, joints) [N m or N] under the motors'
+    ``effort``.
 
     ``sliding`` is positive for joints that were sliding in the last step.
     """
@@ -198,11 +220,12 @@ def bound_of(friction: Friction, sliding: Array, effort: Array, velocity: Array)
 
 
 def compensation(coulomb: Array, error: Array, rate: Array, band: Array) -> Array:
-    """Return the feedforward that cancels friction on the way to r: F times (e + LOOKAHEAD r') / band in [-1, 1].
+    """Return the feedforward that cancels friction on the way to r: F times (e + LOOKAHEAD r') /
+    band in [-1, 1].
 
-    It has the sign of the commanded motion, not of the velocity, so it cannot chatter: friction, which is at least as
-    large and opposes the velocity, leaves no more than 0 in the direction of motion. A joint that is at rest within
-    ``band`` of its setpoint stays there.
+    It has the sign of the commanded motion, not of the velocity, so it cannot chatter: friction,
+    which is at least as large and opposes the velocity, leaves no more than 0 in the direction of
+    motion. A joint that is at rest within ``band`` of its setpoint stays there.
 
     Parameters
     ----------

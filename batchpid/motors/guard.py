@@ -1,7 +1,8 @@
-r"""Guard of setpoints: limits of their position, rate and acceleration. Pure functions on (envs, joints).
+r"""Guard of setpoints: limits of their position, rate and acceleration. Pure functions on (envs,
+joints).
 
-With the setpoint r that is asked for, the guarded setpoint g and its rate v, primes for the step before, and limits
-lower, upper, V, A::
+With the setpoint r that is asked for, the guarded setpoint g and its rate v, primes for the step
+before, and limits lower, upper, V, A::
 
     e    = min(max(r, lower), upper) - g'                                the short way round on continuous joints
     m    = max(ceil(sqrt(1/4 + 2 |e| / (A dt^2)) - 1/2), 1)              steps of a stop within e
@@ -10,10 +11,11 @@ lower, upper, V, A::
     v    = min(max(w, v' - A dt), v' + A dt)
     g    = g' + dt v
 
-``stop`` is the rate whose m steps of deceleration A end at rest at e: m stop dt - A dt^2 m (m - 1) / 2 = |e|. So g
-reaches a constant r in the shortest time that the limits allow, without overshoot, and does not leave [lower, upper]
-once inside: the sampled form of the nonlinear trajectory filters of L. Biagiotti and C. Melchiorri, Trajectory Planning
-for Automatic Machines and Robots (Springer, 2008), section 4.6.
+``stop`` is the rate whose m steps of deceleration A end at rest at e: m stop dt - A dt^2 m (m - 1)
+/ 2 = |e|. So g reaches a constant r in the shortest time that the limits allow, without overshoot,
+and does not leave [lower, upper] once inside: the sampled form of the nonlinear trajectory filters
+of L. Biagiotti and C. Melchiorri, Trajectory Planning for Automatic Machines and Robots (Springer,
+2008), section 4.6.
 """
 
 from __future__ import annotations
@@ -31,7 +33,9 @@ from batchpid.checks.validate import check_time_step
 
 
 class Guard(NamedTuple):
-    """Limits of setpoints, (1, joints) or (envs, joints); None is off. Build one with :func:`make_guard`."""
+    """Limits of setpoints, (1, joints) or (envs, joints); None is off. Build one with
+    :func:`make_guard`.
+    """
 
     lower: Array = None
     upper: Array = None
@@ -70,7 +74,8 @@ def make_guard(
     joint_names: Sequence[str] | None = None,
     dtype: DType = None,
 ) -> Guard:
-    """Build a validated :class:`Guard`; a number may be a scalar, (joints,) or (envs, joints), None is off.
+    """Build a validated :class:`Guard`; a number may be a scalar, (joints,) or (envs, joints), None
+    is off.
 
     Parameters
     ----------
@@ -114,10 +119,12 @@ def init(guard: Guard, qpos: Array) -> GuardState:
 
 
 def advance(guard: Guard, state: GuardState, setpoint: Array, dt: float) -> tuple[GuardState, Any]:
-    """Advance the guard by ``dt`` [s]; return the state, with the guarded ``setpoint``, and a mask of the changes.
+    """Advance the guard by ``dt`` [s]; return the state, with the guarded ``setpoint``, and a mask
+    of the changes.
 
-    ``setpoint`` (envs, joints) [rad or m] is the requested setpoint; it is not modified. The mask has the same shape.
-    Raises InvalidArgumentError if dt is a number that is not positive, or above 1 s.
+    ``setpoint`` (envs, joints) [rad or m] is the requested setpoint; it is not modified. The mask
+    has the same shape. Raises InvalidArgumentError if dt is a number that is not positive, or above
+    1 s.
     """
     check_time_step("dt", dt)
     (setpoint,) = in_dtype_of(guard, setpoint)

@@ -1,13 +1,14 @@
-r"""Gaussian noise from counters: a function of seed, env, episode, step and joint, and of nothing else.
+r"""Gaussian noise from counters: a function of seed, env, episode, step and joint, and of nothing
+else.
 
-The hash is pcg4d (M. Jarzynski and M. Olano, "Hash functions for GPU rendering", Journal of Computer Graphics
-Techniques 9, 2020), on four words of 32 bits each. 16 bits i of its result choose a quantile of the normal distribution
-from a table::
+The hash is pcg4d (M. Jarzynski and M. Olano, "Hash functions for GPU rendering", Journal of
+Computer Graphics Techniques 9, 2020), on four words of 32 bits each. 16 bits i of its result choose
+a quantile of the normal distribution from a table::
 
     z = c Phi^-1((i + 1/2) / 2^16)          i = 0, ..., 2^16 - 1, c such that the variance is 1
 
-So there are 65,536 equally likely values, up to 4.3 standard deviations, and not a function whose last bits depend on
-the library. The mean is 0 and the kurtosis 3 to within 3e-3.
+So there are 65,536 equally likely values, up to 4.3 standard deviations, and not a function whose
+last bits depend on the library. The mean is 0 and the kurtosis 3 to within 3e-3.
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ def pcg4d(x: Array, y: Array, z: Array, w: Array) -> tuple[Array, Array, Array, 
 
 
 def keys(seed: Any, envs: Any, episode: Any, xp: ArrayModule) -> Array:
-    """Return the key of each env's noise (envs, 2) uint32, from a ``seed`` (1, 2) uint32 and numbers (envs,)."""
+    """Return the key of each env's noise (envs, 2) uint32, from a ``seed`` (1, 2) uint32 and
+    numbers (envs,).
+    """
     words = (xp.asarray(number).astype(xp.uint32) for number in (envs, episode))
     return xp.stack(pcg4d(seed[:, 0], seed[:, 1], *words)[:2], axis=1)
 

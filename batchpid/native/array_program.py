@@ -1,9 +1,11 @@
-"""Array functions as programs of the native extension, which executes all their operations in one call.
+"""Array functions as programs of the native extension, which executes all their operations in one
+call.
 
-With few envs, the overhead of a NumPy call is a hundred times its computation; with many, each call moves whole arrays
-to and from memory. A function is traced (:mod:`batchpid.native.tracing`), and the recorded operations are the program.
-The program processes the rows in blocks that stay in the cache. Each operation is rounded as in NumPy, so results are
-bit-identical, except for the sign of a NaN, which has no meaning. Programs give no floating-point warnings.
+With few envs, the overhead of a NumPy call is a hundred times its computation; with many, each call
+moves whole arrays to and from memory. A function is traced (:mod:`batchpid.native.tracing`), and
+the recorded operations are the program. The program processes the rows in blocks that stay in the
+cache. Each operation is rounded as in NumPy, so results are bit-identical, except for the sign of a
+NaN, which has no meaning. Programs give no floating-point warnings.
 """
 
 from __future__ import annotations
@@ -26,32 +28,47 @@ NUMBERS_PER_THREAD = 2**17
 
 @cache
 def interpreter() -> Any:
-    """Return the extension, initialised with NumPy's array type; errors as in :func:`extensions.load`."""
+    """Return the extension, initialised with NumPy's array type; errors as in
+    :func:`extensions.load`.
+    """
     native = load(PROGRAM)
     native.use(np.ndarray, np.empty)
     rows, fixed = np.empty((2, 3)), np.empty((4, 1), np.float32)
     fixed.flags.writeable = False
     for each in (rows, fixed):
-        if native.look(each) != (each.ctypes.data, *each.shape, each.dtype.num, each.flags.writeable):
+        if native.look(each) != (
+            each.ctypes.data,
+            *each.shape,
+            each.dtype.num,
+            each.flags.writeable,
+        ):
             raise StaleExtensionError(f"cannot read the arrays of NumPy {np.__version__}")
     return native
 
 
 def threads_for(numbers: int, threads: int | None = None) -> int:
-    """Return the number of threads for arrays of ``numbers`` numbers: at most ``threads``, or the cores available."""
+    """Return the number of threads for arrays of ``numbers`` numbers: at most ``threads``, or the
+    cores available.
+    """
     most = numbers // NUMBERS_PER_THREAD
     if most < 2:
         return 1
     if threads is None:
-        threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        threads = (
+            len(os.sched_getaffinity(0))
+            if hasattr(os, "sched_getaffinity")
+            else os.cpu_count() or 1
+        )
     return min(most, threads)
 
 
 class ArrayProgram:
-    """A trace with its first inputs fixed to ``constants``, for arrays (rows, columns) = ``shape`` of one dtype.
+    """A trace with its first inputs fixed to ``constants``, for arrays (rows, columns) = ``shape``
+    of one dtype.
 
-    A constant is an array (rows, columns) or (1, columns), or a number. ``inputs`` is the number of other inputs,
-    ``threads`` the largest number of threads (None: the cores that this process may use).
+    A constant is an array (rows, columns) or (1, columns), or a number. ``inputs`` is the number of
+    other inputs, ``threads`` the largest number of threads (None: the cores that this process may
+    use).
     """
 
     def __init__(
@@ -81,25 +98,33 @@ class ArrayProgram:
     def __call__(self, *arrays: Rows, out: Sequence[Rows] | None = None) -> Sequence[Rows]:
         """Return the results for the other inputs, in new arrays or in ``out``.
 
-        An input is (rows, columns), (1, columns), (rows, 1) or (1, 1), or (rows, columns, columns) for products of
-        matrices and vectors. An array of ``out`` is (rows, columns), of dtype bool for masks. It may be an input of
-        that shape, and must not overlap any other array. Raises ValueError if an array has a wrong shape or dtype, or
-        one of ``out`` overlaps.
+        An input is (rows, columns), (1, columns), (rows, 1) or (1, 1), or (rows, columns, columns)
+        for products of matrices and vectors. An array of ``out`` is (rows, columns), of dtype bool
+        for masks. It may be an input of that shape, and must not overlap any other array. Raises
+        ValueError if an array has a wrong shape or dtype, or one of ``out`` overlaps.
         """
         if out is None:
             out = [np.empty(self.shape, bool if is_mask else self.dtype) for is_mask in self.masks]
         try:
             self._run(self._program, self.shape[0], arrays, tuple(out), self._threads)
         except ValueError:  # the extension takes plain ndarrays only, contiguous and aligned
-            plain = tuple([np.asarray(np.require(each, requirements=["C", "A"])) for each in arrays])
-            self._run(self._program, self.shape[0], plain, tuple(map(np.asarray, out)), self._threads)
+            plain = tuple(
+                [np.asarray(np.require(each, requirements=["C", "A"])) for each in arrays]
+            )
+            self._run(
+                self._program, self.shape[0], plain, tuple(map(np.asarray, out)), self._threads
+            )
         return out
 
-    def bind(self, inputs: Sequence[Rows], outputs: Sequence[Rows], given: int, full: int) -> Callable[..., Any]:
-        """Return a fast function with the first inputs, and all outputs but the last, fixed to these arrays.
+    def bind(
+        self, inputs: Sequence[Rows], outputs: Sequence[Rows], given: int, full: int
+    ) -> Callable[..., Any]:
+        """Return a fast function with the first inputs, and all outputs but the last, fixed to
+        these arrays.
 
-        Its arguments are ``out`` and the further inputs, each an array or None. It returns ``out`` or a new array. If
-        an array needs a check or conversion in Python, it does nothing and returns NotImplemented.
+        Its arguments are ``out`` and the further inputs, each an array or None. It returns ``out``
+        or a new array. If an array needs a check or conversion in Python, it does nothing and
+        returns NotImplemented.
 
         Parameters
         ----------

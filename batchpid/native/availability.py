@@ -16,7 +16,8 @@ SWITCH = "BATCHPID_NATIVE"
 
 
 def obstacle(*extensions: Extension) -> str:
-    """Return why native code is not used, "" if it is; a faulty installation gives one RuntimeWarning per process.
+    """Return why native code is not used, "" if it is; a faulty installation gives one
+    RuntimeWarning per process.
 
     ``extensions`` are needed besides the extensions of this package.
     """

@@ -1,9 +1,9 @@
 """Native extensions: their files, and loading of those that were built from the present files.
 
-C++ code repeats tables of the Python code, so an extension works only with the files that it was built from.
-``setup.py`` compiles a digest of each file into the extension, and :func:`load` compares them. ``setup.py`` imports
-this module without its package, before NumPy is installed: it may import the standard library only. Modules that
-define extensions may import this one.
+C++ code repeats tables of the Python code, so an extension works only with the files that it was
+built from. ``setup.py`` compiles a digest of each file into the extension, and :func:`load`
+compares them. ``setup.py`` imports this module without its package, before NumPy is installed: it
+may import the standard library only. Modules that define extensions may import this one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ LANES_ONLY = (
     *("-fno-peel-loops", "-fno-tree-loop-distribute-patterns", "-fno-split-paths", "-fno-gcse"),
     "-Wno-psabi",
 )
-"""Flags for code that computes on Lanes (lanes.h), which are vectors already: half to compile, equally fast."""
+"""Flags for code that computes on Lanes (lanes.h), which are vectors already: half to compile,
+equally fast.
+"""
 VECTORIZED_ONLY = ("-O2", "-fvect-cost-model=dynamic")
 """Flags for code that gains nothing from -O3 but vectors: a third less to compile, equally fast."""
 
@@ -41,15 +43,22 @@ class Extension(NamedTuple):
     module: str
     """Full name, e.g. "batchpid.native._program"."""
     files: tuple[str, ...]
-    """Paths in the repository: the C++ file to compile, the headers that it includes, and modules with its tables."""
+    """Paths in the repository: the C++ file to compile, the headers that it includes, and modules
+    with its tables.
+    """
     flags: tuple[str, ...]
     """Compiler flags."""
 
     def digests(self, root: Path = ROOT) -> list[str]:
-        """Return "name=digest" for the flags, and for each file that exists: a wheel has no C++ files."""
+        """Return "name=digest" for the flags, and for each file that exists: a wheel has no C++
+        files.
+        """
         files = {file: (root / file).read_bytes() for file in self.files if (root / file).is_file()}
         parts = {"flags": repr(self.flags).encode(), **files}
-        return [f"{name}={hashlib.blake2b(part, digest_size=8).hexdigest()}" for name, part in parts.items()]
+        return [
+            f"{name}={hashlib.blake2b(part, digest_size=8).hexdigest()}"
+            for name, part in parts.items()
+        ]
 
 
 @cache
@@ -69,10 +78,16 @@ def load(extension: Extension) -> Any:
     except ModuleNotFoundError:
         raise ModuleNotFoundError(NOT_BUILT, name=extension.module) from None
     except ImportError as error:
-        raise StaleExtensionError(f"{name} cannot be loaded ({error}); {_remedy(extension)}") from error
+        raise StaleExtensionError(
+            f"{name} cannot be loaded ({error}); {_remedy(extension)}"
+        ) from error
     built = getattr(module, "sources", "").split()
-    if changed := [digest.partition("=")[0] for digest in extension.digests() if digest not in built]:
-        raise StaleExtensionError(f"{name} was built from other sources ({', '.join(changed)}); {_remedy(extension)}")
+    if changed := [
+        digest.partition("=")[0] for digest in extension.digests() if digest not in built
+    ]:
+        raise StaleExtensionError(
+            f"{name} was built from other sources ({', '.join(changed)}); {_remedy(extension)}"
+        )
     return module
 
 

@@ -1,6 +1,7 @@
 """Operations of programs, and the extension that executes them.
 
-``setup.py`` imports this module without its package: it may import the standard library and the module of extensions.
+``setup.py`` imports this module without its package: it may import the standard library and the
+module of extensions.
 """
 
 from __future__ import annotations
@@ -26,5 +27,7 @@ MOST_SUMMED = 128
 _FILES = ("make_program.h", "extension.h", "program.h", "operations.py")
 PROGRAMS = tuple(f"batchpid/native/{name}" for name in _FILES)
 """Headers and tables of programs, for extensions that include them."""
-PROGRAM = Extension("batchpid.native._program", ("batchpid/native/program.cpp", *PROGRAMS), (*ROUNDED, "-pthread"))
+PROGRAM = Extension(
+    "batchpid.native._program", ("batchpid/native/program.cpp", *PROGRAMS), (*ROUNDED, "-pthread")
+)
 EXTENSIONS = {"_program": PROGRAM}

@@ -1,4 +1,6 @@
-"""Symbols in place of arrays in a trace (:mod:`batchpid.native.tracing`), and the namespace of their operations."""
+"""Symbols in place of arrays in a trace (:mod:`batchpid.native.tracing`), and the namespace of
+their operations.
+"""
 
 from __future__ import annotations
 
@@ -91,7 +93,9 @@ class Symbol:
         return self
 
     def record(self, name: str, *arrays: Any) -> Symbol:
-        """Record a function of :mod:`batchpid.arrays.elementwise` as the operation ``name``; return its result."""
+        """Record a function of :mod:`batchpid.arrays.elementwise` as the operation ``name``; return
+        its result.
+        """
         return self._namespace.apply(name, *arrays)
 
     def __bool__(self) -> NoReturn:
@@ -117,7 +121,9 @@ class Symbol:
     __sub__ = _operator("subtract")
     __mul__ = __rmul__ = _operator("multiply")
     __truediv__ = _operator("divide")
-    __gt__, __ge__, __lt__, __le__ = map(_operator, ("greater", "greater_equal", "less", "less_equal"))
+    __gt__, __ge__, __lt__, __le__ = map(
+        _operator, ("greater", "greater_equal", "less", "less_equal")
+    )
     __eq__ = _operator("equal")  # type: ignore[assignment]
     __ne__ = _operator("not_equal")  # type: ignore[assignment]
     __and__, __or__ = map(_operator, ("and", "or"))

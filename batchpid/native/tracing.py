@@ -1,4 +1,6 @@
-"""Traces of array functions: a call with symbols in place of arrays records the operations of the function."""
+"""Traces of array functions: a call with symbols in place of arrays records the operations of the
+function.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +33,11 @@ class Trace(NamedTuple):
     """Trace of the operations on constants and literals only; its results are further constants."""
 
 
-def trace(function: Callable[..., Any], constants: int, inputs: int, dtype: DType = np.float64) -> Trace:
-    """Return the trace of a function with this number of ``constants`` and ``inputs``, which returns a list of arrays.
+def trace(
+    function: Callable[..., Any], constants: int, inputs: int, dtype: DType = np.float64
+) -> Trace:
+    """Return the trace of a function with this number of ``constants`` and ``inputs``, which
+    returns a list of arrays.
 
     The constants are its first arguments.
 
@@ -46,7 +51,9 @@ def trace(function: Callable[..., Any], constants: int, inputs: int, dtype: DTyp
     results = [namespace.symbol(result) for result in function(*given)]
     operations = _needed(namespace.noted, results)
     needed = {*results, *(operand for _, operands, _ in operations for operand in operands)}
-    literals = {symbol: number for number, symbol in namespace.literals.values() if symbol in needed}
+    literals = {
+        symbol: number for number, symbol in namespace.literals.values() if symbol in needed
+    }
     first = [*given[:constants], *literals]
     fixed = set(first)
     early = list[_Operation]()
@@ -59,13 +66,16 @@ def trace(function: Callable[..., Any], constants: int, inputs: int, dtype: DTyp
     used = {*results, *(operand for _, operands, _ in late for operand in operands)}
     shared = [result for _, _, result in early if result in used]
     prelude = _assembled(early, first, shared, ()) if shared else None
-    return _assembled(late, [*first, *shared, *given[constants:]], results, tuple(literals.values()), prelude)
+    return _assembled(
+        late, [*first, *shared, *given[constants:]], results, tuple(literals.values()), prelude
+    )
 
 
 def trace_trees(function: Callable[..., Any], *structures: Any, dtype: DType = np.float64) -> Trace:
     """Return the trace of a function of nested tuples, as :func:`trace` does.
 
-    ``structures`` (:func:`batchpid.arrays.trees.structure`) describe its arguments; the first one has the constants.
+    ``structures`` (:func:`batchpid.arrays.trees.structure`) describe its arguments; the first one
+    has the constants.
     """
 
     def flat(*symbols: Symbol) -> list[Any]:
@@ -96,14 +106,20 @@ _PAIRS = {
 
 
 def _fused(operations: list[_Operation], results: list[Symbol]) -> list[_Operation]:
-    """Return the operations with pairs fused, where the result of the first is used only by the second."""
-    uses = Counter(operand for _, operands, _ in operations for operand in operands) + Counter(results)
+    """Return the operations with pairs fused, where the result of the first is used only by the
+    second.
+    """
+    uses = Counter(operand for _, operands, _ in operations for operand in operands) + Counter(
+        results
+    )
     found: dict[Symbol, _Operation] = {}
     for name, operands, result in operations:
         found[result] = (name, operands, result)
         for at in range(2 if name in ("add", "multiply") else 1):
             before = found.get(operands[at])
-            pair = None if before is None or uses[operands[at]] > 1 else _PAIRS.get((before[0], name))
+            pair = (
+                None if before is None or uses[operands[at]] > 1 else _PAIRS.get((before[0], name))
+            )
             if before is not None and pair is not None:
                 del found[operands[at]]
                 found[result] = (pair, (*before[1], operands[1 - at]), result)
@@ -120,11 +136,13 @@ def _assembled(
 ) -> Trace:
     """Return a trace of ``operations`` on the symbols ``order``.
 
-    A register is reused after the last use of its value. Each result has a separate register, and may be made in place.
-    A history keeps its register.
+    A register is reused after the last use of its value. Each result has a separate register, and
+    may be made in place. A history keeps its register.
     """
     places = {symbol: place for place, symbol in enumerate(order)}
-    last_use = {operand: at for at, (_, operands, _) in enumerate(operations) for operand in operands}
+    last_use = {
+        operand: at for at, (_, operands, _) in enumerate(operations) for operand in operands
+    }
     registers = len(order)
     free = list[int]()
     rows = list[list[int]]()
@@ -141,6 +159,9 @@ def _assembled(
         numbers = [places[operand] for operand in operands]
         rows.append([OPERATIONS.index(name), places[result], *numbers, *(2 * numbers[:1])][:5])
         free += {places[one] for one in operands if last_use[one] == at and one not in kept}
-    table, ends = np.array(rows, np.int32), np.array([places[result] for result in results], np.int32)
+    table, ends = (
+        np.array(rows, np.int32),
+        np.array([places[result] for result in results], np.int32),
+    )
     masks = tuple(result.is_mask for result in results)
     return Trace(table.tobytes(), ends.tobytes(), masks, registers, literals, prelude)

@@ -1,16 +1,34 @@
 """Kinematics, dynamics and control in the space of a tool: pure functions of a :class:`RigidTree`.
 
-Arrays are (envs, dof), or have any other leading axes; poses are (..., 7): a position and a quaternion (w, x, y, z);
-twists, wrenches and Jacobians have linear parts first. NumPy computes in float64; JAX's arrays keep their dtype.
+Arrays are (envs, dof), or have any other leading axes; poses are (..., 7): a position and a
+quaternion (w, x, y, z); twists, wrenches and Jacobians have linear parts first. NumPy computes in
+float64; JAX's arrays keep their dtype.
 """
 
-from batchpid.task_space.inverse_kinematics import IKResult, InverseKinematicsWarning, inverse_kinematics
+from batchpid.task_space.inverse_kinematics import (
+    IKResult,
+    InverseKinematicsWarning,
+    inverse_kinematics,
+)
 from batchpid.task_space.operational_space import init, osc, reset, track
 from batchpid.task_space.osc_coefficients import OSCCoefficients, discretise
 from batchpid.task_space.osc_params import OSCParams, make_osc_params
-from batchpid.task_space.osc_state import OSCInputs, OSCState, OSCTerms, TaskDynamics, Tool, task_dynamics
+from batchpid.task_space.osc_state import (
+    OSCInputs,
+    OSCState,
+    OSCTerms,
+    TaskDynamics,
+    Tool,
+    task_dynamics,
+)
 from batchpid.task_space.rigid_tree import RigidTree
-from batchpid.task_space.tree_dynamics import bias, forward_dynamics, gravity, inverse_dynamics, mass_matrix
+from batchpid.task_space.tree_dynamics import (
+    bias,
+    forward_dynamics,
+    gravity,
+    inverse_dynamics,
+    mass_matrix,
+)
 from batchpid.task_space.tree_kinematics import jacobian, jacobian_rate, link_poses
 
 __all__ = [

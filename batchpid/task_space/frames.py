@@ -1,8 +1,8 @@
 """Frames and rotations, batched over any leading axes, for NumPy and JAX arrays.
 
-A frame is a matrix (..., 3, 4): the axes of the frame as columns, and its position. A pose (..., 7) is a position and a
-unit quaternion (w, x, y, z). Products are written as sums of elementwise products: their rounding does not depend on
-the number of rows, as a library's does.
+A frame is a matrix (..., 3, 4): the axes of the frame as columns, and its position. A pose (..., 7)
+is a position and a unit quaternion (w, x, y, z). Products are written as sums of elementwise
+products: their rounding does not depend on the number of rows, as a library's does.
 """
 
 from __future__ import annotations
@@ -22,18 +22,28 @@ def cross(a: Array, b: Array) -> Array:
 
 def rotate(turn: Any, vector: Array) -> Array:
     """Return the vectors (..., 3) turned by matrices (..., 3, 3): R v."""
-    return turn[..., 0] * vector[..., :1] + turn[..., 1] * vector[..., 1:2] + turn[..., 2] * vector[..., 2:3]
+    return (
+        turn[..., 0] * vector[..., :1]
+        + turn[..., 1] * vector[..., 1:2]
+        + turn[..., 2] * vector[..., 2:3]
+    )
 
 
 def unrotate(turn: Any, vector: Array) -> Array:
     """Return the vectors (..., 3) in the axes of matrices (..., 3, 3): R^T v."""
-    return turn[..., 0, :] * vector[..., :1] + turn[..., 1, :] * vector[..., 1:2] + turn[..., 2, :] * vector[..., 2:3]
+    return (
+        turn[..., 0, :] * vector[..., :1]
+        + turn[..., 1, :] * vector[..., 1:2]
+        + turn[..., 2, :] * vector[..., 2:3]
+    )
 
 
 def in_axes(turn: Any, twists: Array) -> Array:
     """Return the columns of ``twists`` (..., 6, n) in the axes of matrices (..., 3, 3)."""
     xp, columns = namespace(turn, twists), namespace(twists).moveaxis(twists, -1, -2)
-    halves = [unrotate(turn[..., None, :, :], part) for part in (columns[..., :3], columns[..., 3:])]
+    halves = [
+        unrotate(turn[..., None, :, :], part) for part in (columns[..., :3], columns[..., 3:])
+    ]
     return xp.moveaxis(xp.concatenate(halves, axis=-1), -1, -2)
 
 
@@ -43,7 +53,9 @@ def multiply(a: Array, b: Array) -> Array:
 
 
 def turned(frame: Any, inner: Any) -> Array:
-    """Return the frames ``inner`` (..., 3, 4), given in ``frame`` (..., 3, 4), where the latter is given."""
+    """Return the frames ``inner`` (..., 3, 4), given in ``frame`` (..., 3, 4), where the latter is
+    given.
+    """
     xp = namespace(frame, inner)
     product = multiply(frame[..., :3], inner)
     shift = xp.zeros_like(frame[..., :3])
@@ -66,10 +78,13 @@ def matrix_of(wxyz: Array) -> Array:
 def wxyz_of(turn: Any) -> Array:
     """Return the unit quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3).
 
-    4 q q^T is linear in the entries of the matrix; its row with the largest diagonal entry is a multiple of q.
+    4 q q^T is linear in the entries of the matrix; its row with the largest diagonal entry is a
+    multiple of q.
     """
     xp = namespace(turn)
-    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = ([turn[..., i, j] for j in range(3)] for i in range(3))
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = (
+        [turn[..., i, j] for j in range(3)] for i in range(3)
+    )
     squares = [1 + r00 + r11 + r22, 1 + r00 - r11 - r22, 1 - r00 + r11 - r22, 1 - r00 - r11 + r22]
     wx = r21 - r12
     wy = r02 - r20
@@ -86,7 +101,10 @@ def wxyz_of(turn: Any) -> Array:
     q, best = xp.stack(rows[0], axis=-1), squares[0]
     for square, row in zip(squares[1:], rows[1:], strict=True):
         better = square > best
-        q, best = xp.where(better[..., None], xp.stack(row, axis=-1), q), xp.where(better, square, best)
+        q, best = (
+            xp.where(better[..., None], xp.stack(row, axis=-1), q),
+            xp.where(better, square, best),
+        )
     q = q / xp.sqrt((q * q).sum(-1, keepdims=True))
     return xp.where(q[..., :1] < 0, -q, q)
 
@@ -97,9 +115,11 @@ def pose_of(frame: Any) -> Array:
 
 
 def rotation_error(goal: Array, wxyz: Array) -> Array:
-    """Return the rotation vectors (..., 3) [rad] from ``wxyz`` to ``goal`` (..., 4) in the world, at most pi long.
+    """Return the rotation vectors (..., 3) [rad] from ``wxyz`` to ``goal`` (..., 4) in the world,
+    at most pi long.
 
-    The quaternions need not have unit length: with (w, v) = goal * conjugate(wxyz) the angle is 2 atan2(|v|, w).
+    The quaternions need not have unit length: with (w, v) = goal * conjugate(wxyz) the angle is 2
+    atan2(|v|, w).
     """
     xp = namespace(goal, wxyz)
     gw, g = goal[..., :1], goal[..., 1:]
@@ -109,10 +129,14 @@ def rotation_error(goal: Array, wxyz: Array) -> Array:
     w, v = xp.where(w < 0, -w, w), xp.where(w < 0, -v, v)
     length = xp.sqrt((v * v).sum(-1, keepdims=True))
     small = length < 1e-12 * w
-    return v * xp.where(small, 2 / xp.where(small, w, 1.0), 2 * xp.atan2(length, w) / xp.where(small, 1.0, length))
+    return v * xp.where(
+        small, 2 / xp.where(small, w, 1.0), 2 * xp.atan2(length, w) / xp.where(small, 1.0, length)
+    )
 
 
 def pose_error(goal: Array, pose: Array) -> Array:
-    """Return the errors (..., 6) [m, rad] from ``pose`` to ``goal`` (..., 7), in the axes of the world."""
+    """Return the errors (..., 6) [m, rad] from ``pose`` to ``goal`` (..., 7), in the axes of the
+    world.
+    """
     turn = rotation_error(goal[..., 3:], pose[..., 3:])
     return namespace(goal, pose).concatenate([goal[..., :3] - pose[..., :3], turn], axis=-1)

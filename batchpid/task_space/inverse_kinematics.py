@@ -1,19 +1,21 @@
 r"""Inverse kinematics by damped least squares, with joint limits and several starts.
 
-With the error e (position, rotation vector) of a pose, the Jacobian J, and E = e^T e / 2, a step is::
+With the error e (position, rotation vector) of a pose, the Jacobian J, and E = e^T e / 2, a step
+is::
 
     J# = J^T (J J^T + (1e-8 + 0.1 E) 1)^-1
     v  = J# e
     a  = -J# J' v                            geodesic acceleration, shortened to 0.75 |v|
     dq = v + a / 2
 
-T. Sugihara, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method", IEEE Transactions on
-Robotics 27 (2011): damping in proportion to the error. M. K. Transtrum and J. P. Sethna, "Improvements to the
-Levenberg-Marquardt algorithm for nonlinear least-squares minimization", arXiv:1201.5885 (2012): geodesic acceleration,
-which takes the curvature of the tool's path into account. An active set keeps the joint limits: joints that v would
-move past a limit stop at it, and the other joints take over the remaining error. If a search does not reach the pose,
-further searches begin at other poses. In these, a joint with a full turn between its limits passes them, and is turned
-back at the end.
+T. Sugihara, "Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method", IEEE
+Transactions on Robotics 27 (2011): damping in proportion to the error. M. K. Transtrum and J. P.
+Sethna, "Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares
+minimization", arXiv:1201.5885 (2012): geodesic acceleration, which takes the curvature of the
+tool's path into account. An active set keeps the joint limits: joints that v would move past a
+limit stop at it, and the other joints take over the remaining error. If a search does not reach the
+pose, further searches begin at other poses. In these, a joint with a full turn between its limits
+passes them, and is turned back at the end.
 """
 
 from __future__ import annotations
@@ -32,7 +34,14 @@ from batchpid.task_space import native_rows
 from batchpid.task_space.frames import pose_error, pose_of
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
 from batchpid.task_space.symmetric import gram, product, quiet, whitened
-from batchpid.task_space.tree_kinematics import jacobian_at, motions_of, rate_at, read_point, tool_frame, velocities_of
+from batchpid.task_space.tree_kinematics import (
+    jacobian_at,
+    motions_of,
+    rate_at,
+    read_point,
+    tool_frame,
+    velocities_of,
+)
 
 ON_FAILURE = ("warn", "raise", "return")
 _DAMPING, _DAMPING_PER_ERROR = 1e-8, 0.1
@@ -81,8 +90,9 @@ def inverse_kinematics(
 ) -> IKResult:
     """Return joint positions that bring a tool to ``pose``, within the joint limits of ``tree``.
 
-    The first search starts at ``start``, others at poses drawn from ``seed``, the same for every env: the result of an
-    env does not depend on the others. Joints outside the chain to the tool stay at ``start``.
+    The first search starts at ``start``, others at poses drawn from ``seed``, the same for every
+    env: the result of an env does not depend on the others. Joints outside the chain to the tool
+    stay at ``start``.
 
     Parameters
     ----------
@@ -99,22 +109,32 @@ def inverse_kinematics(
     position_tolerance, rotation_tolerance
         Largest errors of a success [m, rad].
     on_failure
-        "warn": an :class:`InverseKinematicsWarning` names the first env that failed; "raise": an error; "return": the
-        caller checks ``success``.
+        "warn": an :class:`InverseKinematicsWarning` names the first env that failed; "raise": an
+        error; "return": the caller checks ``success``.
 
     Raises
     ------
     InvalidArgumentError
-        An argument has a wrong shape or range, a quaternion is not of unit length, or, with "raise", a pose was not
-        reached.
+        An argument has a wrong shape or range, a quaternion is not of unit length, or, with
+        "raise", a pose was not reached.
     """
-    index, how = instance("tree", tree, RigidTree, MAKE_TREE).index(link), choice("on_failure", on_failure, ON_FAILURE)
+    index, how = (
+        instance("tree", tree, RigidTree, MAKE_TREE).index(link),
+        choice("on_failure", on_failure, ON_FAILURE),
+    )
     integer("starts", starts, 1, 10_000)
     integer("iterations", iterations, 1, 100_000)
-    tolerances = {"position_tolerance": (position_tolerance, "m"), "rotation_tolerance": (rotation_tolerance, "rad")}
+    tolerances = {
+        "position_tolerance": (position_tolerance, "m"),
+        "rotation_tolerance": (rotation_tolerance, "rad"),
+    }
     tolerance = np.array([positive(name, *value) for name, value in tolerances.items()])
     goal, rows = _goals_and_starts(tree, pose, start)
-    at = None if point is None else array("point", read_point(goal[0], point), (3,), "xyz", kind="entry")
+    at = (
+        None
+        if point is None
+        else array("point", read_point(goal[0], point), (3,), "xyz", kind="entry")
+    )
     search = _Search(tree, index, at, tolerance, iterations)
     integer("seed", seed, 0, 2**63)
     with quiet():
@@ -122,13 +142,20 @@ def inverse_kinematics(
         if best.success.all():
             return best
         shares = np.random.default_rng(seed).uniform(size=(starts - 1, tree.dof))
-        for first, last in ((0, 4), (4, starts - 1)):  # most poses are reached from one of the first five
+        for first, last in (
+            (0, 4),
+            (4, starts - 1),
+        ):  # most poses are reached from one of the first five
             left, drawn = np.flatnonzero(~best.success), shares[first:last]
             if len(left) and len(drawn):
                 began = np.concatenate([search.drawn(rows[left], share) for share in drawn])
                 found = search.solve_past_limits(np.tile(goal[left], (len(drawn), 1)), began)
-                for number, part in enumerate(np.arange(len(began)).reshape(len(drawn), -1), start=first + 1):
-                    _replace(best, left, IKResult._make(leaf[part] for leaf in found), number, tolerance)
+                for number, part in enumerate(
+                    np.arange(len(began)).reshape(len(drawn), -1), start=first + 1
+                ):
+                    _replace(
+                        best, left, IKResult._make(leaf[part] for leaf in found), number, tolerance
+                    )
     if how != "return" and not best.success.all():
         _report(best, how)
     return best
@@ -137,7 +164,14 @@ def inverse_kinematics(
 class _Search:
     """Searches for the poses of one tool."""
 
-    def __init__(self, tree: RigidTree, index: int, point: Float64 | None, tolerance: Float64, iterations: int) -> None:
+    def __init__(
+        self,
+        tree: RigidTree,
+        index: int,
+        point: Float64 | None,
+        tolerance: Float64,
+        iterations: int,
+    ) -> None:
         self._tree = tree
         self._index = index
         self._point = point
@@ -149,34 +183,58 @@ class _Search:
         self._full = self._chain & turns & (turn > _FULL_TURN) & np.isfinite(turn)
 
     def drawn(self, rows: Float64, share: Float64) -> Float64:
-        """Return starts at a ``share`` (dof,) of the range of each joint, half a turn about ``rows`` without limits."""
+        """Return starts at a ``share`` (dof,) of the range of each joint, half a turn about
+        ``rows`` without limits.
+        """
         low, high = self._limits
-        low, high = np.where(np.isfinite(low), low, rows - np.pi), np.where(np.isfinite(high), high, rows + np.pi)
+        low, high = (
+            np.where(np.isfinite(low), low, rows - np.pi),
+            np.where(np.isfinite(high), high, rows + np.pi),
+        )
         return self._tree.positions(np.where(self._chain, low + share * (high - low), rows))
 
     def solve_past_limits(self, goal: Float64, qpos: Float64) -> IKResult:
-        """Return the results of searches in which joints with a full turn between their limits pass these."""
+        """Return the results of searches in which joints with a full turn between their limits pass
+        these.
+        """
         low, high = self._limits
         if not self._full.any():
             return self.solve(goal, qpos)
-        found = self.solve(goal, qpos, (np.where(self._full, -np.inf, low), np.where(self._full, np.inf, high)))
+        found = self.solve(
+            goal, qpos, (np.where(self._full, -np.inf, low), np.where(self._full, np.inf, high))
+        )
         over, turn = found.qpos - np.where(self._full, high, np.inf), 2 * np.pi
         under = np.where(self._full, low, -np.inf) - found.qpos
         back = turn * (np.ceil(np.maximum(under, 0) / turn) - np.ceil(np.maximum(over, 0) / turn))
         past = back.any(axis=1)
-        if past.any():  # a joint between two turns is clipped to its limits, so search again from there
+        if (
+            past.any()
+        ):  # a joint between two turns is clipped to its limits, so search again from there
             within = self.solve(goal[past], np.clip(found.qpos[past] + back[past], low, high))
             for whole, part in zip(
-                found, within._replace(iterations=within.iterations + found.iterations[past]), strict=True
+                found,
+                within._replace(iterations=within.iterations + found.iterations[past]),
+                strict=True,
             ):
                 whole[past] = part
         return found
 
-    def solve(self, goal: Float64, qpos: Float64, limits: tuple[Float64, Float64] | None = None) -> IKResult:
-        """Return the results of searches that begin at ``qpos`` (n, dof), within ``limits``, by default the tree's."""
+    def solve(
+        self, goal: Float64, qpos: Float64, limits: tuple[Float64, Float64] | None = None
+    ) -> IKResult:
+        """Return the results of searches that begin at ``qpos`` (n, dof), within ``limits``, by
+        default the tree's.
+        """
         limits = limits or self._limits
         found = native_rows.search(
-            self._tree, self._index, self._point, limits, goal, qpos, self._tolerance, self._iterations
+            self._tree,
+            self._index,
+            self._point,
+            limits,
+            goal,
+            qpos,
+            self._tolerance,
+            self._iterations,
         )
         if found is None:
             found = self._solve(goal, qpos, limits)
@@ -185,7 +243,9 @@ class _Search:
         success, count = near[:, 0] & near[:, 1], steps[:, 0].astype(np.intp)
         return IKResult(nearest, lengths[:, 0], lengths[:, 1], success, start, count)
 
-    def _solve(self, goal: Float64, qpos: Float64, limits: tuple[Float64, Float64]) -> list[Float64]:
+    def _solve(
+        self, goal: Float64, qpos: Float64, limits: tuple[Float64, Float64]
+    ) -> list[Float64]:
         """Compute the results of :func:`native_rows.search` in NumPy."""
         count = len(goal)
         nearest, lengths, steps = [qpos.copy(), np.full((count, 2), np.inf), np.zeros((count, 1))]
@@ -235,7 +295,10 @@ def _stepped(limits: tuple[Float64, Float64], at: _At, qpos: Float64, error: Flo
         if not beyond.any():
             break
     acceleration = -_damped(part, damping, at.rate(move))
-    size, most = (np.sqrt((x * x).sum(-1, keepdims=True)) for x in (acceleration, _LARGEST_ACCELERATION * move))
+    size, most = (
+        np.sqrt((x * x).sum(-1, keepdims=True))
+        for x in (acceleration, _LARGEST_ACCELERATION * move)
+    )
     share = np.where(size > most, most / size, 1.0) / 2
     return np.clip(qpos + move + np.where(free, share * acceleration, 0.0), *limits)
 
@@ -243,11 +306,15 @@ def _stepped(limits: tuple[Float64, Float64], at: _At, qpos: Float64, error: Flo
 def _damped(part: Float64, damping: Float64, vector: Float64) -> Float64:
     """Return J^T (J J^T + damping 1)^-1 v (n, dof) of the columns ``part`` (n, 6, dof) of J."""
     rows = part.swapaxes(-1, -2)
-    factor = whitened(gram(rows, rows) + damping * np.eye(6), np.concatenate([part, vector[..., None]], axis=-1))
+    factor = whitened(
+        gram(rows, rows) + damping * np.eye(6), np.concatenate([part, vector[..., None]], axis=-1)
+    )
     return gram(factor[..., :-1], factor[..., -1:])[..., 0]
 
 
-def _goals_and_starts(tree: RigidTree, pose: ArrayLike, start: ArrayLike) -> tuple[Float64, Float64]:
+def _goals_and_starts(
+    tree: RigidTree, pose: ArrayLike, start: ArrayLike
+) -> tuple[Float64, Float64]:
     """Return checked poses (envs, 7) and starts (envs, dof)."""
     columns = ("x", "y", "z", "qw", "qx", "qy", "qz")
     envs = max(1, *(np.shape(given)[0] for given in (pose, start) if np.ndim(given) == 2), 1)
@@ -264,7 +331,9 @@ def _goals_and_starts(tree: RigidTree, pose: ArrayLike, start: ArrayLike) -> tup
 def _wholly_turning(tree: RigidTree) -> NDArray[np.bool_]:
     """Return the joints (dof,) that a whole turn brings back to the same pose of all links."""
     turning = tree.bodies.slides[:, 0] == 0
-    pitch = np.where(turning, tree.coupling.multiplier % 1, tree.coupling.multiplier)  # 0 if the follower is back, too
+    pitch = np.where(
+        turning, tree.coupling.multiplier % 1, tree.coupling.multiplier
+    )  # 0 if the follower is back, too
     back = np.bincount(tree.coupling.leader, pitch != 0, minlength=tree.dof) == 0
     return turning & back & tree.independent
 
@@ -279,7 +348,9 @@ def _size(lengths: Float64, tolerance: Float64) -> Float64:
 
 
 def _replace(best: IKResult, left: Array, found: IKResult, start: int, tolerance: Float64) -> None:
-    """Write ``found`` over the rows ``left`` of ``best`` that have not succeeded, where it is nearer."""
+    """Write ``found`` over the rows ``left`` of ``best`` that have not succeeded, where it is
+    nearer.
+    """
     nearer = _size(_lengths(found, slice(None)), tolerance) < _size(_lengths(best, left), tolerance)
     rows = nearer & ~best.success[left]
     for whole, part in zip(best, found, strict=True):
@@ -292,11 +363,15 @@ def _report(found: IKResult, how: str) -> None:
     failed = np.flatnonzero(~found.success)
     env = int(failed[0])
     problem = (
-        f"was not reached in {len(failed)} of {len(found.success)} envs: {found.position_error[env] * 1e3:.3g} mm and "
-        f"{found.rotation_error[env] * 1e3:.3g} mrad are left"
+        f"was not reached in {len(failed)} of {len(found.success)} envs:"
+        f" {found.position_error[env] * 1e3:.3g} mm and {found.rotation_error[env] * 1e3:.3g} mrad"
+        " are left"
     )
     error = InvalidArgumentError(
-        "pose", problem, env=env, remedy="check that it is in reach, or give more starts or larger tolerances"
+        "pose",
+        problem,
+        env=env,
+        remedy="check that it is in reach, or give more starts or larger tolerances",
     )
     if how == "raise":
         raise error

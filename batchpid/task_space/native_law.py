@@ -1,4 +1,5 @@
-"""Operational-space control in native code, for any number of rows, or within the sim steps of a tick.
+"""Operational-space control in native code, for any number of rows, or within the sim steps of a
+tick.
 
 The code is in task_space.cpp.
 """
@@ -20,7 +21,16 @@ from batchpid.task_space.rigid_tree import RigidTree
 from batchpid.task_space.tree_kinematics import prepared, read_point
 
 _RESULTS = {
-    **{"effort": 0, "integral": 6, "limited": 0, "error": 6, "wrench": 6, "task": 0, "posture": 0, "unsaturated": 0},
+    **{
+        "effort": 0,
+        "integral": 6,
+        "limited": 0,
+        "error": 6,
+        "wrench": 6,
+        "task": 0,
+        "posture": 0,
+        "unsaturated": 0,
+    },
     **{"task_share": 1, "posture_share": 1, "near_singular": 1},
 }
 """Terms and state in the order of the results in LAW, and their columns; 0 for one per joint."""
@@ -29,7 +39,11 @@ _WITHOUT_TREE = None, -1, None
 
 
 def law(
-    k: OSCCoefficients, state: OSCState, dynamics: TaskDynamics | Tool, inputs: OSCInputs, wanted: tuple[str, ...]
+    k: OSCCoefficients,
+    state: OSCState,
+    dynamics: TaskDynamics | Tool,
+    inputs: OSCInputs,
+    wanted: tuple[str, ...],
 ) -> tuple[OSCState, OSCTerms] | None:
     """Return the results of :func:`batchpid.task_space.osc`; None where native code is not used.
 
@@ -46,7 +60,9 @@ def law(
         return None
     rows, dof = inputs.qpos.shape
     wanted = wanted if state.integral is None else (*wanted, "integral")
-    results = [np.empty((rows, size or dof)) if name in wanted else None for name, size in _RESULTS.items()]
+    results = [
+        np.empty((rows, size or dof)) if name in wanted else None for name, size in _RESULTS.items()
+    ]
     fixed: tuple[Any, ...] = (k.frame is not None, *_WITHOUT_TREE)
     if tool is not None:
         fixed, chain = _of_tree(native, tool.tree, tool.link, given[0], k)
@@ -68,14 +84,18 @@ def friction(arrays: Mapping[str, Any], coulomb: Array, band: Array) -> Float64 
         return None
     found = np.empty(qpos.shape)
     given = map({**arrays, "effort": found}.get, LAW)
-    native_rows.call(native.friction, *qpos.shape, False, *_WITHOUT_TREE, *given, None, coulomb, band)
+    native_rows.call(
+        native.friction, *qpos.shape, False, *_WITHOUT_TREE, *given, None, coulomb, band
+    )
     return found
 
 
 def _of_tree(
     native: Any, tree: RigidTree, link: str, point: Array, k: OSCCoefficients
 ) -> tuple[tuple[Any, ...], Float64]:
-    """Return the arguments of ``law`` and ``bind`` between sizes and arrays, and the chain to the tool (dof,)."""
+    """Return the arguments of ``law`` and ``bind`` between sizes and arrays, and the chain to the
+    tool (dof,).
+    """
     own, index = native_rows.native_tree(native, tree), tree.index(link)
     body = tree.link_bodies[index]
     fixed = k.frame is not None, own.tree, body, native_rows.tool(own, index, point)
@@ -112,7 +132,9 @@ class BoundOSC:
         (rows, dof), native = qpos.shape, native_rows.in_use()
         assert native is not None
         self._parts, self._columns = {"setpoint": slice(0, 7), **parts}, columns
-        self._given = {name: np.zeros((rows, part.stop - part.start)) for name, part in self._parts.items()}
+        self._given = {
+            name: np.zeros((rows, part.stop - part.start)) for name, part in self._parts.items()
+        }
         self._posture = np.zeros_like(qpos)
         self.state = {"posture": np.zeros_like(qpos)}
         if k.ki_dt is not None:
@@ -121,8 +143,19 @@ class BoundOSC:
         fixed, chain = _of_tree(native, tool.tree, tool.link, tool.point, k)
         integral = self.state.get("integral")
         known: Document = dict(zip(k._fields[:-1], k[:-1], strict=True)) | self._given
-        known |= {"qpos": qpos, "qvel": qvel, "bias": bias, "chain": chain, "posture": self._posture}
-        known |= {"integral": integral, "next_integral": integral, "effort": self.effort, "limited": self.limited}
+        known |= {
+            "qpos": qpos,
+            "qvel": qvel,
+            "bias": bias,
+            "chain": chain,
+            "posture": self._posture,
+        }
+        known |= {
+            "integral": integral,
+            "next_integral": integral,
+            "effort": self.effort,
+            "limited": self.limited,
+        }
         if damping is not None:
             known |= {"damping": damping, "added_inertia": timestep * damping}
         rubbing: list[Float64 | None] = [None, None, None]
@@ -136,7 +169,11 @@ class BoundOSC:
             array[...] = state[name]
 
     def load(self, setpoint: Float64) -> None:
-        """Copy the setpoints of a tick (envs, size); joints without a column in them keep the state's posture."""
+        """Copy the setpoints of a tick (envs, size); joints without a column in them keep the
+        state's posture.
+        """
         for name, part in self._parts.items():
             self._given[name][...] = setpoint[:, part]
-        self._posture[...] = np.where(self._columns > 0, setpoint[:, self._columns], self.state["posture"])
+        self._posture[...] = np.where(
+            self._columns > 0, setpoint[:, self._columns], self.state["posture"]
+        )

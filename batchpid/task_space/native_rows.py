@@ -1,8 +1,9 @@
-"""Kinematics and inverse kinematics of NumPy arrays in native code, for any number of rows: task_space.cpp.
+"""Kinematics and inverse kinematics of NumPy arrays in native code, for any number of rows:
+task_space.cpp.
 
-Each function takes float64 arrays and returns None where native code is not used: switched off (``BATCHPID_NATIVE=0``),
-not built, or for arrays of another library. The caller then computes the same in NumPy, the definition; results differ
-in their last bits, since sums have another order.
+Each function takes float64 arrays and returns None where native code is not used: switched off
+(``BATCHPID_NATIVE=0``), not built, or for arrays of another library. The caller then computes the
+same in NumPy, the definition; results differ in their last bits, since sums have another order.
 """
 
 from __future__ import annotations
@@ -22,7 +23,13 @@ from batchpid.native.extensions import load
 from batchpid.native.task_space_extension import KINEMATICS, TASK_SPACE
 from batchpid.task_space.rigid_tree import RigidTree
 
-_SIZES = {"pose": (7,), "jacobian": (6, -1), "jacobian_rate": (6,), "mass_matrix": (-1, -1), "bias": (-1,)}
+_SIZES = {
+    "pose": (7,),
+    "jacobian": (6, -1),
+    "jacobian_rate": (6,),
+    "mass_matrix": (-1, -1),
+    "bias": (-1,),
+}
 """Shapes of the results of :func:`kinematics`; -1 stands for the degrees of freedom."""
 _PLAIN = frozenset({np.ndarray, type(None)})
 _DYNAMICS = {"mass_matrix", "bias"}
@@ -50,14 +57,24 @@ def _extension() -> Array:
 
 
 def kinematics(
-    tree: RigidTree, wanted: tuple[str, ...], qpos: Array, qvel: Array = None, index: int = 0, point: Array = None
+    tree: RigidTree,
+    wanted: tuple[str, ...],
+    qpos: Array,
+    qvel: Array = None,
+    index: int = 0,
+    point: Array = None,
 ) -> tuple[Array, ...] | None:
-    """Return the ``wanted`` arrays (..., ...), of "pose", "jacobian", "jacobian_rate", "mass_matrix" and "bias".
+    """Return the ``wanted`` arrays (..., ...), of "pose", "jacobian", "jacobian_rate",
+    "mass_matrix" and "bias".
 
-    The first three belong to a ``point`` (3,) or (..., 3) of the link ``index``. "jacobian_rate" and "bias" need
-    ``qvel``. ``qpos`` and ``qvel`` are checked arrays (..., dof).
+    The first three belong to a ``point`` (3,) or (..., 3) of the link ``index``. "jacobian_rate"
+    and "bias" need ``qvel``. ``qpos`` and ``qvel`` are checked arrays (..., dof).
     """
-    native = in_use() if type(qpos) is np.ndarray and (point is None or isinstance(point, np.ndarray)) else None
+    native = (
+        in_use()
+        if type(qpos) is np.ndarray and (point is None or isinstance(point, np.ndarray))
+        else None
+    )
     if native is None or not (tree.fixed_base or _DYNAMICS.isdisjoint(wanted)):
         return None
     dof = tree.dof
@@ -72,16 +89,17 @@ def kinematics(
 def bound(
     tree: RigidTree, wanted: tuple[str, ...], qpos: Float64, qvel: Float64, index: int
 ) -> tuple[Callable[[], None], tuple[Float64, ...]] | None:
-    """Return a function that computes the results of :func:`kinematics`, on a fixed base, and their arrays.
+    """Return a function that computes the results of :func:`kinematics`, on a fixed base, and their
+    arrays.
 
     A call reads the contiguous arrays ``qpos`` and ``qvel`` (rows, dof).
     """
     if (native := in_use()) is None:
         return None
     found = empty(wanted, qpos.shape[:1], tree.dof)
-    return partial(native.kinematics, *_arguments(native, tree, found, [qpos, qvel], index, None)), tuple(
-        found.values()
-    )
+    return partial(
+        native.kinematics, *_arguments(native, tree, found, [qpos, qvel], index, None)
+    ), tuple(found.values())
 
 
 def _arguments(
@@ -109,11 +127,11 @@ def search(
     tolerance: Array,
     iterations: int,
 ) -> list[Float64] | None:
-    """Search, from ``start`` (n, dof), for joint positions within ``limits`` (dof,) that bring a tool to the poses
-    ``goal`` (n, 7).
+    """Search, from ``start`` (n, dof), for joint positions within ``limits`` (dof,) that bring a
+    tool to the poses ``goal`` (n, 7).
 
-    Return the nearest positions (n, dof), their errors (n, 2) and their numbers of steps (n, 1). The tool is at a
-    ``point`` (3,) of the link ``index``; ``tolerance`` is (2,).
+    Return the nearest positions (n, dof), their errors (n, 2) and their numbers of steps (n, 1).
+    The tool is at a ``point`` (3,) of the link ``index``; ``tolerance`` is (2,).
     """
     if (native := in_use()) is None:
         return None
@@ -126,7 +144,9 @@ def search(
 
 
 def tool(own: _NativeTree, index: int, point: Array) -> Float64:
-    """Return the frames (1 | rows, 12) of a link in its body, with the origin at a ``point`` (3,) or (..., 3)."""
+    """Return the frames (1 | rows, 12) of a link in its body, with the origin at a ``point`` (3,)
+    or (..., 3).
+    """
     tool = own.tools[index]
     if point is not None:
         tool = np.broadcast_to(tool, (*point.shape[:-1], 3, 4)).copy()
@@ -148,12 +168,16 @@ def native_tree(native: Any, tree: RigidTree) -> _NativeTree:
 
 def for_rows(like: Any, *arrays: Array) -> Array:
     """Return the extension if all arrays are NumPy's and ``like`` is (envs, columns), else None."""
-    plain = _PLAIN.issuperset(map(type, arrays)) or all(x is None or isinstance(x, np.ndarray) for x in arrays)
+    plain = _PLAIN.issuperset(map(type, arrays)) or all(
+        x is None or isinstance(x, np.ndarray) for x in arrays
+    )
     return in_use() if plain and like.ndim == 2 else None
 
 
 def call(function: Callable[..., None], *arguments: Any) -> None:
-    """Call a function of the extension, which takes contiguous arrays of float64 only; others are converted."""
+    """Call a function of the extension, which takes contiguous arrays of float64 only; others are
+    converted.
+    """
     try:
         function(*arguments)
     except (ValueError, BufferError):

@@ -1,8 +1,9 @@
-r"""Operational-space control: the tool as decoupled unit masses on springs, pure functions on (envs, ...) arrays.
+r"""Operational-space control: the tool as decoupled unit masses on springs, pure functions on
+(envs, ...) arrays.
 
-With the tool's Jacobian J and pose, the mass matrix M and the bias h at present, the joints c of the chain to the tool
-and the other joints o, the setpoint's pose, twist V and acceleration V', and the gains kp, kd, ki of the task and kp_n,
-kd_n of the posture::
+With the tool's Jacobian J and pose, the mass matrix M and the bias h at present, the joints c of
+the chain to the tool and the other joints o, the setpoint's pose, twist V and acceleration V', and
+the gains kp, kd, ki of the task and kp_n, kd_n of the posture::
 
     e     = position and rotation vector from the pose to the setpoint, each shortened to its limit
     a     = kp e + kd (V - J q') + V' + I                       acceleration of the task
@@ -18,26 +19,28 @@ kd_n of the posture::
     u_o   = h + M_oo a_o + M_oc M_cc^-1 (s1 task + s2 null) + feedforward
     I    <- I + ki dt e, within its limit, unless s1 < 1, u is clipped or L is bounded, and a e > 0
 
-These are the gains of the explicit law; :mod:`batchpid.task_space.osc_coefficients` has the implicit one. Springs of
-stiffness kp_l push joints of the chain away from their limits; x is the depth of q in the margin.
+These are the gains of the explicit law; :mod:`batchpid.task_space.osc_coefficients` has the
+implicit one. Springs of stiffness kp_l push joints of the chain away from their limits; x is the
+depth of q in the margin.
 
-The other joints, such as fingers, are controlled by computed torque: in the task they would move with the hand. L_n is
-the inertia over the axes of motion and force. A bounded inverse turns an eigenvalue s into 1/s, or s/s0^2 below s0:
-near a singularity the direction in which the tool cannot move loses its stiffness to the posture, continuously, and the
-motion returns from it.
+The other joints, such as fingers, are controlled by computed torque: in the task they would move
+with the hand. L_n is the inertia over the axes of motion and force. A bounded inverse turns an
+eigenvalue s into 1/s, or s/s0^2 below s0: near a singularity the direction in which the tool cannot
+move loses its stiffness to the posture, continuously, and the motion returns from it.
 
-Below its bound an inertia lets the posture into the task. The damping has to enter below s0, where the task loses its
-own. The springs would pull the tool off poses that it reaches: at rest its error would be (s0^2/s^2 - 1) (v J a_s) / kp
-along the eigenvector v. So L_s has a lower bound s1 = s0/5, below which the springs draw the robot out of the singular
-pose: an eigenvalue s turns into 1/s, or s (2 - s^2/s1^2) / s1^2 below s1. The derivative is continuous, since a robot
-whose setpoint is out of reach rests just below s1, where a kink would chatter.
+Below its bound an inertia lets the posture into the task. The damping has to enter below s0, where
+the task loses its own. The springs would pull the tool off poses that it reaches: at rest its error
+would be (s0^2/s^2 - 1) (v J a_s) / kp along the eigenvector v. So L_s has a lower bound s1 = s0/5,
+below which the springs draw the robot out of the singular pose: an eigenvalue s turns into 1/s, or
+s (2 - s^2/s1^2) / s1^2 below s1. The derivative is continuous, since a robot whose setpoint is out
+of reach rests just below s1, where a kink would chatter.
 
-Saturation keeps the direction of the motion: s1 in [0, 1] is the largest share of the task with which all joints are
-within their limits, and s2 the largest share of the posture in the room that is left. A joint whose u is out of limits
-with neither is clipped, and left out of both.
+Saturation keeps the direction of the motion: s1 in [0, 1] is the largest share of the task with
+which all joints are within their limits, and s2 the largest share of the posture in the room that
+is left. A joint whose u is out of limits with neither is clipped, and left out of both.
 
-O. Khatib, "A unified approach for motion and force control of robot manipulators: the operational space formulation",
-IEEE Journal on Robotics and Automation 3 (1987).
+O. Khatib, "A unified approach for motion and force control of robot manipulators: the operational
+space formulation", IEEE Journal on Robotics and Automation 3 (1987).
 """
 
 from __future__ import annotations
@@ -69,7 +72,8 @@ from batchpid.task_space.symmetric import product, quiet, solve
 
 
 def init(params: OSCParams, qpos: Array) -> OSCState:
-    """Return the state before the first step: the posture is ``qpos`` (envs, dof) [rad or m], the integral 0.
+    """Return the state before the first step: the posture is ``qpos`` (envs, dof) [rad or m], the
+    integral 0.
 
     Raises InvalidArgumentError for params of another type.
     """
@@ -86,7 +90,10 @@ def reset(params: OSCParams, state: OSCState, qpos: Array, mask: Array) -> OSCSt
     xp, fresh = namespace(*state, qpos, mask), init(params, qpos)
     chosen = xp.asarray(mask)[:, None]
     return OSCState(
-        *[None if old is None else xp.where(chosen, new, old) for new, old in zip(fresh, state, strict=True)]
+        *[
+            None if old is None else xp.where(chosen, new, old)
+            for new, old in zip(fresh, state, strict=True)
+        ]
     )
 
 
@@ -106,7 +113,8 @@ def osc(
     k
         Params at the time step: :func:`batchpid.task_space.discretise`.
     dynamics
-        Dynamics at the present state, such as an engine's, or a tool, with whose tree they are computed.
+        Dynamics at the present state, such as an engine's, or a tool, with whose tree they are
+        computed.
     wanted
         Names of the terms that the caller uses. Others may be None: native code leaves them out.
 
@@ -135,11 +143,15 @@ def osc(
             held = (p.near_singular | (effort != whole).any(-1))[:, None] & (a * task.near > 0)
             state = state._replace(integral=_integrated(k, state.integral, task, held))
     shares = s1[..., 0], s2[..., 0]
-    return state, OSCTerms(task.error, p.force, p.task, p.posture, whole, effort, *shares, p.near_singular)
+    return state, OSCTerms(
+        task.error, p.force, p.task, p.posture, whole, effort, *shares, p.near_singular
+    )
 
 
 def _check_shapes(k: OSCCoefficients, inputs: OSCInputs) -> None:
-    """Raise InvalidArgumentError for an input that is not (envs, size), and for coefficients of other envs."""
+    """Raise InvalidArgumentError for an input that is not (envs, size), and for coefficients of
+    other envs.
+    """
     if np.ndim(inputs.qpos) != 2:
         problem = f"has shape {np.shape(inputs.qpos)}, not (envs, dof)"
         raise InvalidArgumentError("qpos", problem, remedy="give one row for each env")
@@ -170,13 +182,25 @@ class Task(NamedTuple):
 def in_frame(k: OSCCoefficients, d: TaskDynamics, inputs: OSCInputs) -> Task:
     """Return the dynamics, error and motion in the axes of the params' frame."""
     xp = namespace(*k, *d, *inputs)
-    error, limits = pose_error(inputs.setpoint, d.pose), (k.position_error_limit, k.rotation_error_limit)
-    near = [_shortened(part, limit, xp) for part, limit in zip((error[..., :3], error[..., 3:]), limits, strict=True)]
-    vectors: tuple[Array, ...] = error, xp.concatenate(near, axis=-1), product(d.jacobian, inputs.qvel)
+    error, limits = (
+        pose_error(inputs.setpoint, d.pose),
+        (k.position_error_limit, k.rotation_error_limit),
+    )
+    near = [
+        _shortened(part, limit, xp)
+        for part, limit in zip((error[..., :3], error[..., 3:]), limits, strict=True)
+    ]
+    vectors: tuple[Array, ...] = (
+        error,
+        xp.concatenate(near, axis=-1),
+        product(d.jacobian, inputs.qvel),
+    )
     vectors += inputs.twist, inputs.acceleration
     if k.frame is not None:
         turn = matrix_of(d.pose[..., 3:])
-        vectors = tuple([None if x is None else in_axes(turn, x[..., None])[..., 0] for x in vectors])
+        vectors = tuple(
+            [None if x is None else in_axes(turn, x[..., None])[..., 0] for x in vectors]
+        )
         d = in_tool_axes(d)
     return Task(d, *vectors)
 
@@ -215,7 +239,10 @@ def posture_acceleration(
         return a, springs
     depth = xp.maximum(k.limit_low - q, 0.0) - xp.maximum(q - k.limit_high, 0.0)
     pushed = k.limit_kp * depth
-    return a + d.chain * (pushed - k.limit_kd * v * xp.abs(depth) / k.limit_margin), springs + d.chain * pushed
+    return (
+        a + d.chain * (pushed - k.limit_kd * v * xp.abs(depth) / k.limit_margin),
+        springs + d.chain * pushed,
+    )
 
 
 def _saturated(p: Projections, low: Array, high: Array) -> tuple[Array, ...]:
@@ -231,7 +258,9 @@ def _saturated(p: Projections, low: Array, high: Array) -> tuple[Array, ...]:
         room = xp.maximum(xp.where(effort > 0, most - at, at - least), 0.0)
         size = xp.abs(effort)
         limited = able & (size > room)
-        return xp.where(limited, room / xp.where(limited, size, 1.0), 1.0).min(axis=-1, keepdims=True)
+        return xp.where(limited, room / xp.where(limited, size, 1.0), 1.0).min(
+            axis=-1, keepdims=True
+        )
 
     s1 = share(task, base)
     s2 = share(null, base + s1 * task)
@@ -254,16 +283,18 @@ def track(
     acceleration: Array = None,
     feedforward: Array = None,
 ) -> OSCState:
-    """Return a state with which the next step, on the same inputs, gives ``effort`` (envs, dof) [N m or N].
+    """Return a state with which the next step, on the same inputs, gives ``effort`` (envs, dof) [N
+    m or N].
 
-    ``effort`` is the last one of another controller, such as a joint PID, or of other gains. In the model it gives the
-    joints the acceleration q'' = M^-1 (effort - h - feedforward). The integral is chosen so that the task asks for the
-    tool's share of q''; the posture is chosen so that the joints ask for the rest, in the null space and outside the
-    chain. A load that the model does not know is thus held by the integral and the posture.
+    ``effort`` is the last one of another controller, such as a joint PID, or of other gains. In the
+    model it gives the joints the acceleration q'' = M^-1 (effort - h - feedforward). The integral
+    is chosen so that the task asks for the tool's share of q''; the posture is chosen so that the
+    joints ask for the rest, in the null space and outside the chain. A load that the model does not
+    know is thus held by the integral and the posture.
 
-    The next effort differs from ``effort`` where the integral or an effort is at its limit, a joint has no posture
-    stiffness, an axis is not selected, or the pose is near a singularity. For a transfer back to a joint PID, call
-    :func:`batchpid.track` with the last effort.
+    The next effort differs from ``effort`` where the integral or an effort is at its limit, a joint
+    has no posture stiffness, an axis is not selected, or the pose is near a singularity. For a
+    transfer back to a joint PID, call :func:`batchpid.track` with the last effort.
 
     Raises
     ------
@@ -275,7 +306,9 @@ def track(
     bias = dynamics.bias
     if params.integral_gain is None:
         problem = "is off, so no integral can carry the effort over"
-        raise InvalidArgumentError("params.integral_gain", problem, remedy="give integral_gain; 0 is allowed")
+        raise InvalidArgumentError(
+            "params.integral_gain", problem, remedy="give integral_gain; 0 is allowed"
+        )
     inputs = OSCInputs(setpoint, qpos, qvel, twist, acceleration)
     xp = namespace(*k, *dynamics, *inputs, effort)
     with quiet():

@@ -1,15 +1,15 @@
 r"""Coefficients of operational-space control at one time step.
 
-A loop with constant params computes them once. They are marked with an asterisk in the acceleration of the task
-(:mod:`batchpid.task_space.operational_space`), where e is the error of the pose, v the twist of the tool, V and V' the
-twist and acceleration of the setpoint, and I the integral::
+A loop with constant params computes them once. They are marked with an asterisk in the acceleration
+of the task (:mod:`batchpid.task_space.operational_space`), where e is the error of the pose, v the
+twist of the tool, V and V' the twist and acceleration of the setpoint, and I the integral::
 
     a = kp* e - kd* v + c* V + g* V' + I        I <- I + ki* dt e - ki2* V
 
-- "explicit": kp* = kp, kd* = c* = kd, g* = 1, ki* = ki and ki2* = 0. Decoupled axes are stable for w dt < 0.828 with
-  kp = w^2, kd = 2 w.
-- "implicit": the error, the twist and the integral are those at the end of the step, where V and V' are given. As for
-  joints (:mod:`batchpid.law.implicit`), with D = 1 + dt kd + dt^2 kp + dt^3 ki::
+- "explicit": kp* = kp, kd* = c* = kd, g* = 1, ki* = ki and ki2* = 0. Decoupled axes are stable for
+  w dt < 0.828 with kp = w^2, kd = 2 w.
+- "implicit": the error, the twist and the integral are those at the end of the step, where V and V'
+  are given. As for joints (:mod:`batchpid.law.implicit`), with D = 1 + dt kd + dt^2 kp + dt^3 ki::
 
       kp* = (kp + dt ki) / D      kd* = (kd + dt kp + dt^2 ki) / D      c* = kd / D      g* = 1 / D      ki* = ki / D
 
@@ -92,11 +92,17 @@ def discretise(params: OSCParams, dt: Array) -> OSCCoefficients:
         posture_kp, posture_kd = _implicit(posture_kp, posture_kd, dt)
         if limit_kp is not None:
             limit_kp, limit_kd = _implicit(limit_kp, limit_kd, dt)
-    same = {name: leaf for name, leaf in params._asdict().items() if name in OSCCoefficients._fields}
+    same = {
+        name: leaf for name, leaf in params._asdict().items() if name in OSCCoefficients._fields
+    }
     own = {
         "limit_margin": None if margin is None else xp.where(margin > 0, margin, 1.0),
-        "limit_low": None if margin is None else xp.where(margin > 0, params.lower + margin, -xp.inf),
-        "limit_high": None if margin is None else xp.where(margin > 0, params.upper - margin, xp.inf),
+        "limit_low": (
+            None if margin is None else xp.where(margin > 0, params.lower + margin, -xp.inf)
+        ),
+        "limit_high": (
+            None if margin is None else xp.where(margin > 0, params.upper - margin, xp.inf)
+        ),
     }
     return OSCCoefficients(
         **same | own,

@@ -14,7 +14,15 @@ from batchpid.arrays.display import array_summary
 from batchpid.arrays.elementwise import TURN
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.arrays.leaves import checked_ends
-from batchpid.checks.validate import AxisKind, array, choice, entries, instance, known_keywords, read_array
+from batchpid.checks.validate import (
+    AxisKind,
+    array,
+    choice,
+    entries,
+    instance,
+    known_keywords,
+    read_array,
+)
 from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rigid_tree import MAKE_TREE, RigidTree
 from batchpid.task_space.tree_dynamics import check_masses
@@ -78,8 +86,9 @@ class OSCParams(NamedTuple):
     """Position limits of the tree (1, dof) [rad or m]; None without ``limit_margin``."""
     upper: Array = None
     turns: Array = None
-    """1 / (2 pi) for joints of the tree that turn without limits, whose posture is the one next to qpos, else 0
-    (1, dof); None without such joints."""
+    """1 / (2 pi) for joints of the tree that turn without limits, whose posture is the one next to
+    qpos, else 0 (1, dof); None without such joints.
+    """
     discretization: Any = None
     """ImplicitLaw(): the gains act on the predicted end of the step; None: on its beginning."""
 
@@ -106,43 +115,55 @@ def make_osc_params(
     rotation_error_limit: Annotated[ArrayLike, Field("rad", math.inf, above=True)] = 0.5,
     smallest_eigenvalue: Annotated[ArrayLike, Field("1/kg or 1/(kg m^2)", above=True)] = 0.02,
     effort_limit: Annotated[ArrayLike | None, Field("N m or N", math.inf, group="joint")] = None,
-    effort_min: Annotated[ArrayLike | None, Field("N m or N", -math.inf, low=-math.inf, group="joint")] = None,
-    effort_max: Annotated[ArrayLike | None, Field("N m or N", math.inf, low=-math.inf, group="joint")] = None,
+    effort_min: Annotated[
+        ArrayLike | None, Field("N m or N", -math.inf, low=-math.inf, group="joint")
+    ] = None,
+    effort_max: Annotated[
+        ArrayLike | None, Field("N m or N", math.inf, low=-math.inf, group="joint")
+    ] = None,
     frame: str = "world",
     discretization: str = "explicit",
 ) -> OSCParams:
     """Build validated :class:`OSCParams` for a tool of ``tree``.
 
-    A number may be a scalar, one per axis (6,) or joint (dof,), or one per env as well, (envs, 6) or (envs, dof).
+    A number may be a scalar, one per axis (6,) or joint (dof,), or one per env as well, (envs, 6)
+    or (envs, dof).
 
     Parameters
     ----------
     stiffness, damping_ratio, damping
-        kp >= 0 [1/s^2] and kd = 2 zeta sqrt(kp), or kd itself [1/s], of the axes x, y, z, rx, ry, rz.
+        kp >= 0 [1/s^2] and kd = 2 zeta sqrt(kp), or kd itself [1/s], of the axes x, y, z, rx, ry,
+        rz.
     integral_gain, integral_limit
-        ki [1/s^3], which learns loads that the model does not know, and the largest size of the integral of each axis
-        [m/s^2, rad/s^2]. A loop with kp and kd is stable for ki < kp kd. None: no integral.
+        ki [1/s^3], which learns loads that the model does not know, and the largest size of the
+        integral of each axis [m/s^2, rad/s^2]. A loop with kp and kd is stable for ki < kp kd.
+        None: no integral.
     axes
         Bools: the axes whose motion is controlled; the posture moves the others. None: all.
     force_axes
-        Bools: axes, not among ``axes``, that the wrench controls, and on which the posture does not act.
+        Bools: axes, not among ``axes``, that the wrench controls, and on which the posture does not
+            act.
     posture_stiffness, posture_damping_ratio
-        Gains of the joints towards their posture: within the null space of the task for the joints of the chain to the
-        tool, fully for others, such as fingers [1/s^2]. Followers have none.
+        Gains of the joints towards their posture: within the null space of the task for the joints
+        of the chain to the tool, fully for others, such as fingers [1/s^2]. Followers have none.
     limit_margin, limit_stiffness
-        Joints of the chain that come nearer to a position limit than the margin [rad or m], or a quarter of their
-        range, are pushed away within the null space, by a critically damped spring [1/s^2]. None: no margin.
+        Joints of the chain that come nearer to a position limit than the margin [rad or m], or a
+        quarter of their range, are pushed away within the null space, by a critically damped spring
+        [1/s^2]. None: no margin.
     position_error_limit, rotation_error_limit
         Largest norm of the error that enters the law [m, rad]; inf for none.
     smallest_eigenvalue
-        s0 > 0 of the bounded inverse (:func:`batchpid.task_space.symmetric.bounded_inverse`): below it, directions near
-        a singularity lose stiffness; below s0/5 the posture pulls the tool there [1/kg, 1/(kg m^2)].
+        s0 > 0 of the bounded inverse (:func:`batchpid.task_space.symmetric.bounded_inverse`): below
+        it, directions near a singularity lose stiffness; below s0/5 the posture pulls the tool
+        there [1/kg, 1/(kg m^2)].
     effort_limit, effort_min, effort_max
-        Limits of the total effort of the joints [N m or N]: ``effort_limit=x`` is ``effort_min=-x, effort_max=x``.
+        Limits of the total effort of the joints [N m or N]: ``effort_limit=x`` is ``effort_min=-x,
+        effort_max=x``.
     frame
         "world" or "tool": the axes of gains, selections and wrenches. Setpoints are in the world.
     discretization
-        "explicit", or "implicit": stable at any time step (:mod:`batchpid.task_space.osc_coefficients`).
+        "explicit", or "implicit": stable at any time step
+        (:mod:`batchpid.task_space.osc_coefficients`).
 
     Raises
     ------
@@ -153,20 +174,32 @@ def make_osc_params(
     joints = tree.joint_names
     # An option without effect is an error: it is nearly always a misunderstanding.
     _check_unused("damping_ratio", damping_ratio, 1.0, damping is not None, "damping is given, too")
-    _check_unused("integral_limit", integral_limit, math.inf, integral_gain is None, "integral_gain is not given")
-    _check_unused("limit_stiffness", limit_stiffness, 400.0, limit_margin is None, "limit_margin is not given")
+    _check_unused(
+        "integral_limit",
+        integral_limit,
+        math.inf,
+        integral_gain is None,
+        "integral_gain is not given",
+    )
+    _check_unused(
+        "limit_stiffness", limit_stiffness, 400.0, limit_margin is None, "limit_margin is not given"
+    )
     kp = _rows("stiffness", stiffness, AXES)
     kd = 2 * _rows("damping_ratio", damping_ratio, AXES) * np.sqrt(kp)
     posture = _rows("posture_stiffness", posture_stiffness, joints) * tree.independent
-    motion, force = (_mask(name, value) for name, value in (("axes", axes), ("force_axes", force_axes)))
+    motion, force = (
+        _mask(name, value) for name, value in (("axes", axes), ("force_axes", force_axes))
+    )
     if force is not None:
         both = force * (np.ones((1, 6)) if motion is None else motion)
         entries("force_axes", both > 0, both == 0, "is an axis of motion, too", AXES, kind="entry")
     given = {"effort_limit": effort_limit, "effort_min": effort_min, "effort_max": effort_max}
-    efforts = {name: None if rows is None else _rows(name, rows, joints) for name, rows in given.items()}
+    efforts = {
+        name: None if rows is None else _rows(name, rows, joints) for name, rows in given.items()
+    }
     low, high = checked_ends(efforts, joints)
-    # Joints without limits that turn are angles modulo 2 pi for the posture. Followers have no posture and no limits of
-    # their own: their leader has them.
+    # Joints without limits that turn are angles modulo 2 pi for the posture. Followers have no
+    # posture and no limits of their own: their leader has them.
     limits, own = np.array([tree.lower, tree.upper]), tree.independent
     endless = np.isinf(limits).all(0) & (tree.bodies.slides[:, 0] == 0)
     margin = None if limit_margin is None else _rows("limit_margin", limit_margin, joints)
@@ -175,7 +208,9 @@ def make_osc_params(
         stiffness=kp,
         damping=kd if damping is None else _rows("damping", damping, AXES),
         posture_stiffness=posture,
-        posture_damping=2 * _rows("posture_damping_ratio", posture_damping_ratio, joints) * np.sqrt(posture),
+        posture_damping=2
+        * _rows("posture_damping_ratio", posture_damping_ratio, joints)
+        * np.sqrt(posture),
         position_error_limit=_rows("position_error_limit", position_error_limit, ("norm",)),
         rotation_error_limit=_rows("rotation_error_limit", rotation_error_limit, ("norm",)),
         smallest_eigenvalue=_rows("smallest_eigenvalue", smallest_eigenvalue, ("s0",)),
@@ -186,7 +221,9 @@ def make_osc_params(
         frame=TASK_CHOICES["frame"][choice("frame", frame, TASK_CHOICES["frame"])],
         integral_gain=integral,
         integral_limit=None if integral is None else _rows("integral_limit", integral_limit, AXES),
-        limit_stiffness=None if margin is None else _rows("limit_stiffness", limit_stiffness, joints) * own,
+        limit_stiffness=(
+            None if margin is None else _rows("limit_stiffness", limit_stiffness, joints) * own
+        ),
         limit_margin=None if margin is None else np.minimum(margin, (limits[1:] - limits[:1]) / 4),
         lower=None if margin is None else limits[:1],
         upper=None if margin is None else limits[1:],
@@ -220,7 +257,9 @@ def _rows(name: str, value: ArrayLike, columns: tuple[str, ...]) -> NDArray[np.f
 def _check_unused(name: str, value: ArrayLike, default: float, unused: bool, reason: str) -> None:
     """Raise InvalidArgumentError for an option that is given, and has no effect."""
     if unused and (read_array(name, value) != default).any():
-        raise InvalidArgumentError(name, f"has no effect: {reason}", remedy="leave it out, or correct the other option")
+        raise InvalidArgumentError(
+            name, f"has no effect: {reason}", remedy="leave it out, or correct the other option"
+        )
 
 
 def _mask(name: str, value: ArrayLike | None) -> NDArray[np.float64] | None:
@@ -230,7 +269,11 @@ def _mask(name: str, value: ArrayLike | None) -> NDArray[np.float64] | None:
 
 def _check_rows(params: OSCParams) -> None:
     """Raise InvalidArgumentError if options have rows for different numbers of envs."""
-    most = max((leaf.shape[0], name) for name, leaf in params._asdict().items() if isinstance(leaf, np.ndarray))
+    most = max(
+        (leaf.shape[0], name)
+        for name, leaf in params._asdict().items()
+        if isinstance(leaf, np.ndarray)
+    )
     for name, leaf in params._asdict().items():
         if isinstance(leaf, np.ndarray) and leaf.shape[0] not in (1, most[0]):
             problem = f"has rows for {leaf.shape[0]} envs, but {most[1]} for {most[0]}"

@@ -45,7 +45,9 @@ class OSCInputs(NamedTuple):
     acceleration: Array = None
     """V' of the setpoint (envs, 6) [m/s^2, rad/s^2], in these axes."""
     wrench: Array = None
-    """Wrench of the tool on its surroundings (envs, 6) [N, N m], in the axes of the params' frame."""
+    """Wrench of the tool on its surroundings (envs, 6) [N, N m], in the axes of the params'
+    frame.
+    """
     feedforward: Array = None
     """Effort added (envs, dof), such as the effort of viscous damping [N m or N]."""
 
@@ -54,7 +56,9 @@ class OSCInputs(NamedTuple):
 
 
 class TaskDynamics(NamedTuple):
-    """Dynamics of a robot and its tool at present positions and velocities, from :func:`task_dynamics` or an engine."""
+    """Dynamics of a robot and its tool at present positions and velocities, from
+    :func:`task_dynamics` or an engine.
+    """
 
     pose: Array
     """Of the tool (envs, 7): position [m] and quaternion (w, x, y, z)."""
@@ -87,7 +91,9 @@ class OSCTerms(NamedTuple):
     """Terms of one step."""
 
     error: Array
-    """Error of the pose (envs, 6) [m, rad], in the axes of the params' frame, before its norms are limited."""
+    """Error of the pose (envs, 6) [m, rad], in the axes of the params' frame, before its norms are
+    limited.
+    """
     wrench: Array
     """Wrench F of the task (envs, 6) [N, N m], in these axes, before saturation."""
     task: Array
@@ -103,7 +109,9 @@ class OSCTerms(NamedTuple):
     posture_share: Array
     """s2 (envs,): share of the posture's efforts."""
     near_singular: Array
-    """Bool (envs,): an eigenvalue of A is below s0, so that some direction has lost stiffness; True for NaN."""
+    """Bool (envs,): an eigenvalue of A is below s0, so that some direction has lost stiffness; True
+    for NaN.
+    """
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")
@@ -112,9 +120,11 @@ class OSCTerms(NamedTuple):
 def task_dynamics(
     tree: RigidTree, qpos: Array, qvel: Array, link: str, *, point: Array = None, bias: Array = None
 ) -> TaskDynamics:
-    """Return the dynamics of ``tree`` with a tool: a ``point`` (3,) [m] of ``link``, default its origin.
+    """Return the dynamics of ``tree`` with a tool: a ``point`` (3,) [m] of ``link``, default its
+    origin.
 
-    ``qpos`` and ``qvel`` are (envs, dof). A ``bias`` (envs, dof), such as an engine's, takes the place of the tree's.
+    ``qpos`` and ``qvel`` are (envs, dof). A ``bias`` (envs, dof), such as an engine's, takes the
+    place of the tree's.
 
     Raises
     ------
@@ -124,7 +134,13 @@ def task_dynamics(
     (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
     index = tree.index(link)
     chain = xp.asarray(tree.chains[tree.link_bodies[index]], dtype=q.dtype)
-    wanted = "pose", "jacobian", "jacobian_rate", "mass_matrix", *(("bias",) if bias is None else ())
+    wanted = (
+        "pose",
+        "jacobian",
+        "jacobian_rate",
+        "mass_matrix",
+        *(("bias",) if bias is None else ()),
+    )
     found = native_rows.kinematics(tree, wanted, q, v, index, read_point(q, point))
     if found is not None:
         pose, matrix, rate, mass, *own = found

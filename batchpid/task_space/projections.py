@@ -45,7 +45,8 @@ def projections(
     feedforward: Array = None,
     springs: Array = None,
 ) -> Projections:
-    """Return the efforts of the accelerations ``a`` (envs, 6) of the task and ``a_n`` (envs, dof) of the posture.
+    """Return the efforts of the accelerations ``a`` (envs, 6) of the task and ``a_n`` (envs, dof)
+    of the posture.
 
     ``springs`` (envs, dof) is the part a_s of a_n, all of it if None.
     """
@@ -54,17 +55,26 @@ def projections(
     m = d.mass_matrix
     chain = d.chain
     eye = xp.eye(m.shape[-1], dtype=m.dtype)
-    m_cc = xp.where((chain[:, None] * chain) > 0, m, eye)  # the other joints apart, with unit inertia
+    m_cc = xp.where(
+        (chain[:, None] * chain) > 0, m, eye
+    )  # the other joints apart, with unit inertia
     y = whitened(m_cc, xp.concatenate([xp.swapaxes(j, -1, -2), eye + xp.zeros_like(m)], axis=-1))
-    task_inertia, null_inertia, spring_inertia, singular = _inertias(k, gram(y[..., :6], y[..., :6]), xp)
+    task_inertia, null_inertia, spring_inertia, singular = _inertias(
+        k, gram(y[..., :6], y[..., :6]), xp
+    )
     f = product(task_inertia, a - d.jacobian_rate)
     f = f if wrench is None else f + wrench
     task = gram(j, f[..., None])[..., 0]
 
     a_c, a_o = a_n * chain, a_n * (1 - chain)
     # The difference is 0 to the bit where neither inertia is bounded.
-    held = product(spring_inertia - null_inertia, product(j, (a_n if springs is None else springs) * chain))
-    null = product(m, a_c) - gram(j, (product(null_inertia, product(j, a_c)) + held)[..., None])[..., 0]
+    held = product(
+        spring_inertia - null_inertia, product(j, (a_n if springs is None else springs) * chain)
+    )
+    null = (
+        product(m, a_c)
+        - gram(j, (product(null_inertia, product(j, a_c)) + held)[..., None])[..., 0]
+    )
     null = null * chain
     base = d.bias + product(m, a_o)
     base = base if feedforward is None else base + feedforward
@@ -78,7 +88,9 @@ def projections(
     return Projections(f, task, null, base, of_others(task), of_others(null), singular)
 
 
-def _inertias(k: OSCCoefficients, mobility: Array, xp: ArrayModule) -> tuple[Array, Array, Array, Array]:
+def _inertias(
+    k: OSCCoefficients, mobility: Array, xp: ArrayModule
+) -> tuple[Array, Array, Array, Array]:
     """Return L, L_n and L_s of the mobility A (envs, 6, 6), and where any is bounded."""
     s0, both = k.smallest_eigenvalue[..., 0], k.axes
     if k.axes is not None and k.force_axes is not None:
@@ -93,7 +105,9 @@ def _inertias(k: OSCCoefficients, mobility: Array, xp: ArrayModule) -> tuple[Arr
 def _selected_inverse(
     mobility: Array, axes: Any, xp: ArrayModule, smallest: Array, *smooth: Array
 ) -> tuple[Array, ...]:
-    """Return S^T (S A S^T)^-1 S, for each bound, with the selected ``axes`` (1 | envs, 6), and where it is bounded."""
+    """Return S^T (S A S^T)^-1 S, for each bound, with the selected ``axes`` (1 | envs, 6), and
+    where it is bounded.
+    """
     if axes is None:
         return bounded_inverse(mobility, smallest, *smooth)
     both = axes[..., :, None] * axes[..., None, :] > 0

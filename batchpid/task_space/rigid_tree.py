@@ -1,10 +1,11 @@
 """Rigid tree of one robot: its links, joints and inertias, as float64 arrays.
 
-Links are listed parents first. The frame of a joint has a fixed place in the frame of its parent link. The frame of its
-child link is the joint's frame, turned about the axis by q (revolute) or shifted along it by q (prismatic). Links that
-fixed joints connect are one rigid body: each link keeps its name and its frame, and the body has the sum of the
-inertias (Huygens and Steiner). There is one body for each degree of freedom, in the frame of its joint with the axis
-along x, and one for the base, which is fixed or floats.
+Links are listed parents first. The frame of a joint has a fixed place in the frame of its parent
+link. The frame of its child link is the joint's frame, turned about the axis by q (revolute) or
+shifted along it by q (prismatic). Links that fixed joints connect are one rigid body: each link
+keeps its name and its frame, and the body has the sum of the inertias (Huygens and Steiner). There
+is one body for each degree of freedom, in the frame of its joint with the axis along x, and one for
+the base, which is fixed or floats.
 """
 
 from __future__ import annotations
@@ -26,7 +27,12 @@ from batchpid.checks.validate import choice, entries, names, read_array
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
 from batchpid.task_space.frames import matrix_of, turned, wxyz_of
-from batchpid.task_space.spatial_inertia import SpatialInertia, inertia_rows, moved_matrix, spatial_matrix
+from batchpid.task_space.spatial_inertia import (
+    SpatialInertia,
+    inertia_rows,
+    moved_matrix,
+    spatial_matrix,
+)
 
 JOINT_TYPES = ("fixed", "revolute", "prismatic")
 GRAVITY = (0.0, 0.0, -9.81)
@@ -38,9 +44,10 @@ MAKE_TREE = "pass robot.kinematic_tree()"
 class Bodies(NamedTuple):
     """Bodies of a tree, one for each degree of freedom, and the frames of its links in them.
 
-    The frame of body j in its parent's is ``at_zero + sin(q) sine + (1 - cos(q)) cosine + q slide``, each (3, 4):
-    rotation and position. This is Rodrigues' formula with the placement of the joint multiplied in. Inertias may differ
-    from robot to robot: mass, center and tensor then have a leading axis (robots, ...).
+    The frame of body j in its parent's is ``at_zero + sin(q) sine + (1 - cos(q)) cosine + q
+    slide``, each (3, 4): rotation and position. This is Rodrigues' formula with the placement of
+    the joint multiplied in. Inertias may differ from robot to robot: mass, center and tensor then
+    have a leading axis (robots, ...).
     """
 
     at_zero: Array
@@ -62,22 +69,25 @@ class Bodies(NamedTuple):
     armature: Array
     gravity: Array
     base_mass: Array
-    """Mass of the base and the links fixed to it (1,) [kg]; center (3,) and tensor (3, 3) as for the bodies."""
+    """Mass of the base and the links fixed to it (1,) [kg]; center (3,) and tensor (3, 3) as for
+    the bodies.
+    """
     base_center: Array
     base_tensor: Array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RigidTree:
-    """Rigid tree of a robot. Arrays are copied and read-only; the degrees of freedom are the joints that move, in the
-    order of their links.
+    """Rigid tree of a robot. Arrays are copied and read-only; the degrees of freedom are the joints
+    that move, in the order of their links.
 
     :meth:`batchpid.sim.Robot.kinematic_tree` makes one from a robot.
 
     Raises
     ------
     InvalidArgumentError
-        A name repeats, a shape is wrong, a parent does not come first, or an inertia is not positive.
+        A name repeats, a shape is wrong, a parent does not come first, or an inertia is not
+        positive.
     """
 
     links: tuple[str, ...]
@@ -85,11 +95,15 @@ class RigidTree:
     parent: NDArray[np.intp]
     """Index of each link's parent (links,), -1 for the base."""
     joint_types: tuple[str, ...]
-    """Type of the joint above each link (links,): "fixed", "revolute" or "prismatic"; "fixed" for the base."""
+    """Type of the joint above each link (links,): "fixed", "revolute" or "prismatic"; "fixed" for
+    the base.
+    """
     joint_names: tuple[str, ...]
     """Names of the joints that move (dof,)."""
     position: Float64
-    """Position of each joint in its parent link's frame (links, 3) [m]; for the base, in the world."""
+    """Position of each joint in its parent link's frame (links, 3) [m]; for the base, in the
+    world.
+    """
     wxyz: Float64
     """Orientation of each joint there, unit quaternions (links, 4)."""
     axis: Float64
@@ -102,42 +116,65 @@ class RigidTree:
     """Inertia tensors about the centers of mass, in the link's axes (links, 3, 3) [kg m^2]."""
     _: KW_ONLY
     armature: ArrayLike = 0.0
-    """Reflected inertia of the motors (dof,) [kg m^2 or kg], added to the diagonal of the mass matrix."""
+    """Reflected inertia of the motors (dof,) [kg m^2 or kg], added to the diagonal of the mass
+    matrix.
+    """
     lower: ArrayLike = -np.inf
     """Lower position limits (dof,) [rad or m], for inverse kinematics."""
     upper: ArrayLike = np.inf
     gravity: ArrayLike = GRAVITY
     """Acceleration of free fall in the world (3,) [m/s^2]."""
     coupling: Coupling = None  # type: ignore[assignment]
-    """Coupling of the joints; None: all are independent. Jacobians, mass matrices and efforts are reduced to the
-    leaders, J G, G^T M G and G^T u: columns and efforts of followers are 0, and their rows in a mass matrix are rows of
-    the identity.
+    """Coupling of the joints; None: all are independent. Jacobians, mass matrices and efforts are
+    reduced to the leaders, J G, G^T M G and G^T u: columns and efforts of followers are 0, and
+    their rows in a mass matrix are rows of the identity.
     """
     fixed_base: bool = True
     """False if the base floats. Mass matrices and biases of the joints are then Schur complements
-    (:mod:`batchpid.task_space.tree_dynamics`); poses and Jacobians are still in the frame of the base."""
+    (:mod:`batchpid.task_space.tree_dynamics`); poses and Jacobians are still in the frame of the
+    base.
+    """
 
     def __post_init__(self) -> None:
         links = tuple(names("links", list(self.links)))
         count = len(links)
         types = tuple(choice("joint_types", one, JOINT_TYPES) for one in self.joint_types)
         if len(types) != count or types[:1] != ("fixed",):
-            problem = f"has {len(types)} entries for {count} links, or does not begin with 'fixed', for the base"
-            raise InvalidArgumentError("joint_types", problem, remedy="give the type of the joint above each link")
-        moving = tuple(names("joint_names", list(self.joint_names), sum(one != "fixed" for one in types)))
+            problem = (
+                f"has {len(types)} entries for {count} links, or does not begin with 'fixed', for"
+                " the base"
+            )
+            raise InvalidArgumentError(
+                "joint_types", problem, remedy="give the type of the joint above each link"
+            )
+        moving = tuple(
+            names("joint_names", list(self.joint_names), sum(one != "fixed" for one in types))
+        )
         parent = np.array(_array("parent", self.parent, (count,)), np.intp)
         first = (parent < np.arange(count)) & (parent >= np.minimum(np.arange(count), 1) - 1)
         entries("parent", parent, first, "does not come before its child", links, kind="entry")
-        shapes = {"position": (3,), "wxyz": (4,), "axis": (3,), "mass": (), "center": (3,), "inertia": (3, 3)}
+        shapes = {
+            "position": (3,),
+            "wxyz": (4,),
+            "axis": (3,),
+            "mass": (),
+            "center": (3,),
+            "inertia": (3, 3),
+        }
         tables: dict[str, Rows] = {
-            name: _array(name, getattr(self, name), (count, *shape)) for name, shape in shapes.items()
+            name: _array(name, getattr(self, name), (count, *shape))
+            for name, shape in shapes.items()
         }
         for name in ("armature", "lower", "upper"):
             given: Any = np.asarray(getattr(self, name))
-            tables[name] = _array(name, given if given.shape else np.full(len(moving), given), (len(moving),))
+            tables[name] = _array(
+                name, given if given.shape else np.full(len(moving), given), (len(moving),)
+            )
         tables["gravity"] = _array("gravity", self.gravity, (3,))
         for name, table in tables.items():
-            finite = np.isfinite(table).reshape(len(table), -1).all(1) | (name in ("lower", "upper"))
+            finite = np.isfinite(table).reshape(len(table), -1).all(1) | (
+                name in ("lower", "upper")
+            )
             of = {count: links, len(moving): moving}.get(len(table)) if name != "gravity" else "xyz"
             entries(name, np.where(finite, 0.0, np.nan), finite, "is not finite", of, kind="entry")
         entries("mass", tables["mass"], tables["mass"] >= 0, "must be >= 0", links, kind="entry")
@@ -152,10 +189,19 @@ class RigidTree:
         coupling = Coupling.of(len(moving)) if self.coupling is None else self.coupling
         if len(coupling.leader) != len(moving):
             problem = f"couples {len(coupling.leader)} joints, but {len(moving)} move"
-            raise InvalidArgumentError("coupling", problem, remedy="give one entry for each joint that moves")
+            raise InvalidArgumentError(
+                "coupling", problem, remedy="give one entry for each joint that moves"
+            )
         for table in (parent, *tables.values()):
             table.setflags(write=False)
-        vars(self).update(tables, links=links, joint_types=types, joint_names=moving, parent=parent, coupling=coupling)
+        vars(self).update(
+            tables,
+            links=links,
+            joint_types=types,
+            joint_names=moving,
+            parent=parent,
+            coupling=coupling,
+        )
 
     def __repr__(self) -> str:
         parts = [f"{len(self.links)} links", f"{self.dof} joints", f"{self.mass.sum():.4g} kg"]
@@ -182,7 +228,9 @@ class RigidTree:
 
     @cached_property
     def tool(self) -> str:
-        """Name of the link at the end of the longest chain of joints, or of the hand if that chain ends in fingers."""
+        """Name of the link at the end of the longest chain of joints, or of the hand if that chain
+        ends in fingers.
+        """
         moves = [kind != "fixed" for kind in self.joint_types]
         depth, branches = [0] * len(self.links), [0] * len(self.links)
         for child, above in enumerate(self.parent[1:].tolist(), start=1):
@@ -206,7 +254,8 @@ class RigidTree:
         return replace(self, fixed_base=True, coupling=Coupling.of(self.dof))
 
     def fixed_at(self, qpos: Float64, moves: NDArray[np.bool_]) -> RigidTree:
-        """Return the tree in which only the joints of the mask ``moves`` (dof,) move, and are independent.
+        """Return the tree in which only the joints of the mask ``moves`` (dof,) move, and are
+        independent.
 
         The others are fixed at ``qpos`` (dof,) [rad or m].
         """
@@ -245,17 +294,22 @@ class RigidTree:
         return namespace(effort).asarray(self.coupling.efforts(effort), dtype=effort.dtype)
 
     def chain(self, link: str) -> NDArray[np.bool_]:
-        """Return the mask (dof,) of the joints between the base and ``link``, and of joints coupled to them."""
+        """Return the mask (dof,) of the joints between the base and ``link``, and of joints coupled
+        to them.
+        """
         return self.chains[self.link_bodies[self.index(link)]] > 0
 
     @cached_property
     def chains(self) -> Float64:
-        """1.0 for the joints between the base and each body, and for joints coupled to them (dof + 1, dof).
+        """1.0 for the joints between the base and each body, and for joints coupled to them (dof +
+        1, dof).
 
         The last row, body -1, is the base.
         """
         rows = np.concatenate([self.bodies.moves, np.zeros((1, self.dof))])
-        rows = (rows @ (self.coupling.leader[:, None] == self.coupling.leader) > 0).astype(np.float64)
+        rows = (rows @ (self.coupling.leader[:, None] == self.coupling.leader) > 0).astype(
+            np.float64
+        )
         rows.setflags(write=False)
         return rows
 
@@ -309,32 +363,58 @@ class RigidTree:
         on_base = [link for link, of in enumerate(body) if of < 0]
         mass, center, tensor = self._inertias([*links_of, on_base], frames)
         own = mass[:-1], center[:-1], tensor[:-1]
-        leaves = *local, slides, *own, moves, frames, self.armature, self.gravity, mass[-1], center[-1], tensor[-1]
+        leaves = (
+            *local,
+            slides,
+            *own,
+            moves,
+            frames,
+            self.armature,
+            self.gravity,
+            mass[-1],
+            center[-1],
+            tensor[-1],
+        )
         for leaf in leaves:
             leaf.setflags(write=False)
         return tuple(body), tuple(parents), Bodies(*leaves)
 
     @cached_property
     def tables(self) -> tuple[NDArray[np.int32], Float64]:
-        """The bodies for native code: the joint above each, or -1, and 1 if it slides (dof, 2); and rows of numbers
-        (dof, 25), :data:`batchpid.native.task_space_extension.BODY`.
+        """The bodies for native code: the joint above each, or -1, and 1 if it slides (dof, 2); and
+        rows of numbers (dof, 25), :data:`batchpid.native.task_space_extension.BODY`.
         """
         bodies = self.bodies
         slides = bodies.slides[:, 0].astype(np.int32)
-        parts = bodies.at_zero[:, :, :3], bodies.at_zero[:, :, 3], bodies.mass, bodies.center, bodies.tensor
+        parts = (
+            bodies.at_zero[:, :, :3],
+            bodies.at_zero[:, :, 3],
+            bodies.mass,
+            bodies.center,
+            bodies.tensor,
+        )
         rows = np.hstack([part.reshape(self.dof, -1) for part in parts])
-        return read_only(np.column_stack([np.array(self.body_parents, np.int32), slides])), read_only(rows)
+        return read_only(
+            np.column_stack([np.array(self.body_parents, np.int32), slides])
+        ), read_only(rows)
 
     def inertias(self, bodies: Bodies | None = None) -> Float64:
-        """Return mass, center of mass and inertia tensor of each body, then of the base (..., dof + 1, 13)."""
+        """Return mass, center of mass and inertia tensor of each body, then of the base (..., dof +
+        1, 13).
+        """
         of = self.bodies if bodies is None else bodies
         parts = of.mass, of.center, of.tensor.reshape(*of.center.shape[:-1], 9)
         rows = np.concatenate(parts, axis=-1)
-        base = np.concatenate([of.base_mass, of.base_center, of.base_tensor.reshape(*of.base_center.shape[:-1], 9)], -1)
+        base = np.concatenate(
+            [of.base_mass, of.base_center, of.base_tensor.reshape(*of.base_center.shape[:-1], 9)],
+            -1,
+        )
         return np.concatenate([rows, base[..., None, :]], axis=-2)
 
     def varied(self, added: Mapping[str, Float64]) -> Bodies:
-        """Return the bodies of n robots with spatial inertias (n, 6, 6) added to links, in the axes of the links."""
+        """Return the bodies of n robots with spatial inertias (n, 6, 6) added to links, in the axes
+        of the links.
+        """
         of_bodies = dict[int, Float64]()
         for name, matrices in added.items():
             link = self.index(name)
@@ -343,7 +423,9 @@ class RigidTree:
         return self.with_added(of_bodies)
 
     def with_added(self, added: Mapping[int, Float64]) -> Bodies:
-        """Return the bodies of n robots with spatial inertias (n, 6, 6) added, by index, in the axes of the bodies."""
+        """Return the bodies of n robots with spatial inertias (n, 6, 6) added, by index, in the
+        axes of the bodies.
+        """
         rows = np.tile(self.inertias(), (len(next(iter(added.values()))), 1, 1))
         for body, matrices in added.items():
             mass, center, tensor = np.split(rows[0, body], [1, 4])
@@ -352,11 +434,21 @@ class RigidTree:
         mass = rows[..., :1]
         center = rows[..., 1:4]
         tensor = rows[..., 4:].reshape(*rows.shape[:-1], 3, 3)
-        base = {"base_mass": mass[:, -1], "base_center": center[:, -1], "base_tensor": tensor[:, -1]}
-        return self.bodies._replace(mass=mass[:, :-1], center=center[:, :-1], tensor=tensor[:, :-1], **base)
+        base = {
+            "base_mass": mass[:, -1],
+            "base_center": center[:, -1],
+            "base_tensor": tensor[:, -1],
+        }
+        return self.bodies._replace(
+            mass=mass[:, :-1], center=center[:, :-1], tensor=tensor[:, :-1], **base
+        )
 
-    def _inertias(self, links_of: list[list[int]], frames: Float64) -> tuple[Float64, Float64, Float64]:
-        """Return mass, center of mass and inertia tensor of the bodies with these links, in their frames."""
+    def _inertias(
+        self, links_of: list[list[int]], frames: Float64
+    ) -> tuple[Float64, Float64, Float64]:
+        """Return mass, center of mass and inertia tensor of the bodies with these links, in their
+        frames.
+        """
         count = len(links_of)
         masses = np.zeros((count, 1))
         centers = np.zeros((count, 3))
@@ -391,5 +483,7 @@ def _array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Float64:
     table = np.array(read_array(name, value), np.float64)
     if table.shape != shape:
         problem = f"has shape {table.shape}, not {shape}"
-        raise InvalidArgumentError(name, problem, remedy="give one row for each link, or one entry for each joint")
+        raise InvalidArgumentError(
+            name, problem, remedy="give one row for each link, or one entry for each joint"
+        )
     return table

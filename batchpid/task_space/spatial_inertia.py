@@ -1,4 +1,5 @@
-"""Spatial inertia of rigid bodies: mass, center of mass and inertia tensor, moved between frames and added.
+"""Spatial inertia of rigid bodies: mass, center of mass and inertia tensor, moved between frames
+and added.
 
 R. Featherstone, Rigid Body Dynamics Algorithms (2008), section 2.13.
 """
@@ -15,19 +16,24 @@ from batchpid.task_space.rotations import rotate
 
 
 class SpatialInertia(NamedTuple):
-    """Mass [kg], center of mass (3,) [m] and inertia tensor about it (3, 3) [kg m^2], in the axes of one frame."""
+    """Mass [kg], center of mass (3,) [m] and inertia tensor about it (3, 3) [kg m^2], in the axes
+    of one frame.
+    """
 
     mass: float
     center: Float64
     tensor: Float64
 
     def moved(self, position: Float64, wxyz: Float64) -> SpatialInertia:
-        """Return the inertia as seen from a frame in which its own has this position and rotation: c' = p + R c.
+        """Return the inertia as seen from a frame in which its own has this position and rotation:
+        c' = p + R c.
 
         The tensor about the center of mass turns with the axes: I' = R I R^T.
         """
         matrix = rotation_matrix(wxyz)
-        return SpatialInertia(self.mass, position + matrix @ self.center, matrix @ self.tensor @ matrix.T)
+        return SpatialInertia(
+            self.mass, position + matrix @ self.center, matrix @ self.tensor @ matrix.T
+        )
 
 
 def rotation_matrix(wxyz: Float64) -> Float64:
@@ -36,7 +42,8 @@ def rotation_matrix(wxyz: Float64) -> Float64:
 
 
 def spatial_matrix(inertia: SpatialInertia) -> Float64:
-    """Return the matrix S (6, 6) of the kinetic energy 1/2 (v, w)^T S (v, w), with v the velocity of the origin.
+    """Return the matrix S (6, 6) of the kinetic energy 1/2 (v, w)^T S (v, w), with v the velocity
+    of the origin.
 
     S = [[m 1, -m C], [m C, I - m C C]] with C a = c x a.
     """
@@ -49,8 +56,12 @@ def spatial_matrix(inertia: SpatialInertia) -> Float64:
 
 
 def moved_matrix(matrix: Float64, place: Float64) -> Float64:
-    """Return spatial matrices (..., 6, 6) in the frame in which their own has the homogeneous pose ``place`` (4, 4)."""
-    turn = np.zeros((6, 6))  # velocity (v, w) in the matrices' frame, from the velocity in the other one
+    """Return spatial matrices (..., 6, 6) in the frame in which their own has the homogeneous pose
+    ``place`` (4, 4).
+    """
+    turn = np.zeros(
+        (6, 6)
+    )  # velocity (v, w) in the matrices' frame, from the velocity in the other one
     turn[:3, :3] = turn[3:, 3:] = place[:3, :3].T
     turn[:3, 3:] = -place[:3, :3].T @ _cross_matrix(place[:3, 3])
     return turn.T @ matrix @ turn
@@ -75,8 +86,8 @@ def _cross_matrix(vector: Float64) -> Float64:
 def total(parts: Sequence[SpatialInertia]) -> SpatialInertia:
     """Return the inertia of ``parts``, given in one frame, as one body (Huygens and Steiner).
 
-    m = sum m_i, c = sum m_i c_i / m, I = sum (I_i + m_i (d_i.d_i 1 - d_i d_i^T)) with d_i = c_i - c. The mass must be
-    positive.
+    m = sum m_i, c = sum m_i c_i / m, I = sum (I_i + m_i (d_i.d_i 1 - d_i d_i^T)) with d_i = c_i -
+    c. The mass must be positive.
     """
     mass = sum(part.mass for part in parts)
     center = sum((part.mass * part.center for part in parts), start=np.zeros(3)) / mass

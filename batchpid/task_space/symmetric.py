@@ -1,8 +1,8 @@
 r"""Small symmetric positive matrices: Cholesky's factor, solutions, bounded inverses, eigenvalues.
 
-Matrices are (..., n, n), and their linear algebra is NumPy's or JAX's. The result of a matrix does not depend on the
-others in a batch. NumPy solves them separately, but raises for the whole batch if one is not finite. So such a matrix
-is replaced by the identity, and its result by NaN.
+Matrices are (..., n, n), and their linear algebra is NumPy's or JAX's. The result of a matrix does
+not depend on the others in a batch. NumPy solves them separately, but raises for the whole batch if
+one is not finite. So such a matrix is replaced by the identity, and its result by NaN.
 """
 
 from __future__ import annotations
@@ -17,12 +17,15 @@ from batchpid.errors import InvalidArgumentError
 
 
 def quiet() -> np.errstate:
-    """Return a context in which rows that are not finite, or not positive definite, cause no warnings."""
+    """Return a context in which rows that are not finite, or not positive definite, cause no
+    warnings.
+    """
     return np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore")
 
 
 def whitened(matrix: Array, right: Array) -> Array:
-    """Return L^-1 B (..., n, m) with Cholesky's factor L of ``matrix`` = L L^T, for B = ``right`` (..., n, m).
+    """Return L^-1 B (..., n, m) with Cholesky's factor L of ``matrix`` = L L^T, for B = ``right``
+    (..., n, m).
 
     A matrix that is not positive definite gives NaN.
     """
@@ -32,7 +35,8 @@ def whitened(matrix: Array, right: Array) -> Array:
     matrix, sound = _sound(matrix)
     factor = _cholesky(matrix)
     positive = sound & ~np.isnan(factor[..., :1, :1])
-    # With rows and columns in reverse the factor is upper triangular, and its solution a substitution, without pivots.
+    # With rows and columns in reverse the factor is upper triangular, and its solution a
+    # substitution, without pivots.
     sane: Array = np.where(positive, factor, _identity(matrix))
     reverse = sane[..., ::-1, ::-1]
     return np.where(positive, np.linalg.solve(reverse, right[..., ::-1, :])[..., ::-1, :], np.nan)
@@ -43,11 +47,17 @@ def _cholesky(matrix: Array) -> Array:
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
-        return np.full_like(matrix, np.nan) if matrix.ndim == 2 else np.stack([_cholesky(row) for row in matrix])
+        return (
+            np.full_like(matrix, np.nan)
+            if matrix.ndim == 2
+            else np.stack([_cholesky(row) for row in matrix])
+        )
 
 
 def _sound(matrix: Array) -> tuple[Array, Array]:
-    """Return ``matrix`` with the identity for non-finite matrices, and the mask of finite ones (..., 1, 1)."""
+    """Return ``matrix`` with the identity for non-finite matrices, and the mask of finite ones
+    (..., 1, 1).
+    """
     sound = np.isfinite(matrix).all((-2, -1), keepdims=True)
     return (matrix if sound.all() else np.where(sound, matrix, _identity(matrix))), sound
 
@@ -72,16 +82,20 @@ def solve(matrix: Array, right: Array) -> Array:
 
 
 def bounded_inverse(matrix: Array, smallest: Array, *smooth: Array) -> tuple[Array, ...]:
-    """Return the bounded inverses (..., n, n) of positive semidefinite matrices, and the mask of those that differ.
+    """Return the bounded inverses (..., n, n) of positive semidefinite matrices, and the mask of
+    those that differ.
 
-    An eigenvalue s becomes 1/s if s >= s0 = ``smallest`` (a number or (...)), else s/s0^2: continuous, at most 1/s0,
-    and 0 where s is 0.
+    An eigenvalue s becomes 1/s if s >= s0 = ``smallest`` (a number or (...)), else s/s0^2:
+    continuous, at most 1/s0, and 0 where s is 0.
 
-    Each bound s1 <= s0 in ``smooth`` gives a further inverse: below s1, s becomes s (2 - s^2/s1^2) / s1^2, with a
-    continuous derivative. It is bit-identical to the first inverse if no eigenvalue is below s0.
+    Each bound s1 <= s0 in ``smooth`` gives a further inverse: below s1, s becomes s (2 - s^2/s1^2)
+    / s1^2, with a continuous derivative. It is bit-identical to the first inverse if no eigenvalue
+    is below s0.
     """
     xp = namespace(matrix)
-    s0, *bounds = [xp.asarray(bound, dtype=matrix.dtype)[..., None] for bound in (smallest, *smooth)]
+    s0, *bounds = [
+        xp.asarray(bound, dtype=matrix.dtype)[..., None] for bound in (smallest, *smooth)
+    ]
     with quiet():
         values, vectors = eigen(matrix)
         positive, rows = xp.maximum(values, 0.0), xp.swapaxes(vectors, -1, -2)
@@ -97,7 +111,9 @@ def bounded_inverse(matrix: Array, smallest: Array, *smooth: Array) -> tuple[Arr
 
 
 def eigen(matrix: Array) -> tuple[Array, Array]:
-    """Return the eigenvalues (..., n), ascending, and eigenvectors (..., n, n), as columns, of symmetric matrices."""
+    """Return the eigenvalues (..., n), ascending, and eigenvectors (..., n, n), as columns, of
+    symmetric matrices.
+    """
     if namespace(matrix) is not np:
         return namespace(matrix).linalg.eigh(matrix)
     matrix, sound = _sound(matrix)
@@ -107,5 +123,7 @@ def eigen(matrix: Array) -> tuple[Array, Array]:
 
 def _identity(matrix: Array) -> Array:
     if matrix.shape[-1] != matrix.shape[-2]:
-        raise InvalidArgumentError("matrix", f"has shape {matrix.shape}", remedy="give square matrices")
+        raise InvalidArgumentError(
+            "matrix", f"has shape {matrix.shape}", remedy="give square matrices"
+        )
     return namespace(matrix).eye(matrix.shape[-1], dtype=matrix.dtype)

@@ -1,15 +1,17 @@
 r"""Dynamics of a rigid tree: M(q) q'' + h(q, q') = tau, without friction and damping.
 
-All quantities are in the axes of the world and about its origin. Joint j has the motion s_j = (v_j, w_j). All bodies
-that it moves together have the mass m, the first moment c and the inertia tensor I. Momenta under s_j and mass matrix
-are (composite rigid bodies; R. Featherstone, Rigid Body Dynamics Algorithms, Springer, 2008, section 6.2)::
+All quantities are in the axes of the world and about its origin. Joint j has the motion s_j = (v_j,
+w_j). All bodies that it moves together have the mass m, the first moment c and the inertia tensor
+I. Momenta under s_j and mass matrix are (composite rigid bodies; R. Featherstone, Rigid Body
+Dynamics Algorithms, Springer, 2008, section 6.2)::
 
     linear  l_j = m v_j + w_j x c        angular  k_j = I w_j + c x v_j
     M_ij = M_ji = s_i . (l_j, k_j)   for a joint i that moves joint j, or is joint j; else 0;   M_jj += armature
 
-The bias h (gravity, Coriolis and centrifugal forces) is the sum of the rates of momentum of the bodies at q'' = 0, less
-their weight (recursive Newton-Euler algorithm, section 5.3). For a body with the center of mass r, a is the
-acceleration of r, I the inertia tensor about r, w the angular velocity and w' the angular acceleration::
+The bias h (gravity, Coriolis and centrifugal forces) is the sum of the rates of momentum of the
+bodies at q'' = 0, less their weight (recursive Newton-Euler algorithm, section 5.3). For a body
+with the center of mass r, a is the acceleration of r, I the inertia tensor about r, w the angular
+velocity and w' the angular acceleration::
 
     f = m (a - g)      n = I w' + w x I w + r x f      h_j = s_j . (sum of (f, n) of the bodies that j moves)
 
@@ -17,10 +19,12 @@ On a floating base (index b; index j for the joints) M and h of the joints are S
 
     M = M_jj - M_jb M_bb^-1 M_bj        h = h_j - M_jb M_bb^-1 h_b
 
-where the columns of M_bj are the momenta (l_j, k_j), and M_bb and h_b belong to all bodies together. Gravity, and the
-velocity and acceleration of the base's origin, cancel. The rate at which the base turns remains in h.
+where the columns of M_bj are the momenta (l_j, k_j), and M_bb and h_b belong to all bodies
+together. Gravity, and the velocity and acceleration of the base's origin, cancel. The rate at which
+the base turns remains in h.
 
-The results for coupled joints are reduced to their leaders, G^T M G and G^T h (:mod:`batchpid.motors.coupling`).
+The results for coupled joints are reduced to their leaders, G^T M G and G^T h
+(:mod:`batchpid.motors.coupling`).
 """
 
 from __future__ import annotations
@@ -45,9 +49,11 @@ from batchpid.task_space.tree_kinematics import (
 
 
 def mass_matrix(tree: RigidTree, qpos: Array, bodies: Bodies | None = None) -> Array:
-    """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof), armature included.
+    """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof), armature
+    included.
 
-    ``bodies`` belong to robots that differ from the tree, one for each row: :meth:`RigidTree.varied`.
+    ``bodies`` belong to robots that differ from the tree, one for each row:
+    :meth:`RigidTree.varied`.
 
     Raises
     ------
@@ -62,11 +68,14 @@ def mass_matrix(tree: RigidTree, qpos: Array, bodies: Bodies | None = None) -> A
         return mass_matrix_of(tree, bodies or own, motions_of(tree, own, q, xp), xp)
 
 
-def bias(tree: RigidTree, qpos: Array, qvel: Array, turning: Any = None, *, bodies: Bodies | None = None) -> Array:
-    """Return h(q, q') (..., dof) [N m or N]: the efforts that cancel gravity and Coriolis and centrifugal forces.
+def bias(
+    tree: RigidTree, qpos: Array, qvel: Array, turning: Any = None, *, bodies: Bodies | None = None
+) -> Array:
+    """Return h(q, q') (..., dof) [N m or N]: the efforts that cancel gravity and Coriolis and
+    centrifugal forces.
 
-    A floating base turns at ``turning`` (..., 3) [rad/s], in its own axes; default 0. ``bodies`` are as in
-    :func:`mass_matrix`.
+    A floating base turns at ``turning`` (..., 3) [rad/s], in its own axes; default 0. ``bodies``
+    are as in :func:`mass_matrix`.
 
     Raises
     ------
@@ -79,11 +88,15 @@ def bias(tree: RigidTree, qpos: Array, qvel: Array, turning: Any = None, *, bodi
         return found[0]
     with quiet():
         motions = motions_of(tree, own, q, xp)
-        return effort_of(tree, bodies or own, motions, velocities_of(tree, motions, v, xp, turning), xp, turning)
+        return effort_of(
+            tree, bodies or own, motions, velocities_of(tree, motions, v, xp, turning), xp, turning
+        )
 
 
 def gravity(tree: RigidTree, qpos: Array) -> Array:
-    """Return the efforts (..., dof) [N m or N] that hold the robot at ``qpos`` (..., dof): h(q, 0)."""
+    """Return the efforts (..., dof) [N m or N] that hold the robot at ``qpos`` (..., dof): h(q,
+    0).
+    """
     return bias(tree, qpos, 0 * qpos if hasattr(qpos, "shape") else [0 * entry for entry in qpos])
 
 
@@ -111,7 +124,8 @@ def inverse_dynamics(tree: RigidTree, qpos: Array, qvel: Array, qacc: Array) -> 
 
 
 def forward_dynamics(tree: RigidTree, qpos: Array, qvel: Array, effort: Array) -> Array:
-    """Return the accelerations (..., dof) [rad/s^2 or m/s^2] under ``effort`` (..., dof): M^-1 (tau - h).
+    """Return the accelerations (..., dof) [rad/s^2 or m/s^2] under ``effort`` (..., dof): M^-1 (tau
+    - h).
 
     Raises
     ------
@@ -127,21 +141,29 @@ def forward_dynamics(tree: RigidTree, qpos: Array, qvel: Array, effort: Array) -
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         force = effort_of(tree, bodies, motions, velocities_of(tree, motions, v, xp), xp)
-        return tree.rates(solve(mass_matrix_of(tree, bodies, motions, xp), (u - force)[..., None])[..., 0])
+        return tree.rates(
+            solve(mass_matrix_of(tree, bodies, motions, xp), (u - force)[..., None])[..., 0]
+        )
 
 
 def check_masses(tree: RigidTree) -> None:
-    """Raise InvalidArgumentError for a joint that moves no mass and has no armature: its mass matrix is singular."""
+    """Raise InvalidArgumentError for a joint that moves no mass and has no armature: its mass
+    matrix is singular.
+    """
     moved = tree.bodies.moves.T @ tree.bodies.mass[:, 0] + tree.bodies.armature
     moved = tree.coupling.of_all(tree.coupling.reduced_damping(moved))
     for joint, kg in zip(tree.joint_names, moved, strict=True):
         if not kg > 0:
             problem = "has a joint that moves no mass and has no armature"
-            raise InvalidArgumentError("tree", problem, joint=joint, remedy="give one of its links a mass")
+            raise InvalidArgumentError(
+                "tree", problem, joint=joint, remedy="give one of its links a mass"
+            )
 
 
 class _Composite(NamedTuple):
-    """The bodies that each joint moves, as one rigid body, and the momenta under the motions of the joints."""
+    """The bodies that each joint moves, as one rigid body, and the momenta under the motions of the
+    joints.
+    """
 
     mass: Array
     """(..., dof, 1)"""
@@ -169,20 +191,30 @@ def _composite(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayModul
 
 
 def _about_origin(moment: Array, center: Array, xp: ArrayModule) -> Array:
-    """Return the inertia tensors (..., 3, 3) about the origin of points with first moments ``moment``."""
+    """Return the inertia tensors (..., 3, 3) about the origin of points with first moments
+    ``moment``.
+    """
     square = (moment * center).sum(-1)[..., None, None] * xp.eye(3, dtype=center.dtype)
     return square - moment[..., :, None] * center[..., None, :]
 
 
 def _of_base(tree: RigidTree, bodies: Bodies, all_: _Composite, xp: ArrayModule) -> Array:
-    """Return M_bb (..., 6, 6), linear parts first: the momenta of the whole robot under the motions of its base."""
+    """Return M_bb (..., 6, 6), linear parts first: the momenta of the whole robot under the motions
+    of its base.
+    """
     roots = [joint for joint, above in enumerate(tree.body_parents) if above < 0]
     own = bodies.base_mass * bodies.base_center
     mass = all_.mass[..., roots, :].sum(-2) + bodies.base_mass
     moment = all_.moment[..., roots, :].sum(-2) + own
-    tensor = all_.tensor[..., roots, :, :].sum(-3) + bodies.base_tensor + _about_origin(own, bodies.base_center, xp)
+    tensor = (
+        all_.tensor[..., roots, :, :].sum(-3)
+        + bodies.base_tensor
+        + _about_origin(own, bodies.base_center, xp)
+    )
     eye = xp.eye(3, dtype=moment.dtype)
-    crossed = xp.stack([cross(moment, eye[axis] + xp.zeros_like(moment)) for axis in range(3)], axis=-1)  # c x
+    crossed = xp.stack(
+        [cross(moment, eye[axis] + xp.zeros_like(moment)) for axis in range(3)], axis=-1
+    )  # c x
     zero = xp.zeros_like(crossed)
     upper = xp.concatenate([mass[..., None] * eye + zero, -crossed], axis=-1)
     return xp.concatenate([upper, xp.concatenate([crossed, tensor + zero], axis=-1)], axis=-2)
@@ -198,15 +230,23 @@ def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayM
     matrix = xp.where(above, table, rest)
     if not tree.fixed_base:
         falls = solve(_of_base(tree, bodies, all_, xp), xp.swapaxes(all_.momenta, -1, -2))
-        matrix = matrix - (all_.momenta[..., :, None, :] * xp.swapaxes(falls, -1, -2)[..., None, :, :]).sum(-1)
+        matrix = matrix - (
+            all_.momenta[..., :, None, :] * xp.swapaxes(falls, -1, -2)[..., None, :, :]
+        ).sum(-1)
     matrix = matrix + bodies.armature * xp.eye(tree.dof, dtype=matrix.dtype)
     return xp.asarray(tree.coupling.mass_matrix(matrix), dtype=matrix.dtype)
 
 
 def effort_of(
-    tree: RigidTree, bodies: Bodies, motions: Motions, rates: Velocities, xp: ArrayModule, turning: Any = None
+    tree: RigidTree,
+    bodies: Bodies,
+    motions: Motions,
+    rates: Velocities,
+    xp: ArrayModule,
+    turning: Any = None,
 ) -> Array:
-    """Return the efforts (..., dof) of given velocities and accelerations of the bodies, without armature.
+    """Return the efforts (..., dof) of given velocities and accelerations of the bodies, without
+    armature.
 
     A floating base turns at ``turning`` (..., 3) [rad/s]; ``rates`` must include this rotation.
     """
@@ -214,16 +254,22 @@ def effort_of(
     center = rotate(turn, bodies.center) + motions.frames[..., 3]
     tensor = _in_world(turn, bodies.tensor, xp)
     v, w = rates.linear, rates.angular
-    acceleration = rates.linear_rate + cross(rates.angular_rate, center) + cross(w, v + cross(w, center))
+    acceleration = (
+        rates.linear_rate + cross(rates.angular_rate, center) + cross(w, v + cross(w, center))
+    )
     force = bodies.mass * (acceleration - bodies.gravity if tree.fixed_base else acceleration)
     spin = rotate(tensor, rates.angular_rate) + cross(w, rotate(tensor, w))
     wrench = from_tips(tree, xp.concatenate([force, spin + cross(center, force)], axis=-1), xp)
     effort = (xp.concatenate([motions.linear, motions.angular], axis=-1) * wrench).sum(-1)
     if not tree.fixed_base:
         all_ = _composite(tree, bodies, motions, xp)
-        on_base = sum(wrench[..., joint, :] for joint, above in enumerate(tree.body_parents) if above < 0)
+        on_base = sum(
+            wrench[..., joint, :] for joint, above in enumerate(tree.body_parents) if above < 0
+        )
         if turning is not None:
-            own = bodies.base_mass * cross(turning, cross(turning, bodies.base_center + xp.zeros_like(turning)))
+            own = bodies.base_mass * cross(
+                turning, cross(turning, bodies.base_center + xp.zeros_like(turning))
+            )
             torque = cross(turning, rotate(bodies.base_tensor, turning)) + cross(
                 bodies.base_center + xp.zeros_like(own), own
             )

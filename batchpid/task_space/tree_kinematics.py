@@ -1,18 +1,21 @@
 r"""Poses, Jacobians and velocity products of a kinematic tree.
 
-With the axis a_j and the place o_j of joint j in the world, a point p of a link that joint j moves has the velocity::
+With the axis a_j and the place o_j of joint j in the world, a point p of a link that joint j moves
+has the velocity::
 
     (v, w) = J q'      J_j = (a_j x (p - o_j), a_j), or (a_j, 0) for a prismatic joint; 0 for a joint that moves it not
     (v', w') = J q'' + J' q'
 
-J' q' is the acceleration at q'' = 0. With the velocity (v_o, w) and the acceleration (A_o, A_w) of a body, as fields
-about the origin, accumulated from the base to the tips with the motions s_j of the joints::
+J' q' is the acceleration at q'' = 0. With the velocity (v_o, w) and the acceleration (A_o, A_w) of
+a body, as fields about the origin, accumulated from the base to the tips with the motions s_j of
+the joints::
 
     V_j = V_above + s_j q'_j        A_j = A_above + V_j x s_j q'_j
     J' q' = (A_o + A_w x p + w x (v_o + w x p), A_w)
 
-R. Featherstone, Rigid Body Dynamics Algorithms (Springer, 2008), sections 2.11 and 5.3. Twists and Jacobians are
-(linear, angular). Arrays have any leading axes; an env's result does not depend on the others, to the last bit.
+R. Featherstone, Rigid Body Dynamics Algorithms (Springer, 2008), sections 2.11 and 5.3. Twists and
+Jacobians are (linear, angular). Arrays have any leading axes; an env's result does not depend on
+the others, to the last bit.
 """
 
 from __future__ import annotations
@@ -36,18 +39,24 @@ FRAMES = ("world", "tool")
 
 
 class Motions(NamedTuple):
-    """Frames of the bodies, and motions per rate of each joint, in the world, at given joint positions."""
+    """Frames of the bodies, and motions per rate of each joint, in the world, at given joint
+    positions.
+    """
 
     frames: Any
     """(..., dof, 3, 4)."""
     linear: Array
-    """Velocity per rate of the joint, of the body's point that is at the origin of the world (..., dof, 3)."""
+    """Velocity per rate of the joint, of the body's point that is at the origin of the world (...,
+    dof, 3).
+    """
     angular: Array
     """Angular velocity per rate of the joint (..., dof, 3)."""
 
 
 class Velocities(NamedTuple):
-    """Velocities of the bodies, and their accelerations at q'' = 0, as fields about the origin (..., dof, 3)."""
+    """Velocities of the bodies, and their accelerations at q'' = 0, as fields about the origin
+    (..., dof, 3).
+    """
 
     linear: Array
     angular: Array
@@ -55,8 +64,11 @@ class Velocities(NamedTuple):
     angular_rate: Array
 
 
-def link_poses(tree: RigidTree, qpos: Array, links: Sequence[str] | None = None, *, point: Array = None) -> Array:
-    """Return the poses (..., links, 7) of ``links``, by default all, at ``qpos`` (..., dof) [rad or m].
+def link_poses(
+    tree: RigidTree, qpos: Array, links: Sequence[str] | None = None, *, point: Array = None
+) -> Array:
+    """Return the poses (..., links, 7) of ``links``, by default all, at ``qpos`` (..., dof) [rad or
+    m].
 
     With a ``point`` (3,) in the frame of the links [m], the positions of this point.
 
@@ -66,7 +78,9 @@ def link_poses(tree: RigidTree, qpos: Array, links: Sequence[str] | None = None,
         A link is unknown, or the shape is wrong.
     """
     if isinstance(links, str):
-        raise InvalidArgumentError("links", "must be a list of names", value=links, remedy=f"pass [{links!r}]")
+        raise InvalidArgumentError(
+            "links", "must be a list of names", value=links, remedy=f"pass [{links!r}]"
+        )
     (q,), bodies, xp = prepared(tree, qpos=qpos)
     indices = [tree.index(link) for link in (tree.links if links is None else links)]
     at = read_point(q, point)
@@ -76,10 +90,14 @@ def link_poses(tree: RigidTree, qpos: Array, links: Sequence[str] | None = None,
         return np.stack(poses, axis=-2)
     frames = frames_of_bodies(tree, bodies, q, xp)
     with quiet():
-        return xp.stack([pose_of(tool_frame(tree, bodies, frames, index, at)) for index in indices], axis=-2)
+        return xp.stack(
+            [pose_of(tool_frame(tree, bodies, frames, index, at)) for index in indices], axis=-2
+        )
 
 
-def jacobian(tree: RigidTree, qpos: Array, link: str, *, point: Array = None, frame: str = "world") -> Array:
+def jacobian(
+    tree: RigidTree, qpos: Array, link: str, *, point: Array = None, frame: str = "world"
+) -> Array:
     """Return the Jacobian (..., 6, dof) of a point of ``link`` at ``qpos`` (..., dof).
 
     Parameters
@@ -108,19 +126,30 @@ def jacobian(tree: RigidTree, qpos: Array, link: str, *, point: Array = None, fr
 
 
 def jacobian_rate(
-    tree: RigidTree, qpos: Array, qvel: Array, link: str, *, point: Array = None, frame: str = "world"
+    tree: RigidTree,
+    qpos: Array,
+    qvel: Array,
+    link: str,
+    *,
+    point: Array = None,
+    frame: str = "world",
 ) -> Array:
-    """Return J' q' (..., 6): the acceleration [m/s^2, rad/s^2] that a point of ``link`` has by velocities alone.
+    """Return J' q' (..., 6): the acceleration [m/s^2, rad/s^2] that a point of ``link`` has by
+    velocities alone.
 
-    ``qpos`` and ``qvel`` are (..., dof). With frame "tool" the same vectors are given in the axes of the link. Other
-    arguments and errors as in :func:`jacobian`.
+    ``qpos`` and ``qvel`` are (..., dof). With frame "tool" the same vectors are given in the axes
+    of the link. Other arguments and errors as in :func:`jacobian`.
     """
     (q, v), bodies, xp = prepared(tree, qpos=qpos, qvel=qvel)
     index, _ = tree.index(link), choice("frame", frame, FRAMES)
-    found = native_rows.kinematics(tree, ("pose", "jacobian_rate"), q, v, index, read_point(q, point))
+    found = native_rows.kinematics(
+        tree, ("pose", "jacobian_rate"), q, v, index, read_point(q, point)
+    )
     if found is not None:
         pose, rate = found
-        return rate if frame == "world" else in_axes(matrix_of(pose[..., 3:]), rate[..., None])[..., 0]
+        return (
+            rate if frame == "world" else in_axes(matrix_of(pose[..., 3:]), rate[..., None])[..., 0]
+        )
     with quiet():
         motions = motions_of(tree, bodies, q, xp)
         tool = tool_frame(tree, bodies, motions.frames, index, point)
@@ -129,31 +158,50 @@ def jacobian_rate(
 
 
 def prepared(tree: RigidTree, **arrays: Array) -> tuple[list[Any], Bodies, Any]:
-    """Return checked arrays (..., dof) in one dtype, the tree's bodies in it, and their namespace."""
+    """Return checked arrays (..., dof) in one dtype, the tree's bodies in it, and their
+    namespace.
+    """
     instance("tree", tree, RigidTree, MAKE_TREE)
     xp = namespace(*arrays.values())
     checked, shape = [], None
     for name, value in arrays.items():
-        array = value if xp is not np or is_traced(value) else read_array(name, value).astype(np.float64, copy=False)
+        array = (
+            value
+            if xp is not np or is_traced(value)
+            else read_array(name, value).astype(np.float64, copy=False)
+        )
         if array.ndim < 1 or array.shape[-1] != tree.dof:
             remedy = f"the last axis counts the joints {', '.join(tree.joint_names)}"
-            raise InvalidArgumentError(name, f"has shape {array.shape}, not (..., {tree.dof})", remedy=remedy)
+            raise InvalidArgumentError(
+                name, f"has shape {array.shape}, not (..., {tree.dof})", remedy=remedy
+            )
         if shape is not None and array.shape != shape:
             remedy = "give both for the same envs"
-            raise InvalidArgumentError(name, f"has shape {array.shape}, but the first has {shape}", remedy=remedy)
+            raise InvalidArgumentError(
+                name, f"has shape {array.shape}, but the first has {shape}", remedy=remedy
+            )
         shape = array.shape
         checked.append(array)
     if xp is np:
         return checked, tree.bodies, xp
     dtype = xp.result_type(*checked)
-    return [a.astype(dtype) for a in checked], Bodies(*(xp.asarray(leaf, dtype) for leaf in tree.bodies)), xp
+    return (
+        [a.astype(dtype) for a in checked],
+        Bodies(*(xp.asarray(leaf, dtype) for leaf in tree.bodies)),
+        xp,
+    )
 
 
 def frames_of_bodies(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModule) -> Array:
     """Return the frames (..., dof, 3, 4) of the bodies in the world."""
     with quiet():
         q = qpos[..., None, None]
-        local = bodies.at_zero + xp.sin(q) * bodies.sine + (1 - xp.cos(q)) * bodies.cosine + q * bodies.slide
+        local = (
+            bodies.at_zero
+            + xp.sin(q) * bodies.sine
+            + (1 - xp.cos(q)) * bodies.cosine
+            + q * bodies.slide
+        )
         frames: list[Any] = []
         for joint, above in enumerate(tree.body_parents):
             own = local[..., joint, :, :]
@@ -169,14 +217,21 @@ def motions_of(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModule) ->
     return Motions(frames, cross(frames[..., 3], turning) + axis * bodies.slides, turning)
 
 
-def velocities_of(tree: RigidTree, motions: Motions, qvel: Array, xp: ArrayModule, turning: Any = None) -> Velocities:
-    """Return the velocities of the bodies, and their accelerations at q'' = 0, on a base that turns at ``turning``."""
+def velocities_of(
+    tree: RigidTree, motions: Motions, qvel: Array, xp: ArrayModule, turning: Any = None
+) -> Velocities:
+    """Return the velocities of the bodies, and their accelerations at q'' = 0, on a base that turns
+    at ``turning``.
+    """
     linear, angular = motions.linear * qvel[..., None], motions.angular * qvel[..., None]
     v, w = from_base(tree, linear, xp), from_base(tree, angular, xp)
     if turning is not None:
         w = w + turning[..., None, :]
     return Velocities(
-        v, w, from_base(tree, cross(w, linear) + cross(v, angular), xp), from_base(tree, cross(w, angular), xp)
+        v,
+        w,
+        from_base(tree, cross(w, linear) + cross(v, angular), xp),
+        from_base(tree, cross(w, angular), xp),
     )
 
 
@@ -216,11 +271,17 @@ def tool_frame(tree: RigidTree, bodies: Bodies, frames: Any, index: int, point: 
 
 
 def read_point(like: Any, point: Array) -> Array:
-    """Return ``point`` as a checked array (3,) or (..., 3), where ``like`` is (..., n); None where it is None."""
+    """Return ``point`` as a checked array (3,) or (..., 3), where ``like`` is (..., n); None where
+    it is None.
+    """
     if point is None:
         return None
     xp = namespace(like, point)
-    at = read_array("point", point).astype(np.float64, copy=False) if xp is np else xp.asarray(point, like.dtype)
+    at = (
+        read_array("point", point).astype(np.float64, copy=False)
+        if xp is np
+        else xp.asarray(point, like.dtype)
+    )
     shapes = dict.fromkeys([(3,), (*like.shape[:-1], 3)])
     if at.shape not in shapes:
         problem = f"has shape {at.shape}, not {' or '.join(map(str, shapes))}"
@@ -229,7 +290,9 @@ def read_point(like: Any, point: Array) -> Array:
 
 
 def jacobian_at(tree: RigidTree, bodies: Bodies, motions: Motions, index: int, place: Any) -> Array:
-    """Return the Jacobian (..., 6, dof) of a link's point at ``place`` (..., 3) in the world, J G of coupled joints."""
+    """Return the Jacobian (..., 6, dof) of a link's point at ``place`` (..., 3) in the world, J G
+    of coupled joints.
+    """
     xp, body = namespace(place), tree.link_bodies[index]
     linear = motions.linear + cross(motions.angular, place[..., None, :])
     columns = xp.concatenate([linear, motions.angular], axis=-1)
@@ -243,4 +306,6 @@ def rate_at(tree: RigidTree, velocities: Velocities, index: int, place: Any) -> 
     if body < 0:
         return xp.concatenate([xp.zeros_like(place)] * 2, axis=-1)
     v, w, linear, angular = (leaf[..., body, :] for leaf in velocities)
-    return xp.concatenate([linear + cross(angular, place) + cross(w, v + cross(w, place)), angular], axis=-1)
+    return xp.concatenate(
+        [linear + cross(angular, place) + cross(w, v + cross(w, place)), angular], axis=-1
+    )

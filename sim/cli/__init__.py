@@ -1,9 +1,10 @@
 """The command line: each command is a frozen dataclass whose fields are its flags.
 
-To add a command, write a module with such a dataclass and list it in :data:`COMMANDS`. The range of a number is a
-:class:`batchpid.arrays.field_tables.Field` in its annotation, and is checked before ``run()`` starts, which returns the
-exit status (None: 0). Modules that load SAPIEN or Matplotlib are named in ``imports`` and imported after the flags are
-parsed, so that ``--help`` answers at once.
+To add a command, write a module with such a dataclass and list it in :data:`COMMANDS`. The range of
+a number is a :class:`batchpid.arrays.field_tables.Field` in its annotation, and is checked before
+``run()`` starts, which returns the exit status (None: 0). Modules that load SAPIEN or Matplotlib
+are named in ``imports`` and imported after the flags are parsed, so that ``--help`` answers at
+once.
 """
 
 from __future__ import annotations
@@ -50,8 +51,10 @@ COMMANDS: dict[str, type[Any]] = {
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status.
 
-    0: success. 2: bad input, or a file that cannot be written. 3: no env of ``rollout`` or ``demo`` settled. 130:
-    Ctrl-C. 141: the reader of stdout closed it, as in ``| head``. 2 and 130 come with one line on stderr.
+    0: success. 2: bad input, or a file that cannot be written. 3: no env of ``rollout`` or ``demo``
+        settled. 130:
+    Ctrl-C. 141: the reader of stdout closed it, as in ``| head``. 2 and 130 come with one line on
+    stderr.
     """
     message = None
     try:
@@ -63,9 +66,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         status, message = 128 + signal.SIGINT, "interrupted"
     except BrokenPipeError:
         status = 128 + signal.SIGPIPE
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes it once more at exit
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # Python flushes it once more at exit
     except OSError as error:
-        status, message = 2, f"{error.filename}: {error.strerror}" if error.filename else error.strerror or str(error)
+        status, message = (
+            2,
+            (
+                f"{error.filename}: {error.strerror}"
+                if error.filename
+                else error.strerror or str(error)
+            ),
+        )
     if message is not None:
         close_bars()
         print("batchpid:", " ".join(message.splitlines()), file=sys.stderr)
@@ -90,14 +102,17 @@ def _run(arguments: list[str]) -> int:
 
 
 def parse(arguments: Sequence[str]) -> Any:
-    """Return the command with its flags; for --help or unknown flags print help and raise SystemExit."""
+    """Return the command with its flags; for --help or unknown flags print help and raise
+    SystemExit.
+    """
     if os.environ.get("NO_COLOR"):
         os.environ["TERM"] = "dumb"  # tyro colours its help on every other terminal
     options = (
         tyro.conf.DisallowNone,  # a flag is left out, not given None
         tyro.conf.FlagCreatePairsOff,  # --force without --no-force
         tyro.conf.PositionalMetavarFromFieldName,
-        # Without a help of the choice itself, tyro looks for one in the source of `typing`, which takes 0.05 s.
+        # Without a help of the choice itself, tyro looks for one in the source of `typing`, which
+        # takes 0.05 s.
         tyro.conf.arg(help="`batchpid COMMAND --help` lists the flags of a command."),
     )
     if arguments and arguments[0] in COMMANDS:  # alone, so that a message names its help

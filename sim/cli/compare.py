@@ -18,10 +18,11 @@ RUNNER = flags.runner_flags(*flags.SCENE_FLAGS, "workers")
 
 @dataclass(frozen=True)
 class CompareCommand:
-    """Compare sets of gains on the same seeded moves: settling, overshoot, final error and chatter of each.
+    """Compare sets of gains on the same seeded moves: settling, overshoot, final error and chatter
+    of each.
 
-    With `--engine sapien mujoco` every set runs in both engines, on the same moves, and the largest difference of their
-    motions is printed.
+    With `--engine sapien mujoco` every set runs in both engines, on the same moves, and the largest
+    difference of their motions is printed.
     """
 
     robot: flags.RobotName = "panda"
@@ -59,14 +60,23 @@ class CompareCommand:
         if not self.engine:
             raise InvalidArgumentError("engine", "is missing", remedy="name sapien, mujoco or both")
         if picture is not None and len(sets) * len(set(self.engine)) < 2:
-            raise InvalidArgumentError("gains", "names a single set", remedy="name two, or two engines, for a picture")
+            raise InvalidArgumentError(
+                "gains", "names a single set", remedy="name two, or two engines, for a picture"
+            )
         if not self.moves and robot.settings is None:
             remedy = "use 1 or more: the robot has no move of a tutorial"
             raise InvalidArgumentError("moves", "leaves none", value=self.moves, remedy=remedy)
-        randomization = None if self.randomize is None else load_randomization(self.randomize, robot)
+        randomization = (
+            None if self.randomize is None else load_randomization(self.randomize, robot)
+        )
         options = flags.chosen(self, "moves seed seconds") | self.runner.options()
-        evaluations = evaluate_sets(robot, sets, randomization=randomization, engines=self.engine, **options)
-        print(f"{robot.name}: {len(evaluations[0].moves.start)} moves, seed {self.seed}, {self.seconds:g} s each\n")
+        evaluations = evaluate_sets(
+            robot, sets, randomization=randomization, engines=self.engine, **options
+        )
+        print(
+            f"{robot.name}: {len(evaluations[0].moves.start)} moves, seed {self.seed},"
+            f" {self.seconds:g} s each\n"
+        )
         print(evaluation_table(robot, evaluations))
         if len(set(self.engine)) == 2:
             print("\nLargest difference of a position between the engines:")
@@ -78,7 +88,14 @@ class CompareCommand:
                 evaluation.name: {name: getattr(evaluation, name) for name in arrays.split()}
                 for evaluation in evaluations
             }
-            write_figures(json, {"joints": robot.joint_names, "moves": evaluations[0].moves.names, "gains": figures})
+            write_figures(
+                json,
+                {
+                    "joints": robot.joint_names,
+                    "moves": evaluations[0].moves.names,
+                    "gains": figures,
+                },
+            )
             print(f"\nfigures: {json}")
         if picture is not None:
             print(f"\npicture: {draw_first_move(robot, evaluations, picture)}")

@@ -17,8 +17,8 @@ RUNNER = flags.runner_flags("ground", "workers", "engine", "backend")
 class DemoCommand:
     """Move 64 arms to the tutorial's setpoint; print a table of the joints and draw a picture.
 
-    PID and passive force are computed at each of the 2000 sim steps of a second. Env 0 starts where SAPIEN's tutorial
-    does, the others at seeded poses near it.
+    PID and passive force are computed at each of the 2000 sim steps of a second. Env 0 starts where
+    SAPIEN's tutorial does, the others at seeded poses near it.
     """
 
     robot: flags.RobotName = "panda"
@@ -40,5 +40,7 @@ class DemoCommand:
     def run(self) -> int:
         """Run the command; return the exit status, 3 if no env settles."""
         picture = self.picture or beside(FOLDER / Path(self.robot).stem, "demo")
-        same = flags.chosen(self, "robot num_envs gains seconds seed spread runner meshes json force")
+        same = flags.chosen(
+            self, "robot num_envs gains seconds seed spread runner meshes json force"
+        )
         return RolloutCommand(**same, picture=picture, substeps=10).run()

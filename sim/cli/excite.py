@@ -18,9 +18,10 @@ from batchpid.sim.cli.outputs import FOLDER, OutputFiles
 class ExciteCommand:
     """Make the motion to record for identification: a chirp of every joint.
 
-    It keeps the limits of position, velocity and effort, and is free of contact. Writes setpoints and their rates as
-    CSV with the header "time, setpoint:JOINT, ..., setpoint_rate:JOINT, ...", which `batchpid rollout --trajectory`
-    follows. Move the robot to the first row before it starts, and add the measured positions to the log as qpos:JOINT.
+    It keeps the limits of position, velocity and effort, and is free of contact. Writes setpoints
+    and their rates as CSV with the header "time, setpoint:JOINT, ..., setpoint_rate:JOINT, ...",
+    which `batchpid rollout --trajectory` follows. Move the robot to the first row before it starts,
+    and add the measured positions to the log as qpos:JOINT.
     """
 
     robot: flags.RobotName = "panda"
@@ -51,7 +52,14 @@ class ExciteCommand:
         out = self.out or FOLDER / f"{Path(self.robot).stem}.excite.csv"
         out = OutputFiles(self).path("out", out, (".csv",))
         robot = Robot.load(self.robot, **vars(self.meshes))
-        motion = excite(robot, self.seconds, rate=self.rate, lowest=self.lowest, highest=self.highest, seed=self.seed)
+        motion = excite(
+            robot,
+            self.seconds,
+            rate=self.rate,
+            lowest=self.lowest,
+            highest=self.highest,
+            seed=self.seed,
+        )
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, setpoint_csv(robot, motion))
         rows = [
@@ -67,9 +75,15 @@ class ExciteCommand:
         ]
         print(table(rows, ["joint", "moves from ... to", "fastest"], "lrr"))
         if still := [
-            name for name, span in zip(robot.joint_names, np.ptp(motion.position, axis=0), strict=True) if not span
+            name
+            for name, span in zip(robot.joint_names, np.ptp(motion.position, axis=0), strict=True)
+            if not span
         ]:
-            print(f"\nToo weak for their friction and gravity, so they stay still: {', '.join(still)}.")
+            print(
+                "\nToo weak for their friction and gravity, so they stay still:"
+                f" {', '.join(still)}."
+            )
         print(
-            f"\nwritten: {out}: {motion.ticks} rows of {motion.time[0]:g} s; the robot starts at rest at the first row"
+            f"\nwritten: {out}: {motion.ticks} rows of {motion.time[0]:g} s; the robot starts at"
+            " rest at the first row"
         )

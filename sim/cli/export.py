@@ -42,9 +42,10 @@ POSES = 64
 class ExportCommand:
     """Write a robot's gains, or the robot itself, as a file for another program.
 
-    Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to batchpid's. "ros2_control"
-    is the YAML of a controller. "mjcf" is the robot with the law in MuJoCo's own actuators, "urdf" the robot with its
-    repairs. Differences between the file and batchpid's law or the robot's file are printed, one line each.
+    Target "c" is a C99 header without dependencies: the law with its gains, bit-identical to
+    batchpid's. "ros2_control" is the YAML of a controller. "mjcf" is the robot with the law in
+    MuJoCo's own actuators, "urdf" the robot with its repairs. Differences between the file and
+    batchpid's law or the robot's file are printed, one line each.
     """
 
     robot: flags.RobotName = "panda"
@@ -52,7 +53,9 @@ class ExportCommand:
     to: Literal["c", "ros2_control", "mjcf", "urdf"] = "c"
     """Target."""
     actuators: flags.Actuators = None
-    controller: Literal["joint_trajectory_controller", "pid_controller"] = "joint_trajectory_controller"
+    controller: Literal["joint_trajectory_controller", "pid_controller"] = (
+        "joint_trajectory_controller"
+    )
     """Controller of ros2_control."""
     timestep: Annotated[float, Field("seconds, not a rate: 1/1000", low=1e-6, high=1.0)] = 1 / 1000
     """Time step of the control on the robot, or of the physics [s]."""
@@ -83,7 +86,9 @@ class ExportCommand:
         out = self.out or FOLDER / f"{Path(self.robot).stem}{FILES[self.to]}"
         out = OutputFiles(self).path("out", out, (Path(FILES[self.to]).suffix,))
         known = {name for names in USED.values() for name in names}
-        unused = [entry.name for entry in fields(self) if entry.name in known.difference(USED[self.to])]
+        unused = [
+            entry.name for entry in fields(self) if entry.name in known.difference(USED[self.to])
+        ]
         flags.refuse(self, unused, f"has no effect with --to {self.to}")
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
         if self.to == "urdf":
@@ -94,7 +99,10 @@ class ExportCommand:
                 raise InvalidArgumentError(
                     "motors", "are written without a law", remedy="leave out --gains and --limits"
                 )
-            exported, content = _mjcf(robot, None, self.timestep, False), f"motors of {robot.dof} joints"
+            exported, content = (
+                _mjcf(robot, None, self.timestep, False),
+                f"motors of {robot.dof} joints",
+            )
         else:
             chosen = gain_set(robot, self.gains)
             if chosen.control != "pid":
@@ -105,7 +113,9 @@ class ExportCommand:
             content = f"{chosen.name} gains of {robot.dof} joints at {1 / self.timestep:g} Hz"
         differences = exported.differences
         if self.strict and differences:
-            raise InvalidArgumentError("to", "; ".join(differences), value=self.to, remedy="leave out --strict")
+            raise InvalidArgumentError(
+                "to", "; ".join(differences), value=self.to, remedy="leave out --strict"
+            )
         out.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(out, _with_differences(exported, COMMENTS.get(self.to, "# {}")))
         for difference in differences:
@@ -119,17 +129,27 @@ class ExportCommand:
         if self.to == "mjcf":
             return _mjcf(robot, params, self.timestep, self.limits)
         joints, followers = (
-            [robot.joint_names[at] for at in np.flatnonzero(mask)] for mask in (robot.independent, ~robot.independent)
+            [robot.joint_names[at] for at in np.flatnonzero(mask)]
+            for mask in (robot.independent, ~robot.independent)
         )
         notes = list[str]()
         if followers:
-            place = "joints of their own in the file; ignore their efforts" if self.to == "c" else "not in the file"
+            place = (
+                "joints of their own in the file; ignore their efforts"
+                if self.to == "c"
+                else "not in the file"
+            )
             notes.append(f"{', '.join(followers)}: followers are {place}")
         if self.to == "c":
             guard = robot.guard() if self.limits else None
             tree = robot.kinematic_tree() if self.dynamics else None
             exported = to_c(
-                params, self.timestep, joint_names=robot.joint_names, guard=guard, prefix=self.prefix, tree=tree
+                params,
+                self.timestep,
+                joint_names=robot.joint_names,
+                guard=guard,
+                prefix=self.prefix,
+                tree=tree,
             )
         else:
             notes += [UNLIMITED] if self.limits else []
@@ -147,10 +167,15 @@ class ExportCommand:
 def _with_differences(exported: Exported, comment: str) -> str:
     """Return the text, with a comment for each difference that it does not hold yet."""
     sentences = [
-        " ".join(difference.split()).replace("--", "- -").replace("*/", "* /") for difference in exported.differences
+        " ".join(difference.split()).replace("--", "- -").replace("*/", "* /")
+        for difference in exported.differences
     ]
-    lines = "".join(f"{comment.format(f'differs: {each}')}\n" for each in sentences if each not in exported.text)
-    declaration, end, rest = exported.text.partition("?>\n") if exported.text.startswith("<?xml") else ("", "", "")
+    lines = "".join(
+        f"{comment.format(f'differs: {each}')}\n" for each in sentences if each not in exported.text
+    )
+    declaration, end, rest = (
+        exported.text.partition("?>\n") if exported.text.startswith("<?xml") else ("", "", "")
+    )
     return f"{declaration}{end}{lines}{rest}" if end else f"{lines}{exported.text}"
 
 
@@ -162,11 +187,15 @@ def _mjcf(robot: Robot, params: bp.PIDParams | None, dt: float, limits: bool) ->
     from batchpid.sim.engine.mujoco.mjcf_export import to_mjcf
 
     guard = robot.guard() if limits else None
-    return to_mjcf(robot, params, dt, actuators=robot.actuators, guard=guard, inertia=_inertia(robot))
+    return to_mjcf(
+        robot, params, dt, actuators=robot.actuators, guard=guard, inertia=_inertia(robot)
+    )
 
 
 def _inertia(robot: Robot) -> np.ndarray:
-    """Return the inertia of the joints (poses, dof), 1 for followers, at the start pose, then at sampled poses."""
+    """Return the inertia of the joints (poses, dof), 1 for followers, at the start pose, then at
+    sampled poses.
+    """
     matrices = robot.mass_matrix(np.vstack([robot.start, robot.sample(POSES)]))
     matrices = robot.coupling.mass_matrix(matrices)
     return np.diagonal(matrices, axis1=1, axis2=2)

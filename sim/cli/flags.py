@@ -13,11 +13,20 @@ import tyro
 from batchpid.arrays.array_types import Document, Kind
 from batchpid.arrays.field_tables import Field, declared, plain
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.runner_keywords import KINDS, OPTIONS, Compensation, EngineName, PhysicsPreset, RunnerKeywords
+from batchpid.sim.runner_keywords import (
+    KINDS,
+    OPTIONS,
+    Compensation,
+    EngineName,
+    PhysicsPreset,
+    RunnerKeywords,
+)
 
 
 def _flag(help: str | None = None, **options: Any) -> Any:
-    """Return tyro's options of a flag; its help leaves out the defaults None, False, True and ()."""
+    """Return tyro's options of a flag; its help leaves out the defaults None, False, True and
+    ().
+    """
 
     def hint(default: str) -> str:
         return "" if default in ("None", "False", "True", "") else f"(default: {default})"
@@ -26,7 +35,8 @@ def _flag(help: str | None = None, **options: Any) -> Any:
 
 
 def check(command: Any) -> None:
-    """Check the flags of a command, and of its groups of flags, by their types and the Field in their annotations.
+    """Check the flags of a command, and of its groups of flags, by their types and the Field in
+    their annotations.
 
     Raises InvalidArgumentError for the first value that is out of range.
     """
@@ -39,7 +49,9 @@ def check(command: Any) -> None:
 
 
 def chosen(command: Any, names: str) -> Document:
-    """Return the values of some flags of a command, as arguments of the same names, which are separated by blanks."""
+    """Return the values of some flags of a command, as arguments of the same names, which are
+    separated by blanks.
+    """
     return {name: getattr(command, name) for name in names.split()}
 
 
@@ -68,11 +80,17 @@ def of_option(name: str) -> Any:
 
 
 def _kind(name: str) -> Kind:
-    """Return the type of the flag of a Runner's option: the part of its declared type that has plain values."""
+    """Return the type of the flag of a Runner's option: the part of its declared type that has
+    plain values.
+    """
     kind = Literal["on", "off"] | None if name in _SWITCHES else get_args(KINDS[name])[0]
     if get_origin(kind) not in (Union, UnionType):
         return kind
-    return Union[tuple(option for option in get_args(kind) if option in _PLAIN or get_origin(option) is Literal)]  # noqa: UP007
+    return Union[  # noqa: UP007
+        tuple(
+            option for option in get_args(kind) if option in _PLAIN or get_origin(option) is Literal
+        )
+    ]
 
 
 @dataclass(frozen=True)
@@ -80,10 +98,14 @@ class RunnerFlags:
     """Flags that are options of a Runner, by :func:`runner_flags`."""
 
     def options(self) -> Document:
-        """Return the options as arguments of a Runner; switches that are left out are left to it."""
+        """Return the options as arguments of a Runner; switches that are left out are left to
+        it.
+        """
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         switches = {name: values.pop(name) for name in _SWITCHES if name in values}
-        return values | {name: value == "on" for name, value in switches.items() if value is not None}
+        return values | {
+            name: value == "on" for name, value in switches.items() if value is not None
+        }
 
 
 def runner_flags(*names: str) -> type[RunnerFlags]:
@@ -106,12 +128,16 @@ Switch = Annotated[bool, _flag()]
 Force = Annotated[bool, _flag("Replace output files that exist.")]
 
 RobotName = Annotated[
-    str, tyro.conf.Positional, _flag("Bundled robot (panda or jaco2), or path of a URDF or MJCF file.")
+    str,
+    tyro.conf.Positional,
+    _flag("Bundled robot (panda or jaco2), or path of a URDF or MJCF file."),
 ]
 RecordedRobot = Annotated[
     str | None,
     tyro.conf.Positional,
-    _flag("Bundled robot, or path of a URDF or MJCF file. Default: that of the recording, or panda."),
+    _flag(
+        "Bundled robot, or path of a URDF or MJCF file. Default: that of the recording, or panda."
+    ),
 ]
 
 
@@ -125,7 +151,8 @@ class MeshOptions:
     package_dirs: Annotated[
         tuple[Path, ...],
         _flag(
-            "Folders that hold the packages of package:// mesh paths, looked up first.", metavar="FOLDER [FOLDER ...]"
+            "Folders that hold the packages of package:// mesh paths, looked up first.",
+            metavar="FOLDER [FOLDER ...]",
         ),
     ] = ()
 
@@ -137,26 +164,26 @@ Cluster = Annotated[Literal["ray"] | None, of_option("cluster")]
 Gains = Annotated[
     str | None,
     _flag(
-        "Gains: tuned, designed, tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file (.yaml or .json) that "
-        "`batchpid tune` or batchpid.save_params wrote, or an MJCF file (.xml). Default: tuned where the robot has "
-        "them, else designed.",
+        "Gains: tuned, designed, tutorial, mjcf, drive:STIFFNESS,DAMPING, or a params file (.yaml"
+        " or .json) that `batchpid tune` or batchpid.save_params wrote, or an MJCF file (.xml)."
+        " Default: tuned where the robot has them, else designed.",
         metavar="NAME|FILE",
     ),
 ]
 Actuators = Annotated[
     Path | None,
     _flag(
-        "Motors and sensors: a file (.yaml or .json) of batchpid.save_actuators. Default: ideal ones. Of these, drives "
-        "have the friction and armature alone.",
+        "Motors and sensors: a file (.yaml or .json) of batchpid.save_actuators. Default: ideal"
+        " ones. Of these, drives have the friction and armature alone.",
         metavar="FILE",
     ),
 ]
 GainSets = Annotated[
     tuple[str, ...],
     _flag(
-        "Sets of gains: tuned, designed, tutorial, mjcf, drive, drive:STIFFNESS,DAMPING, params files (.yaml or "
-        ".json) that `batchpid tune` or batchpid.save_params wrote, or MJCF files (.xml). Default: tuned, tutorial "
-        "and drive for a bundled robot, else designed and drive.",
+        "Sets of gains: tuned, designed, tutorial, mjcf, drive, drive:STIFFNESS,DAMPING, params"
+        " files (.yaml or .json) that `batchpid tune` or batchpid.save_params wrote, or MJCF files"
+        " (.xml). Default: tuned, tutorial and drive for a bundled robot, else designed and drive.",
         metavar="NAME|FILE [NAME|FILE ...]",
     ),
 ]
@@ -165,18 +192,25 @@ Engines = Annotated[tuple[EngineName, ...], _flag("Physics engines, one or both.
 Physics = Annotated[PhysicsPreset, of_option("physics")]
 Compensate = Annotated[Compensation, of_option("compensate")]
 Seed = Annotated[int, Field(high=2**31 - 1)]
-Seconds = Annotated[float, Field("simulated time, s", low=1e-6, high=1e6), _flag("Simulated time [s].")]
+Seconds = Annotated[
+    float, Field("simulated time, s", low=1e-6, high=1e6), _flag("Simulated time [s].")
+]
 MoveSeconds = Annotated[float, Field("simulated time, s", low=0.05, high=600.0)]
 Distance = Annotated[float, Field("rad or m", high=10.0)]
-Spread = Annotated[Distance, _flag("Largest distance of a start pose from that of env 0 [rad or m].")]
+Spread = Annotated[
+    Distance, _flag("Largest distance of a start pose from that of env 0 [rad or m].")
+]
 Json = Annotated[Path | None, _flag("Figures to write: .json.", metavar="FILE")]
 ShownEnvs = Annotated[int, Field(low=1, high=64)]
 Fps = Annotated[float, Field("frames per second", low=1.0, high=120.0), _flag("Frames per second.")]
-TimeLimit = Annotated[float | None, Field("s"), _flag("Stop after this wall-clock time [s]. Default: none.")]
+TimeLimit = Annotated[
+    float | None, Field("s"), _flag("Stop after this wall-clock time [s]. Default: none.")
+]
 Randomize = Annotated[
     str | None,
     _flag(
-        "Draw the robot of each move or env: a YAML file (docs/randomization.md), e.g. `payload: {uniform: [0, 0.5]}`.",
+        "Draw the robot of each move or env: a YAML file (docs/randomization.md), e.g. `payload:"
+        " {uniform: [0, 0.5]}`.",
         metavar="FILE",
     ),
 ]

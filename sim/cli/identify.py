@@ -28,37 +28,52 @@ Logs = Annotated[
 class IdentifyCommand:
     """Identify a robot's motors from logs of its motion, from this robot or another simulator.
 
-    Finds armature, damping, friction, strength and bias of each joint, the delays of efforts and setpoints and the
-    payload at the tool, by fitting simulated motions; writes them for --actuators of other commands. A log has a header
-    and SI units: "time, setpoint:JOINT ..., qpos:JOINT ...", with the gains that drove the robot as --gains FILE, or
-    "time, effort:JOINT ..., qpos:JOINT ...". The fit simulates a rigid-body model with a Runner's control and motors.
+    Finds armature, damping, friction, strength and bias of each joint, the delays of efforts and
+    setpoints and the payload at the tool, by fitting simulated motions; writes them for --actuators
+    of other commands. A log has a header and SI units: "time, setpoint:JOINT ..., qpos:JOINT ...",
+    with the gains that drove the robot as --gains FILE, or "time, effort:JOINT ..., qpos:JOINT
+    ...". The fit simulates a rigid-body model with a Runner's control and motors.
     """
 
     robot: flags.RobotName = "panda"
     logs: Logs = ()
     gains: Annotated[flags.OptionalName, tyro.conf.arg(metavar="NAME|FILE")] = None
-    """Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file as for --gains of
-    other commands. Without it a recording's own, or the logs' efforts."""
+    """Gains of the PID law that drove the robot: a params file (.yaml or .json), or a name or file
+    as for --gains of other commands. Without it a recording's own, or the logs' efforts.
+    """
     compensate: Annotated[flags.Compensate | None, tyro.conf.arg(metavar="FORCES")] = None
-    """Forces that the robot compensates: gravity+coriolis+friction, gravity+coriolis, gravity or none. Default: as the
-    recordings say, else gravity+coriolis+friction."""
-    timestep: Annotated[float | None, Field("s", low=1e-5, high=0.01), tyro.conf.arg(metavar="FLOAT")] = None
-    """Time step of the control that drove the robot [s]. Default: as the recordings say, else 1/2000."""
+    """Forces that the robot compensates: gravity+coriolis+friction, gravity+coriolis, gravity or
+    none. Default: as the recordings say, else gravity+coriolis+friction.
+    """
+    timestep: Annotated[
+        float | None, Field("s", low=1e-5, high=0.01), tyro.conf.arg(metavar="FLOAT")
+    ] = None
+    """Time step of the control that drove the robot [s]. Default: as the recordings say, else
+    1/2000.
+    """
     hold: flags.Switch = False
-    """Commands hold from row to row of a log; otherwise they are interpolated. Recordings are always held."""
+    """Commands hold from row to row of a log; otherwise they are interpolated. Recordings are
+    always held.
+    """
     degrees: flags.Switch = False
     """Positions and setpoints of revolute joints are in degrees."""
     topic: str = "/joint_states"
-    """Topic of the measurements in a ROS bag (sensor_msgs/JointState), whose efforts count as measured."""
+    """Topic of the measurements in a ROS bag (sensor_msgs/JointState), whose efforts count as
+    measured.
+    """
     command_topic: Annotated[flags.OptionalName, tyro.conf.arg(metavar="TOPIC")] = None
-    """Topic of the commands in a ROS bag: positions are setpoints, efforts are efforts. Default: measured efforts."""
+    """Topic of the commands in a ROS bag: positions are setpoints, efforts are efforts. Default:
+    measured efforts.
+    """
     prefix: str = ""
     """Prefix of the joints' names in the logs."""
     no_payload: flags.Switch = False
     """The tool carries no payload."""
     extras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME")] = ()
-    """Further unknowns: load_friction, stribeck, offset, mass (of each link); with --gains also gain (a factor of gains
-    that are not known), kd, saturation and slew (the limit of the goal's rate)."""
+    """Further unknowns: load_friction, stribeck, offset, mass (of each link); with --gains also
+    gain (a factor of gains that are not known), kd, saturation and slew (the limit of the goal's
+    rate).
+    """
     workers: Annotated[int, Field(low=0, high=1000)] = 0
     """Number of processes, 0 for none besides this one. The result does not depend on it."""
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
@@ -102,8 +117,13 @@ class IdentifyCommand:
         )
         print(result.report())
         if not (result.explains or self.force):
-            problem = "are explained to less than half of the error of ideal motors, and no file is written"
-            raise InvalidArgumentError("logs", problem, remedy=f"{result.advice}; --force writes the file nevertheless")
+            problem = (
+                "are explained to less than half of the error of ideal motors, and no file is"
+                " written"
+            )
+            raise InvalidArgumentError(
+                "logs", problem, remedy=f"{result.advice}; --force writes the file nevertheless"
+            )
         result.save(out)
         print(f"\nwritten: {out}")
         if (gains := result.gains()) is not None:

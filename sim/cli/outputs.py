@@ -30,7 +30,8 @@ P = TypeVar("P", bound=Path | None)
 
 
 class OutputFiles:
-    """Output files of one run of a ``command``. With ``--force`` they replace files, but none that the command reads.
+    """Output files of one run of a ``command``. With ``--force`` they replace files, but none that
+    the command reads.
 
     The command reads the file that any other flag names.
     """
@@ -42,13 +43,16 @@ class OutputFiles:
         for name, value in vars(command).items():
             if name not in OUTPUTS:
                 values = value if isinstance(value, tuple) else (value,)
-                self._inputs += [path for path in values if isinstance(path, str | Path) and os.path.isfile(path)]
+                self._inputs += [
+                    path for path in values if isinstance(path, str | Path) and os.path.isfile(path)
+                ]
 
     def path(self, argument: str, path: P, suffixes: Collection[str]) -> P:
         """Return ``path`` after a check that a file may be written there; None is returned as None.
 
-        Raises InvalidArgumentError if its suffix is not one of ``suffixes``, its folder neither exists nor is
-        :data:`FOLDER`, the command reads it or writes it as another output, or it exists and may not be replaced.
+        Raises InvalidArgumentError if its suffix is not one of ``suffixes``, its folder neither
+        exists nor is :data:`FOLDER`, the command reads it or writes it as another output, or it
+        exists and may not be replaced.
         """
         if path is None:
             return path
@@ -61,7 +65,10 @@ class OutputFiles:
             problem = "is another output of this run"
         elif not path.parent.exists() and path.parent != FOLDER:
             folder = str(path.parent)
-            problem, remedy = f"has no folder {folder!r}", f"make it: mkdir -p {shlex.quote(folder)}"
+            problem, remedy = (
+                f"has no folder {folder!r}",
+                f"make it: mkdir -p {shlex.quote(folder)}",
+            )
         elif exists and not self._force:
             problem, remedy = "exists already", "add --force to replace it, or choose another name"
         if problem is not None:
@@ -71,13 +78,21 @@ class OutputFiles:
 
 
 def write_figures(path: Path, figures: Any) -> None:
-    """Write figures as JSON: arrays as lists, named tuples and mappings as objects, null for NaN and infinity."""
+    """Write figures as JSON: arrays as lists, named tuples and mappings as objects, null for NaN
+    and infinity.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps(_plain(figures), indent=1, allow_nan=False) + "\n")
 
 
 def _plain(value: Any) -> Any:
-    value = value._asdict() if hasattr(value, "_asdict") else value.tolist() if hasattr(value, "tolist") else value
+    value = (
+        value._asdict()
+        if hasattr(value, "_asdict")
+        else value.tolist()
+        if hasattr(value, "tolist")
+        else value
+    )
     if isinstance(value, Mapping):
         return {name: _plain(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -86,23 +101,33 @@ def _plain(value: Any) -> Any:
 
 
 def beside(path: Path, shown: str, suffix: str = ".png") -> Path:
-    """Return the default path of a picture or film of ``path``, in the same folder: NAME-SHOWN.png."""
+    """Return the default path of a picture or film of ``path``, in the same folder:
+    NAME-SHOWN.png.
+    """
     return path.with_name(f"{path.stem}-{shown}{suffix}")
 
 
-AT_MOST = "{desc}: {n_fmt} of at most {total_fmt} evaluations, {elapsed}, at most {remaining} more{postfix}"
+AT_MOST = (
+    "{desc}: {n_fmt} of at most {total_fmt} evaluations, {elapsed}, at most {remaining}"
+    " more{postfix}"
+)
 """Format of a bar for work that usually ends long before the last step."""
 _bars: weakref.WeakSet[tqdm[Any]] = weakref.WeakSet()
 
 
 def bar(label: str, **options: Any) -> Callable[[Iterable[Any]], Iterable[Any]]:
-    """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; ``options`` go to tqdm.
+    """Return a function that wraps an iterable with a bar on stderr, shown after 1 s; ``options``
+    go to tqdm.
 
     A file as stderr gets no bar.
     """
     from tqdm import tqdm
 
-    options = {"delay": 1.0} | options | {"leave": False, "dynamic_ncols": True, "disable": not sys.stderr.isatty()}
+    options = (
+        {"delay": 1.0}
+        | options
+        | {"leave": False, "dynamic_ncols": True, "disable": not sys.stderr.isatty()}
+    )
 
     def wrap(items: Iterable[Any]) -> Iterable[Any]:
         shown = tqdm(items, desc=label, **options)

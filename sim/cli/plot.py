@@ -33,13 +33,16 @@ class PlotCommand:
     """Another recording, to compare with."""
     kind: Literal["responses", "efforts"] = "responses"
     """Step responses, or efforts against their limits, of one recording."""
-    joints: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]", help_behavior_hint="")] = ()
+    joints: Annotated[
+        tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]", help_behavior_hint="")
+    ] = ()
     """Names of joints to draw. Default: all."""
     every: Annotated[int, Field(low=1, high=1e9)] = 1
     """Draw only every n-th tick, for long recordings."""
     picture: flags.OptionalPath = None
-    """Picture to draw: .png or .svg. Default: next to the recording NAME.h5, NAME-responses.png, NAME-efforts.png, or
-    NAME-versus-OTHER.png."""
+    """Picture to draw: .png or .svg. Default: next to the recording NAME.h5, NAME-responses.png,
+    NAME-efforts.png, or NAME-versus-OTHER.png.
+    """
     film: flags.OptionalPath = None
     """Film of the first 16 envs in real time, to write instead of a picture: .mp4 or .gif."""
     meshes: flags.Meshes = field(default_factory=flags.MeshOptions)
@@ -57,11 +60,15 @@ class PlotCommand:
         outputs = OutputFiles(self)
         if self.film is not None:
             return self._film(outputs)
-        picture = outputs.path("picture", self.picture or beside(self.recording, shown), plots.FORMATS)
+        picture = outputs.path(
+            "picture", self.picture or beside(self.recording, shown), plots.FORMATS
+        )
         rollout = _read(self.recording, self.every)
         if self.versus is not None:
             labels = (self.recording.name, self.versus.name)
-            figure = plots.comparison(rollout, _read(self.versus, self.every), labels=labels, joints=self.joints)
+            figure = plots.comparison(
+                rollout, _read(self.versus, self.every), labels=labels, joints=self.joints
+            )
         else:
             draw: Any = plots.step_responses if self.kind == "responses" else plots.efforts
             figure = draw(rollout, joints=self.joints)
@@ -77,13 +84,20 @@ class PlotCommand:
         usage = f"batchpid plot {shlex.quote(str(self.recording))} PATH/TO/ROBOT.urdf --film {film}"
         rollout, robot = read_run(self.recording, self.robot, self.meshes, usage)
         shown = rollout.for_envs(slice(0, SHOWN_ENVS))
-        print(f"film: {write_film(shown, film, robot=robot, progress=bar('filming', unit='frame'))}")
+        print(
+            f"film: {write_film(shown, film, robot=robot, progress=bar('filming', unit='frame'))}"
+        )
 
 
 def _read(path: Path, every: int) -> Rollout:
     """Return the run in a file, unless it is empty, and print a line about it."""
     rollout = read_recording(path, every=every)
-    print(f"{path}{'' if rollout.info.complete else ' (cut short)'}: {rollout.info.robot}, {rollout!r}")
+    print(
+        f"{path}{'' if rollout.info.complete else ' (cut short)'}: {rollout.info.robot},"
+        f" {rollout!r}"
+    )
     if not len(rollout.time):
-        raise InvalidArgumentError("recording", f"{path} holds no tick", remedy="its run was cut short: run it again")
+        raise InvalidArgumentError(
+            "recording", f"{path} holds no tick", remedy="its run was cut short: run it again"
+        )
     return rollout

@@ -1,4 +1,6 @@
-"""Reports of runs and evaluations: figures of each joint or axis, tables, failed envs, and causes."""
+"""Reports of runs and evaluations: figures of each joint or axis, tables, failed envs, and
+causes.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,12 @@ from tabulate import tabulate
 from batchpid.arrays.array_types import Document, Rows
 from batchpid.sim import Finding, Robot, Rollout, Runner
 from batchpid.sim.diagnosis.findings import settled_envs
-from batchpid.sim.tuning.evaluation import Evaluation, arm_joints, following_error, step_response_metrics
+from batchpid.sim.tuning.evaluation import (
+    Evaluation,
+    arm_joints,
+    following_error,
+    step_response_metrics,
+)
 from batchpid.task_space.frames import pose_error
 
 NOT_SETTLED = 3
@@ -45,21 +52,31 @@ joint settled, within the run and within a second or 1.2 times the shortest that
 
 
 def table(rows: Sequence[Sequence[str]], headers: Sequence[str], align: str) -> str:
-    """Return ``rows`` under ``headers`` as text; ``align`` has one letter per column, "l" or "r"."""
+    """Return ``rows`` under ``headers`` as text; ``align`` has one letter per column, "l" or
+    "r".
+    """
     sides = tuple("left" if side == "l" else "right" for side in align)
     return tabulate(rows, headers, disable_numparse=True, colalign=sides)
 
 
-def run_columns(robot: Robot, rollout: Rollout) -> tuple[Sequence[str], Sequence[str], dict[str, Rows]]:
-    """Return the names and units of a run's joints, or of the axes of its tool, and their figures (envs, joints).
+def run_columns(
+    robot: Robot, rollout: Rollout
+) -> tuple[Sequence[str], Sequence[str], dict[str, Rows]]:
+    """Return the names and units of a run's joints, or of the axes of its tool, and their figures
+    (envs, joints).
 
-    The figures are errors of a tool's pose, following errors of setpoints that move, or metrics of steps.
+    The figures are errors of a tool's pose, following errors of setpoints that move, or metrics of
+    steps.
     """
     info, ticks = rollout.info, len(rollout.time)
     ends = slice(-max(1, ticks // 10), None)
     if rollout.tool_pose is not None:
         error = np.abs(pose_error(rollout.setpoint[..., :7], rollout.tool_pose.astype(float)))
-        return list(AXES), list(AXES.values()), {"first_error": error[0], "final_error": error[ends].max(0)}
+        return (
+            list(AXES),
+            list(AXES.values()),
+            {"first_error": error[0], "final_error": error[ends].max(0)},
+        )
     if ticks < 2 or (rollout.setpoint != rollout.setpoint[0]).any():
         errors = [following_error(robot, part) for part in (rollout, rollout.for_ticks(ends))]
         columns = dict(zip(("following_error", "final_error"), errors, strict=True))
@@ -68,7 +85,9 @@ def run_columns(robot: Robot, rollout: Rollout) -> tuple[Sequence[str], Sequence
     else:
         start = robot.start if info.start is None else info.start.astype(np.float64)
         metrics = step_response_metrics(robot, rollout, start, with_effort=info.control != "drive")
-        columns = metrics._asdict() | {"overshoot": _of_settled(metrics.overshoot, metrics.settling_time)}
+        columns = metrics._asdict() | {
+            "overshoot": _of_settled(metrics.overshoot, metrics.settling_time)
+        }
     return robot.joint_names, robot.units, columns
 
 
@@ -79,10 +98,18 @@ def run_figures(robot: Robot, rollout: Rollout) -> Document:
         name: {"unit": unit} | {column: figures[:, row] for column, figures in columns.items()}
         for row, (name, unit) in enumerate(zip(names, units, strict=True))
     }
-    about = {name: getattr(rollout.info, name) for name in ("robot", "control", "tool", "engine", "physics")}
+    about = {
+        name: getattr(rollout.info, name)
+        for name in ("robot", "control", "tool", "engine", "physics")
+    }
     failed = np.flatnonzero(~rollout.ok.all(0))
     seconds = rollout.tick * len(rollout.time)
-    return about | {"num_envs": rollout.num_envs, "seconds": seconds, "failed": failed, "joints": rows}
+    return about | {
+        "num_envs": rollout.num_envs,
+        "seconds": seconds,
+        "failed": failed,
+        "joints": rows,
+    }
 
 
 def run_report(runner: Runner, rollout: Rollout, wall: float) -> str:
@@ -93,7 +120,10 @@ def run_report(runner: Runner, rollout: Rollout, wall: float) -> str:
     names, units, columns = run_columns(robot, rollout)
     shown = {name: COLUMNS[name] for name in COLUMNS if name in columns}
     rows = [
-        [f"{name} [{unit}]", *(_pair(columns[column][:, row], style) for column, (_, style) in shown.items())]
+        [
+            f"{name} [{unit}]",
+            *(_pair(columns[column][:, row], style) for column, (_, style) in shown.items()),
+        ]
         for row, (name, unit) in enumerate(zip(names, units, strict=True))
     ]
     headers = ["median / worst env", *(header for header, _ in shown.values())]
@@ -107,25 +137,37 @@ def run_report(runner: Runner, rollout: Rollout, wall: float) -> str:
         first = rollout.tick * (1 + np.argmin(rollout.ok.all(1)))
         more = f" and {failed.size - 8} more" if failed.size > 8 else ""
         envs = ", ".join(map(str, failed[:8]))
-        lines.append(f"FAILED: {failed.size} of {count} envs, the first after {first:.3g} s: env {envs}{more}.")
+        lines.append(
+            f"FAILED: {failed.size} of {count} envs, the first after {first:.3g} s: env"
+            f" {envs}{more}."
+        )
     if "settling_time" in columns:
-        never = np.isinf(np.delete(columns["settling_time"], failed, axis=0)).sum(0) * robot.independent
+        never = (
+            np.isinf(np.delete(columns["settling_time"], failed, axis=0)).sum(0) * robot.independent
+        )
         unsettled = [f"{name} ({envs})" for name, envs in zip(names, never, strict=True) if envs]
         if unsettled:
             where = ", ".join(unsettled)
-            lines.append(f"NOT SETTLED within {seconds:g} s to 2 % of the move, with the number of envs: {where}.")
+            lines.append(
+                f"NOT SETTLED within {seconds:g} s to 2 % of the move, with the number of envs:"
+                f" {where}."
+            )
         elif not failed.size:
-            lines.append(f"Every joint of every env settled within {seconds:g} s to 2 % of its move.")
+            lines.append(
+                f"Every joint of every env settled within {seconds:g} s to 2 % of its move."
+            )
     findings = [] if "following_error" in columns else rollout.findings(robot)
     return "\n".join([*lines, *cause_lines(findings)])
 
 
 def speed_line(num_envs: int, simulated: float, timestep: float, wall: float) -> str:
-    """Return the speed of a run: ``simulated`` seconds of ``num_envs`` robots in ``wall`` seconds."""
+    """Return the speed of a run: ``simulated`` seconds of ``num_envs`` robots in ``wall``
+    seconds.
+    """
     factor = simulated / wall
     return (
-        f"{num_envs * factor / timestep:,.0f} env-steps/s: {simulated:g} s of {num_envs} robots in {wall:.2f} s; "
-        f"real-time factor {factor:.3g} per robot, {num_envs * factor:.3g} in total"
+        f"{num_envs * factor / timestep:,.0f} env-steps/s: {simulated:g} s of {num_envs} robots in"
+        f" {wall:.2f} s; real-time factor {factor:.3g} per robot, {num_envs * factor:.3g} in total"
     )
 
 
@@ -138,7 +180,8 @@ def cause_lines(findings: Sequence[Finding]) -> Iterator[str]:
 
 
 def exit_status(robot: Robot, rollout: Rollout) -> int:
-    """Return the exit status of a command that held a setpoint, :data:`NOT_SETTLED` if no env settled, else 0.
+    """Return the exit status of a command that held a setpoint, :data:`NOT_SETTLED` if no env
+    settled, else 0.
 
     In a run shorter than :data:`SHORTEST` an env only must not fail.
     """
@@ -148,7 +191,9 @@ def exit_status(robot: Robot, rollout: Rollout) -> int:
 
 
 def evaluation_table(robot: Robot, evaluations: Iterable[Evaluation]) -> str:
-    """Return a table with one row per evaluation: median and worst over the arm's joints and all moves."""
+    """Return a table with one row per evaluation: median and worst over the arm's joints and all
+    moves.
+    """
     arm = arm_joints(robot)
     rows = []
     causes = list[str]()
@@ -156,7 +201,9 @@ def evaluation_table(robot: Robot, evaluations: Iterable[Evaluation]) -> str:
         metrics, error = evaluation.metrics, evaluation.following_error
         settling, count = metrics.settling_time[:, arm], len(evaluation.moves.start)
         settled = np.isfinite(settling).all(1).sum()
-        in_time = (np.nan_to_num(settling, nan=0.0, posinf=np.inf).max(1) <= evaluation.settling_limit).sum()
+        in_time = (
+            np.nan_to_num(settling, nan=0.0, posinf=np.inf).max(1) <= evaluation.settling_limit
+        ).sum()
         rows.append(
             [
                 evaluation.name,
@@ -169,14 +216,29 @@ def evaluation_table(robot: Robot, evaluations: Iterable[Evaluation]) -> str:
             ]
         )
         names = {None, *np.array(robot.joint_names)[arm]}
-        if findings := [finding for finding in evaluation.rollout.findings(robot) if finding.joint in names]:
-            causes += [f"\nNot settled under {evaluation.name} (each env makes one move):", *cause_lines(findings)]
-    headers = ["gains", "settling", "following error", "overshoot", "final error", "chatter", "settled /\nin time"]
+        if findings := [
+            finding for finding in evaluation.rollout.findings(robot) if finding.joint in names
+        ]:
+            causes += [
+                f"\nNot settled under {evaluation.name} (each env makes one move):",
+                *cause_lines(findings),
+            ]
+    headers = [
+        "gains",
+        "settling",
+        "following error",
+        "overshoot",
+        "final error",
+        "chatter",
+        "settled /\nin time",
+    ]
     return "\n".join([table(rows, headers, "lrrrrrr"), ABOUT_SETS, *causes])
 
 
 def motion_difference(robot: Robot, first: Evaluation, second: Evaluation) -> str:
-    """Return a line with the largest difference of a position between two evaluations on the same moves."""
+    """Return a line with the largest difference of a position between two evaluations on the same
+    moves.
+    """
     apart = np.nan_to_num(np.abs(first.rollout.qpos - second.rollout.qpos), nan=np.inf).max(0)
     move, joint = np.unravel_index(int(apart.argmax()), apart.shape)
     place = f"joint {robot.joint_names[joint]!r}, move {first.moves.names[move]!r}"
@@ -199,7 +261,9 @@ def _of_settled(overshoot: Rows, settling: Rows) -> Rows:
 
 
 def _pair(figures: Rows, style: str) -> str:
-    """Return the median and the worst of ``figures``, "never" for infinity, and "-" where none is defined."""
+    """Return the median and the worst of ``figures``, "never" for infinity, and "-" where none is
+    defined.
+    """
     if np.isnan(figures).all():
         return "-"
     quantiles = np.nanquantile(figures, [0.5, 1.0], method="higher")

@@ -1,4 +1,6 @@
-"""``batchpid rollout``: N of any robot hold a setpoint or follow a trajectory; the run is written to a file."""
+"""``batchpid rollout``: N of any robot hold a setpoint or follow a trajectory; the run is written
+to a file.
+"""
 
 from __future__ import annotations
 
@@ -27,11 +29,13 @@ RUNNER = flags.runner_flags()
 
 @dataclass(frozen=True)
 class RolloutCommand:
-    """Move N of any robot to a setpoint or along a trajectory; print a table and write the run to a file.
+    """Move N of any robot to a setpoint or along a trajectory; print a table and write the run to a
+    file.
 
-    Robots start from seeded poses. The file holds time (ticks,), setpoint, qpos, qvel, effort and saturated (ticks,
-    envs, joints), ok (ticks, envs), with --control osc tool_pose (ticks, envs, 7), and the robot's joint names, units
-    and limits. The exit status is 3 if no robot settles at its setpoint; the report says why.
+    Robots start from seeded poses. The file holds time (ticks,), setpoint, qpos, qvel, effort and
+    saturated (ticks, envs, joints), ok (ticks, envs), with --control osc tool_pose (ticks, envs,
+    7), and the robot's joint names, units and limits. The exit status is 3 if no robot settles at
+    its setpoint; the report says why.
     """
 
     robot: flags.RobotName = "panda"
@@ -42,14 +46,20 @@ class RolloutCommand:
     tool: Annotated[str | None, tyro.conf.arg(metavar="LINK", help_behavior_hint="")] = None
     """With --control osc: link to move. Default: the last one of the longest chain."""
     setpoint: flags.OptionalFloats = None
-    """One position per joint [rad or m]; with --control osc x y z qw qx qy qz of the tool. Default: the bundled robot's
-    target, else the start pose; with --control osc the pose of the tool there."""
+    """One position per joint [rad or m]; with --control osc x y z qw qx qy qz of the tool. Default:
+    the bundled robot's target, else the start pose; with --control osc the pose of the tool
+    there.
+    """
     trajectory: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
-    """Setpoints to follow instead: a CSV file with the columns time, setpoint:JOINT ..., and, where they are known,
-    setpoint_rate:JOINT ... and setpoint_acceleration:JOINT ... A row holds at its time, and rows are equally spaced: by
-    a tick. The first is at 0, with the start pose of env 0, or at the end of the first tick."""
+    """Setpoints to follow instead: a CSV file with the columns time, setpoint:JOINT ..., and, where
+    they are known, setpoint_rate:JOINT ... and setpoint_acceleration:JOINT ... A row holds at its
+    time, and rows are equally spaced: by a tick. The first is at 0, with the start pose of env 0,
+    or at the end of the first tick.
+    """
     rates: bool = True
-    """--no-rates: give robots no rates of the setpoints, for a recording that `batchpid identify` reads."""
+    """--no-rates: give robots no rates of the setpoints, for a recording that `batchpid identify`
+    reads.
+    """
     seconds: flags.Seconds = 2.0
     timestep: Annotated[float, flags.BOUNDS["timestep"]] = 1 / 2000
     """Time step of simulation and control [s]."""
@@ -58,8 +68,9 @@ class RolloutCommand:
     seed: flags.Seed = 0
     """Seed of the start poses."""
     spread: flags.Distance = 0.3
-    """Largest distance of a start pose from the robot's own, with --control osc from its target, with --trajectory
-    from its first row at time 0 [rad or m]; env 0 starts at that itself."""
+    """Largest distance of a start pose from the robot's own, with --control osc from its target,
+    with --trajectory from its first row at time 0 [rad or m]; env 0 starts at that itself.
+    """
     runner: Annotated[flags.RunnerFlags, flags.group(RUNNER)] = field(default_factory=RUNNER)
     dissipation: Literal["urdf", "sapien"] = "urdf"
     """Joint friction and damping as in the URDF, or SAPIEN's defaults."""
@@ -87,7 +98,9 @@ class RolloutCommand:
         out = outputs.path("out", self.out, HDF5)
         picture = outputs.path("picture", self.picture, plots.FORMATS)
         json = outputs.path("json", self.json, (".json",))
-        robot = Robot.load(self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes))
+        robot = Robot.load(
+            self.robot, actuators=self.actuators, dissipation=self.dissipation, **vars(self.meshes)
+        )
         options: Document = {"timestep": self.timestep, "substeps": self.substeps}
         options |= self.runner.options() | {"control": self.control}
         if self.randomize is not None:
@@ -118,7 +131,10 @@ class RolloutCommand:
             setpoints, options["substeps"] = motion.position, motion.substeps
             center = center if motion.start is None else motion.start
             if self.rates:
-                rates = {"setpoint_rates": motion.rate, "setpoint_accelerations": motion.acceleration}
+                rates = {
+                    "setpoint_rates": motion.rate,
+                    "setpoint_accelerations": motion.acceleration,
+                }
         else:
             goal = goal if self.setpoint is None else self.setpoint
             goal = array("setpoint", goal, (1, len(columns)), columns, kind="entry")[0]
@@ -128,7 +144,11 @@ class RolloutCommand:
         print(f"{title}, {1 / self.timestep:g} Hz: {self.num_envs} robots in {engine}", flush=True)
         with (
             Runner(robot, self.num_envs, **options) as runner,
-            nullcontext() if out is None else Recorder(out, runner, seed=self.seed, overwrite=self.force),
+            (
+                nullcontext()
+                if out is None
+                else Recorder(out, runner, seed=self.seed, overwrite=self.force)
+            ),
         ):
             start = start_poses(robot, self.num_envs, self.spread, self.seed, center)
             rollout, report = simulate(runner, start, setpoints, **rates)
@@ -160,6 +180,9 @@ class RolloutCommand:
         elif setpoints.has_rates:
             rates = "from the file"
         elif setpoints.steps:
-            rates += f"; {setpoints.steps} changes are too fast for the velocity limits: steps, with rate 0"
+            rates += (
+                f"; {setpoints.steps} changes are too fast for the velocity limits: steps, with"
+                " rate 0"
+            )
         print(f"Rates of the setpoints: {rates}.\n")
         return setpoints

@@ -1,4 +1,6 @@
-"""Runs of the commands: to setpoints, over the moves that gains are compared on, or read from a recording."""
+"""Runs of the commands: to setpoints, over the moves that gains are compared on, or read from a
+recording.
+"""
 
 from __future__ import annotations
 
@@ -31,10 +33,12 @@ from batchpid.sim.tuning.randomization_files import at_the_joints, reseeded
 def start_poses(
     robot: Robot, num_envs: int, spread: float, seed: int, center: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """Return poses (envs, dof) [rad or m] around ``center``, inside the limits; env 0 is that pose itself.
+    """Return poses (envs, dof) [rad or m] around ``center``, inside the limits; env 0 is that pose
+    itself.
 
-    The center is by default the robot's start pose. Uniform within ``spread`` [rad or m], and within a quarter of the
-    joint's range where that is less. Row k is the same for any ``num_envs``.
+    The center is by default the robot's start pose. Uniform within ``spread`` [rad or m], and
+    within a quarter of the joint's range where that is less. Row k is the same for any
+    ``num_envs``.
     """
     random = np.random.default_rng(seed)
     reach = np.minimum(spread, (robot.upper - robot.lower) / 4)
@@ -44,8 +48,12 @@ def start_poses(
     return robot.coupled(np.clip(poses, robot.lower, robot.upper))
 
 
-def simulate(runner: Runner, start: Rows, setpoints: Rows, **rates: Rows | None) -> tuple[Rollout, str]:
-    """Run ``setpoints`` (ticks, size) from rest at ``start`` (envs, dof); return the rollout and a report on it."""
+def simulate(
+    runner: Runner, start: Rows, setpoints: Rows, **rates: Rows | None
+) -> tuple[Rollout, str]:
+    """Run ``setpoints`` (ticks, size) from rest at ``start`` (envs, dof); return the rollout and a
+    report on it.
+    """
     began = time.perf_counter()
     runner.reset(start, seed=None if runner.options.randomization is None else 0)
     with warnings.catch_warnings():
@@ -55,7 +63,9 @@ def simulate(runner: Runner, start: Rows, setpoints: Rows, **rates: Rows | None)
 
 
 def held(setpoint: Rows, seconds: float, tick: float) -> Rows:
-    """Return rows (ticks, size) that hold ``setpoint`` (size,) for ``seconds``, two ticks at least."""
+    """Return rows (ticks, size) that hold ``setpoint`` (size,) for ``seconds``, two ticks at
+    least.
+    """
     return np.tile(setpoint, (max(2, round(seconds / tick)), 1))
 
 
@@ -69,10 +79,11 @@ def evaluate_sets(
     engines: Sequence[str] = (DEFAULT_ENGINE,),
     **options: Any,
 ) -> list[Evaluation]:
-    """Evaluate ``sets`` in ``engines``, on the tutorial's move and random ``moves`` that no search with ``seed`` sees.
+    """Evaluate ``sets`` in ``engines``, on the tutorial's move and random ``moves`` that no search
+    with ``seed`` sees.
 
-    ``options`` go to :func:`batchpid.sim.tuning.evaluation.evaluate_gains`. Of the actuators, those at the joints act
-    on drives.
+    ``options`` go to :func:`batchpid.sim.tuning.evaluation.evaluate_gains`. Of the actuators, those
+    at the joints act on drives.
     """
     titles = {engine: load_engine(engine).title for engine in engines}
     unseen = tutorial_move(robot) + random_moves(robot, moves, seed + 1)
@@ -87,12 +98,16 @@ def evaluate_sets(
     return [evaluate(*pair) for pair in bar("comparing", unit="set")(list(product(sets, titles)))]
 
 
-def read_run(path: Path, robot: str | None, meshes: MeshOptions, usage: str) -> tuple[Rollout, Robot]:
-    """Return the run in a file and its robot: that name or URDF, or the bundled robot that was recorded.
+def read_run(
+    path: Path, robot: str | None, meshes: MeshOptions, usage: str
+) -> tuple[Rollout, Robot]:
+    """Return the run in a file and its robot: that name or URDF, or the bundled robot that was
+    recorded.
 
-    ``usage`` is a command that names the robot, for the error message. A recording is untrusted input, so no path in it
-    is opened. Raises InvalidArgumentError if the file cannot be read; or no robot is named, and the recorded one is not
-    a bundled robot, or differs from the bundled robot of the same name.
+    ``usage`` is a command that names the robot, for the error message. A recording is untrusted
+    input, so no path in it is opened. Raises InvalidArgumentError if the file cannot be read; or no
+    robot is named, and the recorded one is not a bundled robot, or differs from the bundled robot
+    of the same name.
     """
     rollout = read_recording(path)
     name, description = rollout.info.robot, rollout.info.urdf
@@ -100,6 +115,12 @@ def read_run(path: Path, robot: str | None, meshes: MeshOptions, usage: str) -> 
         return rollout, Robot.load(robot, **vars(meshes))
     bundled = Robot.load(name, **vars(meshes)) if name in Robot.bundled() else None
     if bundled is None or description not in (None, bundled.urdf):
-        problem = "is not bundled" if bundled is None else "is another one than the bundled robot of that name"
-        raise InvalidArgumentError("robot", f"{name!r} of the recording {problem}", remedy=f"name its URDF: {usage}")
+        problem = (
+            "is not bundled"
+            if bundled is None
+            else "is another one than the bundled robot of that name"
+        )
+        raise InvalidArgumentError(
+            "robot", f"{name!r} of the recording {problem}", remedy=f"name its URDF: {usage}"
+        )
     return rollout, bundled

@@ -23,9 +23,11 @@ RUNNER = flags.runner_flags("engine", "workers", "cluster", *flags.SCENE_FLAGS)
 
 @dataclass(frozen=True)
 class TuneCommand:
-    """Tune the gains of any robot: design them from its inertia, then search by CMA-ES on simulated moves.
+    """Tune the gains of any robot: design them from its inertia, then search by CMA-ES on simulated
+    moves.
 
-    Ends with a table of the gains before and after, on moves that the search did not see, and writes the better params.
+    Ends with a table of the gains before and after, on moves that the search did not see, and
+    writes the better params.
     """
 
     robot: flags.RobotName = "panda"
@@ -38,7 +40,9 @@ class TuneCommand:
     seconds: flags.MoveSeconds = 1.5
     """Simulated time of each move of the search [s]."""
     gain_units: Literal["mass_matrix", "effort"] = "mass_matrix"
-    """Gains per mass matrix (all joints respond equally fast), or as efforts (for any controller)."""
+    """Gains per mass matrix (all joints respond equally fast), or as efforts (for any
+    controller).
+    """
     per_joint: flags.Switch = False
     """Search for a factor of each joint too; needs more generations."""
     weights: Annotated[Weights, tyro.conf.arg(name="")] = field(default_factory=Weights)
@@ -50,7 +54,9 @@ class TuneCommand:
     out: flags.OptionalPath = None
     """Params file to write: .yaml or .json. Default: out/ROBOT.tuned.yaml."""
     picture: flags.OptionalPath = None
-    """Before and after on the first move, to draw: .png or .svg. Default: NAME-tune.png, next to the params file."""
+    """Before and after on the first move, to draw: .png or .svg. Default: NAME-tune.png, next to
+    the params file.
+    """
     force: flags.Force = False
 
     imports = ("batchpid.sim.plots", "batchpid.sim.tuning.search")
@@ -65,21 +71,35 @@ class TuneCommand:
         from batchpid.sim.tuning.search import tune
 
         outputs, named = OutputFiles(self), FOLDER / Path(self.robot).stem
-        out = outputs.path("out", self.out or named.with_suffix(".tuned.yaml"), (".yaml", ".yml", ".json"))
-        picture = outputs.path("picture", self.picture or beside(self.out or named, "tune"), plots.FORMATS)
+        out = outputs.path(
+            "out", self.out or named.with_suffix(".tuned.yaml"), (".yaml", ".yml", ".json")
+        )
+        picture = outputs.path(
+            "picture", self.picture or beside(self.out or named, "tune"), plots.FORMATS
+        )
         robot = Robot.load(self.robot, actuators=self.actuators, **vars(self.meshes))
-        randomization = None if self.randomize is None else load_randomization(self.randomize, robot)
-        options: Document = {"randomization": randomization, "seed": self.seed} | self.runner.options()
-        searched = flags.chosen(self, "generations population seconds gain_units per_joint weights time_limit")
+        randomization = (
+            None if self.randomize is None else load_randomization(self.randomize, robot)
+        )
+        options: Document = {
+            "randomization": randomization,
+            "seed": self.seed,
+        } | self.runner.options()
+        searched = flags.chosen(
+            self, "generations population seconds gain_units per_joint weights time_limit"
+        )
         result = tune(robot, progress=bar("tuning", unit="generation"), **searched, **options)
         print(
-            f"{robot.name}: cost {result.start_cost:.4f} as designed, {result.cost:.4f} as tuned; weight of the "
-            f"settling time {self.weights.settling:g}, of the following error {self.weights.following:g}\n"
+            f"{robot.name}: cost {result.start_cost:.4f} as designed, {result.cost:.4f} as tuned;"
+            f" weight of the settling time {self.weights.settling:g}, of the following error"
+            f" {self.weights.following:g}\n"
         )
 
         # The gains are judged on moves that the search did not see.
         sets = GainSet("designed", result.start_params), GainSet("tuned", result.params)
-        evaluations = evaluate_sets(robot, sets, moves=20, engines=(options.pop("engine"),), **options)
+        evaluations = evaluate_sets(
+            robot, sets, moves=20, engines=(options.pop("engine"),), **options
+        )
         print(evaluation_table(robot, evaluations))
         arm = arm_joints(robot)
         rejected = result.rejected or evaluations[1].drawback(evaluations[0], arm)
@@ -93,4 +113,6 @@ class TuneCommand:
         for shortfall in evaluations[chosen].shortfalls(arm)[:5]:
             print(f"SHORT of the usual demands: {shortfall}")
         motors = [] if self.actuators is None else ["--actuators", str(self.actuators)]
-        print("next:", shlex.join(["batchpid", "rollout", self.robot, "--gains", str(out), *motors]))
+        print(
+            "next:", shlex.join(["batchpid", "rollout", self.robot, "--gains", str(out), *motors])
+        )

@@ -42,7 +42,9 @@ class ViewCommand:
     """Recorded run to show, .h5."""
     fps: flags.Fps = 30.0
     host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0 for all of this machine. Everyone who sees the printed address can use it."""
+    """Address to listen on; 0.0.0.0 for all of this machine. Everyone who sees the printed address
+    can use it.
+    """
     port: Annotated[int, Field(low=1, high=65535)] = 8080
     """Port, or a free one if it is taken."""
     time_limit: flags.TimeLimit = None
@@ -56,7 +58,10 @@ class ViewCommand:
         source = self._live() if self.play is None else self._recorded(self.play)
         with closing(source), View(source, host=self.host, port=self.port) as view:
             if self.host not in LOOPBACK:
-                warning = f"listening on {self.host}, unencrypted: everyone who sees the address can move the robots"
+                warning = (
+                    f"listening on {self.host}, unencrypted: everyone who sees the address can move"
+                    " the robots"
+                )
                 print(f"batchpid: warning: {warning}", file=sys.stderr)
             if view.port != self.port:
                 print(f"port {self.port} is in use; the page is at {view.port}")
@@ -74,7 +79,9 @@ class ViewCommand:
         robot = Robot.load(self.robot or "panda", actuators=self.actuators, **vars(self.meshes))
         gains = None if self.gains is None else gain_set(robot, self.gains)
         if gains and gains.control != "pid":
-            raise InvalidArgumentError("gains", "must be PID gains", value=self.gains, remedy="name others")
+            raise InvalidArgumentError(
+                "gains", "must be PID gains", value=self.gains, remedy="name others"
+            )
         return LiveSimulation(
             robot,
             self.num_envs,

@@ -1,7 +1,8 @@
 """Causes for which a run does not settle: the envs, the joint, the time, and the remedy.
 
-A joint has settled if it ends within its band: 2 % of its move, and 1e-3 rad or 1e-4 m at least. :data:`RULES` is the
-table of causes; an env has the first that fits one of its joints outside their bands.
+A joint has settled if it ends within its band: 2 % of its move, and 1e-3 rad or 1e-4 m at least.
+:data:`RULES` is the table of causes; an env has the first that fits one of its joints outside their
+bands.
 """
 
 from __future__ import annotations
@@ -34,16 +35,19 @@ def absolute_band(robot: RobotDescription) -> Float64:
 
 
 def settled_envs(rollout: Rollout, robot: RobotDescription) -> Bool:
-    """Return the envs of a ``rollout`` of ``robot`` that have not failed and whose joints all settle (envs,)."""
+    """Return the envs of a ``rollout`` of ``robot`` that have not failed and whose joints all
+    settle (envs,).
+    """
     return np.asarray(~_Run(rollout, robot).unsettled.any(1))
 
 
 def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
-    """Return the causes for which joints of a ``rollout`` of ``robot`` do not settle, in the order of :data:`RULES`.
+    """Return the causes for which joints of a ``rollout`` of ``robot`` do not settle, in the order
+    of :data:`RULES`.
 
-    Every finding has the envs and the time [s] from which the joint hardly moved in the first of them, or at which that
-    env failed. Only failures are found where setpoints are neither joint positions nor poses of a tool, and no more
-    than :data:`EXAMINED` envs are examined.
+    Every finding has the envs and the time [s] from which the joint hardly moved in the first of
+    them, or at which that env failed. Only failures are found where setpoints are neither joint
+    positions nor poses of a tool, and no more than :data:`EXAMINED` envs are examined.
     """
     if robot.joint_names != rollout.info.joint_names:
         problem = f"{robot.name!r} has other joints than the run of {rollout.info.robot!r}"
@@ -60,7 +64,8 @@ def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
     for rule in RULES:
         fits = unexplained & rule.test(run)
         unexplained[fits.any(1)] = False
-        # The joint that is farthest from its setpoint comes first; a cause of whole envs names no other.
+        # The joint that is farthest from its setpoint comes first; a cause of whole envs names no
+        # other.
         places = farthest if rule.names_joint else farthest[:1]
         for joint in places:
             rows = np.flatnonzero(fits[:, joint] if rule.names_joint else fits.any(1))
@@ -71,8 +76,12 @@ def unsettled_findings(rollout: Rollout, robot: RobotDescription) -> Findings:
     return findings
 
 
-def _finding(run: _Run, rule: Rule, joint: int, rows: NDArray[np.intp], envs: NDArray[np.intp]) -> Finding:
-    """Return one finding for the same cause in ``rows`` of the examined ``envs``, with the detail of the first."""
+def _finding(
+    run: _Run, rule: Rule, joint: int, rows: NDArray[np.intp], envs: NDArray[np.intp]
+) -> Finding:
+    """Return one finding for the same cause in ``rows`` of the examined ``envs``, with the detail
+    of the first.
+    """
     times = run.rest_time[rows, joint]
     rows = rows[np.argsort(times, kind="stable")]
     first, name = rows[0], None
@@ -80,12 +89,23 @@ def _finding(run: _Run, rule: Rule, joint: int, rows: NDArray[np.intp], envs: ND
         name = run.robot.joint_names[joint]
         detail = f"{run.error[-1, first, joint]:.2g} {run.robot.units[joint]} remain"
     elif run.failed[first]:
-        faults = [f"{fault.joint}: {fault.cause}" for fault in run.info.faults if fault.env == first]
+        faults = [
+            f"{fault.joint}: {fault.cause}" for fault in run.info.faults if fault.env == first
+        ]
         detail = "".join(faults[-1:])
     else:
         detail = run.pressed[first]
     numbers = tuple(envs[rows].tolist())
-    return Finding("warning", rule.code, rule.text, rule.remedy, name, detail=detail, envs=numbers, time=times.min())
+    return Finding(
+        "warning",
+        rule.code,
+        rule.text,
+        rule.remedy,
+        name,
+        detail=detail,
+        envs=numbers,
+        time=times.min(),
+    )
 
 
 class _Run:
@@ -109,11 +129,15 @@ class _Run:
         pose = self.rollout.setpoint[-1, :, :7].copy()
         pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
         end = np.nan_to_num(self.qpos[-1])
-        return ts.inverse_kinematics(self.robot.rigid_tree, self.info.tool or "", pose, end, on_failure="return")
+        return ts.inverse_kinematics(
+            self.robot.rigid_tree, self.info.tool or "", pose, end, on_failure="return"
+        )
 
     @cached_property
     def goal(self) -> Float64:
-        """Joint positions at the last setpoints, of a pose those nearest to the end; the end where they are unknown."""
+        """Joint positions at the last setpoints, of a pose those nearest to the end; the end where
+        they are unknown.
+        """
         if self.is_pose:
             return np.asarray(self.solution.qpos)
         is_known = self.info.own_command is None and self.info.control != "effort"
@@ -132,7 +156,9 @@ class _Run:
 
     @cached_property
     def unsettled(self) -> Bool:
-        """Joints that end outside their band, and all joints of envs that failed, or whose tool has no such pose."""
+        """Joints that end outside their band, and all joints of envs that failed, or whose tool has
+        no such pose.
+        """
         outside = (np.abs(self.error[-1]) > self.band) | self.failed
         if self.is_pose:
             outside |= ~self.solution.success[:, None]
@@ -142,7 +168,11 @@ class _Run:
     def limit(self) -> Float64:
         """Largest effort [N m or N]."""
         params = self.info.params
-        limit = self.info.effort_limit if params is None or params.effort_max is None else params.effort_max
+        limit = (
+            self.info.effort_limit
+            if params is None or params.effort_max is None
+            else params.effort_max
+        )
         return np.broadcast_to(limit, self.band.shape)
 
     @cached_property
@@ -159,7 +189,9 @@ class _Run:
 
     @cached_property
     def load(self) -> Float64:
-        """Effort that holds the robot against gravity at the end, and at the setpoints (2, envs, dof)."""
+        """Effort that holds the robot against gravity at the end, and at the setpoints (2, envs,
+        dof).
+        """
         ends = np.stack([self.qpos[-1], self.goal])
         if not self.robot.fixed_base:
             return np.zeros_like(ends)
@@ -175,26 +207,44 @@ class _Run:
 
     @cached_property
     def buzzes(self) -> Bool:
-        """Joints that are fast at the end and yet stay where they are, since their effort alternates."""
-        motion = np.median(np.abs(np.diff(self.qpos[self.tail], axis=0)), axis=0) / self.rollout.tick
-        return np.asarray(np.median(np.abs(self.rollout.qvel[self.tail]), axis=0) > 3 * motion + 1e-2)
+        """Joints that are fast at the end and yet stay where they are, since their effort
+        alternates.
+        """
+        motion = (
+            np.median(np.abs(np.diff(self.qpos[self.tail], axis=0)), axis=0) / self.rollout.tick
+        )
+        return np.asarray(
+            np.median(np.abs(self.rollout.qvel[self.tail]), axis=0) > 3 * motion + 1e-2
+        )
 
     @cached_property
     def rest_time(self) -> Float64:
-        """Time from which each joint stays within its band around its last position, or at which its env failed [s]."""
+        """Time from which each joint stays within its band around its last position, or at which
+        its env failed [s].
+        """
         away = np.abs(self.qpos - self.qpos[-1]) > self.band
         last = np.where(away.any(0), len(away) - 1 - np.argmax(away[::-1], axis=0), 0)
         rest = np.minimum(last + 1, len(away) - 1)
-        return self.rollout.time[np.where(self.failed, np.argmin(self.rollout.ok, axis=0)[:, None], rest)]
+        return self.rollout.time[
+            np.where(self.failed, np.argmin(self.rollout.ok, axis=0)[:, None], rest)
+        ]
 
     def _near(self, qpos: Float64, within: float) -> dict[str, float]:
-        """Return the distances [m] below ``within`` of pairs of links, and of links to the ground."""
-        ground = self.info.ground if self.robot.fixed_base else False  # on which a floating base stands
-        pairs = sorted(self.robot.dynamics(ground).contacts.near(qpos, within), key=itemgetter(2), reverse=True)
+        """Return the distances [m] below ``within`` of pairs of links, and of links to the
+        ground.
+        """
+        ground = (
+            self.info.ground if self.robot.fixed_base else False
+        )  # on which a floating base stands
+        pairs = sorted(
+            self.robot.dynamics(ground).contacts.near(qpos, within), key=itemgetter(2), reverse=True
+        )
         return {f"{link} on {other or 'the ground'}": distance for link, other, distance in pairs}
 
     def _pressed_links(self, env: int) -> str:
-        """Return the nearest links that a step of the unsettled joints brings nearer still; "" if there are none."""
+        """Return the nearest links that a step of the unsettled joints brings nearer still; "" if
+        there are none.
+        """
         most = 20 * absolute_band(self.robot)
         step = np.clip(self.error[-1, env], -most, most) * self.unsettled[env]
         before = self._near(self.qpos[-1, env], TOUCH)
@@ -206,7 +256,9 @@ class _Run:
     def pressed(self) -> list[str]:
         """Links that are pressed together at the end, per env; "" if there are none."""
         collides = ~self.failed[:, 0] & (self.info.collisions is not False)
-        return [self._pressed_links(env) if examined else "" for env, examined in enumerate(collides)]
+        return [
+            self._pressed_links(env) if examined else "" for env, examined in enumerate(collides)
+        ]
 
 
 class Rule(NamedTuple):
@@ -246,9 +298,10 @@ def _is_blocked(run: _Run) -> Bool:
     return run.is_at_rest.all(1, keepdims=True) & (unexplained > 1.2 * run.robot.friction + noise)
 
 
-# Facts come before symptoms: an env that failed, setpoints that cannot be reached, links that touch. An effort at its
-# limit and oscillations come before rest, since such a joint can rest for a moment. A force that the model does not
-# explain comes before gains that are small, which would explain any error at rest.
+# Facts come before symptoms: an env that failed, setpoints that cannot be reached, links that
+# touch. An effort at its limit and oscillations come before rest, since such a joint can rest for a
+# moment. A force that the model does not explain comes before gains that are small, which would
+# explain any error at rest.
 RULES: tuple[Rule, ...] = (
     Rule("failed", "an input was not finite, or the state diverged", "correct the input or lower the gains",
          lambda run: run.failed, names_joint=False),

@@ -1,21 +1,24 @@
-r"""Constraint efforts of coupled joints: followers move with their leaders, and the leaders feel them.
+r"""Constraint efforts of coupled joints: followers move with their leaders, and the leaders feel
+them.
 
-With the constraint c = q_f - m q_l - o = 0 of every follower, J its Jacobian, and efforts u, the joints get
-qf = u + J^T lambda, where::
+With the constraint c = q_f - m q_l - o = 0 of every follower, J its Jacobian, and efforts u, the
+joints get qf = u + J^T lambda, where::
 
     J M^-1 J^T lambda = -(J M^-1 (u - p) + 0.5 c' / dt + 0.25 c / dt^2)
 
-p is the passive force. lambda does no work on the motion of the independent joints, J G = 0, so that exactly their
-coupled dynamics remain. The last two terms bring c back to zero within a few steps (J. Baumgarte, "Stabilization of
-constraints and integrals of motion in dynamical systems", Computer Methods in Applied Mechanics and Engineering 1,
-1972): their poles are at |z| = 0.71, and stay stable up to three times these gains, when M is that much off. A force F
-on the follower alone, as of an object, displaces it by 4 F dt^2 (J M^-1 J^T).
+p is the passive force. lambda does no work on the motion of the independent joints, J G = 0, so
+that exactly their coupled dynamics remain. The last two terms bring c back to zero within a few
+steps (J. Baumgarte, "Stabilization of constraints and integrals of motion in dynamical systems",
+Computer Methods in Applied Mechanics and Engineering 1, 1972): their poles are at |z| = 0.71, and
+stay stable up to three times these gains, when M is that much off. A force F on the follower alone,
+as of an object, displaces it by 4 F dt^2 (J M^-1 J^T).
 
-SAPIEN's positions of continuous joints jump from one end of [-2 pi, 2 pi] to the other, which would move a follower by
-4 pi m. So the constraint counts the jumps: it takes the position nearest to the one in the sim step before.
+SAPIEN's positions of continuous joints jump from one end of [-2 pi, 2 pi] to the other, which would
+move a follower by 4 pi m. So the constraint counts the jumps: it takes the position nearest to the
+one in the sim step before.
 
-PhysX's fixed tendons, which SAPIEN takes for this, hold one follower, but several followers of one leader shake a whole
-arm, or make it diverge. See docs/joints.md.
+PhysX's fixed tendons, which SAPIEN takes for this, hold one follower, but several followers of one
+leader shake a whole arm, or make it diverge. See docs/joints.md.
 """
 
 from __future__ import annotations
@@ -40,11 +43,13 @@ WRAP = 2 * TURN
 
 
 class ConstraintEfforts:
-    """Constraint efforts of robots with the coupling ``coupling``; positions of the joints ``wraps`` (dof,) jump.
+    """Constraint efforts of robots with the coupling ``coupling``; positions of the joints
+    ``wraps`` (dof,) jump.
 
-    Arrays are (robots, dof). :meth:`update` comes before the first :meth:`apply`. Native code applies and updates the
-    efforts by the structure at :attr:`address`; it writes the efforts without the constraint's into ``asked``, if
-    given. Where positions jump, call :meth:`place` after every reset of positions.
+    Arrays are (robots, dof). :meth:`update` comes before the first :meth:`apply`. Native code
+    applies and updates the efforts by the structure at :attr:`address`; it writes the efforts
+    without the constraint's into ``asked``, if given. Where positions jump, call :meth:`place`
+    after every reset of positions.
 
     Attributes
     ----------
@@ -53,7 +58,8 @@ class ConstraintEfforts:
     unwrapped
         Positions in the last sim step, without jumps (robots, dof); not used for other joints.
     implicit
-        Inertia on the diagonal of the mass matrix besides the model's: armature of the motors, and damping times dt.
+        Inertia on the diagonal of the mass matrix besides the model's: armature of the motors, and
+        damping times dt.
     """
 
     def __init__(
@@ -71,7 +77,10 @@ class ConstraintEfforts:
         self.wraps, self.unwrapped = wraps, np.zeros((robots, joints))
         self._rate_gain, self._position_gain = RATE_GAIN / timestep, POSITION_GAIN / timestep**2
         self._response = np.zeros((robots, len(followers), joints))
-        self._push, self._passive = np.zeros((robots, joints, len(followers))), np.zeros((robots, joints))
+        self._push, self._passive = (
+            np.zeros((robots, joints, len(followers))),
+            np.zeros((robots, joints)),
+        )
         self.implicit = np.zeros((robots, joints))
         self._model: NativeModel | None = None
         arrays: dict[str, Rows] = {
@@ -102,17 +111,26 @@ class ConstraintEfforts:
         return ctypes.addressof(self._native)
 
     def use(self, model: NativeModel, force: NativeModel | None) -> None:
-        """Update in native code, within a tick too, with mass matrices of ``model`` and passive forces of ``force``.
+        """Update in native code, within a tick too, with mass matrices of ``model`` and passive
+        forces of ``force``.
 
         None: the passive forces are the engine's own.
         """
         self._model, self._force = model, force
-        self._native.model, self._native.force = model.address, None if force is None else force.address
+        self._native.model, self._native.force = (
+            model.address,
+            None if force is None else force.address,
+        )
 
     def update(
-        self, mass_matrix: Callable[[Float64], Float64], qpos: Float64, passive: Float64, rows: Sequence[int]
+        self,
+        mass_matrix: Callable[[Float64], Float64],
+        qpos: Float64,
+        passive: Float64,
+        rows: Sequence[int],
     ) -> None:
-        """Set mass matrix and passive force of robots ``rows``, at positions and passive forces of all robots.
+        """Set mass matrix and passive force of robots ``rows``, at positions and passive forces of
+        all robots.
 
         ``mass_matrix`` is a function of positions; native code does not need it.
         """
@@ -128,7 +146,10 @@ class ConstraintEfforts:
         matrix = np.where(sound, matrices, np.eye(qpos.shape[1]))
         jacobian = self._jacobian
         response = np.linalg.solve(matrix, jacobian.T).swapaxes(1, 2)
-        self._response[rows], self._passive[rows] = response, np.where(sound[:, 0], passive[rows], 0.0)
+        self._response[rows], self._passive[rows] = (
+            response,
+            np.where(sound[:, 0], passive[rows], 0.0),
+        )
         self._push[rows] = jacobian.T @ np.linalg.inv(response @ jacobian.T)
 
     def place(self, rows: Sequence[int], qpos: Rows) -> None:
@@ -138,7 +159,9 @@ class ConstraintEfforts:
     def apply(self, effort: NDArray[np.floating], qpos: Float64, qvel: Float64) -> Float64:
         """Return ``effort`` with the constraint efforts added."""
         coupling, followers = self._coupling, self._followers
-        self.unwrapped[...] = np.where(self.wraps, qpos + WRAP * np.rint((self.unwrapped - qpos) / WRAP), qpos)
+        self.unwrapped[...] = np.where(
+            self.wraps, qpos + WRAP * np.rint((self.unwrapped - qpos) / WRAP), qpos
+        )
         error = (self.unwrapped - coupling.positions(self.unwrapped))[:, followers]
         rate = (qvel - coupling.rates(qvel))[:, followers]
         wrong = matrix_vector(self._response, effort - self._passive)

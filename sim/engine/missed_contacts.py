@@ -1,4 +1,6 @@
-"""Missed contacts of robots without collision shapes, by the shapes of their description, at the ends of ticks."""
+"""Missed contacts of robots without collision shapes, by the shapes of their description, at the
+ends of ticks.
+"""
 
 from __future__ import annotations
 
@@ -10,41 +12,56 @@ from batchpid.sim.engine.robot_model import contacts_of, description_tree
 from batchpid.sim.engine.scene_spec import SceneSpec
 
 DEPTH = 1e-3
-"""Smallest depth [m] of an overlap that counts as a contact: bodies at rest on each other may overlap by less."""
+"""Smallest depth [m] of an overlap that counts as a contact: bodies at rest on each other may
+overlap by less.
+"""
 _LONGEST = 10.0
 """Travel of a sliding joint without limits [m]."""
 
 
 class MissedContacts:
-    """Contacts that ``size`` robots of ``spec`` would have had, with a ground at height 0 or without.
+    """Contacts that ``size`` robots of ``spec`` would have had, with a ground at height 0 or
+    without.
 
-    Distances take as long to compute as the sim steps of a tick. They are computed where joint motion since the last
-    time can have closed one of them: unit speed of a joint brings two links together at most at the speed ``arms``.
+    Distances take as long to compute as the sim steps of a tick. They are computed where joint
+    motion since the last time can have closed one of them: unit speed of a joint brings two links
+    together at most at the speed ``arms``.
     """
 
     def __init__(self, spec: SceneSpec, size: int, ground: bool) -> None:
         self._contacts, tree = contacts_of(spec, ground), description_tree(spec).held
         slides, parents = tree.bodies.slides.ravel() > 0, tree.body_parents
         body, balls = self._contacts.balls
-        farthest = np.zeros(tree.dof + 1)  # from the origin of each body to the end of its last child; the base is last
+        farthest = np.zeros(
+            tree.dof + 1
+        )  # from the origin of each body to the end of its last child; the base is last
         np.maximum.at(farthest, body, np.linalg.norm(balls[:, :3], axis=1) + balls[:, 3])
         for joint in reversed(range(tree.dof)):
             limits = spec.joints[joint].lower, spec.joints[joint].upper
             travel = np.abs(np.clip(limits, -_LONGEST, _LONGEST)).max() if slides[joint] else 0.0
             offset = np.linalg.norm(tree.bodies.at_zero[joint][:, 3])
-            farthest[parents[joint]] = max(farthest[parents[joint]], offset + travel + farthest[joint])
+            farthest[parents[joint]] = max(
+                farthest[parents[joint]], offset + travel + farthest[joint]
+            )
         moves = np.vstack([tree.bodies.moves, np.zeros(tree.dof)])
         self._pairs = list(self._contacts.least_distances(np.zeros(tree.dof)))
         first, second = np.array(self._pairs, np.intp).reshape(-1, 2).T
-        self._arms = np.where(moves[first] != moves[second], np.where(slides, 1.0, farthest[:-1]), 0.0)
-        self._centers, self._margins = np.zeros((size, tree.dof)), np.zeros((size, len(self._pairs)))
+        self._arms = np.where(
+            moves[first] != moves[second], np.where(slides, 1.0, farthest[:-1]), 0.0
+        )
+        self._centers, self._margins = (
+            np.zeros((size, tree.dof)),
+            np.zeros((size, len(self._pairs))),
+        )
 
     def place(self, mask: NDArray[np.bool_]) -> None:
         """Forget the distances of the robots of ``mask`` (size,), which are now in other states."""
         self._margins[mask] = 0.0
 
     def look(self, qpos: Float64, step: int, first: NDArray[np.int64]) -> None:
-        """Write ``step`` into ``first`` (size,), if it is 0, for robots with overlaps at ``qpos`` (size, dof)."""
+        """Write ``step`` into ``first`` (size,), if it is 0, for robots with overlaps at ``qpos``
+        (size, dof).
+        """
         closed = np.abs(qpos - self._centers) @ self._arms.T
         for row in np.flatnonzero((closed >= self._margins).any(axis=1) & (first == 0)):
             distances = self._contacts.least_distances(qpos[row])

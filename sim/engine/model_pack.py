@@ -1,4 +1,6 @@
-"""Base class of the engines' packs: models of the robots, and friction and armature of their joints."""
+"""Base class of the engines' packs: models of the robots, and friction and armature of their
+joints.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +16,23 @@ from batchpid.checks.single_owner import SingleOwner
 from batchpid.motors import Actuators
 from batchpid.sim.engine.coupled_joints import ConstraintEfforts
 from batchpid.sim.engine.native_model import NativeModel, passive_force_of
-from batchpid.sim.engine.scene_spec import SceneSpec, Variation, VariedMasses, added_friction, own_friction
+from batchpid.sim.engine.scene_spec import (
+    SceneSpec,
+    Variation,
+    VariedMasses,
+    added_friction,
+    own_friction,
+)
 from batchpid.task_space.rigid_tree import RigidTree
 
 
 class ModelPack(SingleOwner):
-    """Pack of ``size`` robots of ``spec``, numbered from ``first_env``, with mass matrices and forces from its model.
+    """Pack of ``size`` robots of ``spec``, numbered from ``first_env``, with mass matrices and
+    forces from its model.
 
-    ``variation`` holds the robots' differences from the model, one row for each. ``carrier`` is the link of the URDF
-    that carries the payload; ``links`` are the links with varying mass or center of mass. ``natively`` selects native
-    code.
+    ``variation`` holds the robots' differences from the model, one row for each. ``carrier`` is the
+    link of the URDF that carries the payload; ``links`` are the links with varying mass or center
+    of mass. ``natively`` selects native code.
     """
 
     _tree: RigidTree
@@ -68,7 +77,9 @@ class ModelPack(SingleOwner):
         return model
 
     def force_model(self) -> NativeModel:
-        """Return the native code's model of the passive force, for compiled steps that do not read it in the engine."""
+        """Return the native code's model of the passive force, for compiled steps that do not read
+        it in the engine.
+        """
         return self._force_model
 
     @cached_property
@@ -76,7 +87,9 @@ class ModelPack(SingleOwner):
         return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "held")
 
     def joint_mass_matrix(self, qpos: Rows) -> Float64:
-        """Return the mass matrices of the joints at ``qpos`` (M, dof, dof) [kg m^2 or kg]; a floating base yields."""
+        """Return the mass matrices of the joints at ``qpos`` (M, dof, dof) [kg m^2 or kg]; a
+        floating base yields.
+        """
         if self.steps_natively:
             return self._joint_model.mass_matrix(qpos)
         added = self._masses.added
@@ -98,12 +111,16 @@ class ModelPack(SingleOwner):
             self._joint_model.vary(rows, self.size, self._masses.added)
 
     def _add_joints(self, actuators: Actuators | None) -> Float64:
-        """Set friction and armature of ``actuators``; return the inertia that the engine has to add to the joints."""
+        """Set friction and armature of ``actuators``; return the inertia that the engine has to add
+        to the joints.
+        """
         self.friction = added_friction(own_friction(self.spec, self._variation), actuators)
         added = None if actuators is None else actuators.armature
         self.armature = self._motors + (0.0 if added is None else added)
         viscous = self.friction.viscous
-        implicit: Float64 = self.armature + self.spec.timestep * (0.0 if viscous is None else viscous)
+        implicit: Float64 = self.armature + self.spec.timestep * (
+            0.0 if viscous is None else viscous
+        )
         if self._constraint is not None:
             self._constraint.implicit[...] = implicit
         return implicit

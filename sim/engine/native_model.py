@@ -1,6 +1,8 @@
-r"""Robots in native code: mass matrices and passive forces, also within the sim steps of a tick, and the step itself.
+r"""Robots in native code: mass matrices and passive forces, also within the sim steps of a tick,
+and the step itself.
 
-The equations are those of :mod:`batchpid.task_space.tree_dynamics`, on a base that is held or floats.
+The equations are those of :mod:`batchpid.task_space.tree_dynamics`, on a base that is held or
+floats.
 """
 
 from __future__ import annotations
@@ -43,7 +45,11 @@ class NativeModel:
         inertias = self._tree.inertias()[None] if self._inertias is None else self._inertias
         arrays: dict[str, Rows] = {"tree": tree, "rows": rows, "inertias": inertias}
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
-        numbers = {"dof": len(tree), "varies": self._inertias is not None, "base": BASES.index(self._base)}
+        numbers = {
+            "dof": len(tree),
+            "varies": self._inertias is not None,
+            "base": BASES.index(self._base),
+        }
         return ModelStruct(gravity=self._spec.gravity, **numbers, **addresses), arrays
 
     @property
@@ -52,9 +58,11 @@ class NativeModel:
         return ctypes.addressof(self._structure[0])
 
     def vary(self, rows: Sequence[int], size: int, added: Mapping[str, Float64]) -> None:
-        """Add spatial inertias (size, 6, 6) to links, by name, of the robots ``rows`` of ``size`` in place.
+        """Add spatial inertias (size, 6, 6) to links, by name, of the robots ``rows`` of ``size``
+        in place.
 
-        They are :func:`batchpid.task_space.spatial_inertia.spatial_matrix`, in the axes of the links.
+        They are :func:`batchpid.task_space.spatial_inertia.spatial_matrix`, in the axes of the
+        links.
         """
         if self._inertias is None:
             self.__dict__.pop("_structure", None)
@@ -64,28 +72,40 @@ class NativeModel:
         self._inertias[picked] = self._tree.inertias(varied)
 
     def mass_matrix(self, qpos: Rows) -> Float64:
-        """Return the mass matrices (n, dof, dof) [kg m^2 or kg] that the joints show at ``qpos`` (n, dof)."""
+        """Return the mass matrices (n, dof, dof) [kg m^2 or kg] that the joints show at ``qpos``
+        (n, dof).
+        """
         rows = np.ascontiguousarray(qpos, np.float64)
         out = np.empty((*rows.shape, rows.shape[1]))
         self._native.joint_matrices(self.address, rows, out, len(rows))
         return out
 
     def passive_force(
-        self, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool, base: Float64 | None = None
+        self,
+        qpos: Float64,
+        qvel: Float64,
+        gravity: bool,
+        coriolis: bool,
+        base: Float64 | None = None,
     ) -> Float64:
-        """Return the efforts (n, dof) [N m or N] that cancel gravity, and Coriolis and centrifugal forces.
+        """Return the efforts (n, dof) [N m or N] that cancel gravity, and Coriolis and centrifugal
+        forces.
 
-        ``base`` (n, 6) are gravity [m/s^2] and the rate [rad/s] at which a base that is not fixed turns, in its own
-        axes: :meth:`batchpid.sim.engine.protocol.EnginePack.read_base_motion`.
+        ``base`` (n, 6) are gravity [m/s^2] and the rate [rad/s] at which a base that is not fixed
+        turns, in its own axes: :meth:`batchpid.sim.engine.protocol.EnginePack.read_base_motion`.
         """
-        state = [None if each is None else np.ascontiguousarray(each, np.float64) for each in (qpos, qvel, base)]
+        state = [
+            None if each is None else np.ascontiguousarray(each, np.float64)
+            for each in (qpos, qvel, base)
+        ]
         out = np.empty(qpos.shape)
         self._native.forces(self.address, gravity, coriolis, *state, out, len(out))
         return out
 
 
 class NativeRefresh:
-    """:func:`batchpid.motors.friction.refresh` of a group of envs, with the joints' mass matrices, in native code.
+    """:func:`batchpid.motors.friction.refresh` of a group of envs, with the joints' mass matrices,
+    in native code.
 
     Parameters
     ----------
@@ -121,10 +141,15 @@ class NativeRefresh:
         viscous = 0.0 if friction.viscous is None else friction.viscous
         named = {"armature": armature, "coulomb": friction.most, "viscous": viscous}
         named |= dict(zip(("damping", "stiffness"), drive, strict=True))
-        arrays = {name: np.array(np.broadcast_to(rows, shape), np.float64, order="C") for name, rows in named.items()}
+        arrays = {
+            name: np.array(np.broadcast_to(rows, shape), np.float64, order="C")
+            for name, rows in named.items()
+        }
         arrays |= coupling.native()
         addresses = {name: array.ctypes.data for name, array in arrays.items()}
-        self._structure = Refresh(model=model.address, timestep=timestep, share=SHARE, steps=steps, **addresses)
+        self._structure = Refresh(
+            model=model.address, timestep=timestep, share=SHARE, steps=steps, **addresses
+        )
         self._kept = model, arrays
 
     @property
@@ -135,19 +160,27 @@ class NativeRefresh:
     def __call__(self, state: FrictionState, qpos: Float64) -> FrictionState:
         """Return ``state`` with its factors at ``qpos`` (M, dof)."""
         factors = np.empty(qpos.shape), np.empty(qpos.shape)
-        self._native.refresh(self.address, np.ascontiguousarray(qpos, np.float64), *factors, len(qpos))
+        self._native.refresh(
+            self.address, np.ascontiguousarray(qpos, np.float64), *factors, len(qpos)
+        )
         return state._replace(gain=factors[0], memory=factors[1])
 
 
 class NativeStep:
-    """Sim step of ``robots`` with ``dof`` joints as one native call, from Python or from an XLA program.
+    """Sim step of ``robots`` with ``dof`` joints as one native call, from Python or from an XLA
+    program.
 
-    ``arrays`` and ``fields`` fill a :class:`.interface.Group`; a joint speed beyond ``speed_limit`` (dof,) shows in the
-    status. Implements :class:`batchpid.sim.engine.protocol.CompiledStep`.
+    ``arrays`` and ``fields`` fill a :class:`.interface.Group`; a joint speed beyond ``speed_limit``
+    (dof,) shows in the status. Implements :class:`batchpid.sim.engine.protocol.CompiledStep`.
     """
 
     def __init__(
-        self, robots: int, dof: int, arrays: Mapping[str, Rows], speed_limit: Float64 | None, **fields: Any
+        self,
+        robots: int,
+        dof: int,
+        arrays: Mapping[str, Rows],
+        speed_limit: Float64 | None,
+        **fields: Any,
     ) -> None:
         self._arrays = dict(arrays)
         if speed_limit is not None:
@@ -157,38 +190,48 @@ class NativeStep:
         self._group = Group(robots=robots, dof=dof, **addresses, **fields)
 
     def prepare(self) -> int:
-        """Return the address of the group, for a call of the extension or of XLA that does a sim step."""
+        """Return the address of the group, for a call of the extension or of XLA that does a sim
+        step.
+        """
         return ctypes.addressof(self._group)
 
     def __call__(self, *arrays: Float64) -> int:
-        """Do one sim step: (effort, qpos, qvel, passive force), each (robots, dof); return the status."""
+        """Do one sim step: (effort, qpos, qvel, passive force), each (robots, dof); return the
+        status.
+        """
         status: int = self._native.sim_step(self.prepare(), *arrays)
         return status
 
     def may_have_failed(self, status: int) -> bool:
-        """Return whether an env may have failed in a sim step with this status; RuntimeError if the engine has."""
+        """Return whether an env may have failed in a sim step with this status; RuntimeError if the
+        engine has.
+        """
         if status & 1 << STATUS.index("failed"):
             raise RuntimeError(self._group.message.decode(errors="replace"))
         return bool(status)
 
 
 def mass_matrix_of(spec: SceneSpec, natively: bool) -> Callable[[Float64], Float64]:
-    """Return the function of positions that computes the mass matrices of a robot's description, on a fixed base.
+    """Return the function of positions that computes the mass matrices of a robot's description, on
+    a fixed base.
 
-    ``natively`` says whether the extension is used; then every executor takes them from it, since NumPy's differ in the
-    last bits.
+    ``natively`` says whether the extension is used; then every executor takes them from it, since
+    NumPy's differ in the last bits.
     """
     if natively:
         return NativeModel(spec).mass_matrix
-    tree = cache(lambda: scene_tree(spec).held)  # looked up once: the hash of a spec takes many calls
+    tree = cache(
+        lambda: scene_tree(spec).held
+    )  # looked up once: the hash of a spec takes many calls
     return lambda qpos: ts.mass_matrix(tree(), qpos)
 
 
 def passive_force_of(spec: SceneSpec, natively: bool) -> Callable[..., Float64]:
-    """Return the function of positions, velocities, gravity, coriolis and base that computes a robot's passive forces.
+    """Return the function of positions, velocities, gravity, coriolis and base that computes a
+    robot's passive forces.
 
-    The base is fixed, or held where it is. ``natively`` says whether the extension is used; then every executor takes
-    them from it, since the engines' and NumPy's differ in the last bits.
+    The base is fixed, or held where it is. ``natively`` says whether the extension is used; then
+    every executor takes them from it, since the engines' and NumPy's differ in the last bits.
     """
     if natively:
         return NativeModel(spec, "fixed" if spec.fixed_base else "held").passive_force

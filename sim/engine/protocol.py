@@ -1,10 +1,11 @@
 """Interface of the physics engines to the loop, the robots and the tuning.
 
 The loop holds the M envs of a group as one :class:`EnginePack`. Robots, controls and tuning use a
-:class:`batchpid.sim.engine.robot_model.RobotModel`. :func:`load_engine` returns an :class:`Engine` by its name, which
-makes packs; the engine's packages are imported at its first use.
+:class:`batchpid.sim.engine.robot_model.RobotModel`. :func:`load_engine` returns an :class:`Engine`
+by its name, which makes packs; the engine's packages are imported at its first use.
 
-A feature of only some engines is a capability. :func:`require` raises an error if the engine lacks it.
+A feature of only some engines is a capability. :func:`require` raises an error if the engine lacks
+it.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ from batchpid.motors.friction import Friction
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
 from batchpid.task_space.rigid_tree import RigidTree
 
-Capability = Literal["drive", "build", "compiled_steps", "partial_force", "base_state", "sapien_dissipation"]
+Capability = Literal[
+    "drive", "build", "compiled_steps", "partial_force", "base_state", "sapien_dissipation"
+]
 """
 - ``"drive"``: packs are :class:`DrivenPack`, for the control "drive";
 - ``"build"``: the user's function ``build`` adds content to scenes;
@@ -38,10 +41,11 @@ Capability = Literal["drive", "build", "compiled_steps", "partial_force", "base_
 
 @runtime_checkable
 class EnginePack(Protocol):
-    """M envs with a robot of ``spec`` each, read and written as arrays (M, dof), in the order of its joints, SI units.
+    """M envs with a robot of ``spec`` each, read and written as arrays (M, dof), in the order of
+    its joints, SI units.
 
-    A method that returns an array returns a new one. The motion of an env depends on its own rows only, not on other
-    envs of the pack or their number.
+    A method that returns an array returns a new one. The motion of an env depends on its own rows
+    only, not on other envs of the pack or their number.
 
     Attributes
     ----------
@@ -50,13 +54,17 @@ class EnginePack(Protocol):
     first_env
         Number of the first env within the runner.
     qf
-        Efforts last written, in the engine's precision, without the engine's constraint efforts of coupled joints.
+        Efforts last written, in the engine's precision, without the engine's constraint efforts of
+        coupled joints.
     friction
-        Friction and damping that the loop has to apply to the joints; None where the engine applies them.
+        Friction and damping that the loop has to apply to the joints; None where the engine applies
+        them.
     armature
-        Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg], not included in :meth:`joint_mass_matrix`.
+        Reflected inertia of the motors (1 | M, dof) [kg m^2 or kg], not included in
+        :meth:`joint_mass_matrix`.
     state_is_complete
-        Whether :meth:`read_state` holds everything that later steps depend on, so that a pack in use can be restored.
+        Whether :meth:`read_state` holds everything that later steps depend on, so that a pack in
+        use can be restored.
     """
 
     spec: SceneSpec
@@ -77,66 +85,87 @@ class EnginePack(Protocol):
     def passive_force(self, gravity: bool, coriolis: bool, dtype: DType = np.float64) -> Rows:
         """Return the efforts that cancel gravity and Coriolis and centrifugal forces [N m or N].
 
-        They come from the model of ``spec`` at the present state, without the pack's variation. On a floating base they
-        are computed as if the base were fixed: no effort of a joint carries the base.
+        They come from the model of ``spec`` at the present state, without the pack's variation. On
+        a floating base they are computed as if the base were fixed: no effort of a joint carries
+        the base.
         """
 
     def joint_mass_matrix(self, qpos: Rows) -> Float64:
-        """Return the joints' effective mass matrices at ``qpos`` (M, dof, dof) [kg m^2 or kg], variation included.
+        """Return the joints' effective mass matrices at ``qpos`` (M, dof, dof) [kg m^2 or kg],
+        variation included.
 
-        On a floating base they are Schur complements: the base's six degrees of freedom are eliminated.
+        On a floating base they are Schur complements: the base's six degrees of freedom are
+        eliminated.
         """
 
     def write_qf(self, effort: Rows) -> None:
         """Apply joint efforts [N m or N]. They persist until written again."""
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
-        """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are coupled."""
+        """Update the mass matrix in the constraint efforts of robots ``rows``, if joints are
+        coupled.
+        """
 
     def step(self) -> None:
-        """Do one sim step of every env, with the constraint efforts of the last :meth:`update_constraint`.
+        """Do one sim step of every env, with the constraint efforts of the last
+        :meth:`update_constraint`.
 
         A non-finite state raises no error: the loop detects it in its next reading.
         """
 
     def read_base(self) -> Float64:
-        """Return pose and twist of floating bases in the world (M, 13), a new array: those of the root link's origin.
+        """Return pose and twist of floating bases in the world (M, 13), a new array: those of the
+        root link's origin.
 
         Position [m], quaternion (w, x, y, z), linear and angular velocity [m/s, rad/s].
         """
 
     def read_base_motion(self) -> Float64 | None:
-        """Return gravity and the rate at which floating bases turn [m/s^2, rad/s], both in their own axes (M, 6).
+        """Return gravity and the rate at which floating bases turn [m/s^2, rad/s], both in their
+        own axes (M, 6).
 
         Gravity is that of ``spec``. None for fixed bases.
         """
 
     def push(self, rows: Sequence[int], twists: Float64) -> None:
-        """Add ``twists`` (len(rows), 6) [m/s, rad/s] to those of floating bases, as :meth:`read_base` has them."""
-
-    def take_sensed(self) -> dict[str, Float64]:
-        """Return the sums of the link sensors over all sim steps since the last call, and reset them.
-
-        ``contact_force`` (M, links, 3), ``touching`` (M, links), 0 without a contact, and ``wrench`` (M, links, 6), as
-        :class:`batchpid.sim.Observation` describes them; of robots that were placed meanwhile, since then.
+        """Add ``twists`` (len(rows), 6) [m/s, rad/s] to those of floating bases, as
+        :meth:`read_base` has them.
         """
 
-    def write_state(self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None) -> None:
+    def take_sensed(self) -> dict[str, Float64]:
+        """Return the sums of the link sensors over all sim steps since the last call, and reset
+        them.
+
+        ``contact_force`` (M, links, 3), ``touching`` (M, links), 0 without a contact, and
+        ``wrench`` (M, links, 6), as :class:`batchpid.sim.Observation` describes them; of robots
+        that were placed meanwhile, since then.
+        """
+
+    def write_state(
+        self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None
+    ) -> None:
         """Set positions and velocities (len(rows), dof) of the envs ``rows``, and zero efforts.
 
-        A floating base is placed at ``base`` (len(rows), 13), as :meth:`read_base` returns it; None is the origin.
+        A floating base is placed at ``base`` (len(rows), 13), as :meth:`read_base` returns it; None
+        is the origin.
 
-        Content of these envs returns to its start. An env whose state was not finite can be used again.
+        Content of these envs returns to its start. An env whose state was not finite can be used
+        again.
         """
 
     def suspend(self, mask: Bool) -> None:
-        """Apply zero effort and no gravity to the robots of ``mask`` (M,); restore both for the others."""
+        """Apply zero effort and no gravity to the robots of ``mask`` (M,); restore both for the
+        others.
+        """
 
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
-        """Add friction, damping and reflected inertia of ``actuators`` to the description's, for ``rows`` or all."""
+        """Add friction, damping and reflected inertia of ``actuators`` to the description's, for
+        ``rows`` or all.
+        """
 
     def vary(self, rows: Sequence[int], variation: Variation) -> None:
-        """Change the robots ``rows`` to ``variation``, one row for each, in a pack that was made with a variation.
+        """Change the robots ``rows`` to ``variation``, one row for each, in a pack that was made
+        with a variation.
 
         Next the loop calls :meth:`write_joints` and :meth:`write_state` for them.
         """
@@ -145,25 +174,31 @@ class EnginePack(Protocol):
         """Return the number of values in the state of each env."""
 
     def read_state(self) -> Float64:
-        """Return the state of every env (M, values) for a snapshot; only the engine can interpret it.
+        """Return the state of every env (M, values) for a snapshot; only the engine can interpret
+        it.
 
         A row determines all later steps of a new pack. Values beyond the size of its env are NaN.
         """
 
     def write_state_rows(self, states: Float64) -> None:
-        """Put all envs into the states that :meth:`read_state` returned; of a new pack, unless they are complete.
+        """Put all envs into the states that :meth:`read_state` returned; of a new pack, unless they
+        are complete.
 
-        Rows may be longer, with more NaN at the end. The loop writes efforts and suspension afterwards.
+        Rows may be longer, with more NaN at the end. The loop writes efforts and suspension
+        afterwards.
         """
 
     def read_poses(self, names: Sequence[str] | None = None) -> list[Rows]:
-        """Return the poses that ``build`` asked for in each env (poses, 7): x, y, z [m], quaternion w, x, y, z.
+        """Return the poses that ``build`` asked for in each env (poses, 7): x, y, z [m], quaternion
+        w, x, y, z.
 
         With ``names``, those of these bodies of the file of ``spec``, in float64.
         """
 
     def strays(self) -> Bool:
-        """Return the envs (M,) with a floating base, or an object of a file, that is not finite or beyond FARTHEST."""
+        """Return the envs (M,) with a floating base, or an object of a file, that is not finite or
+        beyond FARTHEST.
+        """
 
     def close(self) -> None:
         """Free the envs. The pack cannot be used afterwards."""
@@ -174,25 +209,32 @@ class DrivenPack(EnginePack, Protocol):
     """Pack whose joints have drives: PD control that the engine integrates implicitly."""
 
     def write_drive(self, stiffness: Rows, damping: Rows, force_limit: Rows) -> None:
-        """Set the drive of every joint; each argument broadcasts to (M, dof) [N m/rad, N m s/rad, N m, or N/m, ...]."""
+        """Set the drive of every joint; each argument broadcasts to (M, dof) [N m/rad, N m s/rad, N
+        m, or N/m, ...].
+        """
 
     def write_drive_target(self, position: Rows, velocity: Rows | None = None) -> None:
         """Set the drives' targets (M, dof): position [rad or m] and velocity [rad/s or m/s]."""
 
 
 class CompiledStep(Protocol):
-    """Sim step of a pack as one native call, also from XLA (:func:`batchpid.sim.engine.native.xla.sim_step`)."""
+    """Sim step of a pack as one native call, also from XLA
+    (:func:`batchpid.sim.engine.native.xla.sim_step`).
+    """
 
     def prepare(self) -> int:
         """Return the address of the native group for the next steps."""
 
     def __call__(self, *arrays: Float64) -> int:
-        """Do one sim step on the arrays effort, qpos, qvel and passive force (envs, dof); return the status."""
+        """Do one sim step on the arrays effort, qpos, qvel and passive force (envs, dof); return
+        the status.
+        """
 
     def may_have_failed(self, status: int) -> bool:
         """Return whether an env may have failed in the last sim step, which had this status.
 
-        The sensors of links are read here, where native code does not. RuntimeError if the engine has failed.
+        The sensors of links are read here, where native code does not. RuntimeError if the engine
+        has failed.
         """
 
 
@@ -217,27 +259,39 @@ class CompiledPack(EnginePack, Protocol):
     steps_natively: bool
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
-        """Return whether a compiled step reads this part of the passive force; otherwise call :meth:`passive_force`."""
+        """Return whether a compiled step reads this part of the passive force; otherwise call
+        :meth:`passive_force`.
+        """
 
     @property
     def calls(self) -> object:
         """Object that is replaced when earlier results of :meth:`compiled_step` become invalid."""
 
     def compiled_step(
-        self, gravity: bool, coriolis: bool, velocities: bool, speed_limit: Any, drives: bool = False
+        self,
+        gravity: bool,
+        coriolis: bool,
+        velocities: bool,
+        speed_limit: Any,
+        drives: bool = False,
     ) -> CompiledStep:
         """Return the sim step of the present robots.
 
-        ``gravity`` and ``coriolis`` select the parts of the passive force that it reads; without both it is zero.
-        Without ``velocities`` it reads zero velocities. The status reports speeds above ``speed_limit`` (dof,), if
-        given. With ``drives`` the targets of the drives may move within a tick.
+        ``gravity`` and ``coriolis`` select the parts of the passive force that it reads; without
+        both it is zero. Without ``velocities`` it reads zero velocities. The status reports speeds
+        above ``speed_limit`` (dof,), if given. With ``drives`` the targets of the drives may move
+        within a tick.
         """
 
     def joint_model(self) -> CompiledModel:
-        """Return the native model of :meth:`joint_mass_matrix`, the same object for the life of the pack."""
+        """Return the native model of :meth:`joint_mass_matrix`, the same object for the life of the
+        pack.
+        """
 
     def force_model(self) -> CompiledModel:
-        """Return the native model of :meth:`passive_force`, for compiled steps that do not read this force."""
+        """Return the native model of :meth:`passive_force`, for compiled steps that do not read
+        this force.
+        """
 
 
 class Engine(Protocol):
@@ -252,8 +306,8 @@ class Engine(Protocol):
     physics
         Settings of its solver, frozen dataclasses of plain values, by the name of the preset.
     group_size
-        Envs that the loop steps together: enough to share the overhead of NumPy calls, few enough for the working set
-        to stay in the cache. It changes no result.
+        Envs that the loop steps together: enough to share the overhead of NumPy calls, few enough
+        for the working set to stay in the cache. It changes no result.
     """
 
     name: str
@@ -283,12 +337,14 @@ class Engine(Protocol):
         Parameters
         ----------
         variation
-            Differences of the robots from the model; None for robots that :meth:`EnginePack.vary` never changes.
+            Differences of the robots from the model; None for robots that :meth:`EnginePack.vary`
+            never changes.
         carrier, links
-            Link of the URDF that carries the payload, and links whose mass or center of mass varies.
+            Link of the URDF that carries the payload, and links whose mass or center of mass
+            varies.
         workspace
-            Working memory, shared by packs that never step at the same time, such as the packs of a loop. Only the
-            engine knows its content. None: the pack allocates its memory.
+            Working memory, shared by packs that never step at the same time, such as the packs of a
+            loop. Only the engine knows its content. None: the pack allocates its memory.
 
         Raises
         ------
@@ -299,14 +355,21 @@ class Engine(Protocol):
         """
 
     def scene_tree(self, spec: SceneSpec) -> RigidTree:
-        """Return the rigid tree of the robot of ``spec`` as the engine has it: the same object for equal specs."""
+        """Return the rigid tree of the robot of ``spec`` as the engine has it: the same object for
+        equal specs.
+        """
 
 
 def require(engine: Engine, capability: Capability, argument: str) -> None:
     """Raise InvalidArgumentError for ``argument`` if ``engine`` lacks ``capability``."""
     if capability not in engine.capabilities:
-        problem = f"needs an engine with the capability {capability!r}, which {engine.name!r} does not have"
-        raise InvalidArgumentError(argument, problem, remedy="omit it, or use the engine 'sapien', which has all")
+        problem = (
+            f"needs an engine with the capability {capability!r}, which {engine.name!r} does not"
+            " have"
+        )
+        raise InvalidArgumentError(
+            argument, problem, remedy="omit it, or use the engine 'sapien', which has all"
+        )
 
 
 MODULES = {

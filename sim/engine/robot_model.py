@@ -1,4 +1,6 @@
-"""Rigid trees and contacts of the robot of a scene, and the efforts that hold it against gravity."""
+"""Rigid trees and contacts of the robot of a scene, and the efforts that hold it against
+gravity.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,19 @@ from batchpid.task_space.rigid_tree import RigidTree
 
 
 def passive_force(
-    tree: RigidTree, qpos: Float64, qvel: Float64, gravity: bool, coriolis: bool, base: Float64 | None = None
+    tree: RigidTree,
+    qpos: Float64,
+    qvel: Float64,
+    gravity: bool,
+    coriolis: bool,
+    base: Float64 | None = None,
 ) -> Float64:
-    """Return the gravity part of :func:`batchpid.task_space.bias` (n, dof), its velocity part, or both.
+    """Return the gravity part of :func:`batchpid.task_space.bias` (n, dof), its velocity part, or
+    both.
 
-    ``base`` (n, 6) are gravity and the rate at which the base turns, in its own axes, of one that floats, or with a
-    tree on a fixed base of one that is held where it is. The gravity part of a floating base is 0.
+    ``base`` (n, 6) are gravity and the rate at which the base turns, in its own axes, of one that
+    floats, or with a tree on a fixed base of one that is held where it is. The gravity part of a
+    floating base is 0.
     """
     zero = np.zeros_like(np.asarray(qpos, np.float64))
     turning = None
@@ -34,14 +43,17 @@ def passive_force(
         bodies = tree.bodies._replace(gravity=base[:, None, :3])
     force = zero
     if coriolis or (gravity and tree.fixed_base):
-        force = ts.bias(tree, qpos, qvel if coriolis else zero, turning if coriolis else None, bodies=bodies)
+        force = ts.bias(
+            tree, qpos, qvel if coriolis else zero, turning if coriolis else None, bodies=bodies
+        )
     if coriolis and not gravity and tree.fixed_base:
         force = force - ts.bias(tree, qpos, zero, bodies=bodies)
     return np.asarray(force, np.float64)
 
 
 def turned_back(wxyz: Float64, vectors: Any) -> Float64:
-    """Return vectors of the world, (3,) or (n, 3), in the axes of bases with these quaternions (n, 4).
+    """Return vectors of the world, (3,) or (n, 3), in the axes of bases with these quaternions (n,
+    4).
 
     Rounded as by ``turn_back`` in ``sim_step.h``.
     """
@@ -50,18 +62,24 @@ def turned_back(wxyz: Float64, vectors: Any) -> Float64:
 
 @lru_cache(maxsize=16)
 def description_tree(spec: SceneSpec) -> RigidTree:
-    """Return the rigid tree of the simulated bodies of ``spec``, not coupled; the same object for equal specs."""
+    """Return the rigid tree of the simulated bodies of ``spec``, not coupled; the same object for
+    equal specs.
+    """
     text = simulated(spec.urdf, spec.separate).urdf
     inertias = body_inertias(spec.urdf, spec.separate)
     return rigid_tree(text, inertias, gravity=spec.gravity, fixed_base=spec.fixed_base)
 
 
 def contacts_of(spec: SceneSpec, ground: bool) -> Contacts:
-    """Return the contacts of the robot of ``spec``, even of one without shapes there; ``ground`` is at height 0."""
+    """Return the contacts of the robot of ``spec``, even of one without shapes there; ``ground`` is
+    at height 0.
+    """
     ignored = {frozenset(pair) for pair in spec.ignored}
     return Contacts(description_tree(spec), link_shapes(spec.urdf, spec.separate), ignored, ground)
 
 
 def scene_tree(spec: SceneSpec) -> RigidTree:
-    """Return the rigid tree of the robot of ``spec`` as its engine simulates it, the same object for equal specs."""
+    """Return the rigid tree of the robot of ``spec`` as its engine simulates it, the same object
+    for equal specs.
+    """
     return load_engine(spec.engine).scene_tree(spec)

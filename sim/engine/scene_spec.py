@@ -1,4 +1,5 @@
-"""Description of the envs of a pack: the robot and its scene, and how each robot differs from the model.
+"""Description of the envs of a pack: the robot and its scene, and how each robot differs from the
+model.
 
 A variation changes a robot's inertias, and the friction and damping of its joints.
 """
@@ -21,7 +22,8 @@ from batchpid.task_space.rigid_tree import GRAVITY
 from batchpid.task_space.spatial_inertia import SpatialInertia, spatial_matrix, total
 
 Build = Callable[[Any, int], Any]
-"""``build(scene, env)`` adds content to the engine's scene of env ``env``; returns objects whose poses are read.
+"""``build(scene, env)`` adds content to the engine's scene of env ``env``; returns objects whose
+poses are read.
 
 An object is an entity or the name of a link of the robot, merged links included. None: no poses.
 """
@@ -31,11 +33,12 @@ An object is an entity or the name of a link of the robot, merged links included
 class SceneSpec:
     """Everything that a scene is built from, picklable.
 
-    ``urdf`` is sanitised text (see :mod:`batchpid.sim.robot.urdf`); ``ignored`` are pairs of its links that do not
-    collide; ``joints`` are the degrees of freedom, in the order of all arrays. ``physics`` are the solver
-    settings of ``engine``, in the engine's type. Without ``collisions`` scenes have no collision shapes and no ground,
-    but the same masses and inertias. ``mjcf`` is the file that MuJoCo compiles in place of ``urdf``. ``contacts`` and
-    ``wrenches`` are links with sensors. Specs that differ in ``build`` alone are equal.
+    ``urdf`` is sanitised text (see :mod:`batchpid.sim.robot.urdf`); ``ignored`` are pairs of its
+    links that do not collide; ``joints`` are the degrees of freedom, in the order of all arrays.
+    ``physics`` are the solver settings of ``engine``, in the engine's type. Without ``collisions``
+    scenes have no collision shapes and no ground, but the same masses and inertias. ``mjcf`` is the
+    file that MuJoCo compiles in place of ``urdf``. ``contacts`` and ``wrenches`` are links with
+    sensors. Specs that differ in ``build`` alone are equal.
     """
 
     urdf: str
@@ -56,7 +59,9 @@ class SceneSpec:
 
     @property
     def separate(self) -> tuple[str, ...]:
-        """Links that are not merged into their parents, since the wrench between them is measured."""
+        """Links that are not merged into their parents, since the wrench between them is
+        measured.
+        """
         return self.wrenches or ()
 
     @property
@@ -73,8 +78,9 @@ class Variation(NamedTuple):
     link_mass: Float64 | None = None
     """Mass of each link relative to its mass in the URDF (envs, links); NaN for 1."""
     center_of_mass: Float64 | None = None
-    """Displacement of the center of mass of each link of the URDF in the link's frame (envs, 3 links) [m]: x, y, z of
-    the first link, of the second, ..."""
+    """Displacement of the center of mass of each link of the URDF in the link's frame (envs, 3
+    links) [m]: x, y, z of the first link, of the second, ...
+    """
     friction: Float64 | None = None
     """Coulomb friction of the joints (envs, dof) [N m or N]."""
     damping: Float64 | None = None
@@ -88,26 +94,38 @@ class Variation(NamedTuple):
 
 
 class VariedMasses:
-    """Inertias of the simulated links of ``size`` robots that differ by ``variation``, one row for each.
+    """Inertias of the simulated links of ``size`` robots that differ by ``variation``, one row for
+    each.
 
-    ``carrier`` is the link of the URDF that carries the payload; ``links`` are those whose mass or center varies.
+    ``carrier`` is the link of the URDF that carries the payload; ``links`` are those whose mass or
+    center varies.
 
     Attributes
     ----------
     added
-        Spatial inertias (size, 6, 6) of the links that vary, by name, minus the model's; empty if no mass varies.
+        Spatial inertias (size, 6, 6) of the links that vary, by name, minus the model's; empty if
+        no mass varies.
     """
 
-    def __init__(self, spec: SceneSpec, size: int, variation: Variation, carrier: str, links: Sequence[str]) -> None:
+    def __init__(
+        self, spec: SceneSpec, size: int, variation: Variation, carrier: str, links: Sequence[str]
+    ) -> None:
         self._variation, self._bodies = variation, dict[str, Body]()
         varies_links = variation.link_mass is not None or variation.center_of_mass is not None
         if varies_links or variation.payload is not None:
-            self._bodies = varied_bodies(spec.urdf, spec.separate, carrier, links if varies_links else [])
-        self._nominal = {name: total([part.inertia for part in body.parts]) for name, body in self._bodies.items()}
+            self._bodies = varied_bodies(
+                spec.urdf, spec.separate, carrier, links if varies_links else []
+            )
+        self._nominal = {
+            name: total([part.inertia for part in body.parts])
+            for name, body in self._bodies.items()
+        }
         self.added = {name: np.zeros((size, 6, 6)) for name in self._bodies}
 
     def of_robot(self, row: int) -> dict[str, SpatialInertia]:
-        """Return the present inertias of robot ``row`` by link, in the frames of the links; :attr:`added` gets them."""
+        """Return the present inertias of robot ``row`` by link, in the frames of the links;
+        :attr:`added` gets them.
+        """
         inertias = {name: self._inertia(body, row) for name, body in self._bodies.items()}
         for name, inertia in inertias.items():
             self.added[name][row] = spatial_matrix(inertia) - spatial_matrix(self._nominal[name])
@@ -125,22 +143,31 @@ class VariedMasses:
                 center = center + part.axes @ np.nan_to_num(displacement)
             parts.append(SpatialInertia(share * mass, center, share * tensor))
         if body.payload is not None and variation.payload is not None:
-            parts.append(SpatialInertia(float(variation.payload[row]), body.payload, np.zeros((3, 3))))
+            parts.append(
+                SpatialInertia(float(variation.payload[row]), body.payload, np.zeros((3, 3)))
+            )
         return total(parts)
 
 
 def own_friction(spec: SceneSpec, variation: Variation | None = None) -> Friction:
-    """Return the friction and damping that the loop applies to robots of ``spec``, with ``variation``."""
+    """Return the friction and damping that the loop applies to robots of ``spec``, with
+    ``variation``.
+    """
     model = Friction()
     if DISSIPATION[spec.dissipation].modelled:
-        rows = (np.array([[getattr(joint, name) for joint in spec.joints]]) for name in ("friction", "damping"))
+        rows = (
+            np.array([[getattr(joint, name) for joint in spec.joints]])
+            for name in ("friction", "damping")
+        )
         model = Friction(*(row if row.any() else None for row in rows))
     if variation is not None and variation.friction is not None:
         # The coupling moves the others.
         model = model._replace(coulomb=coupling_of(spec.joints).of_independent(variation.friction))
     if variation is not None and variation.damping is not None:
         model = model._replace(viscous=variation.damping.copy())
-    return model if spec.mjcf is None else model._replace(viscous=None)  # there MuJoCo computes the damping
+    return (
+        model if spec.mjcf is None else model._replace(viscous=None)
+    )  # there MuJoCo computes the damping
 
 
 def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
@@ -148,7 +175,9 @@ def added_friction(own: Friction, actuators: Actuators | None) -> Friction:
     added = Actuators() if actuators is None else actuators
     static, load = added.static, added.load_friction
     both = zip(own[:2], (added.coulomb, added.viscous), strict=True)
-    coulomb, viscous = (one if more is None else more if one is None else one + more for one, more in both)
+    coulomb, viscous = (
+        one if more is None else more if one is None else one + more for one, more in both
+    )
     if static is not None:
         static = static if own.coulomb is None else static + own.coulomb
     if coulomb is None and (rubs := Friction(None, None, static, load=load).most) is not None:

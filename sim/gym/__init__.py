@@ -1,7 +1,9 @@
-"""Gymnasium environments: :class:`RobotVectorEnv`, the base class of tasks of N robots, and the task Reach.
+"""Gymnasium environments: :class:`RobotVectorEnv`, the base class of tasks of N robots, and the
+task Reach.
 
-``import batchpid.sim.gym`` registers ``batchpid/Reach-v0`` for ``gymnasium.make_vec("batchpid/Reach-v0",
-num_envs=64)``; ``make_vec("batchpid.sim.gym:batchpid/Reach-v0", ...)`` does both. Arrays are NumPy's, new at every
+``import batchpid.sim.gym`` registers ``batchpid/Reach-v0`` for
+``gymnasium.make_vec("batchpid/Reach-v0", num_envs=64)``;
+``make_vec("batchpid.sim.gym:batchpid/Reach-v0", ...)`` does both. Arrays are NumPy's, new at every
 step: ``jax.dlpack.from_dlpack`` and ``torch.from_dlpack`` take them without a copy.
 """
 

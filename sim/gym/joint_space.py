@@ -1,4 +1,6 @@
-"""Independent joints of a robot, as observed by tasks: with finite ranges, and continuous joints within half a turn."""
+"""Independent joints of a robot, as observed by tasks: with finite ranges, and continuous joints
+within half a turn.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,11 @@ FARTHEST = 1000.0
 
 
 class JointSpace:
-    """Independent joints of ``robot`` (:attr:`batchpid.sim.Robot.independent`), with a finite range each.
+    """Independent joints of ``robot`` (:attr:`batchpid.sim.Robot.independent`), with a finite range
+    each.
 
-    The range is the joint's limits. For a continuous joint it is [-pi, pi], for another joint without limits half a
-    turn, or pi m, on either side of its start.
+    The range is the joint's limits. For a continuous joint it is [-pi, pi], for another joint
+    without limits half a turn, or pi m, on either side of its start.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -30,7 +33,9 @@ class JointSpace:
         self.names = tuple(robot.joint_names[joint] for joint in self.index)
         self.continuous = robot.continuous[self.index]
         self.turns = np.where(self.continuous, 1 / TURN, 0.0)
-        """1 / (2 pi) for continuous joints, else 0: the argument of :func:`batchpid.arrays.elementwise.wrap`."""
+        """1 / (2 pi) for continuous joints, else 0: the argument of
+        :func:`batchpid.arrays.elementwise.wrap`.
+        """
         self.start = wrap(robot.start[self.index], self.turns, np)
         """Start pose (joints,) [rad or m]."""
         lower, upper = robot.lower[self.index], robot.upper[self.index]
@@ -48,7 +53,8 @@ class JointSpace:
         return np.concatenate(low), np.concatenate(high)
 
     def observe(self, observed: Observation) -> Float64:
-        """Return positions and velocities (envs, 2 joints), then pose and twist (envs, 13) of a floating base.
+        """Return positions and velocities (envs, 2 joints), then pose and twist (envs, 13) of a
+        floating base.
 
         Positions of continuous joints are in [-pi, pi].
         """
@@ -57,7 +63,9 @@ class JointSpace:
         return np.concatenate([qpos, observed.qvel[:, self.index], *base], axis=1)
 
     def of_robot(self, positions: Float64) -> Float64:
-        """Return positions (..., joints) for all joints of the robot (..., dof); followers have 0."""
+        """Return positions (..., joints) for all joints of the robot (..., dof); followers have
+        0.
+        """
         rows = np.zeros((*positions.shape[:-1], self._dof))  # the runner puts followers in place
         rows[..., self.index] = positions
         return rows

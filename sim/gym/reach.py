@@ -23,7 +23,9 @@ from batchpid.sim.robot.robot import Robot
 
 ACTIONS = ("setpoint", "increment")
 SPREAD = 0.1
-"""Largest distance of a joint from the robot's start pose at the beginning of an episode [rad or m]."""
+"""Largest distance of a joint from the robot's start pose at the beginning of an episode [rad or
+m].
+"""
 MARGIN = 0.05
 """Share of a joint's range, at each limit, in which no goal is drawn."""
 
@@ -31,23 +33,26 @@ MARGIN = 0.05
 class ReachVectorEnv(RobotVectorEnv):
     """N robots, each with a joint pose to reach.
 
-    Joints are the independent ones (:attr:`batchpid.sim.Robot.independent`): followers move with their leaders. A
-    setpoint has one number for each of them. A :class:`batchpid.sim.Controller` may define another command, within the
-    bounds of its :class:`batchpid.sim.CommandSpec`.
+    Joints are the independent ones (:attr:`batchpid.sim.Robot.independent`): followers move with
+    their leaders. A setpoint has one number for each of them. A :class:`batchpid.sim.Controller`
+    may define another command, within the bounds of its :class:`batchpid.sim.CommandSpec`.
 
-    - *Observation* (envs, 3 joints): qpos, qvel, goal [rad or m, and per second], clipped to the space.
-    - *Action* (envs, size) in [-1, 1]: the setpoint within its limits, or an increment of the setpoint, which moves
-      during the step. An episode begins with the setpoint at the joints' pose, or with the ``neutral`` one of the
-      command.
-    - *Reward*: minus the mean over joints of |goal - qpos| / range, plus 1 where every joint is within ``tolerance``.
-      A joint without a range counts as 0.
-    - *Terminated*: the env diverged (``info["diverged"]``), or reached its goal if ``terminate_on_success``.
+    - *Observation* (envs, 3 joints): qpos, qvel, goal [rad or m, and per second], clipped to the
+      space.
+    - *Action* (envs, size) in [-1, 1]: the setpoint within its limits, or an increment of the
+      setpoint, which moves during the step. An episode begins with the setpoint at the joints'
+      pose, or with the ``neutral`` one of the command.
+    - *Reward*: minus the mean over joints of |goal - qpos| / range, plus 1 where every joint is
+      within ``tolerance``. A joint without a range counts as 0.
+    - *Terminated*: the env diverged (``info["diverged"]``), or reached its goal if
+      ``terminate_on_success``.
     - *Truncated*: after ``max_episode_steps``.
     - *Info*: "success", "error" (largest |goal - qpos|), "diverged".
 
-    A continuous joint has the range [-pi, pi]. Its qpos and goal are observed in that range, its error is the short way
-    round, and increments move it past pi if the law can (control "pid" with ``continuous`` in its params).
-    Another joint without limits has the range of half a turn, or pi m, on either side of its start.
+    A continuous joint has the range [-pi, pi]. Its qpos and goal are observed in that range, its
+    error is the short way round, and increments move it past pi if the law can (control "pid" with
+    ``continuous`` in its params). Another joint without limits has the range of half a turn, or pi
+    m, on either side of its start.
 
     Parameters
     ----------
@@ -56,12 +61,14 @@ class ReachVectorEnv(RobotVectorEnv):
     actions
         ``"setpoint"`` or ``"increment"``.
     max_increment
-        Change of the setpoint by an increment of 1, scalar or (size,) [rad or m]; default the velocity limit times the
-        time of a step. No default for a controller that defines its command.
+        Change of the setpoint by an increment of 1, scalar or (size,) [rad or m]; default the
+        velocity limit times the time of a step. No default for a controller that defines its
+        command.
     tolerance
         Largest error of a reached goal [rad or m].
     options
-        Of :class:`RobotVectorEnv`: rate_hz, terminate_on_success, ..., and of :class:`batchpid.sim.Runner`.
+        Of :class:`RobotVectorEnv`: rate_hz, terminate_on_success, ..., and of
+        :class:`batchpid.sim.Runner`.
 
     Raises
     ------
@@ -85,9 +92,13 @@ class ReachVectorEnv(RobotVectorEnv):
         self._spec = own_command(options.get("control"))
         super().__init__(num_envs, robot, **options)
         law = self.runner.params.continuous if self.runner.control == "pid" else None
-        turns = np.zeros(self.robot.dof) if law is None else np.asarray(law, np.float64).min(0) / TURN
+        turns = (
+            np.zeros(self.robot.dof) if law is None else np.asarray(law, np.float64).min(0) / TURN
+        )
         joint_turns = np.minimum(self._joints.turns, turns[self._joints.index])
-        self._setpoint_turns = joint_turns if self._spec is None else np.zeros(len(self.action_names))
+        self._setpoint_turns = (
+            joint_turns if self._spec is None else np.zeros(len(self.action_names))
+        )
         self._goal = np.zeros((self.num_envs, len(self.joint_names)))
 
     def spaces(self) -> tuple[spaces.Box, spaces.Box]:
@@ -110,15 +121,22 @@ class ReachVectorEnv(RobotVectorEnv):
         if max_increment is None:
             if spec is not None and self.actions == "increment":
                 remedy = f"give one number for each of {', '.join(spec.names)}"
-                raise InvalidArgumentError("max_increment", "is needed for the command of this control", remedy=remedy)
+                raise InvalidArgumentError(
+                    "max_increment", "is needed for the command of this control", remedy=remedy
+                )
             fastest = self.robot.velocity_limit[joints.index]
-            max_increment = 0.0 if spec is not None else np.minimum(fastest, MAX_SPEED) * self.step_seconds
+            max_increment = (
+                0.0 if spec is not None else np.minimum(fastest, MAX_SPEED) * self.step_seconds
+            )
         names = self.action_names
         kind: Any = "joint" if spec is None else "entry"
-        self.max_increment = array("max_increment", max_increment, (1, len(names)), names, kind=kind)[0]
+        self.max_increment = array(
+            "max_increment", max_increment, (1, len(names)), names, kind=kind
+        )[0]
         low, high = joints.bounds()
         observation = spaces.Box(
-            np.concatenate([low, self.low]).astype(np.float32), np.concatenate([high, self.high]).astype(np.float32)
+            np.concatenate([low, self.low]).astype(np.float32),
+            np.concatenate([high, self.high]).astype(np.float32),
         )
         return observation, spaces.Box(-1.0, 1.0, (len(names),), np.float32)
 
@@ -136,20 +154,31 @@ class ReachVectorEnv(RobotVectorEnv):
             chosen = low + (action + 1) / 2 * (high - low)
         else:
             last = setpoint if self._spec is not None else setpoint[:, self._joints.index]
-            chosen = np.clip(wrap(last + action * self.max_increment, self._setpoint_turns, np), low, high)
+            chosen = np.clip(
+                wrap(last + action * self.max_increment, self._setpoint_turns, np), low, high
+            )
         return self._joints.of_robot(chosen) if self._spec is None else chosen
 
     def rate(self, setpoint: Float64, last: Float64) -> Float64 | None:
-        """Return the rates of increments, the short way round on continuous joints; None for other actions."""
+        """Return the rates of increments, the short way round on continuous joints; None for other
+        actions.
+        """
         if self.actions == "setpoint" or self._spec is not None:
             return None
-        rate, index = np.zeros_like(setpoint), self._joints.index  # the runner gives followers their leaders' rates
-        rate[:, index] = wrap((setpoint - last)[:, index], self._setpoint_turns, np) / self.step_seconds
+        rate, index = (
+            np.zeros_like(setpoint),
+            self._joints.index,
+        )  # the runner gives followers their leaders' rates
+        rate[:, index] = (
+            wrap((setpoint - last)[:, index], self._setpoint_turns, np) / self.step_seconds
+        )
         return rate
 
     def observe(self, observed: Observation) -> Float32:
         """Return qpos, qvel, pose and twist of a floating base, and goal."""
-        return np.concatenate([self._joints.observe(observed), self._goal], axis=1).astype(np.float32)
+        return np.concatenate([self._joints.observe(observed), self._goal], axis=1).astype(
+            np.float32
+        )
 
     def success(self, observation: Float32) -> Bool:
         """Return whether every joint is within the tolerance."""
@@ -167,7 +196,9 @@ class ReachVectorEnv(RobotVectorEnv):
 
     def _error(self, observation: Float32) -> Float64:
         """Return |goal - qpos| (envs, joints) [rad or m], the short way round."""
-        return np.abs(wrap(self._goal - observation[:, : len(self.joint_names)], self._joints.turns, np))
+        return np.abs(
+            wrap(self._goal - observation[:, : len(self.joint_names)], self._joints.turns, np)
+        )
 
 
 class ReachEnv(RobotEnv):

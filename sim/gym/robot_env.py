@@ -19,10 +19,11 @@ _FIXED = ("num_envs", "max_episode_steps", "autoreset_mode")
 
 
 class RobotEnv(SingleOwner, gymnasium.Env):
-    """One robot of a task as a :class:`gymnasium.Env`, by default in this process. A subclass names its ``task``.
+    """One robot of a task as a :class:`gymnasium.Env`, by default in this process. A subclass names
+    its ``task``.
 
-    ``robot`` None is the task's own default. Episodes have no time limit, which :func:`gymnasium.make` adds. The
-    other arguments belong to the task.
+    ``robot`` None is the task's own default. Episodes have no time limit, which
+    :func:`gymnasium.make` adds. The other arguments belong to the task.
     """
 
     instead = RobotVectorEnv.instead
@@ -30,8 +31,14 @@ class RobotEnv(SingleOwner, gymnasium.Env):
     task: ClassVar[type[RobotVectorEnv]]
     """Class of the task."""
 
-    def __init__(self, robot: str | Robot | None = None, *, render_mode: str | None = None, **options: Any) -> None:
-        check_keywords(type(self).__name__, options, [name for name in arguments_of(self.task) if name not in _FIXED])
+    def __init__(
+        self, robot: str | Robot | None = None, *, render_mode: str | None = None, **options: Any
+    ) -> None:
+        check_keywords(
+            type(self).__name__,
+            options,
+            [name for name in arguments_of(self.task) if name not in _FIXED],
+        )
         options |= {"workers": options.get("workers", 0), "autoreset_mode": AutoresetMode.DISABLED}
         if robot is not None:
             options["robot"] = robot
@@ -41,16 +48,26 @@ class RobotEnv(SingleOwner, gymnasium.Env):
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space
 
-    def reset(self, *, seed: int | None = None, options: Document | None = None) -> tuple[Float32, Document]:
+    def reset(
+        self, *, seed: int | None = None, options: Document | None = None
+    ) -> tuple[Float32, Document]:
         """Begin a new episode."""
         super().reset(seed=seed)
         observation, info = self._envs.reset(seed=seed)
         return observation[0], self._single(info)
 
     def step(self, action: ArrayLike) -> tuple[Float32, float, bool, bool, Document]:
-        """Apply an action (size,) for one step; return observation, reward, terminated, truncated and info."""
+        """Apply an action (size,) for one step; return observation, reward, terminated, truncated
+        and info.
+        """
         observation, reward, terminated, truncated, info = self._envs.step(np.asarray(action)[None])
-        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), self._single(info)
+        return (
+            observation[0],
+            float(reward[0]),
+            bool(terminated[0]),
+            bool(truncated[0]),
+            self._single(info),
+        )
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture (height, width, 3) in RGB; None without a ``render_mode``."""

@@ -1,6 +1,8 @@
-"""Base class of tasks: N robots under a Runner as a vector environment of Gymnasium, with hooks for the task.
+"""Base class of tasks: N robots under a Runner as a vector environment of Gymnasium, with hooks for
+the task.
 
-Longer than 350 lines because one class is the whole environment, and documents every hook of a task.
+Longer than 350 lines because one class is the whole environment, and documents every hook of a
+task.
 """
 
 from __future__ import annotations
@@ -32,22 +34,28 @@ RUNNER_OPTIONS = tuple(OPTIONS.keys() - {"robot", "num_envs", "substeps"})
 
 
 class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
-    """Task of N robots: a :class:`gymnasium.vector.VectorEnv` over the Runner. A task is a subclass with hooks.
+    """Task of N robots: a :class:`gymnasium.vector.VectorEnv` over the Runner. A task is a subclass
+    with hooks.
 
-    This class has the spaces, seeds, episodes, autoreset, send and recv, faults and randomization. The hooks define the
-    task, in the order of a step. All but :meth:`spaces`, :meth:`observe` and :meth:`reward` have a default:
+    This class has the spaces, seeds, episodes, autoreset, send and recv, faults and randomization.
+    The hooks define the task, in the order of a step. All but :meth:`spaces`, :meth:`observe` and
+    :meth:`reward` have a default:
 
-    - :meth:`spaces`: spaces of observation and action of one env; called once, before the runner starts;
-    - :meth:`runner_options`: options of the runner that belong to the task, such as ``control`` and ``build``;
+    - :meth:`spaces`: spaces of observation and action of one env; called once, before the runner
+      starts;
+    - :meth:`runner_options`: options of the runner that belong to the task, such as ``control`` and
+      ``build``;
     - :meth:`draw`: the start and the goal of an episode, drawn for one env;
-    - :meth:`first_setpoint`, :meth:`command`: the setpoint at the start of an episode, and for an action;
+    - :meth:`first_setpoint`, :meth:`command`: the setpoint at the start of an episode, and for an
+      action;
     - :meth:`rate`: the rate of a setpoint that moves;
     - :meth:`observe`: the observation, made from the runner's;
-    - :meth:`success`, :meth:`reward`, :meth:`terminated`, :meth:`info`: results, from the observation.
+    - :meth:`success`, :meth:`reward`, :meth:`terminated`, :meth:`info`: results, from the
+      observation.
 
-    Hooks get and return arrays with a row for each env. Each row may depend on that env alone, so that an episode is
-    the same in any number of envs. An env that diverged keeps its last finite observation, is terminated, and its
-    ``info["diverged"]`` is True.
+    Hooks get and return arrays with a row for each env. Each row may depend on that env alone, so
+    that an episode is the same in any number of envs. An env that diverged keeps its last finite
+    observation, is terminated, and its ``info["diverged"]`` is True.
 
     Parameters
     ----------
@@ -66,7 +74,8 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     render_mode
         ``"rgb_array"``: :meth:`render` returns pictures.
     options
-        Of :class:`batchpid.sim.Runner`: params, workers, timestep, physics, compensate, build, randomization, ...
+        Of :class:`batchpid.sim.Runner`: params, workers, timestep, physics, compensate, build,
+        randomization, ...
 
     Raises
     ------
@@ -90,7 +99,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     observed: Observation
     """Last observation of the runner: joint positions, velocities, efforts, ..."""
     action_names: tuple[str, ...]
-    """Names of an action's entries, for errors; a task may set them in :meth:`spaces`. Default: numbers."""
+    """Names of an action's entries, for errors; a task may set them in :meth:`spaces`. Default:
+    numbers.
+    """
 
     def __init__(
         self,
@@ -110,25 +121,33 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self.num_envs = checked_option("num_envs", num_envs)
         self.terminate_on_success = flag("terminate_on_success", terminate_on_success)
         self.max_episode_steps = (
-            None if max_episode_steps is None else integer("max_episode_steps", max_episode_steps, 1, 10**9)
+            None
+            if max_episode_steps is None
+            else integer("max_episode_steps", max_episode_steps, 1, 10**9)
         )
         modes = {mode.value: mode for mode in AutoresetMode}
         mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         self.autoreset_mode = modes[choice("autoreset_mode", mode, modes)]
         timestep = checked_option("timestep", options.get("timestep", RunnerOptions.timestep))
-        substeps = round(1 / (number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second") * timestep))
+        substeps = round(
+            1 / (number("rate_hz", rate_hz, 1e-3, 1 / timestep, "actions per second") * timestep)
+        )
         self.step_seconds = substeps * timestep
         chosen = dict(self.runner_options())
         for option in options:
             if option in chosen:
-                raise InvalidArgumentError(option, f"is chosen by {name}", remedy=f"leave it out, or subclass {name}")
+                raise InvalidArgumentError(
+                    option, f"is chosen by {name}", remedy=f"leave it out, or subclass {name}"
+                )
         self._options = options | chosen
         self.single_observation_space, self.single_action_space = self.spaces()
         size: int = self.single_action_space.shape[0]
         self.action_names = getattr(self, "action_names", tuple(map(str, range(size))))
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.render_mode = None if render_mode is None else choice("render_mode", render_mode, ("rgb_array",))
+        self.render_mode = (
+            None if render_mode is None else choice("render_mode", render_mode, ("rgb_array",))
+        )
         self.metadata = {  # type: ignore[misc]
             **type(self).metadata,
             "render_fps": 1 / self.step_seconds,
@@ -140,40 +159,51 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._starts = np.tile(self.robot.start, (self.num_envs, 1))
         self._setpoint = np.zeros((self.num_envs, self.runner.command.size))
         self.action = np.zeros((self.num_envs, size))
-        self._observation = np.zeros((self.num_envs, *self.single_observation_space.shape), np.float32)
+        self._observation = np.zeros(
+            (self.num_envs, *self.single_observation_space.shape), np.float32
+        )
         self._success = self._diverged = np.zeros(self.num_envs, bool)
         self._steps = np.zeros(self.num_envs, np.int64)
         self._done = np.ones(self.num_envs, bool)
         self._is_stepping = False
         self._received: Observation | None = None
 
-    # -- hooks -----------------------------------------------------------------------------------------------------
+    # -- hooks
+    # ----------------------------------------------------------------------------------------------
 
     @abstractmethod
     def spaces(self) -> tuple[spaces.Box, spaces.Box]:
         """Return the spaces of the observation (n,) and of the action (size,) of one env.
 
-        Attributes ``robot``, ``num_envs`` and ``step_seconds`` exist by now, ``runner`` does not. Actions are clipped
-        to their space, and observations to theirs.
+        Attributes ``robot``, ``num_envs`` and ``step_seconds`` exist by now, ``runner`` does not.
+        Actions are clipped to their space, and observations to theirs.
         """
 
     def runner_options(self) -> Mapping[str, Any]:
-        """Return the options of the Runner that belong to the task; the caller cannot give these. Default: none."""
+        """Return the options of the Runner that belong to the task; the caller cannot give these.
+        Default: none.
+        """
         return {}
 
     def draw(self, env: int, random: np.random.Generator) -> ArrayLike:
-        """Draw an episode of one env: keep its goal, and return the joint positions at its start (dof,) [rad or m].
+        """Draw an episode of one env: keep its goal, and return the joint positions at its start
+        (dof,) [rad or m].
 
-        ``random`` is the generator of this env, so that episodes depend on its seed alone. Default: ``robot.start``.
+        ``random`` is the generator of this env, so that episodes depend on its seed alone. Default:
+        ``robot.start``.
         """
         return self.robot.start
 
     def first_setpoint(self, qpos: Float64) -> ArrayLike:
-        """Return the setpoints (envs, command size) at the start of an episode from ``qpos`` (envs, dof).
+        """Return the setpoints (envs, command size) at the start of an episode from ``qpos`` (envs,
+        dof).
 
-        Default: ``qpos`` where setpoints are joint positions, else the neutral setpoint of the command.
+        Default: ``qpos`` where setpoints are joint positions, else the neutral setpoint of the
+            command.
         """
-        return qpos if self.runner.options.sets_positions else np.asarray(self.runner.command.neutral)
+        return (
+            qpos if self.runner.options.sets_positions else np.asarray(self.runner.command.neutral)
+        )
 
     def command(self, action: Float64, setpoint: Float64) -> ArrayLike:
         """Return the setpoints of the Runner (envs, command size) for the actions (envs, size).
@@ -183,10 +213,12 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         return action
 
     def rate(self, setpoint: Float64, last: Float64) -> ArrayLike | None:
-        """Return the rates (envs, command size) per second at which the setpoints move from ``last`` to ``setpoint``.
+        """Return the rates (envs, command size) per second at which the setpoints move from
+        ``last`` to ``setpoint``.
 
-        Increments move the setpoint over the whole step: their rate is the change by :attr:`step_seconds`. Without a
-        rate, setpoints that move in every step are followed with a lag. None: setpoints are steps. Default: None.
+        Increments move the setpoint over the whole step: their rate is the change by
+        :attr:`step_seconds`. Without a rate, setpoints that move in every step are followed with a
+        lag. None: setpoints are steps. Default: None.
         """
         return None
 
@@ -194,8 +226,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
     def observe(self, observed: Observation) -> ArrayLike:
         """Return the observations (envs, n) for the last observation of the runner.
 
-        Poses of user content are ``self.runner.poses()`` (envs, entities, 7): the entities that ``build`` returned. It
-        is one more message to each worker. Rows of envs that are not ``observed.ok`` are ignored.
+        Poses of user content are ``self.runner.poses()`` (envs, entities, 7): the entities that
+        ``build`` returned. It is one more message to each worker. Rows of envs that are not
+        ``observed.ok`` are ignored.
         """
 
     def success(self, observation: Float32) -> ArrayLike:
@@ -214,18 +247,22 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         return success & self.terminate_on_success
 
     def info(self, observation: Float32) -> Mapping[str, Rows]:
-        """Return further entries of the info, arrays (envs,), between "success" and "diverged". Default: none."""
+        """Return further entries of the info, arrays (envs,), between "success" and "diverged".
+        Default: none.
+        """
         return {}
 
-    # -- the vector environment ------------------------------------------------------------------------------------
+    # -- the vector environment
+    # ------------------------------------------------------------------------------------
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Document | None = None
     ) -> tuple[Float32, Document]:
         """Begin new episodes, in the envs of ``options["reset_mask"]`` (envs,) or in all.
 
-        An int ``seed`` gives env k the seed + k; a sequence has one for each env, or None to go on with the last. What
-        an env draws depends on its own seed alone, which is the stream of a ``randomization``, too.
+        An int ``seed`` gives env k the seed + k; a sequence has one for each env, or None to go on
+        with the last. What an env draws depends on its own seed alone, which is the stream of a
+        ``randomization``, too.
 
         Raises
         ------
@@ -241,17 +278,23 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             mask = env_mask("options['reset_mask']", options["reset_mask"], self.num_envs)
         if not mask.any():
             raise InvalidArgumentError(
-                "options['reset_mask']", "selects no env", remedy="use e.g. mask = terminated | truncated"
+                "options['reset_mask']",
+                "selects no env",
+                remedy="use e.g. mask = terminated | truncated",
             )
         seeds: Sequence[int | None] | None = None
         if isinstance(seed, Sequence | np.ndarray):
-            seeds = [None if entry is None else integer("seed", entry, 0, LARGEST) for entry in seed]
+            seeds = [
+                None if entry is None else integer("seed", entry, 0, LARGEST) for entry in seed
+            ]
         elif seed is not None:
             first = integer("seed", seed, 0, LARGEST - self.num_envs)
             seeds = range(first, first + self.num_envs)
         if seeds is not None and len(seeds) != self.num_envs:
             raise InvalidArgumentError(
-                "seed", f"has {len(seeds)} entries for {self.num_envs} envs", remedy="give an int, or one for each env"
+                "seed",
+                f"has {len(seeds)} entries for {self.num_envs} envs",
+                remedy="give an int, or one for each env",
             )
         streams: dict[int, int] = {}
         for env in np.flatnonzero(mask).tolist():
@@ -261,12 +304,15 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         return self._observation.copy(), self._info(mask)
 
     def step(self, actions: ArrayLike) -> tuple[Float32, Float64, Bool, Bool, Document]:
-        """Apply an action (envs, size) for one step; return observation, reward, terminated, truncated and info."""
+        """Apply an action (envs, size) for one step; return observation, reward, terminated,
+        truncated and info.
+        """
         self.step_async(actions)
         return self.step_wait()
 
     def step_async(self, actions: ArrayLike) -> None:
-        """Begin a step, which the workers make while the caller computes something else, and return.
+        """Begin a step, which the workers make while the caller computes something else, and
+        return.
 
         Raises
         ------
@@ -281,11 +327,15 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         begins = self._done.copy()
         if begins.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             raise error.ResetNeeded(f"reset env {int(np.argmax(begins))} before the next step")
-        setpoint = self._returned("command", self.command(action, self._setpoint), self._setpoint.shape, np.float64)
+        setpoint = self._returned(
+            "command", self.command(action, self._setpoint), self._setpoint.shape, np.float64
+        )
         setpoint = np.where(begins[:, None], self._setpoint, setpoint)
         rate = self.rate(setpoint, self._setpoint)
         if rate is not None:
-            rate = np.where(begins[:, None], 0.0, self._returned("rate", rate, self._setpoint.shape, np.float64))
+            rate = np.where(
+                begins[:, None], 0.0, self._returned("rate", rate, self._setpoint.shape, np.float64)
+            )
         self.runner.send(setpoint, setpoint_rate=rate)
         self.action = action
         self._setpoint = setpoint
@@ -304,7 +354,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         try:
             self._received = self.runner.recv() if self._received is None else self._received
             self._observe(self._received)
-        except Exception:  # the step has ended; after an interrupt, in contrast, the call can be repeated
+        except (
+            Exception
+        ):  # the step has ended; after an interrupt, in contrast, the call can be repeated
             self._is_stepping, self._received = False, None
             raise
         self._is_stepping, self._received = False, None
@@ -312,10 +364,16 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         self._steps += 1
 
         count = (self.num_envs,)
-        reward = self._returned("reward", self.reward(self._observation, self._success), count, np.float64)
-        ends = self._returned("terminated", self.terminated(self._observation, self._success), count, np.bool_)
+        reward = self._returned(
+            "reward", self.reward(self._observation, self._success), count, np.float64
+        )
+        ends = self._returned(
+            "terminated", self.terminated(self._observation, self._success), count, np.bool_
+        )
         terminated = self._diverged | ends
-        truncated = self._steps >= (np.inf if self.max_episode_steps is None else self.max_episode_steps)
+        truncated = self._steps >= (
+            np.inf if self.max_episode_steps is None else self.max_episode_steps
+        )
         if begins.any():  # in next-step mode this step begins the next episode
             self._begin(begins)
             reward = np.where(begins, 0.0, reward)
@@ -328,7 +386,12 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             final = np.full(self.num_envs, None, object)
             for env in np.flatnonzero(done):
                 final[env] = self._observation[env].copy()
-            info = {"final_obs": final, "_final_obs": done, "final_info": self._info(done), "_final_info": done}
+            info = {
+                "final_obs": final,
+                "_final_obs": done,
+                "final_info": self._info(done),
+                "_final_info": done,
+            }
             self._begin(done)
             info |= self._info(everywhere)
         return self._observation.copy(), reward, terminated, truncated, info
@@ -360,10 +423,13 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         """Close the runner."""
         self.runner.close()
 
-    # -- episodes --------------------------------------------------------------------------------------------------
+    # -- episodes
+    # ----------------------------------------------------------------------------------------------
 
     def _begin(self, mask: Bool, streams: Mapping[int, int] | None = None) -> None:
-        """Draw episodes for the masked envs, and place their robots; ``streams`` are new ones of some envs."""
+        """Draw episodes for the masked envs, and place their robots; ``streams`` are new ones of
+        some envs.
+        """
         dof = (self.robot.dof,)
         for env in np.flatnonzero(mask).tolist():
             drawn = self.draw(env, self._generators[env])
@@ -375,31 +441,48 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if streams and randomization is not None:
             seeded = np.isin(np.arange(self.num_envs), list(streams))
             seeds[list(streams)] = list(streams.values())
-            observed, rest = self.runner.reset(self._starts, mask=seeded, seed=seeds), mask & ~seeded
+            observed, rest = (
+                self.runner.reset(self._starts, mask=seeded, seed=seeds),
+                mask & ~seeded,
+            )
         if rest.any():
             observed = self.runner.reset(self._starts, mask=rest)
         assert observed is not None
-        if randomization is not None and randomization.qpos is not None:  # the setpoint belongs to the drawn pose
+        if (
+            randomization is not None and randomization.qpos is not None
+        ):  # the setpoint belongs to the drawn pose
             self._starts = np.where(mask[:, None], observed.qpos, self._starts)
         first = np.broadcast_to(np.asarray(self.first_setpoint(self._starts)), self._setpoint.shape)
         self._setpoint = np.where(mask[:, None], first, self._setpoint)
         self._observe(observed)
 
     def _observe(self, observed: Observation) -> None:
-        """Update observation and success; an env that diverged keeps its last finite observation."""
+        """Update observation and success; an env that diverged keeps its last finite
+        observation.
+        """
         space: Any = self.single_observation_space
         self.observed = observed
-        rows = self._returned("observe", self.observe(observed), self._observation.shape, np.float32, observed.ok)
+        rows = self._returned(
+            "observe", self.observe(observed), self._observation.shape, np.float32, observed.ok
+        )
         self._diverged = ~observed.ok
         rows = np.clip(rows, space.low, space.high)
         self._observation = np.where(observed.ok[:, None], rows, self._observation)
-        success = self._returned("success", self.success(self._observation), (self.num_envs,), np.bool_)
+        success = self._returned(
+            "success", self.success(self._observation), (self.num_envs,), np.bool_
+        )
         self._success = observed.ok & success
 
     def _returned(
-        self, hook: str, value: ArrayLike, shape: tuple[int, ...], dtype: DType, ok: Bool | None = None
+        self,
+        hook: str,
+        value: ArrayLike,
+        shape: tuple[int, ...],
+        dtype: DType,
+        ok: Bool | None = None,
     ) -> Rows:
-        """Return a hook's value as an array; raise InvalidArgumentError for another shape, NaN or infinity.
+        """Return a hook's value as an array; raise InvalidArgumentError for another shape, NaN or
+        infinity.
 
         Where ``ok`` (envs,) is given, the rows of other envs are not checked.
         """
@@ -413,7 +496,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
         if bad.any():
             at = tuple(int(index[0]) for index in np.nonzero(bad))
             problem = f"returned a number that is not finite, at index {at}"
-            raise InvalidArgumentError(name, problem, value=rows[at], remedy="return finite numbers")
+            raise InvalidArgumentError(
+                name, problem, value=rows[at], remedy="return finite numbers"
+            )
         return rows.astype(dtype, copy=False)
 
     def _expect_no_step(self, call: str) -> None:
@@ -422,7 +507,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
             raise CallOrderError(f"{call}: a step is under way; call step_wait() first")
 
     def _info(self, mask: Bool) -> Document:
-        """Return the info of the masked envs in Gymnasium's vector style: each key and, as _key, the mask."""
+        """Return the info of the masked envs in Gymnasium's vector style: each key and, as _key,
+        the mask.
+        """
         further = {
             key: self._returned("info", value, (self.num_envs,), value.dtype)
             for key, value in self.info(self._observation).items()
@@ -433,7 +520,9 @@ class RobotVectorEnv(SingleOwner, VectorEnv, ABC):
 
 
 def arguments_of(task: type[RobotVectorEnv]) -> tuple[str, ...]:
-    """Return the names of a task's arguments: its parameters, its bases' parameters, and the options of the runner."""
+    """Return the names of a task's arguments: its parameters, its bases' parameters, and the
+    options of the runner.
+    """
     bases = task.__mro__[: task.__mro__.index(RobotVectorEnv) + 1]
     names: dict[str, None] = {}
     for base in bases:

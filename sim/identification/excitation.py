@@ -1,18 +1,22 @@
-r"""Motion that shows a robot's actuators: a chirp of every joint within its limits, free of contact.
+r"""Motion that shows a robot's actuators: a chirp of every joint within its limits, free of
+contact.
 
-Joint j sweeps its frequency exponentially from f0 to f1, on a wave of slowly changing amplitude about a center::
+Joint j sweeps its frequency exponentially from f0 to f1, on a wave of slowly changing amplitude
+about a center::
 
     q_j(t) = c_j + w(t) A_j(f) sin(phi_j(t)),     phi_j' = 2 pi f,     f = f0 (f1 / f0)^s_j(t)
 
     A_j(f)^-4 = A_max^-4 + (v_max / (2 pi f))^-4 + (a_max / (2 pi f)^2)^-4
 
-so that it is limited by the joint's range at low frequencies, by velocity and by effort at higher ones. s_j runs from 0
-to 1 and back as a cosine, shifted by the joint's share of the time, so that all joints move differently. The window w
-rises from 0 and falls back within a tenth of the time: the motion begins and ends at rest at c. Low frequencies show
-friction, gravity and strength, high ones inertia and delay.
+so that it is limited by the joint's range at low frequencies, by velocity and by effort at higher
+ones. s_j runs from 0 to 1 and back as a cosine, shifted by the joint's share of the time, so that
+all joints move differently. The window w rises from 0 and falls back within a tenth of the time:
+the motion begins and ends at rest at c. Low frequencies show friction, gravity and strength, high
+ones inertia and delay.
 
-Where two links would come too near each other, the joints that bring them together get smaller amplitudes, and so does
-a joint beyond its limits, until the motion is free: about the start pose, or about another one with more room.
+Where two links would come too near each other, the joints that bring them together get smaller
+amplitudes, and so does a joint beyond its limits, until the motion is free: about the start pose,
+or about another one with more room.
 """
 
 from __future__ import annotations
@@ -35,13 +39,17 @@ REACH = {"rad": 0.8, "m": 0.1}
 VELOCITY_SHARE, EFFORT_SHARE = 0.6, 0.7
 """Shares of the limits of velocity and effort that the motion takes."""
 CLEARANCE = 0.01
-"""Least distance from contact [m]; half of the distance at the center for links that are nearer there."""
+"""Least distance from contact [m]; half of the distance at the center for links that are nearer
+there.
+"""
 _EDGE = 0.1
 _DRAWS = 20
 _ROUNDS = 60
 _SHRINK = 0.7
 _LEAST = 0.04
-"""Number of motions about a center, factor of an amplitude from one to the next, and its least share."""
+"""Number of motions about a center, factor of an amplitude from one to the next, and its least
+share.
+"""
 _ENOUGH = 0.5  # mean share of the amplitudes with which no other center is tried
 _COARSE = 40  # poses that are tested first
 _CHECKS = 400  # poses of a motion that are tested for contact
@@ -60,7 +68,8 @@ def excite(
 ) -> Trajectory:
     """Return setpoints (ticks, dof) that move every joint, from rest to rest at their first row.
 
-    A joint whose effort limit does not overcome its friction and gravity in nearly any pose stays still.
+    A joint whose effort limit does not overcome its friction and gravity in nearly any pose stays
+    still.
 
     Parameters
     ----------
@@ -76,10 +85,13 @@ def excite(
     Raises
     ------
     InvalidArgumentError
-        An argument is out of range, or near every pose the robot touches itself or is too weak: the message names the
-        links or the joint.
+        An argument is out of range, or near every pose the robot touches itself or is too weak: the
+        message names the links or the joint.
     """
-    duration, rate = number("duration", duration, 1.0, 3600.0, "s"), number("rate", rate, 20.0, 10_000.0, "Hz")
+    duration, rate = (
+        number("duration", duration, 1.0, 3600.0, "s"),
+        number("rate", rate, 20.0, 10_000.0, "Hz"),
+    )
     lowest = number("lowest", lowest, 0.01, 50.0, "Hz")
     highest = number("highest", highest, lowest, rate / 10, "Hz, at most a tenth of the rate")
     rng = np.random.default_rng(integer("seed", seed, 0, 2**31 - 1))
@@ -109,13 +121,18 @@ def excite(
     if best is None:
         ((text, _),) = obstacles.most_common(1)
         problem = f"{robot.name!r} has no free motion about any pose that was tried: {text}"
-        remedy = "disable pairs of links that only seem to touch in an .srdf, or correct the effort limit or the masses"
+        remedy = (
+            "disable pairs of links that only seem to touch in an .srdf, or correct the effort"
+            " limit or the masses"
+        )
         raise InvalidArgumentError("robot", problem, remedy=remedy)
     return best[1]
 
 
 class _Obstacle(NamedTuple):
-    """Reason for which a motion is not possible, and the joints that have to move less; none if that does not help."""
+    """Reason for which a motion is not possible, and the joints that have to move less; none if
+    that does not help.
+    """
 
     text: str
     joints: tuple[int, ...] = ()
@@ -127,7 +144,9 @@ def _obstacle(robot: Robot, motion: Trajectory) -> _Obstacle | None:
     outside |= np.abs(motion.velocity) > robot.velocity_limit
     if outside.any():
         joints = np.flatnonzero(outside.any(0)).tolist()
-        return _Obstacle(f"joint {robot.joint_names[joints[0]]!r} exceeds its limits", tuple(joints))
+        return _Obstacle(
+            f"joint {robot.joint_names[joints[0]]!r} exceeds its limits", tuple(joints)
+        )
     rows = np.unique(np.linspace(0, motion.ticks - 1, _CHECKS).astype(int))
     position, velocity = motion.position[rows], motion.velocity[rows]
     effort = motion_effort(robot, position, velocity, motion.acceleration[rows])
@@ -141,11 +160,15 @@ def _obstacle(robot: Robot, motion: Trajectory) -> _Obstacle | None:
 
 
 def _contact(robot: Robot, position: Float64) -> _Obstacle | None:
-    """Return the first pair of links that come too near each other at poses (n, dof), compared with the first one."""
+    """Return the first pair of links that come too near each other at poses (n, dof), compared with
+    the first one.
+    """
     contacts = robot.dynamics().contacts
     allowed = dict[tuple[str, str], float]()
     for first, second, distance in contacts.near(position[0], CLEARANCE):
-        allowed[first, second] = min(max(0.0, 0.5 * distance), allowed.get((first, second), CLEARANCE))
+        allowed[first, second] = min(
+            max(0.0, 0.5 * distance), allowed.get((first, second), CLEARANCE)
+        )
     coarse = np.linspace(0, len(position) - 1, _COARSE).astype(int)
     for row in (*coarse, *range(len(position))):
         for first, second, distance in contacts.near(position[row], CLEARANCE):
@@ -157,7 +180,9 @@ def _contact(robot: Robot, position: Float64) -> _Obstacle | None:
 
 
 def _between(robot: Robot, pair: tuple[str, str]) -> set[int]:
-    """Return the joints, or the leaders of followers, that move two links relative to each other or the ground."""
+    """Return the joints, or the leaders of followers, that move two links relative to each other or
+    the ground.
+    """
     above = {joint.child_link: joint for joint in robot.all_joints}
     chains = []
     for link in pair:
@@ -171,8 +196,13 @@ def _between(robot: Robot, pair: tuple[str, str]) -> set[int]:
 
 
 def _centers(robot: Robot, easy: Float64, rng: np.random.Generator) -> Iterator[Float64]:
-    """Yield candidates for the center, away from joint limits: the start pose, the ``easy`` one, and random ones."""
-    low, high = np.maximum(robot.lower, robot.start - np.pi), np.minimum(robot.upper, robot.start + np.pi)
+    """Yield candidates for the center, away from joint limits: the start pose, the ``easy`` one,
+    and random ones.
+    """
+    low, high = (
+        np.maximum(robot.lower, robot.start - np.pi),
+        np.minimum(robot.upper, robot.start + np.pi),
+    )
     edge = np.minimum(0.4 * (high - low), [REACH[unit] for unit in robot.units])
 
     def inside(pose: Float64, share: float = 1.0) -> Float64:
@@ -186,17 +216,32 @@ def _centers(robot: Robot, easy: Float64, rng: np.random.Generator) -> Iterator[
 
 
 def _chirp(
-    robot: Robot, center: Float64, share: Float64, time: Float64, lowest: float, highest: float, phase: Float64
+    robot: Robot,
+    center: Float64,
+    share: Float64,
+    time: Float64,
+    lowest: float,
+    highest: float,
+    phase: Float64,
 ) -> Trajectory:
-    """Return the chirp about ``center`` with amplitudes of ``share`` (dof,) of the possible ones."""
+    """Return the chirp about ``center`` with amplitudes of ``share`` (dof,) of the possible
+    ones.
+    """
     dt = float(time[0])
     total = float(time[-1])
     dof = robot.dof
     room = np.minimum(robot.upper - center, center - robot.lower) * (1 - _EDGE)
     reach = np.minimum(room, [REACH[unit] for unit in robot.units])
-    velocity = np.minimum(robot.velocity_limit, [FREE_VELOCITY[unit] for unit in robot.units]) * VELOCITY_SHARE
+    velocity = (
+        np.minimum(robot.velocity_limit, [FREE_VELOCITY[unit] for unit in robot.units])
+        * VELOCITY_SHARE
+    )
     still = np.zeros((1, dof))
-    left = robot.design_effort_limit - np.abs(motion_effort(robot, center[None], still, still)[0]) - robot.friction
+    left = (
+        robot.design_effort_limit
+        - np.abs(motion_effort(robot, center[None], still, still)[0])
+        - robot.friction
+    )
     inertia = np.abs(robot.mass_matrix(center)[0]).sum(1)
     acceleration = EFFORT_SHARE * np.maximum(left, 0.05 * robot.design_effort_limit) / inertia
     shift = np.argsort(np.argsort(phase)) / dof  # each joint begins at another point of the sweep

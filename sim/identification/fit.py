@@ -1,10 +1,11 @@
 r"""Fit: nonlinear least squares of simulated against measured positions.
 
-A log of efforts is simulated in windows, each from a free initial state, whose effect is projected out of residuals and
-derivatives (H. G. Bock, "Recent advances in parameter identification techniques for ODE", 1983). A log of setpoints is
-simulated as a whole. Residuals over their size, with the loss of SciPy's "soft_l1" against outliers, and the unknowns'
-distances from the prior are minimised by ``scipy.optimize.least_squares``. All candidates of an evaluation - the
-present point, one change of each unknown and of each initial state - are simulated in one batch.
+A log of efforts is simulated in windows, each from a free initial state, whose effect is projected
+out of residuals and derivatives (H. G. Bock, "Recent advances in parameter identification
+techniques for ODE", 1983). A log of setpoints is simulated as a whole. Residuals over their size,
+with the loss of SciPy's "soft_l1" against outliers, and the unknowns' distances from the prior are
+minimised by ``scipy.optimize.least_squares``. All candidates of an evaluation - the present point,
+one change of each unknown and of each initial state - are simulated in one batch.
 """
 
 from __future__ import annotations
@@ -21,13 +22,21 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.trees import structure
 from batchpid.sim.identification.log import Log
 from batchpid.sim.identification.regression import Motion
-from batchpid.sim.identification.simulator import LogControl, Plant, PlantCandidates, Stretch, simulate
+from batchpid.sim.identification.simulator import (
+    LogControl,
+    Plant,
+    PlantCandidates,
+    Stretch,
+    simulate,
+)
 from batchpid.sim.identification.unknowns import Unknowns
 
 WINDOW = 0.3
 """Length of a window of a log of efforts [s]."""
 SETTLE = 0.3
-"""Time after the start of a log under the PID law in which the initial state is forgotten [s]: it is not fitted."""
+"""Time after the start of a log under the PID law in which the initial state is forgotten [s]: it
+is not fitted.
+"""
 HELD_OUT = 0.25
 """Share of each log, at its end, that is held out."""
 MOST_WINDOWS = 500
@@ -90,18 +99,25 @@ class Problem:
     run: Callable[..., Any] = map
     """Map over the logs: ``map``, or ``Pool.map`` of worker processes."""
 
-    def evaluate(self, point: Float64, steps: Float64 | None = None, free_states: bool = True) -> FitResiduals:
-        """Return residuals at a point (unknowns,), and derivatives by ``steps`` (unknowns,); None: no derivatives.
+    def evaluate(
+        self, point: Float64, steps: Float64 | None = None, free_states: bool = True
+    ) -> FitResiduals:
+        """Return residuals at a point (unknowns,), and derivatives by ``steps`` (unknowns,); None:
+        no derivatives.
 
         Initial states of windows are projected out if they are free.
         """
         joints = self.windows[0].measured.shape[1]
         changes = np.zeros((0, len(point))) if steps is None else np.diag(steps)
-        shifts = np.zeros((2 * joints if free_states and self.drives[0].params is None else 0, 2, joints))
+        shifts = np.zeros(
+            (2 * joints if free_states and self.drives[0].params is None else 0, 2, joints)
+        )
         for number in range(len(shifts)):
             side = number // joints
             shifts[number, side, number % joints] = STATE_STEPS[side]
-        points = np.concatenate([point[None], point + changes, np.repeat(point[None], len(shifts), axis=0)])
+        points = np.concatenate(
+            [point[None], point + changes, np.repeat(point[None], len(shifts), axis=0)]
+        )
         states = np.concatenate([np.zeros((1 + len(changes), 2, joints)), shifts])
         candidates = self.unknowns.candidates(self.unknowns.values(points))
         groups = self._groups(len(points))
@@ -109,11 +125,15 @@ class Problem:
         tables = [table for group in self.run(_simulated, tasks) for table in group]
         residuals: list[Any] = [None] * len(self.windows)
         slopes: list[Any] = [None] * len(self.windows)
-        for number, table in zip([number for group in groups for number in group], tables, strict=True):
+        for number, table in zip(
+            [number for group in groups for number in group], tables, strict=True
+        ):
             errors = np.clip(self.windows[number].measured - table, -FARTHEST, FARTHEST)
             residual, change = errors[0], np.moveaxis(errors[1:] - errors[0], 0, 2)
             slope = change[..., : len(changes)] / (1.0 if steps is None else steps)
-            residuals[number], slopes[number] = _projected(residual, slope, change[..., len(changes) :])
+            residuals[number], slopes[number] = _projected(
+                residual, slope, change[..., len(changes) :]
+            )
         return FitResiduals(residuals, slopes)
 
     def _task(self, group: list[int], candidates: PlantCandidates, states: Float64) -> Any:
@@ -132,12 +152,20 @@ class Problem:
         for number, (log, *_) in enumerate(self.windows):
             alike[id(self.plants[log]), structure(self.drives[log].params)].append(number)
         many = max(1, ENVS // candidates)
-        return [group[at : at + many] for group in alike.values() for at in range(0, len(group), many)]
+        return [
+            group[at : at + many] for group in alike.values() for at in range(0, len(group), many)
+        ]
 
     def solve(
-        self, start: Float64, evaluations: int, size: Float64 | None = None, progress: Callable[[], Any] | None = None
+        self,
+        start: Float64,
+        evaluations: int,
+        size: Float64 | None = None,
+        progress: Callable[[], Any] | None = None,
     ) -> Solution:
-        """Return the fit from a point ``start``, with residuals of a ``size`` (joints,), or that at the start."""
+        """Return the fit from a point ``start``, with residuals of a ``size`` (joints,), or that at
+        the start.
+        """
         from scipy.optimize import least_squares
 
         first = self.evaluate(start, np.full(len(start), STEP))
@@ -168,8 +196,12 @@ class Problem:
         evaluation = at(optimum.x)[0]
         return Solution(optimum.x, evaluation, self.size(evaluation), optimum.status > 0)
 
-    def system(self, evaluation: FitResiduals, point: Float64, size: Float64) -> tuple[Float64, Float64]:
-        """Return residuals and derivatives (n, unknowns) of the fitted rows over their ``size``, then of the prior."""
+    def system(
+        self, evaluation: FitResiduals, point: Float64, size: Float64
+    ) -> tuple[Float64, Float64]:
+        """Return residuals and derivatives (n, unknowns) of the fitted rows over their ``size``,
+        then of the prior.
+        """
         rows = sum(int(window.fitted.sum()) for window in self.windows)
         every = 1 + rows * len(size) * len(point) // MOST_NUMBERS
         residuals, slopes = list[Float64](), list[Float64]()
@@ -181,15 +213,26 @@ class Problem:
         return np.concatenate(residuals), np.concatenate(slopes)
 
     def size(self, evaluation: FitResiduals) -> Float64:
-        """Return the size of fitted residuals (joints,): the root mean square, the largest tenth of each joint cut."""
-        rows = [residual[window.fitted] for window, residual in zip(self.windows, evaluation.residuals, strict=True)]
+        """Return the size of fitted residuals (joints,): the root mean square, the largest tenth of
+        each joint cut.
+        """
+        rows = [
+            residual[window.fitted]
+            for window, residual in zip(self.windows, evaluation.residuals, strict=True)
+        ]
         errors = np.abs(np.concatenate(rows))
         return np.sqrt((np.minimum(errors, np.quantile(errors, 0.9, axis=0)) ** 2).mean(0)) + 1e-9
 
-    def error(self, point: Float64, mask: Callable[[Window], Any], free_states: bool = True) -> Float64:
-        """Return the root mean square (joints,) of the position error at the rows of each window that ``mask`` has."""
+    def error(
+        self, point: Float64, mask: Callable[[Window], Any], free_states: bool = True
+    ) -> Float64:
+        """Return the root mean square (joints,) of the position error at the rows of each window
+        that ``mask`` has.
+        """
         residuals = self.evaluate(point, None, free_states).residuals
-        rows = [residual[mask(window)] for window, residual in zip(self.windows, residuals, strict=True)]
+        rows = [
+            residual[mask(window)] for window, residual in zip(self.windows, residuals, strict=True)
+        ]
         return np.sqrt((np.concatenate(rows) ** 2).mean(0))
 
 
@@ -203,7 +246,9 @@ def _stacked(parts: Any) -> Any:
 
 
 def _projected(residual: Float64, slope: Float64, basis: Float64) -> tuple[Float64, Float64]:
-    """Return residual (rows, joints) and ``slope`` (rows, joints, n) without what ``basis`` explains."""
+    """Return residual (rows, joints) and ``slope`` (rows, joints, n) without what ``basis``
+    explains.
+    """
     if not basis.shape[2]:
         return residual, slope
     flat = basis.reshape(-1, basis.shape[2])
@@ -214,7 +259,9 @@ def _projected(residual: Float64, slope: Float64, basis: Float64) -> tuple[Float
 
 
 def windows_of(number: int, log: Log, motion: Motion, timestep: float, whole: bool) -> list[Window]:
-    """Return the windows of a log; one for ``whole``. A window begins where the held-out part begins."""
+    """Return the windows of a log; one for ``whole``. A window begins where the held-out part
+    begins.
+    """
     total = len(motion.qpos) - 1
     share = {None: 1 - HELD_OUT, False: np.inf, True: -1.0}[log.settings.held_out]
     if whole:
@@ -225,11 +272,21 @@ def windows_of(number: int, log: Log, motion: Motion, timestep: float, whole: bo
     first = max(split + 1, edge)
     length = min(round(WINDOW / timestep), max(total - first, split - edge))
     starts = [*range(edge, split - length + 1, length), *range(first, total - length + 1, length)]
-    return [_window(number, log, motion, timestep, start, start + length, 0.0, share) for start in starts]
+    return [
+        _window(number, log, motion, timestep, start, start + length, 0.0, share)
+        for start in starts
+    ]
 
 
 def _window(
-    number: int, log: Log, motion: Motion, dt: float, first: int, last: int, settle: float, share: float
+    number: int,
+    log: Log,
+    motion: Motion,
+    dt: float,
+    first: int,
+    last: int,
+    settle: float,
+    share: float,
 ) -> Window:
     """Return the window from sim step ``first`` to ``last`` of the log's grid."""
     at = (log.time - log.time[0]) / dt
@@ -246,7 +303,9 @@ def _window(
 
 
 def _start(log: Log) -> tuple[Float64, Float64]:
-    """Return position and velocity at the start of a log: a line through its first 30 ms; small speeds are rest."""
+    """Return position and velocity at the start of a log: a line through its first 30 ms; small
+    speeds are rest.
+    """
     count = max(4, int((log.time <= log.time[0] + 0.03).sum()))
     slope, place = np.polyfit(log.time[:count] - log.time[0], log.qpos[:count], 1)
     speed = np.abs(np.diff(log.qpos, axis=0) / np.diff(log.time)[:, None])

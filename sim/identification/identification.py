@@ -22,7 +22,14 @@ from batchpid.sim.identification.fit import MOST_WINDOWS, Problem, windows_of
 from batchpid.sim.identification.intervals import intervals_of
 from batchpid.sim.identification.log import Log, LogWarning, checked
 from batchpid.sim.identification.logs import Reading, read_logs
-from batchpid.sim.identification.regression import STRENGTHS, Guess, Motion, Regression, better_reading, smooth
+from batchpid.sim.identification.regression import (
+    STRENGTHS,
+    Guess,
+    Motion,
+    Regression,
+    better_reading,
+    smooth,
+)
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.identification.simulator import LogControl, Plant
 from batchpid.sim.identification.unknowns import BASIC, EXTRAS, LAW, Unknowns
@@ -37,7 +44,9 @@ SHARE, SHAKEN = 0.01, 1.5
 BEYOND = 3.0
 """Effort over the robot's limit from which it looks like another unit."""
 FOLLOWS = 0.02
-"""Ratio of the standard deviation of positions to the setpoints', up to which a joint counts as stuck."""
+"""Ratio of the standard deviation of positions to the setpoints', up to which a joint counts as
+stuck.
+"""
 
 
 class Data(NamedTuple):
@@ -73,21 +82,24 @@ def identify(
     Parameters
     ----------
     logs
-        Files (:mod:`batchpid.sim.identification.logs`), or logs from :func:`read_logs`, each with separate settings.
+        Files (:mod:`batchpid.sim.identification.logs`), or logs from :func:`read_logs`, each with
+        separate settings.
     params
-        Params of the PID law that drove the robot, of all its joints or of those in the logs: the setpoints of the logs
-        are used. None: the params of a recording, or the logged efforts.
+        Params of the PID law that drove the robot, of all its joints or of those in the logs: the
+        setpoints of the logs are used. None: the params of a recording, or the logged efforts.
     compensate
-        Forces that the robot compensates by itself, or "none", as for logs of the complete efforts. Default: as the
-        recordings say, else "gravity+coriolis+friction".
+        Forces that the robot compensates by itself, or "none", as for logs of the complete efforts.
+        Default: as the recordings say, else "gravity+coriolis+friction".
     timestep
-        Time step of the control that drove the robot [s]. Default: as the recordings say, else 1/2000.
+        Time step of the control that drove the robot [s]. Default: as the recordings say, else
+        1/2000.
     payload
         Find a payload at the tool, too.
     extras
-        Further unknowns: "load_friction", "stribeck" (friction at rest and the speed at which it has fallen), "offset"
-        (of the encoder), "mass" (factors of the links' masses); and of the law, for logs of setpoints, "saturation"
-        (its effort limit), "slew" (the limit of the setpoints' rate), "kd", and "gain", a factor of all gains.
+        Further unknowns: "load_friction", "stribeck" (friction at rest and the speed at which it
+        has fallen), "offset" (of the encoder), "mass" (factors of the links' masses); and of the
+        law, for logs of setpoints, "saturation" (its effort limit), "slew" (the limit of the
+        setpoints' rate), "kd", and "gain", a factor of all gains.
     reading
         Units and names in the files.
     evaluations
@@ -115,7 +127,9 @@ def identify(
     guess = _guess(data)
     # An effect of the law, which the regression does not have, may look like another reading.
     if {*LAW}.isdisjoint(extras) and _is_odd(data, guess) and (words := _better_reading(data)):
-        raise InvalidArgumentError("logs", f"make sense with {words}", remedy="correct the log or its options")
+        raise InvalidArgumentError(
+            "logs", f"make sense with {words}", remedy="correct the log or its options"
+        )
     unknowns = _unknowns(data, guess, [*extras], flag("payload", payload))
     pool: Any = nullcontext()
     if integer("workers", workers, 0, 1000) > 1:
@@ -125,7 +139,9 @@ def identify(
         problem = Problem(data.plants, data.drives, _windows(data), unknowns, run)
         found = _fitted(data, problem, integer("evaluations", evaluations, 2, 1000), progress)
     if not found.explains and (words := _better_reading(data)):
-        return replace(found, advice=f"the logs make more sense with {words}: correct the log or its options")
+        return replace(
+            found, advice=f"the logs make more sense with {words}: correct the log or its options"
+        )
     return found
 
 
@@ -147,12 +163,18 @@ def _read(
         if isinstance(source, Log):
             read += checked(source.settings.robot or robot, source)
         else:
-            read += read_logs(robot, [source], None if params is None else "setpoint", reading=reading)
+            read += read_logs(
+                robot, [source], None if params is None else "setpoint", reading=reading
+            )
     if not read:
         raise InvalidArgumentError("logs", "are missing", remedy="name one file or more")
     if params is not None:
-        params = _of_joints(instance("params", params, bp.PIDParams, "load them with load_params()"), robot, read[0])
-    forces = str(_recorded("compensate", compensate, read, "gravity+coriolis+friction")).removesuffix("+friction")
+        params = _of_joints(
+            instance("params", params, bp.PIDParams, "load them with load_params()"), robot, read[0]
+        )
+    forces = str(
+        _recorded("compensate", compensate, read, "gravity+coriolis+friction")
+    ).removesuffix("+friction")
     choice("compensate", forces, ("gravity+coriolis", "gravity", "none"))
     dt = number("timestep", _recorded("timestep", timestep, read, 1 / 2000), 1e-5, 0.01, "seconds")
     laws = [_law(robot, log, params) for log in read]
@@ -165,23 +187,37 @@ def _read(
             raise InvalidArgumentError(log.source, f"holds {log.kind}s", remedy=remedy)
         if law is not None and law.gain_units is not None:
             problem = "have gains per inertia or mass matrix, which a fit does not simulate"
-            raise InvalidArgumentError("params", problem, remedy="log the efforts, and give no params")
+            raise InvalidArgumentError(
+                "params", problem, remedy="log the efforts, and give no params"
+            )
     if all(log.settings.held_out for log in read):
-        raise InvalidArgumentError("logs", "are all held out", remedy="set held_out of some of them")
+        raise InvalidArgumentError(
+            "logs", "are all held out", remedy="set held_out of some of them"
+        )
     moves = _moves(robot, read)
-    still = [robot.joint_names[joint] for joint, moving in zip(read[0].joints, moves, strict=True) if not moving]
+    still = [
+        robot.joint_names[joint]
+        for joint, moving in zip(read[0].joints, moves, strict=True)
+        if not moving
+    ]
     start = robot.start
     places = np.concatenate([log.qpos for log in read]).mean(0)
     start[np.array(read[0].joints)[~moves]] = places[~moves]
     parts = [log.part(joints=moves) for log in read]
     resting = _resting(robot, start) if still else robot
-    robots = [resting if log.settings.robot is None else _resting(log.settings.robot, start) for log in parts]
+    robots = [
+        resting if log.settings.robot is None else _resting(log.settings.robot, start)
+        for log in parts
+    ]
     plants = dict[Any, Plant]()
     for log, at_rest in zip(parts, robots, strict=True):
         plants.setdefault(
-            (id(log.settings.robot), log.settings.payload), Plant(at_rest, log.joints, log.settings.payload)
+            (id(log.settings.robot), log.settings.payload),
+            Plant(at_rest, log.joints, log.settings.payload),
         )
-    drives = [LogControl(dt, None if law is None else law.for_joints(moves), forces) for law in laws]
+    drives = [
+        LogControl(dt, None if law is None else law.for_joints(moves), forces) for law in laws
+    ]
     chosen = [plants[id(log.settings.robot), log.settings.payload] for log in parts]
     return Data(resting, parts, [smooth(log, dt) for log in parts], chosen, drives, still)
 
@@ -192,27 +228,40 @@ def _resting(robot: Robot, start: Float64) -> Robot:
 
 
 def _law(robot: Robot, log: Log, params: bp.PIDParams | None) -> bp.PIDParams | None:
-    """Return the params that drove a log; raise InvalidArgumentError if a recording contradicts them."""
+    """Return the params that drove a log; raise InvalidArgumentError if a recording contradicts
+    them.
+    """
     chosen = params if log.settings.params is None else log.settings.params
-    recorded, law = (None if one is None else _of_joints(one, robot, log) for one in (log.params, chosen))
+    recorded, law = (
+        None if one is None else _of_joints(one, robot, log) for one in (log.params, chosen)
+    )
     if recorded is None or law is None:
         return recorded if law is None else law
     for name in ("kp", "ki", "kd"):
-        before, now = (0.0 if gain is None else gain for gain in (getattr(recorded, name), getattr(law, name)))
+        before, now = (
+            0.0 if gain is None else gain for gain in (getattr(recorded, name), getattr(law, name))
+        )
         if not np.allclose(before, now, rtol=1e-6):
             problem = f"contradict {log.source}, which was recorded with another {name}"
-            raise InvalidArgumentError("params", problem, remedy="leave them out: a recording has its own")
+            raise InvalidArgumentError(
+                "params", problem, remedy="leave them out: a recording has its own"
+            )
     return law
 
 
 def _of_joints(params: bp.PIDParams, robot: Robot, log: Log) -> bp.PIDParams:
     """Return the params of the joints of a log, one row."""
     if params.num_envs != 1:
-        raise InvalidArgumentError("params", f"hold {params.num_envs} envs", remedy="give those of the logged robot")
+        raise InvalidArgumentError(
+            "params", f"hold {params.num_envs} envs", remedy="give those of the logged robot"
+        )
     if params.num_joints == len(log.joints):
         return params
     if params.num_joints != robot.dof:
-        problem = f"hold {params.num_joints} joints; the robot has {robot.dof}, the logs {len(log.joints)}"
+        problem = (
+            f"hold {params.num_joints} joints; the robot has {robot.dof}, the logs"
+            f" {len(log.joints)}"
+        )
         raise InvalidArgumentError("params", problem, remedy="give one gain per joint of the robot")
     return params.for_joints(list(log.joints))
 
@@ -232,9 +281,13 @@ def _recorded(name: str, value: Any, logs: list[Log], default: Any) -> Any:
 
 
 def _moves(robot: Robot, logs: list[Log]) -> Any:
-    """Return the mask (joints,) of the joints that moved; warn about the others, which are jammed or not driven."""
+    """Return the mask (joints,) of the joints that moved; warn about the others, which are jammed
+    or not driven.
+    """
     joints, qpos = logs[0].joints, np.concatenate([log.qpos for log in logs])
-    noise = np.sqrt(np.mean(np.concatenate([np.diff(log.qpos, axis=0) for log in logs]) ** 2, axis=0) / 2)
+    noise = np.sqrt(
+        np.mean(np.concatenate([np.diff(log.qpos, axis=0) for log in logs]) ** 2, axis=0) / 2
+    )
     spread = qpos.std(0)
     least = np.clip(SHARE * spread.max(), 1e-9, [STILL[robot.units[joint]] for joint in joints])
     moves = spread > np.maximum(least, SHAKEN * noise)
@@ -244,13 +297,24 @@ def _moves(robot: Robot, logs: list[Log]) -> Any:
         if degrees.any():
             name = robot.joint_names[joints[int(np.argmax(degrees))]]
             problem = f"have setpoints of joint {name!r} that move 57 times as far as its positions"
-            raise InvalidArgumentError("logs", problem, remedy="setpoints look like degrees: give both in rad")
+            raise InvalidArgumentError(
+                "logs", problem, remedy="setpoints look like degrees: give both in rad"
+            )
         moves &= spread > FOLLOWS * commanded
-    names = ", ".join(repr(robot.joint_names[joint]) for joint, moving in zip(joints, moves, strict=True) if not moving)
+    names = ", ".join(
+        repr(robot.joint_names[joint])
+        for joint, moving in zip(joints, moves, strict=True)
+        if not moving
+    )
     if not moves.any():
-        raise InvalidArgumentError("logs", f"show no motion of any joint ({names})", remedy="record a motion")
+        raise InvalidArgumentError(
+            "logs", f"show no motion of any joint ({names})", remedy="record a motion"
+        )
     if names:
-        warn(f"{names} did not move, or did not follow its setpoint: left out, and held in place", LogWarning)
+        warn(
+            f"{names} did not move, or did not follow its setpoint: left out, and held in place",
+            LogWarning,
+        )
     return moves
 
 
@@ -260,7 +324,10 @@ def _guess(data: Data) -> Guess:
     guesses = []
     for through in (True, False) if data.drives[0].compensate != "none" else (True,):
         drives = [drive._replace(through=through) for drive in data.drives]
-        parts = zip(*[(data.plants[at], drives[at], data.logs[at], data.motions[at]) for at in fitted], strict=True)
+        parts = zip(
+            *[(data.plants[at], drives[at], data.logs[at], data.motions[at]) for at in fitted],
+            strict=True,
+        )
         guess = Regression(*parts).best()
         guesses.append((guess.cost - (0.1 if through else 0.0), drives, guess))
     _, data.drives[:], best = min(guesses, key=lambda option: option[0])
@@ -268,7 +335,9 @@ def _guess(data: Data) -> Guess:
 
 
 def _is_odd(data: Data, guess: Guess) -> bool:
-    """Return whether a strength is at its bound, or efforts are far beyond the limits of the robot."""
+    """Return whether a strength is at its bound, or efforts are far beyond the limits of the
+    robot.
+    """
     if data.logs[0].kind == "effort":
         most = np.quantile(np.abs(np.concatenate([log.command for log in data.logs])), 0.99, axis=0)
         limits = data.robot.effort_limit[list(data.logs[0].joints)]
@@ -287,19 +356,25 @@ def _unknowns(data: Data, guess: Guess, extras: list[str], payload: bool) -> Unk
     first = data.logs[0]
     if first.kind == "effort" and (of_law := [name for name in extras if name in LAW]):
         remedy = "leave it out, or give the params of the law"
-        raise InvalidArgumentError("extras", "is of a law, and the logs hold efforts", value=of_law[0], remedy=remedy)
+        raise InvalidArgumentError(
+            "extras", "is of a law, and the logs hold efforts", value=of_law[0], remedy=remedy
+        )
     kinds = [kind for kind in BASIC if not (kind == "delay" and first.measured)]
     kinds = [kind for kind in kinds if not (kind == "strength" and "gain" in extras)]
     kinds += ["setpoint_delay"] * (first.kind == "setpoint") + ["payload"] * payload
     kinds += [kind for name in extras for kind in EXTRAS[name]]
-    qpos, qvel, qacc = (np.concatenate([motion[part] for motion in data.motions]) for part in range(3))
+    qpos, qvel, qacc = (
+        np.concatenate([motion[part] for motion in data.motions]) for part in range(3)
+    )
     poses = np.ascontiguousarray(qpos[:: max(1, len(qpos) // 200)])
     dynamics = data.plants[0].dynamics([()] * len(poses), poses, np.zeros_like(poses))
     dynamics.update()
     links = np.diagonal(dynamics.matrix, axis1=1, axis2=2).mean(0)
     speed = np.maximum(np.sqrt((qvel**2).mean(0)), 1e-3)
     inertia = links + guess.values["armature"]
-    effort = np.maximum(inertia * np.sqrt((qacc**2).mean(0)) + guess.values["friction"], 0.1 * inertia)
+    effort = np.maximum(
+        inertia * np.sqrt((qacc**2).mean(0)) + guess.values["friction"], 0.1 * inertia
+    )
     sizes = {"inertia": links, "damping": effort / speed, "effort": effort, "speed": 0.1 * speed}
     sizes |= {"friction": 0.3 * np.maximum(guess.values["friction"], 0.05 * effort)}
     sizes |= {"top_speed": np.quantile(np.abs(qvel), 0.99, axis=0)}
@@ -322,7 +397,9 @@ def _windows(data: Data) -> list[Any]:
     return windows[:: 1 + len(windows) // MOST_WINDOWS]
 
 
-def _fitted(data: Data, problem: Problem, evaluations: int, progress: Callable[[], Any] | None) -> Identification:
+def _fitted(
+    data: Data, problem: Problem, evaluations: int, progress: Callable[[], Any] | None
+) -> Identification:
     """Return the fit: first of all unknowns, then of those that the logs show."""
     fitted = replace(problem, windows=[window for window in problem.windows if window.fitted.any()])
     rough = fitted.solve(problem.unknowns.start, max(evaluations // 4, 1), progress=progress)

@@ -1,7 +1,7 @@
 """Log of a robot in motion, and the checks that every log passes once.
 
-A log is divided where its times have a gap, because the commands within it are unknown. Positions and setpoints of
-revolute joints that were logged modulo 2 pi become continuous.
+A log is divided where its times have a gap, because the commands within it are unknown. Positions
+and setpoints of revolute joints that were logged modulo 2 pi become continuous.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ MIN_ROWS, MIN_SECONDS = 50, 0.2
 GAP, PERIODS = 0.1, 5.0
 """Least length of a gap, in seconds and in median periods of the rows; the longer one applies."""
 CLEAR = np.pi / 2
-"""Largest change from row to row, apart from whole turns, at which the number of turns is certain [rad]."""
+"""Largest change from row to row, apart from whole turns, at which the number of turns is certain
+[rad].
+"""
 
 
 class LogWarning(UserWarning):
@@ -90,7 +92,9 @@ class Log:
         """Length [s]."""
         return float(self.time[-1] - self.time[0])
 
-    def part(self, rows: Any = slice(None), commands: Any = slice(None), joints: Any = slice(None)) -> Log:
+    def part(
+        self, rows: Any = slice(None), commands: Any = slice(None), joints: Any = slice(None)
+    ) -> Log:
         """Return the log of some rows, commands and joints: slices or masks."""
         forward = self.feedforward
         return replace(
@@ -104,7 +108,8 @@ class Log:
         )
 
     def commands_at(self, time: Float64, table: Float64 | None = None) -> Float64:
-        """Return the commands that act at ``time`` (n,), as (n, joints); the first one also acts before its time.
+        """Return the commands that act at ``time`` (n,), as (n, joints); the first one also acts
+        before its time.
 
         ``table`` takes the place of the commands, such as the feedforward.
         """
@@ -116,7 +121,9 @@ class Log:
 
 
 def interpolated(time: Float64, known: Rows, table: Rows) -> Float64:
-    """Return the rows (n, columns) at ``time`` (n,) of a table whose rows are for the times ``known``."""
+    """Return the rows (n, columns) at ``time`` (n,) of a table whose rows are for the times
+    ``known``.
+    """
     return np.stack([np.interp(time, known, column) for column in table.T], axis=1)
 
 
@@ -128,11 +135,16 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
     Raises
     ------
     InvalidArgumentError
-        A value is not finite, times decrease, there are too few rows, or positions are in another unit.
+        A value is not finite, times decrease, there are too few rows, or positions are in another
+        unit.
     """
     if log.is_checked:
         return [log]
-    places = [f"row {index + 1}" for index in range(len(log.time))] if lines is None else [f"line {n}" for n in lines]
+    places = (
+        [f"row {index + 1}" for index in range(len(log.time))]
+        if lines is None
+        else [f"line {n}" for n in lines]
+    )
     _check_finite(robot, log, places)
     if (log.time[1:] < log.time[:-1]).any():
         index = int(np.argmax(log.time[1:] < log.time[:-1])) + 1
@@ -140,17 +152,31 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
     repeated = np.append(False, log.time[1:] == log.time[:-1])
     if repeated.any():
         first = places[int(np.argmax(repeated))]
-        warn(f"{log.source}: {repeated.sum()} rows repeat a time, the first at {first}: left out", LogWarning)
+        warn(
+            f"{log.source}: {repeated.sum()} rows repeat a time, the first at {first}: left out",
+            LogWarning,
+        )
         places = [place for place, again in zip(places, repeated, strict=True) if not again]
-        log = log.part(~repeated, ~repeated if len(log.command_time) == len(repeated) else slice(None))
+        log = log.part(
+            ~repeated, ~repeated if len(log.command_time) == len(repeated) else slice(None)
+        )
     need = f"{MIN_ROWS} rows and {MIN_SECONDS} s"
     if len(log.time) < MIN_ROWS or log.seconds < MIN_SECONDS:
         problem = f"has {len(log.time)} rows of {log.seconds:.3g} s"
-        raise error(log.source, problem, f"record {need} at least; time is in seconds, or the column is time_ms")
+        raise error(
+            log.source,
+            problem,
+            f"record {need} at least; time is in seconds, or the column is time_ms",
+        )
     period = float(np.median(np.diff(log.time)))
     if period > 0.05:
-        remedy = "record at 100 Hz or more; time is in seconds, or the column is time_ms, time_us or time_ns"
-        raise error(log.source, f"has one row per {period:.3g} s, too few to see friction and delay", remedy)
+        remedy = (
+            "record at 100 Hz or more; time is in seconds, or the column is time_ms, time_us or"
+            " time_ns"
+        )
+        raise error(
+            log.source, f"has one row per {period:.3g} s, too few to see friction and delay", remedy
+        )
     gap = max(GAP, PERIODS * period)
     ends = [0, *(np.flatnonzero(np.diff(log.time) > gap) + 1).tolist(), len(log.time)]
     parts, short = list[Log](), list[str]()
@@ -161,9 +187,16 @@ def checked(robot: Robot, log: Log, lines: Sequence[int] | None = None) -> list[
         part = log if len(ends) == 2 else _between(log, slice(begin, end), places)
         parts.append(replace(_unwrapped(robot, part, places[begin:end]), is_checked=True))
     if not parts:
-        raise error(log.source, f"has gaps of more than {gap:.3g} s in time", f"a stretch between gaps needs {need}")
+        raise error(
+            log.source,
+            f"has gaps of more than {gap:.3g} s in time",
+            f"a stretch between gaps needs {need}",
+        )
     if short:
-        warn(f"{log.source}: stretches between gaps in time are too short, left out: {short[0]} ...", LogWarning)
+        warn(
+            f"{log.source}: stretches between gaps in time are too short, left out: {short[0]} ...",
+            LogWarning,
+        )
     return parts
 
 
@@ -177,12 +210,19 @@ def _between(log: Log, rows: slice, places: list[str]) -> Log:
 
 
 def _check_finite(robot: Robot, log: Log, places: list[str]) -> None:
-    tables = {"time": log.time[:, None], "qpos": log.qpos, log.kind: log.command, "feedforward": log.feedforward}
+    tables = {
+        "time": log.time[:, None],
+        "qpos": log.qpos,
+        log.kind: log.command,
+        "feedforward": log.feedforward,
+    }
     for quantity, table in tables.items():
         if table is None or np.isfinite(table).all():
             continue
         index, joint = (int(n) for n in np.argwhere(~np.isfinite(table))[0])
-        column = "time" if quantity == "time" else f"{quantity}:{robot.joint_names[log.joints[joint]]}"
+        column = (
+            "time" if quantity == "time" else f"{quantity}:{robot.joint_names[log.joints[joint]]}"
+        )
         raise error(
             log.source,
             f"{places[min(index, len(places) - 1)]}, column {column!r} is empty or not finite",
@@ -191,7 +231,9 @@ def _check_finite(robot: Robot, log: Log, places: list[str]) -> None:
 
 
 def _unwrapped(robot: Robot, log: Log, places: list[str]) -> Log:
-    """Return ``log``, without gaps, with continuous positions, and setpoints on the turns closest to them."""
+    """Return ``log``, without gaps, with continuous positions, and setpoints on the turns closest
+    to them.
+    """
     qpos = log.qpos.copy()
     command = log.command.copy()
     wrapped = list[str]()
@@ -217,17 +259,34 @@ def _unwrapped(robot: Robot, log: Log, places: list[str]) -> Log:
             command[:, number] -= TURN * np.rint((command[:, number] - measured) / TURN)
     limited = [name for name in wrapped if not robot.continuous[robot.joint_names.index(name)]]
     if limited:
-        problem = f"{log.source}: the positions of {', '.join(limited)} jump by whole turns, and were unwrapped"
+        problem = (
+            f"{log.source}: the positions of {', '.join(limited)} jump by whole turns, and were"
+            " unwrapped"
+        )
         warn(f"{problem}; in the robot's file the type is not continuous: correct it", LogWarning)
     return replace(log, qpos=qpos, command=command)
 
 
 def _check_unit(robot: Robot, log: Log, joint: int, column: Float64, places: list[str]) -> None:
-    """Raise InvalidArgumentError for positions that are not in the joint's unit, or far beyond its limits."""
-    name, unit, (low, high) = robot.joint_names[joint], robot.units[joint], (robot.lower[joint], robot.upper[joint])
+    """Raise InvalidArgumentError for positions that are not in the joint's unit, or far beyond its
+    limits.
+    """
+    name, unit, (low, high) = (
+        robot.joint_names[joint],
+        robot.units[joint],
+        (robot.lower[joint], robot.upper[joint]),
+    )
     remedy = f"positions are in {unit}; degrees need the option degrees (--degrees)"
     beyond = (column < low - BEYOND[unit]) | (column > high + BEYOND[unit])
     if beyond.any() and not robot.continuous[joint]:
         index = int(np.argmax(beyond))
-        problem = f"{places[index]}, column 'qpos:{name}' is far beyond the joint's limits, {low:g} to {high:g}"
-        raise error(log.source, problem, f"{remedy}; a joint that turns freely is of type continuous", column[index])
+        problem = (
+            f"{places[index]}, column 'qpos:{name}' is far beyond the joint's limits, {low:g} to"
+            f" {high:g}"
+        )
+        raise error(
+            log.source,
+            problem,
+            f"{remedy}; a joint that turns freely is of type continuous",
+            column[index],
+        )

@@ -1,9 +1,11 @@
-"""Logs from files: CSV and HDF5 with a column for each quantity and joint, recordings of a runner, and ROS bags.
+"""Logs from files: CSV and HDF5 with a column for each quantity and joint, recordings of a runner,
+and ROS bags.
 
-Columns are ``time`` [s] (or ``time_ms``, ``time_us``, ``time_ns``), ``qpos:JOINT``, and ``setpoint:JOINT``,
-``effort:JOINT`` or ``measured_effort:JOINT``, optionally ``feedforward:JOINT``; others are ignored. A bag is a bag of
-ROS 1 or ROS 2 or an MCAP file with messages ``sensor_msgs/JointState``, which hold values of joints by name, in any
-order. In the topic of measurements efforts are measured efforts. In the topic of commands positions are setpoints, and
+Columns are ``time`` [s] (or ``time_ms``, ``time_us``, ``time_ns``), ``qpos:JOINT``, and
+``setpoint:JOINT``, ``effort:JOINT`` or ``measured_effort:JOINT``, optionally ``feedforward:JOINT``;
+others are ignored. A bag is a bag of ROS 1 or ROS 2 or an MCAP file with messages
+``sensor_msgs/JointState``, which hold values of joints by name, in any order. In the topic of
+measurements efforts are measured efforts. In the topic of commands positions are setpoints, and
 efforts are commanded efforts.
 """
 
@@ -65,7 +67,8 @@ def read_logs(
     Parameters
     ----------
     kind
-        Command to read where a file has both: "setpoint" or "effort"; default the one that it has, else "effort".
+        Command to read where a file has both: "setpoint" or "effort"; default the one that it has,
+        else "effort".
     reading
         Units and names in the files; default SI units and the robot's names.
 
@@ -105,7 +108,8 @@ def _read(robot: Robot, path: Path, kind: CommandKind | None, reading: Reading) 
 def logs_of_rollout(
     robot: Robot, rollout: Rollout, kind: CommandKind | None = None, source: str = "rollout"
 ) -> list[Log]:
-    """Return one log for each env of ``rollout``, whose setpoints are efforts under control "effort".
+    """Return one log for each env of ``rollout``, whose setpoints are efforts under control
+    "effort".
 
     Raises InvalidArgumentError if the simulation of a fit lacks an effect of the run.
     """
@@ -126,12 +130,18 @@ def logs_of_rollout(
     }
     for problem, holds in obstacles.items():
         if holds:
-            raise error(source, f"{problem}, which a fit cannot use", "record another run under control pid or effort")
+            raise error(
+                source,
+                f"{problem}, which a fit cannot use",
+                "record another run under control pid or effort",
+            )
     joints = tuple(np.flatnonzero(robot.independent).tolist())
     forwards = rollout.feedforward
     logs = []
     for env in range(rollout.num_envs):
-        setpoint, qpos = (np.asarray(table, float)[:, env, joints] for table in (rollout.setpoint, rollout.qpos))
+        setpoint, qpos = (
+            np.asarray(table, float)[:, env, joints] for table in (rollout.setpoint, rollout.qpos)
+        )
         name = source if rollout.num_envs == 1 else f"{source}, env {env}"
         log = Log(
             name,
@@ -145,18 +155,30 @@ def logs_of_rollout(
             info.timestep,
             info.compensate,
             feedforward=None if forwards is None else np.asarray(forwards, float)[:, env, joints],
-            params=None if info.params is None or recorded == "effort" else info.params.for_envs(slice(env, env + 1)),
+            params=(
+                None
+                if info.params is None or recorded == "effort"
+                else info.params.for_envs(slice(env, env + 1))
+            ),
         )
         logs += checked(robot, log)
     return logs
 
 
-def _build(robot: Robot, source: str, columns: dict[str, Float64], kind: CommandKind | None, reading: Reading) -> Log:
+def _build(
+    robot: Robot,
+    source: str,
+    columns: dict[str, Float64],
+    kind: CommandKind | None,
+    reading: Reading,
+) -> Log:
     """Return the log that the columns of a file hold."""
     times = {name: match[1] for name in columns if (match := _TIME.fullmatch(name))}
     if not times:
         problem = f"has no column 'time', but {', '.join(list(columns)[:6])}"
-        raise error(source, problem, "begin the header with time, in seconds, or time_ms, time_us, time_ns")
+        raise error(
+            source, problem, "begin the header with time, in seconds, or time_ms, time_us, time_ns"
+        )
     name, unit = next(iter(times.items()))
     time = SECONDS[unit] * columns[name]
     by = columns_by_joint(robot, source, columns, QUANTITIES, reading.prefix)
@@ -170,7 +192,11 @@ def _build(robot: Robot, source: str, columns: dict[str, Float64], kind: Command
         remedy = f"commands are needed, e.g. {kind}:{robot.joint_names[0]}"
         raise error(source, f"has no column {kind}:JOINT", remedy)
     if kind == "effort" and by["feedforward"]:
-        raise error(source, "has a feedforward, which efforts include", "give the gains of the law, or leave it out")
+        raise error(
+            source,
+            "has a feedforward, which efforts include",
+            "give the gains of the law, or leave it out",
+        )
     used = ("qpos", kind, *(("feedforward",) if by["feedforward"] else ()))
     names = [name for name, free in zip(robot.joint_names, robot.independent, strict=True) if free]
     names = [name for name in names if any(name in by[quantity] for quantity in used)]
@@ -178,7 +204,10 @@ def _build(robot: Robot, source: str, columns: dict[str, Float64], kind: Command
     for quantity in used:
         for joint in names:
             if joint not in by[quantity]:
-                remedy = "give all columns of a joint or none; a joint that is left out rests at the robot's start pose"
+                remedy = (
+                    "give all columns of a joint or none; a joint that is left out rests at the"
+                    " robot's start pose"
+                )
                 raise error(f"{source}: column {quantity}:{joint}", "is missing", remedy)
         tables[quantity] = np.stack([by[quantity][joint] for joint in names], axis=1)
         if reading.degrees and quantity in ("qpos", "setpoint"):
@@ -201,7 +230,9 @@ def _build(robot: Robot, source: str, columns: dict[str, Float64], kind: Command
 
 
 def _read_hdf5(path: Path) -> dict[str, Float64] | None:
-    """Return the datasets of an HDF5 file by the last part of their names; None for a recording of a runner."""
+    """Return the datasets of an HDF5 file by the last part of their names; None for a recording of
+    a runner.
+    """
     import h5py
 
     datasets = dict[str, Any]()
@@ -215,27 +246,41 @@ def _read_hdf5(path: Path) -> dict[str, Float64] | None:
             if "joint_names" in file.attrs:
                 return None
             file.visititems(note)
-            columns = {name: table for name, table in datasets.items() if table.ndim == 1 and table.dtype.kind in "iuf"}
+            columns = {
+                name: table
+                for name, table in datasets.items()
+                if table.ndim == 1 and table.dtype.kind in "iuf"
+            }
             if not columns:
-                problem = f"has no column 'time' and no qpos:JOINT, but {', '.join(list(datasets)[:6])}"
-                raise error(str(path), problem, "give one dataset of one number per row for each column")
-            return {name.rpartition("/")[2].strip(): np.asarray(table, float) for name, table in columns.items()}
+                problem = (
+                    f"has no column 'time' and no qpos:JOINT, but {', '.join(list(datasets)[:6])}"
+                )
+                raise error(
+                    str(path), problem, "give one dataset of one number per row for each column"
+                )
+            return {
+                name.rpartition("/")[2].strip(): np.asarray(table, float)
+                for name, table in columns.items()
+            }
     except (OSError, RuntimeError) as bad:
         raise RecordingError(f"{path}: cannot be read as a log: {bad}") from bad
 
 
 def _read_bag(robot: Robot, path: Path, reading: Reading) -> dict[str, Float64]:
-    """Return the columns of a bag by name, of the joints of ``robot``, in seconds since the first row.
+    """Return the columns of a bag by name, of the joints of ``robot``, in seconds since the first
+    row.
 
-    Messages are merged by the names of joints: each joint has the samples of all messages that name it. Rows are at the
-    stamps of the joint with most of them, as long as all joints are measured.
+    Messages are merged by the names of joints: each joint has the samples of all messages that name
+    it. Rows are at the stamps of the joint with most of them, as long as all joints are measured.
     """
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingDependencyError("rosbags", "a log in a ROS bag", "tune") from None
-    topics = {reading.topic: _MEASURED} | ({reading.command_topic: _COMMANDED} if reading.command_topic else {})
+    topics = {reading.topic: _MEASURED} | (
+        {reading.command_topic: _COMMANDED} if reading.command_topic else {}
+    )
     samples = {topic: defaultdict[str, list[tuple[int, float]]](list) for topic in topics}
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
@@ -244,19 +289,27 @@ def _read_bag(robot: Robot, path: Path, reading: Reading) -> dict[str, Float64]:
                 for connection in reader.connections
                 if connection.topic in topics and connection.msgtype == JOINT_STATE
             ]
-            present = sorted(connection.topic for connection in reader.connections if connection.msgtype == JOINT_STATE)
+            present = sorted(
+                connection.topic
+                for connection in reader.connections
+                if connection.msgtype == JOINT_STATE
+            )
             for connection, received, raw in reader.messages(connections=chosen) if chosen else ():
                 message: Any = reader.deserialize(raw, connection.msgtype)
                 stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec or received
                 for field, quantity in topics[connection.topic].items():
                     # A driver without such a value leaves the list empty.
                     for joint, value in zip(message.name, getattr(message, field), strict=False):
-                        samples[connection.topic][f"{quantity}:{joint}"].append((stamp, float(value)))
+                        samples[connection.topic][f"{quantity}:{joint}"].append(
+                            (stamp, float(value))
+                        )
     except Exception as bad:  # a damaged file can make the library raise anything
         raise error(str(path), f"cannot be read: {bad}", "correct or record it again") from None
     for topic, columns in samples.items():
         if not columns:
-            remedy = f"use one of its topics of {JOINT_STATE}: {', '.join(present) or 'there are none'}"
+            remedy = (
+                f"use one of its topics of {JOINT_STATE}: {', '.join(present) or 'there are none'}"
+            )
             raise error(str(path), f"has no values in the topic {topic!r} of {JOINT_STATE}", remedy)
     names = {f"{reading.prefix}{joint}" for joint in robot.joint_names}
     joints = {name.partition(":")[2] for columns in samples.values() for name in columns}
@@ -267,12 +320,24 @@ def _read_bag(robot: Robot, path: Path, reading: Reading) -> dict[str, Float64]:
         if name in {f"qpos:{joint}" for joint in names}
     ]
     if not stamps:
-        remedy = f"the robot has {', '.join(robot.joint_names)}: give the prefix of the names, or another topic"
-        raise error(str(path), f"has no positions of the robot's joints, but {others or 'other values'}", remedy)
+        remedy = (
+            f"the robot has {', '.join(robot.joint_names)}: give the prefix of the names, or"
+            " another topic"
+        )
+        raise error(
+            str(path),
+            f"has no positions of the robot's joints, but {others or 'other values'}",
+            remedy,
+        )
     if others:
         warn(f"{path}: {others}: no joint of the robot, left out", LogWarning)
     first, last = max(map(min, stamps)), min(map(max, stamps))
-    merged = {"time": np.unique([stamp - first for stamp in max(stamps, key=len) if first <= stamp <= last]) / 1e9}
+    merged = {
+        "time": (
+            np.unique([stamp - first for stamp in max(stamps, key=len) if first <= stamp <= last])
+            / 1e9
+        )
+    }
     for columns in samples.values():
         for name, rows in columns.items():
             if name.partition(":")[2] in names:

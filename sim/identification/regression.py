@@ -1,13 +1,15 @@
-r"""Start of the fit: smoothed motions, and the inverse dynamics as a linear regression at given delays.
+r"""Start of the fit: smoothed motions, and the inverse dynamics as a linear regression at given
+delays.
 
-With the measured motion filtered without phase lag, and the effort u filtered in the same way, each joint obeys::
+With the measured motion filtered without phase lag, and the effort u filtered in the same way, each
+joint obeys::
 
     s u(t - d) + b - h - (M q'')_j = A q''_j + B q'_j + F sgn(q'_j)
 
-which is solved by least squares with A, B, F >= 0, where the joint moves fast enough not to stick (J. Swevers, W.
-Verdonck and J. De Schutter, "Dynamic model identification for industrial robots", IEEE Control Systems Magazine 27(5),
-2007). Under the PID law u follows from the setpoints and the filtered positions. The delays with the least residual
-are taken from a grid.
+which is solved by least squares with A, B, F >= 0, where the joint moves fast enough not to stick
+(J. Swevers, W. Verdonck and J. De Schutter, "Dynamic model identification for industrial robots",
+IEEE Control Systems Magazine 27(5), 2007). Under the PID law u follows from the setpoints and the
+filtered positions. The delays with the least residual are taken from a grid.
 """
 
 from __future__ import annotations
@@ -48,12 +50,15 @@ ALIKE = 0.5
 TRIED = 10.0
 """Length of a log from which other readings are tried [s]."""
 LEAST_SHARE = 0.05
-"""Share of a joint's effort that moves the links, below which its strength is not identifiable: the motor's inertia and
-friction take the rest, which determines their ratios to the strength only."""
+"""Share of a joint's effort that moves the links, below which its strength is not identifiable: the
+motor's inertia and friction take the rest, which determines their ratios to the strength only.
+"""
 
 
 class Motion(NamedTuple):
-    """Smoothed motion of a log on the grid of the sim steps, from its first row on; arrays (steps, joints)."""
+    """Smoothed motion of a log on the grid of the sim steps, from its first row on; arrays (steps,
+    joints).
+    """
 
     qpos: Float64
     qvel: Float64
@@ -70,7 +75,9 @@ class Guess(NamedTuple):
     cost: float
     """Mean over the joints of log(mean square of the residual / mean square of all efforts)."""
     unexplained: float
-    """Mean over the joints of log(mean square of the residual / mean square of the motors' efforts)."""
+    """Mean over the joints of log(mean square of the residual / mean square of the motors'
+    efforts).
+    """
 
 
 def smooth(log: Log, timestep: float) -> Motion:
@@ -85,7 +92,9 @@ def smooth(log: Log, timestep: float) -> Motion:
 
 
 def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
-    """Return the columns of a table (steps, columns) without frequencies above ``cutoff`` [Hz], without phase lag."""
+    """Return the columns of a table (steps, columns) without frequencies above ``cutoff`` [Hz],
+    without phase lag.
+    """
     from scipy.signal import butter, sosfiltfilt
 
     pad = min(len(table) - 1, round(0.5 / timestep))
@@ -93,9 +102,11 @@ def lowpass(table: Float64, cutoff: float, timestep: float) -> Float64:
 
 
 def better_reading(plant: Plant, drive: LogControl, log: Log, names: Sequence[str]) -> str:
-    """Return the reading of a log that explains its efforts far better than the present one, in words; "" for none.
+    """Return the reading of a log that explains its efforts far better than the present one, in
+    words; "" for none.
 
-    Signs, exchanged joints, factors of units and times of the commands are tried. ``names`` are the joints' names.
+    Signs, exchanged joints, factors of units and times of the commands are tried. ``names`` are the
+    joints' names.
     """
     first = log.part(log.time < log.time[0] + TRIED, log.command_time < log.time[0] + TRIED)
     present, costs = _cost(plant, drive, first), dict[str, float]()
@@ -118,7 +129,11 @@ def _readings(log: Log, names: Sequence[str]) -> Iterator[tuple[str, Log]]:
 
     def changed(sides: tuple[bool, bool], matrix: Float64) -> Log:
         qpos, command = log.qpos, log.command
-        return replace(log, qpos=qpos @ matrix if sides[0] else qpos, command=command @ matrix if sides[1] else command)
+        return replace(
+            log,
+            qpos=qpos @ matrix if sides[0] else qpos,
+            command=command @ matrix if sides[1] else command,
+        )
 
     eye = np.eye(joints)
     for column, sides in columns.items():
@@ -128,7 +143,10 @@ def _readings(log: Log, names: Sequence[str]) -> Iterator[tuple[str, Log]]:
         for first, second in combinations(range(joints), 2):
             order = np.arange(joints)
             order[[first, second]] = second, first
-            yield f"{column} of {names[first]} and {names[second]} exchanged", changed(sides, eye[order])
+            yield (
+                f"{column} of {names[first]} and {names[second]} exchanged",
+                changed(sides, eye[order]),
+            )
     yield f"{log.kind} of all joints with the other sign", changed((False, True), -eye)
     if log.kind == "effort":
         yield "effort in thousandths of SI units", changed((False, True), 1e-3 * eye)
@@ -139,10 +157,16 @@ def _readings(log: Log, names: Sequence[str]) -> Iterator[tuple[str, Log]]:
 
 
 class Regression:
-    """Efforts that motions of logs require, and efforts of the motors so far, for regressions at any delay."""
+    """Efforts that motions of logs require, and efforts of the motors so far, for regressions at
+    any delay.
+    """
 
     def __init__(
-        self, plants: Sequence[Plant], drives: Sequence[LogControl], logs: Sequence[Log], motions: Sequence[Motion]
+        self,
+        plants: Sequence[Plant],
+        drives: Sequence[LogControl],
+        logs: Sequence[Log],
+        motions: Sequence[Motion],
     ) -> None:
         dt = drives[0].timestep
         self._setpoints = drives[0].params is not None
@@ -161,13 +185,19 @@ class Regression:
             time = dt * np.arange(commanded.shape[1])
             late = [
                 np.stack([interpolated(time[rows] - delay, time, effort) for delay in DELAYS])
-                for effort in (commanded if self._setpoints else [lowpass(effort, cutoff, dt) for effort in commanded])
+                for effort in (
+                    commanded
+                    if self._setpoints
+                    else [lowpass(effort, cutoff, dt) for effort in commanded]
+                )
             ]
             still = 0.01 * np.abs(motion.qvel).max(0) + 1e-9
             sign = lowpass(np.clip(motion.qvel / still, -1, 1), cutoff, dt)[rows]
             tables.append((required, motion.qacc[rows], motion.qvel[rows], sign))
             efforts.append(np.stack(late))
-        self.required, self._acceleration, self._velocity, self._sign = map(np.concatenate, zip(*tables, strict=True))
+        self.required, self._acceleration, self._velocity, self._sign = map(
+            np.concatenate, zip(*tables, strict=True)
+        )
         self.efforts = np.concatenate(efforts, axis=2)
         """Efforts of the motors (setpoint delays, delays, rows, joints)."""
         speed = np.abs(self._velocity)
@@ -183,7 +213,13 @@ class Regression:
         effort, rows = self.efforts[first, second], list[Float64]()
         cost = unexplained = 0.0
         for joint, moves in enumerate(self._moves.T):
-            columns = [-self._acceleration, -self._velocity, -self._sign, effort, np.ones_like(effort)]
+            columns = [
+                -self._acceleration,
+                -self._velocity,
+                -self._sign,
+                effort,
+                np.ones_like(effort),
+            ]
             matrix = np.stack([column[moves, joint] for column in columns], axis=1)
             target = self.required[moves, joint]
             links, whole = (np.mean(table**2) for table in (target, matrix[:, 3]))
@@ -201,14 +237,21 @@ class Regression:
 
 
 def _bounded(matrix: Float64, target: Float64, is_strong: bool) -> tuple[Float64, Float64]:
-    """Return armature, damping, friction (at least 0), strength (0.2 to 3) and bias, and the residual.
+    """Return armature, damping, friction (at least 0), strength (0.2 to 3) and bias, and the
+    residual.
 
     The strength is 1 if ``is_strong``.
     """
     size = np.abs(matrix).max(0) + 1e-12
     scaled = matrix / size
     gram = scaled.T @ scaled
-    weight = WEIGHT**2 * len(target) * size[3] ** -2 * (target**2).mean() / max((target**2).mean(), 1e-12)
+    weight = (
+        WEIGHT**2
+        * len(target)
+        * size[3] ** -2
+        * (target**2).mean()
+        / max((target**2).mean(), 1e-12)
+    )
     gram[np.arange(5), np.arange(5)] += 1e-8 * len(target)
     gram[3, 3] += weight
     moment = scaled.T @ target
@@ -230,8 +273,12 @@ def _bounded(matrix: Float64, target: Float64, is_strong: bool) -> tuple[Float64
     return values, target - matrix @ values
 
 
-def _required(plant: Plant, drive: LogControl, motion: Motion, rows: Any) -> tuple[Float64, Float64 | None]:
-    """Return the efforts (rows, joints) that a motion requires, and the compensation (steps, joints)."""
+def _required(
+    plant: Plant, drive: LogControl, motion: Motion, rows: Any
+) -> tuple[Float64, Float64 | None]:
+    """Return the efforts (rows, joints) that a motion requires, and the compensation (steps,
+    joints).
+    """
     q, v, a = (np.ascontiguousarray(table[rows]) for table in motion[:3])
     dynamics = plant.dynamics([()] * len(q), q, v)
     dynamics.update()
@@ -245,7 +292,9 @@ def _required(plant: Plant, drive: LogControl, motion: Motion, rows: Any) -> tup
 
 
 def _efforts(plant: Plant, drive: LogControl, motion: Motion) -> Float64:
-    """Return logged efforts (1, steps, joints), or the law's along a motion (setpoint delays, steps, joints)."""
+    """Return logged efforts (1, steps, joints), or the law's along a motion (setpoint delays,
+    steps, joints).
+    """
     if drive.params is None:
         return motion.command[None]
     count, steps = len(SETPOINT_DELAYS), len(motion.qpos)

@@ -1,4 +1,6 @@
-"""Result of an identification: values with intervals, a report, an actuators file, and draws from its region."""
+"""Result of an identification: values with intervals, a report, an actuators file, and draws from
+its region.
+"""
 
 from __future__ import annotations
 
@@ -51,10 +53,13 @@ class Identification:
     """Values of the unknowns (unknowns,)."""
     intervals: Intervals
     held_out_error: tuple[float, float]
-    """Root mean square of the position error [rad or m] on the held-out part of the logs, simulated from the logged
-    state, of the robot as described and as identified."""
+    """Root mean square of the position error [rad or m] on the held-out part of the logs, simulated
+    from the logged state, of the robot as described and as identified.
+    """
     errors: tuple[Float64, Float64, Float64]
-    """The same by joint (joints,), and with the initial state of each window fitted, as in the fit."""
+    """The same by joint (joints,), and with the initial state of each window fitted, as in the
+    fit.
+    """
     converged: bool
     """False if the fit has stopped at the largest number of evaluations."""
     advice: str
@@ -108,11 +113,15 @@ class Identification:
             solution.point,
         )
 
-    def interval(self, kind: str, joint: int | str | None = None) -> tuple[float, float, float] | None:
-        """Return estimate, lower and upper end of the 95 % interval; None if the logs do not identify it.
+    def interval(
+        self, kind: str, joint: int | str | None = None
+    ) -> tuple[float, float, float] | None:
+        """Return estimate, lower and upper end of the 95 % interval; None if the logs do not
+        identify it.
 
-        ``kind`` is a name of :data:`batchpid.sim.identification.unknowns.KINDS`, ``joint`` the number of a joint among
-        :attr:`joints`, the name of a link for "mass", None for "delay", "setpoint_delay" and "payload".
+        ``kind`` is a name of :data:`batchpid.sim.identification.unknowns.KINDS`, ``joint`` the
+        number of a joint among :attr:`joints`, the name of a link for "mass", None for "delay",
+        "setpoint_delay" and "payload".
 
         Raises
         ------
@@ -124,11 +133,17 @@ class Identification:
             if (entry.kind, entry.joint if entry.link is None else entry.link) == (kind, joint):
                 return self._row(at) if at < len(self.values) else None
         kinds = ", ".join(sorted({entry.kind for entry in entries}))
-        raise InvalidArgumentError("kind", f"is no unknown of {joint!r}", value=kind, remedy=f"there are {kinds}")
+        raise InvalidArgumentError(
+            "kind", f"is no unknown of {joint!r}", value=kind, remedy=f"there are {kinds}"
+        )
 
     def _row(self, at: int) -> tuple[float, float, float]:
         value, half = float(self.values[at]), INTERVAL * float(self.intervals.deviation[at])
-        low = self.unknowns.entries[at].floor if KINDS[self.unknowns.entries[at].kind].positive else -np.inf
+        low = (
+            self.unknowns.entries[at].floor
+            if KINDS[self.unknowns.entries[at].kind].positive
+            else -np.inf
+        )
         return value, max(value - half, low), value + half
 
     @property
@@ -154,25 +169,37 @@ class Identification:
         return bp.make_actuators(self.robot.dof, **options, joint_names=self.robot.joint_names)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write :meth:`actuators` to a .yaml or .json file, with intervals, errors and the confidence region."""
+        """Write :meth:`actuators` to a .yaml or .json file, with intervals, errors and the
+        confidence region.
+        """
         document = self.document()
         names = [[entry.kind, self._place(entry)] for entry in self.unknowns.entries]
-        rows = [[float(f"{value:.5f}") for value in row[: at + 1]] for at, row in enumerate(self.intervals.correlation)]
+        rows = [
+            [float(f"{value:.5f}") for value in row[: at + 1]]
+            for at, row in enumerate(self.intervals.correlation)
+        ]
         region = {
             "unknowns": names,
             "estimate": self.values.tolist(),
             "standard_deviation": self.intervals.deviation.tolist(),
             "correlation": rows,
         }
-        about = {key: document[key] for key in ("identified_from", "held_out_error", "intervals", "not_shown")}
+        about = {
+            key: document[key]
+            for key in ("identified_from", "held_out_error", "intervals", "not_shown")
+        }
         about["did_not_move_hence_ideal"] = list(self.still)
         bp.save_actuators(path, self.actuators(), self.robot.joint_names, about | {KEY: region})
 
     def _place(self, entry: Unknown) -> str | None:
-        return entry.link if entry.joint is None else self.robot.joint_names[self.joints[entry.joint]]
+        return (
+            entry.link if entry.joint is None else self.robot.joint_names[self.joints[entry.joint]]
+        )
 
     def document(self) -> Document:
-        """Return the result as plain values: estimate and 95 % interval of each unknown, and the errors."""
+        """Return the result as plain values: estimate and 95 % interval of each unknown, and the
+        errors.
+        """
         intervals: Document = {}
         for at, entry in enumerate(self.unknowns.entries):
             place = self._place(entry)
@@ -189,7 +216,8 @@ class Identification:
         }
 
     def corrected_urdf(self) -> str:
-        """Return the URDF of the robot with the identified masses; the links of a body keep their shares of its mass.
+        """Return the URDF of the robot with the identified masses; the links of a body keep their
+        shares of its mass.
 
         Raises
         ------
@@ -199,11 +227,15 @@ class Identification:
         pairs = zip(self.unknowns.entries, self.values.tolist(), strict=True)
         factors = {entry.link: value for entry, value in pairs if entry.link is not None}
         if not factors:
-            raise InvalidArgumentError("corrected_urdf", "no mass was found", remedy="identify with extras=['mass']")
+            raise InvalidArgumentError(
+                "corrected_urdf", "no mass was found", remedy="identify with extras=['mass']"
+            )
         return to_urdf(self.robot, mass_factors=factors).text
 
     def gains(self) -> bp.PIDParams | None:
-        """Return the params of the identified law, of the logged joints; None without unknowns of the law."""
+        """Return the params of the identified law, of the logged joints; None without unknowns of
+        the law.
+        """
         law = self.unknowns.candidates(self.values[None]).law
         if self.drive.params is None or law.keys().isdisjoint(("gain", "kd", "saturation")):
             return None
@@ -221,20 +253,36 @@ class Identification:
         before = ideal.evaluate(np.zeros(0), free_states=False).residuals
         after = shown.evaluate(self.point, free_states=False).residuals
         parts = zip(windows, before, after, strict=True)
-        errors = [plots.FitErrors(window.time, window.fitted, first, second) for window, first, second in parts]
-        names, units = ([table[joint] for joint in self.joints] for table in (self.robot.joint_names, self.robot.units))
+        errors = [
+            plots.FitErrors(window.time, window.fitted, first, second)
+            for window, first, second in parts
+        ]
+        names, units = (
+            [table[joint] for joint in self.joints]
+            for table in (self.robot.joint_names, self.robot.units)
+        )
         title = f"{self.robot.name}: position error, shaded where it was not fitted"
         return plots.fit_errors(errors, names, units, title)
 
     def report(self) -> str:
         """Return values, intervals and errors as text."""
-        kinds = list(dict.fromkeys(entry.kind for entry in self.unknowns.entries if entry.joint is not None))
+        kinds = list(
+            dict.fromkeys(entry.kind for entry in self.unknowns.entries if entry.joint is not None)
+        )
         names = [self.robot.joint_names[joint] for joint in self.joints]
-        cells = {(entry.kind, self._place(entry)): self._cell(at) for at, entry in enumerate(self.unknowns.entries)}
+        cells = {
+            (entry.kind, self._place(entry)): self._cell(at)
+            for at, entry in enumerate(self.unknowns.entries)
+        }
         rows = [["95 % intervals, SI units", *kinds]]
-        rows += [[name, *(cells.get((kind, name), "not shown") for kind in kinds)] for name in names]
+        rows += [
+            [name, *(cells.get((kind, name), "not shown") for kind in kinds)] for name in names
+        ]
         widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-        lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+        lines = [
+            "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
+            for row in rows
+        ]
         lines += [""]
         shared = [entry for entry in self.unknowns.entries if entry.joint is None]
         lines += [f"{self._name(entry)}: {cells[entry.kind, entry.link]}" for entry in shared]
@@ -244,15 +292,17 @@ class Identification:
         before, after = self.held_out_error
         free = float(np.sqrt((self.errors[2] ** 2).mean()))
         lines.append(
-            f"position error on the held-out part, simulated from the logged state: {before:.3g} with ideal motors, "
-            f"{after:.3g} with these"
+            f"position error on the held-out part, simulated from the logged state: {before:.3g}"
+            f" with ideal motors, {after:.3g} with these"
         )
         if self.drive.params is None:
             lines.append(f"with the initial state of each 0.3 s fitted: {free:.3g}")
         joints = [f"{name} {error:.2g}" for name, error in zip(names, self.errors[1], strict=True)]
         lines.append(f"by joint: {', '.join(joints)}")
         if self.hidden.entries:
-            lines.append(f"not shown by these logs, hence as ideal: {', '.join(self.not_identified)}")
+            lines.append(
+                f"not shown by these logs, hence as ideal: {', '.join(self.not_identified)}"
+            )
         if not self.converged:
             lines.append("the fit has not converged: the values are the best so far")
         lines.append(self.advice)
@@ -263,12 +313,16 @@ class Identification:
         half = max(high - value, value - low)
         if half > abs(value) and KINDS[self.unknowns.entries[at].kind].positive:
             return f"< {high:.2g}"
-        digits = int(np.clip(np.ceil(np.log10(abs(value) / half)) + 1, 1, 6)) if value and half else 3
+        digits = (
+            int(np.clip(np.ceil(np.log10(abs(value) / half)) + 1, 1, 6)) if value and half else 3
+        )
         return f"{value:.{digits}g} ± {half:.1g}"
 
 
 def _columns(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
-    """Return the fields of actuators (n, dof) with ``values`` (n, unknowns), without the description's part."""
+    """Return the fields of actuators (n, dof) with ``values`` (n, unknowns), without the
+    description's part.
+    """
     robot = unknowns.robot
     joints = list(unknowns.joints)
     columns = dict[str, Float64]()
@@ -289,15 +343,24 @@ def _columns(unknowns: Unknowns, values: Float64) -> dict[str, Float64]:
 
 
 def advice(problem: Problem, solution: Solution) -> str:
-    """Return a sentence on the effect that would explain most of the remaining error of a fit, by its derivatives.
+    """Return a sentence on the effect that would explain most of the remaining error of a fit, by
+    its derivatives.
 
     Each further unknown is added alone to the unknowns of the fit.
     """
     unknowns = problem.unknowns
     plant = problem.plants[0]
     present = {entry.kind for entry in unknowns.entries}
-    further = [Unknown("mass", None, 1.0, 1.0, link=link) for link in plant.heavy_links if "mass" not in present]
-    for kind in ("offset", "load_friction", *(("kd",) if problem.drives[0].params is not None else ())):
+    further = [
+        Unknown("mass", None, 1.0, 1.0, link=link)
+        for link in plant.heavy_links
+        if "mass" not in present
+    ]
+    for kind in (
+        "offset",
+        "load_friction",
+        *(("kd",) if problem.drives[0].params is not None else ()),
+    ):
         if kind not in present:
             start = {"offset": 0.0, "load_friction": 1e-4, "kd": 1.0}[kind]
             size = float(KINDS[kind].size)
@@ -311,7 +374,9 @@ def advice(problem: Problem, solution: Solution) -> str:
     residual, matrix = wider.system(wider.evaluate(point, steps), point, solution.size)
     count = len(unknowns.entries)
     weight = (1 + residual**2 / 4) ** -0.25
-    weight[-len(further) :] = 0.1 * np.array([entry.spread for entry in further])  # each may change by a factor
+    weight[-len(further) :] = 0.1 * np.array(
+        [entry.spread for entry in further]
+    )  # each may change by a factor
     residual, matrix = weight * residual, weight[:, None] * matrix
     strengths = [at for at, entry in enumerate(unknowns.entries) if entry.kind == "strength"]
     gains = list[float]()
@@ -323,11 +388,15 @@ def advice(problem: Problem, solution: Solution) -> str:
         left = residual + matrix[:, columns] @ change
         gains.append(1 - float(left @ left) / float(residual @ residual))
         changes.append(float(change[-1]))
-        distances.append(float((((solution.point + change[:-1]) / unknowns.spread) ** 2)[strengths].sum()))
+        distances.append(
+            float((((solution.point + change[:-1]) / unknowns.spread) ** 2)[strengths].sum())
+        )
     if not further or max(gains) < LEAST_GAIN:
         return "no further effect that was tried would explain a tenth of the remaining error"
     # Explanations that are as good as equal differ in how far they bring the strengths from 1.
-    alike = sorted(np.flatnonzero(np.array(gains) > ALIKE * max(gains)), key=lambda number: distances[number])
+    alike = sorted(
+        np.flatnonzero(np.array(gains) > ALIKE * max(gains)), key=lambda number: distances[number]
+    )
     words = " or ".join(_effect(problem, further[number], changes[number]) for number in alike[:2])
     text = f"{words} would explain {100 * max(gains):.0f} % of the remaining squared error"
     kinds = {further[number].kind for number in alike[:2]}
@@ -344,12 +413,16 @@ def _effect(problem: Problem, entry: Unknown, change: float) -> str:
     return f"{entry.kind} of {names[problem.unknowns.joints[entry.joint or 0]]}"
 
 
-def draw_motors(path: str | os.PathLike[str], robot: Robot, count: int, seed: int = 0) -> bp.Actuators:
-    """Return ``count`` sets of motors of ``robot``, drawn from the confidence region in an actuators file.
+def draw_motors(
+    path: str | os.PathLike[str], robot: Robot, count: int, seed: int = 0
+) -> bp.Actuators:
+    """Return ``count`` sets of motors of ``robot``, drawn from the confidence region in an
+    actuators file.
 
-    With the estimate m, standard deviations d and correlations R, a draw is m + d * (R^1/2 z) with normal z, within
-    the bounds of the unknowns. Effects outside of the region keep their values in the file. Friction and damping are in
-    addition to the robot's description. For ``robot.tuned(actuators=...)`` or a Runner with as many envs.
+    With the estimate m, standard deviations d and correlations R, a draw is m + d * (R^1/2 z) with
+    normal z, within the bounds of the unknowns. Effects outside of the region keep their values in
+    the file. Friction and damping are in addition to the robot's description. For
+    ``robot.tuned(actuators=...)`` or a Runner with as many envs.
 
     Raises
     ------
@@ -363,12 +436,19 @@ def draw_motors(path: str | os.PathLike[str], robot: Robot, count: int, seed: in
     try:
         region = document["about"][KEY]
         names, rows = [tuple(name) for name in region["unknowns"]], region["correlation"]
-        estimate, deviation = (np.array(region[key], float) for key in ("estimate", "standard_deviation"))
+        estimate, deviation = (
+            np.array(region[key], float) for key in ("estimate", "standard_deviation")
+        )
         correlation = np.zeros((len(names), len(names)))
         for at, row in enumerate(rows):
             correlation[at, : at + 1] = correlation[: at + 1, at] = row
         entries = tuple(
-            Unknown(kind, robot.joint_names.index(place) if KINDS[kind].per == "joint" else None, 0.0, 1.0)
+            Unknown(
+                kind,
+                robot.joint_names.index(place) if KINDS[kind].per == "joint" else None,
+                0.0,
+                1.0,
+            )
             for kind, place in names
         )
         values, vectors = np.linalg.eigh(correlation)
@@ -376,6 +456,8 @@ def draw_motors(path: str | os.PathLike[str], robot: Robot, count: int, seed: in
         points = estimate + deviation * (z @ (vectors * np.sqrt(np.maximum(values, 0.0))).T)
     except (KeyError, IndexError, TypeError, ValueError) as bad:
         remedy = "write the file with `batchpid identify` of this robot"
-        raise InvalidArgumentError(source, f"is missing or cannot be read ({bad})", remedy=remedy) from None
+        raise InvalidArgumentError(
+            source, f"is missing or cannot be read ({bad})", remedy=remedy
+        ) from None
     columns = _columns(Unknowns(robot, tuple(range(robot.dof)), entries), points)
     return nominal.replace(**columns)

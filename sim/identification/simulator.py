@@ -1,14 +1,15 @@
-r"""Simulation of many candidates along stretches of logs: the Runner's control step on a rigid tree.
+r"""Simulation of many candidates along stretches of logs: the Runner's control step on a rigid
+tree.
 
-Control, motors and friction are :func:`batchpid.sim.loop.control_step.control_step` at every sim step, as in a Runner.
-In place of an engine the rigid tree of the logged joints moves by semi-implicit Euler with steps of dt, as in SAPIEN
-and MuJoCo, with mass matrix M, armature A, viscous damping B, gravity and Coriolis forces h, and the effort u of
-motors and friction::
+Control, motors and friction are :func:`batchpid.sim.loop.control_step.control_step` at every sim
+step, as in a Runner. In place of an engine the rigid tree of the logged joints moves by
+semi-implicit Euler with steps of dt, as in SAPIEN and MuJoCo, with mass matrix M, armature A,
+viscous damping B, gravity and Coriolis forces h, and the effort u of motors and friction::
 
     (M + A + dt B) (v+ - v) = dt (u - h),     q+ = q + dt v+
 
-The motion equals the Runner's up to the rounding of its observations. Unlogged joints rest at the robot's start pose,
-followers move with their leaders, and joints stop at their limits.
+The motion equals the Runner's up to the rounding of its observations. Unlogged joints rest at the
+robot's start pose, followers move with their leaders, and joints stop at their limits.
 """
 
 from __future__ import annotations
@@ -72,17 +73,22 @@ class PlantCandidates(NamedTuple):
     actuators: Actuators
     """(n, joints), friction and damping of the description included."""
     law: Mapping[str, Float64]
-    """Changes (n, joints) of the law: factors "gain" and "kd", "saturation" (effort limit over kp) and "slew" (limit of
-    the setpoints' rate)."""
+    """Changes (n, joints) of the law: factors "gain" and "kd", "saturation" (effort limit over kp)
+    and "slew" (limit of the setpoints' rate).
+    """
     setpoint_delay: Float64
     """Delay of the setpoints (n,) [s]."""
     masses: tuple[tuple[tuple[str, float], ...], ...]
-    """Factors of the masses of some links of each candidate, and the mass of its payload [kg] under PAYLOAD."""
+    """Factors of the masses of some links of each candidate, and the mass of its payload [kg] under
+    PAYLOAD.
+    """
 
     def repeated(self, times: int) -> PlantCandidates:
         """Return each candidate ``times`` times, one after the other."""
         tables = [{name: np.repeat(rows, times, axis=0) for name, rows in self.law.items()}]
-        actuators = mapped(lambda leaf: leaf if len(leaf) == 1 else np.repeat(leaf, times, axis=0), self.actuators)
+        actuators = mapped(
+            lambda leaf: leaf if len(leaf) == 1 else np.repeat(leaf, times, axis=0), self.actuators
+        )
         masses = tuple(row for row in self.masses for _ in range(times))
         return PlantCandidates(actuators, tables[0], np.repeat(self.setpoint_delay, times), masses)
 
@@ -94,7 +100,9 @@ class Stretch(NamedTuple):
     """Position at its start (joints,) [rad or m]."""
     qvel: Float64
     command: Float64
-    """Setpoints or efforts (past + steps, joints) at the sim steps, from ``past`` steps before the start on."""
+    """Setpoints or efforts (past + steps, joints) at the sim steps, from ``past`` steps before the
+    start on.
+    """
     past: int
     feedforward: Float64 | None
     """Efforts that are added to the efforts of the law (past + steps, joints)."""
@@ -117,7 +125,12 @@ class Plant:
         moves = np.isin(coupling.leader, joints)
         number = np.cumsum(moves) - 1
         followers = [
-            Follower(number[joint], number[coupling.leader[joint]], coupling.multiplier[joint], coupling.offset[joint])
+            Follower(
+                number[joint],
+                number[coupling.leader[joint]],
+                coupling.multiplier[joint],
+                coupling.offset[joint],
+            )
             for joint in np.flatnonzero(moves & ~coupling.independent)
         ]
         self._robot = robot
@@ -160,7 +173,9 @@ class Plant:
         return [link for link, body, mass in links if body >= 0 and mass > 0 and link != PAYLOAD]
 
     def dynamics(self, masses: Sequence[Any], qpos: Float64, qvel: Float64) -> Dynamics:
-        """Return the dynamics of robots at ``qpos`` and ``qvel`` (n, joints), arrays that may change."""
+        """Return the dynamics of robots at ``qpos`` and ``qvel`` (n, joints), arrays that may
+        change.
+        """
         return Dynamics(self, masses, qpos, qvel)
 
 
@@ -173,7 +188,9 @@ class Dynamics:
         self._parts, first = list[Any](), 0
         for row in range(1, rows + 1):
             if row == rows or masses[row] != masses[first]:
-                self._parts.append(self._part(plant.tree_of(masses[first]), qpos, qvel, slice(first, row)))
+                self._parts.append(
+                    self._part(plant.tree_of(masses[first]), qpos, qvel, slice(first, row))
+                )
                 first = row
 
     def _part(self, tree: RigidTree, qpos: Float64, qvel: Float64, rows: slice) -> Any:
@@ -196,7 +213,10 @@ class Dynamics:
                 native[0]()
                 matrix, force = native[1]
             if columns is not None:
-                matrix, force = np.ascontiguousarray(matrix[:, columns[:, None], columns]), force[:, columns]
+                matrix, force = (
+                    np.ascontiguousarray(matrix[:, columns[:, None], columns]),
+                    force[:, columns],
+                )
             if len(self._parts) == 1:
                 self.matrix, self.force = matrix, force
             else:
@@ -211,7 +231,9 @@ class Dynamics:
 
 
 class Control:
-    """Control, motors and friction of n robots; a native program where programs are used, with the same bits."""
+    """Control, motors and friction of n robots; a native program where programs are used, with the
+    same bits.
+    """
 
     def __init__(
         self,
@@ -235,9 +257,13 @@ class Control:
         if drive.params is not None:
             law = PIDLaw.of(drive.params)
             times = count // len(drive.params.kp)
-            params = mapped(lambda leaf: np.tile(leaf, (times, 1)) if leaf.ndim == 2 else leaf, drive.params)
+            params = mapped(
+                lambda leaf: np.tile(leaf, (times, 1)) if leaf.ndim == 2 else leaf, drive.params
+            )
             params = changed_params(params, candidates.law)
-            params = params._replace(measurement_rate=None)  # the law of the layout decides, not the params
+            params = params._replace(
+                measurement_rate=None
+            )  # the law of the layout decides, not the params
             offset = 0.0 if actuators.position_offset is None else actuators.position_offset
             k, state = bp.discretise(params, dt, count), StepState(bp.init(params, qpos + offset))
         guard = None
@@ -247,18 +273,31 @@ class Control:
         motors = None
         ideal = dict.fromkeys(actuator_model.JOINT_SIDE)
         if not actuators._replace(**ideal).is_ideal:
-            history = actuator_model.init(actuators, qpos, dt, qvel=qvel, effort=None if asked is None else asked[0])
+            history = actuator_model.init(
+                actuators, qpos, dt, qvel=qvel, effort=None if asked is None else asked[0]
+            )
             if history.command is not None and asked is not None:
                 samples = np.minimum(np.arange(history.command.shape[1]), len(asked) - 1)
                 history = history._replace(command=asked[samples].swapaxes(0, 1))
-            motors, state = actuator_model.discretise(actuators, history, dt, count), state._replace(motors=history)
+            motors, state = (
+                actuator_model.discretise(actuators, history, dt, count),
+                state._replace(motors=history),
+            )
         if self.friction.coulomb is not None:
             started = friction_model.started(qvel, np.zeros_like(qpos))
             sliding = (np.abs(qvel) > MOVING).astype(float)
-            state = state._replace(friction=started._replace(sliding=sliding), age=np.ones_like(qpos))
+            state = state._replace(
+                friction=started._replace(sliding=sliding), age=np.ones_like(qpos)
+            )
         self._layout = Layout("effort" if law is None else "pid", law, actuators.measures, _MODEL)
         self._constants = Constants(
-            dt, (None, None), Coupling.of(qpos.shape[1]), k, friction=self.friction, guard=guard, motors=motors
+            dt,
+            (None, None),
+            Coupling.of(qpos.shape[1]),
+            k,
+            friction=self.friction,
+            guard=guard,
+            motors=motors,
         )
         self.state = mapped(lambda leaf: np.array(leaf, order="C"), state)
         self._program: Any = None
@@ -266,11 +305,15 @@ class Control:
     def refresh(self, matrix: Float64) -> None:
         """Update the inertia of the friction model."""
         if self.friction.coulomb is not None:
-            fresh = friction_model.refresh(self.friction, self.state.friction, matrix, self._constants.timestep)
+            fresh = friction_model.refresh(
+                self.friction, self.state.friction, matrix, self._constants.timestep
+            )
             for name in ("gain", "memory"):
                 getattr(self.state.friction, name)[...] = getattr(fresh, name)
 
-    def advance(self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64 | None) -> Float64:
+    def advance(
+        self, command: Float64, qpos: Float64, qvel: Float64, passive: Float64 | None
+    ) -> Float64:
         """Return the efforts of motors and friction (n, joints), which the next call may reuse.
 
         ``command`` are setpoints or efforts, ``passive`` the compensated force and the feedforward.
@@ -286,23 +329,32 @@ class Control:
         return effort
 
     def _compiled(self, inputs: Any) -> Any:
-        """Return the program, the arrays of its state, of its results, and of the efforts; None for NumPy."""
+        """Return the program, the arrays of its state, of its results, and of the efforts; None for
+        NumPy.
+        """
         if obstacle():
             return None
         constants = mapped(lambda leaf: tuple(leaf) if leaf.ndim == 3 else leaf, self._constants)
         trace = _trace(self._layout, *map(structure, (constants, self.state, inputs)))
         effort, state = np.zeros_like(inputs[1]), leaves(self.state)
-        program = ArrayProgram(trace, leaves(constants), len(state) + len(leaves(inputs)), effort.shape)
+        program = ArrayProgram(
+            trace, leaves(constants), len(state) + len(leaves(inputs)), effort.shape
+        )
         return program, state, (*leaves(_returned(self.state)), effort), effort
 
 
 def simulate(
-    plant: Plant, drive: LogControl, candidates: PlantCandidates, states: Float64, stretches: Sequence[Stretch]
+    plant: Plant,
+    drive: LogControl,
+    candidates: PlantCandidates,
+    states: Float64,
+    stretches: Sequence[Stretch],
 ) -> list[Float64]:
-    """Return the positions (candidates, rows, joints) of all candidates at the rows of each stretch.
+    """Return the positions (candidates, rows, joints) of all candidates at the rows of each
+    stretch.
 
-    ``states`` (candidates, 2, joints) are added to positions and velocities at the starts. A simulation that diverges
-    ends at inf.
+    ``states`` (candidates, 2, joints) are added to positions and velocities at the starts. A
+    simulation that diverges ends at inf.
     """
     many = len(stretches)
     count = len(states)
@@ -320,7 +372,9 @@ def simulate(
     past = min(stretch.past for stretch in stretches)
     if drive.params is None and past:
         held = compensation.now() if drive.through else None
-        earlier = np.stack([stretch.command[stretch.past - 1 :: -1][:past] for stretch in stretches], axis=1)
+        earlier = np.stack(
+            [stretch.command[stretch.past - 1 :: -1][:past] for stretch in stretches], axis=1
+        )
         efforts = np.tile(earlier, (1, count, 1)) + (0.0 if held is None else held)
     control = Control(drive, rows, q, v, efforts, plant.turns)
     if control.friction.coulomb is not None:
@@ -329,7 +383,9 @@ def simulate(
     commands = _Commands(drive, rows, stretches)
     forwards = None
     if any(stretch.feedforward is not None for stretch in stretches):
-        tables = [np.zeros_like(s.command) if s.feedforward is None else s.feedforward for s in stretches]
+        tables = [
+            np.zeros_like(s.command) if s.feedforward is None else s.feedforward for s in stretches
+        ]
         forwards = _padded([table[s.past :] for table, s in zip(tables, stretches, strict=True)])
     # Inertias that are added to the mass matrix; damping is implicit.
     armature = 0.0 if rows.actuators.armature is None else rows.actuators.armature
@@ -363,7 +419,17 @@ def simulate(
                 passive = forward if passive is None else passive + forward
             effort = control.advance(commands.at(step), q, v, passive)
             if native is not None:
-                native.move(*q.shape, dt, q, v, dynamics.matrix, effort - force, added, plant.low, plant.high)
+                native.move(
+                    *q.shape,
+                    dt,
+                    q,
+                    v,
+                    dynamics.matrix,
+                    effort - force,
+                    added,
+                    plant.low,
+                    plant.high,
+                )
             else:
                 inertia = dynamics.matrix + added[:, :, None] * eye
                 v += dt * np.linalg.solve(inertia, (effort - force)[..., None])[..., 0]
@@ -385,19 +451,29 @@ class _Compensation:
     """Forces that the robot compensates by its description, at the present measured poses."""
 
     def __init__(
-        self, plant: Plant, drive: LogControl, dynamics: Dynamics, qpos: Float64, qvel: Float64, offset: Float64 | None
+        self,
+        plant: Plant,
+        drive: LogControl,
+        dynamics: Dynamics,
+        qpos: Float64,
+        qvel: Float64,
+        offset: Float64 | None,
     ) -> None:
         self._dynamics: Dynamics | None = None
         self._qpos = qpos
         self._measured = qpos
         self._offset = offset
-        self._updates = offset is not None or drive.compensate != "gravity+coriolis" or any(dynamics.masses)
+        self._updates = (
+            offset is not None or drive.compensate != "gravity+coriolis" or any(dynamics.masses)
+        )
         if drive.compensate == "none":
             return
         if offset is not None:
             self._measured = qpos + offset
         speed = np.zeros_like(qvel) if drive.compensate == "gravity" else qvel
-        self._dynamics = plant.dynamics([()] * len(qpos), self._measured, speed) if self._updates else dynamics
+        self._dynamics = (
+            plant.dynamics([()] * len(qpos), self._measured, speed) if self._updates else dynamics
+        )
 
     def now(self) -> Float64 | None:
         """Return the forces (n, joints); None without compensation."""
@@ -415,11 +491,15 @@ _MODEL = Model(when=lambda due, function, otherwise: otherwise)
 """The simulation refreshes the friction model by itself."""
 
 
-def _step(layout: Layout, constants: Constants, state: StepState, inputs: tuple[Any, ...]) -> tuple[StepState, Any]:
+def _step(
+    layout: Layout, constants: Constants, state: StepState, inputs: tuple[Any, ...]
+) -> tuple[StepState, Any]:
     """Return state and efforts of a control step."""
     command, qpos, qvel, passive = inputs
     step = Step(0, 1)
-    new, outputs = control_step(layout, constants, state, Command(command), Measured(qpos, qvel, passive), step)
+    new, outputs = control_step(
+        layout, constants, state, Command(command), Measured(qpos, qvel, passive), step
+    )
     return new, outputs.qf
 
 
@@ -433,7 +513,9 @@ def _trace(layout: Layout, *structures: Any) -> Trace:
 
 
 def _returned(state: StepState) -> StepState:
-    """Return the leaves of a state that a program returns: without histories, which it changes in place."""
+    """Return the leaves of a state that a program returns: without histories, which it changes in
+    place.
+    """
     motors = None if state.motors is None else state.motors._replace(command=None, sensor=None)
     return state._replace(motors=motors)
 
@@ -452,15 +534,23 @@ def changed_params(params: bp.PIDParams, law: Mapping[str, Float64]) -> bp.PIDPa
 
 
 def _padded(tables: Sequence[Float64]) -> Float64:
-    """Return tables (steps, joints) as one (most steps, tables, joints), each with its last row repeated."""
+    """Return tables (steps, joints) as one (most steps, tables, joints), each with its last row
+    repeated.
+    """
     most = max(map(len, tables))
-    return np.stack([table[np.minimum(np.arange(most), len(table) - 1)] for table in tables], axis=1)
+    return np.stack(
+        [table[np.minimum(np.arange(most), len(table) - 1)] for table in tables], axis=1
+    )
 
 
 class _Commands:
-    """Commands of n robots at the sim steps, late by their delay of setpoints, computed in blocks of steps."""
+    """Commands of n robots at the sim steps, late by their delay of setpoints, computed in blocks
+    of steps.
+    """
 
-    def __init__(self, drive: LogControl, rows: PlantCandidates, stretches: Sequence[Stretch]) -> None:
+    def __init__(
+        self, drive: LogControl, rows: PlantCandidates, stretches: Sequence[Stretch]
+    ) -> None:
         self._table = _padded([stretch.command[stretch.past :] for stretch in stretches])
         times = len(rows.setpoint_delay) // len(stretches)
         self._stretch = np.tile(np.arange(len(stretches)), times)
@@ -481,14 +571,22 @@ class _Commands:
 
 
 def _with_payload(tree: RigidTree, named: RigidTree) -> RigidTree:
-    """Return ``tree`` with a link without mass for the payload, at the center of mass of the tool of ``named``."""
+    """Return ``tree`` with a link without mass for the payload, at the center of mass of the tool
+    of ``named``.
+    """
     tool = named.index(named.tool)
     frame = named.bodies.link_frames[tool]
     place = frame[:, :3] @ named.center[tool] + frame[:, 3]
     carrier = tree.link_bodies.index(named.link_bodies[tool])
     frame = tree.bodies.link_frames[carrier]
-    more: Document = {"position": frame[:, :3].T @ (place - frame[:, 3]), "wxyz": [1, 0, 0, 0], "axis": [1, 0, 0]}
+    more: Document = {
+        "position": frame[:, :3].T @ (place - frame[:, 3]),
+        "wxyz": [1, 0, 0, 0],
+        "axis": [1, 0, 0],
+    }
     more |= {"parent": carrier, "mass": 0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}
-    tables: Document = {name: np.concatenate([getattr(tree, name), np.array([row])]) for name, row in more.items()}
+    tables: Document = {
+        name: np.concatenate([getattr(tree, name), np.array([row])]) for name, row in more.items()
+    }
     links, types = (*tree.links, PAYLOAD), (*tree.joint_types, "fixed")
     return replace(tree, links=links, joint_types=types, **tables)

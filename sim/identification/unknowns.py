@@ -1,4 +1,5 @@
-"""Unknowns of a fit: objects with a start, a typical size and a prior, and the candidates at their values.
+"""Unknowns of a fit: objects with a start, a typical size and a prior, and the candidates at their
+values.
 
 A positive unknown x of typical size s is fitted as log(x / s), in place of bounds; others as x / s.
 """
@@ -21,7 +22,9 @@ FARTHEST = 7.0
 
 
 LEAST_START = 0.02
-"""Least start of a positive unknown, over its typical size: further down its logarithm has no slope."""
+"""Least start of a positive unknown, over its typical size: further down its logarithm has no
+slope.
+"""
 
 
 class Kind(NamedTuple):
@@ -62,9 +65,11 @@ KINDS = {
     "slew": Kind("law", "joint", "top_speed", 2.0, np.inf),
     "mass": Kind("robot", "link", 1.0, 0.05, 1.0),
 }
-"""Kinds of unknowns. "static" is the friction at rest in addition to "friction", "stribeck" the speed at which half of
-it is left. "gain" is a factor of all gains of the law, "kd" of kd alone, "saturation" the law's effort limit over its
-kp [rad or m], "slew" the limit of the setpoints' rate, "mass" a factor of a link's mass and inertia."""
+"""Kinds of unknowns. "static" is the friction at rest in addition to "friction", "stribeck" the
+speed at which half of it is left. "gain" is a factor of all gains of the law, "kd" of kd alone,
+"saturation" the law's effort limit over its kp [rad or m], "slew" the limit of the setpoints' rate,
+"mass" a factor of a link's mass and inertia.
+"""
 BASIC = ("armature", "damping", "friction", "strength", "bias", "delay")
 """Kinds that every fit has."""
 EXTRAS = {
@@ -81,7 +86,9 @@ EXTRAS = {
 LAW = ("gain", "kd", "saturation", "slew")
 """Extras of a law."""
 DESCRIBED = {"damping": "damping", "friction": "friction"}
-"""Kinds to which the robot's description contributes, and the name there. Values of a fit include that part."""
+"""Kinds to which the robot's description contributes, and the name there. Values of a fit include
+that part.
+"""
 
 
 @dataclass(frozen=True)
@@ -90,7 +97,9 @@ class Unknown:
 
     kind: str
     joint: int | None
-    """Number of its joint among the logged ones; None for an unknown of the whole robot or of a link."""
+    """Number of its joint among the logged ones; None for an unknown of the whole robot or of a
+    link.
+    """
     start: float
     size: float
     floor: float = 0.0
@@ -113,7 +122,9 @@ class Unknown:
         if not KINDS[self.kind].positive:
             return coordinates * self.size
         begin = self.coordinate(self.start)
-        values = self.floor + self.size * np.exp(np.clip(coordinates, begin - FARTHEST, begin + FARTHEST))
+        values = self.floor + self.size * np.exp(
+            np.clip(coordinates, begin - FARTHEST, begin + FARTHEST)
+        )
         return np.minimum(values, KINDS[self.kind].most)
 
 
@@ -137,8 +148,9 @@ class Unknowns:
     ) -> Unknowns:
         """Return the unknowns of ``kinds``.
 
-        ``starts`` (joints,) or (1,) are values of some kinds, others begin at their typical size. ``sizes`` (joints,)
-        are typical values by name. A positive unknown begins at :data:`LEAST_START` of its typical size at least.
+        ``starts`` (joints,) or (1,) are values of some kinds, others begin at their typical size.
+        ``sizes`` (joints,) are typical values by name. A positive unknown begins at
+        :data:`LEAST_START` of its typical size at least.
         """
         entries = list[Unknown]()
         for name in kinds:
@@ -148,9 +160,21 @@ class Unknowns:
                 continue
             numbers: Sequence[int | None] = range(len(joints)) if kind.per == "joint" else (None,)
             for joint in numbers:
-                size = float(sizes[kind.size][joint or 0]) if isinstance(kind.size, str) else kind.size
-                start = float(starts[name][joint or 0]) if name in starts else size if kind.positive else 0.0
-                floor = 0.0 if name not in DESCRIBED else getattr(robot, DESCRIBED[name])[joints[joint or 0]]
+                size = (
+                    float(sizes[kind.size][joint or 0]) if isinstance(kind.size, str) else kind.size
+                )
+                start = (
+                    float(starts[name][joint or 0])
+                    if name in starts
+                    else size
+                    if kind.positive
+                    else 0.0
+                )
+                floor = (
+                    0.0
+                    if name not in DESCRIBED
+                    else getattr(robot, DESCRIBED[name])[joints[joint or 0]]
+                )
                 start = max(start, floor + LEAST_START * size) if kind.positive else start
                 entries.append(Unknown(name, joint, start, size, float(floor)))
         return cls(robot, joints, tuple(entries))
@@ -162,11 +186,15 @@ class Unknowns:
 
     @property
     def prior(self) -> Float64:
-        """Mean of the prior: ideal motors for strengths, factors and signed unknowns, else the start."""
+        """Mean of the prior: ideal motors for strengths, factors and signed unknowns, else the
+        start.
+        """
         means = [KINDS[entry.kind].neutral for entry in self.entries]
         return np.array(
             [
-                entry.coordinate(mean if mean == 1.0 or not KINDS[entry.kind].positive else entry.start)
+                entry.coordinate(
+                    mean if mean == 1.0 or not KINDS[entry.kind].positive else entry.start
+                )
                 for entry, mean in zip(self.entries, means, strict=True)
             ]
         )
@@ -182,7 +210,9 @@ class Unknowns:
         return np.stack(columns, axis=1) if columns else points
 
     def tables(self, values: Float64) -> dict[str, Float64]:
-        """Return the values (n, joints) of all kinds of motor, law and log, by kind; neutral or described elsewhere."""
+        """Return the values (n, joints) of all kinds of motor, law and log, by kind; neutral or
+        described elsewhere.
+        """
         count, tables = len(values), dict[str, Float64]()
         for name, described in DESCRIBED.items():
             row = getattr(self.robot, described)[list(self.joints)]
@@ -200,15 +230,25 @@ class Unknowns:
     def candidates(self, values: Float64) -> PlantCandidates:
         """Return the candidates with ``values`` (n, unknowns)."""
         tables = self.tables(values)
-        fields = {KINDS[name].field: table for name, table in tables.items() if KINDS[name].target == "motor"}
+        fields = {
+            KINDS[name].field: table
+            for name, table in tables.items()
+            if KINDS[name].target == "motor"
+        }
         if "static" in fields:
             fields["static"] = fields["static"] + fields["coulomb"]
         longest = np.array([[fields["command_delay"].max()]]) if "command_delay" in fields else None
         heavy = {
-            at: entry.link or PAYLOAD for at, entry in enumerate(self.entries) if entry.kind in ("payload", "mass")
+            at: entry.link or PAYLOAD
+            for at, entry in enumerate(self.entries)
+            if entry.kind in ("payload", "mass")
         }
-        masses = tuple(tuple((link, float(row[at])) for at, link in heavy.items()) for row in values)
-        delay = tables["setpoint_delay"][:, 0] if "setpoint_delay" in tables else np.zeros(len(values))
+        masses = tuple(
+            tuple((link, float(row[at])) for at, link in heavy.items()) for row in values
+        )
+        delay = (
+            tables["setpoint_delay"][:, 0] if "setpoint_delay" in tables else np.zeros(len(values))
+        )
         law = {name: table for name, table in tables.items() if KINDS[name].target == "law"}
         return PlantCandidates(Actuators(**fields, max_delay=longest), law, delay, masses)
 

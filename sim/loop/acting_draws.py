@@ -40,7 +40,11 @@ def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variati
     for name in PHYSICAL:
         if name in randomization.given:
             nominal = nominal_values(name, robot, options.mjcf)
-            rows = np.tile(nominal, (size, 1)) if draws is None else randomization.apply(name, nominal, draws, robot)
+            rows = (
+                np.tile(nominal, (size, 1))
+                if draws is None
+                else randomization.apply(name, nominal, draws, robot)
+            )
             values[name] = rows / nominal if name == "link_mass" else rows
     for name in ("payload", "ground_friction"):
         if name in values:
@@ -48,10 +52,16 @@ def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variati
     return Variation(**values)
 
 
-def acting_params(options: RunnerOptions, params: bp.PIDParams, draws: Draws | None) -> bp.PIDParams:
+def acting_params(
+    options: RunnerOptions, params: bp.PIDParams, draws: Draws | None
+) -> bp.PIDParams:
     """Return ``params`` with the draws applied."""
     randomization = options.randomization
-    return params if randomization is None else randomization.randomized_params(params, draws, options.robot)
+    return (
+        params
+        if randomization is None
+        else randomization.randomized_params(params, draws, options.robot)
+    )
 
 
 def acting_actuators(
@@ -59,4 +69,8 @@ def acting_actuators(
 ) -> bp.Actuators | None:
     """Return ``actuators`` with the draws applied."""
     randomization = options.randomization
-    return actuators if randomization is None else randomization.randomized_actuators(actuators, draws, options.robot)
+    return (
+        actuators
+        if randomization is None
+        else randomization.randomized_actuators(actuators, draws, options.robot)
+    )

@@ -18,10 +18,14 @@ Layout = dict[str, tuple[tuple[int, ...], Any]]
 
 
 class Command(NamedTuple):
-    """Command of one tick, (envs, ...), or of several, (ticks, envs, ...); None where nothing is given."""
+    """Command of one tick, (envs, ...), or of several, (ticks, envs, ...); None where nothing is
+    given.
+    """
 
     setpoint: Array
-    """(envs, size), as :attr:`batchpid.sim.RunnerOptions.command` describes it: for joints (envs, dof) [rad or m]."""
+    """(envs, size), as :attr:`batchpid.sim.RunnerOptions.command` describes it: for joints (envs,
+    dof) [rad or m].
+    """
     setpoint_rate: Array = None
     """Rate of the setpoint, per second (envs, size)."""
     setpoint_acceleration: Array = None
@@ -40,14 +44,17 @@ class Command(NamedTuple):
 
     def with_only(self, given: tuple[bool, ...]) -> Command:
         """Return the command with only the arrays that are ``given``."""
-        return Command(*[rows if is_given else None for rows, is_given in zip(self, given, strict=True)])
+        return Command(
+            *[rows if is_given else None for rows, is_given in zip(self, given, strict=True)]
+        )
 
 
 class FaultArrays(NamedTuple):
     """Last fault of each env (envs,): sim step (-1: none), joint, and index into
     :data:`batchpid.sim.loop.faults.CAUSES`.
 
-    Where the cause is one of :data:`batchpid.sim.loop.faults.COMMAND_CAUSES`, ``joint`` is the entry of the command.
+    Where the cause is one of :data:`batchpid.sim.loop.faults.COMMAND_CAUSES`, ``joint`` is the
+    entry of the command.
 
     ``missed_contact`` is the sim step of its first missed contact (0: none).
     """
@@ -59,7 +66,8 @@ class FaultArrays(NamedTuple):
 
 
 class Arrays(NamedTuple):
-    """Input and output of a loop, with leading axes (envs,) for one tick or (ticks, envs) for several.
+    """Input and output of a loop, with leading axes (envs,) for one tick or (ticks, envs) for
+    several.
 
     Each run tells which commands it uses; the others are ignored.
     """
@@ -76,11 +84,15 @@ class Arrays(NamedTuple):
         command_size: int | None = None,
         observed: Mapping[str, Quantity] = OBSERVED,
     ) -> Layout:
-        """Return the layout of all fields, for :meth:`from_fields`; a setpoint has ``command_size`` (dof) numbers."""
+        """Return the layout of all fields, for :meth:`from_fields`; a setpoint has ``command_size``
+        (dof) numbers.
+        """
         row, table = (ticks, num_envs), (ticks, num_envs, dof)
         setpoint = table if command_size is None else (*row, command_size)
         sizes = Command(setpoint, setpoint, setpoint, table)
-        layout: Layout = {f"command.{name}": (shape, np.float64) for name, shape in sizes._asdict().items()}
+        layout: Layout = {
+            f"command.{name}": (shape, np.float64) for name, shape in sizes._asdict().items()
+        }
         for name, quantity in observed.items():
             layout[f"observation.{name}"] = (quantity.shape(table), quantity.dtype)
         return layout | {f"fault.{name}": (row, np.int64) for name in FaultArrays._fields}
@@ -92,12 +104,20 @@ class Arrays(NamedTuple):
         def group(kind: Any, prefix: str) -> Any:
             return kind(*[fields.get(f"{prefix}.{name}") for name in kind._fields])
 
-        return Arrays(group(Command, "command"), group(Observation, "observation"), group(FaultArrays, "fault"))
+        return Arrays(
+            group(Command, "command"),
+            group(Observation, "observation"),
+            group(FaultArrays, "fault"),
+        )
 
     def at(self, index: Any) -> Arrays:
         """Return views at an index of the leading axes, such as a tick or a slice of envs."""
         part = itemgetter(index)
-        return Arrays(self.command.map(part), self.observation.map(part), FaultArrays._make(map(part, self.fault)))
+        return Arrays(
+            self.command.map(part),
+            self.observation.map(part),
+            FaultArrays._make(map(part, self.fault)),
+        )
 
 
 class Ticks:

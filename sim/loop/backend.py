@@ -1,4 +1,6 @@
-"""How law and sim steps run under the options of a runner: in native code, XLA or NumPy, and why."""
+"""How law and sim steps run under the options of a runner: in native code, XLA or NumPy, and
+why.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,11 @@ def native_obstacle(options: RunnerOptions) -> str:
     if options.robot.dof > MOST_SUMMED:
         return f"more than {MOST_SUMMED} joints"
     engine = options.load_engine()
-    return "" if "compiled_steps" in engine.capabilities else f"the sim steps of {engine.name!r} are calls of Python"
+    return (
+        ""
+        if "compiled_steps" in engine.capabilities
+        else f"the sim steps of {engine.name!r} are calls of Python"
+    )
 
 
 def describe(options: RunnerOptions) -> str:

@@ -1,6 +1,8 @@
-r"""One sim step of the control of many robots: a table of stages, each a pure function of arrays, for NumPy and JAX.
+r"""One sim step of the control of many robots: a table of stages, each a pure function of arrays,
+for NumPy and JAX.
 
-With setpoint r, joint positions q and velocities v, and passive force p, :data:`STAGES` are in this order::
+With setpoint r, joint positions q and velocities v, and passive force p, :data:`STAGES` are in this
+order::
 
     sensors         y    = sensors(q), y' = sensors(v)
     passive force   p    = p(y, y')                       where sensors measure
@@ -17,10 +19,11 @@ With setpoint r, joint positions q and velocities v, and passive force p, :data:
     constraint      of coupled joints                     every 4 sim steps of a tick
     engine          applies qf, does its step; q, v and p are read
 
-The executors run this table, each with its own kind of arrays. :mod:`batchpid.sim.loop.numpy_executor` and
-:mod:`batchpid.sim.loop.xla_executor` call its functions. :mod:`batchpid.sim.loop.native_ticks` makes native programs of
-them. The last three stages are the executors' own. A :class:`batchpid.sim.loop.step_values.StepState` is the whole
-state of the control between sim steps.
+The executors run this table, each with its own kind of arrays.
+:mod:`batchpid.sim.loop.numpy_executor` and :mod:`batchpid.sim.loop.xla_executor` call its
+functions. :mod:`batchpid.sim.loop.native_ticks` makes native programs of them. The last three
+stages are the executors' own. A :class:`batchpid.sim.loop.step_values.StepState` is the whole state
+of the control between sim steps.
 """
 
 from __future__ import annotations
@@ -37,26 +40,48 @@ from batchpid.motors import guard as guard_model
 from batchpid.motors.friction import FrictionState
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.pid_law import half_way
-from batchpid.sim.loop.step_values import Constants, Layout, Measured, Outputs, Step, StepState, Values
+from batchpid.sim.loop.step_values import (
+    Constants,
+    Layout,
+    Measured,
+    Outputs,
+    Step,
+    StepState,
+    Values,
+)
 
 REFRESH_STEPS = 64
 """Sim steps of an env between updates of the friction model's inertia."""
 COUPLING_STEPS = 4
-"""Sim steps for which the constraint efforts of coupled joints keep their mass matrix within a tick."""
+"""Sim steps for which the constraint efforts of coupled joints keep their mass matrix within a
+tick.
+"""
 
 
 def control_step(
-    layout: Layout, constants: Constants, state: StepState, command: Command, measured: Measured, step: Step
+    layout: Layout,
+    constants: Constants,
+    state: StepState,
+    command: Command,
+    measured: Measured,
+    step: Step,
 ) -> tuple[StepState, Outputs]:
-    """Advance the control by one sim step; return its state and the efforts to apply. Inputs are not modified."""
+    """Advance the control by one sim step; return its state and the efforts to apply. Inputs are
+    not modified.
+    """
     values = sim_step(layout, constants, Values(state, command, measured, step, measured), {})
     return values.state, values.outputs
 
 
 def sim_step(
-    layout: Layout, constants: Constants, values: Values, engine: Mapping[str, Callable[[Values], Values]]
+    layout: Layout,
+    constants: Constants,
+    values: Values,
+    engine: Mapping[str, Callable[[Values], Values]],
 ) -> Values:
-    """Run the stages of a sim step in the order of the table; ``engine`` has the executor's own stages, by name."""
+    """Run the stages of a sim step in the order of the table; ``engine`` has the executor's own
+    stages, by name.
+    """
     for stage in STAGES:
         if stage.function is not None:
             values = stage.function(layout, constants, values)
@@ -66,7 +91,9 @@ def sim_step(
 
 
 def mass_matrix(layout: Layout, constants: Constants, qpos: Array) -> Array:
-    """Return the law's mass matrix (M, dof, dof): M + known armature + dt B, for the leaders only."""
+    """Return the law's mass matrix (M, dof, dof): M + known armature + dt B, for the leaders
+    only.
+    """
     xp, matrix = namespace(qpos), layout.model.mass_matrix(qpos)
     if constants.armature is not None:
         matrix = matrix + xp.diag(constants.armature)
@@ -75,12 +102,16 @@ def mass_matrix(layout: Layout, constants: Constants, qpos: Array) -> Array:
     return constants.coupling.mass_matrix(matrix)
 
 
-def refreshed(layout: Layout, constants: Constants, friction: FrictionState, qpos: Array) -> FrictionState:
+def refreshed(
+    layout: Layout, constants: Constants, friction: FrictionState, qpos: Array
+) -> FrictionState:
     """Return the state of the friction model with the inertia at ``qpos``, for the leaders only."""
     if layout.model.refresh is not None:
         return layout.model.refresh(friction, qpos)
     matrix = constants.coupling.mass_matrix(layout.model.joint_mass_matrix(qpos))
-    return friction_model.refresh(constants.friction, friction, matrix, constants.timestep, *constants.drive)
+    return friction_model.refresh(
+        constants.friction, friction, matrix, constants.timestep, *constants.drive
+    )
 
 
 def carried(command: Command, left: Array) -> Command:
@@ -88,8 +119,8 @@ def carried(command: Command, left: Array) -> Command:
 
         r <- r - left (r' - left r'' / 2)        r' <- r' - left r''
 
-    A setpoint and its rate hold at the end of their tick, as in :class:`batchpid.trajectories.Trajectory`; an
-    acceleration is the same in the whole tick.
+    A setpoint and its rate hold at the end of their tick, as in
+    :class:`batchpid.trajectories.Trajectory`; an acceleration is the same in the whole tick.
     """
     setpoint, rate, acceleration, _ = command
     if rate is None:
@@ -97,20 +128,28 @@ def carried(command: Command, left: Array) -> Command:
     if acceleration is None:
         return command._replace(setpoint=setpoint - left * rate)
     change = left * acceleration
-    return command._replace(setpoint=setpoint - left * (rate - 0.5 * change), setpoint_rate=rate - change)
+    return command._replace(
+        setpoint=setpoint - left * (rate - 0.5 * change), setpoint_rate=rate - change
+    )
 
 
 def feedforward(constants: Constants, command: Command, qpos: Array, passive: Array) -> Array:
-    """Return the passive force plus the caller's feedforward and known friction, for the leaders; None for zero."""
+    """Return the passive force plus the caller's feedforward and known friction, for the leaders;
+    None for zero.
+    """
     forward = _sum(passive, command.feedforward)
     forward = None if forward is None else constants.coupling.efforts(forward)
     if (known := constants.known) is None:
         return forward
     error = wrap(command.setpoint - qpos, known.turns, namespace(qpos))
-    return _sum(friction_model.compensation(known.friction, error, command.setpoint_rate, known.band), forward)
+    return _sum(
+        friction_model.compensation(known.friction, error, command.setpoint_rate, known.band),
+        forward,
+    )
 
 
-# -- stages ------------------------------------------------------------------------------------------------------
+# -- stages
+# --------------------------------------------------------------------------------------------------
 
 
 def _sensors(layout: Layout, constants: Constants, values: Values) -> Values:
@@ -118,17 +157,23 @@ def _sensors(layout: Layout, constants: Constants, values: Values) -> Values:
     if motors is None:
         return values
     noise = values.noise if model.noise is None else model.noise(constants.motors, motors, qpos)
-    motors, qpos, qvel = advance_measurement(constants.motors, motors, qpos, qvel, noise, model.stages)
+    motors, qpos, qvel = advance_measurement(
+        constants.motors, motors, qpos, qvel, noise, model.stages
+    )
     seen = Measured(qpos, qvel, passive)
     return values._replace(state=values.state._replace(motors=motors), seen=seen, noise=None)
 
 
 def _passive_force(layout: Layout, constants: Constants, values: Values) -> Values:
-    """The passive force of the description at the measured state, which the engine does not know."""
+    """The passive force of the description at the measured state, which the engine does not
+    know.
+    """
     if not layout.measures or layout.model.passive_force is None:
         return values
     qpos, qvel, _ = values.seen
-    return values._replace(seen=values.seen._replace(passive=layout.model.passive_force(qpos, qvel)))
+    return values._replace(
+        seen=values.seen._replace(passive=layout.model.passive_force(qpos, qvel))
+    )
 
 
 def _inertia(layout: Layout, constants: Constants, values: Values) -> Values:
@@ -167,7 +212,8 @@ def _setpoint(layout: Layout, constants: Constants, values: Values) -> Values:
 
 
 def _guard(layout: Layout, constants: Constants, values: Values) -> Values:
-    """Guarded setpoints and rates (if given), and the mask of changes. Followers move with their leaders.
+    """Guarded setpoints and rates (if given), and the mask of changes. Followers move with their
+    leaders.
 
     A given acceleration is 0 where the guard changes the setpoint.
     """
@@ -177,7 +223,9 @@ def _guard(layout: Layout, constants: Constants, values: Values) -> Values:
     if state is None:
         return values
     xp = namespace(command.setpoint)
-    state, changed = guard_model.advance(constants.guard, state, command.setpoint, constants.timestep)
+    state, changed = guard_model.advance(
+        constants.guard, state, command.setpoint, constants.timestep
+    )
     setpoint = state.setpoint
     rate = command.setpoint_rate
     acceleration = command.setpoint_acceleration
@@ -186,7 +234,9 @@ def _guard(layout: Layout, constants: Constants, values: Values) -> Values:
     if acceleration is not None:
         acceleration = xp.where(changed, 0.0, acceleration)
     setpoint, changed = coupling.positions(setpoint), coupling.of_leaders(changed)
-    rate, acceleration = (None if each is None else coupling.rates(each) for each in (rate, acceleration))
+    rate, acceleration = (
+        None if each is None else coupling.rates(each) for each in (rate, acceleration)
+    )
     return values._replace(
         state=values.state._replace(guard=state),
         command=Command(setpoint, rate, acceleration, command.feedforward),
@@ -205,9 +255,13 @@ def _controller(layout: Layout, constants: Constants, values: Values) -> Values:
     if layout.control != "custom":
         return values
     passive = namespace(seen.qpos).zeros_like(seen.qpos) if seen.passive is None else seen.passive
-    law, returned, *limited = layout.model.controller(state.law, values.command.setpoint, seen.qpos, seen.qvel, passive)
+    law, returned, *limited = layout.model.controller(
+        state.law, values.command.setpoint, seen.qpos, seen.qvel, passive
+    )
     outputs = values.outputs._replace(returned=returned)
-    return values._replace(state=state._replace(law=law), limited=limited[0] if limited else None, outputs=outputs)
+    return values._replace(
+        state=state._replace(law=law), limited=limited[0] if limited else None, outputs=outputs
+    )
 
 
 def _law(layout: Layout, constants: Constants, values: Values) -> Values:
@@ -219,28 +273,45 @@ def _law(layout: Layout, constants: Constants, values: Values) -> Values:
     return values._replace(outputs=values.outputs._replace(motor=values.outputs.qf))
 
 
-def _pid(layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]) -> Values:
+def _pid(
+    layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]
+) -> Values:
     """qf = sat(PID(setpoint, qpos) + feedforward)."""
     seen = values.seen
     state = values.state
     law = layout.law
     assert law is not None
-    viscous = None if constants.damping is None else constants.coupling.efforts(constants.damping * seen.qvel)
+    viscous = (
+        None
+        if constants.damping is None
+        else constants.coupling.efforts(constants.damping * seen.qvel)
+    )
     setpoint, rate, acceleration, _ = values.command
     if acceleration is not None:  # the leaders' mass matrix has the followers' share
         acceleration = constants.coupling.of_independent(acceleration)
-    inputs = ((setpoint, rate, acceleration), seen.qpos, seen.qvel, seen.passive, state.matrix, viscous, *limits)
+    inputs = (
+        (setpoint, rate, acceleration),
+        seen.qpos,
+        seen.qvel,
+        seen.passive,
+        state.matrix,
+        viscous,
+        *limits,
+    )
     new, effort, saturated = layout.model.law(law, constants.k, state.law, *inputs)
     outputs = values.outputs._replace(qf=effort, saturated=saturated)
     return values._replace(state=state._replace(law=new), outputs=outputs)
 
 
-def _drive(layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]) -> Values:
+def _drive(
+    layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]
+) -> Values:
     """The engine's drives with stiffness kp and damping kd; qf = feedforward.
 
-    With ki the drive's target moves by the integral over kp (:func:`batchpid.drive_target`), so that the drive acts as
-    a PID whose P and D the engine integrates implicitly. The engine's drives do not know whole turns, so the target of
-    a continuous joint is the one next to qpos, which may jump at every sim step.
+    With ki the drive's target moves by the integral over kp (:func:`batchpid.drive_target`), so
+    that the drive acts as a PID whose P and D the engine integrates implicitly. The engine's drives
+    do not know whole turns, so the target of a continuous joint is the one next to qpos, which may
+    jump at every sim step.
     """
     (target, rate, *_), seen, state = values.command, values.seen, values.state
     xp = namespace(seen.qpos)
@@ -254,35 +325,56 @@ def _drive(layout: Layout, constants: Constants, values: Values, limits: tuple[A
     return values._replace(state=state, outputs=outputs)
 
 
-def _effort(layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]) -> Values:
-    """qf = sat(the caller's effort + feedforward); the setpoint is the effort, and a follower's acts on its leader."""
+def _effort(
+    layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]
+) -> Values:
+    """qf = sat(the caller's effort + feedforward); the setpoint is the effort, and a follower's
+    acts on its leader.
+    """
     asked = constants.coupling.efforts(values.command.setpoint)
     return _saturated(constants, _sum(asked, values.seen.passive), values, limits)
 
 
-def _custom(layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]) -> Values:
+def _custom(
+    layout: Layout, constants: Constants, values: Values, limits: tuple[Array, Array]
+) -> Values:
     """qf = sat(effort of the caller's own controller)."""
-    values = _saturated(constants, constants.coupling.efforts(values.outputs.returned), values, limits)
+    values = _saturated(
+        constants, constants.coupling.efforts(values.outputs.returned), values, limits
+    )
     outputs = values.outputs
     if values.limited is None:
         return values
-    return values._replace(outputs=outputs._replace(saturated=outputs.saturated | (values.limited > 0)))
+    return values._replace(
+        outputs=outputs._replace(saturated=outputs.saturated | (values.limited > 0))
+    )
 
 
-_LAWS: dict[str, Callable[..., Values]] = {"pid": _pid, "drive": _drive, "effort": _effort, "custom": _custom}
+_LAWS: dict[str, Callable[..., Values]] = {
+    "pid": _pid,
+    "drive": _drive,
+    "effort": _effort,
+    "custom": _custom,
+}
 
 
 def _motors(layout: Layout, constants: Constants, values: Values) -> Values:
     (qpos, qvel, _), state, outputs = values.measured, values.state, values.outputs
     if state.motors is None:
         return values
-    motors, effort = advance_effort(constants.motors, state.motors, outputs.qf, qpos, qvel, layout.model.stages)
-    return values._replace(state=state._replace(motors=motors), outputs=outputs._replace(qf=effort, motor=effort))
+    motors, effort = advance_effort(
+        constants.motors, state.motors, outputs.qf, qpos, qvel, layout.model.stages
+    )
+    return values._replace(
+        state=state._replace(motors=motors), outputs=outputs._replace(qf=effort, motor=effort)
+    )
 
 
 def _friction(layout: Layout, constants: Constants, values: Values) -> Values:
     state, outputs = values.state, values.outputs
-    friction, qf = friction_model.advance(constants.friction, state.friction, outputs.qf, values.measured.qvel)
+    friction, qf = friction_model.advance(
+        constants.friction, state.friction, outputs.qf, values.measured.qvel
+    )
     return values._replace(state=state._replace(friction=friction), outputs=outputs._replace(qf=qf))
 
 
@@ -313,7 +405,9 @@ STAGES = (
 """Stages of a sim step, in order."""
 
 
-def _saturated(constants: Constants, total: Array, values: Values, limits: tuple[Array, Array]) -> Values:
+def _saturated(
+    constants: Constants, total: Array, values: Values, limits: tuple[Array, Array]
+) -> Values:
     """Return ``values`` with the effort ``total`` clipped to the limits of motors and params."""
     xp = namespace(total, *limits)
     effort = clip(clip(total, *limits, xp), *constants.limits, xp)

@@ -1,4 +1,6 @@
-"""Control by the caller's own controller, called at every sim step with the state of a group of envs."""
+"""Control by the caller's own controller, called at every sim step with the state of a group of
+envs.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,8 @@ from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 
 class OwnController:
-    """Caller's own controller (:class:`batchpid.sim.options.Controller`), checked; its state is a dictionary of arrays
-    by name.
+    """Caller's own controller (:class:`batchpid.sim.options.Controller`), checked; its state is a
+    dictionary of arrays by name.
 
     All groups of envs share it, and thus its JAX program.
     """
@@ -30,13 +32,16 @@ class OwnController:
     def __init__(self, options: RunnerOptions) -> None:
         assert not isinstance(options.control, str)
         self._options, self._controller = options, options.control
-        self._reporting = options.control.reporting if isinstance(options.control, OperationalSpace) else None
+        self._reporting = (
+            options.control.reporting if isinstance(options.control, OperationalSpace) else None
+        )
         self._structure: Any = None
 
     def init(self, envs: int) -> dict[str, Rows]:
         """Return a checked copy of the controller's initial state for ``envs`` envs.
 
-        Raises InvalidArgumentError if an array of the state does not have the envs as its first axis.
+        Raises InvalidArgumentError if an array of the state does not have the envs as its first
+        axis.
         """
         state = self._structure = _begin(self._options, envs)
         leaves = {name: np.array(leaf) for name, leaf in flatten(state).items()}
@@ -44,7 +49,8 @@ class OwnController:
             if leaf.shape[:1] != (envs,):
                 raise InvalidArgumentError(
                     "control",
-                    f"init returned a state{name and ' ' + name} of shape {leaf.shape}, for {envs} envs",
+                    f"init returned a state{name and ' ' + name} of shape {leaf.shape}, for {envs}"
+                    " envs",
                     remedy="make the envs the first axis of every array of the state",
                 )
         return leaves
@@ -59,13 +65,18 @@ class OwnController:
         return rows
 
     def __call__(self, state: Mapping[str, Any], *inputs: Float64) -> tuple[Array, ...]:
-        """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel and passive force.
+        """Return the new state and the effort (M, dof); inputs are setpoint, qpos, qvel and passive
+        force.
 
-        Operational-space control limits efforts itself; a third result are the joints with limited efforts (M, dof).
+        Operational-space control limits efforts itself; a third result are the joints with limited
+        efforts (M, dof).
 
-        Raises InvalidArgumentError if the controller returned an effort or a state of a wrong shape or dtype.
+        Raises InvalidArgumentError if the controller returned an effort or a state of a wrong shape
+        or dtype.
         """
-        copies = (read_only(np.array(rows)) for rows in inputs)  # the controller may keep them, but not write to them
+        copies = (
+            read_only(np.array(rows)) for rows in inputs
+        )  # the controller may keep them, but not write to them
         new, wanted, *limited = self._called(unflatten(self._structure, state), *copies)
         leaves = _like(state, flatten(new, read=np.array))
         effort = np.array(wanted, np.float64)
@@ -81,8 +92,8 @@ class OwnController:
     def traced(self, leaves: Mapping[str, Any], *inputs: Any) -> tuple[Array, ...]:
         """Call the controller within a JAX program; arguments and results as in :meth:`__call__`.
 
-        Raises InvalidArgumentError if JAX cannot trace the controller, or it returns an effort or a state of a wrong
-        shape or dtype.
+        Raises InvalidArgumentError if JAX cannot trace the controller, or it returns an effort or a
+        state of a wrong shape or dtype.
         """
         import jax
 
@@ -110,7 +121,9 @@ def initial_state(options: RunnerOptions, params: bp.PIDParams) -> dict[str, Row
 
 @contextmanager
 def controller_errors(controller: object, step: int = 0) -> Iterator[None]:
-    """Convert errors in sim step ``step`` of a tick to ControllerErrors, unless ``controller`` is None."""
+    """Convert errors in sim step ``step`` of a tick to ControllerErrors, unless ``controller`` is
+    None.
+    """
     try:
         yield
     except Exception as error:
@@ -132,9 +145,14 @@ def _begin(options: RunnerOptions, envs: int) -> Any:
 def _check_effort(effort: Array, qpos: Array) -> None:
     if effort.shape != qpos.shape:
         rows = effort.shape[:1] == qpos.shape[:1]  # the number of rows depends on the groups
-        got, wanted = (f"(envs{''.join(f', {n}' for n in a.shape[1:])})" if rows else a.shape for a in (effort, qpos))
+        got, wanted = (
+            f"(envs{''.join(f', {n}' for n in a.shape[1:])})" if rows else a.shape
+            for a in (effort, qpos)
+        )
         problem = f"returned an effort of shape {got}, not {wanted}"
-        raise InvalidArgumentError("control", problem, remedy="return (state, effort), effort of shape (envs, dof)")
+        raise InvalidArgumentError(
+            "control", problem, remedy="return (state, effort), effort of shape (envs, dof)"
+        )
 
 
 def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
@@ -146,7 +164,9 @@ def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
     for name in dict.fromkeys([*before, *leaves]):
         old, leaf = before.get(name), leaves.get(name)
         if old is None or leaf is None:
-            problem = f"returned a state {'without' if leaf is None else 'with an unknown'} {name!r}"
+            problem = (
+                f"returned a state {'without' if leaf is None else 'with an unknown'} {name!r}"
+            )
         elif leaf.shape != old.shape:
             problem = f"returned a state {name!r} of shape {leaf.shape}, not {old.shape}"
         elif leaf.dtype == old.dtype:
@@ -156,6 +176,8 @@ def _like(before: Mapping[str, Any], leaves: Mapping[str, Any]) -> Document:
             new[name] = leaf.astype(old.dtype)
             continue
         else:
-            problem = f"returned a state {name!r} of {leaf.dtype}, which does not fit into {old.dtype}"
+            problem = (
+                f"returned a state {name!r} of {leaf.dtype}, which does not fit into {old.dtype}"
+            )
         raise InvalidArgumentError("control", problem, remedy="return a state as init does")
     return new

@@ -1,4 +1,5 @@
-"""Group of envs that advance together: their state, and its changes by ticks, resets, params, actuators and faults.
+"""Group of envs that advance together: their state, and its changes by ticks, resets, params,
+actuators and faults.
 
 Longer than 350 lines because every change of the state is here.
 """
@@ -45,10 +46,11 @@ from batchpid.sim.randomization.distributions import Draws
 
 
 class EnvGroup:
-    """One pack and its control; runs the sim steps of a tick, and suspends or resets envs that fail.
+    """One pack and its control; runs the sim steps of a tick, and suspends or resets envs that
+    fail.
 
-    ``envs`` are its rows in the loop's arrays, and ``params`` the params of these envs. ``controller`` is the caller's
-    own, or None.
+    ``envs`` are its rows in the loop's arrays, and ``params`` the params of these envs.
+    ``controller`` is the caller's own, or None.
     """
 
     def __init__(
@@ -64,10 +66,14 @@ class EnvGroup:
         self._options = options
         self._controller = controller
         self.draws: Draws | None = None
-        """Draws of the randomization for these envs; a reset, or new params, put them into effect."""
+        """Draws of the randomization for these envs; a reset, or new params, put them into
+        effect.
+        """
         self._params = self._acting_params = params  # before and after the randomization
         self._own_actuators: bp.Actuators | None = None  # before the randomization
-        self._actuators: bp.Actuators | None = None  # after it; None without effect on efforts or measurements
+        self._actuators: bp.Actuators | None = (
+            None  # after it; None without effect on efforts or measurements
+        )
         self._episode = np.zeros(pack.size, np.int64)
         self._drops_actuators = False  # of a pack in use, at the next write()
         self._containment = FaultContainment(pack.size, pack.dof, options.on_fault)
@@ -80,10 +86,16 @@ class EnvGroup:
         observed = pack.spec.is_alone or (reads_base and not pack.spec.fixed_base)
         self._observes_natively = observed and not self._sensed and self._pushes is None
         self._steps = 0
-        missed = MissedContacts(pack.spec, pack.size, options.robot.has_ground) if options.misses_contacts else None
+        missed = (
+            MissedContacts(pack.spec, pack.size, options.robot.has_ground)
+            if options.misses_contacts
+            else None
+        )
         self._contacts = missed
         qpos = pack.read_qpos()
-        self._state = StepState(bp.init(params, qpos) if controller is None else controller.init(pack.size))
+        self._state = StepState(
+            bp.init(params, qpos) if controller is None else controller.init(pack.size)
+        )
         self._prepare()
         everyone = np.ones(pack.size, bool)
         self._state = reset_guard(self._constants, self._state, qpos, everyone)
@@ -99,7 +111,8 @@ class EnvGroup:
         layout = make_layout(options, self._acting_params, self._actuators)
         layout = with_model(options, pack, layout, constants, self._controller)
         self._layout, self._constants = layout, constants
-        # Native wherever the engine has native steps, under backend "numpy" too: the bits are the same.
+        # Native wherever the engine has native steps, under backend "numpy" too: the bits are the
+        # same.
         self._executor: NumPyExecutor | XLAExecutor
         if not isinstance(pack, CompiledPack) or not pack.steps_natively:
             self._executor = NumPyExecutor(options, pack, layout, constants)
@@ -110,7 +123,9 @@ class EnvGroup:
         self._measured = self._executor.measure()
 
     def execute_in_numpy(self) -> None:
-        """Run sim steps call by call in NumPy until the next change, so that the phases of a step can be timed."""
+        """Run sim steps call by call in NumPy until the next change, so that the phases of a step
+        can be timed.
+        """
         self._executor = NumPyExecutor(self._options, self.pack, self._layout, self._constants)
 
     def _write_drives(self) -> None:
@@ -118,7 +133,9 @@ class EnvGroup:
         if isinstance(self.pack, DrivenPack) and self._options.control == "drive":
             damping, stiffness = self._constants.drive
             limit = self._acting_params.effort_max
-            self.pack.write_drive(stiffness, damping, np.full_like(stiffness, np.inf) if limit is None else limit)
+            self.pack.write_drive(
+                stiffness, damping, np.full_like(stiffness, np.inf) if limit is None else limit
+            )
 
     @property
     def _qpos(self) -> Float64:
@@ -155,7 +172,11 @@ class EnvGroup:
         """Put the actuators, with the draws applied, into effect; return them."""
         actuators = acting_actuators(self._options, self._own_actuators, self.draws)
         old, motors = self._state.motors, None
-        self._actuators = actuators if actuators is not None and (actuators.measures or actuators.delivers) else None
+        self._actuators = (
+            actuators
+            if actuators is not None and (actuators.measures or actuators.delivers)
+            else None
+        )
         if self._actuators is not None:
             if old is None:
                 self._episode[:] = 0
@@ -165,18 +186,28 @@ class EnvGroup:
         return actuators
 
     def reset(
-        self, mask: NDArray[np.bool_], qpos: Float64, qvel: Float64, steps: int, base: Float64 | None = None
+        self,
+        mask: NDArray[np.bool_],
+        qpos: Float64,
+        qvel: Float64,
+        steps: int,
+        base: Float64 | None = None,
     ) -> None:
-        """Place the envs of ``mask`` (M,), with a fresh controller state, after ``steps`` sim steps.
+        """Place the envs of ``mask`` (M,), with a fresh controller state, after ``steps`` sim
+        steps.
 
         Floating bases are placed at ``base`` (M, 13).
 
-        An env whose ``qpos`` or ``qvel`` (M, dof) is not finite returns to its last start, and has failed.
+        An env whose ``qpos`` or ``qvel`` (M, dof) is not finite returns to its last start, and has
+        failed.
         """
         containment = self._containment
         containment.clear(mask)
         self._vary(mask)
-        bad = {cause: mask[:, None] & ~np.isfinite(rows) for cause, rows in (("qpos", qpos), ("qvel", qvel))}
+        bad = {
+            cause: mask[:, None] & ~np.isfinite(rows)
+            for cause, rows in (("qpos", qpos), ("qvel", qvel))
+        }
         good = mask & ~(bad["qpos"] | bad["qvel"]).any(1)
         containment.start_qpos[good], containment.start_qvel[good] = qpos[good], qvel[good]
         if base is not None:
@@ -188,11 +219,21 @@ class EnvGroup:
             containment.fail(entries, cause, steps, containment.start_qpos)
         self._place_failed()
 
-    def run(self, ticks: Ticks, given: tuple[bool, ...], first: int, until: int, substeps: int, steps: int) -> int:
-        """Run ticks of ``substeps`` sim steps from ``first`` on, at least one; observe them; return the next one.
+    def run(
+        self,
+        ticks: Ticks,
+        given: tuple[bool, ...],
+        first: int,
+        until: int,
+        substeps: int,
+        steps: int,
+    ) -> int:
+        """Run ticks of ``substeps`` sim steps from ``first`` on, at least one; observe them; return
+        the next one.
 
-        It returns before ``until`` after a tick with an event: a possible contact, or a failed env. ``given`` marks the
-        commands that are used, and ``steps`` is the number of sim steps before the first tick.
+        It returns before ``until`` after a tick with an event: a possible contact, or a failed env.
+        ``given`` marks the commands that are used, and ``steps`` is the number of sim steps before
+        the first tick.
         """
         containment, command = self._containment, ticks[first].command.with_only(given)
         containment.failed, table = containment.suspended.copy(), None
@@ -206,10 +247,13 @@ class EnvGroup:
         elif self._contacts is None and self._observes_natively:
             if self._table is None:
                 fault = FaultArrays(*[getattr(containment, name) for name in FaultArrays._fields])
-                self._table = Table(ticks.arrays, self._motor, self._saturated, self._guarded, fault)
+                self._table = Table(
+                    ticks.arrays, self._motor, self._saturated, self._guarded, fault
+                )
             table = self._table
-        # With a table native code reads the commands and writes the observations of many ticks by itself. It stops
-        # within a tick where Python has to look: then ``done`` steps of it are made, and the rest follows here.
+        # With a table native code reads the commands and writes the observations of many ticks by
+        # itself. It stops within a tick where Python has to look: then ``done`` steps of it are
+        # made, and the rest follows here.
         tick, done = self._execute(command, Span(first, 0, until, substeps), table)
         if not done:
             return tick
@@ -241,7 +285,9 @@ class EnvGroup:
         pushes.advance(substeps)
 
     def _execute(self, command: Command, span: Span, table: Table | None) -> tuple[int, int]:
-        """Run sim steps and handle an event; return the first tick that is not observed, and its steps done."""
+        """Run sim steps and handle an event; return the first tick that is not observed, and its
+        steps done.
+        """
         with np.errstate(all="ignore"):  # overflow and invalid values become faults
             ran = self._executor.run(self._state, self._measured, command, span, table)
             self._state = ran.state
@@ -269,11 +315,17 @@ class EnvGroup:
         observation.guarded[...] = self._guarded
         observation.ok[...] = ~containment.failed
         if observation.base_pose is not None and observation.base_twist is not None:
-            observation.base_pose[...], observation.base_twist[...] = np.split(self.pack.read_base(), [7], axis=1)
+            observation.base_pose[...], observation.base_twist[...] = np.split(
+                self.pack.read_base(), [7], axis=1
+            )
         for name, values in self._sensed.items():
             getattr(observation, name)[...] = values
         fault = rows.fault
-        fault.step[...], fault.joint[...], fault.cause[...] = containment.step, containment.joint, containment.cause
+        fault.step[...], fault.joint[...], fault.cause[...] = (
+            containment.step,
+            containment.joint,
+            containment.cause,
+        )
         fault.missed_contact[...] = containment.missed_contact
         if containment.suspended.any():
             envs = containment.suspended
@@ -291,17 +343,33 @@ class EnvGroup:
             engine=pack.read_state(),
             effort=self._motor.copy(),
             saturated=self._saturated.copy(),
-            controller=state.law.leaves() if isinstance(state.law, bp.PIDState) else dict(state.law),
+            controller=(
+                state.law.leaves() if isinstance(state.law, bp.PIDState) else dict(state.law)
+            ),
             friction=friction,
-            actuators={} if state.motors is None else {**state.motors.leaves(), EPISODE: self._episode.copy()},
-            guard={} if state.guard is None else {**state.guard._asdict(), CHANGED: self._guarded.copy()},
+            actuators=(
+                {}
+                if state.motors is None
+                else {**state.motors.leaves(), EPISODE: self._episode.copy()}
+            ),
+            guard=(
+                {}
+                if state.guard is None
+                else {**state.guard._asdict(), CHANGED: self._guarded.copy()}
+            ),
             containment=self._containment.read(),
             sensors={name: rows.copy() for name, rows in self._sensed.items()},
-            pushes={} if self._pushes is None else {name: rows.copy() for name, rows in self._pushes.counts.items()},
+            pushes=(
+                {}
+                if self._pushes is None
+                else {name: rows.copy() for name, rows in self._pushes.counts.items()}
+            ),
         )
 
     def adopt(self, params: bp.PIDParams, actuators: bp.Actuators | None, draws: Draws) -> None:
-        """Take the params, actuators and draws of a snapshot; :meth:`write` puts them into effect."""
+        """Take the params, actuators and draws of a snapshot; :meth:`write` puts them into
+        effect.
+        """
         self._drops_actuators = actuators is None and self._own_actuators is not None
         self.draws = draws
         self._params = params
@@ -317,7 +385,9 @@ class EnvGroup:
         self._containment.write(states.containment)
         pack.suspend(self._containment.suspended)
         pack.write_qf(states.effort)
-        state = StepState(states.controller if self._controller else bp.PIDState(**states.controller))
+        state = StepState(
+            states.controller if self._controller else bp.PIDState(**states.controller)
+        )
         self._saturated[...], self._motor[...] = states.saturated, states.effort
         for name, rows in states.sensors.items():
             self._sensed[name][...] = rows
@@ -332,7 +402,9 @@ class EnvGroup:
             state = state._replace(motors=ActuatorState(**motors))
         if states.guard:
             self._guarded[...] = states.guard[CHANGED]
-            state = state._replace(guard=GuardState(*(states.guard[name] for name in GuardState._fields)))
+            state = state._replace(
+                guard=GuardState(*(states.guard[name] for name in GuardState._fields))
+            )
         self._state = state
         self._prepare()
         self._write_drives()
@@ -350,23 +422,28 @@ class EnvGroup:
         self.pack.write_joints(self._take_actuators(), rows)
         self.set_params(self._params)
 
-    # -- envs that fail ----------------------------------------------------------------------------------------
+    # -- envs that fail
+    # ----------------------------------------------------------------------------------------
 
     def _contain(self, before: Float64, done: int, returned: Any) -> None:
-        """Suspend or reset the envs that failed ``done`` substeps into a tick, after positions ``before`` (M, dof).
+        """Suspend or reset the envs that failed ``done`` substeps into a tick, after positions
+        ``before`` (M, dof).
 
         ``returned`` is the effort of the caller's own controller, or None.
         """
         containment, step = self._containment, self._steps + done
         qpos, qvel = self.pack.read_qpos(), self.pack.read_qvel()
         bad = far(qpos) | ~np.isfinite(qvel) | self.pack.strays()[:, None]
-        # One step after a NaN effort at one joint, all joints are NaN. The effort shows the first joint.
+        # One step after a NaN effort at one joint, all joints are NaN. The effort shows the first
+        # joint.
         failed = bad.any(1, keepdims=True)
         source = ~np.isfinite(self.pack.qf) & failed
         if returned is not None:
             wanted = clip(self._executor.rows(returned), *self._constants.limits, np)
             wrong = ~np.isfinite(wanted) & failed
-            wrong = np.where(wrong.any(1, keepdims=True), wrong, source)  # actuators may have delayed it
+            wrong = np.where(
+                wrong.any(1, keepdims=True), wrong, source
+            )  # actuators may have delayed it
             containment.fail(wrong, "effort", step, before)
         containment.fail(np.where(source.any(1, keepdims=True), source, bad), "state", step, before)
         if (limit := self._options.speed_limit) is not None:
@@ -374,25 +451,36 @@ class EnvGroup:
         self._place_failed()
 
     def _without_faults(self, command: Command) -> Command:
-        """Mark the envs with non-finite commands as failed; return commands with neutral values for all failed envs."""
+        """Mark the envs with non-finite commands as failed; return commands with neutral values for
+        all failed envs.
+        """
         containment = self._containment
         for cause, rows in command._asdict().items():
             if rows is not None:
                 containment.fail(~np.isfinite(rows), cause, self._steps + 1, self._qpos)
         self._place_failed()
         neutral, failed = (
-            (self._qpos if self._options.sets_positions else self._options.command.neutral, 0.0, 0.0, 0.0),
+            (
+                self._qpos if self._options.sets_positions else self._options.command.neutral,
+                0.0,
+                0.0,
+                0.0,
+            ),
             containment.failed[:, None],
         )
         both = zip(command, neutral, strict=True)
-        return Command._make(None if rows is None else np.where(failed, value, rows) for rows, value in both)
+        return Command._make(
+            None if rows is None else np.where(failed, value, rows) for rows, value in both
+        )
 
     def _place_failed(self) -> None:
         """Place the envs that have failed since the last call: suspended, or at their start."""
         containment = self._containment
         failed = containment.pop_unplaced()
         if failed.any() and containment.suspends:
-            self._place(failed, containment.suspended_qpos, np.zeros_like(containment.suspended_qpos))
+            self._place(
+                failed, containment.suspended_qpos, np.zeros_like(containment.suspended_qpos)
+            )
         elif failed.any():
             self._place(failed, containment.start_qpos, containment.start_qvel)
 
@@ -415,14 +503,22 @@ class EnvGroup:
         if self._actuators is not None and state.motors is not None:
             self._episode[mask] += 1
             gravity, coriolis = passive_forces(self._options)
-            holding = self._constants.coupling.efforts(pack.passive_force(gravity, coriolis)) if gravity else None
+            holding = (
+                self._constants.coupling.efforts(pack.passive_force(gravity, coriolis))
+                if gravity
+                else None
+            )
             qvel = pack.read_qvel()
-            fresh = init_motors(self._actuators, pack, qpos, self._episode, qvel=qvel, effort=holding)
+            fresh = init_motors(
+                self._actuators, pack, qpos, self._episode, qvel=qvel, effort=holding
+            )
             motors = bp.motors.reset(state.motors, fresh, mask)
             state = state._replace(motors=motors)
             model = layout.model
             noise = model.noise(self._constants.motors, motors, qpos)
-            _, qpos, _ = advance_measurement(self._constants.motors, motors, qpos, qvel, noise, model.stages)
+            _, qpos, _ = advance_measurement(
+                self._constants.motors, motors, qpos, qvel, noise, model.stages
+            )
         if self._controller is None:
             state = state._replace(law=bp.reset(self._acting_params, state.law, qpos, mask))
         else:

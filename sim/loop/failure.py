@@ -1,4 +1,6 @@
-"""Errors of a loop during a request, in a form that does not depend on how envs are divided among workers."""
+"""Errors of a loop during a request, in a form that does not depend on how envs are divided among
+workers.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,8 @@ from batchpid.errors import BatchPIDError, ControllerError, WorkerError
 
 
 class Failure(NamedTuple):
-    """Error of a loop during a request. Whole ticks before it are valid; the state of the loop after it is undefined.
+    """Error of a loop during a request. Whole ticks before it are valid; the state of the loop
+    after it is undefined.
 
     Of several failures, the first by :func:`order` is reported.
     """
@@ -23,26 +26,33 @@ class Failure(NamedTuple):
     error: Exception
 
     def portable(self) -> Failure:
-        """Return the failure with an error class of this project, which another process can raise, and the traceback.
+        """Return the failure with an error class of this project, which another process can raise,
+        and the traceback.
 
         :meth:`of_worker` puts the name of the worker in front of the message of a WorkerError.
         """
         error, text = self.error, "".join(traceback.format_exception(self.error))
         if isinstance(error, ControllerError):
-            if not hasattr(error, "__notes__"):  # a node of a cluster passes on the failure of its worker
+            if not hasattr(
+                error, "__notes__"
+            ):  # a node of a cluster passes on the failure of its worker
                 error.add_note(text)
         elif not isinstance(error, BatchPIDError):
             error = WorkerError(f"raised:\n{text}")
         return self._replace(error=error)
 
     def of_worker(self, name: str) -> Failure:
-        """Return the failure with the name of its worker in front of the message of a WorkerError."""
+        """Return the failure with the name of its worker in front of the message of a
+        WorkerError.
+        """
         is_ours = type(self.error) is WorkerError
         return self._replace(error=WorkerError(f"{name} {self.error}")) if is_ours else self
 
 
 def order(failure: Failure) -> tuple[int, int]:
-    """Return the key by which failures are sorted: the earliest sim step first, then the lowest env."""
+    """Return the key by which failures are sorted: the earliest sim step first, then the lowest
+    env.
+    """
     return failure.step, failure.env
 
 

@@ -1,7 +1,8 @@
-"""Faults of single envs: detected, reported, and contained, while the other envs are bit-identical to a run without.
+"""Faults of single envs: detected, reported, and contained, while the other envs are bit-identical
+to a run without.
 
-Envs that share a pack are not influenced by one whose state is NaN. So containment is to notice a fault in time, and to
-put that env into a state from which it can be simulated.
+Envs that share a pack are not influenced by one whose state is NaN. So containment is to notice a
+fault in time, and to put that env into a state from which it can be simulated.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ CAUSES = (
     *("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort"),
     "setpoint_acceleration",
 )
-"""Causes of faults: the state is not finite or a position beyond :data:`FARTHEST`, a joint is too fast, or the array of
-that name was not finite.
+"""Causes of faults: the state is not finite or a position beyond :data:`FARTHEST`, a joint is too
+fast, or the array of that name was not finite.
 
-"effort" is the effort that the caller's own controller returned. Snapshots hold indices of causes, so new causes are
-appended at the end.
+"effort" is the effort that the caller's own controller returned. Snapshots hold indices of causes,
+so new causes are appended at the end.
 """
 COMMAND_CAUSES = ("setpoint", "setpoint_rate", "setpoint_acceleration")
 """Causes in an entry of the command, which need not be a joint."""
@@ -48,7 +49,9 @@ class Fault(NamedTuple):
     time: float
     """Time of that step [s]."""
     joint: str
-    """First joint that failed; with ``kind`` "entry" the first entry of the command that is not finite."""
+    """First joint that failed; with ``kind`` "entry" the first entry of the command that is not
+    finite.
+    """
     cause: str
     """One of :data:`CAUSES`."""
     action: str
@@ -64,11 +67,16 @@ class Fault(NamedTuple):
         }
         cause = known.get(self.cause, f"the {self.cause} given for it is not finite")
         action = "held until it is reset" if self.action == "hold" else "reset"
-        return f"env {self.env}, {self.kind} {self.joint!r}: {cause}, at step {self.step} ({self.time:g} s); {action}"
+        return (
+            f"env {self.env}, {self.kind} {self.joint!r}: {cause}, at step {self.step}"
+            f" ({self.time:g} s); {action}"
+        )
 
 
 class FaultWarning(UserWarning):
-    """An env failed: its state is not finite, a position is beyond :data:`FARTHEST`, or a joint is too fast."""
+    """An env failed: its state is not finite, a position is beyond :data:`FARTHEST`, or a joint is
+    too fast.
+    """
 
 
 class FaultLog:
@@ -91,7 +99,9 @@ class FaultLog:
         self._steps = np.full(num_envs, -1)
 
     def without(self, mask: Bool) -> FaultLog:
-        """Return a log that knows no last fault of the envs of ``mask`` (envs,), which were reset."""
+        """Return a log that knows no last fault of the envs of ``mask`` (envs,), which were
+        reset.
+        """
         return self.restored(np.where(mask, -1, self._steps))
 
     def restored(self, steps: Rows) -> FaultLog:
@@ -130,7 +140,8 @@ class FaultContainment:
     start_qpos, start_qvel, suspended_qpos
         State to which each env is reset, and pose in which it is suspended (M, dof).
     start_base
-        Pose and twist of the base (M, 13) to which each env is reset, and where it is suspended; unused on fixed ones.
+        Pose and twist of the base (M, 13) to which each env is reset, and where it is suspended;
+        unused on fixed ones.
     step, joint, cause
         Last fault of each env (M,): sim step (-1: none), joint, and index into :data:`CAUSES`.
     missed_contact
@@ -145,7 +156,9 @@ class FaultContainment:
     def __init__(self, size: int, dof: int, action: FaultAction) -> None:
         self.suspends = action == "hold"
         self.suspended, self.failed, self._unplaced = (np.zeros(size, bool) for _ in range(3))
-        self.start_qpos, self.start_qvel, self.suspended_qpos = (np.zeros((size, dof)) for _ in range(3))
+        self.start_qpos, self.start_qvel, self.suspended_qpos = (
+            np.zeros((size, dof)) for _ in range(3)
+        )
         self.start_base = np.tile(ORIGIN, (size, 1))
         self.step = np.full(size, -1)
         self.joint, self.cause, self.missed_contact = (np.zeros(size, int) for _ in range(3))
@@ -156,12 +169,18 @@ class FaultContainment:
         self.step[mask], self.missed_contact[mask] = -1, 0
 
     def fail(self, bad: Bool, cause: str, step: int, qpos: NDArray[np.float64]) -> None:
-        """Note a fault of the envs with a True entry in ``bad`` (M, dof); suspended envs stay at ``qpos`` (M, dof)."""
+        """Note a fault of the envs with a True entry in ``bad`` (M, dof); suspended envs stay at
+        ``qpos`` (M, dof).
+        """
         failed = bad.any(1)
         if not failed.any():
             return
         new = failed & ~self.failed
-        self.step[new], self.joint[new], self.cause[new] = step, bad.argmax(1)[new], CAUSES.index(cause)
+        self.step[new], self.joint[new], self.cause[new] = (
+            step,
+            bad.argmax(1)[new],
+            CAUSES.index(cause),
+        )
         self.failed |= failed
         self._unplaced |= failed
         if self.suspends:
@@ -198,12 +217,16 @@ def far(qpos: NDArray[np.float64]) -> Bool:
 
 def sound(measured: Measured, speed_limit: Array) -> bool:
     """Return whether certainly no robot has failed."""
-    return near(measured.qpos) and (speed_limit is None or bool((np.abs(measured.qvel) <= speed_limit).all()))
+    return near(measured.qpos) and (
+        speed_limit is None or bool((np.abs(measured.qvel) <= speed_limit).all())
+    )
 
 
 def finite(*arrays: Rows | None) -> bool:
-    """Return whether all entries are finite and below 1e150, in one pass: otherwise a sum of squares is inf or NaN."""
-    for array in arrays:  # noqa: SIM110  (twice as fast as all() of a generator)
+    """Return whether all entries are finite and below 1e150, in one pass: otherwise a sum of
+    squares is inf or NaN.
+    """
+    for array in arrays:  # noqa: SIM110
         if array is not None and not math.isfinite(np.vdot(array, array)):
             return False
     return True

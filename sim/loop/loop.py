@@ -1,7 +1,8 @@
 """The closed loop over some packs of scenes: read, compensate, control, write, step.
 
-The same code runs in a worker process and in the caller's. A group of envs runs all its substeps before the next
-group, so that its working set stays in the cache; nothing depends on how envs are grouped.
+The same code runs in a worker process and in the caller's. A group of envs runs all its substeps
+before the next group, so that its working set stays in the cache; nothing depends on how envs are
+grouped.
 """
 
 from __future__ import annotations
@@ -40,11 +41,13 @@ class Loop:
     envs
         Rows of the runner's envs.
     arrays
-        Input and output (ticks, envs, ...) of these envs, for the ticks of a :meth:`run`. The other methods write to
-        the first tick.
+        Input and output (ticks, envs, ...) of these envs, for the ticks of a :meth:`run`. The other
+        methods write to the first tick.
     """
 
-    def __init__(self, options: RunnerOptions, params: bp.PIDParams, envs: slice, arrays: Arrays) -> None:
+    def __init__(
+        self, options: RunnerOptions, params: bp.PIDParams, envs: slice, arrays: Arrays
+    ) -> None:
         robot = options.robot
         self.options, self.arrays = options, arrays
         self.ticks = Ticks(arrays)
@@ -65,14 +68,17 @@ class Loop:
         slices = [slice(start, min(start + size, count)) for start in range(0, count, size)]
         controller = None if isinstance(options.control, str) else OwnController(options)
         self.groups = [
-            EnvGroup(self._build(group), group, params.for_envs(group), options, controller) for group in slices
+            EnvGroup(self._build(group), group, params.for_envs(group), options, controller)
+            for group in slices
         ]
         self.set_actuators(None if options.actuators is None else options.actuators.for_envs(envs))
         self._group_ticks = [Ticks(arrays.at((slice(None), group))) for group in slices]
 
     def _build(self, envs: slice, draws: Draws | None = None) -> EnginePack:
         first = self.options.first_env + self._first_env + envs.start
-        return make_pack(self.options, self._scene, envs.stop - envs.start, first, draws, self._workspace)
+        return make_pack(
+            self.options, self._scene, envs.stop - envs.start, first, draws, self._workspace
+        )
 
     def reset(
         self,
@@ -82,10 +88,12 @@ class Loop:
         draws: Draws = NOTHING,
         base: NDArray[np.float64] | None = None,
     ) -> None:
-        """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh controller state.
+        """Place the envs of ``mask`` (envs,) at ``qpos``, ``qvel`` (envs, dof), with a fresh
+        controller state.
 
         Floating bases are placed at ``base`` (envs, 13): pose and twist. None is the origin.
-        ``draws`` apply to all envs from now on; they differ from the previous draws in these envs alone.
+        ``draws`` apply to all envs from now on; they differ from the previous draws in these envs
+        alone.
         """
         for group, ticks in zip(self.groups, self._group_ticks, strict=True):
             group.draws = draws.for_envs(group.envs)
@@ -104,11 +112,12 @@ class Loop:
             group.set_actuators(None if actuators is None else actuators.for_envs(group.envs))
 
     def run(self, ticks: int, substeps: int, given: tuple[bool, ...]) -> float:
-        """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the seconds it took.
+        """Run ``ticks`` of ``substeps`` sim steps under the commands in their arrays; return the
+        seconds it took.
 
-        ``given`` says which arrays of the commands are used (:attr:`batchpid.sim.loop.arrays.Command.given`).
-        Raises RunError if a group failed. The other groups complete the run, so that the first failure does not depend
-        on grouping.
+        ``given`` says which arrays of the commands are used
+        (:attr:`batchpid.sim.loop.arrays.Command.given`). Raises RunError if a group failed. The
+        other groups complete the run, so that the first failure does not depend on grouping.
         """
         began = time.perf_counter()
         failures = []
@@ -116,7 +125,9 @@ class Loop:
             done = 0
             try:
                 while done < ticks:
-                    done = group.run(group_ticks, given, done, ticks, substeps, self._steps + done * substeps)
+                    done = group.run(
+                        group_ticks, given, done, ticks, substeps, self._steps + done * substeps
+                    )
             except Exception as error:
                 failures.append(self._failure(error, group, done, self._steps + done * substeps))
         if failures:
@@ -125,7 +136,9 @@ class Loop:
         return time.perf_counter() - began
 
     def _failure(self, error: Exception, group: EnvGroup, ticks: int, steps: int) -> Failure:
-        """Return the failure of a group after ``ticks`` whole ticks of a run; ``steps`` counts from the start."""
+        """Return the failure of a group after ``ticks`` whole ticks of a run; ``steps`` counts from
+        the start.
+        """
         step = steps + 1
         if isinstance(error, ControllerError):
             step = steps + error.step
@@ -133,7 +146,9 @@ class Loop:
         return Failure(step, self._first_env + group.envs.start, ticks, error)
 
     def snapshot(self) -> EnvStates:
-        """Return the state of every env. It is a barrier: the loop goes on as if restored from it."""
+        """Return the state of every env. It is a barrier: the loop goes on as if restored from
+        it.
+        """
         states = EnvStates.join([group.read() for group in self.groups])
         self._place(states)
         return states
@@ -150,8 +165,8 @@ class Loop:
             group.observe(ticks[0])
 
     def _place(self, states: EnvStates) -> None:
-        # The contact caches of some engines, and the order in which they solve contacts, depend on the past. A new
-        # world has no past.
+        # The contact caches of some engines, and the order in which they solve contacts, depend on
+        # the past. A new world has no past.
         varies = self.options.randomization is not None and self.options.randomization.changes_robot
         for group in self.groups:
             pack = group.pack
@@ -165,7 +180,9 @@ class Loop:
         return [size for group in self.groups for size in group.pack.state_sizes()]
 
     def poses(self, names: Sequence[str] | None = None) -> list[Rows]:
-        """Return the poses of the entities that ``build`` returned for each env, or of bodies ``names``, (..., 7)."""
+        """Return the poses of the entities that ``build`` returned for each env, or of bodies
+        ``names``, (..., 7).
+        """
         return [rows for group in self.groups for rows in group.pack.read_poses(names)]
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
 """Ticks in native code: one call of the extension runs them until an event needs Python.
 
-With a controller in Python, or more than MOST_SUMMED joints, the stages run in NumPy. One native call then applies
-efforts, does the engine's step and reads the state.
+With a controller in Python, or more than MOST_SUMMED joints, the stages run in NumPy. One native
+call then applies efforts, does the engine's step and reads the state.
 """
 
 from __future__ import annotations
@@ -22,11 +22,15 @@ from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 
 class NativeExecutor(NumPyExecutor):
-    """Executor of control steps in native code, for the robots of ``pack``; ``layout`` has its model functions."""
+    """Executor of control steps in native code, for the robots of ``pack``; ``layout`` has its
+    model functions.
+    """
 
     _pack: CompiledPack
 
-    def __init__(self, options: RunnerOptions, pack: CompiledPack, layout: Layout, constants: Constants) -> None:
+    def __init__(
+        self, options: RunnerOptions, pack: CompiledPack, layout: Layout, constants: Constants
+    ) -> None:
         super().__init__(options, pack, layout, constants)
         self._step: CompiledStep | None = None
         self._bound: object = None
@@ -34,18 +38,26 @@ class NativeExecutor(NumPyExecutor):
         self._reads_qvel = True  # for the observation
         self._steps_read_force = pack.steps_read_force(self._gravity, self._coriolis)
         self._force: CompiledModel | None = None
-        if (layout.measures and self._gravity) or (self._reads_force and not self._steps_read_force):
+        if (layout.measures and self._gravity) or (
+            self._reads_force and not self._steps_read_force
+        ):
             self._force = pack.force_model()
         has_native_law = layout.control != "custom" or _is_native(self._controller)
         self._compiles = has_native_law and is_compiled(constants, pack.dof)
 
     def run(
-        self, state: StepState, measured: Measured, command: Command, span: Span, table: Table | None = None
+        self,
+        state: StepState,
+        measured: Measured,
+        command: Command,
+        span: Span,
+        table: Table | None = None,
     ) -> Ran:
-        """Run sim steps until an event needs Python: an env may have failed, or a command is not finite.
+        """Run sim steps until an event needs Python: an env may have failed, or a command is not
+        finite.
 
-        With ``table``, its ticks run: commands are read from it, and observations are written to it. Otherwise one tick
-        runs under ``command``.
+        With ``table``, its ticks run: commands are read from it, and observations are written to
+        it. Otherwise one tick runs under ``command``.
         """
         if not self._compiles:
             return super().run(state, measured, command, span)
@@ -56,13 +68,19 @@ class NativeExecutor(NumPyExecutor):
         if table:
             ticks.exchange(table)
         until = span.until if table else span.tick + 1
-        tick, done, status = ticks.run(self._prepared(), span.tick, span.begin, until, span.steps, table is not None)
+        tick, done, status = ticks.run(
+            self._prepared(), span.tick, span.begin, until, span.steps, table is not None
+        )
         failed = self._prepared().may_have_failed(status)
         return Ran(ticks.state, ticks.outputs, ticks.measured, ticks.before, tick, done, failed)
 
     def numpy_state(self, state: StepState) -> StepState:
         """Return a copy of ``state``, since the next sim steps overwrite its arrays."""
-        own = {name: np.array(leaf) for name, leaf in state.law.items()} if isinstance(state.law, dict) else state.law
+        own = (
+            {name: np.array(leaf) for name, leaf in state.law.items()}
+            if isinstance(state.law, dict)
+            else state.law
+        )
         return mapped(np.array, state._replace(law=own))
 
     def _step_engine(self, values: Values) -> Values:
@@ -85,7 +103,10 @@ class NativeExecutor(NumPyExecutor):
             reads_force = self._reads_force and self._steps_read_force
             force = (self._gravity, self._coriolis) if reads_force else (False, False)
             drives = self._layout.control == "drive" and isinstance(pack, DrivenPack)
-            self._bound, self._step = pack.calls, pack.compiled_step(*force, self._reads_qvel, limit, drives)
+            self._bound, self._step = (
+                pack.calls,
+                pack.compiled_step(*force, self._reads_qvel, limit, drives),
+            )
         return self._step
 
     def _ticks_for(self, state: StepState, command: Command) -> NativeTicks:
@@ -93,7 +114,15 @@ class NativeExecutor(NumPyExecutor):
         key = command.given
         if key not in self._ticks:
             compensated = self._gravity, self._coriolis
-            given = self._layout, self._constants, state, command, compensated, self._controller, self._force
+            given = (
+                self._layout,
+                self._constants,
+                state,
+                command,
+                compensated,
+                self._controller,
+                self._force,
+            )
             self._ticks[key] = NativeTicks(self._pack, *given)
         return self._ticks[key]
 
@@ -106,5 +135,7 @@ def _is_native(controller: Any) -> bool:
 
 
 def is_compiled(constants: Constants, dof: int) -> bool:
-    """Return whether the control step can be a program: in float64, with at most MOST_SUMMED joints."""
+    """Return whether the control step can be a program: in float64, with at most MOST_SUMMED
+    joints.
+    """
     return dof <= MOST_SUMMED and all(leaf.dtype != np.float32 for leaf in leaves(constants))

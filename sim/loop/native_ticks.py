@@ -1,7 +1,9 @@
-"""Ticks of a group of envs in one native call: the stages of a sim step as programs and native functions; see tick.h.
+"""Ticks of a group of envs in one native call: the stages of a sim step as programs and native
+functions; see tick.h.
 
-The constructor has three steps: buffers for everything that the stages read and write; programs, traced from the stages
-that are pure functions of arrays, one for each run of neighbouring stages; the table of stages that native code runs.
+The constructor has three steps: buffers for everything that the stages read and write; programs,
+traced from the stages that are pure functions of arrays, one for each run of neighbouring stages;
+the table of stages that native code runs.
 
 Longer than 350 lines because all three steps work on the same buffers.
 """
@@ -28,7 +30,16 @@ from batchpid.sim.engine.robot_model import scene_tree
 from batchpid.sim.loop import control_step
 from batchpid.sim.loop.arrays import Arrays, Command, FaultArrays
 from batchpid.sim.loop.control_step import COUPLING_STEPS, SimStage
-from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
+from batchpid.sim.loop.step_values import (
+    Constants,
+    Layout,
+    Measured,
+    Model,
+    Outputs,
+    Step,
+    StepState,
+    Values,
+)
 
 
 class Table(NamedTuple):
@@ -47,9 +58,9 @@ class Table(NamedTuple):
 class NativeTicks:
     """Ticks of the robots of ``pack`` in native code, for commands with the entries of ``command``.
 
-    ``compensated`` says whether gravity is compensated, and whether Coriolis and centrifugal forces are. A
-    ``controller`` (:class:`batchpid.sim.OperationalSpace`) is a native call. ``force`` is the model of the passive
-    force where the engine's steps do not read it.
+    ``compensated`` says whether gravity is compensated, and whether Coriolis and centrifugal forces
+    are. A ``controller`` (:class:`batchpid.sim.OperationalSpace`) is a native call. ``force`` is
+    the model of the passive force where the engine's steps do not read it.
 
     Attributes
     ----------
@@ -135,7 +146,8 @@ class NativeTicks:
         self._is_noisy = bool(leaves(noise))
         self._counted = None if self.state.motors is None else self.state.motors.step
 
-    # -- running -----------------------------------------------------------------------------------------------
+    # -- running
+    # ----------------------------------------------------------------------------------------------
 
     def load(self, state: StepState, measured: Measured, command: Command | None) -> None:
         """Copy the arguments into the arrays, where they are not these arrays."""
@@ -162,16 +174,20 @@ class NativeTicks:
     def run(
         self, step: CompiledStep, tick: int, begin: int, until: int, steps: int, whole: bool
     ) -> tuple[int, int, int]:
-        """Run ticks of ``steps`` sim steps, from sim step ``begin`` of ``tick``, up to the tick ``until``.
+        """Run ticks of ``steps`` sim steps, from sim step ``begin`` of ``tick``, up to the tick
+        ``until``.
 
-        With ``whole``, commands and observations are those of :meth:`exchange`. Return the first tick that is not
-        complete or not observed, its sim steps that are done, and the last status. An event that needs Python stops
-        the ticks: a status that is not 0, and with ``whole`` a command or velocities that are not finite.
+        With ``whole``, commands and observations are those of :meth:`exchange`. Return the first
+        tick that is not complete or not observed, its sim steps that are done, and the last status.
+        An event that needs Python stops the ticks: a status that is not 0, and with ``whole`` a
+        command or velocities that are not finite.
         """
         arguments, status = (self._calls, self._address, step.prepare()), _NO_NOISE
         while status == _NO_NOISE:
             drawn, before = self._give_noise() if self._is_noisy else -1, (tick, begin)
-            tick, begin, status = self._native.ticks(*arguments, tick, begin, until, steps, drawn, whole)
+            tick, begin, status = self._native.ticks(
+                *arguments, tick, begin, until, steps, drawn, whole
+            )
             if self._counted is not None:
                 self._counted[...] += (tick - before[0]) * steps + begin - before[1]
         return tick, begin, status
@@ -184,7 +200,9 @@ class NativeTicks:
         return min(map(len, noise))
 
     def _draw(self) -> Any:
-        """Return the noise of positions and velocities in the next steps (steps, M, dof) each, or None."""
+        """Return the noise of positions and velocities in the next steps (steps, M, dof) each, or
+        None.
+        """
         if self.state.motors is None or not self._layout.measures:
             return None
         return self._noise.from_step(self._constants.motors, self.state.motors, self.before)
@@ -197,9 +215,12 @@ class NativeTicks:
         if state.matrix is not None:
             self.state.matrix[...] = state.matrix
         if state.motors is not None:  # the same object, by which the executor knows its noise
-            self.state = self.state._replace(motors=self.state.motors._replace(key=state.motors.key))
+            self.state = self.state._replace(
+                motors=self.state.motors._replace(key=state.motors.key)
+            )
 
-    # -- buffers -----------------------------------------------------------------------------------------------
+    # -- buffers
+    # ----------------------------------------------------------------------------------------------
 
     def _place(self, **arrays: Rows | None) -> None:
         """Let fields of the structure of native code point to these arrays."""
@@ -213,7 +234,9 @@ class NativeTicks:
             self._kept.append(array)
 
     def _traced_state(self) -> StepState:
-        """Return the part of the state that programs have: no key of the noise, counts, or state of a controller."""
+        """Return the part of the state that programs have: no key of the noise, counts, or state of
+        a controller.
+        """
         state, motors = self.state, self.state.motors
         if motors is not None:
             motors = motors._replace(key=None, step=None)
@@ -229,10 +252,18 @@ class NativeTicks:
             dtype = {"read": np.float64, "write_floats": np.float32}.get(kind, row.dtype)
             is_fit = table.dtype == dtype and row.flags.c_contiguous and table[0].flags.c_contiguous
             if not is_fit or table.shape[1:] != row.shape:
-                raise ValueError(f"a table {table.shape} of {table.dtype} does not fit rows {row.shape} of {row.dtype}")
-            addresses, size = (table.ctypes.data, row.ctypes.data), row.nbytes if kind == "write_bytes" else row.size
+                raise ValueError(
+                    f"a table {table.shape} of {table.dtype} does not fit rows {row.shape} of"
+                    f" {row.dtype}"
+                )
+            addresses, size = (
+                (table.ctypes.data, row.ctypes.data),
+                row.nbytes if kind == "write_bytes" else row.size,
+            )
             stride = table.strides[0] if stride is None else stride
-            transfers.append(interface.Transfer(*addresses, stride, size, interface.TRANSFERS.index(kind)))
+            transfers.append(
+                interface.Transfer(*addresses, stride, size, interface.TRANSFERS.index(kind))
+            )
             self._kept.extend((table, row))
 
         for table, row in zip(own.arrays.command, self.command, strict=True):
@@ -260,7 +291,8 @@ class NativeTicks:
             add("write_bytes", table, row)
         return (interface.Transfer * len(transfers))(*transfers)
 
-    # -- programs ----------------------------------------------------------------------------------------------
+    # -- programs
+    # ----------------------------------------------------------------------------------------------
 
     def _add_program(self, stages: Sequence[SimStage], values: Values, is_last: bool) -> Values:
         """Add a program of stages; return ``values`` with the arrays that it writes.
@@ -268,14 +300,28 @@ class NativeTicks:
         State is changed in place. Other results have arrays of their own.
         """
         before = values.outputs
-        masks = [name for name, value in before._asdict().items() if value is not None and value.dtype == bool]
-        values = values._replace(outputs=before._replace(**dict.fromkeys(masks)))  # programs take no masks
+        masks = [
+            name
+            for name, value in before._asdict().items()
+            if value is not None and value.dtype == bool
+        ]
+        values = values._replace(
+            outputs=before._replace(**dict.fromkeys(masks))
+        )  # programs take no masks
         constants = mapped(_split, self._constants)
         inputs = leaves(values)
         state = leaves(values.state)
-        layout, histories = self._layout._replace(model=Model()), tuple(array.ndim == 3 for array in state)
-        traced = _trace(tuple(stages), is_last, layout, histories, structure(constants), structure(values))
-        outputs = [np.zeros(self._shape, bool if is_mask else np.float64) for is_mask in traced.program.masks]
+        layout, histories = (
+            self._layout._replace(model=Model()),
+            tuple(array.ndim == 3 for array in state),
+        )
+        traced = _trace(
+            tuple(stages), is_last, layout, histories, structure(constants), structure(values)
+        )
+        outputs = [
+            np.zeros(self._shape, bool if is_mask else np.float64)
+            for is_mask in traced.program.masks
+        ]
         for array, place in zip(state, traced.places, strict=False):  # the state comes first
             if place.is_result:
                 outputs[place.number] = array
@@ -286,17 +332,28 @@ class NativeTicks:
         if not outputs:
             return new
         program = ArrayProgram(traced.program, leaves(constants), len(inputs), self._shape)
-        pairs = tuple([(array, 0 if array.ndim == 2 else array[0].size if array.ndim else -1) for array in inputs])
-        noise = [next(at for at, each in enumerate(inputs) if each is block) for block in leaves(values.noise)]
+        pairs = tuple(
+            [
+                (array, 0 if array.ndim == 2 else array[0].size if array.ndim else -1)
+                for array in inputs
+            ]
+        )
+        noise = [
+            next(at for at, each in enumerate(inputs) if each is block)
+            for block in leaves(values.noise)
+        ]
         self._add_stage("program", program=len(self._programs), noise=(*noise, -1, -1)[:2])
         self._programs.append(self._native.bind(program.arguments, pairs, tuple(outputs)))
         self._kept.append((inputs, outputs))
         return new
 
     def _add_stage(self, kind: str, every: int = 1, **fields: Any) -> None:
-        self._stages.append(interface.Stage(kind=interface.STAGES.index(kind), every=every, **fields))
+        self._stages.append(
+            interface.Stage(kind=interface.STAGES.index(kind), every=every, **fields)
+        )
 
-    # -- stages of native code ---------------------------------------------------------------------------------
+    # -- stages of native code
+    # ---------------------------------------------------------------------------------
 
     def _add_force(self, values: Values) -> Values:
         assert self._force is not None
@@ -317,14 +374,24 @@ class NativeTicks:
         law, constants = self._layout.law, self._constants
         assert law is not None
         tree, bodies = scene_tree(self._pack.spec).tables
-        self._place(pose=values.seen.qpos, rate=values.seen.qvel, matrix=self.state.matrix, tree=tree, bodies=bodies)
-        self._place(armature=constants.armature, damping=constants.damping, **constants.coupling.native())
+        self._place(
+            pose=values.seen.qpos,
+            rate=values.seen.qvel,
+            matrix=self.state.matrix,
+            tree=tree,
+            bodies=bodies,
+        )
+        self._place(
+            armature=constants.armature, damping=constants.damping, **constants.coupling.native()
+        )
         self._add_stage("mass_matrix", law.matrix_steps)
         return values
 
     def _add_controller(self, values: Values) -> Values:
         qpos, qvel, bias = values.seen
-        self._control = self._controller.bound(qpos, qvel, self._reading.passive if bias is None else bias)
+        self._control = self._controller.bound(
+            qpos, qvel, self._reading.passive if bias is None else bias
+        )
         self._tick.control = self._control.address
         self._add_stage("controller")
         outputs = values.outputs._replace(returned=self._control.effort)
@@ -356,12 +423,16 @@ class _Native(NamedTuple):
 
 
 _NATIVE = {
-    "passive force": _Native(lambda of: of._layout.measures and of._force is not None, NativeTicks._add_force),
+    "passive force": _Native(
+        lambda of: of._layout.measures and of._force is not None, NativeTicks._add_force
+    ),
     "inertia": _Native(lambda of: of.state.age is not None, NativeTicks._add_inertia),
     "mass matrix": _Native(lambda of: of.state.matrix is not None, NativeTicks._add_mass_matrix),
     "controller": _Native(lambda of: of._controller is not None, NativeTicks._add_controller),
     "targets": _Native(lambda of: of._layout.control == "drive", NativeTicks._add_targets),
-    "constraint": _Native(lambda of: not of._constants.coupling.is_identity, NativeTicks._add_constraint),
+    "constraint": _Native(
+        lambda of: not of._constants.coupling.is_identity, NativeTicks._add_constraint
+    ),
     "engine": _Native(lambda of: True, NativeTicks._add_engine),
 }
 """Stages that are no programs, or have a native function."""
@@ -399,13 +470,18 @@ def moves_drives(layout: Layout, constants: Constants, command: Command) -> bool
 
 @lru_cache(maxsize=64)
 def _trace(
-    stages: tuple[SimStage, ...], is_last: bool, layout: Layout, histories: tuple[bool, ...], constants: Any, given: Any
+    stages: tuple[SimStage, ...],
+    is_last: bool,
+    layout: Layout,
+    histories: tuple[bool, ...],
+    constants: Any,
+    given: Any,
 ) -> _Traced:
     """Return the program of stages.
 
-    ``constants`` and ``given`` are structures of the constants and of the values before it. ``histories`` says which
-    arrays of the state are histories, which a program changes in place. The last program has no results but state and
-    outputs.
+    ``constants`` and ``given`` are structures of the constants and of the values before it.
+    ``histories`` says which arrays of the state are histories, which a program changes in place.
+    The last program has no results but state and outputs.
     """
     first, count = len(leaves(constants)), len(leaves(given))
     result_parts: list[Any] = []
@@ -418,7 +494,9 @@ def _trace(
             values = stage.function(layout, k, values)
         if is_last:
             nothing = Measured(None, None, None)
-            values = Values(values.state, Command(None), nothing, values.step, nothing, outputs=values.outputs)
+            values = Values(
+                values.state, Command(None), nothing, values.step, nothing, outputs=values.outputs
+            )
         numbers = {symbol: number for number, symbol in enumerate(symbols[first:])}
         results, places = list[Any](), list[_Place]()
         returned = set(map(id, leaves(values.outputs)))
@@ -439,7 +517,9 @@ def _trace(
 
 
 def _copied(state: StepState) -> StepState:
-    """Return the part of a state whose arrays keep their structure: without matrices and the key of the noise."""
+    """Return the part of a state whose arrays keep their structure: without matrices and the key of
+    the noise.
+    """
     motors = None if state.motors is None else state.motors._replace(key=None)
     return state._replace(matrix=None, motors=motors)
 

@@ -18,7 +18,16 @@ from batchpid.sim.loop.control_step import COUPLING_STEPS, REFRESH_STEPS, sim_st
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.faults import sound
 from batchpid.sim.loop.step_setup import needs_qvel
-from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
+from batchpid.sim.loop.step_values import (
+    Constants,
+    Layout,
+    Measured,
+    Model,
+    Outputs,
+    Step,
+    StepState,
+    Values,
+)
 from batchpid.sim.options import RunnerOptions
 
 
@@ -60,9 +69,13 @@ def passive_forces(options: RunnerOptions) -> tuple[bool, bool]:
 
 
 class NumPyExecutor:
-    """Executor of control steps in NumPy, for the robots of ``pack``; ``layout`` has its model functions."""
+    """Executor of control steps in NumPy, for the robots of ``pack``; ``layout`` has its model
+    functions.
+    """
 
-    def __init__(self, options: RunnerOptions, pack: EnginePack, layout: Layout, constants: Constants) -> None:
+    def __init__(
+        self, options: RunnerOptions, pack: EnginePack, layout: Layout, constants: Constants
+    ) -> None:
         self._pack = pack
         self._layout = layout
         self._constants = constants
@@ -76,7 +89,9 @@ class NumPyExecutor:
     @cached_property
     def _spread(self) -> Constants:
         k = self._constants.k
-        return self._constants if k is None else self._constants._replace(k=spread(k, self._pack.size))
+        return (
+            self._constants if k is None else self._constants._replace(k=spread(k, self._pack.size))
+        )
 
     def measure(self) -> Measured:
         """Return a reading of the robots."""
@@ -87,7 +102,9 @@ class NumPyExecutor:
             pack.passive_force(self._gravity, self._coriolis) if self._reads_force else None,
         )
 
-    def run(self, state: StepState, measured: Measured, command: Command, span: Span, table: Any = None) -> Ran:
+    def run(
+        self, state: StepState, measured: Measured, command: Command, span: Span, table: Any = None
+    ) -> Ran:
         """Run the sim steps of a tick, or until an env may have failed."""
         constants = self._spread
         end = span.steps
@@ -99,12 +116,20 @@ class NumPyExecutor:
             # Writing the drives' targets costs a call for each joint.
             if outputs.target is not target[0] and isinstance(pack, DrivenPack):
                 is_known = outputs.target_rate is target[1] and target[0] is not None
-                rate = np.zeros_like(outputs.target) if outputs.target_rate is None else outputs.target_rate
+                rate = (
+                    np.zeros_like(outputs.target)
+                    if outputs.target_rate is None
+                    else outputs.target_rate
+                )
                 pack.write_drive_target(outputs.target, None if is_known else rate)
                 target = outputs.target, outputs.target_rate
             return values
 
-        engine = {"targets": write_targets, "constraint": self._update_constraint, "engine": self._step_engine}
+        engine = {
+            "targets": write_targets,
+            "constraint": self._update_constraint,
+            "engine": self._step_engine,
+        }
         for index in range(span.begin, end):
             left = self._layout.left(index, end, constants.timestep)
             values = Values(state, command, measured, Step(index, end, left), measured)
@@ -121,7 +146,9 @@ class NumPyExecutor:
         return values
 
     def _step_engine(self, values: Values) -> Values:
-        """Do a sim step; return its reading as the values' ``measured``, and note whether an env may have failed."""
+        """Do a sim step; return its reading as the values' ``measured``, and note whether an env
+        may have failed.
+        """
         self._pack.write_qf(values.outputs.qf)
         self._pack.step()
         measured = self.measure()
@@ -138,7 +165,11 @@ class NumPyExecutor:
 
 
 def with_model(
-    options: RunnerOptions, pack: EnginePack, layout: Layout, constants: Constants, controller: OwnController | None
+    options: RunnerOptions,
+    pack: EnginePack,
+    layout: Layout,
+    constants: Constants,
+    controller: OwnController | None,
 ) -> Layout:
     """Return ``layout`` with model functions for NumPy arrays, natively compiled where possible."""
     motors, (gravity, coriolis) = constants.motors, passive_forces(options)
@@ -153,12 +184,16 @@ def with_model(
     if constants.friction.coulomb is not None and _is_native(pack):
         given = constants.friction, constants.drive, constants.coupling, constants.timestep
         model = model._replace(
-            refresh=NativeRefresh(pack.joint_model(), pack.size, pack.armature, *given, REFRESH_STEPS)
+            refresh=NativeRefresh(
+                pack.joint_model(), pack.size, pack.armature, *given, REFRESH_STEPS
+            )
         )
     if gravity:
         force = passive_force_of(pack.spec, _is_native(pack))
         parts = gravity, coriolis
-        model = model._replace(passive_force=lambda qpos, qvel: force(qpos, qvel, *parts, pack.read_base_motion()))
+        model = model._replace(
+            passive_force=lambda qpos, qvel: force(qpos, qvel, *parts, pack.read_base_motion())
+        )
     return layout._replace(model=model)
 
 
@@ -177,22 +212,30 @@ BLOCK = 64
 
 
 class NoiseBlocks:
-    """:func:`batchpid.motors.measurement_noise` at the step of a state, from blocks of consecutive steps."""
+    """:func:`batchpid.motors.measurement_noise` at the step of a state, from blocks of consecutive
+    steps.
+    """
 
     def __init__(self) -> None:
         self._key: Any = None
         self._first = 0
         self._block: tuple[Array, Array] = (None, None)
 
-    def __call__(self, k: MotorCoefficients, state: ActuatorState, like: Float64) -> tuple[Array, Array] | None:
+    def __call__(
+        self, k: MotorCoefficients, state: ActuatorState, like: Float64
+    ) -> tuple[Array, Array] | None:
         """Return the noise of positions and velocities; None for sensors without noise."""
         blocks = self.from_step(k, state, like)
         return None if blocks is None else (_first(blocks[0]), _first(blocks[1]))
 
-    def from_step(self, k: MotorCoefficients, state: ActuatorState, like: Float64) -> tuple[Array, Array] | None:
-        """Return the noise of the step of a state and the next ones (steps, M, dof), as far as it has been drawn.
+    def from_step(
+        self, k: MotorCoefficients, state: ActuatorState, like: Float64
+    ) -> tuple[Array, Array] | None:
+        """Return the noise of the step of a state and the next ones (steps, M, dof), as far as it
+        has been drawn.
 
-        A reset replaces the key. While the key is the same, all envs advance by the same number of steps.
+        A reset replaces the key. While the key is the same, all envs advance by the same number of
+        steps.
         """
         if state.key is None:
             return None
@@ -204,7 +247,9 @@ class NoiseBlocks:
             self._first = int(state.step[0])
             at = 0
         position, velocity = self._block
-        return None if position is None else position[at:], None if velocity is None else velocity[at:]
+        return None if position is None else position[at:], (
+            None if velocity is None else velocity[at:]
+        )
 
 
 def _first(block: Any) -> Array:

@@ -1,4 +1,6 @@
-"""Law of the control "pid" in a sim step: pure functions of arrays (envs, dof), for NumPy and JAX."""
+"""Law of the control "pid" in a sim step: pure functions of arrays (envs, dof), for NumPy and
+JAX.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,8 @@ from batchpid.law.computed_torque import advance_with_mass_matrix, given_acceler
 MASS_MATRIX_STEPS = 4
 """Sim steps for which a mass matrix is kept within a tick.
 
-The implicit law takes a fresh one in each: in setpoint steps at w dt = 1 panda diverges with a matrix kept for 4 steps,
-at w dt = 3 with one kept for 2.
+The implicit law takes a fresh one in each: in setpoint steps at w dt = 1 panda diverges with a
+matrix kept for 4 steps, at w dt = 3 with one kept for 2.
 """
 
 
@@ -61,11 +63,11 @@ class PIDLaw(NamedTuple):
         matrix
             M + dt B (envs, dof, dof) for gains per mass matrix.
         viscous
-            B q', where the whole matrix is used: the engine integrates it implicitly, (M + dt B) (v+ - v) =
-            dt (u - B v), so that u = (M + dt B) a + B v gives exactly v+ = v + dt a.
+            B q', where the whole matrix is used: the engine integrates it implicitly, (M + dt B)
+            (v+ - v) = dt (u - B v), so that u = (M + dt B) a + B v gives exactly v+ = v + dt a.
         low, high
-            Least and largest effort of the motors (envs, dof); None for no limit. Saturation and anti-windup use them
-            after clipping to the limits of the params.
+            Least and largest effort of the motors (envs, dof); None for no limit. Saturation and
+            anti-windup use them after clipping to the limits of the params.
         """
         if low is not None:
             xp = namespace(low, high)
@@ -80,15 +82,22 @@ class PIDLaw(NamedTuple):
             new, terms = advance_with_mass_matrix(k, state, *inputs)
         else:
             given = given_acceleration(k, acceleration)
-            feedforward = feedforward if given is None else given if feedforward is None else feedforward + given
+            feedforward = (
+                feedforward
+                if given is None
+                else given
+                if feedforward is None
+                else feedforward + given
+            )
             new, terms = bp.advance(k, state, setpoint, qpos, *rates, feedforward)
         return new, terms.effort, terms.effort != terms.unsaturated
 
 
 def half_way(qpos: Array, qvel: Array, steps: Any, timestep: float) -> Array:
-    """Return the pose for the mass matrix of the next ``steps`` sim steps from ``qpos``: half way through them.
+    """Return the pose for the mass matrix of the next ``steps`` sim steps from ``qpos``: half way
+    through them.
 
-    The matrix error is then zero on average. With matrices 0.3 steps ahead, a jaco2 that is near upright, its axes
-    nearly in line, leaves its path by 18 mrad.
+    The matrix error is then zero on average. With matrices 0.3 steps ahead, a jaco2 that is near
+    upright, its axes nearly in line, leaves its path by 18 mrad.
     """
     return qpos + 0.5 * (steps - 1) * timestep * qvel

@@ -52,4 +52,6 @@ class Pushes:
     def _draw(self, name: str, rows: NDArray[np.intp], episodes: Int64) -> Float64:
         randomization = self._options.randomization
         assert randomization is not None
-        return randomization.next_push(name, self._options.robot, episodes[rows], self.counts["number"][rows])
+        return randomization.next_push(
+            name, self._options.robot, episodes[rows], self.counts["number"][rows]
+        )

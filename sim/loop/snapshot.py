@@ -1,11 +1,13 @@
 """Snapshots: the state of all envs, physics and controller, as arrays by name.
 
-A snapshot is a barrier. The engine has more state than positions and velocities: contact caches, warm starts, and the
-order in which it solves contacts. All of these depend on the past, and can be neither read nor written. So every
-continuation from a snapshot, in this process or in another, starts in a new world in that state, and the results are
-bit-identical. The barrier itself changes the last bits.
+A snapshot is a barrier. The engine has more state than positions and velocities: contact caches,
+warm starts, and the order in which it solves contacts. All of these depend on the past, and can be
+neither read nor written. So every continuation from a snapshot, in this process or in another,
+starts in a new world in that state, and the results are bit-identical. The barrier itself changes
+the last bits.
 
-A file is checked where a runner restores it: its arrays are compared with a fresh state of that runner.
+A file is checked where a runner restores it: its arrays are compared with a fresh state of that
+runner.
 """
 
 from __future__ import annotations
@@ -42,7 +44,9 @@ _FORMAT = 13
 _DIGITS = 64
 """Length of a digest."""
 _PARAMS, _MOTORS = "params", "actuator_params"
-_CHOICES: dict[str, tuple[Any, ...]] = {name: tuple(named.values()) for name, named in CHOICES.items()}
+_CHOICES: dict[str, tuple[Any, ...]] = {
+    name: tuple(named.values()) for name, named in CHOICES.items()
+}
 _CHOICES["conditional"] = (Everywhere(),)
 """Params that hold no numbers, by name, with their values."""
 
@@ -52,41 +56,59 @@ class EnvStates:
     """State of some envs; every array has a row for each."""
 
     engine: NDArray[np.float64]
-    """Robots and content (envs, values), of which only the engine knows the meaning; NaN where an env has fewer values
-    than another (:meth:`batchpid.sim.engine.protocol.EnginePack.read_state`)."""
+    """Robots and content (envs, values), of which only the engine knows the meaning; NaN where an
+    env has fewer values than another
+    (:meth:`batchpid.sim.engine.protocol.EnginePack.read_state`).
+    """
     effort: NDArray[np.float32]
     saturated: NDArray[np.bool_]
     controller: dict[str, Rows]
     """Leaves of :class:`batchpid.PIDState`."""
     friction: dict[str, Rows]
-    """Leaves of :class:`batchpid.motors.friction.FrictionState`, and :data:`AGE`; none without Coulomb friction."""
+    """Leaves of :class:`batchpid.motors.friction.FrictionState`, and :data:`AGE`; none without
+    Coulomb friction.
+    """
     actuators: dict[str, Rows]
-    """Leaves of :class:`batchpid.motors.ActuatorState`, and :data:`EPISODE`; none without effects on
-    efforts or measurements."""
+    """Leaves of :class:`batchpid.motors.ActuatorState`, and :data:`EPISODE`; none without effects
+    on efforts or measurements.
+    """
     guard: dict[str, Rows]
-    """Leaves of :class:`batchpid.motors.guard.GuardState`, and :data:`CHANGED`; none without guard."""
+    """Leaves of :class:`batchpid.motors.guard.GuardState`, and :data:`CHANGED`; none without
+    guard.
+    """
     containment: dict[str, Rows]
     """See :class:`batchpid.sim.loop.faults.FaultContainment`."""
     sensors: dict[str, Rows]
-    """Quantities of :class:`batchpid.sim.Observation` from the sensors of links; none without such sensors."""
+    """Quantities of :class:`batchpid.sim.Observation` from the sensors of links; none without such
+    sensors.
+    """
     pushes: dict[str, NDArray[np.int64]]
     """Counts of :class:`batchpid.sim.loop.pushes.Pushes`; none without pushes."""
 
     @classmethod
     def fresh(
-        cls, num_envs: int, dof: int, *, stiction: bool, guard: bool, pushes: bool, **parts: dict[str, Rows]
+        cls,
+        num_envs: int,
+        dof: int,
+        *,
+        stiction: bool,
+        guard: bool,
+        pushes: bool,
+        **parts: dict[str, Rows],
     ) -> EnvStates:
         """Return states of zeros, in the shapes and dtypes of ``num_envs`` envs of ``dof`` joints.
 
-        ``stiction``, ``guard`` and ``pushes`` tell whether the envs have Coulomb friction, a guard and pushes;
-        ``parts`` are the states of controller, actuators and sensors.
+        ``stiction``, ``guard`` and ``pushes`` tell whether the envs have Coulomb friction, a guard
+        and pushes; ``parts`` are the states of controller, actuators and sensors.
         """
         counts, rows = np.zeros(num_envs, np.int64), np.zeros((num_envs, dof))
         return cls(
             engine=np.zeros((num_envs, 0)),
             effort=rows.astype(np.float32),
             saturated=rows > 0,
-            friction={**dict.fromkeys(FrictionState._fields, rows), AGE: counts} if stiction else {},
+            friction=(
+                {**dict.fromkeys(FrictionState._fields, rows), AGE: counts} if stiction else {}
+            ),
             guard={**dict.fromkeys(GuardState._fields, rows), CHANGED: rows > 0} if guard else {},
             containment=FaultContainment(num_envs, dof, "hold").read(),
             pushes=dict.fromkeys(COUNTS, counts) if pushes else {},
@@ -96,7 +118,9 @@ class EnvStates:
     def for_envs(self, envs: slice | NDArray[np.intp]) -> EnvStates:
         """Return the state of some envs, as copies."""
         tables = flatten(vars(self), ".")
-        return EnvStates(**unflatten(vars(self), {name: rows[envs].copy() for name, rows in tables.items()}, "."))
+        return EnvStates(
+            **unflatten(vars(self), {name: rows[envs].copy() for name, rows in tables.items()}, ".")
+        )
 
     @staticmethod
     def join(parts: Sequence[EnvStates]) -> EnvStates:
@@ -113,7 +137,8 @@ class EnvStates:
     def check(self, fresh: EnvStates, command_size: int, engine_sizes: Sequence[int]) -> None:
         """Compare the arrays with :meth:`fresh` states of the runner that restores them.
 
-        ``command_size`` is the size of a setpoint; ``engine_sizes`` (envs,) are the numbers of engine values.
+        ``command_size`` is the size of a setpoint; ``engine_sizes`` (envs,) are the numbers of
+        engine values.
 
         Raises
         ------
@@ -125,11 +150,24 @@ class EnvStates:
         of_command = np.isin(cause, [CAUSES.index(name) for name in COMMAND_CAUSES])
         joints = np.where(of_command, command_size, self.effort.shape[1])
         if ((joint < 0) | (joint >= joints) | (cause < 0) | (cause >= len(CAUSES))).any():
-            raise InvalidArgumentError("snapshot", "has a fault of an unknown joint or cause", remedy="take a new one")
+            raise InvalidArgumentError(
+                "snapshot", "has a fault of an unknown joint or cause", remedy="take a new one"
+            )
         sizes, columns = np.array(engine_sizes)[:, None], np.arange(self.engine.shape[-1])
-        is_table = self.engine.ndim == 2 and len(self.engine) == len(sizes) and self.engine.dtype == np.float64
-        if not is_table or sizes.max() > len(columns) or not np.isnan(self.engine[columns >= sizes]).all():
-            problem, remedy = "holds other content than this runner's build makes", "use the same build="
+        is_table = (
+            self.engine.ndim == 2
+            and len(self.engine) == len(sizes)
+            and self.engine.dtype == np.float64
+        )
+        if (
+            not is_table
+            or sizes.max() > len(columns)
+            or not np.isnan(self.engine[columns >= sizes]).all()
+        ):
+            problem, remedy = (
+                "holds other content than this runner's build makes",
+                "use the same build=",
+            )
             raise InvalidArgumentError("snapshot", problem, remedy=remedy)
 
     def __repr__(self) -> str:
@@ -138,19 +176,27 @@ class EnvStates:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """State of all envs of a runner at one moment. It can be pickled, or kept in a file: :meth:`save`, :meth:`load`."""
+    """State of all envs of a runner at one moment. It can be pickled, or kept in a file:
+    :meth:`save`, :meth:`load`.
+    """
 
     about: Document
-    """Options that a runner must share to restore it: :meth:`batchpid.sim.RunnerOptions.describe`."""
+    """Options that a runner must share to restore it:
+    :meth:`batchpid.sim.RunnerOptions.describe`.
+    """
     steps: int
     """Sim steps up to this moment."""
     params: bp.PIDParams
     states: EnvStates
     actuators: bp.Actuators | None = None
     episodes: NDArray[np.int64] | None = None
-    """Stream and episode of each env (envs, 2), from which everything is drawn again; None without randomization."""
+    """Stream and episode of each env (envs, 2), from which everything is drawn again; None without
+    randomization.
+    """
     motion: NDArray[np.float64] | None = None
-    """Last joint setpoints and their rates (envs, 2, dof); None where setpoints are not for joints."""
+    """Last joint setpoints and their rates (envs, 2, dof); None where setpoints are not for
+    joints.
+    """
 
     def check_options(self, about: Mapping[str, Any]) -> None:
         """Raise InvalidArgumentError if a runner with options ``about`` cannot restore it."""
@@ -158,17 +204,25 @@ class Snapshot:
         if different:
             key, *others = different
             ours, theirs = about[key], self.about.get(key)
-            is_digest = any(isinstance(value, str) and len(value) == _DIGITS for value in (ours, theirs))
-            problem = f"another {key}" if is_digest else f"{key} {reprlib.repr(theirs)}, not {ours!r}"
+            is_digest = any(
+                isinstance(value, str) and len(value) == _DIGITS for value in (ours, theirs)
+            )
+            problem = (
+                f"another {key}" if is_digest else f"{key} {reprlib.repr(theirs)}, not {ours!r}"
+            )
             problem += "".join(f", and another {other}" for other in others)
             remedy = "restore it in a runner made with the same options"
             raise InvalidArgumentError("snapshot", f"is of a runner with {problem}", remedy=remedy)
 
     def check_tables(self, present: dict[str, Rows]) -> None:
-        """Raise InvalidArgumentError if :meth:`tables` have other names, shapes or dtypes than those of a runner."""
+        """Raise InvalidArgumentError if :meth:`tables` have other names, shapes or dtypes than
+        those of a runner.
+        """
         _compare(self.tables(), present)
         if self.episodes is not None and (self.episodes < 0).any():
-            raise InvalidArgumentError("snapshot", "has a negative episode", remedy="take a new one")
+            raise InvalidArgumentError(
+                "snapshot", "has a negative episode", remedy="take a new one"
+            )
 
     def tables(self) -> dict[str, Rows]:
         """Return episodes and motion by name, where it has them."""
@@ -176,10 +230,11 @@ class Snapshot:
         return {name: rows for name, rows in tables.items() if rows is not None}
 
     def for_envs(self, envs: slice | Sequence[int] | NDArray[np.intp]) -> Snapshot:
-        """Return a snapshot of the envs with these numbers, in this order, and repeatedly where a number repeats.
+        """Return a snapshot of the envs with these numbers, in this order, and repeatedly where a
+        number repeats.
 
-        A runner of as many envs restores it. An env continues bit by bit as the original would, with the noise of the
-        original's sensors, until it is reset.
+        A runner of as many envs restores it. An env continues bit by bit as the original would,
+        with the noise of the original's sensors, until it is reset.
 
         Raises
         ------
@@ -196,7 +251,10 @@ class Snapshot:
                 or not (envs < count).all()
                 or (envs < 0).any()
             ):
-                problem, remedy = f"are not numbers of {count} envs", f"pass a sequence of 0 to {count - 1}"
+                problem, remedy = (
+                    f"are not numbers of {count} envs",
+                    f"pass a sequence of 0 to {count - 1}",
+                )
                 raise InvalidArgumentError("envs", problem, value=envs, remedy=remedy)
         num_envs = len(np.arange(count)[envs])
         return replace(
@@ -210,7 +268,8 @@ class Snapshot:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write an .npz file, as a whole or not at all: an older file stays until this one is complete.
+        """Write an .npz file, as a whole or not at all: an older file stays until this one is
+        complete.
 
         Raises
         ------
@@ -218,7 +277,9 @@ class Snapshot:
             The file cannot be written.
         """
         leaves = {name: leaf for name, leaf in self.params._asdict().items() if leaf is not None}
-        choices = {name: type(leaf).__name__ for name, leaf in leaves.items() if isinstance(leaf, tuple)}
+        choices = {
+            name: type(leaf).__name__ for name, leaf in leaves.items() if isinstance(leaf, tuple)
+        }
         numbers = {name: leaf for name, leaf in leaves.items() if name not in choices}
         motors = {} if self.actuators is None else self.actuators.options()
         motors = {name: np.asarray(value) for name, value in motors.items() if name != "dtype"}
@@ -257,13 +318,24 @@ class Snapshot:
         if head["format"] != _FORMAT:
             raise ValueError(f"format {head['format']}, not {_FORMAT}")
         episodes, motion = tables.pop("episodes", None), tables.pop("motion", None)
-        groups: Document = {"controller": {}, "friction": {}, "actuators": {}, "guard": {}, "sensors": {}, "pushes": {}}
+        groups: Document = {
+            "controller": {},
+            "friction": {},
+            "actuators": {},
+            "guard": {},
+            "sensors": {},
+            "pushes": {},
+        }
         for name, rows in tables.items():
             group, dot, leaf = name.partition(".")
             groups = groups | {group: groups.get(group, {}) | {leaf: rows} if dot else rows}
         numbers, motors = groups.pop(_PARAMS), groups.pop(_MOTORS, None)
-        kinds = {name: {type(one).__name__: one for one in _CHOICES[name]} for name in head["choices"]}
-        params = bp.PIDParams(**numbers, **{name: kinds[name][kind] for name, kind in head["choices"].items()})
+        kinds = {
+            name: {type(one).__name__: one for one in _CHOICES[name]} for name in head["choices"]
+        }
+        params = bp.PIDParams(
+            **numbers, **{name: kinds[name][kind] for name, kind in head["choices"].items()}
+        )
         params.options()  # raises for an unknown choice
         params.check(len(groups["effort"]))
         if params.dtype.kind != "f":
@@ -273,30 +345,45 @@ class Snapshot:
             motors = {name: leaf if leaf.ndim else leaf.item() for name, leaf in motors.items()}
             actuators = bp.make_actuators(params.num_joints, **motors)
         steps = integer("steps", head["steps"], 0, 2**62)
-        return cls(dict(head["about"]), steps, params, EnvStates(**groups), actuators, episodes, motion)
+        return cls(
+            dict(head["about"]), steps, params, EnvStates(**groups), actuators, episodes, motion
+        )
 
     def __repr__(self) -> str:
         about = self.about
         return (
-            f"Snapshot({about.get('robot')}, {about.get('num_envs')} envs, control {about.get('control')!r}, "
-            f"after {self.steps} sim steps)"
+            f"Snapshot({about.get('robot')}, {about.get('num_envs')} envs, control"
+            f" {about.get('control')!r}, after {self.steps} sim steps)"
         )
 
 
 def _compare(theirs: dict[str, Rows], ours: dict[str, Rows]) -> None:
-    """Raise InvalidArgumentError if the arrays of a snapshot differ in name, shape or dtype from those of a runner."""
+    """Raise InvalidArgumentError if the arrays of a snapshot differ in name, shape or dtype from
+    those of a runner.
+    """
     for name in sorted(ours.keys() | theirs.keys()):
-        kinds = [f"{rows[name].dtype} {rows[name].shape}" if name in rows else "no array" for rows in (theirs, ours)]
+        kinds = [
+            f"{rows[name].dtype} {rows[name].shape}" if name in rows else "no array"
+            for rows in (theirs, ours)
+        ]
         if kinds[0] != kinds[1]:
             problem = f"has {kinds[0]} for {name}, not {kinds[1]}"
             raise InvalidArgumentError("snapshot", problem, remedy="take a new one")
 
 
-def initial_actuators(actuators: bp.Actuators | None, num_envs: int, dof: int, timestep: float) -> dict[str, Rows]:
-    """Return a state of ``actuators`` by name, in its shapes for ``num_envs`` envs and ``dof`` joints."""
+def initial_actuators(
+    actuators: bp.Actuators | None, num_envs: int, dof: int, timestep: float
+) -> dict[str, Rows]:
+    """Return a state of ``actuators`` by name, in its shapes for ``num_envs`` envs and ``dof``
+    joints.
+    """
     if actuators is None or not (actuators.measures or actuators.delivers):
         return {}
-    longest = bp.Actuators(*(None if leaf is None else leaf.max(0, keepdims=True) for leaf in actuators))
+    longest = bp.Actuators(
+        *(None if leaf is None else leaf.max(0, keepdims=True) for leaf in actuators)
+    )
     state = bp.motors.init(longest, np.zeros((1, dof)), timestep).leaves()
     state[EPISODE] = np.zeros(1, np.int64)
-    return {name: np.broadcast_to(leaf, (num_envs, *leaf.shape[1:])) for name, leaf in state.items()}
+    return {
+        name: np.broadcast_to(leaf, (num_envs, *leaf.shape[1:])) for name, leaf in state.items()
+    }

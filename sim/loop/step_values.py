@@ -1,4 +1,6 @@
-"""Values of a sim step: state, command and reading of the control, its constants, and the functions of an executor."""
+"""Values of a sim step: state, command and reading of the control, its constants, and the functions
+of an executor.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +20,17 @@ from batchpid.sim.loop.pid_law import PIDLaw
 
 
 class StepState(NamedTuple):
-    """State of the control of M envs between sim steps; arrays have the envs as their first axis."""
+    """State of the control of M envs between sim steps; arrays have the envs as their first
+    axis.
+    """
 
     law: Any
     """:class:`batchpid.PIDState`, or the arrays of the caller's own controller by name."""
     friction: FrictionState = FrictionState()
     age: Any = None
-    """Sim steps since the last update of the friction model's inertia (M,); None without Coulomb friction."""
+    """Sim steps since the last update of the friction model's inertia (M,); None without Coulomb
+    friction.
+    """
     motors: ActuatorState | None = None
     """Motors and sensors; None for ideal ones."""
     guard: GuardState | None = None
@@ -39,7 +45,9 @@ class Measured(NamedTuple):
     qvel: Array
     """None where nothing needs it."""
     passive: Array
-    """Efforts that cancel gravity, and Coriolis and centrifugal forces; None without compensation."""
+    """Efforts that cancel gravity, and Coriolis and centrifugal forces; None without
+    compensation.
+    """
 
 
 class Step(NamedTuple):
@@ -50,7 +58,9 @@ class Step(NamedTuple):
     end: Array
     """Sim steps of the tick."""
     left: Array = 0.0
-    """:meth:`Layout.left`: time from the moment of the law's setpoint to the end of the tick [s]."""
+    """:meth:`Layout.left`: time from the moment of the law's setpoint to the end of the tick
+    [s].
+    """
 
 
 class Outputs(NamedTuple):
@@ -80,11 +90,15 @@ class Values(NamedTuple):
     """Reading of the robots before the step."""
     step: Step
     seen: Measured
-    """Reading as the sensors measure it, with the whole feedforward as its passive force from that stage on."""
+    """Reading as the sensors measure it, with the whole feedforward as its passive force from that
+    stage on.
+    """
     noise: Any = None
     """Noise of the sensors in this step, if it is drawn in advance."""
     limited: Array = None
-    """Joints whose effort the caller's own controller has limited (M, dof); None if it does not say."""
+    """Joints whose effort the caller's own controller has limited (M, dof); None if it does not
+    say.
+    """
     outputs: Outputs = Outputs()
 
 
@@ -100,7 +114,9 @@ class KnownFriction(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """Arrays that stay the same for many ticks, (M, dof) or (1, dof); None where they are not needed."""
+    """Arrays that stay the same for many ticks, (M, dof) or (1, dof); None where they are not
+    needed.
+    """
 
     timestep: Array
     """[s]"""
@@ -128,30 +144,41 @@ class Constants(NamedTuple):
 
 
 def when(due: Any, function: Callable[[], Any], otherwise: Array) -> Any:
-    """Return ``function()`` if ``due``, a bool or an array, has a True entry; else ``otherwise``."""
+    """Return ``function()`` if ``due``, a bool or an array, has a True entry; else
+    ``otherwise``.
+    """
     return function() if np.any(due) else otherwise
 
 
 class Model(NamedTuple):
-    """Functions that an executor passes to the control step. Their results do not depend on the executor."""
+    """Functions that an executor passes to the control step. Their results do not depend on the
+    executor.
+    """
 
     mass_matrix: Any = None
     """qpos (M, dof) -> mass matrix of the description (M, dof, dof), as the law knows it."""
     joint_mass_matrix: Any = None
     """qpos -> effective mass matrix of the joints, armature of the motors included."""
     refresh: Any = None
-    """state of the friction model, qpos -> the state with its inertia there; None: by :attr:`joint_mass_matrix`."""
+    """state of the friction model, qpos -> the state with its inertia there; None: by
+    :attr:`joint_mass_matrix`.
+    """
     passive_force: Any = None
-    """qpos, qvel -> passive force of the description, for a measured state that differs from the joints' state."""
+    """qpos, qvel -> passive force of the description, for a measured state that differs from the
+    joints' state.
+    """
     when: Callable[[Any, Callable[[], Any], Any], Any] = when
     """:func:`when`, or a conditional of JAX."""
     law: Callable[..., Any] = PIDLaw.advance
     """:meth:`batchpid.sim.loop.pid_law.PIDLaw.advance`, or a law with its arguments."""
     controller: Any = None
-    """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort), and, if it limits efforts
-    itself, the mask of joints with limited efforts."""
+    """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort), and,
+    if it limits efforts itself, the mask of joints with limited efforts.
+    """
     noise: Any = None
-    """coefficients and state of the sensors, qpos -> their noise, drawn in advance; None to draw it at each step."""
+    """coefficients and state of the sensors, qpos -> their noise, drawn in advance; None to draw it
+    at each step.
+    """
     stages: Stages = STAGES
 
 
@@ -167,9 +194,11 @@ class Layout(NamedTuple):
     model: Model = Model()
 
     def left(self, index: Any, end: Array, timestep: Array) -> Array:
-        """Return the time from the law's setpoint in sim step ``index`` to the end of a tick of ``end`` steps [s].
+        """Return the time from the law's setpoint in sim step ``index`` to the end of a tick of
+        ``end`` steps [s].
 
-        The explicit law takes its setpoint at the beginning of the step, the implicit law and drives at the end.
+        The explicit law takes its setpoint at the beginning of the step, the implicit law and
+        drives at the end.
         """
         return (end - index - self.late) * timestep
 

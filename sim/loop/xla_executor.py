@@ -1,9 +1,10 @@
 """Sim steps of a tick as one program of XLA, which reaches the engine by a call of the extension.
 
-The program is a loop over the sim steps, ``lax.while_loop``: :func:`batchpid.sim.loop.control_step.control_step`,
-traced, then :func:`batchpid.sim.engine.native.xla.sim_step`. It stops early where an env may have failed,
-which Python handles. The number of rows is a multiple of ROWS for any group of envs, so that one program serves all
-groups, and the results of an env do not depend on its group.
+The program is a loop over the sim steps, ``lax.while_loop``:
+:func:`batchpid.sim.loop.control_step.control_step`, traced, then
+:func:`batchpid.sim.engine.native.xla.sim_step`. It stops early where an env may have failed, which
+Python handles. The number of rows is a multiple of ROWS for any group of envs, so that one program
+serves all groups, and the results of an env do not depend on its group.
 """
 
 from __future__ import annotations
@@ -24,7 +25,16 @@ from batchpid.sim.loop.control_step import sim_step
 from batchpid.sim.loop.custom import OwnController, controller_errors
 from batchpid.sim.loop.numpy_executor import Ran, Span, passive_forces
 from batchpid.sim.loop.step_setup import needs_qvel
-from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Outputs, Step, StepState, Values
+from batchpid.sim.loop.step_values import (
+    Constants,
+    Layout,
+    Measured,
+    Model,
+    Outputs,
+    Step,
+    StepState,
+    Values,
+)
 from batchpid.sim.options import RunnerOptions
 
 ROWS = 16
@@ -82,7 +92,9 @@ class XLAExecutor:
         self._bound: Any = None
         self._no_matrix: Any = None
         law = layout.law
-        needs_bodies = (law is not None and law.uses_mass_matrix) or constants.friction.coulomb is not None
+        needs_bodies = (
+            law is not None and law.uses_mass_matrix
+        ) or constants.friction.coulomb is not None
         tables = scene_tree(pack.spec).tables if needs_bodies else None
 
         def spread(part: Any) -> Array:
@@ -105,9 +117,13 @@ class XLAExecutor:
         qpos, qvel = pack.read_qpos(), pack.read_qvel()
         passive = pack.passive_force(self._gravity, self._coriolis) if self._gravity else None
         with own_settings("float64"):
-            return put(Measured(padded(qpos), padded(qvel), None if passive is None else padded(passive)))
+            return put(
+                Measured(padded(qpos), padded(qvel), None if passive is None else padded(passive))
+            )
 
-    def run(self, state: StepState, measured: Measured, command: Command, span: Span, table: Any = None) -> Ran:
+    def run(
+        self, state: StepState, measured: Measured, command: Command, span: Span, table: Any = None
+    ) -> Ran:
         """Run the sim steps of a tick, or until an env may have failed."""
         native = self._bind()
         with own_settings("float64"):
@@ -120,10 +136,14 @@ class XLAExecutor:
             traced = None if self._controller is None else self._controller.traced
             with controller_errors(self._controller and self._options.control, span.begin + 1):
                 program = compiled(self._layout, traced, self._gravity)
-                carry = program(steps, self._constants, self._bodies, self._started(state), measured, command)
+                carry = program(
+                    steps, self._constants, self._bodies, self._started(state), measured, command
+                )
             done, status = np.asarray(carry.progress).tolist()
         failed = native.may_have_failed(status)
-        return Ran(carry.state, carry.outputs, carry.measured, carry.before, span.tick, done, failed)
+        return Ran(
+            carry.state, carry.outputs, carry.measured, carry.before, span.tick, done, failed
+        )
 
     def rows(self, array: Array) -> Rows:
         """Return an array of the executor as a new NumPy array."""
@@ -137,7 +157,9 @@ class XLAExecutor:
         return state if state.age is None else state._replace(age=state.age.astype(np.int64))
 
     def _started(self, state: StepState) -> StepState:
-        """Return ``state`` as the program takes it: padded JAX arrays, with a mass matrix if the law needs one."""
+        """Return ``state`` as the program takes it: padded JAX arrays, with a mass matrix if the
+        law needs one.
+        """
         import jax
 
         law, pack = self._layout.law, self._pack
@@ -155,7 +177,9 @@ class XLAExecutor:
         pack = self._pack
         if self._native is None or self._bound is not pack.calls:
             self._bound = pack.calls
-            self._native = pack.compiled_step(self._gravity, self._coriolis, self._reads_qvel, self._speed_limit)
+            self._native = pack.compiled_step(
+                self._gravity, self._coriolis, self._reads_qvel, self._speed_limit
+            )
         return self._native
 
 
@@ -172,8 +196,9 @@ def tick(
 ) -> Carry:
     """Run sim steps of a tick; arrays (rows, dof).
 
-    ``span`` (4,) of int32 holds the first step, the step after the last, and the address of the group in two parts.
-    They share one array because each array from NumPy adds some microseconds to a call.
+    ``span`` (4,) of int32 holds the first step, the step after the last, and the address of the
+    group in two parts. They share one array because each array from NumPy adds some microseconds to
+    a call.
     """
     import jax
     from jax import lax
@@ -209,7 +234,9 @@ def tick(
     zero, none = xp.zeros_like(qpos), xp.zeros(qpos.shape, bool)
     outputs = Outputs(zero, zero, none, returned=None if controller is None else zero)
     carry = Carry(xp.stack([span[0], xp.zeros_like(end)]), state, measured, outputs, qpos)
-    return lax.while_loop(lambda carry: (carry.progress[0] < end) & (carry.progress[1] == 0), body, carry)
+    return lax.while_loop(
+        lambda carry: (carry.progress[0] < end) & (carry.progress[1] == 0), body, carry
+    )
 
 
 @lru_cache(maxsize=8)
@@ -217,4 +244,7 @@ def compiled(layout: Layout, controller: Any, gravity: bool) -> Any:
     """Return :func:`tick` of this layout, compiled at its first call."""
     import jax
 
-    return jax.jit(partial(tick, layout, controller, gravity), compiler_options={"xla_cpu_multi_thread_eigen": False})
+    return jax.jit(
+        partial(tick, layout, controller, gravity),
+        compiler_options={"xla_cpu_multi_thread_eigen": False},
+    )

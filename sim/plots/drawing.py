@@ -1,4 +1,6 @@
-"""Parts of a figure: the envs as a fan or a band, setpoints, limits and efforts, and the range of an axis."""
+"""Parts of a figure: the envs as a fan or a band, setpoints, limits and efforts, and the range of
+an axis.
+"""
 
 from __future__ import annotations
 
@@ -23,17 +25,24 @@ SETPOINT = "#2f8f4e"
 LIMIT = "#b23a48"
 SMALL = 7.0
 """Font size of ticks and units."""
-_NOTE: Any = {"fontsize": 6.5, "color": "#444444", "bbox": {"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6}}
+_NOTE: Any = {
+    "fontsize": 6.5,
+    "color": "#444444",
+    "bbox": {"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6},
+}
 
 
 def draw_fan(axes: Axes, time: Rows, values: Rows, mark: int | None) -> None:
-    """Draw each env of ``values`` (ticks, envs) as a thin line, their median as a bold one, env ``mark`` in colour."""
+    """Draw each env of ``values`` (ticks, envs) as a thin line, their median as a bold one, env
+    ``mark`` in colour.
+    """
     lines = np.empty((values.shape[1], len(time), 2))
     lines[..., 0], lines[..., 1] = time, values.T
     alpha = min(0.9, max(0.08, 12.0 / len(lines)))
     # As one bitmap: an SVG of 64 envs by 9 joints would hold half a million points.
     axes.add_collection(
-        LineCollection(list(lines), colors=ENV, linewidths=0.6, alpha=alpha, rasterized=True), autolim=False
+        LineCollection(list(lines), colors=ENV, linewidths=0.6, alpha=alpha, rasterized=True),
+        autolim=False,
     )
     axes.plot(time, *quantiles(values, 0.5), color=MEDIAN, lw=1.5)
     if mark is not None:
@@ -55,11 +64,15 @@ def draw_setpoint(axes: Axes, run: Rollout, joint: int, band: float | None) -> N
     move = move[np.isfinite(move)]
     if band is not None and shared and move.size:
         half = band * float(np.median(move))
-        axes.axhspan(setpoint[-1, 0] - half, setpoint[-1, 0] + half, color=SETPOINT, alpha=0.2, lw=0)
+        axes.axhspan(
+            setpoint[-1, 0] - half, setpoint[-1, 0] + half, color=SETPOINT, alpha=0.2, lw=0
+        )
 
 
 def draw_entry(axes: Axes, time: Rows, values: Rows) -> bool:
-    """Draw one number of the setpoints (ticks, envs), as one line where all envs share it; return whether they do."""
+    """Draw one number of the setpoints (ticks, envs), as one line where all envs share it; return
+    whether they do.
+    """
     shared = bool((values == values[:, :1]).all())
     axes.plot(time, values[:, 0] if shared else values, color=SETPOINT, lw=1.1, ls="--", zorder=3)
     return shared
@@ -75,7 +88,9 @@ def draw_limits(axes: Axes, low: float, high: float) -> None:
 
 
 def draw_efforts(axes: Axes, run: Rollout, joint: int, mark: int | None) -> None:
-    """Draw the efforts as a fan against their limit, with the share of envs in saturation as a strip at the top."""
+    """Draw the efforts as a fan against their limit, with the share of envs in saturation as a
+    strip at the top.
+    """
     values, limit = run.effort[..., joint], float(run.info.effort_limit[joint])
     draw_limits(axes, -limit, limit)
     draw_fan(axes, run.time, values, mark)
@@ -83,17 +98,28 @@ def draw_efforts(axes: Axes, run: Rollout, joint: int, mark: int | None) -> None
     share = run.saturated[..., joint].mean(1)
     if share.any():
         strip = axes.inset_axes((0, 0.97, 1, 0.06))
-        colours = LinearSegmentedColormap.from_list("saturation", [to_rgba(LIMIT, 0.0), to_rgba(LIMIT, 0.9)])
-        strip.imshow(share[None], aspect="auto", cmap=colours, vmin=0, vmax=1, interpolation="nearest")
+        colours = LinearSegmentedColormap.from_list(
+            "saturation", [to_rgba(LIMIT, 0.0), to_rgba(LIMIT, 0.9)]
+        )
+        strip.imshow(
+            share[None], aspect="auto", cmap=colours, vmin=0, vmax=1, interpolation="nearest"
+        )
         strip.set_axis_off()
-    peak, unit = np.max(np.abs(values), initial=0.0, where=np.isfinite(values)), _effort_unit(run.info, joint)
+    peak, unit = (
+        np.max(np.abs(values), initial=0.0, where=np.isfinite(values)),
+        _effort_unit(run.info, joint),
+    )
     note = f"peak {peak:.3g} {unit}, no limit"
     if math.isfinite(limit):
         note = f"peak {peak / limit:.0%} of ±{limit:g} {unit}"
     # The note goes where the curves do not end.
     low, high = axes.get_ylim()
     ends = values[2 * len(values) // 3 :]
-    above = np.mean(ends, where=np.isfinite(ends)) < (low + high) / 2 if np.isfinite(ends).any() else False
+    above = (
+        np.mean(ends, where=np.isfinite(ends)) < (low + high) / 2
+        if np.isfinite(ends).any()
+        else False
+    )
     height, anchor = (0.86, "top") if above else (0.1, "bottom")
     axes.text(0.99, height, note, transform=axes.transAxes, ha="right", va=anchor, **_NOTE)
 
@@ -126,7 +152,9 @@ def set_effort_range(axes: Axes, runs: Sequence[Rollout], joint: int) -> None:
 
 
 def quantiles(values: Rows, *at: float) -> Rows:
-    """Return quantiles over the finite envs of ``values`` (ticks, envs), (len(at), ticks); NaN without finite envs."""
+    """Return quantiles over the finite envs of ``values`` (ticks, envs), (len(at), ticks); NaN
+    without finite envs.
+    """
     finite = np.where(np.isfinite(values), values, np.nan)
     if not np.isnan(finite).any():  # nanquantile is many times slower
         return np.quantile(finite, at, axis=1)

@@ -1,6 +1,8 @@
-"""Figures of runs: step responses, efforts against their limits, two runs compared, errors of an identification.
+"""Figures of runs: step responses, efforts against their limits, two runs compared, errors of an
+identification.
 
-Everything is drawn by Matplotlib's object interface on the Agg and SVG canvases: no display, no global state.
+Everything is drawn by Matplotlib's object interface on the Agg and SVG canvases: no display, no
+global state.
 """
 
 from __future__ import annotations
@@ -50,13 +52,19 @@ _SATURATION = Patch(color=drawing.LIMIT, alpha=0.6, lw=0, label="share of envs i
 
 
 def step_responses(
-    rollout: Rollout, *, joints: Joints = None, band: float = 0.02, mark: int | None = None, title: str = ""
+    rollout: Rollout,
+    *,
+    joints: Joints = None,
+    band: float = 0.02,
+    mark: int | None = None,
+    title: str = "",
 ) -> Figure:
-    """Draw, for each joint, positions against setpoint and limits above efforts against their limit.
+    """Draw, for each joint, positions against setpoint and limits above efforts against their
+    limit.
 
-    Setpoints that are not one number for each joint have separate axes, one for each entry of the command, with the
-    pose of the tool where there is one. Not-finite samples are gaps; so is everything of an env from where ``ok`` is
-    False.
+    Setpoints that are not one number for each joint have separate axes, one for each entry of the
+    command, with the pose of the tool where there is one. Not-finite samples are gaps; so is
+    everything of an env from where ``ok`` is False.
 
     Parameters
     ----------
@@ -76,7 +84,11 @@ def step_responses(
     command = None if run.info.sets_positions else run.info.own_command
     figure, blocks = _figure(run, joints, rows=2, title=title, command=command)
     own_blocks = blocks[len(blocks) - command.size :] if command is not None else []
-    pose = None if run.tool_pose is None else _like_setpoints(run.tool_pose, rollout.setpoint[..., 3:7])
+    pose = (
+        None
+        if run.tool_pose is None
+        else _like_setpoints(run.tool_pose, rollout.setpoint[..., 3:7])
+    )
     for entry, (axes,) in own_blocks:
         values = rollout.setpoint[..., entry]
         drawing.draw_entry(axes, run.time, np.where(np.isfinite(values), values, np.nan))
@@ -88,12 +100,16 @@ def step_responses(
         drawing.draw_fan(above, run.time, run.qpos[..., joint], mark)
         drawing.set_position_range(above, [run], joint)
         drawing.draw_efforts(below, run, joint, mark)
-    settling = Patch(color=drawing.SETPOINT, alpha=0.2, lw=0, label=f"settling band, {band:.0%} of the move")
+    settling = Patch(
+        color=drawing.SETPOINT, alpha=0.2, lw=0, label=f"settling band, {band:.0%} of the move"
+    )
     _legend(figure, [*_fan_entries(run, mark), _SETPOINT, settling, _BEYOND, _SATURATION])
     return figure
 
 
-def efforts(rollout: Rollout, *, joints: Joints = None, mark: int | None = None, title: str = "") -> Figure:
+def efforts(
+    rollout: Rollout, *, joints: Joints = None, mark: int | None = None, title: str = ""
+) -> Figure:
     """Draw, for each joint, efforts against their limit, and the share of envs in saturation.
 
     Parameters as in :func:`step_responses`.
@@ -115,7 +131,8 @@ def comparison(
     joints: Joints = None,
     title: str = "",
 ) -> Figure:
-    """Draw median and 10 to 90 % of the envs of two runs of the same joints, positions above efforts.
+    """Draw median and 10 to 90 % of the envs of two runs of the same joints, positions above
+    efforts.
 
     Raises
     ------
@@ -152,7 +169,8 @@ def comparison(
 
 
 def save(figure: Figure, path: str | Path, dpi: int = 110) -> Path:
-    """Write ``figure`` to ``path`` (.png or .svg) as a whole or not at all, making its folder, and return the path.
+    """Write ``figure`` to ``path`` (.png or .svg) as a whole or not at all, making its folder, and
+    return the path.
 
     Raises
     ------
@@ -184,7 +202,9 @@ def _png(figure: Figure, dpi: int) -> bytes:
 
 
 def _blank_failed(rollout: Rollout) -> Rollout:
-    """Return the rollout with NaN where an env has failed, and for setpoints that are not positions."""
+    """Return the rollout with NaN where an env has failed, and for setpoints that are not
+    positions.
+    """
     alive, seen = rollout.ok[..., None], rollout.observation
     blank = seen._replace(
         qpos=np.where(alive, seen.qpos, np.nan),
@@ -205,25 +225,33 @@ def _like_setpoints(pose: Array, wxyz: Array) -> Any:
 
 def _joint_indices(run: Rollout, joints: Joints) -> list[int]:
     names = run.info.joint_names
-    indices: dict[int | str, int] = {key: index for index, name in enumerate(names) for key in (name, index)}
+    indices: dict[int | str, int] = {
+        key: index for index, name in enumerate(names) for key in (name, index)
+    }
     for joint in joints or ():
         if joint not in indices:
-            raise InvalidArgumentError("joints", "no such joint", value=joint, remedy=f"use {', '.join(names)}")
+            raise InvalidArgumentError(
+                "joints", "no such joint", value=joint, remedy=f"use {', '.join(names)}"
+            )
     return [indices[joint] for joint in joints or names]
 
 
 def _figure(
     run: Rollout, joints: Joints, *, rows: int, title: str, command: CommandSpec | None = None
 ) -> tuple[Figure, list[tuple[int, list[Axes]]]]:
-    """Return a figure with ``rows`` axes for each joint, then one for each entry of ``command``, in a grid.
+    """Return a figure with ``rows`` axes for each joint, then one for each entry of ``command``, in
+    a grid.
 
     The pairs are (joint, axes) and, after these, (entry, axes).
     """
     chosen = [(joint, run.info.joint_names[joint], rows) for joint in _joint_indices(run, joints)]
     if command is not None:
         chosen += [(entry, f"setpoint {label}", 1) for entry, label in enumerate(command.labels)]
-    # Up to three columns; with more than 9 joints four or five, which leaves the fewest empty cells.
-    columns = min(len(chosen), 3) if len(chosen) <= 9 else min((4, 5), key=lambda n: -len(chosen) % n)
+    # Up to three columns; with more than 9 joints four or five, which leaves the fewest empty
+    # cells.
+    columns = (
+        min(len(chosen), 3) if len(chosen) <= 9 else min((4, 5), key=lambda n: -len(chosen) % n)
+    )
     lines = math.ceil(len(chosen) / columns)
     heights = (1.7, 0.85)[:rows]
     between = 0.06  # a thin empty row separates the joints
@@ -233,7 +261,9 @@ def _figure(
     if title:
         figure.suptitle(title, fontsize=11)
     # One flat grid, so that the axes of a column are aligned.
-    grid = figure.add_gridspec(lines * (rows + 1), columns, height_ratios=(*heights, between) * lines)
+    grid = figure.add_gridspec(
+        lines * (rows + 1), columns, height_ratios=(*heights, between) * lines
+    )
     blocks = []
     for place, (index, name, parts) in enumerate(chosen):
         line, column = divmod(place, columns)
@@ -242,7 +272,9 @@ def _figure(
         block = [figure.add_subplot(grid[cell, column]) for cell in cells]
         last = place + columns >= len(chosen)
         for axes in block:
-            axes.tick_params(labelsize=drawing.SMALL, length=2, labelbottom=axes is block[-1] and last)
+            axes.tick_params(
+                labelsize=drawing.SMALL, length=2, labelbottom=axes is block[-1] and last
+            )
             axes.spines[["top", "right"]].set_visible(False)
             axes.set_xlim(0, run.time[-1])
             axes.yaxis.set_major_locator(MaxNLocator(4))
@@ -254,18 +286,28 @@ def _figure(
 
 
 def _fan_entries(run: Rollout, mark: int | None) -> list[Line2D]:
-    line = Line2D([], [], color=drawing.ENV, alpha=0.6, lw=0.8, label=f"each of {run.num_envs} envs")
-    marked = [] if mark is None else [Line2D([], [], color=drawing.MARKED, lw=1.2, label=f"env {mark}")]
+    line = Line2D(
+        [], [], color=drawing.ENV, alpha=0.6, lw=0.8, label=f"each of {run.num_envs} envs"
+    )
+    marked = (
+        [] if mark is None else [Line2D([], [], color=drawing.MARKED, lw=1.2, label=f"env {mark}")]
+    )
     return [line, *marked, _MEDIAN]
 
 
 def _legend(figure: Figure, handles: list[Any]) -> None:
-    # As many columns as the figure is wide enough for: an entry of n letters takes about n + 8 of them.
+    # As many columns as the figure is wide enough for: an entry of n letters takes about n + 8 of
+    # them.
     letters = figure.get_figwidth() * 17
-    columns = max(1, min(len(handles), int(letters / (8 + max(len(handle.get_label()) for handle in handles)))))
+    columns = max(
+        1,
+        min(len(handles), int(letters / (8 + max(len(handle.get_label()) for handle in handles)))),
+    )
     if sum(len(handle.get_label()) + 8 for handle in handles) < letters:
         columns = len(handles)
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=7.5, frameon=False)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=columns, fontsize=7.5, frameon=False
+    )
 
 
 class FitErrors(NamedTuple):
@@ -281,8 +323,11 @@ class FitErrors(NamedTuple):
     """Of the robot as identified."""
 
 
-def fit_errors(fits: Sequence[FitErrors], names: Sequence[str], units: Sequence[str], title: str) -> Figure:
-    """Draw the position errors of the joints ``names`` along the stretches of one log, before and after.
+def fit_errors(
+    fits: Sequence[FitErrors], names: Sequence[str], units: Sequence[str], title: str
+) -> Figure:
+    """Draw the position errors of the joints ``names`` along the stretches of one log, before and
+    after.
 
     The part that was kept to judge is shaded.
     """
@@ -301,7 +346,11 @@ def fit_errors(fits: Sequence[FitErrors], names: Sequence[str], units: Sequence[
                 error[~np.isfinite(error)] = np.nan
                 every = max(1, len(error) // 2000)
                 axes.semilogy(
-                    fit.time[::every], error[::every], color=colour, lw=0.8, label=label if index == 0 else None
+                    fit.time[::every],
+                    error[::every],
+                    color=colour,
+                    lw=0.8,
+                    label=label if index == 0 else None,
                 )
         for times in held_out:
             if len(times):

@@ -1,1 +1,3 @@
-"""Randomization of the robots: distributions, and the values drawn from them for each env and episode."""
+"""Randomization of the robots: distributions, and the values drawn from them for each env and
+episode.
+"""

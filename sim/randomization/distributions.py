@@ -34,7 +34,9 @@ class Distribution(ABC):
     """
 
     operation: Operation = "add"
-    """Use of a draw: ``"add"`` it to the nominal value, ``"scale"`` that by it, or ``"abs"``: take it instead."""
+    """Use of a draw: ``"add"`` it to the nominal value, ``"scale"`` that by it, or ``"abs"``: take
+    it instead.
+    """
     shared: bool = False
     """True for one draw for all joints or links of an env."""
     kind: ClassVar[str] = ""
@@ -62,7 +64,11 @@ class Distribution(ABC):
     def to_dict(self) -> Document:
         """Return it as plain values: ``{"uniform": [low, high], "operation": "scale"}``."""
         values = [getattr(self, each.name) for each in fields(self) if not each.kw_only]
-        options = [each for each in fields(self) if each.kw_only and getattr(self, each.name) != each.default]
+        options = [
+            each
+            for each in fields(self)
+            if each.kw_only and getattr(self, each.name) != each.default
+        ]
         first = values if len(values) > 1 else list(*values)
         return {self.kind: first, **{each.name: getattr(self, each.name) for each in options}}
 
@@ -73,7 +79,9 @@ class Distribution(ABC):
 
     def _ordered(self, low: float, high: float) -> None:
         if low > high:
-            raise InvalidArgumentError("high", f"is less than low, {low:g}", value=high, remedy="swap them")
+            raise InvalidArgumentError(
+                "high", f"is less than low, {low:g}", value=high, remedy="swap them"
+            )
 
 
 @dataclass(frozen=True)
@@ -124,10 +132,14 @@ class Normal(Distribution):
         self._numbers("std", low=np.finfo(float).tiny)
         low, high = (_bound(name, getattr(self, name)) for name in ("low", "high"))
         self._ordered(low, high)
-        share = 0.5 * (math.erf((high - self.mean) / self._scale) - math.erf((low - self.mean) / self._scale))
+        share = 0.5 * (
+            math.erf((high - self.mean) / self._scale) - math.erf((low - self.mean) / self._scale)
+        )
         if share < LEAST_SHARE:
             problem = f"and high leave {share:.2g} of the draws"
-            raise InvalidArgumentError("low", problem, value=low, remedy="use a uniform distribution for a tail")
+            raise InvalidArgumentError(
+                "low", problem, value=low, remedy="use a uniform distribution for a tail"
+            )
 
     @property
     def _scale(self) -> float:
@@ -150,8 +162,14 @@ class Choice(Distribution):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(self.values, str) or not isinstance(self.values, Sequence | np.ndarray) or not len(self.values):
-            raise InvalidArgumentError("values", "must be a list of numbers", value=self.values, remedy="give one")
+        if (
+            isinstance(self.values, str)
+            or not isinstance(self.values, Sequence | np.ndarray)
+            or not len(self.values)
+        ):
+            raise InvalidArgumentError(
+                "values", "must be a list of numbers", value=self.values, remedy="give one"
+            )
         unit = "in the unit of the field"
         values = tuple(number("values", value, -math.inf, math.inf, unit) for value in self.values)
         object.__setattr__(self, "values", values)
@@ -166,12 +184,15 @@ class Choice(Distribution):
         return np.array(self.values)[generator.integers(len(self.values), size=size)]
 
 
-KINDS: dict[str, type[Distribution]] = {each.kind: each for each in (Uniform, LogUniform, Normal, Choice)}
+KINDS: dict[str, type[Distribution]] = {
+    each.kind: each for each in (Uniform, LogUniform, Normal, Choice)
+}
 """Distributions by their name in a file."""
 
 
 def read_distribution(name: str, value: Any) -> Distribution:
-    """Return the distribution of the field ``name`` that a file describes, as :meth:`Distribution.to_dict` does.
+    """Return the distribution of the field ``name`` that a file describes, as
+    :meth:`Distribution.to_dict` does.
 
     Raises
     ------
@@ -185,10 +206,15 @@ def read_distribution(name: str, value: Any) -> Distribution:
     (kind,) = kinds
     options = {key: option for key, option in value.items() if key != kind}
     arguments = [value[kind]] if kind == Choice.kind else value[kind]
-    numbers, known = ([each.name for each in fields(KINDS[kind]) if each.kw_only is only] for only in (False, True))
+    numbers, known = (
+        [each.name for each in fields(KINDS[kind]) if each.kw_only is only]
+        for only in (False, True)
+    )
     if not isinstance(arguments, list | tuple) or len(arguments) != len(numbers):
         problem, remedy = f"{kind} needs a list of numbers", f"write {kind}: [{', '.join(numbers)}]"
-        raise InvalidArgumentError(name, f"is not a distribution: {problem}", value=value, remedy=remedy)
+        raise InvalidArgumentError(
+            name, f"is not a distribution: {problem}", value=value, remedy=remedy
+        )
     for option in options:
         choice(name, option, known)
     with documents.named(name):
@@ -197,7 +223,11 @@ def read_distribution(name: str, value: Any) -> Distribution:
 
 def _bound(name: str, value: Any) -> float:
     """Return a bound, which may be infinite."""
-    return float(value) if value in (-math.inf, math.inf) else number(name, value, -math.inf, math.inf, "bound")
+    return (
+        float(value)
+        if value in (-math.inf, math.inf)
+        else number(name, value, -math.inf, math.inf, "bound")
+    )
 
 
 class Draws(NamedTuple):
@@ -206,14 +236,18 @@ class Draws(NamedTuple):
     episodes: Episodes
     """Stream and episode of each env (envs, 2)."""
     values: dict[str, Float64]
-    """Draws by field, e.g. "payload" or "params.kp": (envs, joints or links); NaN where nothing is drawn."""
+    """Draws by field, e.g. "payload" or "params.kp": (envs, joints or links); NaN where nothing is
+    drawn.
+    """
 
     def for_envs(self, envs: slice | Any) -> Draws:
         """Return the draws of some envs."""
         return Draws(self.episodes[envs], {name: rows[envs] for name, rows in self.values.items()})
 
     def replaced(self, mask: NDArray[np.bool_], new: Draws) -> Draws:
-        """Return the draws, with the envs of ``mask`` (envs,) taken from ``new``, which holds only these envs."""
+        """Return the draws, with the envs of ``mask`` (envs,) taken from ``new``, which holds only
+        these envs.
+        """
         values = {name: rows.copy() for name, rows in self.values.items()}
         for name, rows in new.values.items():
             values[name][mask] = rows
@@ -232,7 +266,9 @@ NOTHING = Draws(np.zeros((0, 2), np.int64), {})
 def generators(
     seed: int, name: str, episodes: Episodes, constant: bool, number: Any = 0
 ) -> Iterator[np.random.Generator]:
-    """Yield a generator for each env, of draw ``number`` (an int, or one for each env) of one field in its episode."""
+    """Yield a generator for each env, of draw ``number`` (an int, or one for each env) of one field
+    in its episode.
+    """
     digest = hashlib.blake2b(name.encode(), digest_size=8).digest()
     bits = np.random.Philox(key=np.array([seed, int.from_bytes(digest, "little")], np.uint64))
     state: Any = bits.state

@@ -1,4 +1,6 @@
-"""Fields of a randomization: names, the joints, links or axes that they have values for, and nominal values."""
+"""Fields of a randomization: names, the joints, links or axes that they have values for, and
+nominal values.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ SINGLE = ("payload", "ground_friction", "push_interval")
 
 
 def elements(name: str, robot: Robot) -> Sequence[str]:
-    """Return the names of a field's values: joints, links, axes of links or of the world, or its own name."""
+    """Return the names of a field's values: joints, links, axes of links or of the world, or its
+    own name.
+    """
     if name in SINGLE:
         return (name,)
     if name == "gravity":
@@ -36,11 +40,17 @@ def elements(name: str, robot: Robot) -> Sequence[str]:
     if name == "center_of_mass":
         return [f"{link}.{axis}" for link in elements("link_mass", robot) for axis in "xyz"]
     if name == "link_mass":
-        return [link.name for link in robot.links if link.mass or (link.mass is None and link.num_shapes)]
+        return [
+            link.name
+            for link in robot.links
+            if link.mass or (link.mass is None and link.num_shapes)
+        ]
     return robot.joint_names
 
 
-def parts(name: str, each: Field, columns: Sequence[str]) -> Iterator[tuple[str, list[int], Distribution]]:
+def parts(
+    name: str, each: Field, columns: Sequence[str]
+) -> Iterator[tuple[str, list[int], Distribution]]:
     """Yield the name of each independent part of a field, its columns and its distribution."""
     if isinstance(each, Distribution):
         yield name, list(range(len(columns))), each
@@ -48,7 +58,11 @@ def parts(name: str, each: Field, columns: Sequence[str]) -> Iterator[tuple[str,
     owners = [column[:-2] for column in columns] if name == "center_of_mass" else columns
     for element, distribution in each.items():
         choice(name, element, list(dict.fromkeys(owners)))
-        yield f"{name}.{element}", [at for at, owner in enumerate(owners) if owner == element], distribution
+        yield (
+            f"{name}.{element}",
+            [at for at, owner in enumerate(owners) if owner == element],
+            distribution,
+        )
 
 
 def nominal_values(name: str, robot: Robot, mjcf: MjcfFile | None = None) -> Float64:
@@ -58,7 +72,11 @@ def nominal_values(name: str, robot: Robot, mjcf: MjcfFile | None = None) -> Flo
     """
     if name == "link_mass":
         return np.array([robot.link_masses[link].mass for link in elements(name, robot)])
-    nominal = {"friction": robot.friction, "damping": robot.damping, "gravity": np.array([0.0, 0.0, -9.81])}
+    nominal = {
+        "friction": robot.friction,
+        "damping": robot.damping,
+        "gravity": np.array([0.0, 0.0, -9.81]),
+    }
     nominal |= {"ground_friction": np.array([CONTACT_FRICTION if mjcf is None else mjcf.friction])}
     return nominal.get(name, np.zeros(len(elements(name, robot))))
 
@@ -67,12 +85,23 @@ def mapping(name: str, value: object) -> Mapping[str, Any]:
     """Return ``value`` if it is a mapping; raise InvalidArgumentError if not."""
     if not isinstance(value, Mapping):
         remedy = "write field: distribution, e.g. kp: {uniform: [0.9, 1.1], operation: scale}"
-        raise InvalidArgumentError(name, "is not a mapping of fields to distributions", value=value, remedy=remedy)
+        raise InvalidArgumentError(
+            name, "is not a mapping of fields to distributions", value=value, remedy=remedy
+        )
     return value
 
 
 def read_field(name: str, value: Any) -> Field:
-    """Return the field that a file describes: a distribution, or a mapping of names to distributions."""
-    if isinstance(value, Mapping) and value and all(isinstance(part, Mapping) for part in value.values()):
-        return {str(element): read_distribution(f"{name}.{element}", part) for element, part in value.items()}
+    """Return the field that a file describes: a distribution, or a mapping of names to
+    distributions.
+    """
+    if (
+        isinstance(value, Mapping)
+        and value
+        and all(isinstance(part, Mapping) for part in value.values())
+    ):
+        return {
+            str(element): read_distribution(f"{name}.{element}", part)
+            for element, part in value.items()
+        }
     return read_distribution(name, value)

@@ -1,9 +1,10 @@
 """Randomization: distributions of a robot's parameters, drawn by (seed, env, episode).
 
-Each env has a stream, by default its index, and counts its episodes. The draws of one field come from the counter-based
-generator Philox4x64 (J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) with the key (seed,
-hash of the field's name) and a counter that begins at (0, 0, episode, stream). So they depend on these alone, and not
-on other envs, fields or earlier episodes.
+Each env has a stream, by default its index, and counts its episodes. The draws of one field come
+from the counter-based generator Philox4x64 (J. K. Salmon et al., "Parallel random numbers: as easy
+as 1, 2, 3", SC 2011) with the key (seed, hash of the field's name) and a counter that begins at (0,
+0, episode, stream). So they depend on these alone, and not on other envs, fields or earlier
+episodes.
 """
 
 from __future__ import annotations
@@ -42,11 +43,12 @@ OF_JOINTS = ("bias", *JOINT_SIDE)
 
 @dataclass(frozen=True, kw_only=True)
 class Randomization:
-    """Distributions of the parameters of the robots, for the option ``randomization`` of :class:`batchpid.sim.Runner`.
+    """Distributions of the parameters of the robots, for the option ``randomization`` of
+    :class:`batchpid.sim.Runner`.
 
     A field is a distribution (:class:`batchpid.sim.Uniform`, :class:`batchpid.sim.LogUniform`,
-    :class:`batchpid.sim.Normal`, :class:`batchpid.sim.Choice`), drawn for each joint or link, or a mapping of the names
-    of some joints or links to distributions.
+    :class:`batchpid.sim.Normal`, :class:`batchpid.sim.Choice`), drawn for each joint or link, or a
+    mapping of the names of some joints or links to distributions.
 
     The controller knows the nominal robot: compensation and mass matrix do not change.
 
@@ -67,7 +69,9 @@ class Randomization:
     link_mass: Annotated[Field | None, Bounds("kg", above=True, group="robot")] = None
     """Masses of the links of the URDF [kg]; their inertia tensors change in proportion."""
     center_of_mass: Annotated[Field | None, Bounds("m", low=-math.inf, group="robot")] = None
-    """Displacement of the centers of mass of the links, along each of the three axes of the link [m]; nominal 0."""
+    """Displacement of the centers of mass of the links, along each of the three axes of the link
+    [m]; nominal 0.
+    """
     friction: Annotated[Field | None, Bounds("N m or N", group="robot")] = None
     """Coulomb friction of the joints [N m or N]; nominal as in the URDF."""
     damping: Annotated[Field | None, Bounds("N m s/rad or N s/m", group="robot")] = None
@@ -75,27 +79,34 @@ class Randomization:
     armature: Annotated[Field | None, Bounds("kg m^2 or kg", group="robot")] = None
     """Reflected inertia of the motors [kg m^2 or kg]; nominal 0."""
     qpos: Annotated[Field | None, Bounds("rad or m", low=-math.inf, group="start")] = None
-    """Position at a reset [rad or m], within the joint limits; nominal the argument of ``reset``."""
+    """Position at a reset [rad or m], within the joint limits; nominal the argument of
+    ``reset``.
+    """
     qvel: Annotated[Field | None, Bounds("rad/s or m/s", low=-math.inf, group="start")] = None
     """Velocity at a reset [rad/s or m/s]."""
     ground_friction: Annotated[Distribution | None, Bounds("1", group="robot")] = None
     """Coefficient of sliding friction of the ground and of all shapes of the robot; nominal 0.3.
 
-    In the scene of an MJCF file the nominal value is the friction of the file's ground, and the robot's shapes change
-    by the same factor."""
+    In the scene of an MJCF file the nominal value is the friction of the file's ground, and the
+    robot's shapes change by the same factor.
+    """
     gravity: Annotated[Field | None, Bounds("m/s^2", low=-math.inf, group="robot")] = None
-    """Gravity along the axes x, y and z of the world [m/s^2]; nominal 0, 0 and -9.81. The compensation has the nominal
-    one."""
+    """Gravity along the axes x, y and z of the world [m/s^2]; nominal 0, 0 and -9.81. The
+    compensation has the nominal one.
+    """
     push: Annotated[Field | None, Bounds("m/s or rad/s", low=-math.inf, group="event")] = None
-    """Velocity change of a floating base, along the axes of the world: vx, vy, vz [m/s], wx, wy, wz [rad/s]; nominal
-    0. Pushes come at the beginning of the first tick after each ``push_interval``."""
+    """Velocity change of a floating base, along the axes of the world: vx, vy, vz [m/s], wx, wy, wz
+    [rad/s]; nominal
+    0. Pushes come at the beginning of the first tick after each ``push_interval``.
+    """
     push_interval: Annotated[Distribution | None, Bounds("s", above=True, group="event")] = None
     """Time from the reset to the first push, and from each to the next [s]."""
     params: Mapping[str, Field] = field(default_factory=dict)
     """Fields of :class:`batchpid.PIDParams` that the runner's params have, e.g. ``{"kp": ...}``."""
     actuators: Mapping[str, Field] = field(default_factory=dict)
-    """Fields of :class:`batchpid.Actuators`, e.g. ``{"command_delay": ...}``; nominal the values of the runner's
-    actuators, or of ideal ones."""
+    """Fields of :class:`batchpid.Actuators`, e.g. ``{"command_delay": ...}``; nominal the values of
+    the runner's actuators, or of ideal ones.
+    """
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seed", integer("seed", self.seed, 0, LARGEST))
@@ -106,10 +117,14 @@ class Randomization:
             mapping(group, getattr(self, group))
         remedy = "pass e.g. Uniform(0, 0.5), or a mapping of names to such"
         for name, each in (self.given | self.events).items():
-            given = list(each.values()) if isinstance(each, Mapping) and name not in SINGLE else [each]
+            given = (
+                list(each.values()) if isinstance(each, Mapping) and name not in SINGLE else [each]
+            )
             for part in given or [None]:
                 if not isinstance(part, Distribution):
-                    raise InvalidArgumentError(name, "is not a distribution", value=part, remedy=remedy)
+                    raise InvalidArgumentError(
+                        name, "is not a distribution", value=part, remedy=remedy
+                    )
 
     @property
     def given(self) -> dict[str, Field]:
@@ -122,7 +137,11 @@ class Randomization:
     @property
     def events(self) -> dict[str, Field]:
         """Given fields of events during an episode, by name."""
-        return {name: distribution for name in EVENTS if (distribution := getattr(self, name)) is not None}
+        return {
+            name: distribution
+            for name in EVENTS
+            if (distribution := getattr(self, name)) is not None
+        }
 
     @property
     def changes_robot(self) -> bool:
@@ -133,18 +152,26 @@ class Randomization:
         """Return the name of the link that carries the payload."""
         return self.payload_link or robot.rigid_tree.tool
 
-    # -- draws -------------------------------------------------------------------------------------------------------
+    # -- draws
+    # ----------------------------------------------------------------------------------------------
 
     def draw(self, robot: Robot, episodes: Rows) -> Draws:
         """Return the draws for envs with these streams and episodes (envs, 2)."""
         episodes = episodes.astype(np.int64)
         return Draws(
             episodes,
-            {name: self._draw(name, distribution, robot, episodes) for name, distribution in self.given.items()},
+            {
+                name: self._draw(name, distribution, robot, episodes)
+                for name, distribution in self.given.items()
+            },
         )
 
-    def _draw(self, name: str, each: Field, robot: Robot, episodes: NDArray[np.int64], number: Any = 0) -> Float64:
-        """Return draws of a field (envs, elements), NaN where nothing is drawn; see :func:`generators`."""
+    def _draw(
+        self, name: str, each: Field, robot: Robot, episodes: NDArray[np.int64], number: Any = 0
+    ) -> Float64:
+        """Return draws of a field (envs, elements), NaN where nothing is drawn; see
+        :func:`generators`.
+        """
         columns = elements(name, robot)
         rows = np.full((len(episodes), len(columns)), np.nan)
         for part, chosen, distribution in parts(name, each, columns):
@@ -154,24 +181,37 @@ class Randomization:
                 row[chosen] = distribution.sample(generator, size)
         return rows
 
-    def next_push(self, name: str, robot: Robot, episodes: NDArray[np.int64], number: NDArray[np.int64]) -> Float64:
-        """Return one field of the push after push ``number`` (n,) of these episodes (n, 2); number 0 is the reset.
+    def next_push(
+        self, name: str, robot: Robot, episodes: NDArray[np.int64], number: NDArray[np.int64]
+    ) -> Float64:
+        """Return one field of the push after push ``number`` (n,) of these episodes (n, 2); number
+        0 is the reset.
 
-        Its ``name`` is "push_interval", the time between the two (n, 1) [s], or "push", the added twist (n, 6).
+        Its ``name`` is "push_interval", the time between the two (n, 1) [s], or "push", the added
+        twist (n, 6).
         """
         return np.nan_to_num(self._draw(name, self.events[name], robot, episodes, number))
 
     def first(self, robot: Robot, num_envs: int, first_env: int = 0) -> Draws:
-        """Return the draws for the first episode of each env, of the stream of its number, from ``first_env`` on."""
-        return self.draw(robot, np.stack([first_env + np.arange(num_envs), np.zeros(num_envs, np.int64)], 1))
+        """Return the draws for the first episode of each env, of the stream of its number, from
+        ``first_env`` on.
+        """
+        return self.draw(
+            robot, np.stack([first_env + np.arange(num_envs), np.zeros(num_envs, np.int64)], 1)
+        )
 
     def redraw(
-        self, robot: Robot, draws: Draws, mask: NDArray[np.bool_], seed: int | ArrayLike | None, first_env: int = 0
+        self,
+        robot: Robot,
+        draws: Draws,
+        mask: NDArray[np.bool_],
+        seed: int | ArrayLike | None,
+        first_env: int = 0,
     ) -> Draws:
         """Return ``draws`` with new ones for the envs of ``mask`` (envs,), which begin an episode.
 
-        It is the next of each env's stream, or the first of the stream ``seed`` + k for env number k, from
-        ``first_env`` on, or of ``seed`` (envs,).
+        It is the next of each env's stream, or the first of the stream ``seed`` + k for env number
+        k, from ``first_env`` on, or of ``seed`` (envs,).
 
         Raises
         ------
@@ -183,39 +223,59 @@ class Randomization:
             episodes = draws.episodes + np.array([0, 1])
         else:
             if np.ndim(seed) == 0:
-                streams = integer("seed", seed, 0, LARGEST - first_env - num_envs) + first_env + np.arange(num_envs)
+                streams = (
+                    integer("seed", seed, 0, LARGEST - first_env - num_envs)
+                    + first_env
+                    + np.arange(num_envs)
+                )
             else:
                 streams = read_array("seed", seed, "iu")
-                if streams.shape != (num_envs,) or not ((streams >= 0) & (streams <= LARGEST)).all():
+                if (
+                    streams.shape != (num_envs,)
+                    or not ((streams >= 0) & (streams <= LARGEST)).all()
+                ):
                     problem = f"must be {num_envs} whole numbers >= 0, one for each env"
-                    raise InvalidArgumentError("seed", problem, value=seed, remedy="pass these, or an int")
+                    raise InvalidArgumentError(
+                        "seed", problem, value=seed, remedy="pass these, or an int"
+                    )
             episodes = np.stack([streams.astype(np.int64), np.zeros(num_envs, np.int64)], 1)
         return draws.replaced(mask, self.draw(robot, episodes[mask]))
 
     def apply(self, name: str, nominal: Any, draws: Draws, robot: Robot) -> Float64:
-        """Return the values of a field (envs, joints or links) that result from ``nominal``, which broadcasts to it.
+        """Return the values of a field (envs, joints or links) that result from ``nominal``, which
+        broadcasts to it.
 
         All entries of a joint's table (1, joints, points) change by one draw.
         """
         drawn = draws.values[name]
         if np.ndim(nominal) == 3:
             drawn = drawn[..., None]
-        values = np.array(np.broadcast_to(nominal, np.broadcast_shapes(np.shape(nominal), drawn.shape)))
+        values = np.array(
+            np.broadcast_to(nominal, np.broadcast_shapes(np.shape(nominal), drawn.shape))
+        )
         for _, chosen, distribution in parts(name, self.given[name], elements(name, robot)):
             values[:, chosen] = distribution.apply(values[:, chosen], drawn[:, chosen])
         return values
 
-    def randomized_params(self, params: bp.PIDParams, draws: Draws | None, robot: Robot) -> bp.PIDParams:
-        """Return ``params`` with the draws applied, one row for each env; the same if nothing is drawn for them."""
+    def randomized_params(
+        self, params: bp.PIDParams, draws: Draws | None, robot: Robot
+    ) -> bp.PIDParams:
+        """Return ``params`` with the draws applied, one row for each env; the same if nothing is
+        drawn for them.
+        """
         if draws is None or not self.params:
             return params
-        values = {name: self.apply(f"params.{name}", getattr(params, name), draws, robot) for name in self.params}
+        values = {
+            name: self.apply(f"params.{name}", getattr(params, name), draws, robot)
+            for name in self.params
+        }
         return params._replace(**{name: rows.astype(params.dtype) for name, rows in values.items()})
 
     def randomized_actuators(
         self, actuators: bp.Actuators | None, draws: Draws | None, robot: Robot
     ) -> bp.Actuators | None:
-        """Return ``actuators`` with the draws applied, one row for each env; the same if nothing is drawn for them.
+        """Return ``actuators`` with the draws applied, one row for each env; the same if nothing is
+        drawn for them.
 
         ``actuators`` come from :func:`batchpid.sim.randomization.checks.prepared_actuators`.
         """
@@ -227,24 +287,34 @@ class Randomization:
             values[name] = rows * robot.independent if name in OF_JOINTS else rows
         return actuators._replace(**values)
 
-    def start(self, qpos: Float64, qvel: Float64, draws: Draws, robot: Robot) -> tuple[Float64, Float64]:
-        """Return position and velocity (envs, dof) at a reset to ``qpos`` and ``qvel``; NaN stays."""
+    def start(
+        self, qpos: Float64, qvel: Float64, draws: Draws, robot: Robot
+    ) -> tuple[Float64, Float64]:
+        """Return position and velocity (envs, dof) at a reset to ``qpos`` and ``qvel``; NaN
+        stays.
+        """
         if self.qpos is not None:
             qpos = np.clip(self.apply("qpos", qpos, draws, robot), robot.lower, robot.upper)
         if self.qvel is not None:
             qvel = self.apply("qvel", qvel, draws, robot)
         return qpos, qvel
 
-    # -- files -------------------------------------------------------------------------------------------------------
+    # -- files
+    # ----------------------------------------------------------------------------------------------
 
     def to_dict(self) -> Document:
         """Return the given fields as plain values, for :meth:`from_dict`."""
         document = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {name: _plain(value) for name, value in document.items() if value is not None and value != {}}
+        return {
+            name: _plain(value)
+            for name, value in document.items()
+            if value is not None and value != {}
+        }
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Randomization:
-        """Return the randomization of :meth:`to_dict`, or of a file: ``{"payload": {"uniform": [0, 0.5]}, ...}``.
+        """Return the randomization of :meth:`to_dict`, or of a file: ``{"payload": {"uniform": [0,
+        0.5]}, ...}``.
 
         Raises
         ------
@@ -257,12 +327,16 @@ class Randomization:
         values |= {name: read_field(name, values[name]) for name in FIELDS.keys() & values.keys()}
         for group in GROUPS:
             group_values = mapping(group, values.get(group, {}))
-            values[group] = {name: read_field(f"{group}.{name}", value) for name, value in group_values.items()}
+            values[group] = {
+                name: read_field(f"{group}.{name}", value) for name, value in group_values.items()
+            }
         return cls(**values)
 
 
 def _copied(each: Any) -> Any:
-    return {name: _copied(part) for name, part in each.items()} if isinstance(each, Mapping) else each
+    return (
+        {name: _copied(part) for name, part in each.items()} if isinstance(each, Mapping) else each
+    )
 
 
 def _plain(each: Any) -> Any:

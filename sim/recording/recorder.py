@@ -1,6 +1,8 @@
-"""Recorder: every tick of a runner, streamed to an HDF5 file that can be read at any time, even after a kill.
+"""Recorder: every tick of a runner, streamed to an HDF5 file that can be read at any time, even
+after a kill.
 
-The runner calls :meth:`Recorder.prepare` before a tick, and :meth:`Recorder.append` after it, with Ctrl-C held back.
+The runner calls :meth:`Recorder.prepare` before a tick, and :meth:`Recorder.append` after it, with
+Ctrl-C held back.
 """
 
 from __future__ import annotations
@@ -35,8 +37,8 @@ WRITE_PERIOD = 0.5
 class Recorder(SingleOwner):
     """Recorder of every tick of ``runner`` until it is closed.
 
-    The file appears with the first tick. If a tick cannot be written, the next one raises RecordingError before it
-    begins, and so does :meth:`close`.
+    The file appears with the first tick. If a tick cannot be written, the next one raises
+    RecordingError before it begins, and so does :meth:`close`.
 
     Parameters
     ----------
@@ -60,7 +62,12 @@ class Recorder(SingleOwner):
     instead = "close it, and record the next run with another Recorder"
 
     def __init__(
-        self, path: str | os.PathLike[str], runner: Runner, *, seed: int | None = None, overwrite: bool = False
+        self,
+        path: str | os.PathLike[str],
+        runner: Runner,
+        *,
+        seed: int | None = None,
+        overwrite: bool = False,
     ) -> None:
         from batchpid.sim.runner import Runner  # loads SAPIEN, as the runner has done already
 
@@ -101,7 +108,9 @@ class Recorder(SingleOwner):
             self._info = replace(self._runner.info, seed=self._seed, complete=False)
 
     def append(self, time_: float, command: Command, observation: Observation) -> None:
-        """Record the state at ``time_`` [s] after a tick under ``command``. The arrays may change afterwards."""
+        """Record the state at ``time_`` [s] after a tick under ``command``. The arrays may change
+        afterwards.
+        """
         episodes = self._runner.episodes
         for env in np.flatnonzero((episodes != self._episodes).any(1)).tolist():
             self._redraws.append(Redraw(time_, env, *episodes[env].tolist()))
@@ -109,7 +118,11 @@ class Recorder(SingleOwner):
         self._params_changed |= self._runner.params is not self._params
         self._rates |= command.setpoint_rate is not None
         feedforward = None if command.feedforward is None else np.array(command.feedforward)
-        inputs = {"time": np.array(time_), "setpoint": np.array(command.setpoint), "feedforward": feedforward}
+        inputs = {
+            "time": np.array(time_),
+            "setpoint": np.array(command.setpoint),
+            "feedforward": feedforward,
+        }
         self._rows.append(inputs | observation._asdict())
         if time.monotonic() - self._last_write > WRITE_PERIOD:
             with suppress(RecordingError):  # the next tick raises it
@@ -118,7 +131,8 @@ class Recorder(SingleOwner):
     def close(self, complete: bool = True) -> None:
         """Write the remaining rows and close the file. May be called again, as after an interrupt.
 
-        If the recording is to be ``complete``, a tick whose call was interrupted is completed first.
+        If the recording is to be ``complete``, a tick whose call was interrupted is completed
+        first.
 
         Raises
         ------
@@ -149,14 +163,20 @@ class Recorder(SingleOwner):
         self._write()
         if self._file:  # not closed yet
             runner = self._runner
-            events: dict[str, Any] = {"faults": runner.faults, "redraws": tuple(self._redraws), "rates": self._rates}
+            events: dict[str, Any] = {
+                "faults": runner.faults,
+                "redraws": tuple(self._redraws),
+                "rates": self._rates,
+            }
             events["params_changed"] = self._params_changed
             values = files.attributes(replace(info, **events))
             self._file.attrs.update({name: values[name] for name in ("complete", *events)})
             self._file.close()
 
     def _write(self) -> None:
-        """Write the rows that are not written yet, into a new file at first. Raises RecordingError."""
+        """Write the rows that are not written yet, into a new file at first. Raises
+        RecordingError.
+        """
         import h5py
 
         rows, runner = self._rows, self._runner
@@ -166,7 +186,9 @@ class Recorder(SingleOwner):
                 assert self._info is not None
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 self._file = h5py.File(self.path, self._mode, libver=files.LIBVER, locking=False)
-                self._datasets = files.create_datasets(self._file, self._info, runner.num_envs, tick)
+                self._datasets = files.create_datasets(
+                    self._file, self._info, runner.num_envs, tick
+                )
             if rows:
                 files.write_rows(self._datasets, self._count, _stacked(rows))
         except (OSError, RuntimeError) as error:
@@ -180,7 +202,9 @@ class Recorder(SingleOwner):
 
 
 def _stacked(rows: list[dict[str, Rows | None]]) -> dict[str, Rows | None]:
-    """Return the arrays of successive ticks, ticks first; None where no tick has one, 0 where some have none."""
+    """Return the arrays of successive ticks, ticks first; None where no tick has one, 0 where some
+    have none.
+    """
     arrays: dict[str, Rows | None] = {}
     for name in rows[0]:
         column = [row[name] for row in rows]
@@ -192,7 +216,9 @@ def _stacked(rows: list[dict[str, Rows | None]]) -> dict[str, Rows | None]:
 
 
 def _abandon(file: h5py.File) -> None:
-    """Close a file that cannot be written, without another write: HDF5 would crash the process at its end."""
+    """Close a file that cannot be written, without another write: HDF5 would crash the process at
+    its end.
+    """
     memory = os.memfd_create("batchpid-recording", os.MFD_CLOEXEC)
     os.dup2(memory, file.id.get_vfd_handle(), inheritable=False)
     os.close(memory)

@@ -1,10 +1,13 @@
-"""Recordings: HDF5 files with the arrays of a :class:`batchpid.sim.Rollout` under their names, ticks first.
+"""Recordings: HDF5 files with the arrays of a :class:`batchpid.sim.Rollout` under their names,
+ticks first.
 
-Each field of its :class:`batchpid.sim.RunInfo` is an attribute of the file: a number, a text, an array of them, or JSON
-(:data:`CODECS`). Two more are ``num_envs`` and ``tick`` [s]. The dataset ``feedforward`` is empty where none was given.
+Each field of its :class:`batchpid.sim.RunInfo` is an attribute of the file: a number, a text, an
+array of them, or JSON (:data:`CODECS`). Two more are ``num_envs`` and ``tick`` [s]. The dataset
+``feedforward`` is empty where none was given.
 
-A row is valid if its ``time`` is a number: times are written last, and only after the other arrays are on the disk. So
-any reader of HDF5 can read the file after a kill, up to the last row that has a time.
+A row is valid if its ``time`` is a number: times are written last, and only after the other arrays
+are on the disk. So any reader of HDF5 can read the file after a kill, up to the last row that has a
+time.
 """
 
 from __future__ import annotations
@@ -34,7 +37,9 @@ if TYPE_CHECKING:
 FORMAT = "batchpid-recording-2"
 HDF5 = (".h5", ".hdf5")
 LIBVER = ("v108", "v108")
-"""Versions of HDF5's format. Later ones mark a file that was not closed, and HDF5 then refuses to open it."""
+"""Versions of HDF5's format. Later ones mark a file that was not closed, and HDF5 then refuses to
+open it.
+"""
 CHUNK_BYTES = 1 << 18
 """Approximate size of a chunk of a dataset."""
 
@@ -44,9 +49,14 @@ class RecordingError(BatchPIDError, OSError):
 
 
 def write_recording(
-    rollout: Rollout, path: str | os.PathLike[str], *, seed: int | None = None, overwrite: bool = False
+    rollout: Rollout,
+    path: str | os.PathLike[str],
+    *,
+    seed: int | None = None,
+    overwrite: bool = False,
 ) -> Path:
-    """Write ``rollout`` to ``path`` as a whole or not at all, making its folder, and return the path.
+    """Write ``rollout`` to ``path`` as a whole or not at all, making its folder, and return the
+    path.
 
     Parameters
     ----------
@@ -66,7 +76,11 @@ def write_recording(
     """
     instance("rollout", rollout, Rollout, "pass what runner.rollout() returned")
     path = check_path(path, overwrite=overwrite)
-    info = rollout.info if seed is None else replace(rollout.info, seed=integer("seed", seed, 0, 2**63 - 1))
+    info = (
+        rollout.info
+        if seed is None
+        else replace(rollout.info, seed=integer("seed", seed, 0, 2**63 - 1))
+    )
     import h5py
 
     content = io.BytesIO()  # on a full disk HDF5 could not close its own file
@@ -83,8 +97,8 @@ def write_recording(
 def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
     """Read a recording: complete, cut short by a kill, or one that is still being written.
 
-    ``info.complete`` of the result says whether the run came to its end. Nothing in the file is executed; SECURITY.md
-    lists the risks of files from strangers.
+    ``info.complete`` of the result says whether the run came to its end. Nothing in the file is
+    executed; SECURITY.md lists the risks of files from strangers.
 
     Parameters
     ----------
@@ -120,12 +134,16 @@ def read_recording(path: str | os.PathLike[str], *, every: int = 1) -> Rollout:
             if not file["feedforward"].id.get_storage_size():
                 arrays["feedforward"] = None
     except Exception as error:  # a damaged file can make HDF5 raise anything
-        raise RecordingError(f"{path}: cannot be read as a recording: {error or type(error).__name__}") from error
+        raise RecordingError(
+            f"{path}: cannot be read as a recording: {error or type(error).__name__}"
+        ) from error
     inputs = {name: arrays.pop(name) for name in ("time", "setpoint", "feedforward")}
     return Rollout(**inputs, observation=Observation(**arrays), tick=tick * every, info=info)
 
 
-def _read_rows(dataset: h5py.Dataset, rows: slice, shape: tuple[int, ...], quantity: Quantity) -> Rows:
+def _read_rows(
+    dataset: h5py.Dataset, rows: slice, shape: tuple[int, ...], quantity: Quantity
+) -> Rows:
     array: Rows = dataset[rows]
     if array.shape != shape:
         raise ValueError(f"its {dataset.name} has shape {array.shape}, not {shape}")
@@ -147,22 +165,34 @@ def check_path(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
     return path
 
 
-def create_datasets(file: h5py.File, info: RunInfo, num_envs: int, tick: float) -> dict[str, h5py.Dataset]:
-    """Write ``info`` to a new file; return empty datasets that can grow: time and :attr:`RunInfo.recorded`."""
+def create_datasets(
+    file: h5py.File, info: RunInfo, num_envs: int, tick: float
+) -> dict[str, h5py.Dataset]:
+    """Write ``info`` to a new file; return empty datasets that can grow: time and
+    :attr:`RunInfo.recorded`.
+    """
     file.attrs.update(attributes(info) | {"format": FORMAT, "num_envs": num_envs, "tick": tick})
-    datasets = {"time": file.create_dataset("time", (0,), "f8", maxshape=(None,), chunks=(4096,), fillvalue=np.nan)}
+    datasets = {
+        "time": file.create_dataset(
+            "time", (0,), "f8", maxshape=(None,), chunks=(4096,), fillvalue=np.nan
+        )
+    }
     datasets["time"].attrs["unit"] = ["s"]
     for name, quantity in info.recorded.items():
         row, dtype = info.row_shape(name, num_envs), np.dtype(quantity.dtype)
         rows = max(1, CHUNK_BYTES // max(1, int(np.prod(row)) * dtype.itemsize))
-        datasets[name] = file.create_dataset(name, (0, *row), dtype, maxshape=(None, *row), chunks=(rows, *row))
+        datasets[name] = file.create_dataset(
+            name, (0, *row), dtype, maxshape=(None, *row), chunks=(rows, *row)
+        )
         if info.units_of(name):
             datasets[name].attrs["unit"] = list(info.units_of(name))
     return datasets
 
 
 def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Mapping[str, Any]) -> None:
-    """Write ``arrays``, ticks first, from row ``first`` on; it can be repeated if it was interrupted."""
+    """Write ``arrays``, ticks first, from row ``first`` on; it can be repeated if it was
+    interrupted.
+    """
     time = datasets["time"]
     end = first + len(arrays["time"])
     for name, dataset in datasets.items():
@@ -171,13 +201,15 @@ def write_rows(datasets: Mapping[str, h5py.Dataset], first: int, arrays: Mapping
             dataset.resize(end, axis=0)
             if rows is not None:
                 dataset[first:end] = rows
-    time.file.flush()  # a row is valid once it has a time, so times follow when the rest is on the disk
+    # a row is valid once it has a time, so times follow when the rest is on the disk
+    time.file.flush()
     time.resize(end, axis=0)
     time[first:end] = arrays["time"]
     time.file.flush()
 
 
-# -- attributes ------------------------------------------------------------------------------------------------------
+# -- attributes
+# --------------------------------------------------------------------------------------------------
 
 
 def _dump_draws(draws: Mapping[str, Rows], joints: tuple[str, ...]) -> str:
@@ -189,7 +221,10 @@ def _load_draws(text: str, joints: tuple[str, ...]) -> dict[str, Rows]:
 
 
 Codec = tuple[Callable[[Any, tuple[str, ...]], str], Callable[[str, tuple[str, ...]], Any]]
-_MAPPING: Codec = (lambda value, joints: json.dumps(dict(value)), lambda text, joints: json.loads(text))
+_MAPPING: Codec = (
+    lambda value, joints: json.dumps(dict(value)),
+    lambda text, joints: json.loads(text),
+)
 CODECS: dict[str, Codec] = {
     "params": (
         lambda params, joints: bp.dumps_params(params, joints, format="json"),
@@ -216,7 +251,9 @@ CODECS: dict[str, Codec] = {
     "randomization": _MAPPING,
     "options": _MAPPING,
 }
-"""Fields of :class:`RunInfo` that are JSON in a recording: functions (value, joint names) that write and read them."""
+"""Fields of :class:`RunInfo` that are JSON in a recording: functions (value, joint names) that
+write and read them.
+"""
 
 
 def attributes(info: RunInfo) -> Document:

@@ -15,13 +15,16 @@ from batchpid.motors import DRIVEN, JOINT_SIDE, check_actuators
 from batchpid.sim.robot.description import RobotDescription
 
 BAND = {"rad": 1e-4, "m": 2e-5}
-"""Half width, by the joint's unit, of the band in which the compensation of friction is less than the friction."""
+"""Half width, by the joint's unit, of the band in which the compensation of friction is less than
+the friction.
+"""
 FRICTION_SHARE = 0.8
 """Share of the robot's own actuators' Coulomb friction that is compensated.
 
-Overcompensated friction lets a joint oscillate about its setpoint (C. Canudas de Wit, "Robust control for
-servo-mechanisms under inexact friction compensation", Automatica 29, 1993). Friction identified from a log is inexact;
-friction in the robot's description is exact, because the joint is simulated with it.
+Overcompensated friction lets a joint oscillate about its setpoint (C. Canudas de Wit, "Robust
+control for servo-mechanisms under inexact friction compensation", Automatica 29, 1993). Friction
+identified from a log is inexact; friction in the robot's description is exact, because the joint is
+simulated with it.
 """
 
 
@@ -37,7 +40,9 @@ class KnownJoints(NamedTuple):
 
 
 def known_joints(robot: RobotDescription) -> KnownJoints:
-    """Return friction, damping and armature of the robot's own actuators, which its controller knows."""
+    """Return friction, damping and armature of the robot's own actuators, which its controller
+    knows.
+    """
     own = bp.Actuators() if robot.actuators is None else robot.actuators
     coulomb, viscous, armature = (
         np.zeros(robot.dof) if leaf is None else leaf[0].astype(float)
@@ -46,7 +51,9 @@ def known_joints(robot: RobotDescription) -> KnownJoints:
     return KnownJoints(FRICTION_SHARE * coulomb, viscous, armature)
 
 
-def load_robot_actuators(source: bp.Actuators | str | Path, robot: RobotDescription) -> bp.Actuators:
+def load_robot_actuators(
+    source: bp.Actuators | str | Path, robot: RobotDescription
+) -> bp.Actuators:
     """Return actuators of ``robot``, given or in a file.
 
     Raises
@@ -61,18 +68,23 @@ def load_robot_actuators(source: bp.Actuators | str | Path, robot: RobotDescript
     return fit_actuators(source, robot, 1, "pid")
 
 
-def fit_actuators(actuators: bp.Actuators, robot: RobotDescription, num_envs: int, control: object) -> bp.Actuators:
+def fit_actuators(
+    actuators: bp.Actuators, robot: RobotDescription, num_envs: int, control: object
+) -> bp.Actuators:
     """Return ``actuators`` if they fit robot and control, with the robot's continuous joints.
 
-    Followers have no motor: their bias, friction and armature are left out. Raises InvalidArgumentError if they do not
-    fit.
+    Followers have no motor: their bias, friction and armature are left out. Raises
+    InvalidArgumentError if they do not fit.
     """
     instance("actuators", actuators, bp.Actuators, "build them with make_actuators()")
     check_actuators(actuators, num_envs, robot.joint_names)
-    if control == "drive" and (actuators.measures or actuators.delivers or actuators.load_friction is not None):
+    if control == "drive" and (
+        actuators.measures or actuators.delivers or actuators.load_friction is not None
+    ):
         raise InvalidArgumentError(
             "actuators",
-            "act on efforts and measurements, or need the effort, and PhysX's drives bypass all three",
+            "act on efforts and measurements, or need the effort, and PhysX's drives bypass all"
+            " three",
             remedy=f"use control 'pid', or leave only {', '.join(DRIVEN)}",
         )
     if actuators.num_joints is None:

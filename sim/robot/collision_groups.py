@@ -1,13 +1,14 @@
 """Collision groups: words for PhysX's filter, by which pairs of bodies are ignored.
 
-Each shape has four words of 32 bits. As SAPIEN sets the filter up, two shapes are ignored if the upper halves of word 3
-differ, or if they share a bit of word 2 and the lower half of word 3. Else they may touch if word
-0 of one shares a bit with word 1 of the other.
+Each shape has four words of 32 bits. As SAPIEN sets the filter up, two shapes are ignored if the
+upper halves of word 3 differ, or if they share a bit of word 2 and the lower half of word 3. Else
+they may touch if word 0 of one shares a bit with word 1 of the other.
 
-The pairs to ignore are the edges of a graph of bodies. Each bit of word 2 ignores all pairs within a clique, so that it
-takes an edge clique cover (L. T. Kou, L. J. Stockmeyer and C. K. Wong, "Covering edges by cliques with regard to
-keyword conflicts and intersection graphs", Comm. ACM 21, 1978, whose greedy method this is). What 32 cliques leave
-over, bits of words 0 and 1 ignore, one for each body of a vertex cover.
+The pairs to ignore are the edges of a graph of bodies. Each bit of word 2 ignores all pairs within
+a clique, so that it takes an edge clique cover (L. T. Kou, L. J. Stockmeyer and C. K. Wong,
+"Covering edges by cliques with regard to keyword conflicts and intersection graphs", Comm. ACM 21,
+1978, whose greedy method this is). What 32 cliques leave over, bits of words 0 and 1 ignore, one
+for each body of a vertex cover.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ def collision_groups(
 ) -> tuple[dict[str, Words], frozenset[Pair]]:
     """Return filter words, and the pairs that should be ignored but that no words were left for.
 
-    With the words, PhysX ignores the other pairs of ``ignored``, perhaps some of ``free``, and no others. The ground
-    and the user's content, with the default words 1, 1, 0, 0, touch every body.
+    With the words, PhysX ignores the other pairs of ``ignored``, perhaps some of ``free``, and no
+    others. The ground and the user's content, with the default words 1, 1, 0, 0, touch every body.
     """
     cliques = _cliques(bodies, ignored, free)
     cliques = sorted(cliques, key=lambda clique: -len(_within(clique, ignored)))[:_MAX_CLIQUES]
@@ -64,21 +65,37 @@ def collision_groups(
 
 
 def link_groups(
-    urdf: str, separate: Separate, fixed_base: bool, joints: Sequence[Joint], ignored: Collection[Pair]
+    urdf: str,
+    separate: Separate,
+    fixed_base: bool,
+    joints: Sequence[Joint],
+    ignored: Collection[Pair],
 ) -> tuple[dict[str, Words], frozenset[Pair]]:
-    """Return :func:`collision_groups` of the links of the URDF that have shapes, to ignore the pairs ``ignored``.
+    """Return :func:`collision_groups` of the links of the URDF that have shapes, to ignore the
+    pairs ``ignored``.
 
-    Links of one rigid body are ignored, too: they cannot move apart, and the solver would shake them. PhysX ignores
-    contacts within a simulated link, and with its parent, unless that is the root of a fixed base.
+    Links of one rigid body are ignored, too: they cannot move apart, and the solver would shake
+    them. PhysX ignores contacts within a simulated link, and with its parent, unless that is the
+    root of a fixed base.
     """
     placements = place_links(urdf, separate)
     bodies = {name: at.link for name, at in place_links(urdf).items()}
-    for first, second in fixed_edges(urdf):  # a fixed joint that is not merged joins two links of one body
-        bodies = {name: bodies[first] if body == bodies[second] else body for name, body in bodies.items()}
+    for first, second in fixed_edges(
+        urdf
+    ):  # a fixed joint that is not merged joins two links of one body
+        bodies = {
+            name: bodies[first] if body == bodies[second] else body for name, body in bodies.items()
+        }
     root = next(at.link for at in placements.values()) if fixed_base else None
-    joined = [(placements[joint.parent_link].link, placements[joint.child_link].link) for joint in joints]
+    joined = [
+        (placements[joint.parent_link].link, placements[joint.child_link].link) for joint in joints
+    ]
     neighbours = {frozenset(pair) for pair in joined if root not in pair}
-    links = list(dict.fromkeys(owner for owners in simulated(urdf, separate).owners.values() for owner in owners))
+    links = list(
+        dict.fromkeys(
+            owner for owners in simulated(urdf, separate).owners.values() for owner in owners
+        )
+    )
     ignored, free = set(ignored), set[Pair]()
     for first, second in combinations(links, 2):
         pair = frozenset((placements[first].link, placements[second].link))
@@ -89,8 +106,12 @@ def link_groups(
     return collision_groups(links, {pair for pair in ignored if pair <= set(links)} - free, free)
 
 
-def _cliques(bodies: Sequence[str], ignored: Collection[Pair], free: Collection[Pair]) -> list[list[str]]:
-    """Return cliques of the graph of edges ``ignored`` and ``free`` that together hold every edge of ``ignored``."""
+def _cliques(
+    bodies: Sequence[str], ignored: Collection[Pair], free: Collection[Pair]
+) -> list[list[str]]:
+    """Return cliques of the graph of edges ``ignored`` and ``free`` that together hold every edge
+    of ``ignored``.
+    """
     uncovered = set(ignored)
     allowed = {*ignored, *free}
     cliques = []

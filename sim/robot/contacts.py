@@ -1,4 +1,5 @@
-"""Distances between the links of one robot, and to the ground, at given poses, from MuJoCo, for convex shapes.
+"""Distances between the links of one robot, and to the ground, at given poses, from MuJoCo, for
+convex shapes.
 
 The distance of two shapes that overlap is negative: the depth by which they penetrate.
 """
@@ -40,13 +41,15 @@ class Contacts:
     Parameters
     ----------
     tree
-        Tree of the simulated links. A link does not collide with its parent, except with the root of a fixed base.
+        Tree of the simulated links. A link does not collide with its parent, except with the root
+        of a fixed base.
     shapes
         Shapes of each simulated link, by name.
     ignored
         Pairs of links of the URDF that do not collide.
     ground
-        Whether there is a ground at height 0. The base and the links fixed to it do not collide with it.
+        Whether there is a ground at height 0. The base and the links fixed to it do not collide
+        with it.
     """
 
     def __init__(
@@ -68,7 +71,9 @@ class Contacts:
             add_geom(spec, spec.worldbody, shape)
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        mujoco.mj_kinematics(self._model, self._data)  # on the world, shapes are where they are in their links
+        mujoco.mj_kinematics(
+            self._model, self._data
+        )  # on the world, shapes are where they are in their links
         self._place = self._data.geom_xpos.copy()
         self._turn = self._data.geom_xmat.reshape(-1, 3, 3).copy()
         first = 1 if tree.fixed_base else 0
@@ -96,8 +101,8 @@ class Contacts:
 
     @property
     def balls(self) -> tuple[NDArray[np.intp], Float64]:
-        """Body of the tree that has each shape (shapes,), -1 for the base, and a ball around each shape (shapes, 4):
-        center in the frame of the body, and radius [m].
+        """Body of the tree that has each shape (shapes,), -1 for the base, and a ball around each
+        shape (shapes, 4): center in the frame of the body, and radius [m].
         """
         tree, at = self._tree, [self._tree.index(self.links[link]) for link in self._link]
         frames = tree.bodies.link_frames[at].reshape(-1, 3, 4)
@@ -105,7 +110,8 @@ class Contacts:
         return self._body, np.column_stack([centers, self._model.geom_rbound[: len(centers)]])
 
     def least_distances(self, qpos: Rows) -> dict[tuple[int, int], float]:
-        """Return a lower bound of the distance [m] of each pair of bodies that may touch, at one pose (dof,).
+        """Return a lower bound of the distance [m] of each pair of bodies that may touch, at one
+        pose (dof,).
 
         It is exact where the bodies are near each other. The ground counts as the base, body -1.
         """
@@ -115,41 +121,54 @@ class Contacts:
             *([-1, body] for body in self._body[self._grounded]),
         ]
         found: dict[tuple[int, int], float] = {}
-        for distance, (first, second) in zip([*apart.tolist(), *heights.tolist()], bodies, strict=True):
+        for distance, (first, second) in zip(
+            [*apart.tolist(), *heights.tolist()], bodies, strict=True
+        ):
             found[first, second] = min(distance, found.get((first, second), np.inf))
         return found
 
     def _apart(self, qpos: Rows, within: float) -> tuple[Float64, Float64]:
-        """Return lower bounds of the distances of the pairs (pairs,) [m], exact below ``within``, and the heights of
-        the lowest points of the shapes that may touch the ground.
+        """Return lower bounds of the distances of the pairs (pairs,) [m], exact below ``within``,
+        and the heights of the lowest points of the shapes that may touch the ground.
         """
         with self._lock:
             centers = self._move(qpos)
             radii, (first, second) = self._model.geom_rbound[: len(centers)], self._pairs.T
-            apart = np.linalg.norm(centers[first] - centers[second], axis=1) - radii[first] - radii[second]
+            apart = (
+                np.linalg.norm(centers[first] - centers[second], axis=1)
+                - radii[first]
+                - radii[second]
+            )
             for row in np.flatnonzero(apart < within).tolist():
                 a, b = self._pairs[row].tolist()
                 apart[row] = mujoco.mj_geomDistance(self._model, self._data, a, b, within, None)
             return apart, np.array([self._lowest(index) for index in self._grounded.tolist()])
 
     def in_contact(self, qpos: Rows, clearance: float = 0.0) -> NDArray[np.bool_]:
-        """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,)."""
+        """Return whether links are closer than ``clearance`` [m] to each other or to the ground
+        (n,).
+        """
         return np.array([any(True for _ in self.near(row, clearance)) for row in np.asarray(qpos)])
 
     def nearest_links(self, qpos: Rows) -> tuple[str, ...]:
-        """Return the two links nearest to each other; one if the other is the ground, none if none are near."""
+        """Return the two links nearest to each other; one if the other is the ground, none if none
+        are near.
+        """
         nearest = min(self.near(qpos), key=lambda each: each.distance, default=Near("", "", np.inf))
         return tuple(name for name in nearest[:2] if name)
 
     def height(self, qpos: Rows, base_too: bool = False) -> float:
-        """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf without shapes."""
+        """Return the height [m] of the lowest point of the links that move, at one pose (dof,); inf
+        without shapes.
+        """
         with self._lock:
             self._move(qpos)
             of = range(len(self._shapes)) if base_too else np.flatnonzero(self._body >= 0).tolist()
             return min((self._lowest(index) for index in of), default=np.inf)
 
     def feet(self, qpos: Rows, within: float = 0.01) -> list[tuple[str, Float64]]:
-        """Return the links on which the robot stands at a pose (dof,), each with the point (3,) [m] that touches.
+        """Return the links on which the robot stands at a pose (dof,), each with the point (3,) [m]
+        that touches.
 
         It belongs to a shape whose lowest point is at most ``within`` [m] above that of the robot.
         """
@@ -157,7 +176,10 @@ class Contacts:
             centers = self._move(qpos)
             heights = np.array([self._lowest(index) for index in range(len(centers))])
             lowest = np.flatnonzero(heights <= heights.min(initial=np.inf) + within).tolist()
-            return [(self.links[self._link[at]], np.array([*centers[at, :2], heights[at]])) for at in lowest]
+            return [
+                (self.links[self._link[at]], np.array([*centers[at, :2], heights[at]]))
+                for at in lowest
+            ]
 
     def _move(self, qpos: Rows) -> Float64:
         """Place the shapes; return their centers (shapes, 3)."""
@@ -173,7 +195,9 @@ class Contacts:
     def _lowest(self, index: int) -> float:
         """Return the height [m] of the lowest point of a shape, as placed."""
         shape, place = self._shapes[index], self._data.geom_xpos[index]
-        x, y, z = self._data.geom_xmat[index].reshape(3, 3)[2]  # the shape's axes along the vertical
+        x, y, z = self._data.geom_xmat[index].reshape(3, 3)[
+            2
+        ]  # the shape's axes along the vertical
         if shape.vertices is not None:
             mesh = self._model.geom_dataid[index]
             start = self._model.mesh_vertadr[mesh]

@@ -43,11 +43,15 @@ ACCELERATION = 30.0  # [rad/s^2 or m/s^2] of all joints at once
 POSES = 50
 
 
-def suggested_effort_limit(gravity: Float64, mass_matrix: Float64, friction: ArrayLike, damping: ArrayLike) -> Float64:
-    """Return an effort limit for each joint (dof,) [N m or N], from gravity (n, dof) and M (n, dof, dof) at n poses.
+def suggested_effort_limit(
+    gravity: Float64, mass_matrix: Float64, friction: ArrayLike, damping: ArrayLike
+) -> Float64:
+    """Return an effort limit for each joint (dof,) [N m or N], from gravity (n, dof) and M (n, dof,
+    dof) at n poses.
 
-    It is 2 (max |g_j| + friction) + damping * 3 rad/s + max sum_k |M_jk| * 30 rad/s^2: twice the effort that holds the
-    joint still, plus the effort that accelerates all joints at once, in the worst directions.
+    It is 2 (max |g_j| + friction) + damping * 3 rad/s + max sum_k |M_jk| * 30 rad/s^2: twice the
+    effort that holds the joint still, plus the effort that accelerates all joints at once, in the
+    worst directions.
     """
     still = np.abs(gravity).max(0) + np.asarray(friction)
     inertia = np.abs(mass_matrix).sum(2).max(0)
@@ -61,11 +65,12 @@ LIMIT_TOLERANCE = 1e-6  # rad or m
 class RobotDescription(Urdf):
     """Robot as its URDF describes it; every array is in the order of ``joint_names``.
 
-    ``joints`` are the degrees of freedom, the moving joints of ``all_joints``. ``bodies`` is the placement of every
-    link, by name, in its simulated link: links joined by fixed joints are simulated as one. ``settings`` come from a
-    bundled robot, ``defaults`` and ``mjcf`` from an MJCF file, else None.
-    ``package_dirs`` are the folders in which meshes are looked up first. ``actuators`` are its motors and sensors, None
-    for ideal ones. ``base_start`` is the pose (7,) at which the file places a floating base, None if it does not.
+    ``joints`` are the degrees of freedom, the moving joints of ``all_joints``. ``bodies`` is the
+    placement of every link, by name, in its simulated link: links joined by fixed joints are
+    simulated as one. ``settings`` come from a bundled robot, ``defaults`` and ``mjcf`` from an MJCF
+    file, else None. ``package_dirs`` are the folders in which meshes are looked up first.
+    ``actuators`` are its motors and sensors, None for ideal ones. ``base_start`` is the pose (7,)
+    at which the file places a floating base, None if it does not.
     """
 
     path: Path
@@ -85,12 +90,14 @@ class RobotDescription(Urdf):
     def __repr__(self) -> str:
         given = sum(link.mass or 0.0 for link in self.links)
         shaped = sum(not link.inertial and link.num_shapes > 0 for link in self.links)
-        masses = [f"{given:.4g} kg"] * (given > 0 or not shaped) + [f"{shaped} links with the mass of shapes"] * (
-            shaped > 0
-        )
+        masses = [f"{given:.4g} kg"] * (given > 0 or not shaped) + [
+            f"{shaped} links with the mass of shapes"
+        ] * (shaped > 0)
         mass = " and ".join(masses)
         joints = textwrap.shorten(", ".join(self.joint_names), 100, placeholder=" ...")
-        head = f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
+        head = (
+            f"{type(self).__name__}({self.name!r}, {self.dof} dof, {mass}, path={str(self.path)!r},"
+        )
         return f"{head}\n  joints={joints})"
 
     @property
@@ -127,19 +134,24 @@ class RobotDescription(Urdf):
     def design_effort_limit(self) -> Float64:
         """Effort limits (dof,) [N m or N] of designed and tuned gains.
 
-        They are the URDF's, or :func:`batchpid.sim.robot.description.suggested_effort_limit` where it gives none.
+        They are the URDF's, or :func:`batchpid.sim.robot.description.suggested_effort_limit` where
+        it gives none.
         """
         limits = self.effort_limit
         if np.isfinite(limits).all():
             return read_only(limits)
         qpos = self.sample(POSES)
         mass_matrix = self.coupling.mass_matrix(self.dynamics().mass_matrix(qpos))
-        suggested = suggested_effort_limit(self.holding_efforts(qpos), mass_matrix, self.friction, self.damping)
+        suggested = suggested_effort_limit(
+            self.holding_efforts(qpos), mass_matrix, self.friction, self.damping
+        )
         return read_only(np.where(np.isfinite(limits), limits, suggested))
 
     @property
     def velocity_limit(self) -> Float64:
-        """Velocity limits (dof,) [rad/s or m/s], infinite where the URDF gives none. No engine enforces them."""
+        """Velocity limits (dof,) [rad/s or m/s], infinite where the URDF gives none. No engine
+        enforces them.
+        """
         return np.array([joint.velocity_limit for joint in self.joints])
 
     @property
@@ -154,11 +166,19 @@ class RobotDescription(Urdf):
 
     @property
     def friction(self) -> Float64:
-        """Coulomb friction of the joints (dof,) [N m or N]; 0 with ``dissipation`` "sapien": PhysX has its own."""
-        return np.array([joint.friction for joint in self.joints]) * DISSIPATION[self.dissipation].modelled
+        """Coulomb friction of the joints (dof,) [N m or N]; 0 with ``dissipation`` "sapien": PhysX
+        has its own.
+        """
+        return (
+            np.array([joint.friction for joint in self.joints])
+            * DISSIPATION[self.dissipation].modelled
+        )
 
-    def guard(self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None) -> bp.Guard:
-        """Return the limits of setpoints: positions, and soft limits of ``safety_controller``, as in the URDF.
+    def guard(
+        self, *, rate: ArrayLike | None = None, acceleration: ArrayLike | None = None
+    ) -> bp.Guard:
+        """Return the limits of setpoints: positions, and soft limits of ``safety_controller``, as
+        in the URDF.
 
         Followers have none: they move with their leaders.
 
@@ -192,17 +212,21 @@ class RobotDescription(Urdf):
 
     @property
     def start(self) -> Float64:
-        """Start pose (dof,) [rad or m]: the bundled settings' or the file's, else zero, clipped to the joint limits."""
+        """Start pose (dof,) [rad or m]: the bundled settings' or the file's, else zero, clipped to
+        the joint limits.
+        """
         if self.settings is not None:
             return self.settings.start.copy()
-        return self.coupled(np.clip(0.0 if self.defaults is None else self.defaults.start, self.lower, self.upper))
+        return self.coupled(
+            np.clip(0.0 if self.defaults is None else self.defaults.start, self.lower, self.upper)
+        )
 
     @property
     def target(self) -> Float64:
         """Pose (dof,) [rad or m] for a first move, within the limits.
 
-        The target of the bundled settings, else a quarter of the way from the start to the farther limit of each joint,
-        at most 0.5 rad or m.
+        The target of the bundled settings, else a quarter of the way from the start to the farther
+        limit of each joint, at most 0.5 rad or m.
         """
         if self.settings is not None:
             return self.settings.target.copy()
@@ -211,10 +235,12 @@ class RobotDescription(Urdf):
         return self.coupled(self.start + np.clip(0.25 * distance, -0.5, 0.5))
 
     def params(self, **options: Any) -> bp.PIDParams:
-        """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's values filled in.
+        """Return PID parameters for this robot: :func:`batchpid.make_params` with the robot's
+        values filled in.
 
-        Effort limits and continuous joints come from the URDF and, for a bundled robot, kp, ki and kd from its
-        settings; anti-windup is "conditional". ``options`` override these and add others.
+        Effort limits and continuous joints come from the URDF and, for a bundled robot, kp, ki and
+        kd from its settings; anti-windup is "conditional". ``options`` override these and add
+        others.
 
         Raises
         ------
@@ -234,7 +260,9 @@ class RobotDescription(Urdf):
         return bp.make_params(joints=self.dof, **(known | options))
 
     def run_info(self, **options: Any) -> RunInfo:
-        """Return the info of a run of this robot; ``options`` are further fields of :class:`batchpid.sim.RunInfo`."""
+        """Return the info of a run of this robot; ``options`` are further fields of
+        :class:`batchpid.sim.RunInfo`.
+        """
         shared = (
             *("joint_names", "units", "lower", "upper", "effort_limit"),
             *("urdf", "dissipation", "fixed_base"),
@@ -243,37 +271,52 @@ class RobotDescription(Urdf):
         return RunInfo(robot=self.name, description=self, **values, **options)
 
     def sample(self, count: int, seed: int = 0) -> Float64:
-        """Return seeded poses (count, dof), uniform within the limits and half a turn of the start; followers match."""
-        low, high = np.maximum(self.lower, self.start - np.pi), np.minimum(self.upper, self.start + np.pi)
+        """Return seeded poses (count, dof), uniform within the limits and half a turn of the start;
+        followers match.
+        """
+        low, high = (
+            np.maximum(self.lower, self.start - np.pi),
+            np.minimum(self.upper, self.start + np.pi),
+        )
         return self.coupled(np.random.default_rng(seed).uniform(low, high, (count, self.dof)))
 
     @cached_property
     def rigid_tree(self) -> RigidTree:
-        """Tree of every link of the URDF, merged ones included, with the coupling and limits of the joints.
+        """Tree of every link of the URDF, merged ones included, with the coupling and limits of the
+        joints.
 
         Raises RobotError if a link's mass comes from its shapes, and a mesh cannot be read.
         """
         inertias = simulated(self.urdf).inertias
         low, high = np.where(self.continuous, [[-np.inf], [np.inf]], [self.lower, self.upper])
         limits = {"lower": low, "upper": high}
-        return rigid_tree(self.urdf, inertias, coupling=self.coupling, fixed_base=self.fixed_base, **limits)
+        return rigid_tree(
+            self.urdf, inertias, coupling=self.coupling, fixed_base=self.fixed_base, **limits
+        )
 
     @cached_property
     def simulated_tree(self) -> RigidTree:
         """Tree of the simulated links, without coupling."""
-        return rigid_tree(simulated(self.urdf).urdf, body_inertias(self.urdf), fixed_base=self.fixed_base)
+        return rigid_tree(
+            simulated(self.urdf).urdf, body_inertias(self.urdf), fixed_base=self.fixed_base
+        )
 
     def mass_matrix(self, qpos: ArrayLike) -> Float64:
-        """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof), on a fixed base."""
+        """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg] at ``qpos`` (n, dof),
+        on a fixed base.
+        """
         return self.dynamics().mass_matrix(np.atleast_2d(np.asarray(qpos, np.float64)))
 
     def holding_efforts(self, qpos: Float64) -> Float64:
-        """Return the efforts (n, dof) [N m or N] that hold ``qpos`` against gravity; leaders hold followers."""
+        """Return the efforts (n, dof) [N m or N] that hold ``qpos`` against gravity; leaders hold
+        followers.
+        """
         still = np.zeros_like(qpos)
         return self.coupling.efforts(self.dynamics().inverse_dynamics(qpos, still, still))
 
     def dynamics(self, ground: bool | None = None) -> RobotModel:
-        """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed base.
+        """Return mass matrix, inverse and forward dynamics and contact of this robot on a fixed
+        base.
 
         ``ground``: whether there is a ground at height 0; default :attr:`has_ground`.
         """
@@ -282,7 +325,9 @@ class RobotDescription(Urdf):
 
     @cached_property
     def self_contact(self) -> SelfContact:
-        """Pairs of links that do not collide, and contact with the ground, computed at the first use."""
+        """Pairs of links that do not collide, and contact with the ground, computed at the first
+        use.
+        """
         return self_contact(self)
 
     @cached_property
@@ -297,14 +342,17 @@ class RobotDescription(Urdf):
 
     @property
     def has_ground(self) -> bool:
-        """True if scenes have a ground by default; False if a fixed base is so low that links start in it."""
+        """True if scenes have a ground by default; False if a fixed base is so low that links start
+        in it.
+        """
         return not self.self_contact.reaches_ground
 
     def describe(self) -> Document:
-        """Return a description of the simulated robot as plain values, equal for robots of equal content.
+        """Return a description of the simulated robot as plain values, equal for robots of equal
+        content.
 
-        The repaired URDF with its collision meshes, the .srdf, and the settings of a bundled robot are given by their
-        digests. The actuators are left out.
+        The repaired URDF with its collision meshes, the .srdf, and the settings of a bundled robot
+        are given by their digests. The actuators are left out.
         """
         return {
             "robot": self.name,
@@ -312,7 +360,10 @@ class RobotDescription(Urdf):
             "srdf": digest(self.srdf.disabled, self.srdf.enabled),
             "settings": digest(self.settings) if self.defaults is None else digest(self.defaults),
             "mjcf": None if self.mjcf is None else digest(replace(self.mjcf, path="")),
-            **{name: getattr(self, name) for name in ("self_collision", "dissipation", "fixed_base")},
+            **{
+                name: getattr(self, name)
+                for name in ("self_collision", "dissipation", "fixed_base")
+            },
             "base_start": self.base_start,
         }
 
@@ -321,10 +372,14 @@ class RobotDescription(Urdf):
         return digest(content_of(self.urdf), self.all_joints, self.joints)
 
     def limit_violations(self, qpos: ArrayLike) -> list[tuple[int, int, float]]:
-        """Return the entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env, joint, value)."""
+        """Return the entries of ``qpos`` (dof,) or (envs, dof) outside the joint limits, as (env,
+        joint, value).
+        """
         rows = np.atleast_2d(np.asarray(qpos, np.float64))
         outside = (rows < self.lower - LIMIT_TOLERANCE) | (rows > self.upper + LIMIT_TOLERANCE)
-        return [(int(env), int(joint), float(rows[env, joint])) for env, joint in np.argwhere(outside)]
+        return [
+            (int(env), int(joint), float(rows[env, joint])) for env, joint in np.argwhere(outside)
+        ]
 
 
 @lru_cache(maxsize=8)

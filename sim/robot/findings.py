@@ -20,10 +20,11 @@ SEVERITIES = ("warning", "note")  # probably an error; good to know
 class Finding:
     """Oddity of a joint, a link or the robot, and the remedy.
 
-    ``severity`` is one of :data:`SEVERITIES`; ``code`` names the kind of finding, for programs. ``text`` and ``remedy``
-    are the same for all joints with one cause; ``detail`` has the figures of this joint or link. ``envs`` and ``time``
-    [s] belong to findings of a run (:meth:`batchpid.sim.Rollout.findings`): the envs that have it, the first one first,
-    and when it began there.
+    ``severity`` is one of :data:`SEVERITIES`; ``code`` names the kind of finding, for programs.
+    ``text`` and ``remedy`` are the same for all joints with one cause; ``detail`` has the figures
+    of this joint or link. ``envs`` and ``time`` [s] belong to findings of a run
+    (:meth:`batchpid.sim.Rollout.findings`): the envs that have it, the first one first, and when it
+    began there.
     """
 
     severity: str
@@ -50,7 +51,9 @@ class Finding:
         more = f" and {len(self.envs) - 1} more" if len(self.envs) > 1 else ""
         env = f"env {self.envs[0]}{more}" if self.envs else ""
         time = "" if self.time is None else f"{self.time:.3g} s"
-        return ", ".join(part for part in (self.detail, " at ".join(filter(None, (env, time)))) if part)
+        return ", ".join(
+            part for part in (self.detail, " at ".join(filter(None, (env, time)))) if part
+        )
 
     @property
     def _kind(self) -> str:
@@ -70,7 +73,9 @@ class Findings(list[Finding]):
 
 
 def summary(findings: Iterable[Finding]) -> list[str]:
-    """Return one sentence for each cause, with all joints or links that have it, in the order of ``findings``."""
+    """Return one sentence for each cause, with all joints or links that have it, in the order of
+    ``findings``.
+    """
     causes: dict[tuple[str, ...], list[Finding]] = defaultdict(list)
     for each in findings:
         causes[each.severity, each.code, each._kind, each.text, each.remedy].append(each)
@@ -80,18 +85,34 @@ def summary(findings: Iterable[Finding]) -> list[str]:
 def _sentence(same: Sequence[Finding]) -> str:
     """Return the sentence for findings that differ only in joint or link, and detail."""
     first = same[0]
-    names = list(dict.fromkeys(f"{each._name} ({each.figures})" if each.figures else each._name for each in same))
+    names = list(
+        dict.fromkeys(
+            f"{each._name} ({each.figures})" if each.figures else each._name for each in same
+        )
+    )
     if len(names) == 1:
-        return f"{first.severity}: {f'{first._kind} {names[0]}'.strip()}: {first.text}; {first.remedy}"
-    return f"{first.severity}: {first.text}; {first.remedy}. {len(names)} {first._kind}s: {', '.join(names)}"
+        return (
+            f"{first.severity}: {f'{first._kind} {names[0]}'.strip()}: {first.text}; {first.remedy}"
+        )
+    return (
+        f"{first.severity}: {first.text}; {first.remedy}. {len(names)} {first._kind}s:"
+        f" {', '.join(names)}"
+    )
 
 
-def finding_of(element: etree._Element, severity: str, code: str, text: str, remedy: str, detail: str = "") -> Finding:
-    """Return a finding of the joint or link that an XML ``element`` is or belongs to, or of the robot."""
+def finding_of(
+    element: etree._Element, severity: str, code: str, text: str, remedy: str, detail: str = ""
+) -> Finding:
+    """Return a finding of the joint or link that an XML ``element`` is or belongs to, or of the
+    robot.
+    """
     owner: etree._Element | None = element
     while owner is not None and owner.tag not in ("joint", "link"):
         owner = owner.getparent()
-    joint, link = (None if owner is None or owner.tag != tag else owner.get("name") for tag in ("joint", "link"))
+    joint, link = (
+        None if owner is None or owner.tag != tag else owner.get("name")
+        for tag in ("joint", "link")
+    )
     return Finding(severity, code, text, remedy, joint, link, detail)
 
 
@@ -100,7 +121,9 @@ class RepairWarning(UserWarning):
 
 
 def report(path: Path, repairs: Sequence[Finding], strict: bool) -> None:
-    """Warn of the ``repairs`` of the file at ``path``; if ``strict``, raise a RobotError that lists them."""
+    """Warn of the ``repairs`` of the file at ``path``; if ``strict``, raise a RobotError that lists
+    them.
+    """
     if not repairs:
         return
     count = "1 repair" if len(repairs) == 1 else f"{len(repairs)} repairs"

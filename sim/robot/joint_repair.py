@@ -33,32 +33,53 @@ def repair(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
 
 
 def ends_of(joint: etree._Element) -> tuple[str | None, str | None]:
-    """Return the names of the parent and the child link of a joint, None where they are not given."""
-    parent, child = (None if end is None else end.get("link") for end in map(joint.find, ("parent", "child")))
+    """Return the names of the parent and the child link of a joint, None where they are not
+    given.
+    """
+    parent, child = (
+        None if end is None else end.get("link") for end in map(joint.find, ("parent", "child"))
+    )
     return parent, child
 
 
 def free_joint_of(root: etree._Element) -> etree._Element | None:
-    """Return the floating or planar joint that leads from a link without mass and shapes at the root to all others.
+    """Return the floating or planar joint that leads from a link without mass and shapes at the
+    root to all others.
 
     None without one. Such a joint and link say that the base is free to move.
     """
     joints = root.findall("joint")
     children = {ends_of(joint)[1] for joint in joints}
     at_root = [joint for joint in joints if ends_of(joint)[0] not in children]
-    link = next((link for link in root.findall("link") if at_root and link.get("name") == ends_of(at_root[0])[0]), None)
+    link = next(
+        (
+            link
+            for link in root.findall("link")
+            if at_root and link.get("name") == ends_of(at_root[0])[0]
+        ),
+        None,
+    )
     if len(at_root) != 1 or at_root[0].get("type") not in FREE_TYPES or link is None:
         return None
-    return None if link.find("inertial") is not None or link.find("collision") is not None else at_root[0]
+    return (
+        None
+        if link.find("inertial") is not None or link.find("collision") is not None
+        else at_root[0]
+    )
 
 
-def free_base(root: etree._Element, joint: etree._Element, findings: list[Finding]) -> tuple[float, ...] | None:
+def free_base(
+    root: etree._Element, joint: etree._Element, findings: list[Finding]
+) -> tuple[float, ...] | None:
     """Remove the joint of :func:`free_joint_of`, and the link at the root, from the robot.
 
     Return the pose (7,) at which the joint places the base, None without one.
     """
     if joint.get("type") == "planar":
-        text, remedy = "the base is free to move in all six directions", "expect it to leave its plane"
+        text, remedy = (
+            "the base is free to move in all six directions",
+            "expect it to leave its plane",
+        )
         findings.append(finding_of(joint, "note", "joint-type", text, remedy))
     parent, origin = ends_of(joint)[0], joint.find("origin")
     for element in (joint, *(link for link in root.findall("link") if link.get("name") == parent)):
@@ -66,7 +87,10 @@ def free_base(root: etree._Element, joint: etree._Element, findings: list[Findin
     if origin is None:
         return None
     name = f"joint {joint.get('name')!r}"
-    return *numbers(origin, "xyz", "0 0 0", name), *from_rpy(numbers(origin, "rpy", "0 0 0", name)).tolist()
+    return (
+        *numbers(origin, "xyz", "0 0 0", name),
+        *from_rpy(numbers(origin, "rpy", "0 0 0", name)).tolist(),
+    )
 
 
 def _type(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
@@ -77,7 +101,9 @@ def _type(joint: etree._Element, root: etree._Element) -> Iterator[Finding]:
         return
     joint.set("type", "fixed")
     parent = ends_of(joint)[0]
-    at_root = kind in FREE_TYPES and all(ends_of(other)[1] != parent for other in root.findall("joint"))
+    at_root = kind in FREE_TYPES and all(
+        ends_of(other)[1] != parent for other in root.findall("joint")
+    )
     severity, remedy = "warning", "use revolute, continuous or prismatic joints"
     if at_root:
         severity, remedy = "note", "load with fixed_base=False for a robot that is free to move"
@@ -96,7 +122,10 @@ def _axis(joint: etree._Element) -> Iterator[Finding]:
     direction = readable(axis, "xyz", "1 0 0")
     length = 0.0 if direction is None else math.hypot(*direction)
     if direction is None or length < 1e-12:
-        text = f"<axis xyz={axis.get('xyz')!r}> has no direction: the x axis is used, the URDF's default"
+        text = (
+            f"<axis xyz={axis.get('xyz')!r}> has no direction: the x axis is used, the URDF's"
+            " default"
+        )
         yield finding_of(joint, "warning", "axis", text, "correct the axis")
         joint.remove(axis)
     elif length < 1e-3:  # SAPIEN's bound, below which it takes another axis
@@ -116,7 +145,9 @@ def _limits(joint: etree._Element) -> Iterator[Finding]:
         text = limit.attrib.pop(key)
         if values is None:
             problem = f"<limit {key}={text!r}> is not a number: no {key} limit"
-            yield finding_of(joint, "warning", "limits", problem, f"give <limit {key}=> of the motor")
+            yield finding_of(
+                joint, "warning", "limits", problem, f"give <limit {key}=> of the motor"
+            )
         elif values[0] < 0 and values[0] != -1:  # exporters write -1 for "not set"
             limit.set(key, repr(-values[0]))
             problem = f"{key} limit is negative: its magnitude is used"
@@ -125,7 +156,9 @@ def _limits(joint: etree._Element) -> Iterator[Finding]:
             placeholders.append(f"{key}={text!r}")
     if placeholders:
         problem = f"<limit {' '.join(placeholders)}> is a placeholder and counts as not given"
-        yield finding_of(joint, "warning", "placeholder", problem, "give <limit effort= velocity=> of the motor")
+        yield finding_of(
+            joint, "warning", "placeholder", problem, "give <limit effort= velocity=> of the motor"
+        )
     if kind in ("revolute", "prismatic"):
         yield from _range(joint, limit)
 
@@ -141,15 +174,21 @@ def _range(joint: etree._Element, limit: etree._Element) -> Iterator[Finding]:
     lower, upper = (-math.inf if low is None else low[0]), (math.inf if high is None else high[0])
     efforts = [limit.get(key) for key in ("effort", "velocity")]
     if lower == upper == 0 and (None in given.values() or efforts == [None, None]):
-        text = "no position limits" if None in given.values() else "position limits of 0, placeholders"
+        text = (
+            "no position limits" if None in given.values() else "position limits of 0, placeholders"
+        )
         yield finding_of(joint, "warning", "limits", f"{text}: motion without end", GIVE_RANGE)
         lower, upper = -math.inf, math.inf
     elif lower > upper and None in given.values():
         missing = "lower" if given["lower"] is None else "upper"
-        yield finding_of(joint, "warning", "limits", f"no {missing} limit: no end there", GIVE_RANGE)
+        yield finding_of(
+            joint, "warning", "limits", f"no {missing} limit: no end there", GIVE_RANGE
+        )
         lower, upper = (-math.inf, upper) if missing == "lower" else (lower, math.inf)
     elif lower > upper:
-        yield finding_of(joint, "warning", "limits", "limits are swapped", "swap them", f"{lower:g}, {upper:g}")
+        yield finding_of(
+            joint, "warning", "limits", "limits are swapped", "swap them", f"{lower:g}, {upper:g}"
+        )
         lower, upper = upper, lower
     limit.set("lower", repr(lower))
     limit.set("upper", repr(upper))
@@ -159,9 +198,22 @@ def _soft_limits(joint: etree._Element) -> Iterator[Finding]:
     """Report soft limits without a range, which have no effect."""
     safety = joint.find("safety_controller")
     low, high = (readable(safety, f"soft_{key}_limit", "0") for key in ("lower", "upper"))
-    if safety is not None and low is not None and high is not None and low >= high and (low, high) != ((0,), (0,)):
+    if (
+        safety is not None
+        and low is not None
+        and high is not None
+        and low >= high
+        and (low, high) != ((0,), (0,))
+    ):
         text = "soft limits without a range have no effect"
-        yield finding_of(joint, "warning", "limits", text, "correct <safety_controller>", f"{low[0]:g}, {high[0]:g}")
+        yield finding_of(
+            joint,
+            "warning",
+            "limits",
+            text,
+            "correct <safety_controller>",
+            f"{low[0]:g}, {high[0]:g}",
+        )
 
 
 def _dynamics(joint: etree._Element) -> Iterator[Finding]:
@@ -188,7 +240,9 @@ def mimics(root: etree._Element) -> Iterator[Finding]:
             chain.add(each)
             each = _leader(joints[each])
         if each in chain:
-            yield _independent(joints[each], "mimics it in turn" if len(chain) > 1 else "is this joint itself")
+            yield _independent(
+                joints[each], "mimics it in turn" if len(chain) > 1 else "is this joint itself"
+            )
         sound |= chain
 
 
@@ -210,7 +264,10 @@ def _mimic_problem(joint: etree._Element, joints: dict[str | None, etree._Elemen
         return "does not move"
     multiplier, offset = readable(mimic, "multiplier", "1"), readable(mimic, "offset", "0")
     if multiplier in (None, (0.0,)) or offset is None:
-        return f"with multiplier {mimic.get('multiplier')!r}, offset {mimic.get('offset')!r} cannot lead it"
+        return (
+            f"with multiplier {mimic.get('multiplier')!r}, offset {mimic.get('offset')!r} cannot"
+            " lead it"
+        )
     return None
 
 

@@ -1,9 +1,10 @@
-"""Inertia tensors that a body can have, and repair of a URDF's links: mass, inertia and collision shapes.
+"""Inertia tensors that a body can have, and repair of a URDF's links: mass, inertia and collision
+shapes.
 
-The principal moments a <= b <= c of a body are positive and satisfy the triangle inequality c <= a + b. This says that
-the density-weighted covariance tr(I)/2 - I has no negative eigenvalue: P. M. Wensing, S. Kim, J.-J. E. Slotine,
-"Linear matrix inequalities for physically consistent inertial parameter identification", IEEE Robotics and Automation
-Letters 3 (2018).
+The principal moments a <= b <= c of a body are positive and satisfy the triangle inequality c <= a
++ b. This says that the density-weighted covariance tr(I)/2 - I has no negative eigenvalue: P. M.
+Wensing, S. Kim, J.-J. E. Slotine, "Linear matrix inequalities for physically consistent inertial
+parameter identification", IEEE Robotics and Automation Letters 3 (2018).
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from batchpid.arrays.array_types import Float64
 from batchpid.sim.robot.findings import Finding, finding_of
 from batchpid.sim.robot.xml import fault, readable
 
-SLENDER = 1e-3  # smallest principal moment over the largest of a tensor that had to be replaced; PhysX divides by it
+# smallest principal moment over the largest of a tensor that had to be replaced; PhysX divides by
+# it
+SLENDER = 1e-3
 DENSITY = 1000.0  # [kg/m^3] of water, with which SAPIEN computes the mass of shapes
 
 
@@ -29,11 +32,12 @@ def from_entries(entries: Sequence[float]) -> Float64:
 
 
 def nearest_physical(tensor: Float64) -> Float64:
-    """Return the physically possible inertia tensor (3, 3) nearest to a symmetric one in the Frobenius norm.
+    """Return the physically possible inertia tensor (3, 3) nearest to a symmetric one in the
+    Frobenius norm.
 
-    The nearest has the same principal axes, so the moments are projected on the cone of the triangle inequalities: on
-    its face c = a + b or, if a would be negative there, on its edge (0, m, m). Then a is raised to SLENDER times c. The
-    result is zero if no moment is positive.
+    The nearest has the same principal axes, so the moments are projected on the cone of the
+    triangle inequalities: on its face c = a + b or, if a would be negative there, on its edge (0,
+    m, m). Then a is raised to SLENDER times c. The result is zero if no moment is positive.
     """
     (a, b, c), axes = np.linalg.eigh(tensor)
     excess = max(c - a - b, 0.0) / 3
@@ -46,20 +50,28 @@ def nearest_physical(tensor: Float64) -> Float64:
 
 
 def triangle_excess(tensor: Float64) -> float:
-    """Return (c - a - b) / c of the principal moments of a tensor (3, 3): positive if the tensor is impossible."""
+    """Return (c - a - b) / c of the principal moments of a tensor (3, 3): positive if the tensor is
+    impossible.
+    """
     a, b, c = np.linalg.eigvalsh(tensor)
     return float((c - a - b) / c)
 
 
 def ball(mass: float) -> Float64:
-    """Return the inertia tensor (3, 3) [kg m^2] of a ball of ``mass`` [kg] at DENSITY: 2/5 m r^2."""
+    """Return the inertia tensor (3, 3) [kg m^2] of a ball of ``mass`` [kg] at DENSITY: 2/5 m
+    r^2.
+    """
     radius = (3 * mass / (4 * np.pi * DENSITY)) ** (1 / 3)
     return 0.4 * mass * radius**2 * np.eye(3)
 
 
-SMALLEST = 1e-30  # mass [kg] and principal moment [kg m^2] with a reciprocal that single precision can hold
+# mass [kg] and principal moment [kg m^2] with a reciprocal that single precision can hold
+SMALLEST = 1e-30
 SMALLEST_RATIO = 1e-9  # of principal moments that SAPIEN's eigenvalues and single precision resolve
-SMALLEST_SIZE, LARGEST_SIZE = 1e-6, 1e6  # of shapes [m] and scales of meshes, by PhysX's limits of the latter
+SMALLEST_SIZE, LARGEST_SIZE = (
+    1e-6,
+    1e6,
+)  # of shapes [m] and scales of meshes, by PhysX's limits of the latter
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 SHAPES = {  # that SAPIEN knows: their attributes, each with as many numbers as it has
     "box": {"size": "0 0 0"},
@@ -87,7 +99,10 @@ def _inertial(link: etree._Element) -> Iterator[Finding]:
         inertial.remove(origin)
     value = readable(mass, "value", "0")
     if value is None or value[0] < 0 or 0 < value[0] < SMALLEST:
-        problem = fault(mass, "value", "0") or f"<mass value={mass.get('value')!r}> is a mass that PhysX cannot hold"
+        problem = (
+            fault(mass, "value", "0")
+            or f"<mass value={mass.get('value')!r}> is a mass that PhysX cannot hold"
+        )
         text = f"{problem}: it counts as not given"
         yield finding_of(link, "warning", "inertia", text, "give a mass > 0 [kg]")
         value = None
@@ -98,7 +113,9 @@ def _inertial(link: etree._Element) -> Iterator[Finding]:
         text = f"{problem}: the inertia tensor counts as not given"
         yield finding_of(link, "warning", "inertia", text, "correct <inertia>")
     parts = [readable(inertia, key, "0") for key in MOMENTS]
-    tensor = np.zeros((3, 3)) if None in parts else from_entries([part[0] for part in parts if part])
+    tensor = (
+        np.zeros((3, 3)) if None in parts else from_entries([part[0] for part in parts if part])
+    )
     moments = np.linalg.eigvalsh(tensor)
     if moments[0] >= max(SMALLEST, SMALLEST_RATIO * moments[2]):
         changed = tensor
@@ -109,9 +126,13 @@ def _inertial(link: etree._Element) -> Iterator[Finding]:
             changed = ball(value[0])
             done = f"that of a ball of its mass at {DENSITY:g} kg/m^3 is used"
         before, after = (
-            " ".join(f"{moment:.3g}" for moment in each) for each in (moments, np.linalg.eigvalsh(changed))
+            " ".join(f"{moment:.3g}" for moment in each)
+            for each in (moments, np.linalg.eigvalsh(changed))
         )
-        text, detail = f"no body has such an inertia tensor: {done}", f"moments {before} kg m^2, used {after}"
+        text, detail = (
+            f"no body has such an inertia tensor: {done}",
+            f"moments {before} kg m^2, used {after}",
+        )
         yield finding_of(link, "warning", "inertia", text, "correct <inertia>", detail)
     if inertia is None:
         inertia = etree.SubElement(inertial, "inertia")
@@ -132,11 +153,20 @@ def _collisions(link: etree._Element) -> Iterator[Finding]:
                 if key == "scale" and len(text.split()) == 1:
                     shape.set(key, " ".join([text] * 3))  # one factor for all axes
                 sizes = readable(shape, key, default)
-                if sizes is None or min(map(abs, sizes)) < SMALLEST_SIZE or max(map(abs, sizes)) > LARGEST_SIZE:
-                    problem = f"<{shape.tag} {key}={text!r}> is not from {SMALLEST_SIZE:g} to {LARGEST_SIZE:g}"
+                if (
+                    sizes is None
+                    or min(map(abs, sizes)) < SMALLEST_SIZE
+                    or max(map(abs, sizes)) > LARGEST_SIZE
+                ):
+                    problem = (
+                        f"<{shape.tag} {key}={text!r}> is not from {SMALLEST_SIZE:g} to"
+                        f" {LARGEST_SIZE:g}"
+                    )
                 elif min(sizes) < 0 and key != "scale":  # a negative scale mirrors the mesh
                     shape.set(key, " ".join(repr(abs(size)) for size in sizes))
-                    problem_text = f"<{shape.tag} {key}={text!r}> is negative: its magnitude is used"
+                    problem_text = (
+                        f"<{shape.tag} {key}={text!r}> is negative: its magnitude is used"
+                    )
                     yield finding_of(link, "warning", "collision", problem_text, "make it positive")
         if problem is not None:
             text = f"a collision shape is left out: {problem}"

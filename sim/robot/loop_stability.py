@@ -1,11 +1,12 @@
-r"""Stability of a robot's sampled PID loop: gains that cannot work at this time step, found before the run diverges.
+r"""Stability of a robot's sampled PID loop: gains that cannot work at this time step, found before
+the run diverges.
 
 The effort is held over a step dt, which bounds the gains, unlike in continuous time: the ratio of
-:func:`batchpid.stability_bound` has to be below 1. With params of discretization "implicit" the ratio, at the gains of
-the same law at this time step, is below 1 for any gains and time step.
+:func:`batchpid.stability_bound` has to be below 1. With params of discretization "implicit" the
+ratio, at the gains of the same law at this time step, is below 1 for any gains and time step.
 
-Motors that are late lower the bound. Their delay and lag, the sensors' delay, and strength, armature and viscous
-friction of the motors are counted, each where it is known.
+Motors that are late lower the bound. Their delay and lag, the sensors' delay, and strength,
+armature and viscous friction of the motors are counted, each where it is known.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from batchpid.sim.robot.parts import DISSIPATION
 class StabilityReport(NamedTuple):
     """Share of the stability range that the gains use at one pose.
 
-    ``robot_ratio``: 1 is the bound; ``participation`` (dof,): share of each joint in the mode that is the first to
+    ``robot_ratio``: 1 is the bound; ``participation`` (dof,): share of each joint in the mode that
+        is the first to
     become unstable; a follower has its leader's.
     """
 
@@ -55,26 +57,40 @@ class StabilityReport(NamedTuple):
 
 
 def _loop(
-    robot: RobotDescription, params: bp.PIDParams, qpos: Float64, timestep: float, actuators: bp.Actuators | None
+    robot: RobotDescription,
+    params: bp.PIDParams,
+    qpos: Float64,
+    timestep: float,
+    actuators: bp.Actuators | None,
 ) -> Document:
-    """Return plant and gains at ``qpos`` (dof,), by the names of :func:`batchpid.stability_bound`, and "ki".
+    """Return plant and gains at ``qpos`` (dof,), by the names of :func:`batchpid.stability_bound`,
+    and "ki".
 
-    Arrays are (1 or envs, n, ...) of the independent joints. Strength of the motors is part of the gains, or of the
-    model.
+    Arrays are (1 or envs, n, ...) of the independent joints. Strength of the motors is part of the
+    gains, or of the model.
     """
-    params, motors, coupling = as_explicit(params, timestep), actuators or bp.Actuators(), robot.coupling
+    params, motors, coupling = (
+        as_explicit(params, timestep),
+        actuators or bp.Actuators(),
+        robot.coupling,
+    )
 
     def column(leaf: Array, neutral: float = 0.0) -> Float64:
         rows = np.full((1, robot.dof), neutral) if leaf is None else np.asarray(leaf, np.float64)
         return np.broadcast_to(rows, (len(rows), robot.dof))[:, coupling.independent]
 
     def matrix(armature: Array) -> Float64:
-        rows = np.atleast_2d(np.zeros(robot.dof) if armature is None else np.asarray(armature, np.float64))
+        rows = np.atleast_2d(
+            np.zeros(robot.dof) if armature is None else np.asarray(armature, np.float64)
+        )
         return coupling.reduced(robot.mass_matrix(qpos) + rows[:, None] * np.eye(robot.dof))
 
     loop: Document = {name: column(getattr(params, name)) for name in ("kp", "ki", "kd")}
     loop["filter_time"] = column(params.derivative_filter_time)
-    loop |= {"delay": column(motors.command_delay) + column(motors.sensor_delay), "lag": column(motors.lag)}
+    loop |= {
+        "delay": column(motors.command_delay) + column(motors.sensor_delay),
+        "lag": column(motors.lag),
+    }
     eye, strength = np.eye(loop["kp"].shape[1]), column(motors.strength, 1.0)
     viscous = np.zeros((1, robot.dof)) if motors.viscous is None else motors.viscous
     damping = np.stack([coupling.reduced_damping(robot.damping + row) for row in viscous])
@@ -85,7 +101,9 @@ def _loop(
         return loop | {"mass_matrix": eye[None]}
     # The law knows the damping, too, as part of its matrix.
     joints = known_joints(robot)
-    model = matrix(joints.armature) + timestep * eye * coupling.reduced_damping(robot.damping + joints.viscous)
+    model = matrix(joints.armature) + timestep * eye * coupling.reduced_damping(
+        robot.damping + joints.viscous
+    )
     plant = matrix(motors.armature) + timestep * eye * damping[:, None]
     return loop | {"mass_matrix": plant, "model": strength[..., None] * model}
 
@@ -97,10 +115,11 @@ def stability_report(
     timestep: float,
     actuators: bp.Actuators | None = None,
 ) -> StabilityReport:
-    """Return the share of the stability range that ``params`` (their least stable env) use at ``qpos`` (dof,).
+    """Return the share of the stability range that ``params`` (their least stable env) use at
+    ``qpos`` (dof,).
 
-    ``actuators`` are motors and sensors, of which delay, lag, strength, armature and viscous friction count; rows are
-    envs, as of the params.
+    ``actuators`` are motors and sensors, of which delay, lag, strength, armature and viscous
+    friction count; rows are envs, as of the params.
     """
     loop = _loop(robot, params, qpos, timestep, actuators)
     del loop["ki"]
@@ -116,7 +135,9 @@ def stability_report(
 def slow_oscillation(
     robot: RobotDescription, params: bp.PIDParams, qpos: Float64, timestep: float, env: int
 ) -> Oscillation:
-    """Return the least damped oscillation that lasts, of one env's ``params`` at ``qpos`` (dof,), with ideal motors."""
+    """Return the least damped oscillation that lasts, of one env's ``params`` at ``qpos`` (dof,),
+    with ideal motors.
+    """
     loop = _loop(robot, params.for_envs(slice(env, env + 1)), qpos, timestep, None)
     loop = {name: leaf[0] for name, leaf in loop.items() if name not in ("delay", "lag")}
     slowest = oscillation(dt=timestep, **loop)
@@ -124,31 +145,41 @@ def slow_oscillation(
 
 
 def implicit_remedy(params: bp.PIDParams) -> str:
-    """Return the way to act with the gains of ``params`` implicitly, as part of a list of remedies."""
+    """Return the way to act with the gains of ``params`` implicitly, as part of a list of
+    remedies.
+    """
     if params.gain_units is None:
-        return "control='drive', which integrates these gains implicitly, as MuJoCo does with a servo's kv, "
+        return (
+            "control='drive', which integrates these gains implicitly, as MuJoCo does with a"
+            " servo's kv, "
+        )
     return "discretization='implicit', "
 
 
 class StabilityWarning(UserWarning):
-    """The gains pass the stability bound of the sampled PID loop, see :mod:`batchpid.sim.robot.loop_stability`.
+    """The gains pass the stability bound of the sampled PID loop, see
+    :mod:`batchpid.sim.robot.loop_stability`.
 
-    The bound holds at the start pose, and counts delays, lag, strength, armature and viscous friction of the actuators.
-    It does not count noise and effort limits: beyond the bound, a joint with limits oscillates instead of diverging.
-    There is no warning with ``dissipation="sapien"``, which adds friction that the formula lacks.
+    The bound holds at the start pose, and counts delays, lag, strength, armature and viscous
+    friction of the actuators. It does not count noise and effort limits: beyond the bound, a joint
+    with limits oscillates instead of diverging. There is no warning with ``dissipation="sapien"``,
+    which adds friction that the formula lacks.
     """
 
 
 MOST = 64
-"""Largest number of envs with late motors that are checked one by one; of more, the ends of their ranges are."""
-_LEAST_STABLE = {name: np.max for name in ("kp", "kd", "command_delay", "sensor_delay", "lag", "strength")} | {
-    name: np.min for name in ("derivative_filter_time", "armature", "viscous")
-}
+"""Largest number of envs with late motors that are checked one by one; of more, the ends of their
+ranges are.
+"""
+_LEAST_STABLE = {
+    name: np.max for name in ("kp", "kd", "command_delay", "sensor_delay", "lag", "strength")
+} | {name: np.min for name in ("derivative_filter_time", "armature", "viscous")}
 """Ends of the ranges at which a loop is the least stable."""
 
 
 class StabilityCheck:
-    """Check of gains against the stability bound. It warns when they pass it, and again only after a return within it.
+    """Check of gains against the stability bound. It warns when they pass it, and again only after
+    a return within it.
 
     Parameters
     ----------
@@ -169,7 +200,9 @@ class StabilityCheck:
         beyond = False
         if DISSIPATION[self._robot.dissipation].modelled:
             try:
-                report = stability_report(self._robot, params, self._robot.start, self._timestep, motors)
+                report = stability_report(
+                    self._robot, params, self._robot.start, self._timestep, motors
+                )
                 beyond = report.robot_ratio >= 1
             except InvalidArgumentError:  # the robot's mass matrix is not positive definite
                 beyond = False
@@ -177,17 +210,24 @@ class StabilityCheck:
             joint = self._robot.joint_names[int(np.argmax(report.participation))]
             env = f", env {report.env}" if rows > 1 else ""
             warn(
-                f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the sampled PID loop, "
-                f"mostly of joint {joint!r}{env}, at the start pose with a time step of {self._timestep:g} s: "
-                f"{report.effect}; {report.remedy}, a derivative_filter_time, "
-                f"{'' if report.late else implicit_remedy(params)}or robot.designed()",
+                f"params: the gains are {report.robot_ratio:.3g} times the stability bound of the"
+                f" sampled PID loop, mostly of joint {joint!r}{env}, at the start pose with a time"
+                f" step of {self._timestep:g} s: {report.effect}; {report.remedy}, a"
+                f" derivative_filter_time, {'' if report.late else implicit_remedy(params)}or"
+                " robot.designed()",
                 StabilityWarning,
             )
         self._has_warned = beyond
 
 
 def _extreme(record: Any) -> Any:
-    """Return params or actuators of one env with the end of the range of all envs that is the least stable."""
-    leaves = {name: leaf for name, leaf in record._asdict().items() if name in _LEAST_STABLE and leaf is not None}
+    """Return params or actuators of one env with the end of the range of all envs that is the least
+    stable.
+    """
+    leaves = {
+        name: leaf
+        for name, leaf in record._asdict().items()
+        if name in _LEAST_STABLE and leaf is not None
+    }
     ends = {name: _LEAST_STABLE[name](leaf, 0, keepdims=True) for name, leaf in leaves.items()}
     return record.for_envs(slice(0, 1))._replace(**ends)

@@ -1,10 +1,11 @@
 """Merging of links that are joined by fixed joints: a robot with one link for each rigid body.
 
-A fixed joint of an articulation costs as much as one that moves, and a frame without mass becomes a link of 1e-6 kg.
-A merged link has the frame of the first link of its body; shapes, inertias and joints of the others are placed in it.
+A fixed joint of an articulation costs as much as one that moves, and a frame without mass becomes a
+link of 1e-6 kg. A merged link has the frame of the first link of its body; shapes, inertias and
+joints of the others are placed in it.
 
-The engine numbers joints breadth first, fixed ones counted, so that a merge may change the order of the joints below
-it. Such fixed joints are kept.
+The engine numbers joints breadth first, fixed ones counted, so that a merge may change the order of
+the joints below it. Such fixed joints are kept.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ _IDENTITY = Placement("", read_only(np.zeros(3)), read_only(np.array([1.0, 0.0, 
 class Merged(NamedTuple):
     """Merged robot.
 
-    ``urdf``: its text; ``bodies``: placement of every link of the original; ``inertias``: inertia of those links of the
-    original that the engine gives one, in their own frames; ``owners``: the original link of each collision shape of
-    each link of ``urdf``, in the engine's order: the order of the text, with mirrored meshes last.
+    ``urdf``: its text; ``bodies``: placement of every link of the original; ``inertias``: inertia
+        of those links of the
+    original that the engine gives one, in their own frames; ``owners``: the original link of each
+    collision shape of each link of ``urdf``, in the engine's order: the order of the text, with
+    mirrored meshes last.
     """
 
     urdf: str
@@ -53,13 +56,18 @@ class Edge(NamedTuple):
 
 
 def place_links(urdf: str, separate: Separate = ()) -> dict[str, Placement]:
-    """Return the placement of every link of a sanitised URDF in its body; links ``separate`` begin a body."""
+    """Return the placement of every link of a sanitised URDF in its body; links ``separate`` begin
+    a body.
+    """
     root = etree.fromstring(urdf.encode())
     return _place(root, _merged_joints(edges_of(root), separate))
 
 
-def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInertia], separate: Separate = ()) -> Merged:
-    """Return the robot of a sanitised URDF with its fixed joints merged, and with all inertias written.
+def merge_fixed_links(
+    urdf: str, inertia_of_shapes: Callable[[str], SpatialInertia], separate: Separate = ()
+) -> Merged:
+    """Return the robot of a sanitised URDF with its fixed joints merged, and with all inertias
+    written.
 
     ``inertia_of_shapes(link)`` is the inertia of a link with collision shapes but without
     ``<inertial>``, in the frame of that link.
@@ -69,7 +77,9 @@ def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInert
     merged = _merged_joints(edges, separate)
     bodies = _place(root, merged)
     links = {link.get("name", ""): link for link in root.findall("link")}
-    inertias = {name: inertia for name, link in links.items() if (inertia := _inertial(link)) is not None}
+    inertias = {
+        name: inertia for name, link in links.items() if (inertia := _inertial(link)) is not None
+    }
     members: dict[str, list[str]] = defaultdict(list)
     for name, placement in bodies.items():
         members[placement.link].append(name)
@@ -98,15 +108,24 @@ def merge_fixed_links(urdf: str, inertia_of_shapes: Callable[[str], SpatialInert
 
 def fixed_edges(urdf: str) -> list[tuple[str, str]]:
     """Return parent and child of every fixed joint, breadth first."""
-    return [(edge.parent, edge.child) for edge in edges_of(etree.fromstring(urdf.encode())) if not edge.moves]
+    return [
+        (edge.parent, edge.child)
+        for edge in edges_of(etree.fromstring(urdf.encode()))
+        if not edge.moves
+    ]
 
 
 def edges_of(root: etree._Element) -> list[Edge]:
     """Return the joints breadth first, siblings in the order of the file."""
     below, children = defaultdict(list), set()
     for element in root.findall("joint"):
-        parent, child = element.find("parent").get("link", ""), element.find("child").get("link", "")
-        edge = Edge(element.get("name", ""), parent, child, element.get("type") in MOVING_TYPES, element)
+        parent, child = (
+            element.find("parent").get("link", ""),
+            element.find("child").get("link", ""),
+        )
+        edge = Edge(
+            element.get("name", ""), parent, child, element.get("type") in MOVING_TYPES, element
+        )
         below[parent].append(edge)
         children.add(child)
     edges = [edge for parent in below if parent not in children for edge in below[parent]]
@@ -116,8 +135,8 @@ def edges_of(root: etree._Element) -> list[Edge]:
 
 
 def _merged_joints(edges: Sequence[Edge], separate: Separate) -> set[str]:
-    """Return the fixed joints to merge: all but the joints of ``separate`` links, and joints whose merge would change
-    the order of joints below them.
+    """Return the fixed joints to merge: all but the joints of ``separate`` links, and joints whose
+    merge would change the order of joints below them.
     """
     wanted = [edge.name for edge in edges if edge.moves]
     carriers: set[str] = set()  # links with a joint that moves below them
@@ -158,21 +177,29 @@ def _place(root: etree._Element, merged: Collection[str]) -> dict[str, Placement
     bodies = {name: _IDENTITY._replace(link=name) for name in names if name not in children}
     for edge in edges:
         alone = _IDENTITY._replace(link=edge.child)
-        bodies[edge.child] = _composed(bodies[edge.parent], edge.element) if edge.name in merged else alone
+        bodies[edge.child] = (
+            _composed(bodies[edge.parent], edge.element) if edge.name in merged else alone
+        )
     return bodies
 
 
 def _join(
-    links: Sequence[etree._Element], placements: Sequence[Placement], inertias: dict[str, SpatialInertia]
+    links: Sequence[etree._Element],
+    placements: Sequence[Placement],
+    inertias: dict[str, SpatialInertia],
 ) -> None:
     """Move the inertia and the collision elements of ``links`` to the first of them."""
     kept, names = links[0], [link.get("name", "") for link in links]
     for link in links:
         for inertial in link.findall("inertial"):
             link.remove(inertial)
-    pairs = [(inertias[name], at) for name, at in zip(names, placements, strict=True) if name in inertias]
+    pairs = [
+        (inertias[name], at) for name, at in zip(names, placements, strict=True) if name in inertias
+    ]
     if pairs:
-        kept.append(_write_inertial(total([inertia.moved(at.position, at.wxyz) for inertia, at in pairs])))
+        kept.append(
+            _write_inertial(total([inertia.moved(at.position, at.wxyz) for inertia, at in pairs]))
+        )
     for link, placement in zip(links[1:], placements[1:], strict=True):
         for collision in link.findall("collision"):
             _set_origin(collision, placement)
@@ -180,8 +207,13 @@ def _join(
 
 
 def _mirrored(link: etree._Element) -> list[bool]:
-    """Return whether each collision shape of a link is a mirrored mesh; an element has one shape of each kind."""
-    elements = [{shape.tag: shape for shape in each.iterfind("geometry/*")} for each in link.findall("collision")]
+    """Return whether each collision shape of a link is a mirrored mesh; an element has one shape of
+    each kind.
+    """
+    elements = [
+        {shape.tag: shape for shape in each.iterfind("geometry/*")}
+        for each in link.findall("collision")
+    ]
     shapes = [shape for element in elements for shape in element.values()]
     return [min(numbers(shape, "scale", "1 1 1", "scale")) < 0 for shape in shapes]
 
@@ -207,15 +239,21 @@ def _write_inertial(inertia: SpatialInertia) -> etree._Element:
 
 
 def _composed(placement: Placement, element: etree._Element) -> Placement:
-    """Return the placement of the ``<origin>`` of an element whose frame is placed at ``placement``."""
+    """Return the placement of the ``<origin>`` of an element whose frame is placed at
+    ``placement``.
+    """
     origin = element.find("origin")
     xyz, rpy = (np.array(numbers(origin, key, "0 0 0", element.tag)) for key in ("xyz", "rpy"))
     position = placement.position + rotate(placement.wxyz, xyz)
-    return Placement(placement.link, read_only(position), read_only(multiply(placement.wxyz, from_rpy(rpy))))
+    return Placement(
+        placement.link, read_only(position), read_only(multiply(placement.wxyz, from_rpy(rpy)))
+    )
 
 
 def _set_origin(element: etree._Element, placement: Placement) -> None:
-    """Replace the ``<origin>`` of an element in a frame at ``placement`` by that in the merged link."""
+    """Replace the ``<origin>`` of an element in a frame at ``placement`` by that in the merged
+    link.
+    """
     at = _composed(placement, element)
     for origin in element.findall("origin"):
         element.remove(origin)

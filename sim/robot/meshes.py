@@ -1,7 +1,7 @@
 """Mesh files of a URDF: the search for them, their reading, and their content.
 
-SAPIEN silently drops a collision shape whose file it cannot read, and a damaged file of some formats ends its process.
-So trimesh reads every file first.
+SAPIEN silently drops a collision shape whose file it cannot read, and a damaged file of some
+formats ends its process. So trimesh reads every file first.
 """
 
 from __future__ import annotations
@@ -27,16 +27,24 @@ LFS_PROBLEM = "a git-lfs pointer instead of the mesh: run git lfs pull"
 
 
 def find_mesh(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Path | None:
-    """Return the mesh file that the URDF at ``path`` refers to as ``name``, or None if it does not exist.
+    """Return the mesh file that the URDF at ``path`` refers to as ``name``, or None if it does not
+    exist.
 
-    ``package://`` and ``model://`` paths are looked up in ``package_dirs``, in the folders above the URDF, and in those
-    of AMENT_PREFIX_PATH and ROS_PACKAGE_PATH, with the name of the package and, in a folder that is the package under
-    another name, without it. Other paths are relative to the URDF's folder, or to one of these. The suffix may be in
-    the other case, and the name percent-encoded.
+    ``package://`` and ``model://`` paths are looked up in ``package_dirs``, in the folders above
+    the URDF, and in those of AMENT_PREFIX_PATH and ROS_PACKAGE_PATH, with the name of the package
+    and, in a folder that is the package under another name, without it. Other paths are relative to
+    the URDF's folder, or to one of these. The suffix may be in the other case, and the name
+    percent-encoded.
     """
-    name = re.sub(r"^(file:/*)?\$\(find ([^)]+)\)", r"package://\2", name.strip().replace("\\", "/"))  # xacro, Windows
+    name = re.sub(
+        r"^(file:/*)?\$\(find ([^)]+)\)", r"package://\2", name.strip().replace("\\", "/")
+    )  # xacro, Windows
     spellings = dict.fromkeys([name, unquote(name)])
-    places = [os.path.splitext(place) for spelling in spellings for place in _candidates(spelling, path, package_dirs)]
+    places = [
+        os.path.splitext(place)
+        for spelling in spellings
+        for place in _candidates(spelling, path, package_dirs)
+    ]
     for change in (str, str.lower, str.upper, str.title):
         for stem, suffix in places:
             if os.path.isfile(file := stem + change(suffix)):
@@ -50,14 +58,18 @@ def _candidates(name: str, path: Path, package_dirs: tuple[Path, ...]) -> Iterat
     if package := re.match(r"(?:package|model):/+([^/]+)/(.+)", name):
         within = package[2]
         yield from (folder / package[1] / within for folder in (*package_dirs, *above))
-        yield from (folder / within for folder in (*package_dirs, *above, *_ros_packages(package[1])))
+        yield from (
+            folder / within for folder in (*package_dirs, *above, *_ros_packages(package[1]))
+        )
         return
     relative = re.sub(r"^file:(//(localhost)?)?", "", name)
     yield from (folder / relative for folder in (above[0], *package_dirs, *above[1:]))
 
 
 def _ros_packages(package: str) -> Iterator[Path]:
-    """Yield the folders of a ROS package that the environment names: ROS 2 installs, then ROS 1 workspaces."""
+    """Yield the folders of a ROS package that the environment names: ROS 2 installs, then ROS 1
+    workspaces.
+    """
     if not re.fullmatch(r"\w[\w.-]*", package):
         return
     prefixes, roots = (
@@ -77,7 +89,9 @@ def read_mesh(path: str | Path) -> Any:
     from trimesh import load
 
     mesh: Any = load(path, force="mesh", process=False)
-    factor, _, unit = str(mesh.metadata.get("units", "")).partition(" * ")  # of COLLADA: "0.01 * meters"
+    factor, _, unit = str(mesh.metadata.get("units", "")).partition(
+        " * "
+    )  # of COLLADA: "0.01 * meters"
     if unit == "meters":
         mesh.vertices = np.asarray(mesh.vertices) * float(factor)
     return mesh
@@ -102,12 +116,20 @@ def mesh_problem(path: Path) -> str | None:
         return str(error) or type(error).__name__
     if not len(corners):
         return "damaged, or without faces"
-    return None if (np.abs(corners) <= LARGEST).all() else f"vertices that are not within {LARGEST:g} m"
+    return (
+        None
+        if (np.abs(corners) <= LARGEST).all()
+        else f"vertices that are not within {LARGEST:g} m"
+    )
 
 
 def _has_its_numbers(data: bytes) -> bool:
-    """Return whether the arrays of a COLLADA file are as long as it says: SAPIEN reads beyond them otherwise."""
-    root = etree.fromstring(data, etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True))
+    """Return whether the arrays of a COLLADA file are as long as it says: SAPIEN reads beyond them
+    otherwise.
+    """
+    root = etree.fromstring(
+        data, etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True)
+    )
     sizes = {}
     for array in root.iter("{*}float_array"):
         sizes["#" + array.get("id", "")] = size = len((array.text or "").split())
@@ -115,7 +137,8 @@ def _has_its_numbers(data: bytes) -> bool:
             return False
     ends = (
         (
-            int(accessor.get("count", "0")) * int(accessor.get("stride", "1")) + int(accessor.get("offset", "0")),
+            int(accessor.get("count", "0")) * int(accessor.get("stride", "1"))
+            + int(accessor.get("offset", "0")),
             accessor.get("source"),
         )
         for accessor in root.iterfind("{*}library_geometries//{*}accessor")
@@ -124,7 +147,9 @@ def _has_its_numbers(data: bytes) -> bool:
 
 
 _in_use: dict[str, str] = {}
-"""Digests of the mesh files that SAPIEN has read in this process; it never reads the same path again."""
+"""Digests of the mesh files that SAPIEN has read in this process; it never reads the same path
+again.
+"""
 
 
 def note_meshes(paths: Iterable[str]) -> None:
@@ -137,16 +162,22 @@ def note_meshes(paths: Iterable[str]) -> None:
 def check_unchanged(path: Path) -> None:
     """Raise RobotError if a mesh file has changed since SAPIEN read it in this process."""
     if (known := _in_use.get(str(path))) is not None and digest(path.read_bytes()) != known:
-        problem = f"{path}: has changed since this process simulated it, and SAPIEN keeps the mesh that it read first"
+        problem = (
+            f"{path}: has changed since this process simulated it, and SAPIEN keeps the mesh that"
+            " it read first"
+        )
         raise RobotError(f"{problem}; start Python again, or save the mesh under another name")
 
 
 def content_of(urdf: str) -> str:
-    """Return the text of a URDF in canonical form, with the digest of each mesh file in place of its path.
+    """Return the text of a URDF in canonical form, with the digest of each mesh file in place of
+    its path.
 
     Raises RobotError for a file that cannot be read.
     """
-    root = etree.fromstring(urdf.encode(), etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True))
+    root = etree.fromstring(
+        urdf.encode(), etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True)
+    )
     for mesh in root.iter("mesh"):
         name = mesh.get("filename", "")
         try:

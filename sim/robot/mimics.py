@@ -14,7 +14,9 @@ from batchpid.sim.robot.parts import Joint
 
 @lru_cache(maxsize=32)
 def coupling_of(joints: tuple[Joint, ...]) -> Coupling:
-    """Return the coupling of the degrees of freedom ``joints``; the identity without mimic joints."""
+    """Return the coupling of the degrees of freedom ``joints``; the identity without mimic
+    joints.
+    """
     indices = {joint.name: index for index, joint in enumerate(joints)}
     followers = [
         Follower(index, indices[joint.mimic.joint], joint.mimic.multiplier, joint.mimic.offset)
@@ -27,18 +29,22 @@ def coupling_of(joints: tuple[Joint, ...]) -> Coupling:
 def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
     """Return ``joints`` with the leaders' limits, friction and damping adapted to their followers.
 
-    A follower's position limits narrow the leader's, unless that would leave no range; the follower then gets the
-    leader's limits, multiplied. Its friction and damping act on the leader as |m| F and m^2 B, which is equivalent in
-    the coupled motion.
+    A follower's position limits narrow the leader's, unless that would leave no range; the follower
+    then gets the leader's limits, multiplied. Its friction and damping act on the leader as |m| F
+    and m^2 B, which is equivalent in the coupled motion.
     """
     joints = tuple(joints)
     coupling = coupling_of(joints)
     limits = [(joint.lower, joint.upper) for joint in joints]
     for index in coupling.followers.tolist():
-        leader, multiplier, offset = (each[index] for each in (coupling.leader, coupling.multiplier, coupling.offset))
+        leader, multiplier, offset = (
+            each[index] for each in (coupling.leader, coupling.multiplier, coupling.offset)
+        )
         if multiplier == 0 or joints[index].continuous:
             continue
-        ends = sorted((end - offset) / multiplier for end in (joints[index].lower, joints[index].upper))
+        ends = sorted(
+            (end - offset) / multiplier for end in (joints[index].lower, joints[index].upper)
+        )
         low, high = max(limits[leader][0], ends[0]), min(limits[leader][1], ends[1])
         if low < high:
             limits[leader] = (float(low), float(high))
@@ -56,6 +62,8 @@ def couple(joints: Sequence[Joint]) -> tuple[Joint, ...]:
 
 
 def _image(coupling: Coupling, index: int, end: float) -> float:
-    """Return the position of follower ``index`` where its leader is at ``end``, which may be infinite."""
+    """Return the position of follower ``index`` where its leader is at ``end``, which may be
+    infinite.
+    """
     multiplier, offset = float(coupling.multiplier[index]), float(coupling.offset[index])
     return offset if multiplier == 0 else multiplier * end + offset

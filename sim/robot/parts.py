@@ -1,4 +1,6 @@
-"""Parts of a robot's description: joints, links, dissipation, the text for the simulator, bundled settings."""
+"""Parts of a robot's description: joints, links, dissipation, the text for the simulator, bundled
+settings.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,8 @@ class Mimic:
 class Joint:
     """Joint of a URDF. Units: rad, N m, rad/s (revolute) or m, N, m/s (prismatic).
 
-    Limits that the URDF leaves out are infinite. ``origin`` [m] and ``rpy`` [rad] place the joint in its parent link;
-    ``axis`` is a direction in the joint's frame, not normalised.
+    Limits that the URDF leaves out are infinite. ``origin`` [m] and ``rpy`` [rad] place the joint
+    in its parent link; ``axis`` is a direction in the joint's frame, not normalised.
     """
 
     name: str
@@ -75,8 +77,9 @@ class Joint:
 class Link:
     """Link of a URDF: its mass [kg] (None without ``<inertial>``) and ``num_shapes`` that collide.
 
-    ``inertial`` is True if SAPIEN takes mass and inertia from the URDF. ``triangle_excess`` is positive if no body has
-    that inertia tensor: see :func:`batchpid.sim.robot.link_repair.triangle_excess`.
+    ``inertial`` is True if SAPIEN takes mass and inertia from the URDF. ``triangle_excess`` is
+    positive if no body has that inertia tensor: see
+    :func:`batchpid.sim.robot.link_repair.triangle_excess`.
     """
 
     name: str
@@ -89,9 +92,10 @@ class Link:
 class LinkMass(NamedTuple):
     """Simulated mass of a link of the URDF.
 
-    ``mass`` [kg]; ``source``: "inertial", "repaired", "shapes" (the collision shapes, at SAPIEN's density) or "none";
-    ``gyration``: largest radius of gyration about the center of mass [m], sqrt(I/m); ``size``: diagonal [m] of the box
-    around its collision shapes, 0 without; ``inertia``: in the link's frame, None without mass.
+    ``mass`` [kg]; ``source``: "inertial", "repaired", "shapes" (the collision shapes, at SAPIEN's
+    density) or "none"; ``gyration``: largest radius of gyration about the center of mass [m],
+    sqrt(I/m); ``size``: diagonal [m] of the box around its collision shapes, 0 without;
+    ``inertia``: in the link's frame, None without mass.
     """
 
     mass: float
@@ -102,7 +106,9 @@ class LinkMass(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """Frame of a link in the simulated ``link`` that it is part of: ``position`` (3,) [m], ``wxyz`` (4,)."""
+    """Frame of a link in the simulated ``link`` that it is part of: ``position`` (3,) [m], ``wxyz``
+    (4,).
+    """
 
     link: str
     position: Float64
@@ -113,9 +119,10 @@ class Placement(NamedTuple):
 class Settings:
     """Tutorial's poses and gains of a bundled robot, in joint order.
 
-    ``start``, ``target``: (dof,) [rad or m]; ``kp``, ``ki``, ``kd``: (dof,) of the PID; ``drive_stiffness`` and
-    ``drive_damping`` of PhysX's internal drive; ``rate_hz``: control and simulation rate; ``notes``: differences from
-    the tutorial, in words.
+    ``start``, ``target``: (dof,) [rad or m]; ``kp``, ``ki``, ``kd``: (dof,) of the PID;
+        ``drive_stiffness`` and
+    ``drive_damping`` of PhysX's internal drive; ``rate_hz``: control and simulation rate;
+    ``notes``: differences from the tutorial, in words.
     """
 
     start: Float64
@@ -131,7 +138,8 @@ class Settings:
 
 @dataclass(frozen=True)
 class FileDefaults:
-    """Start pose (dof,) [rad or m] of an MJCF file, and the gains (dof,) of its servos; None without servos.
+    """Start pose (dof,) [rad or m] of an MJCF file, and the gains (dof,) of its servos; None
+    without servos.
 
     ``imax`` is the limit of the integral of the error [rad s or m s], infinite without one.
     """
@@ -147,12 +155,13 @@ class FileDefaults:
 class MjcfFile:
     """MJCF file that MuJoCo simulates itself, with everything in it besides the robot.
 
-    ``is_whole`` says whether all of it is compiled (:func:`batchpid.sim.robot.mjcf.mjcf_compiler.attempt`), and
-    ``content`` is the digest of the files. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on
-    free joints other than the robot's. ``loops`` are the equality constraints that close loops of the robot's links.
-    ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of the world can collide, unless
-    the root is fixed to the origin in place of its free joint. ``friction`` is the coefficient of its ground, the first
-    of these planes.
+    ``is_whole`` says whether all of it is compiled
+    (:func:`batchpid.sim.robot.mjcf.mjcf_compiler.attempt`), and ``content`` is the digest of the
+    files. ``bodies`` are the names of all bodies, ``falling`` the names of bodies on free joints
+    other than the robot's. ``loops`` are the equality constraints that close loops of the robot's
+    links. ``is_alone`` is False if more than the robot moves. ``has_floor`` is True if planes of
+    the world can collide, unless the root is fixed to the origin in place of its free joint.
+    ``friction`` is the coefficient of its ground, the first of these planes.
     """
 
     path: str
@@ -170,9 +179,9 @@ class MjcfFile:
 class Urdf:
     """URDF prepared for headless simulation.
 
-    ``urdf`` is the text that the simulator parses. ``all_joints`` are in SAPIEN's order: breadth first from the root,
-    fixed joints counted, joints of one parent in the order of the file. ``repairs`` are findings, one
-    for each change that the simulator needs.
+    ``urdf`` is the text that the simulator parses. ``all_joints`` are in SAPIEN's order: breadth
+    first from the root, fixed joints counted, joints of one parent in the order of the file.
+    ``repairs`` are findings, one for each change that the simulator needs.
     """
 
     name: str
@@ -182,11 +191,23 @@ class Urdf:
     repairs: tuple[Finding, ...]
 
 
-HEADERS = ("", "joint", "type", "limits", "effort", "velocity", "damping", "friction", "parent > child link")
+HEADERS = (
+    "",
+    "joint",
+    "type",
+    "limits",
+    "effort",
+    "velocity",
+    "damping",
+    "friction",
+    "parent > child link",
+)
 
 
 def joint_rows(joints: Iterable[Joint]) -> Iterator[list[str]]:
-    """Yield the cells of each joint under :data:`HEADERS`. Moving joints are numbered as in qpos."""
+    """Yield the cells of each joint under :data:`HEADERS`. Moving joints are numbered as in
+    qpos.
+    """
     index = 0
     for joint in joints:
         links = f"{joint.parent_link} > {joint.child_link}"
@@ -209,7 +230,11 @@ def joint_rows(joints: Iterable[Joint]) -> Iterator[list[str]]:
 
 def _range(joint: Joint) -> str:
     limits = joint.lower, joint.upper
-    return f"{_bound(limits[0])} to {_bound(limits[1])} {joint.unit}" if any(map(math.isfinite, limits)) else "none"
+    return (
+        f"{_bound(limits[0])} to {_bound(limits[1])} {joint.unit}"
+        if any(map(math.isfinite, limits))
+        else "none"
+    )
 
 
 def _bound(value: float, unit: str = "") -> str:
@@ -223,8 +248,10 @@ CONTACT_FRICTION = 0.3
 class Dissipation(NamedTuple):
     """Friction and damping in the engine.
 
-    ``joint_friction``: PhysX's dimensionless coefficient of every joint; ``link_damping``: damping of every link [1/s];
-    ``modelled``: whether :mod:`batchpid.motors.friction` computes the joints' friction and damping, in the URDF's
+    ``joint_friction``: PhysX's dimensionless coefficient of every joint; ``link_damping``: damping
+        of every link [1/s];
+    ``modelled``: whether :mod:`batchpid.motors.friction` computes the joints' friction and damping,
+        in the URDF's
     units, instead of the engine.
     """
 
@@ -235,6 +262,8 @@ class Dissipation(NamedTuple):
 
 DISSIPATION = {
     "urdf": Dissipation(joint_friction=0.0, link_damping=0.0, modelled=True),
-    "sapien": Dissipation(joint_friction=0.05, link_damping=0.05, modelled=False),  # SAPIEN 3's defaults
+    "sapien": Dissipation(
+        joint_friction=0.05, link_damping=0.05, modelled=False
+    ),  # SAPIEN 3's defaults
 }
 """Values of the option ``dissipation`` of :meth:`batchpid.sim.Robot.load`."""

@@ -1,19 +1,23 @@
-"""Implausible figures of a robot: meshes in millimetres, masses in grams, inertia tensors in kg mm^2, ...
+"""Implausible figures of a robot: meshes in millimetres, masses in grams, inertia tensors in kg
+mm^2, ...
 
-Every figure is compared with the reach of the robot: the length L [m] of its longest chain of joints. The reach itself
-is seldom wrong, because the robot would be drawn in pieces. The limits are far from the figures of sound robots. In
-brackets are the most extreme figures of the 66 robots of example-robot-data 6.0.0 and of the bundled ones:
+Every figure is compared with the reach of the robot: the length L [m] of its longest chain of
+joints. The reach itself is seldom wrong, because the robot would be drawn in pieces. The limits are
+far from the figures of sound robots. In brackets are the most extreme figures of the 66 robots of
+example-robot-data 6.0.0 and of the bundled ones:
 
 - the shapes of a link are larger than 20 L (3.2 L), or all are smaller than L/200 (L/5);
-- the mass of a link, if given by ``<inertial>``, over its cubed size is below 0.1 (2.6) or above 30,000 (1030) kg/m^3;
-  the size is the diagonal of its shapes, or the distance to the next joint if that is longer;
+- the mass of a link, if given by ``<inertial>``, over its cubed size is below 0.1 (2.6) or above
+  30,000 (1030) kg/m^3; the size is the diagonal of its shapes, or the distance to the next joint if
+  that is longer;
 - its radius of gyration exceeds twice L and twice its size (0.6);
-- a joint bears more than a mass of 1000 L^3 kg at the distance L (10 L^3), by gravity or by inertia;
-- a limit or mimic offset of a hinge is from 4 pi to 1000 rad (10 rad), or an angle of an <origin> is beyond 2 pi (4.7
-  rad), as if degrees were read as radians.
+- a joint bears more than a mass of 1000 L^3 kg at the distance L (10 L^3), by gravity or by
+  inertia;
+- a limit or mimic offset of a hinge is from 4 pi to 1000 rad (10 rad), or an angle of an <origin>
+  is beyond 2 pi (4.7 rad), as if degrees were read as radians.
 
-Mass and inertia are not checked for a fixed base and for links with less than a hundredth of the total mass: sensors,
-frames and stands often have arbitrary figures.
+Mass and inertia are not checked for a fixed base and for links with less than a hundredth of the
+total mass: sensors, frames and stands often have arbitrary figures.
 """
 
 from __future__ import annotations
@@ -43,7 +47,9 @@ JUDGED = 0.01
 """Share of the total mass from which the mass and inertia of a link are checked."""
 
 FARTHEST, PLACEHOLDER = 4 * np.pi, 1000.0
-"""Bounds between which limits of a hinge are taken for degrees [rad]; larger ones mean "no limit"."""
+"""Bounds between which limits of a hinge are taken for degrees [rad]; larger ones mean "no
+limit".
+"""
 TURN = 2 * np.pi + 0.01
 """Bound of an angle of an origin [rad]."""
 
@@ -62,8 +68,13 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
             text = f"no robot has such large collision shapes: {of_reach}"
             yield Finding("warning", "scale", text, _UNITS, link=name, detail=f"{size:.3g} m")
     if sizes and max(sizes.values()) < SMALLEST * reach:
-        text = f"no robot has such small collision shapes, at most {max(sizes.values()):.2g} m: {of_reach}"
-        yield Finding("warning", "scale", text, "correct <mesh scale=>; the meshes may be in metres already")
+        text = (
+            f"no robot has such small collision shapes, at most {max(sizes.values()):.2g} m:"
+            f" {of_reach}"
+        )
+        yield Finding(
+            "warning", "scale", text, "correct <mesh scale=>; the meshes may be in metres already"
+        )
     root = robot.bodies[robot.all_joints[0].parent_link].link
     for name, mass in masses.items():
         at_rest = robot.fixed_base and robot.bodies[name].link == root
@@ -72,35 +83,65 @@ def implausible_figures(robot: RobotDescription) -> Iterator[Finding]:
         size = max(mass.size, next_joint[name])
         if mass.size > 0 and not SPARSEST <= mass.mass / size**3 <= DENSEST:
             kind = "light" if mass.mass < SPARSEST * size**3 else "heavy"
-            text, remedy = f"no link of such a size is so {kind}", "give <mass> in kg and <collision> in metres"
-            yield Finding("warning", "mass", text, remedy, link=name, detail=f"{mass.mass:.3g} kg over {size:.3g} m")
+            text, remedy = (
+                f"no link of such a size is so {kind}",
+                "give <mass> in kg and <collision> in metres",
+            )
+            yield Finding(
+                "warning",
+                "mass",
+                text,
+                remedy,
+                link=name,
+                detail=f"{mass.mass:.3g} kg over {size:.3g} m",
+            )
         if mass.gyration > GYRATION * max(length, size):
-            text = f"no link has so much inertia for its mass: its radius of gyration exceeds the robot, {of_reach}"
-            remedy, detail = "give <inertia> in kg m^2, about the centre of mass", f"{mass.gyration:.3g} m"
+            text = (
+                "no link has so much inertia for its mass: its radius of gyration exceeds the"
+                f" robot, {of_reach}"
+            )
+            remedy, detail = (
+                "give <inertia> in kg m^2, about the centre of mass",
+                f"{mass.gyration:.3g} m",
+            )
             yield Finding("warning", "inertia", text, remedy, link=name, detail=detail)
     yield from _loads(robot, max(reach, 1.0))
     yield from _degrees(robot)
 
 
 def _loads(robot: RobotDescription, length: float) -> Iterator[Finding]:
-    """Yield a finding for each joint with a load beyond the weight of any robot of this ``length`` [m]."""
+    """Yield a finding for each joint with a load beyond the weight of any robot of this ``length``
+    [m].
+    """
     poses = robot.sample(POSES, seed=0)
     gravity = np.abs(robot.holding_efforts(poses)).max(0)
     inertia = np.diagonal(robot.mass_matrix(poses), axis1=1, axis2=2).max(0)
     arms = np.where([joint.type == "prismatic" for joint in robot.joints], 1.0, length)
-    for at in np.flatnonzero(np.maximum(gravity / (-GRAVITY[2] * arms), inertia / arms**2) > LOAD * length**3):
+    for at in np.flatnonzero(
+        np.maximum(gravity / (-GRAVITY[2] * arms), inertia / arms**2) > LOAD * length**3
+    ):
         text = f"no robot whose chain of joints is up to {length:.3g} m long has such a load"
         remedy = f"correct <mass> and <inertia>; for links without, {_UNITS}"
-        detail = f"gravity {gravity[at]:.3g} {robot.joints[at].effort_unit}, inertia {inertia[at]:.3g}"
+        detail = (
+            f"gravity {gravity[at]:.3g} {robot.joints[at].effort_unit}, inertia {inertia[at]:.3g}"
+        )
         yield Finding("warning", "load", text, remedy, robot.joint_names[at], detail=detail)
 
 
 def _degrees(robot: RobotDescription) -> Iterator[Finding]:
-    """Yield a finding for limits and mimic offsets of a hinge, and for angles of an origin, that look like degrees."""
+    """Yield a finding for limits and mimic offsets of a hinge, and for angles of an origin, that
+    look like degrees.
+    """
     for joint in robot.all_joints:
-        angles = {name: getattr(joint, name) for name in ("lower", "upper", "soft_lower", "soft_upper")}
+        angles = {
+            name: getattr(joint, name) for name in ("lower", "upper", "soft_lower", "soft_upper")
+        }
         angles["mimic offset"] = 0.0 if joint.mimic is None else joint.mimic.offset
-        large = [f"{name} {angle:g} rad" for name, angle in angles.items() if FARTHEST < abs(angle) <= PLACEHOLDER]
+        large = [
+            f"{name} {angle:g} rad"
+            for name, angle in angles.items()
+            if FARTHEST < abs(angle) <= PLACEHOLDER
+        ]
         if large and joint.unit == "rad":
             text = "angles of many turns, as if degrees were read as radians"
             remedy = "give radians, and velocities in rad/s"
@@ -109,12 +150,14 @@ def _degrees(robot: RobotDescription) -> Iterator[Finding]:
         if max(map(abs, numbers(origin, "rpy", "0 0 0", robot.name))) > TURN:
             text = "roll, pitch or yaw of more than a turn, as if degrees were read as radians"
             detail = f"<{origin.getparent().tag}> rpy {origin.get('rpy')}"
-            yield finding_of(origin, "warning", "degrees", text, "give <origin rpy=> in radians", detail)
+            yield finding_of(
+                origin, "warning", "degrees", text, "give <origin rpy=> in radians", detail
+            )
 
 
 def _distances(robot: RobotDescription) -> tuple[float, dict[str, float]]:
-    """Return the length [m] of the longest chain of joints, slides extended, and of each link the distance [m] to its
-    farthest joint.
+    """Return the length [m] of the longest chain of joints, slides extended, and of each link the
+    distance [m] to its farthest joint.
     """
     depth: dict[str, float] = defaultdict(float)
     farthest: dict[str, float] = defaultdict(float)

@@ -1,7 +1,9 @@
-"""Repair of published URDFs: all faults that can be repaired without a guess about the robot's geometry.
+"""Repair of published URDFs: all faults that can be repaired without a guess about the robot's
+geometry.
 
-Every function changes the XML tree in place and yields a finding of each repair. After the repairs the tree is valid
-for the reader (:mod:`batchpid.sim.robot.urdf`), or has a fault without repair, which is an error there.
+Every function changes the XML tree in place and yields a finding of each repair. After the repairs
+the tree is valid for the reader (:mod:`batchpid.sim.robot.urdf`), or has a fault without repair,
+which is an error there.
 """
 
 from __future__ import annotations
@@ -22,7 +24,16 @@ from batchpid.sim.robot.link_repair import MOMENTS, SHAPES
 _READ = {  # elements to keep, by parent: SAPIEN may fail to parse elements that it does not use
     "robot": {"link", "joint"},
     "link": {"inertial", "collision"},
-    "joint": {"origin", "parent", "child", "axis", "limit", "dynamics", "mimic", "safety_controller"},
+    "joint": {
+        "origin",
+        "parent",
+        "child",
+        "axis",
+        "limit",
+        "dynamics",
+        "mimic",
+        "safety_controller",
+    },
     "inertial": {"origin", "mass", "inertia"},
     "collision": {"origin", "geometry"},
     "geometry": {*SHAPES},
@@ -30,8 +41,13 @@ _READ = {  # elements to keep, by parent: SAPIEN may fail to parse elements that
 _MANY = {"link", "joint", "collision", *SHAPES}  # elements that a parent may have several of
 UNUSED = {"visual", "material", "transmission", "gazebo", "sensor", "ros2_control", "calibration"}
 """Elements of a URDF that have no effect here."""
-_SCALARS = "value lower upper effort velocity damping friction multiplier offset soft_lower_limit soft_upper_limit"
-_NUMBERS: dict[str, tuple[int, ...]] = dict.fromkeys([*_SCALARS.split(), *MOMENTS, "radius", "length"], (1,))
+_SCALARS = (
+    "value lower upper effort velocity damping friction multiplier offset soft_lower_limit"
+    " soft_upper_limit"
+)
+_NUMBERS: dict[str, tuple[int, ...]] = dict.fromkeys(
+    [*_SCALARS.split(), *MOMENTS, "radius", "length"], (1,)
+)
 _NUMBERS |= {"xyz": (3,), "rpy": (3,), "size": (3,), "scale": (3, 1)}
 """Attributes that hold numbers, and how many."""
 _DECIMAL_COMMA = re.compile(r"[+-]?(\d+,?\d*|,\d+)([eE][+-]?\d+)?")
@@ -83,7 +99,9 @@ def _elements(root: etree._Element) -> Iterator[Finding]:
             parent.remove(child)
     if xacro:
         text = f"elements of xacro, not expanded, are left out: {_list(xacro)}"
-        yield Finding("warning", "xacro", text, "expand the file first: xacro FILE.xacro > FILE.urdf")
+        yield Finding(
+            "warning", "xacro", text, "expand the file first: xacro FILE.xacro > FILE.urdf"
+        )
     if unknown:
         text = f"elements that the simulation does not use are left out: {_list(unknown)}"
         yield Finding("note", "unknown-element", text, "remove them, or expect no effect")
@@ -102,7 +120,9 @@ def _attributes(root: etree._Element) -> Iterator[Finding]:
                 del element.attrib[key]
                 if key != "name":
                     problem = f"<{element.tag} {key}=''> is empty and counts as not given"
-                    yield finding_of(element, "note", "empty-attribute", problem, "give a value, or remove it")
+                    yield finding_of(
+                        element, "note", "empty-attribute", problem, "give a value, or remove it"
+                    )
             elif "," in text and (read := _without_commas(text, _NUMBERS.get(key, ()))) is not None:
                 element.set(key, read)
                 done, remedy = "points in place of decimal commas", "write decimal points"
@@ -115,20 +135,31 @@ def _attributes(root: etree._Element) -> Iterator[Finding]:
 
 
 def _without_commas(text: str, counts: Sequence[int]) -> str | None:
-    """Return one of ``counts`` numbers with blanks between them and decimal points; None if the commas are neither."""
+    """Return one of ``counts`` numbers with blanks between them and decimal points; None if the
+    commas are neither.
+    """
     if len((separated := text.replace(",", " ")).split()) in counts:
         return separated
     words = text.split()
-    decimal = len(words) in counts and all("," not in word or _DECIMAL_COMMA.fullmatch(word) for word in words)
+    decimal = len(words) in counts and all(
+        "," not in word or _DECIMAL_COMMA.fullmatch(word) for word in words
+    )
     return text.replace(",", ".") if decimal else None
 
 
 def _refuse_xacro(root: etree._Element, path: Path) -> None:
     for element in root.iter():
         for key, value in element.items():
-            if "${" in value or ("$(" in value and key != "filename"):  # of which find_mesh reads $(find PACKAGE)
-                problem = f"<{element.tag} {key}={value!r}> is an expression of xacro, so this is no URDF yet"
-                raise RobotError(f"{path}: {problem}; expand it first: xacro FILE.xacro > FILE.urdf")
+            if "${" in value or (
+                "$(" in value and key != "filename"
+            ):  # of which find_mesh reads $(find PACKAGE)
+                problem = (
+                    f"<{element.tag} {key}={value!r}> is an expression of xacro, so this is no"
+                    " URDF yet"
+                )
+                raise RobotError(
+                    f"{path}: {problem}; expand it first: xacro FILE.xacro > FILE.urdf"
+                )
 
 
 def _links(root: etree._Element) -> Iterator[Finding]:
@@ -136,9 +167,19 @@ def _links(root: etree._Element) -> Iterator[Finding]:
     seen: set[str | None] = {None}
     for link in root.findall("link"):
         if (name := link.get("name")) in seen:
-            text = "no joint can refer to a link without name" if name is None else "this name is used twice"
+            text = (
+                "no joint can refer to a link without name"
+                if name is None
+                else "this name is used twice"
+            )
             effect = "left out" if name is None else "the first link is kept, the other left out"
-            yield finding_of(link, "warning", "repeated-name", f"{text}: {effect}", "give every link a name to itself")
+            yield finding_of(
+                link,
+                "warning",
+                "repeated-name",
+                f"{text}: {effect}",
+                "give every link a name to itself",
+            )
             root.remove(link)
         seen.add(name)
 
@@ -150,7 +191,13 @@ def _joints(root: etree._Element) -> Iterator[Finding]:
     for joint in root.findall("joint"):
         name, ends = joint.get("name"), ends_of(joint)
         if name is not None and seen.get(name) == ends:
-            yield finding_of(joint, "warning", "repeated-name", "given twice: the first is kept", "remove the copy")
+            yield finding_of(
+                joint,
+                "warning",
+                "repeated-name",
+                "given twice: the first is kept",
+                "remove the copy",
+            )
             root.remove(joint)
             continue
         base = new = name or "{}_to_{}".format(*ends)
@@ -160,21 +207,33 @@ def _joints(root: etree._Element) -> Iterator[Finding]:
         if new != name:
             joint.set("name", new)
             problem = "no name" if name is None else f"the name {name!r} is used twice"
-            yield finding_of(joint, "warning", "repeated-name", f"{problem}: called {new!r}", "name it in the URDF")
+            yield finding_of(
+                joint,
+                "warning",
+                "repeated-name",
+                f"{problem}: called {new!r}",
+                "name it in the URDF",
+            )
         seen[new] = ends
 
 
 def _tree(root: etree._Element) -> Iterator[Finding]:
-    """Add links that only joints name; remove links that no joint names, if others make the robot."""
+    """Add links that only joints name; remove links that no joint names, if others make the
+    robot.
+    """
     links = {link.get("name"): link for link in root.findall("link")}
     ends = [ends_of(joint) for joint in root.findall("joint")]
     for name in dict.fromkeys(end for pair in ends for end in pair if end is not None):
         if name not in links:
             links[name] = etree.SubElement(root, "link", name=name)
             text = "named by joints, but not in the file: added, without mass and shape"
-            yield Finding("warning", "missing-link", text, "correct the name, or add the link", link=name)
+            yield Finding(
+                "warning", "missing-link", text, "correct the name, or add the link", link=name
+            )
     joined = {end for pair in ends for end in pair}
     for name, link in links.items():
         if joined and name not in joined:
-            yield finding_of(link, "warning", "loose-link", "held by no joint: left out", "join it, or remove it")
+            yield finding_of(
+                link, "warning", "loose-link", "held by no joint: left out", "join it, or remove it"
+            )
             root.remove(link)

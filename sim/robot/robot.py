@@ -38,7 +38,9 @@ MAX_LINKS = 255  # PhysX counts the links of an articulation in a byte
 DESIGN_HZ = 1.7
 """Bandwidth of :meth:`Robot.designed` with the mass matrix."""
 STANDING_HZ = 3.0
-"""Bandwidth of :meth:`Robot.designed` for a robot that stands: its weight sinks by about g / (2 pi STANDING_HZ)^2."""
+"""Bandwidth of :meth:`Robot.designed` for a robot that stands: its weight sinks by about g / (2 pi
+STANDING_HZ)^2.
+"""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,33 +67,38 @@ class Robot(RobotDescription):
         package_dirs
             Folders in which ``package://`` mesh paths are looked up first.
         missing_meshes
-            ``"skip"`` to leave out collision shapes whose mesh is missing or cannot be read, or ``"error"``.
+            ``"skip"`` to leave out collision shapes whose mesh is missing or cannot be read, or
+            ``"error"``.
         dissipation
-            ``"urdf"``: joint friction and damping as the URDF says, in N m and N m s/rad, by the model of
-            :mod:`batchpid.motors.friction`; no link damping. ``"sapien"``: SAPIEN's defaults, PhysX's joint friction
-            0.05 and link damping 0.05, for comparison with its tutorial.
+            ``"urdf"``: joint friction and damping as the URDF says, in N m and N m s/rad, by the
+            model of :mod:`batchpid.motors.friction`; no link damping. ``"sapien"``: SAPIEN's
+            defaults, PhysX's joint friction 0.05 and link damping 0.05, for comparison with its
+            tutorial.
         fixed_base
-            True to fix the root link to the world. Default True, unless the root of a URDF is a link without mass and
-            shapes and its only joint is floating or planar: then the base floats, and the root is that joint's child.
+            True to fix the root link to the world. Default True, unless the root of a URDF is a
+            link without mass and shapes and its only joint is floating or planar: then the base
+            floats, and the root is that joint's child.
         self_collision
-            ``"auto"``: links that are neighbours, or touch or overlap at the start pose or in nearly every sampled pose
-            do not collide (:attr:`self_contact`). ``"urdf"``: all links collide. An .srdf next to the URDF, of the same
-            name, disables and enables further pairs. ``"none"``: no link collides with another.
+            ``"auto"``: links that are neighbours, or touch or overlap at the start pose or in
+            nearly every sampled pose do not collide (:attr:`self_contact`). ``"urdf"``: all links
+            collide. An .srdf next to the URDF, of the same name, disables and enables further
+            pairs. ``"none"``: no link collides with another.
         actuators
-            Motors and sensors that runners of this robot have by default: :class:`batchpid.Actuators` of one row, or a
-            file of :func:`batchpid.save_actuators`, in which joints are matched by name. None: ideal ones, with the
-            armature, torque-speed lines and lags of an MJCF file.
+            Motors and sensors that runners of this robot have by default:
+            :class:`batchpid.Actuators` of one row, or a file of :func:`batchpid.save_actuators`, in
+            which joints are matched by name. None: ideal ones, with the armature, torque-speed
+            lines and lags of an MJCF file.
         strict
-            True to refuse a file that needs repairs, which are otherwise made, with a warning, and listed by
-            :meth:`check`.
+            True to refuse a file that needs repairs, which are otherwise made, with a warning, and
+            listed by :meth:`check`.
 
         Raises
         ------
         RobotNotFoundError
             No bundled robot and no file of that name.
         RobotError
-            The file is neither a usable URDF nor a usable MJCF file; the message names the element and the remedy. With
-            ``strict``, it needs repairs, which the message lists.
+            The file is neither a usable URDF nor a usable MJCF file; the message names the element
+            and the remedy. With ``strict``, it needs repairs, which the message lists.
         MissingDependencyError
             The file is MJCF, and the package ``mujoco`` is missing.
         InvalidArgumentError
@@ -104,8 +111,11 @@ class Robot(RobotDescription):
         strict = flag("strict", strict)
         if not isinstance(package_dirs, list | tuple):
             problem = "must be a list of folders"
-            raise InvalidArgumentError("package_dirs", problem, value=package_dirs, remedy="pass a list of paths")
-        # Options are checked before a file is read, so that a wrong one is not hidden by a fault of the file.
+            raise InvalidArgumentError(
+                "package_dirs", problem, value=package_dirs, remedy="pass a list of paths"
+            )
+        # Options are checked before a file is read, so that a wrong one is not hidden by a fault of
+        # the file.
         path = _find(name_or_path)
         folders = tuple(file_path("package_dirs", each) for each in package_dirs)
         root, repairs, mjcf = read_source(path, fixed_base is not False, missing_meshes)
@@ -116,7 +126,9 @@ class Robot(RobotDescription):
             base = free_base(root, free_joint, repairs)
         urdf = read_urdf(root, path, repairs, folders, missing_meshes, strict)
         if not any(joint.moves for joint in urdf.all_joints):
-            raise RobotError(f"{path}: a robot without moving joints cannot be controlled; check the joint types")
+            raise RobotError(
+                f"{path}: a robot without moving joints cannot be controlled; check the joint types"
+            )
         # From here on links mean bodies: those that fixed joints hold together are one.
         bodies = place_links(urdf.urdf)
         if (count := len({at.link for at in bodies.values()})) > MAX_LINKS:
@@ -124,7 +136,11 @@ class Robot(RobotDescription):
             raise RobotError(f"{path}: {problem}; split the robot")
         joints = couple([joint for joint in urdf.all_joints if joint.moves])
         beside = path.with_suffix(".srdf")
-        srdf = read_srdf(beside, [link.name for link in urdf.links]) if os.path.isfile(beside) else Srdf()
+        srdf = (
+            read_srdf(beside, [link.name for link in urdf.links])
+            if os.path.isfile(beside)
+            else Srdf()
+        )
         if mjcf is not None:
             srdf = srdf._replace(disabled=(*mjcf.pairs, *srdf.disabled))
         bundled = path.parent == _ASSETS
@@ -145,7 +161,11 @@ class Robot(RobotDescription):
         )
         if actuators is None and mjcf is not None:
             actuators = _file_actuators(mjcf, joints)
-        return robot if actuators is None else replace(robot, actuators=load_robot_actuators(actuators, robot))
+        return (
+            robot
+            if actuators is None
+            else replace(robot, actuators=load_robot_actuators(actuators, robot))
+        )
 
     @staticmethod
     def bundled() -> tuple[str, ...]:
@@ -161,14 +181,16 @@ class Robot(RobotDescription):
         timestep: float = 1 / 2000,
         control: str = "pid",
     ) -> Findings:
-        """Return the findings of the preflight, most severe first: oddities of this robot and of running it this way.
+        """Return the findings of the preflight, most severe first: oddities of this robot and of
+        running it this way.
 
         Parameters
         ----------
         params
             PID parameters to check, too; default :meth:`params` if the robot has gains.
         qpos, setpoint
-            Start pose (default :attr:`start`) and setpoint (default: none) to check, (dof,) [rad or m].
+            Start pose (default :attr:`start`) and setpoint (default: none) to check, (dof,) [rad or
+            m].
         timestep
             Time step of control and simulation [s].
         control
@@ -184,52 +206,62 @@ class Robot(RobotDescription):
         return check(self, params, qpos, setpoint, timestep, control)
 
     def designed(self, gain_units: str | None = None) -> bp.PIDParams:
-        """Return params designed from the robot's inertia alone; a search for gains starts from them.
+        """Return params designed from the robot's inertia alone; a search for gains starts from
+        them.
 
-        With the mass matrix the poles lie between the poles of Bessel's prototype s^3 + 6 s^2 + 15 s + 15 (W. E.
-        Thomson, "Delay networks having maximally flat frequency characteristics", Proc. IEE 96, 1949), with zeta =
-        sqrt(0.6) and Ti = sqrt(15) / w, and three equal ones. A step settles in 0.91 s with 0.1 % overshoot, at two
-        thirds of the effort that three equal poles of that speed need. In other units the joints disturb each other,
-        which three equal poles tolerate better.
+        With the mass matrix the poles lie between the poles of Bessel's prototype s^3 + 6 s^2 + 15
+        s + 15 (W. E. Thomson, "Delay networks having maximally flat frequency characteristics",
+        Proc. IEE 96, 1949), with zeta = sqrt(0.6) and Ti = sqrt(15) / w, and three equal ones. A
+        step settles in 0.91 s with 0.1 % overshoot, at two thirds of the effort that three equal
+        poles of that speed need. In other units the joints disturb each other, which three equal
+        poles tolerate better.
 
         Parameters
         ----------
         gain_units
             ``"mass_matrix"`` or ``"effort"``: :mod:`batchpid.law.computed_torque`. Default
-            ``"mass_matrix"``; on a floating base ``"effort"``, for legs that carry the base at the start pose: the mass
-            matrix is that of legs in the air, a twentieth.
+            ``"mass_matrix"``; on a floating base ``"effort"``, for legs that carry the base at the
+            start pose: the mass matrix is that of legs in the air, a twentieth.
 
         Raises
         ------
         InvalidArgumentError
             Unknown gain_units, or a mass matrix that is not positive definite.
         """
-        chosen = ("mass_matrix" if self.fixed_base else "effort") if gain_units is None else gain_units
+        chosen = (
+            ("mass_matrix" if self.fixed_base else "effort") if gain_units is None else gain_units
+        )
         gain_units = choice("gain_units", chosen, CHOICES["gain_units"])
         options: Document = {"gain_units": gain_units, "measurement_rate": "measured"}
         if gain_units == "effort" and not self.fixed_base:
-            return bp.design_gains(self, STANDING_HZ, load=self.dynamics().standing_inertia(self.start), **options)
+            return bp.design_gains(
+                self, STANDING_HZ, load=self.dynamics().standing_inertia(self.start), **options
+            )
         if gain_units != "mass_matrix":
             return bp.design_gains(self, 2.25, **options)
-        return bp.design_gains(self, DESIGN_HZ, 0.82, integral_time=4.5 / (2 * np.pi * DESIGN_HZ), **options)
+        return bp.design_gains(
+            self, DESIGN_HZ, 0.82, integral_time=4.5 / (2 * np.pi * DESIGN_HZ), **options
+        )
 
     def kinematic_tree(self, **options: Any) -> RigidTree:
         """Return the kinematic tree of this robot, for :mod:`batchpid.task_space`, in float64.
 
         No engine is needed.
 
-        It knows every link of the URDF by name, merged ones included. Followers move with their leaders
-        (:attr:`coupling`). It has no friction and damping.
+        It knows every link of the URDF by name, merged ones included. Followers move with their
+        leaders (:attr:`coupling`). It has no friction and damping.
 
         Parameters
         ----------
         options
-            ``armature`` (dof,) [kg m^2 or kg], by default the one in :attr:`actuators`; ``gravity`` (3,) [m/s^2].
+            ``armature`` (dof,) [kg m^2 or kg], by default the one in :attr:`actuators`; ``gravity``
+            (3,) [m/s^2].
 
         Raises
         ------
         RobotError
-            The base is not fixed, or a mesh cannot be read of a link whose mass comes from its collision shapes.
+            The base is not fixed, or a mesh cannot be read of a link whose mass comes from its
+            collision shapes.
         InvalidArgumentError
             An option is not one of those above, or has a wrong shape or sign.
         """
@@ -238,8 +270,14 @@ class Robot(RobotDescription):
         if self.actuators is not None and self.actuators.armature is not None:
             known["armature"] = np.asarray(self.actuators.armature, float)[0]
         if not self.fixed_base:
-            problem = "operational space and inverse kinematics need a kinematic tree, which has a fixed base"
-            raise RobotError(f"{self.path}: {problem}; load the robot with fixed_base=True, or control its joints")
+            problem = (
+                "operational space and inverse kinematics need a kinematic tree, which has a fixed"
+                " base"
+            )
+            raise RobotError(
+                f"{self.path}: {problem}; load the robot with fixed_base=True, or control its"
+                " joints"
+            )
         return replace(self.rigid_tree, **(known | options))
 
     @property
@@ -261,10 +299,12 @@ class Robot(RobotDescription):
         return bp.load_params(self.path.with_suffix(".tuned.yaml"), self.joint_names)[0]
 
     def mjcf_gains(self) -> bp.PIDParams:
-        """Return params with the gains of the servos of an MJCF file: kp and, on the measurement alone, kd.
+        """Return params with the gains of the servos of an MJCF file: kp and, on the measurement
+        alone, kd.
 
-        Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of the servo's control;
-        a velocity servo has kd alone. For <pid> and <dcmotor> ki and its limit are included.
+        Joints without servo have gains of 0. The setpoint is a joint's position, for any unit of
+        the servo's control; a velocity servo has kd alone. For <pid> and <dcmotor> ki and its limit
+        are included.
 
         Raises
         ------
@@ -274,7 +314,8 @@ class Robot(RobotDescription):
         defaults = self.defaults
         if defaults is None or defaults.kp is None or defaults.kv is None:
             problem = (
-                f"{self.name!r} has no servos of an MJCF file (<position>, <pid>, or <general> with an affine bias)"
+                f"{self.name!r} has no servos of an MJCF file (<position>, <pid>, or <general> with"
+                " an affine bias)"
             )
             raise InvalidArgumentError("robot", problem, remedy="use robot.designed()")
         options: Document = {"ki": 0.0}
@@ -288,13 +329,15 @@ def _find(name_or_path: str | Path) -> Path:
     path = Path(os.path.expanduser(file_path("name_or_path", name_or_path)))
     if str(name_or_path) in Robot.bundled():
         return _ASSETS / f"{name_or_path}.urdf"
-    if os.path.isdir(path):  # pathlib's methods raise other errors for names that are too long or start with ~
+    if os.path.isdir(
+        path
+    ):  # pathlib's methods raise other errors for names that are too long or start with ~
         raise RobotNotFoundError(f"{path} is a folder; pass the path of a URDF or MJCF file in it")
     if os.path.exists(path):  # also a pipe, such as /dev/stdin
         return path.absolute()
     raise RobotNotFoundError(
-        f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a file; "
-        "check the spelling, or pass the path of a URDF or MJCF file"
+        f"no robot {str(name_or_path)!r}: neither bundled ({', '.join(Robot.bundled())}) nor a"
+        " file; check the spelling, or pass the path of a URDF or MJCF file"
     )
 
 
@@ -305,7 +348,9 @@ def _file_defaults(mjcf: Mjcf, joints: tuple[Joint, ...]) -> FileDefaults:
     if not any((*motors.kp.values(), *motors.kv.values(), *motors.ki.values())):
         return FileDefaults(start)
     columns = (motors.kp, 0.0), (motors.kv, 0.0), (motors.ki, 0.0), (motors.imax, np.inf)
-    kp, kv, ki, imax = (read_only(np.array([gains.get(name, off) for name in names])) for gains, off in columns)
+    kp, kv, ki, imax = (
+        read_only(np.array([gains.get(name, off) for name in names])) for gains, off in columns
+    )
     return FileDefaults(start, kp, kv, ki, imax)
 
 
@@ -313,10 +358,13 @@ def _file_actuators(mjcf: Mjcf, joints: tuple[Joint, ...]) -> bp.Actuators | Non
     """Return the motors of an MJCF file; None if they are ideal."""
     effects = {"armature": 0.0, "saturation_effort": np.inf, "no_load_speed": np.inf, "lag": 0.0}
     columns: Document = {
-        name: [getattr(mjcf.motors, name).get(joint.name, off) for joint in joints] for name, off in effects.items()
+        name: [getattr(mjcf.motors, name).get(joint.name, off) for joint in joints]
+        for name, off in effects.items()
     }
     found: Document = {
-        name: column for name, column in columns.items() if any(each != effects[name] for each in column)
+        name: column
+        for name, column in columns.items()
+        if any(each != effects[name] for each in column)
     }
     return bp.make_actuators(len(joints), **found) if found else None
 

@@ -1,4 +1,5 @@
-"""Model of one robot at given poses: dynamics by :mod:`batchpid.task_space`, contacts from its collision shapes.
+"""Model of one robot at given poses: dynamics by :mod:`batchpid.task_space`, contacts from its
+collision shapes.
 
 The rigid tree has the simulated bodies in double precision. SAPIEN's tree has single precision.
 """
@@ -36,7 +37,12 @@ class RobotModel:
     """
 
     def __init__(
-        self, tree: RigidTree, coupling: Coupling, urdf: str, ignored: frozenset[frozenset[str]], ground: bool
+        self,
+        tree: RigidTree,
+        coupling: Coupling,
+        urdf: str,
+        ignored: frozenset[frozenset[str]],
+        ground: bool,
     ) -> None:
         self.tree = tree
         self._coupling = coupling
@@ -48,7 +54,9 @@ class RobotModel:
         return RobotModel, (self.tree, self._coupling, self._urdf, self._ignored, self._ground)
 
     def mass_matrix(self, qpos: Array) -> Array:
-        """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg], in NumPy or JAX as ``qpos``."""
+        """Return the joint-space mass matrices (n, dof, dof) [kg m^2 or kg], in NumPy or JAX as
+        ``qpos``.
+        """
         return ts.mass_matrix(self.tree, qpos)
 
     def inverse_dynamics(self, qpos: Rows, qvel: Rows, qacc: Rows) -> Float64:
@@ -56,24 +64,29 @@ class RobotModel:
         return np.asarray(ts.inverse_dynamics(self.tree, qpos, qvel, qacc), np.float64)
 
     def forward_dynamics(self, qpos: Rows, qvel: Rows, effort: Rows) -> Float64:
-        """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity included.
+        """Return the accelerations (n, dof) [rad/s^2 or m/s^2] under ``effort`` [N m or N], gravity
+        included.
 
         Followers move with their leaders.
         """
         return np.asarray(ts.forward_dynamics(self._coupled, qpos, qvel, effort), np.float64)
 
     def standing_inertia(self, qpos: Rows) -> Float64:
-        """Return the inertia (dof,) that each joint moves at one pose (dof,) if the base floats and its feet stand.
+        """Return the inertia (dof,) that each joint moves at one pose (dof,) if the base floats and
+        its feet stand.
 
-        The feet F are pinned. Velocities q' of the joints move the base at V = A q', A = -J_b^+ J_j, where J_b and J_j
-        are the Jacobians of F with respect to the base and the joints. The mass matrix of this motion is the sum of
-        J^T I J of all bodies, with J = J_j + J_b A. The result is the sum of the absolute values in each of its rows:
-        diagonal gains for these sums are at least as stiff as gains for the matrix (Gershgorin's theorem).
+        The feet F are pinned. Velocities q' of the joints move the base at V = A q', A = -J_b^+
+        J_j, where J_b and J_j are the Jacobians of F with respect to the base and the joints. The
+        mass matrix of this motion is the sum of J^T I J of all bodies, with J = J_j + J_b A. The
+        result is the sum of the absolute values in each of its rows: diagonal gains for these sums
+        are at least as stiff as gains for the matrix (Gershgorin's theorem).
         """
         tree, joints = self.tree, np.asarray(qpos, np.float64)
 
         def jacobians(link: str, point: Float64) -> tuple[Float64, Float64]:
-            """Return the Jacobians of a point of the world in a link (6, dof), and with respect to the base (6, 6)."""
+            """Return the Jacobians of a point of the world in a link (6, dof), and with respect to
+            the base (6, 6).
+            """
             x, y, z = point
             crossed = np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # -(p x)
             of_base = np.block([[np.eye(3), crossed], [np.zeros((3, 3)), np.eye(3)]])
@@ -84,7 +97,9 @@ class RobotModel:
         feet = [jacobians(link, point) for link, point in self.contacts.feet(joints)]
         follow = np.zeros((6, tree.dof))
         if feet:
-            of_joints, of_base = (np.concatenate([foot[:3] for foot in part]) for part in zip(*feet, strict=True))
+            of_joints, of_base = (
+                np.concatenate([foot[:3] for foot in part]) for part in zip(*feet, strict=True)
+            )
             follow = -np.linalg.pinv(of_base, rcond=1e-3) @ of_joints
         matrix = np.zeros((tree.dof, tree.dof))
         for at, link in enumerate(tree.links):
@@ -93,7 +108,10 @@ class RobotModel:
             of_joints, of_base = jacobians(link, pose[:3] + turn @ tree.center[at])
             moving = of_joints + of_base @ follow
             linear, angular = moving[:3], moving[3:]
-            matrix += tree.mass[at] * linear.T @ linear + angular.T @ turn @ tree.inertia[at] @ turn.T @ angular
+            matrix += (
+                tree.mass[at] * linear.T @ linear
+                + angular.T @ turn @ tree.inertia[at] @ turn.T @ angular
+            )
         return np.abs(matrix).sum(1)
 
     @cached_property
@@ -106,9 +124,11 @@ class RobotModel:
         return Contacts(self.tree, link_shapes(self._urdf), self._ignored, self._ground)
 
     def in_contact(self, qpos: Rows, clearance: float = 0.0) -> Bool:
-        """Return whether links are closer than ``clearance`` [m] to each other or to the ground (n,).
+        """Return whether links are closer than ``clearance`` [m] to each other or to the ground
+        (n,).
 
-        Links that a fixed joint connects may touch, and the base and the links fixed to it may touch the ground.
+        Links that a fixed joint connects may touch, and the base and the links fixed to it may
+        touch the ground.
         """
         return self.contacts.in_contact(qpos, clearance)
 
@@ -116,9 +136,9 @@ class RobotModel:
 def base_start(robot: Any, qpos: Float64, ground: bool) -> Float64:
     """Return the pose (7,) from which a floating base starts with its joints at ``qpos`` (dof,).
 
-    It is the file's, with the lowest point of the robot as high as at the start pose of the joints. If the file does
-    not place the base, it is upright at the origin. On a ``ground`` at height 0 the lowest point is then on the ground,
-    and otherwise not below.
+    It is the file's, with the lowest point of the robot as high as at the start pose of the joints.
+    If the file does not place the base, it is upright at the origin. On a ``ground`` at height 0
+    the lowest point is then on the ground, and otherwise not below.
     """
     pose, model = np.array(robot.base_start or (0, 0, 0, 1, 0, 0, 0), np.float64), robot.dynamics()
     height = model.contacts.height(np.nan_to_num(qpos), base_too=True)

@@ -23,11 +23,15 @@ class SetpointWarning(UserWarning):
 
 
 class MovingSetpointWarning(UserWarning):
-    """Setpoints move in every tick, without rates, under gains that follow such a motion with a lag."""
+    """Setpoints move in every tick, without rates, under gains that follow such a motion with a
+    lag.
+    """
 
 
 class SetpointCheck:
-    """Check of positions against the limits of ``robot``, which warns once for each argument and joint."""
+    """Check of positions against the limits of ``robot``, which warns once for each argument and
+    joint.
+    """
 
     def __init__(self, robot: RobotDescription) -> None:
         self._robot = robot
@@ -37,7 +41,8 @@ class SetpointCheck:
     def check(self, argument: str, positions: Rows, envs: NDArray[np.bool_] | None = None) -> None:
         """Warn of finite ``positions`` (..., envs, dof) [rad or m] outside the limits.
 
-        One warning names all joints, each with its worst position and its envs; ``envs`` (envs,) masks those to check.
+        One warning names all joints, each with its worst position and its envs; ``envs`` (envs,)
+        masks those to check.
         """
         outside = (positions < self._low) | (positions > self._high)
         if not np.logical_or.reduce(outside, axis=None):  # outside.any() takes a call of Python
@@ -53,28 +58,41 @@ class SetpointCheck:
         if not new:
             return
         self._warned.update((argument, joint) for joint in new)
-        found = "; ".join(self._describe(joint, positions[..., joint], outside[..., joint]) for joint in new)
+        found = "; ".join(
+            self._describe(joint, positions[..., joint], outside[..., joint]) for joint in new
+        )
         warn(
-            f"{argument} is outside the joint limits, where no joint can follow: {found}; move it inside",
+            f"{argument} is outside the joint limits, where no joint can follow: {found}; move it"
+            " inside",
             SetpointWarning,
         )
 
     def _describe(self, index: int, positions: Rows, outside: NDArray[np.bool_]) -> str:
-        """Return joint, limits, worst position and envs of ``positions`` (..., envs), of which some are outside."""
+        """Return joint, limits, worst position and envs of ``positions`` (..., envs), of which some
+        are outside.
+        """
         joint = self._robot.joints[index]
-        beyond = np.where(outside, np.maximum(joint.lower - positions, positions - joint.upper), 0.0)
+        beyond = np.where(
+            outside, np.maximum(joint.lower - positions, positions - joint.upper), 0.0
+        )
         worst = positions.flat[np.argmax(beyond)]
         envs = np.flatnonzero(outside.reshape(-1, outside.shape[-1]).any(0)).tolist()
-        listed = ", ".join(map(str, envs[:LISTED])) + (f" and {len(envs) - LISTED} more" if len(envs) > LISTED else "")
+        listed = ", ".join(map(str, envs[:LISTED])) + (
+            f" and {len(envs) - LISTED} more" if len(envs) > LISTED else ""
+        )
         of_envs = "" if outside.shape[-1] == 1 else f" (env{'s' * (len(envs) > 1)} {listed})"
-        return f"joint {joint.name!r} at {worst:g} {joint.unit}, not in [{joint.lower:g}, {joint.upper:g}]{of_envs}"
+        return (
+            f"joint {joint.name!r} at {worst:g} {joint.unit}, not in [{joint.lower:g},"
+            f" {joint.upper:g}]{of_envs}"
+        )
 
 
 class MovingSetpointCheck:
     """Check for setpoints that move without rates under gains with a large lag. It warns once.
 
-    A joint's lag is kp (1 - b) / ki: with setpoint weight b, the integral alone follows a ramp. Setpoints move in a
-    tick if they change by no more than the velocity limits allow; larger changes are steps.
+    A joint's lag is kp (1 - b) / ki: with setpoint weight b, the integral alone follows a ramp.
+    Setpoints move in a tick if they change by no more than the velocity limits allow; larger
+    changes are steps.
     """
 
     def __init__(self, robot: RobotDescription) -> None:
@@ -88,7 +106,9 @@ class MovingSetpointCheck:
 
     @property
     def is_watching(self) -> bool:
-        """False where no joint lags, and after the warning: :meth:`see` then has nothing to find."""
+        """False where no joint lags, and after the warning: :meth:`see` then has nothing to
+        find.
+        """
         return self._lag is not None and not self._has_warned
 
     def set_params(self, params: bp.PIDParams) -> None:
@@ -104,7 +124,9 @@ class MovingSetpointCheck:
             self._lag = np.broadcast_to(lag, (self._robot.dof,))
 
     def see(self, setpoints: NDArray[np.float64], rated: bool, seconds: float) -> None:
-        """Look at the setpoints of ticks (ticks, envs, dof) of ``seconds`` each, which are ``rated`` or not."""
+        """Look at the setpoints of ticks (ticks, envs, dof) of ``seconds`` each, which are
+        ``rated`` or not.
+        """
         if self._lag is None or self.found is not None:
             return
         if rated:
@@ -135,8 +157,8 @@ class MovingSetpointCheck:
         self._has_warned = True
         joint, lag = self._robot.joint_names[self.found], self._lag[self.found]
         warn(
-            f"setpoint moves in every tick without its rate: under these gains joint {joint!r} follows {1e3 * lag:.0f} "
-            "ms behind (kp (1 - b) / ki); pass setpoint_rate, such as the change over a tick by the tick, or use gains "
-            "with setpoint_weight=1",
+            f"setpoint moves in every tick without its rate: under these gains joint {joint!r}"
+            f" follows {1e3 * lag:.0f} ms behind (kp (1 - b) / ki); pass setpoint_rate, such as the"
+            " change over a tick by the tick, or use gains with setpoint_weight=1",
             MovingSetpointWarning,
         )

@@ -1,7 +1,9 @@
-"""Self-collision: pairs of links that do not collide, from an .srdf, or from their distances at sampled poses.
+"""Self-collision: pairs of links that do not collide, from an .srdf, or from their distances at
+sampled poses.
 
-MoveIt's setup assistant finds the pairs that its planners leave out of collision checks in this way (D. Coleman et al.,
-"Reducing the barrier to entry of complex robotic software: a MoveIt! case study", J. Softw. Eng. Robotics 5, 2014).
+MoveIt's setup assistant finds the pairs that its planners leave out of collision checks in this way
+(D. Coleman et al., "Reducing the barrier to entry of complex robotic software: a MoveIt! case
+study", J. Softw. Eng. Robotics 5, 2014).
 """
 
 from __future__ import annotations
@@ -27,8 +29,9 @@ SELF_COLLISION = ("auto", "urdf", "none")
 ALWAYS = 0.95
 """Share of sampled poses beyond which a pair counts as always in contact; MoveIt's."""
 GAP = 1e-3
-"""Distance [m] that counts as contact: links built to glide along each other never come apart, and PhysX pushes links
-apart that just touch at the start."""
+"""Distance [m] that counts as contact: links built to glide along each other never come apart, and
+PhysX pushes links apart that just touch at the start.
+"""
 SAMPLES = 200
 """Number of sampled poses; MoveIt's."""
 
@@ -36,8 +39,8 @@ SAMPLES = 200
 class DisabledPair(NamedTuple):
     """Two links that do not collide.
 
-    ``reason`` is one of MoveIt's: "Adjacent" (neighbours), "Default" (in contact at the start pose), "Always" (in
-    nearly every sampled pose), "Never" or "User" (in an .srdf).
+    ``reason`` is one of MoveIt's: "Adjacent" (neighbours), "Default" (in contact at the start
+    pose), "Always" (in nearly every sampled pose), "Never" or "User" (in an .srdf).
     """
 
     first: str
@@ -61,9 +64,10 @@ class Srdf(NamedTuple):
 class SelfContact(NamedTuple):
     """Contact of a robot's links with each other and with the ground.
 
-    ``pairs`` do not collide. The pairs ``left_over`` should not collide, but do, because PhysX's filter is full: it
-    holds all pairs of up to 31 links, any 62 pairs of more links, and usually many more. ``reaches_ground`` is True if
-    a link other than the base touches the ground at the start pose.
+    ``pairs`` do not collide. The pairs ``left_over`` should not collide, but do, because PhysX's
+    filter is full: it holds all pairs of up to 31 links, any 62 pairs of more links, and usually
+    many more. ``reaches_ground`` is True if a link other than the base touches the ground at the
+    start pose.
     """
 
     pairs: tuple[DisabledPair, ...]
@@ -74,8 +78,8 @@ class SelfContact(NamedTuple):
 def read_srdf(path: Path, links: Iterable[str]) -> Srdf:
     """Return the pairs in the .srdf at ``path``, for any reason; a pair without reason gets "User".
 
-    Pairs that name a link twice or an unknown link are left out, as in MoveIt, with a finding. Raises RobotError for
-    what :func:`batchpid.sim.robot.xml.parse_xml` refuses.
+    Pairs that name a link twice or an unknown link are left out, as in MoveIt, with a finding.
+    Raises RobotError for what :func:`batchpid.sim.robot.xml.parse_xml` refuses.
     """
     known = set(links)
     disabled = list[DisabledPair]()
@@ -84,7 +88,10 @@ def read_srdf(path: Path, links: Iterable[str]) -> Srdf:
     for element in parse_xml(path).iterchildren("disable_collisions", "enable_collisions"):
         pair = element.get("link1", ""), element.get("link2", "")
         if len(known.intersection(pair)) != 2:
-            text = f"{path.name}: <{element.tag} link1={pair[0]!r} link2={pair[1]!r}> does not name two of its links"
+            text = (
+                f"{path.name}: <{element.tag} link1={pair[0]!r} link2={pair[1]!r}> does not name"
+                " two of its links"
+            )
             findings.append(Finding("warning", "srdf-link", text, "left out; correct the names"))
         elif element.tag == "enable_collisions":
             enabled.add(frozenset(pair))
@@ -99,9 +106,11 @@ def disabled_pairs(
     rest: Iterable[frozenset[str]],
     samples: Sequence[Iterable[frozenset[str]]],
 ) -> tuple[DisabledPair, ...]:
-    """Return the pairs that do not collide, each with the first of its reasons, in ``order`` of the links.
+    """Return the pairs that do not collide, each with the first of its reasons, in ``order`` of the
+    links.
 
-    ``adjacent`` are neighbours, ``rest`` the pairs in contact at rest, ``samples`` those in contact at each pose.
+    ``adjacent`` are neighbours, ``rest`` the pairs in contact at rest, ``samples`` those in contact
+    at each pose.
     """
     touches = Counter(pair for sample in samples for pair in set(sample))
     always = (pair for pair, count in touches.items() if count > ALWAYS * len(samples))
@@ -110,14 +119,16 @@ def disabled_pairs(
         for pair in pairs:
             reasons.setdefault(pair, reason)
     number = {link: index for index, link in enumerate(order)}
-    ordered = {tuple(sorted(pair, key=number.__getitem__)): reason for pair, reason in reasons.items()}
+    ordered = {
+        tuple(sorted(pair, key=number.__getitem__)): reason for pair, reason in reasons.items()
+    }
     listed = [DisabledPair(first, second, reason) for (first, second), reason in ordered.items()]
     return tuple(sorted(listed, key=lambda pair: (number[pair.first], number[pair.second])))
 
 
 def self_contact(robot: Any) -> SelfContact:
-    """Return the pairs of links of a :class:`.description.RobotDescription` that do not collide, under its option
-    ``self_collision`` and its .srdf.
+    """Return the pairs of links of a :class:`.description.RobotDescription` that do not collide,
+    under its option ``self_collision`` and its .srdf.
 
     Deterministic: the poses are seeded. Raises RobotError for a mesh that cannot be read.
     """
@@ -129,11 +140,20 @@ def self_contact(robot: Any) -> SelfContact:
     if robot.self_collision == "none":
         computed = tuple(DisabledPair(*pair, "User") for pair in combinations(solid, 2))
     elif robot.self_collision == "auto" and len({bodies[link] for link in solid}) > 1:
-        at_rest, *samples = [_distances(contacts, qpos) for qpos in (robot.start, *robot.sample(SAMPLES, seed=0))]
-        rest, *close = [[pair for pair, distance in near.items() if distance < GAP] for near in (at_rest, *samples)]
+        at_rest, *samples = [
+            _distances(contacts, qpos) for qpos in (robot.start, *robot.sample(SAMPLES, seed=0))
+        ]
+        rest, *close = [
+            [pair for pair, distance in near.items() if distance < GAP]
+            for near in (at_rest, *samples)
+        ]
         computed = disabled_pairs(solid, _adjacent_links(robot.all_joints, solid), rest, close)
     listed = {pair.links: pair for pair in (*computed, *robot.srdf.disabled)}
-    pairs = [pair for links, pair in listed.items() if links not in robot.srdf.enabled and links <= set(solid)]
+    pairs = [
+        pair
+        for links, pair in listed.items()
+        if links not in robot.srdf.enabled and links <= set(solid)
+    ]
     ignored = [pair.links for pair in pairs]
     _, left_over = link_groups(robot.urdf, (), robot.fixed_base, robot.joints, ignored)
     return SelfContact(
@@ -144,7 +164,9 @@ def self_contact(robot: Any) -> SelfContact:
 
 
 def _distances(contacts: Contacts, qpos: Float64) -> dict[frozenset[str], float]:
-    """Return the distances [m] of the pairs of links that are near each other, at one pose (dof,)."""
+    """Return the distances [m] of the pairs of links that are near each other, at one pose
+    (dof,).
+    """
     distances: dict[frozenset[str], float] = {}
     for near in contacts.near(qpos):
         pair = frozenset(near[:2])
@@ -153,7 +175,9 @@ def _distances(contacts: Contacts, qpos: Float64) -> dict[frozenset[str], float]
 
 
 def _rigid_bodies(joints: Iterable[Joint]) -> dict[str, str]:
-    """Return the rigid body of each link, named after its first link, for ``joints`` in breadth-first order."""
+    """Return the rigid body of each link, named after its first link, for ``joints`` in
+    breadth-first order.
+    """
     bodies: dict[str, str] = {}
     for joint in joints:
         body = bodies.setdefault(joint.parent_link, joint.parent_link)

@@ -16,8 +16,11 @@ from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import Joint
 
 
-def setpoint_guard(joints: Sequence[Joint], rate: ArrayLike | None, acceleration: ArrayLike | None) -> bp.Guard:
-    """Return the limits of setpoints of the degrees of freedom ``joints``, of the URDF where they are not given.
+def setpoint_guard(
+    joints: Sequence[Joint], rate: ArrayLike | None, acceleration: ArrayLike | None
+) -> bp.Guard:
+    """Return the limits of setpoints of the degrees of freedom ``joints``, of the URDF where they
+    are not given.
 
     Followers have none: their limits narrow the limits of their leaders.
 
@@ -37,9 +40,11 @@ def setpoint_guard(joints: Sequence[Joint], rate: ArrayLike | None, acceleration
 
 
 def _of_leaders(guard: bp.Guard, joints: Sequence[Joint]) -> bp.Guard:
-    """Return ``guard`` with limits of the leaders that hold for their followers, too, and none of the followers.
+    """Return ``guard`` with limits of the leaders that hold for their followers, too, and none of
+    the followers.
 
-    Position limits of a follower that leave its leader no range are left out, as in a robot's own limits.
+    Position limits of a follower that leave its leader no range are left out, as in a robot's own
+    limits.
     """
     coupling = coupling_of(tuple(joints))
     if coupling.is_identity:  # its limits keep their shapes
@@ -56,24 +61,37 @@ def _of_leaders(guard: bp.Guard, joints: Sequence[Joint]) -> bp.Guard:
             continue
         for fastest in (rate, acceleration):
             fastest[:, leader] = np.minimum(fastest[:, leader], fastest[:, index] / abs(multiplier))
-        ends = np.sort([(end[:, index] - coupling.offset[index]) / multiplier for end in (low, high)], axis=0)
+        ends = np.sort(
+            [(end[:, index] - coupling.offset[index]) / multiplier for end in (low, high)], axis=0
+        )
         if joints[leader].continuous:
             _check_turning(joints[index].name, joints[leader].name, ends)
             continue
         ends = np.stack([np.maximum(low[:, leader], ends[0]), np.minimum(high[:, leader], ends[1])])
         narrower = ends[0] < ends[1]
-        low[:, leader], high[:, leader] = np.where(narrower, ends, (low[:, leader], high[:, leader]))
+        low[:, leader], high[:, leader] = np.where(
+            narrower, ends, (low[:, leader], high[:, leader])
+        )
     for limits, none in zip((low, high, rate, acceleration), free, strict=False):
         limits[:, coupling.followers] = none
     found = dict(zip(guard._fields, (low, high, rate, acceleration), strict=False))
-    return guard._replace(**{name: None if np.isinf(limits).all() else limits for name, limits in found.items()})
+    return guard._replace(
+        **{name: None if np.isinf(limits).all() else limits for name, limits in found.items()}
+    )
 
 
 def _check_turning(follower: str, leader: str, ends: NDArray[np.float64]) -> None:
-    """Raise InvalidArgumentError for position limits ``ends`` of a follower of a continuous joint."""
+    """Raise InvalidArgumentError for position limits ``ends`` of a follower of a continuous
+    joint.
+    """
     if np.isfinite(ends).any():
-        problem = f"cannot hold the position limits of {follower!r}, which follows the continuous joint"
-        remedy = "make the leader revolute with limits, or pass batchpid.make_guard(...) without lower and upper"
+        problem = (
+            f"cannot hold the position limits of {follower!r}, which follows the continuous joint"
+        )
+        remedy = (
+            "make the leader revolute with limits, or pass batchpid.make_guard(...) without lower"
+            " and upper"
+        )
         raise InvalidArgumentError("guard", problem, joint=leader, remedy=remedy)
 
 
@@ -82,13 +100,16 @@ def fit_guard(
 ) -> bp.Guard | None:
     """Return the guard for a runner's option ``guard``; None means no guard.
 
-    Raises InvalidArgumentError if it does not fit the robot or the control, or limits the positions of a follower of a
-    continuous joint.
+    Raises InvalidArgumentError if it does not fit the robot or the control, or limits the positions
+    of a follower of a continuous joint.
     """
     if guard is False or guard is None:
         return None
     if not sets_positions:
-        problem, remedy = "limits positions of joints, which this control does not take", "use control 'pid' or 'drive'"
+        problem, remedy = (
+            "limits positions of joints, which this control does not take",
+            "use control 'pid' or 'drive'",
+        )
         raise InvalidArgumentError("guard", problem, value=control, remedy=remedy)
     limits = setpoint_guard(joints, None, None) if guard is True else guard
     limits = instance("guard", limits, bp.Guard, "pass True, or robot.guard(...)")

@@ -1,8 +1,9 @@
 """Visible surfaces of a robot: the shapes of its URDF as coloured triangles, for page and films.
 
-A link is drawn by its ``<visual>`` elements; where it has none, or one of their mesh files cannot be read, by its
-collision shapes. Unreadable files are reported. A robot of which nothing can be drawn is drawn by rods between its
-joints. The triangles are made, or read from mesh files, by ``trimesh``.
+A link is drawn by its ``<visual>`` elements; where it has none, or one of their mesh files cannot
+be read, by its collision shapes. Unreadable files are reported. A robot of which nothing can be
+drawn is drawn by rods between its joints. The triangles are made, or read from mesh files, by
+``trimesh``.
 """
 
 from __future__ import annotations
@@ -23,17 +24,29 @@ from batchpid.sim.robot.xml import numbers, parse_xml
 from batchpid.task_space.rotations import from_rpy, rotate
 
 Rgba = tuple[float, ...]
-_REMEDY = "repair the file, put it next to the URDF, or pass package_dirs=[...] to Robot.load (--package-dirs)"
+_REMEDY = (
+    "repair the file, put it next to the URDF, or pass package_dirs=[...] to Robot.load"
+    " (--package-dirs)"
+)
 
 DEVIATION = 2e-3  # default distance allowed between a chord and its arc [m]
 FEWEST, MOST = 6, 48  # bounds of the number of segments of a circle
 _ROD = 0.08  # thickness of a rod, as a share of the longest one
 _PALETTE = ((0.62, 0.65, 0.70, 1.0), (0.42, 0.46, 0.53, 1.0), (0.80, 0.81, 0.83, 1.0))
-_CYLINDER = ((0.0, -0.5), (1.0, -0.5), (1.0, -0.5), (1.0, 0.5), (1.0, 0.5), (0.0, 0.5))  # (radius, z), rims twice
+_CYLINDER = (
+    (0.0, -0.5),
+    (1.0, -0.5),
+    (1.0, -0.5),
+    (1.0, 0.5),
+    (1.0, 0.5),
+    (0.0, 0.5),
+)  # (radius, z), rims twice
 
 
 class Surface(NamedTuple):
-    """Triangles of one colour that move with a link: ``vertices`` (v, 3) [m] in its frame, ``faces`` (f, 3)."""
+    """Triangles of one colour that move with a link: ``vertices`` (v, 3) [m] in its frame,
+    ``faces`` (f, 3).
+    """
 
     link: str
     rgba: Rgba
@@ -44,7 +57,8 @@ class Surface(NamedTuple):
 def surfaces(
     robot: RobotDescription, deviation: float = DEVIATION, findings: list[Finding] | None = None
 ) -> list[Surface]:
-    """Return the surfaces of ``robot``, one for each link and colour; ``deviation`` [m] as in :func:`segments_of`.
+    """Return the surfaces of ``robot``, one for each link and colour; ``deviation`` [m] as in
+    :func:`segments_of`.
 
     A mesh that cannot be read is appended to ``findings``.
 
@@ -90,20 +104,28 @@ def surfaces(
             shown = "collision shapes are drawn instead" if parts else "it is not drawn"
             for mesh, reason in (error.args for error in unreadable):
                 text = f"mesh cannot be read ({reason}): {shown}"
-                findings.append(Finding("warning", "visual-mesh", text, _REMEDY, link=name, detail=repr(mesh)))
+                findings.append(
+                    Finding("warning", "visual-mesh", text, _REMEDY, link=name, detail=repr(mesh))
+                )
         for rgba, same in parts.items():
             joined: Any = concatenate(same)
-            result.append(Surface(name, rgba, np.asarray(joined.vertices), np.asarray(joined.faces)))
+            result.append(
+                Surface(name, rgba, np.asarray(joined.vertices), np.asarray(joined.faces))
+            )
     return result or _rods(robot)
 
 
 def _rods(robot: RobotDescription) -> list[Surface]:
-    """Return a rod from the frame of each link to each joint on it, from the last links to their centers of mass."""
+    """Return a rod from the frame of each link to each joint on it, from the last links to their
+    centers of mass.
+    """
     from trimesh import creation
 
     tree = robot.rigid_tree
     ends = [(parent, tree.position[link]) for link, parent in enumerate(tree.parent) if parent >= 0]
-    ends += [(link, tree.center[link]) for link in range(len(tree.links)) if link not in tree.parent]
+    ends += [
+        (link, tree.center[link]) for link in range(len(tree.links)) if link not in tree.parent
+    ]
     lengths = [float(np.linalg.norm(end)) for _, end in ends]
     thickness = _ROD * max(lengths)
     rods = []
@@ -111,12 +133,17 @@ def _rods(robot: RobotDescription) -> list[Surface]:
         if length > thickness:
             name = tree.links[link]
             rod: Any = creation.cylinder(thickness / 2, segment=[np.zeros(3), end], sections=FEWEST)
-            rods.append(Surface(name, _default_colour(name), np.asarray(rod.vertices), np.asarray(rod.faces)))
+            rods.append(
+                Surface(
+                    name, _default_colour(name), np.asarray(rod.vertices), np.asarray(rod.faces)
+                )
+            )
     return rods
 
 
 def segments_of(radius: float, deviation: float) -> int:
-    """Return how many chords, within FEWEST and MOST, keep a circle within ``deviation`` [m] of its arc.
+    """Return how many chords, within FEWEST and MOST, keep a circle within ``deviation`` [m] of its
+    arc.
 
     A chord over the angle 2a is r (1 - cos a) away from the arc.
     """
@@ -130,7 +157,9 @@ class _UnreadableMesh(Exception):
 
 
 def _read_mesh(name: str, robot: RobotDescription) -> Any:
-    """Return the result of ``trimesh`` for a mesh file of the robot, in metres. Raises _UnreadableMesh."""
+    """Return the result of ``trimesh`` for a mesh file of the robot, in metres. Raises
+    _UnreadableMesh.
+    """
     path = find_mesh(name, robot.path, robot.package_dirs)
     if path is None:
         raise _UnreadableMesh(name, "not found")
@@ -144,7 +173,8 @@ def _read_mesh(name: str, robot: RobotDescription) -> Any:
 
 
 def _mesh(element: etree._Element, robot: RobotDescription, deviation: float, where: str) -> Any:
-    """Return the ``trimesh.Trimesh`` of a visual or collision in its link's frame, or None if it has no shape.
+    """Return the ``trimesh.Trimesh`` of a visual or collision in its link's frame, or None if it
+    has no shape.
 
     Raises _UnreadableMesh.
     """
@@ -160,14 +190,19 @@ def _mesh(element: etree._Element, robot: RobotDescription, deviation: float, wh
         mesh = creation.box(numbers(shape, "size", "0 0 0", where))
         mesh.unmerge_vertices()
     elif kind in ("cylinder", "capsule", "sphere"):
-        (radius,), (length,) = numbers(shape, "radius", "0", where), numbers(shape, "length", "0", where)
+        (radius,), (length,) = (
+            numbers(shape, "radius", "0", where),
+            numbers(shape, "length", "0", where),
+        )
         segments = segments_of(radius, deviation)
         # Made with radius 1 and scaled: trimesh drops triangles smaller than 1e-8 m^2.
         if kind == "cylinder":
             mesh = creation.revolve(_CYLINDER, sections=segments, process=False)
             mesh.vertices *= (radius, radius, length)
         else:
-            mesh = creation.capsule(length / max(radius, 1e-9), 1.0, count=((segments + 1) // 2, segments))
+            mesh = creation.capsule(
+                length / max(radius, 1e-9), 1.0, count=((segments + 1) // 2, segments)
+            )
             mesh.vertices *= radius
     else:
         return None
@@ -177,7 +212,9 @@ def _mesh(element: etree._Element, robot: RobotDescription, deviation: float, wh
     return mesh
 
 
-def _colour(element: etree._Element, colours: dict[str | None, Rgba], link: str, where: str) -> Rgba:
+def _colour(
+    element: etree._Element, colours: dict[str | None, Rgba], link: str, where: str
+) -> Rgba:
     """Return the colour of an element, or one chosen by the name of its link."""
     material = element.find("material")
     if material is not None and material.find("color") is not None:
@@ -187,7 +224,9 @@ def _colour(element: etree._Element, colours: dict[str | None, Rgba], link: str,
 
 
 def _default_colour(link: str) -> Rgba:
-    return _PALETTE[zlib.crc32(link.encode()) % len(_PALETTE)]  # the same in every run, unlike hash()
+    return _PALETTE[
+        zlib.crc32(link.encode()) % len(_PALETTE)
+    ]  # the same in every run, unlike hash()
 
 
 def _rgba(color: etree._Element, where: str) -> Rgba:

@@ -2,7 +2,8 @@
 
 Links of the URDF that fixed joints connect may be merged.
 
-A link without ``<inertial>`` has the inertia of its collision shapes. Functions take the text of a sanitised URDF.
+A link without ``<inertial>`` has the inertia of its collision shapes. Functions take the text of a
+sanitised URDF.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ class Part(NamedTuple):
 
 
 class Body(NamedTuple):
-    """Links of a simulated body, and the place of the payload in its frame (3,) [m]; None without payload."""
+    """Links of a simulated body, and the place of the payload in its frame (3,) [m]; None without
+    payload.
+    """
 
     parts: list[Part]
     payload: Float64 | None
@@ -50,7 +53,9 @@ class Body(NamedTuple):
 
 @lru_cache(maxsize=16)
 def simulated(urdf: str, separate: Separate = ()) -> Merged:
-    """Return the simulated robot, with its fixed joints merged; its text has the inertia of every link."""
+    """Return the simulated robot, with its fixed joints merged; its text has the inertia of every
+    link.
+    """
 
     def of_shapes(link: str) -> SpatialInertia:
         return inertia_of(own_shapes(urdf)[link])
@@ -65,7 +70,8 @@ def body_inertias(urdf: str, separate: Separate = ()) -> dict[str, SpatialInerti
 
 
 def center_of_mass(urdf: str, separate: Separate, link: str) -> tuple[str, Float64]:
-    """Return the simulated link that contains ``link`` of the URDF, and in its frame the center of mass of ``link``.
+    """Return the simulated link that contains ``link`` of the URDF, and in its frame the center of
+    mass of ``link``.
 
     For a link without mass that is its origin.
     """
@@ -73,8 +79,12 @@ def center_of_mass(urdf: str, separate: Separate, link: str) -> tuple[str, Float
     return at.link, at.position if inertia is None else inertia.moved(at.position, at.wxyz).center
 
 
-def varied_bodies(urdf: str, separate: Separate, carrier: str, links: Sequence[str]) -> dict[str, Body]:
-    """Return the simulated links with varying mass, by name: they contain ``links`` or ``carrier``."""
+def varied_bodies(
+    urdf: str, separate: Separate, carrier: str, links: Sequence[str]
+) -> dict[str, Body]:
+    """Return the simulated links with varying mass, by name: they contain ``links`` or
+    ``carrier``.
+    """
     loaded, place = center_of_mass(urdf, separate, carrier)
     return {
         body: Body(members, place if body == loaded else None)
@@ -84,7 +94,9 @@ def varied_bodies(urdf: str, separate: Separate, carrier: str, links: Sequence[s
 
 
 def _parts(urdf: str, separate: Separate, links: Sequence[str]) -> dict[str, list[Part]]:
-    """Return the links with mass of every simulated body; a body without any gets one part of ``NO_MASS``."""
+    """Return the links with mass of every simulated body; a body without any gets one part of
+    ``NO_MASS``.
+    """
     placements, inertias = place_links(urdf, separate), simulated(urdf, separate).inertias
     parts: dict[str, list[Part]] = defaultdict(list)
     for name, at in placements.items():
@@ -113,10 +125,14 @@ def link_masses(robot: Urdf) -> dict[str, LinkMass]:
             masses[link.name] = LinkMass(0.0, "none", 0.0, 0.0)
             continue
         inertia = SpatialInertia(given.mass, read_only(given.center), read_only(given.tensor))
-        source = "shapes" if not link.inertial else "repaired" if link.name in repaired else "inertial"
+        source = (
+            "shapes" if not link.inertial else "repaired" if link.name in repaired else "inertial"
+        )
         largest = np.linalg.eigvalsh(inertia.tensor)[-1]
         gyration = float(np.sqrt(largest / inertia.mass)) if inertia.mass > 0 else 0.0
-        masses[link.name] = LinkMass(inertia.mass, source, gyration, _size(shapes[link.name]), inertia)
+        masses[link.name] = LinkMass(
+            inertia.mass, source, gyration, _size(shapes[link.name]), inertia
+        )
     return masses
 
 
@@ -134,13 +150,16 @@ _KIND = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismat
 
 
 def rigid_tree(urdf: str, inertias: Mapping[str, SpatialInertia], **options: Any) -> RigidTree:
-    """Return the tree of a sanitised URDF with ``inertias`` of its links, by name, in the frames of the links.
+    """Return the tree of a sanitised URDF with ``inertias`` of its links, by name, in the frames of
+    the links.
 
     Links are in breadth-first order, as in SAPIEN. ``options`` are passed to :class:`RigidTree`.
     """
     root = etree.fromstring(urdf.encode())
     joints = edges_of(root)
-    (base,) = {link.get("name", "") for link in root.findall("link")} - {joint.child for joint in joints}
+    (base,) = {link.get("name", "") for link in root.findall("link")} - {
+        joint.child for joint in joints
+    }
     links = [base, *(joint.child for joint in joints)]
     of_links = [inertias.get(link, _EMPTY) for link in links]
     elements = [joint.element for joint in joints]
@@ -149,9 +168,13 @@ def rigid_tree(urdf: str, inertias: Mapping[str, SpatialInertia], **options: Any
         links=tuple(links),
         parent=np.array([-1, *(links.index(joint.parent) for joint in joints)]),
         joint_types=("fixed", *kinds),
-        joint_names=tuple(joint.name for joint, kind in zip(joints, kinds, strict=True) if kind != "fixed"),
+        joint_names=tuple(
+            joint.name for joint, kind in zip(joints, kinds, strict=True) if kind != "fixed"
+        ),
         position=np.array([_numbers(each, "origin", "xyz", "0 0 0") for each in (root, *elements)]),
-        wxyz=np.array([from_rpy(_numbers(each, "origin", "rpy", "0 0 0")) for each in (root, *elements)]),
+        wxyz=np.array(
+            [from_rpy(_numbers(each, "origin", "rpy", "0 0 0")) for each in (root, *elements)]
+        ),
         axis=np.array([_numbers(each, "axis", "xyz", "1 0 0") for each in (root, *elements)]),
         mass=np.array([inertia.mass for inertia in of_links]),
         center=np.array([inertia.center for inertia in of_links]),

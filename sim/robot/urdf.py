@@ -1,10 +1,12 @@
-"""URDF reader for headless simulation: parses safely, drops visuals, resolves meshes, lists the joints.
+"""URDF reader for headless simulation: parses safely, drops visuals, resolves meshes, lists the
+joints.
 
 An MJCF file is read as the URDF that is equivalent to it (:mod:`batchpid.sim.robot.mjcf`).
 
-SAPIEN's own loader builds render components for every ``<visual>``, which fails on a machine without a render device,
-and silently skips a collision mesh that it cannot read. The text made here has no visuals, absolute mesh paths, and no
-mimic joint: the coupling is not SAPIEN's (:mod:`batchpid.sim.engine.coupled_joints`).
+SAPIEN's own loader builds render components for every ``<visual>``, which fails on a machine
+without a render device, and silently skips a collision mesh that it cannot read. The text made here
+has no visuals, absolute mesh paths, and no mimic joint: the coupling is not SAPIEN's
+(:mod:`batchpid.sim.engine.coupled_joints`).
 """
 
 from __future__ import annotations
@@ -42,8 +44,11 @@ def is_mjcf(root: etree._Element) -> bool:
     return root.prefix is None and etree.QName(root).localname == "mujoco"
 
 
-def read_source(path: Path, fixed_base: bool, missing_meshes: str) -> tuple[etree._Element, list[Finding], Mjcf | None]:
-    """Return the root of the URDF at ``path``, or of one that is equivalent to the MJCF there, and the findings.
+def read_source(
+    path: Path, fixed_base: bool, missing_meshes: str
+) -> tuple[etree._Element, list[Finding], Mjcf | None]:
+    """Return the root of the URDF at ``path``, or of one that is equivalent to the MJCF there, and
+    the findings.
 
     The last value is the rest of an MJCF file, None for a URDF.
 
@@ -59,7 +64,9 @@ def read_source(path: Path, fixed_base: bool, missing_meshes: str) -> tuple[etre
     if not is_mjcf(root):
         return root, findings, None
     if not path.is_file():
-        raise RobotError(f"{path}: an MJCF file is read several times, also by workers; save it as a file first")
+        raise RobotError(
+            f"{path}: an MJCF file is read several times, also by workers; save it as a file first"
+        )
     try:
         import mujoco  # noqa: F401
     except ImportError as error:
@@ -69,7 +76,9 @@ def read_source(path: Path, fixed_base: bool, missing_meshes: str) -> tuple[etre
     try:
         mjcf = read_mjcf(path, root.get("model") or path.stem, fixed_base, missing_meshes)
     except UnicodeDecodeError as error:
-        raise RobotError(f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8") from error
+        raise RobotError(
+            f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"
+        ) from error
     return mjcf.root, [*findings, *mjcf.findings], mjcf
 
 
@@ -110,30 +119,47 @@ def read_urdf(
 
 
 def repair_urdf(
-    root: etree._Element, path: Path, repairs: list[Finding], package_dirs: tuple[Path, ...], missing_meshes: str
+    root: etree._Element,
+    path: Path,
+    repairs: list[Finding],
+    package_dirs: tuple[Path, ...],
+    missing_meshes: str,
 ) -> None:
     """Repair the ``<robot>`` of the file at ``path``, and append the repairs. See above."""
     if root.tag != "robot":
         problem = f"the root element is <{root.tag}>, not <robot> (URDF) or <mujoco> (MJCF)"
-        raise RobotError(f"{path}: {problem}; is this a robot's file (not SDF, xacro, a part of an MJCF)?")
+        raise RobotError(
+            f"{path}: {problem}; is this a robot's file (not SDF, xacro, a part of an MJCF)?"
+        )
     if max(len(root.findall(tag)) for tag in ("link", "joint")) > MOST_READ:
-        raise RobotError(f"{path}: has more than {MOST_READ} links or joints; remove what the robot does not need")
+        raise RobotError(
+            f"{path}: has more than {MOST_READ} links or joints; remove what the robot does not"
+            " need"
+        )
     repairs += repair(root, path)
     missing = _resolve_meshes(root, path, package_dirs)
     if missing and missing_meshes == "error":
         raise RobotError(
-            f"{path}: collision mesh not found or not readable: {', '.join(missing)}; repair the file, pass "
-            "package_dirs=[...] (--package-dirs on the command line) with the folder that holds the package, or "
-            "missing_meshes='skip' (--missing-meshes skip) to simulate without"
+            f"{path}: collision mesh not found or not readable: {', '.join(missing)}; repair the"
+            " file, pass package_dirs=[...] (--package-dirs on the command line) with the folder"
+            " that holds the package, or missing_meshes='skip' (--missing-meshes skip) to simulate"
+            " without"
         )
     if missing:
-        text = f"collision meshes not found or not readable, simulated without: {', '.join(missing)}"
-        remedy = "repair the files, or pass package_dirs=[...] to Robot.load (--package-dirs on the command line)"
+        text = (
+            f"collision meshes not found or not readable, simulated without: {', '.join(missing)}"
+        )
+        remedy = (
+            "repair the files, or pass package_dirs=[...] to Robot.load (--package-dirs on the"
+            " command line)"
+        )
         repairs.append(Finding("warning", "missing-mesh", text, remedy))
 
 
 def _resolve_meshes(root: etree._Element, path: Path, package_dirs: tuple[Path, ...]) -> list[str]:
-    """Make mesh paths absolute; drop the shapes whose file is missing or unreadable; return their names and why."""
+    """Make mesh paths absolute; drop the shapes whose file is missing or unreadable; return their
+    names and why.
+    """
     missing, check = [], cache(mesh_problem)
     for collision in root.findall("link/collision"):
         mesh = collision.find("geometry/mesh")
@@ -163,11 +189,16 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
     if axis is not None:
         fields["axis"] = numbers(axis, "xyz", "1 0 0", where)
     if limit is not None:
-        fields |= {f"{key}_limit": number(limit, key, "inf", where, limit=True) for key in ("effort", "velocity")}
+        fields |= {
+            f"{key}_limit": number(limit, key, "inf", where, limit=True)
+            for key in ("effort", "velocity")
+        }
         if kind == "continuous":
             element.remove(limit)
         else:
-            fields |= {key: number(limit, key, "0", where, limit=True) for key in ("lower", "upper")}
+            fields |= {
+                key: number(limit, key, "0", where, limit=True) for key in ("lower", "upper")
+            }
     for safety in element.findall("safety_controller"):
         element.remove(safety)
         soft = [number(safety, f"soft_{key}_limit", "0", where) for key in ("lower", "upper")]
@@ -177,7 +208,10 @@ def _read_joint(element: etree._Element, path: Path) -> Joint:
         fields[key] = number(dynamics, key, "0", where)
         dynamics.set(key, repr(fields[key]))
     if mimic is not None:
-        multiplier, offset = number(mimic, "multiplier", "1", where), number(mimic, "offset", "0", where)
+        multiplier, offset = (
+            number(mimic, "multiplier", "1", where),
+            number(mimic, "offset", "0", where),
+        )
         fields["mimic"] = Mimic(mimic.get("joint", ""), multiplier, offset)
     return Joint(name, kind, parent, child, **fields)
 
@@ -198,11 +232,17 @@ def _read_link(element: etree._Element, path: Path) -> Link:
 def _origin(element: etree._Element, where: str) -> dict[str, tuple[float, ...]]:
     """Return the position [m] and the roll, pitch and yaw [rad] of an element's ``<origin>``."""
     origin = element.find("origin")
-    return {"origin": numbers(origin, "xyz", "0 0 0", where), "rpy": numbers(origin, "rpy", "0 0 0", where)}
+    return {
+        "origin": numbers(origin, "xyz", "0 0 0", where),
+        "rpy": numbers(origin, "rpy", "0 0 0", where),
+    }
 
 
-def _breadth_first(links: list[Link], joints: list[Joint], path: Path, added: list[str]) -> list[Joint]:
-    """Return the joints level by level from the root, siblings in file order, if they form one tree.
+def _breadth_first(
+    links: list[Link], joints: list[Joint], path: Path, added: list[str]
+) -> list[Joint]:
+    """Return the joints level by level from the root, siblings in file order, if they form one
+    tree.
 
     ``added`` are links that joints name and the file does not hold.
     """
@@ -211,14 +251,25 @@ def _breadth_first(links: list[Link], joints: list[Joint], path: Path, added: li
     for joint in joints:
         below[joint.parent_link].append(joint)
     if twice := sorted(name for name, count in Counter(children).items() if count > 1):
-        raise RobotError(f"{path}: link with two parents: {', '.join(twice)}; a robot must be a tree")
+        raise RobotError(
+            f"{path}: link with two parents: {', '.join(twice)}; a robot must be a tree"
+        )
     roots = [name for name in known if name not in moved]
     if len(roots) != 1:
-        remedy = f"joints name {added}, not in the file: correct the names" if added else "a robot must be one tree"
-        raise RobotError(f"{path}: needs exactly one root link, found {roots or 'a loop'}; {remedy}")
+        remedy = (
+            f"joints name {added}, not in the file: correct the names"
+            if added
+            else "a robot must be one tree"
+        )
+        raise RobotError(
+            f"{path}: needs exactly one root link, found {roots or 'a loop'}; {remedy}"
+        )
     ordered = below[roots[0]].copy()
     for joint in ordered:
         ordered += below[joint.child_link]
     if len(ordered) != len(joints):
-        raise RobotError(f"{path}: some joints form a loop apart from the root {roots[0]!r}; a robot must be one tree")
+        raise RobotError(
+            f"{path}: some joints form a loop apart from the root {roots[0]!r}; a robot must be one"
+            " tree"
+        )
     return ordered

@@ -21,12 +21,14 @@ from batchpid.task_space.rigid_tree import RigidTree
 
 
 def to_urdf(
-    robot: RobotDescription, folder: Path | None = None, mass_factors: Mapping[str, float] | None = None
+    robot: RobotDescription,
+    folder: Path | None = None,
+    mass_factors: Mapping[str, float] | None = None,
 ) -> Exported:
     """Return the URDF of ``robot`` with its repairs, which need none again, and a list of them.
 
-    Links, joints, numbers and mimics are copied from the file unless repaired; visuals and other elements
-    without effect here are copied. Links that fixed joints connect stay apart.
+    Links, joints, numbers and mimics are copied from the file unless repaired; visuals and other
+    elements without effect here are copied. Links that fixed joints connect stay apart.
 
     Parameters
     ----------
@@ -35,8 +37,8 @@ def to_urdf(
     folder
         Of the new file: paths of meshes are relative to it. Default: absolute paths.
     mass_factors
-        Factors of the masses and inertia tensors of rigid bodies, each by the name of one of its links. The links that
-        fixed joints connect keep their shares.
+        Factors of the masses and inertia tensors of rigid bodies, each by the name of one of its
+        links. The links that fixed joints connect keep their shares.
 
     Raises
     ------
@@ -66,7 +68,9 @@ def to_urdf(
 
 
 def _scale_masses(root: etree._Element, tree: RigidTree, link: str, factor: float) -> None:
-    """Multiply mass and inertia tensor of each link of a body by ``factor``; those by shapes become numbers."""
+    """Multiply mass and inertia tensor of each link of a body by ``factor``; those by shapes become
+    numbers.
+    """
     body = tree.link_bodies[tree.index(link)]
     for index, name in enumerate(tree.links):
         if tree.link_bodies[index] != body or not tree.mass[index]:
@@ -77,14 +81,29 @@ def _scale_masses(root: etree._Element, tree: RigidTree, link: str, factor: floa
         inertial = etree.SubElement(owner, "inertial")
         etree.SubElement(inertial, "origin", xyz=" ".join(map(repr, tree.center[index].tolist())))
         etree.SubElement(inertial, "mass", value=repr(factor * float(tree.mass[index])))
-        places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-        tensor = {key: repr(factor * float(tree.inertia[index][place])) for key, place in places.items()}
+        places = {
+            "ixx": (0, 0),
+            "ixy": (0, 1),
+            "ixz": (0, 2),
+            "iyy": (1, 1),
+            "iyz": (1, 2),
+            "izz": (2, 2),
+        }
+        tensor = {
+            key: repr(factor * float(tree.inertia[index][place])) for key, place in places.items()
+        }
         etree.SubElement(inertial, "inertia", **tensor)
 
 
-def _copy_unused(source: etree._Element, root: etree._Element, path: Path, packages: tuple[Path, ...]) -> list[str]:
-    """Copy the elements without effect here into ``root``; return the visual meshes that are not found."""
-    owners = {(tag, each.get("name")): each for tag in ("link", "joint") for each in root.findall(tag)}
+def _copy_unused(
+    source: etree._Element, root: etree._Element, path: Path, packages: tuple[Path, ...]
+) -> list[str]:
+    """Copy the elements without effect here into ``root``; return the visual meshes that are not
+    found.
+    """
+    owners = {
+        (tag, each.get("name")): each for tag in ("link", "joint") for each in root.findall(tag)
+    }
     copied = set()
     missing = []
     for parent in (source, *source.findall("link"), *source.findall("joint")):
@@ -99,20 +118,36 @@ def _copy_unused(source: etree._Element, root: etree._Element, path: Path, packa
             missing.append(mesh.get("filename", ""))
         else:
             mesh.set("filename", str(found))
-    return [f"visual meshes not found, written as they were: {', '.join(sorted({*missing}))}"] if missing else []
+    return (
+        [f"visual meshes not found, written as they were: {', '.join(sorted({*missing}))}"]
+        if missing
+        else []
+    )
 
 
 def _lacking(robot: RobotDescription) -> Iterator[str]:
-    """Yield sentences about infinite limits, for which a URDF has no number, and about actuators."""
+    """Yield sentences about infinite limits, for which a URDF has no number, and about
+    actuators.
+    """
     for what, names in (
         ("effort limit", [joint.name for joint in robot.joints if math.isinf(joint.effort_limit)]),
-        ("velocity limit", [joint.name for joint in robot.joints if math.isinf(joint.velocity_limit)]),
+        (
+            "velocity limit",
+            [joint.name for joint in robot.joints if math.isinf(joint.velocity_limit)],
+        ),
     ):
         if names:
             yield f"no {what}, which other programs may require: {', '.join(names)}"
-    endless = [joint for joint in robot.joints if not joint.continuous and math.isinf(joint.upper - joint.lower)]
+    endless = [
+        joint
+        for joint in robot.joints
+        if not joint.continuous and math.isinf(joint.upper - joint.lower)
+    ]
     if endless:
         names = [joint.name for joint in endless]
-        yield f"no position limit, written as inf, which other programs may refuse: {', '.join(names)}"
+        yield (
+            "no position limit, written as inf, which other programs may refuse:"
+            f" {', '.join(names)}"
+        )
     if robot.actuators is not None:
         yield "motors and sensors (actuators) are not in a URDF"

@@ -1,7 +1,9 @@
-"""Safe reading of XML from untrusted sources: no entities, no DTD, no network, no oversized trees, no odd numbers.
+"""Safe reading of XML from untrusted sources: no entities, no DTD, no network, no oversized trees,
+no odd numbers.
 
-The options of lxml suffice: they cover the checks of ``defusedxml``, whose lxml module is deprecated. libxml2 also
-limits nesting and the size of text, unlike the parser of the standard library.
+The options of lxml suffice: they cover the checks of ``defusedxml``, whose lxml module is
+deprecated. libxml2 also limits nesting and the size of text, unlike the parser of the standard
+library.
 """
 
 from __future__ import annotations
@@ -16,23 +18,29 @@ from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 
 SIZE_LIMIT = 2**25  # bytes of a file; its tree takes about ten times as much memory
-LFS_POINTER = b"version https://git-lfs"  # beginning of the file that git-lfs puts in place of another
+LFS_POINTER = (  # beginning of the file that git-lfs puts in place of another
+    b"version https://git-lfs"
+)
 MOST_PREFIXES = 100  # of namespaces that nobody declared
 LARGEST = 1e18  # magnitude of a number whose square fits in PhysX's single precision
 LARGEST_LIMIT = 3.4e38  # magnitude of a finite joint limit, which is compared and not multiplied
 
 
 def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Element:
-    """Return the root element of the file at ``path``, without comments and processing instructions.
+    """Return the root element of the file at ``path``, without comments and processing
+    instructions.
 
-    A file that is almost XML is read by :func:`_lenient`, which appends a finding to ``repairs``. Raises RobotError if
-    the file cannot be read, is larger than SIZE_LIMIT, is not well-formed, or has a DTD.
+    A file that is almost XML is read by :func:`_lenient`, which appends a finding to ``repairs``.
+    Raises RobotError if the file cannot be read, is larger than SIZE_LIMIT, is not well-formed, or
+    has a DTD.
     """
     try:
         with open(path, "rb") as file:
             data = file.read(SIZE_LIMIT + 1)
         if len(data) > SIZE_LIMIT:
-            raise RobotError(f"{path}: larger than {SIZE_LIMIT >> 20} MiB; remove what the robot does not need")
+            raise RobotError(
+                f"{path}: larger than {SIZE_LIMIT >> 20} MiB; remove what the robot does not need"
+            )
         if data.startswith(LFS_POINTER):
             raise RobotError(f"{path}: a git-lfs pointer instead of the file; run git lfs pull")
         root = _parse(data)
@@ -40,14 +48,21 @@ def parse_xml(path: Path, repairs: list[Finding] | None = None) -> etree._Elemen
         try:
             root = _lenient(data)
         except etree.XMLSyntaxError:
-            raise RobotError(f"{path}: not well-formed XML: {error.msg}; correct the file at that line") from error
+            raise RobotError(
+                f"{path}: not well-formed XML: {error.msg}; correct the file at that line"
+            ) from error
         if repairs is not None:
             text = f"not well-formed XML: {error.msg}; read as if that were correct"
             repairs.append(Finding("warning", "xml", text, "correct the file at that line"))
     except OSError as error:
-        raise RobotError(f"{path}: cannot be read: {error}; check that it is a readable text file") from error
+        raise RobotError(
+            f"{path}: cannot be read: {error}; check that it is a readable text file"
+        ) from error
     if root.getroottree().docinfo.internalDTD is not None:
-        raise RobotError(f"{path}: a DTD or entity declaration is refused for safety; remove the <!DOCTYPE> lines")
+        raise RobotError(
+            f"{path}: a DTD or entity declaration is refused for safety; remove the <!DOCTYPE>"
+            " lines"
+        )
     _drop_default_namespace(root)
     return root
 
@@ -67,21 +82,27 @@ def _parse(data: bytes) -> etree._Element:
 
 
 def _lenient(data: bytes) -> etree._Element:
-    """Return the first ``<robot>``, or other element, of a file with faults in its XML that other readers accept.
+    """Return the first ``<robot>``, or other element, of a file with faults in its XML that other
+    readers accept.
 
-    Accepted faults are: text or comments before the declaration or after the root, a wrong encoding, ``--`` in
-    comments, ``&`` alone, and prefixes of namespaces that nobody declared.
+    Accepted faults are: text or comments before the declaration or after the root, a wrong
+    encoding, ``--`` in comments, ``&`` alone, and prefixes of namespaces that nobody declared.
     """
     utf16 = data.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
         text = data.decode("utf-16" if utf16 else "utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("latin-1")
-    for start, end in (("<!--", "-->"), ("<?", "?>")):  # comments and processing instructions, in linear time
+    for start, end in (
+        ("<!--", "-->"),
+        ("<?", "?>"),
+    ):  # comments and processing instructions, in linear time
         first, *rest = text.split(start)
         text = first + "".join(part.partition(end)[2] for part in rest)
     text = re.sub(r"&(?!\w+;|#)", "&amp;", text)
-    prefixes = sorted(set(re.findall(r"[<\s]([A-Za-z_]\w{0,40}):", text)) - {"xml", "xmlns"})[:MOST_PREFIXES]
+    prefixes = sorted(set(re.findall(r"[<\s]([A-Za-z_]\w{0,40}):", text)) - {"xml", "xmlns"})[
+        :MOST_PREFIXES
+    ]
     declared = " ".join(f'xmlns:{prefix}="urn:{prefix}"' for prefix in prefixes)
     wrapper = _parse(f"<file {declared}>{text}</file>".encode(errors="replace"))
     root = wrapper.find("{*}robot")
@@ -96,10 +117,11 @@ def _lenient(data: bytes) -> etree._Element:
 def numbers(
     element: etree._Element | None, key: str, default: str, where: str, limit: bool = False
 ) -> tuple[float, ...]:
-    """Return the numbers in an attribute, as many as there are in ``default``, which replaces a missing or empty one.
+    """Return the numbers in an attribute, as many as there are in ``default``, which replaces a
+    missing or empty one.
 
-    Raises a RobotError, whose message begins with ``where``, unless they are finite and at most LARGEST in magnitude;
-    numbers of a joint ``limit`` may be up to LARGEST_LIMIT or infinite.
+    Raises a RobotError, whose message begins with ``where``, unless they are finite and at most
+    LARGEST in magnitude; numbers of a joint ``limit`` may be up to LARGEST_LIMIT or infinite.
     """
     values = readable(element, key, default, limit)
     if values is None:
@@ -107,12 +129,16 @@ def numbers(
     return values
 
 
-def number(element: etree._Element | None, key: str, default: str, where: str, limit: bool = False) -> float:
+def number(
+    element: etree._Element | None, key: str, default: str, where: str, limit: bool = False
+) -> float:
     """Return the number in an attribute; see :func:`numbers`."""
     return numbers(element, key, default, where, limit)[0]
 
 
-def readable(element: etree._Element | None, key: str, default: str, limit: bool = False) -> tuple[float, ...] | None:
+def readable(
+    element: etree._Element | None, key: str, default: str, limit: bool = False
+) -> tuple[float, ...] | None:
     """Return the numbers in an attribute, or None where :func:`numbers` raises."""
     given = default if element is None else element.get(key, default)
     words = (given if given.strip() else default).split()
@@ -127,8 +153,12 @@ def readable(element: etree._Element | None, key: str, default: str, limit: bool
     return values if fits and len(values) == len(words) == len(default.split()) else None
 
 
-def fault(element: etree._Element | None, key: str, default: str, limit: bool = False) -> str | None:
-    """Return the reason for which :func:`numbers` raises, which quotes the attribute, or None where it does not."""
+def fault(
+    element: etree._Element | None, key: str, default: str, limit: bool = False
+) -> str | None:
+    """Return the reason for which :func:`numbers` raises, which quotes the attribute, or None where
+    it does not.
+    """
     if element is None or readable(element, key, default, limit) is not None:
         return None
     count = len(default.split())

@@ -39,17 +39,20 @@ OPTIONAL = {
 
 
 class OperationalSpace:
-    """Controller for ``Runner(control=...)``: the law of :mod:`batchpid.task_space.operational_space`.
+    """Controller for ``Runner(control=...)``: the law of
+    :mod:`batchpid.task_space.operational_space`.
 
-    A setpoint is a pose of the tool in the world (7,): position [m] and quaternion (w, x, y, z). The quaternion is
-    normalised: its length and sign have no effect; one of length 0 has no direction, and fails its env. Further entries
-    are the tool's twist, acceleration and wrench (6,), where these are True, and the positions of ``joints``.
+    A setpoint is a pose of the tool in the world (7,): position [m] and quaternion (w, x, y, z).
+    The quaternion is normalised: its length and sign have no effect; one of length 0 has no
+    direction, and fails its env. Further entries are the tool's twist, acceleration and wrench
+    (6,), where these are True, and the positions of ``joints``.
 
-    The bias is the runner's passive force, as ``compensate`` selects, plus the efforts of the joints' known damping and
-    friction. Friction is compensated for the motion to the setpoint. Its direction is dq = J^T (J J^T + 1e-4)^-1 e,
-    with the error e of the pose. Jacobian and mass matrix are computed from ``tree``.
-    The state is the posture of each env, which a reset restores, and the integral. An env that has failed holds the
-    pose of the posture. A runner sets time step and ``compensate``; elsewhere they are 1/2000 s and "none".
+    The bias is the runner's passive force, as ``compensate`` selects, plus the efforts of the
+    joints' known damping and friction. Friction is compensated for the motion to the setpoint. Its
+    direction is dq = J^T (J J^T + 1e-4)^-1 e, with the error e of the pose. Jacobian and mass
+    matrix are computed from ``tree``. The state is the posture of each env, which a reset restores,
+    and the integral. An env that has failed holds the pose of the posture. A runner sets time step
+    and ``compensate``; elsewhere they are 1/2000 s and "none".
 
     Parameters
     ----------
@@ -60,13 +63,15 @@ class OperationalSpace:
     point
         Tool in the link's frame (3,) [m]; default its origin.
     twist, acceleration
-        Whether setpoints give the velocity of the tool (m/s and rad/s), and its acceleration, in the world: a tool that
-        moves follows its setpoint without the delay kd/kp, and on a circle without the error r w^2/kp.
+        Whether setpoints give the velocity of the tool (m/s and rad/s), and its acceleration, in
+        the world: a tool that moves follows its setpoint without the delay kd/kp, and on a circle
+        without the error r w^2/kp.
     wrench
-        Whether setpoints give the wrench of the tool on its surroundings (N and N m), in the axes of the params' frame.
+        Whether setpoints give the wrench of the tool on its surroundings (N and N m), in the axes
+        of the params' frame.
     joints
-        Joints outside the chain to the link, such as fingers, whose positions are part of the setpoint; others hold
-        their posture.
+        Joints outside the chain to the link, such as fingers, whose positions are part of the
+        setpoint; others hold their posture.
     posture
         Joint positions (dof,) that the null space is drawn to; default ``robot.start``.
     tree
@@ -74,8 +79,8 @@ class OperationalSpace:
     params
         Params of one row, in place of ``options``.
     options
-        Options of :func:`batchpid.task_space.make_osc_params`, one row for all envs; ``effort_limit`` is by default
-        the robot's.
+        Options of :func:`batchpid.task_space.make_osc_params`, one row for all envs;
+        ``effort_limit`` is by default the robot's.
 
     Raises
     ------
@@ -106,25 +111,41 @@ class OperationalSpace:
         """Model of the robot."""
         self.link = link
         """Link that carries the tool."""
-        self.point = None if point is None else array("point", point, (1, 3), "xyz", kind="entry")[0]
+        self.point = (
+            None if point is None else array("point", point, (1, 3), "xyz", kind="entry")[0]
+        )
         """Tool in the link's frame (3,) [m]; None for its origin."""
         _check_coupling(tree, robot)
-        given = array("posture", robot.start if posture is None else posture, (1, tree.dof), tree.joint_names)
+        given = array(
+            "posture", robot.start if posture is None else posture, (1, tree.dof), tree.joint_names
+        )
         self._posture = robot.coupled(given)
         if params is None:
             if not {"effort_limit", "effort_min", "effort_max"} & set(options):
                 options["effort_limit"] = robot.effort_limit
             params = ts.make_osc_params(tree, **options)
         elif options:
-            problem, remedy = "are given together with params", "give them to the function that makes the params"
+            problem, remedy = (
+                "are given together with params",
+                "give them to the function that makes the params",
+            )
             raise InvalidArgumentError(next(iter(options)), problem, remedy=remedy)
-        params = _of_one_row(instance("params", params, ts.OSCParams, "make them with make_osc_params()"))
+        params = _of_one_row(
+            instance("params", params, ts.OSCParams, "make them with make_osc_params()")
+        )
         if (params.posture_stiffness * ~tree.independent).any():
-            problem = "are for a tree without the coupling of the joints: followers have a posture stiffness"
-            raise InvalidArgumentError("params", problem, remedy="make them with robot.kinematic_tree()")
+            problem = (
+                "are for a tree without the coupling of the joints: followers have a posture"
+                " stiffness"
+            )
+            raise InvalidArgumentError(
+                "params", problem, remedy="make them with robot.kinematic_tree()"
+            )
         self._params = params
         self._k, self._timestep = ts.discretise(params, 1 / 2000), 1 / 2000
-        self._friction: tuple[Array, Array] | None = None  # Coulomb's, and the band of errors in which it is reduced
+        self._friction: tuple[Array, Array] | None = (
+            None  # Coulomb's, and the band of errors in which it is reduced
+        )
         # Damping and friction that the robot is known to have: the law acts against them.
         modelled, known = DISSIPATION[robot.dissipation].modelled, known_joints(robot)
         damping = known.viscous + np.array([joint.damping * modelled for joint in robot.joints])
@@ -133,10 +154,15 @@ class OperationalSpace:
         band = np.array([BAND[unit] for unit in robot.units])
         self._known_friction = (coulomb[None], band[None]) if coulomb.any() else None
         chain = tree.chain(link)
-        # A setpoint has the pose (7), then the optional twist, acceleration and wrench (6 each), then single joints.
+        # A setpoint has the pose (7), then the optional twist, acceleration and wrench (6 each),
+        # then single joints.
         self._columns = np.zeros(tree.dof, np.intp)  # of the setpoint, for each joint; 0 for none
         entries, self._parts = dict(POSE_UNITS), dict[str, slice]()
-        for name, wanted in {"twist": twist, "acceleration": acceleration, "wrench": wrench}.items():
+        for name, wanted in {
+            "twist": twist,
+            "acceleration": acceleration,
+            "wrench": wrench,
+        }.items():
             if flag(name, wanted):
                 (words, linear, angular), first = OPTIONAL[name], len(entries)
                 entries |= zip(words.split(), [linear] * 3 + [angular] * 3, strict=True)
@@ -146,9 +172,13 @@ class OperationalSpace:
             joint = tree.joint_names.index(choice("joints", name, tree.joint_names))
             if chain[joint]:
                 remedy = "name joints outside the chain, such as fingers"
-                raise InvalidArgumentError("joints", f"the pose of {link!r} controls it", joint=name, remedy=remedy)
+                raise InvalidArgumentError(
+                    "joints", f"the pose of {link!r} controls it", joint=name, remedy=remedy
+                )
             if not tree.independent[joint]:
-                raise InvalidArgumentError("joints", "follows another joint", joint=name, remedy="name its leader")
+                raise InvalidArgumentError(
+                    "joints", "follows another joint", joint=name, remedy="name its leader"
+                )
             self._columns[joint] = column
         units = dict(zip(robot.joint_names, robot.units, strict=True)) if joints else {}
         entries |= {name: units[name] for name in joints}
@@ -166,10 +196,14 @@ class OperationalSpace:
     @property
     def version(self) -> str:
         """Digest of all that the law depends on, besides the robot."""
-        return digest(self.link, self.point, self._posture, self._params, self.tree, self.command.names)
+        return digest(
+            self.link, self.point, self._posture, self._params, self.tree, self.command.names
+        )
 
     def __repr__(self) -> str:
-        return summary(type(self).__name__, [self.link, "setpoints " + " ".join(self.command.names)])
+        return summary(
+            type(self).__name__, [self.link, "setpoints " + " ".join(self.command.names)]
+        )
 
     def init(self, robot: Robot, num_envs: int) -> ts.OSCState:
         """Return the state of ``num_envs`` envs.
@@ -180,8 +214,13 @@ class OperationalSpace:
             The robot has other joints than the one of this controller.
         """
         if robot.joint_names != self.tree.joint_names:
-            problem = f"was made for the joints {', '.join(self.tree.joint_names)}, but the runner's robot has others"
-            raise InvalidArgumentError("control", problem, remedy="make it for the robot of the runner")
+            problem = (
+                f"was made for the joints {', '.join(self.tree.joint_names)}, but the runner's"
+                " robot has others"
+            )
+            raise InvalidArgumentError(
+                "control", problem, remedy="make it for the robot of the runner"
+            )
         return ts.init(self._params, np.repeat(self._posture, num_envs, axis=0))
 
     def __call__(
@@ -204,18 +243,28 @@ class OperationalSpace:
         xp = namespace(setpoint, qpos)
         aimed = state
         if self._columns.any():
-            aimed = state._replace(posture=xp.where(self._columns > 0, setpoint[:, self._columns], state.posture))
-        dynamics = ts.task_dynamics(self.tree, qpos, qvel, self.link, point=self.point, bias=passive)
+            aimed = state._replace(
+                posture=xp.where(self._columns > 0, setpoint[:, self._columns], state.posture)
+            )
+        dynamics = ts.task_dynamics(
+            self.tree, qpos, qvel, self.link, point=self.point, bias=passive
+        )
         parts, feedforward = {name: setpoint[:, part] for name, part in self._parts.items()}, None
         if self._damping is not None:
             feedforward = self._damping * qvel
             added = self._timestep * (self._damping[:, None] * xp.eye(qpos.shape[1]))
-            dynamics = dynamics._replace(mass_matrix=dynamics.mass_matrix + added.astype(qpos.dtype))
+            dynamics = dynamics._replace(
+                mass_matrix=dynamics.mass_matrix + added.astype(qpos.dtype)
+            )
         if self._friction is not None:
-            friction = self._friction_to(setpoint, parts.get("twist"), aimed.posture, qpos, dynamics)
+            friction = self._friction_to(
+                setpoint, parts.get("twist"), aimed.posture, qpos, dynamics
+            )
             feedforward = friction if feedforward is None else feedforward + friction
         inputs = ts.OSCInputs(setpoint[:, :7], qpos, qvel, **parts, feedforward=feedforward)
-        new, terms = ts.osc(self._coefficients(setpoint), aimed, dynamics, inputs, ("effort", "unsaturated"))
+        new, terms = ts.osc(
+            self._coefficients(setpoint), aimed, dynamics, inputs, ("effort", "unsaturated")
+        )
         return new._replace(posture=state.posture), terms.effort, terms.effort != terms.unsaturated
 
     @property
@@ -224,11 +273,15 @@ class OperationalSpace:
         return type(self) is OperationalSpace
 
     def bound(self, qpos: Array, qvel: Array, passive: Array) -> BoundOSC | None:
-        """Return this controller as a native call on these arrays (envs, dof); None where it must run in Python."""
+        """Return this controller as a native call on these arrays (envs, dof); None where it must
+        run in Python.
+        """
         if not self.is_native or native_rows.in_use() is None:
             return None
         given = self._parts, self._columns, self._damping, self._friction, self._timestep
-        return BoundOSC(self._k, ts.Tool(self.tree, self.link, self.point), *given, (qpos, qvel, passive))
+        return BoundOSC(
+            self._k, ts.Tool(self.tree, self.link, self.point), *given, (qpos, qvel, passive)
+        )
 
     def _coefficients(self, setpoint: Array) -> ts.OSCCoefficients:
         """Return the coefficients of the law for setpoints (envs, size)."""
@@ -237,7 +290,9 @@ class OperationalSpace:
     def _friction_to(
         self, setpoint: Array, twist: Array, posture: Array, qpos: Array, dynamics: ts.TaskDynamics
     ) -> Array:
-        """Return the friction (envs, dof) on the way to the setpoint; joints outside the chain go to ``posture``."""
+        """Return the friction (envs, dof) on the way to the setpoint; joints outside the chain go
+        to ``posture``.
+        """
         assert self._friction is not None
         arrays = {"pose": dynamics.pose, "jacobian": dynamics.jacobian, "chain": dynamics.chain}
         arrays |= {"setpoint": setpoint[:, :7], "twist": twist, "posture": posture, "qpos": qpos}
@@ -255,7 +310,9 @@ class OperationalSpace:
         return compensation(coulomb, chain * moved + (1 - chain) * others, None, band)
 
     def in_runner(self, timestep: float, compensate: str) -> OperationalSpace:
-        """Return this controller for the time step [s] and the option ``compensate`` of a runner."""
+        """Return this controller for the time step [s] and the option ``compensate`` of a
+        runner.
+        """
         other = copy(self)
         other._k, other._timestep = ts.discretise(self._params, timestep), timestep
         other._friction = self._known_friction if "friction" in compensate.split("+") else None
@@ -273,9 +330,10 @@ class OperationalSpace:
             ratio = (kp * dt * dt + 2 * kd * dt)[0] / 4
             if ratio[worst := int(ratio.argmax())] > 1:
                 warn(
-                    f"{name}, {columns[worst]!r}: {kp[0, worst]:g} with damping {kd[0, worst]:g} is {ratio[worst]:.3g} "
-                    f"times the stability bound of the sampled loop at a time step of {dt:g} s; use less, a smaller "
-                    f"timestep, or discretization='implicit'",
+                    f"{name}, {columns[worst]!r}: {kp[0, worst]:g} with damping {kd[0, worst]:g} is"
+                    f" {ratio[worst]:.3g} times the stability bound of the sampled loop at a time"
+                    f" step of {dt:g} s; use less, a smaller timestep, or"
+                    " discretization='implicit'",
                     StabilityWarning,
                 )
 
@@ -285,7 +343,9 @@ class OperationalSpace:
 
 
 def default_tool(robot: Robot) -> str:
-    """Return the last link of the robot's longest chain, or the hand if that chain ends in fingers."""
+    """Return the last link of the robot's longest chain, or the hand if that chain ends in
+    fingers.
+    """
     return robot.rigid_tree.tool
 
 
@@ -296,16 +356,22 @@ def tool_pose(tree: ts.RigidTree, link: str, point: Array, qpos: Array) -> NDArr
 
 def _check_coupling(tree: ts.RigidTree, robot: Robot) -> None:
     """Raise InvalidArgumentError if ``tree`` has another coupling of the joints than ``robot``."""
-    ours, theirs = ((each.leader, each.multiplier, each.offset) for each in (robot.coupling, tree.coupling))
+    ours, theirs = (
+        (each.leader, each.multiplier, each.offset) for each in (robot.coupling, tree.coupling)
+    )
     if not all(map(np.array_equal, ours, theirs)):
         problem = f"has {tree.coupling}, but the robot {robot.coupling}"
         raise InvalidArgumentError("tree", problem, remedy="pass robot.kinematic_tree(...)")
 
 
 def _of_one_row(params: ts.OSCParams) -> ts.OSCParams:
-    """Return a copy; raise InvalidArgumentError for options that differ by env: a controller gets any group of envs."""
+    """Return a copy; raise InvalidArgumentError for options that differ by env: a controller gets
+    any group of envs.
+    """
     for name, leaf in params._asdict().items():
         if isinstance(leaf, np.ndarray) and len(leaf) > 1:
             problem = f"has rows for {len(leaf)} envs"
-            raise InvalidArgumentError(name, problem, remedy="give one row: a controller is called for groups of envs")
+            raise InvalidArgumentError(
+                name, problem, remedy="give one row: a controller is called for groups of envs"
+            )
     return frozen(params)

@@ -18,16 +18,21 @@ class Weights:
     overshoot: float = 1.0
     """Weight of log(1 + overshoot / 5 %): one move out of reach must not outweigh all others."""
     late: float = 4.0
-    """Weight of log(1 + excess of the settling time over the time asked for / 5 %), of a move's last joint."""
+    """Weight of log(1 + excess of the settling time over the time asked for / 5 %), of a move's
+    last joint.
+    """
     final: float = 2.0
     """Weight of log(1 + final error / least half width of the settling band)."""
     chatter: float = 0.3
-    """Weight of log(variation of the effort / variation in the smooth move), if that is positive."""
+    """Weight of log(variation of the effort / variation in the smooth move), if that is
+    positive.
+    """
     saturation: float = 3.0
     """Weight of the share of time for which the effort is saturated."""
     following: float = 1.0
-    """Weight of log(1 + following error / 10 times the least half width of the settling band), where moves are smooth
-    motions of the setpoint; 0: steps alone."""
+    """Weight of log(1 + following error / 10 times the least half width of the settling band),
+    where moves are smooth motions of the setpoint; 0: steps alone.
+    """
 
     def __post_init__(self) -> None:
         for entry in fields(self):

@@ -1,7 +1,9 @@
-"""Evaluation of gains: a set of moves, each in a separate env, all at once, with metrics of every joint.
+"""Evaluation of gains: a set of moves, each in a separate env, all at once, with metrics of every
+joint.
 
-A move is made in two ways: as a step of the setpoint, which shows how fast and how cleanly it is approached, and as a
-minimum-jerk motion of the setpoint, with its rate, which shows how closely it is followed.
+A move is made in two ways: as a step of the setpoint, which shows how fast and how cleanly it is
+approached, and as a minimum-jerk motion of the setpoint, with its rate, which shows how closely it
+is followed.
 """
 
 from __future__ import annotations
@@ -36,35 +38,53 @@ from batchpid.sim.tuning.moves import (
 from batchpid.trajectories import minimum_jerk
 
 SUBSTEPS = 5
-"""Sim steps of a tick: an odd number, so that an effort that alternates from step to step shows in the samples."""
+"""Sim steps of a tick: an odd number, so that an effort that alternates from step to step shows in
+the samples.
+"""
 SETTLE_SECONDS, SETTLE_SLACK = 1.0, 1.2
-"""A move should settle within a second, or within this multiple of the shortest that its effort limits allow."""
+"""A move should settle within a second, or within this multiple of the shortest that its effort
+limits allow.
+"""
 MAX_ERROR, MAX_CHATTER = 1e-3, 2.0
 """Demands on the steady-state error [rad or m] and on the chatter."""
-CRITERIA = ("moves that settle too late", "moves that miss a demand", "largest excess over a demand")
+CRITERIA = (
+    "moves that settle too late",
+    "moves that miss a demand",
+    "largest excess over a demand",
+)
 """Criteria that rank two sets of gains, the most important first."""
 POSES = 3
-"""Number of poses, starts and targets of moves, at which the stability of each draw is evaluated."""
+"""Number of poses, starts and targets of moves, at which the stability of each draw is
+evaluated.
+"""
 
 
 class Evaluation(NamedTuple):
-    """Performance of a set of gains on a set of moves; arrays are (moves, dof) unless said otherwise."""
+    """Performance of a set of gains on a set of moves; arrays are (moves, dof) unless said
+    otherwise.
+    """
 
     name: str
     moves: Moves
     rollout: Rollout
     metrics: StepMetrics
     chatter: Float64
-    """Total variation of the effort, over the variation in a smooth (minimum-jerk) motion of the same duration."""
+    """Total variation of the effort, over the variation in a smooth (minimum-jerk) motion of the
+    same duration.
+    """
     settling_limit: Float64
     """Settling time asked for (moves,) [s]."""
     following_error: Float64 | None = None
-    """Largest error on the same moves as smooth motions [rad or m]: :func:`following_error`; None if not asked for."""
+    """Largest error on the same moves as smooth motions [rad or m]: :func:`following_error`; None
+    if not asked for.
+    """
 
     def demands(self, joints: NDArray[np.bool_]) -> dict[str, Float64]:
-        """Return the figure of each demand on ``joints`` (dof,), in units of its limit (moves, dof); 0 elsewhere.
+        """Return the figure of each demand on ``joints`` (dof,), in units of its limit (moves,
+        dof); 0 elsewhere.
 
-        Settling within ``settling_limit``, overshoot <= 5 %, steady-state error <= 1e-3, chatter <= 2.
+        Settling within ``settling_limit``, overshoot <= 5 %, steady-state error <= 1e-3, chatter <=
+        2.
         """
         figures = {
             "settling time": self.metrics.settling_time / self.settling_limit[:, None],
@@ -82,26 +102,35 @@ class Evaluation(NamedTuple):
         drawbacks = []
         for demand, excess in self.demands(joints).items():
             for move, joint in np.argwhere(excess > 1):
-                where = f"move {self.moves.names[move]!r}, joint {self.rollout.info.joint_names[joint]!r}"
+                where = (
+                    f"move {self.moves.names[move]!r}, joint"
+                    f" {self.rollout.info.joint_names[joint]!r}"
+                )
                 text = f"{demand} of {where}: {excess[move, joint]:.2f} x limit"
                 drawbacks.append((float(excess[move, joint]), text))
         return [text for _, text in sorted(drawbacks, reverse=True)]
 
     def drawback(self, other: Evaluation, joints: NDArray[np.bool_]) -> str | None:
-        """Return the criterion by which these gains are worse than ``other``, with both figures, or None.
+        """Return the criterion by which these gains are worse than ``other``, with both figures, or
+        None.
 
-        The first of :data:`CRITERIA` in which the two differ decides, over the :meth:`demands` on ``joints`` (dof,).
+        The first of :data:`CRITERIA` in which the two differ decides, over the :meth:`demands` on
+        ``joints`` (dof,).
         """
         ranks = self._rank(joints), other._rank(joints)
         if ranks[0] <= ranks[1]:
             return None
         index, criterion = next(
-            (index, criterion) for index, criterion in enumerate(CRITERIA) if ranks[0][index] != ranks[1][index]
+            (index, criterion)
+            for index, criterion in enumerate(CRITERIA)
+            if ranks[0][index] != ranks[1][index]
         )
         figures = [
-            evaluation.shortfalls(joints)[0]
-            if criterion == CRITERIA[-1]
-            else f"{rank[index]} of {len(evaluation.moves.start)}"
+            (
+                evaluation.shortfalls(joints)[0]
+                if criterion == CRITERIA[-1]
+                else f"{rank[index]} of {len(evaluation.moves.start)}"
+            )
             for evaluation, rank in zip((self, other), ranks, strict=True)
         ]
         return f"{criterion}: {self.name} {figures[0]}, {other.name} {figures[1]}"
@@ -113,11 +142,14 @@ class Evaluation(NamedTuple):
         return int(late.sum()), int((excess > 1).sum()), max(1.0, float(excess.max(initial=0.0)))
 
 
-def step_response_metrics(robot: Robot, rollout: Rollout, start: Rows, *, with_effort: bool = True) -> StepMetrics:
-    """Return the metrics of a rollout from rest at ``start`` (envs, dof); inf for envs that diverged.
+def step_response_metrics(
+    robot: Robot, rollout: Rollout, start: Rows, *, with_effort: bool = True
+) -> StepMetrics:
+    """Return the metrics of a rollout from rest at ``start`` (envs, dof); inf for envs that
+    diverged.
 
-    Followers have the metrics of their leaders. Without ``with_effort`` the metrics of efforts are undefined (NaN), as
-    under control "drive".
+    Followers have the metrics of their leaders. Without ``with_effort`` the metrics of efforts are
+    undefined (NaN), as under control "drive".
     """
     if (command := rollout.info.own_command) is not None:
         problem, remedy = (
@@ -139,10 +171,11 @@ def step_response_metrics(robot: Robot, rollout: Rollout, start: Rows, *, with_e
 
 
 def following_error(robot: Robot, rollout: Rollout) -> Float64:
-    """Return the largest |qpos - setpoint| at the ends of the ticks (envs, dof) [rad or m]; inf for envs that diverged.
+    """Return the largest |qpos - setpoint| at the ends of the ticks (envs, dof) [rad or m]; inf for
+    envs that diverged.
 
-    A setpoint and its rate hold at the end of their tick, so the error of an ideal loop is 0. Followers have the error
-    of their leaders. The errors of continuous joints are modulo 2 pi.
+    A setpoint and its rate hold at the end of their tick, so the error of an ideal loop is 0.
+    Followers have the error of their leaders. The errors of continuous joints are modulo 2 pi.
     """
     error = rollout.qpos - rollout.setpoint
     error = np.abs(np.where(robot.continuous, error - TURN * np.rint(error / TURN), error))
@@ -150,9 +183,11 @@ def following_error(robot: Robot, rollout: Rollout) -> Float64:
 
 
 def arm_joints(robot: Robot) -> NDArray[np.bool_]:
-    """Return which joints belong to the arm (dof,): those that carry more than one leaf link, so no fingers.
+    """Return which joints belong to the arm (dof,): those that carry more than one leaf link, so no
+    fingers.
 
-    Followers do not count. A robot with fewer than three such joints (legs, a bare chain) is all arm.
+    Followers do not count. A robot with fewer than three such joints (legs, a bare chain) is all
+    arm.
     """
     above = {joint.child_link: joint for joint in robot.all_joints}
     leaves = Counter[str]()
@@ -165,7 +200,9 @@ def arm_joints(robot: Robot) -> NDArray[np.bool_]:
 
 
 def settling_limits(robot: Robot, moves: Moves) -> Float64:
-    """Return the settling time asked for on each move (moves,) [s]: a second, or 1.2 times the shortest motion."""
+    """Return the settling time asked for on each move (moves,) [s]: a second, or 1.2 times the
+    shortest motion.
+    """
     return np.maximum(SETTLE_SECONDS, SETTLE_SLACK * shortest_durations(robot, moves))
 
 
@@ -178,13 +215,16 @@ def run_moves(
     *,
     durations: NDArray[np.float64] | None = None,
 ) -> tuple[Rollout, StepMetrics]:
-    """Run ``moves``, one per env, from rest for ``seconds``, two ticks at least; return the rollout and its metrics.
+    """Run ``moves``, one per env, from rest for ``seconds``, two ticks at least; return the rollout
+    and its metrics.
 
-    ``progress`` wraps the range of ticks, e.g. ``tqdm.tqdm``. ``streams`` (moves,) are streams of the runner's
-    randomization, by default one for each move, so that the draws are the same at every call.
+    ``progress`` wraps the range of ticks, e.g. ``tqdm.tqdm``. ``streams`` (moves,) are streams of
+    the runner's randomization, by default one for each move, so that the draws are the same at
+    every call.
 
-    A move is a step of the setpoint, or, where ``durations`` (moves,) [s] are above 0, a minimum-jerk motion of that
-    duration, or its beginning, with setpoint rates. Raises InvalidArgumentError if ``seconds`` are out of range.
+    A move is a step of the setpoint, or, where ``durations`` (moves,) [s] are above 0, a
+    minimum-jerk motion of that duration, or its beginning, with setpoint rates. Raises
+    InvalidArgumentError if ``seconds`` are out of range.
     """
     seconds = number("seconds", seconds, 1e-6, 1e6, "simulated time, s")
     tick = runner.timestep * runner.substeps
@@ -192,13 +232,17 @@ def run_moves(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SetpointWarning)
         randomized = runner.options.randomization is not None
-        start = runner.reset(moves.start, seed=(0 if streams is None else streams) if randomized else None)
+        start = runner.reset(
+            moves.start, seed=(0 if streams is None else streams) if randomized else None
+        )
         setpoints, further = np.broadcast_to(moves.target, (ticks, *moves.target.shape)), {}
         if durations is not None:
             total = np.maximum(durations, tick)[:, None]
             began = start.qpos.astype(np.float64) if randomized else moves.start
             motion = minimum_jerk(began, moves.target, tick, duration=total)
-            rows = np.minimum(np.arange(ticks), motion.ticks - 1)  # the last one holds the target, at rest
+            rows = np.minimum(
+                np.arange(ticks), motion.ticks - 1
+            )  # the last one holds the target, at rest
             smooth = durations[:, None] > 0
             setpoints = np.where(smooth, motion.position[rows], setpoints)
             further["setpoint_rates"] = np.where(smooth, motion.velocity[rows], 0.0)
@@ -219,13 +263,16 @@ def evaluate_gains(
     follow: bool = False,
     **runner_options: Any,
 ) -> Evaluation:
-    """Run ``moves`` from rest for ``seconds`` under ``params``, all at once, and return the metrics of every joint.
+    """Run ``moves`` from rest for ``seconds`` under ``params``, all at once, and return the metrics
+    of every joint.
 
-    ``params`` have one row for all moves, or one row per move; ``runner_options`` go to :class:`batchpid.sim.Runner`.
-    With ``follow`` the moves are made once more, as smooth motions of :func:`smooth_durations`, of which the first
-    ``seconds`` are run, with setpoint rates.
+    ``params`` have one row for all moves, or one row per move; ``runner_options`` go to
+    :class:`batchpid.sim.Runner`. With ``follow`` the moves are made once more, as smooth motions of
+    :func:`smooth_durations`, of which the first ``seconds`` are run, with setpoint rates.
     """
-    with Runner(robot, len(moves.start), params=params, **{"substeps": SUBSTEPS, **runner_options}) as runner:
+    with Runner(
+        robot, len(moves.start), params=params, **{"substeps": SUBSTEPS, **runner_options}
+    ) as runner:
         rollout, metrics = run_moves(runner, moves, seconds)
         followed = None
         if follow:
@@ -233,7 +280,9 @@ def evaluate_gains(
             followed = following_error(robot, motion)
     shortest = shortest_durations(robot, moves)
     # The smooth motion to compare with takes as long as the slowest arm joint took to settle.
-    settled = np.where(np.isfinite(metrics.settling_time) & arm_joints(robot), metrics.settling_time, 0.0).max(1)
+    settled = np.where(
+        np.isfinite(metrics.settling_time) & arm_joints(robot), metrics.settling_time, 0.0
+    ).max(1)
     durations = np.maximum(np.maximum(settled, np.where(np.isfinite(shortest), shortest, 0.0)), 0.1)
     return Evaluation(
         name=name,
@@ -252,7 +301,9 @@ class Within(NamedTuple):
     stability: StabilityReport
     """Report for the least stable set and pose; ``env`` is the number of the set."""
     settling: Float64
-    """Settling time of the slowest joint of the arm in the slowest move of each set (sets,) [s]; inf: never."""
+    """Settling time of the slowest joint of the arm in the slowest move of each set (sets,) [s];
+    inf: never.
+    """
 
     @property
     def holds(self) -> bool:
@@ -261,7 +312,12 @@ class Within(NamedTuple):
 
 
 def within(
-    robot: Robot, params: bp.PIDParams, motors: bp.Actuators, moves: Moves, seconds: float = 2.0, **options: Any
+    robot: Robot,
+    params: bp.PIDParams,
+    motors: bp.Actuators,
+    moves: Moves,
+    seconds: float = 2.0,
+    **options: Any,
 ) -> Within:
     """Run all ``moves`` as setpoint steps from rest with each row of ``motors``, and evaluate them.
 
@@ -269,8 +325,13 @@ def within(
     """
     sets, count = motors.num_envs, len(moves.start)
     repeated = motors.for_envs(np.repeat(np.arange(sets), count))
-    with Runner(robot, sets * count, params=params, actuators=repeated, **{"substeps": SUBSTEPS, **options}) as runner:
-        metrics, timestep = run_moves(runner, moves.take(np.tile(np.arange(count), sets)), seconds)[1], runner.timestep
+    with Runner(
+        robot, sets * count, params=params, actuators=repeated, **{"substeps": SUBSTEPS, **options}
+    ) as runner:
+        metrics, timestep = (
+            run_moves(runner, moves.take(np.tile(np.arange(count), sets)), seconds)[1],
+            runner.timestep,
+        )
     settled = np.nan_to_num(metrics.settling_time[:, arm_joints(robot)], nan=0.0, posinf=np.inf)
     poses = np.concatenate([moves.start, moves.target])[:POSES]
     reports = [stability_report(robot, params, pose, timestep, actuators=motors) for pose in poses]

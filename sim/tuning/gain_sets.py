@@ -27,12 +27,14 @@ class GainSet(NamedTuple):
 
 
 def gain_set(robot: Robot, name: str | None = None) -> GainSet:
-    """Return the gains of ``robot`` by name; default "tuned" where the robot has them, else "designed".
+    """Return the gains of ``robot`` by name; default "tuned" where the robot has them, else
+    "designed".
 
-    "tuned" gains ship with the robot, "designed" is :meth:`batchpid.sim.Robot.designed`, "tutorial" are the gains in
-    SAPIEN's tutorial, for a bundled robot, "mjcf" is :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or
-    "drive:STIFFNESS,DAMPING" is the engine's internal drive. Other names are params files, or an MJCF file (.xml),
-    whose differences are warnings.
+    "tuned" gains ship with the robot, "designed" is :meth:`batchpid.sim.Robot.designed`, "tutorial"
+    are the gains in SAPIEN's tutorial, for a bundled robot, "mjcf" is
+    :meth:`batchpid.sim.Robot.mjcf_gains`; "drive" or "drive:STIFFNESS,DAMPING" is the engine's
+    internal drive. Other names are params files, or an MJCF file (.xml), whose differences are
+    warnings.
 
     Raises
     ------
@@ -40,7 +42,12 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
         There is no such name or file, or the robot lacks these gains.
     """
     name = name or ("tuned" if robot.has_tuned else "designed")
-    named = {"tuned": robot.tuned, "designed": robot.designed, "tutorial": robot.params, "mjcf": robot.mjcf_gains}
+    named = {
+        "tuned": robot.tuned,
+        "designed": robot.designed,
+        "tutorial": robot.params,
+        "mjcf": robot.mjcf_gains,
+    }
     if name in named:
         return GainSet(name, named[name]())
     if name.partition(":")[0] == "drive":
@@ -48,7 +55,10 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
             stiffness, damping = map(float, (name.partition(":")[2] or "20,5").split(","))
         except ValueError:
             raise InvalidArgumentError(
-                "gains", "is not a drive", value=name, remedy="write drive:STIFFNESS,DAMPING, e.g. drive:20,5"
+                "gains",
+                "is not a drive",
+                value=name,
+                remedy="write drive:STIFFNESS,DAMPING, e.g. drive:20,5",
             ) from None
         params = robot.params(kp=stiffness, ki=0.0, kd=damping, effort_limit=None)
         return GainSet(f"drive ({stiffness:g}, {damping:g})", params, "drive")
@@ -56,7 +66,9 @@ def gain_set(robot: Robot, name: str | None = None) -> GainSet:
     if not path.is_file():
         near = difflib.get_close_matches(name, NAMES, 1)
         remedy = f"did you mean {near[0]!r}?" if near else f"use a file or {', '.join(NAMES)}"
-        raise InvalidArgumentError("gains", "is neither a name nor a file", value=name, remedy=remedy)
+        raise InvalidArgumentError(
+            "gains", "is neither a name nor a file", value=name, remedy=remedy
+        )
     if path.suffix.lower() == ".xml":
         return GainSet(path.name, _of_mjcf(path, robot))
     return GainSet(path.name, bp.load_params(path, robot.joint_names)[0])
@@ -67,9 +79,17 @@ def _of_mjcf(path: Path, robot: Robot) -> bp.PIDParams:
     joints = [robot.joint_names[joint] for joint in np.flatnonzero(robot.independent)]
     other = Robot.load(path)
     if missing := sorted(set(joints) - set(other.joint_names)):
-        raise InvalidArgumentError("gains", f"{path.name} lacks joints", value=", ".join(missing), remedy="rename them")
+        raise InvalidArgumentError(
+            "gains", f"{path.name} lacks joints", value=", ".join(missing), remedy="rename them"
+        )
     gains = other.mjcf_gains().for_joints([other.joint_names.index(joint) for joint in joints])
     if gains.continuous is not None:
-        turning = ", ".join(joint for joint, yes in zip(joints, gains.continuous[0], strict=True) if yes)
-        warn(f"{path}: continuous: errors are taken the short way round, which MuJoCo does not: {turning}", UserWarning)
+        turning = ", ".join(
+            joint for joint, yes in zip(joints, gains.continuous[0], strict=True) if yes
+        )
+        warn(
+            f"{path}: continuous: errors are taken the short way round, which MuJoCo does not:"
+            f" {turning}",
+            UserWarning,
+        )
     return gains.for_joints(robot.coupling.of_all(np.arange(len(joints))))

@@ -26,7 +26,9 @@ def load_randomization(path: str | Path, robot: Robot, seed: int = 0) -> Randomi
     path = file_path("randomize", path)
     document = documents.read(path)
     with documents.named(str(path)):
-        randomization = Randomization.from_dict({"seed": seed, **document} if isinstance(document, dict) else document)
+        randomization = Randomization.from_dict(
+            {"seed": seed, **document} if isinstance(document, dict) else document
+        )
         check_robot(randomization, robot)
     return randomization
 
@@ -37,8 +39,14 @@ def reseeded(randomization: Randomization | None, seed: int) -> Randomization | 
 
 
 def at_the_joints(randomization: Randomization | None) -> Randomization | None:
-    """Return ``randomization`` with only the actuator fields that affect PhysX's drives: friction and inertia."""
+    """Return ``randomization`` with only the actuator fields that affect PhysX's drives: friction
+    and inertia.
+    """
     if randomization is None:
         return None
-    fields = {name: distribution for name, distribution in randomization.actuators.items() if name in DRIVEN}
+    fields = {
+        name: distribution
+        for name, distribution in randomization.actuators.items()
+        if name in DRIVEN
+    }
     return replace(randomization, actuators=fields)

@@ -1,17 +1,17 @@
 """Search for gains of joints by CMA-ES from the designed gains, in log space, and a final round.
 
-Each env runs one move of one candidate, as a step or as a smooth motion of the setpoint, so a generation is one
-rollout. The moves are free of contact, so the robots have no collision shapes in the search. A share of the effort
-limits is a reserve for harder moves. The search itself is the package ``cmaes`` (N. Hansen, "The CMA evolution
-strategy: a tutorial", arXiv:1604.00772).
+Each env runs one move of one candidate, as a step or as a smooth motion of the setpoint, so a
+generation is one rollout. The moves are free of contact, so the robots have no collision shapes in
+the search. A share of the effort limits is a reserve for harder moves. The search itself is the
+package ``cmaes`` (N. Hansen, "The CMA evolution strategy: a tutorial", arXiv:1604.00772).
 
-Gains that are best on the few moves of the search need not be best on others. So the candidates that beat the designed
-gains run a final round with these on more moves, with collisions, with the caller's solver, at the full effort limits.
-The gains with the lowest cost there are the result.
+Gains that are best on the few moves of the search need not be best on others. So the candidates
+that beat the designed gains run a final round with these on more moves, with collisions, with the
+caller's solver, at the full effort limits. The gains with the lowest cost there are the result.
 
-Good gains for robots that differ from the model, by actuators or a randomization, are farther from the designed ones.
-For such robots the first generation consists of designs for the loop's delay (:mod:`batchpid.sim.tuning.candidates`),
-and CMA-ES starts from the best of them.
+Good gains for robots that differ from the model, by actuators or a randomization, are farther from
+the designed ones. For such robots the first generation consists of designs for the loop's delay
+(:mod:`batchpid.sim.tuning.candidates`), and CMA-ES starts from the best of them.
 """
 
 from __future__ import annotations
@@ -48,9 +48,13 @@ INITIAL_SPREAD = 0.12
 HEADROOM = 0.9
 """Share of the effort limits that candidates may use."""
 VARIED_MOVES, DRAWN_MOVES = 20, 8
-"""Number of random moves in the search for robots that differ from the model, and with drawn motors."""
+"""Number of random moves in the search for robots that differ from the model, and with drawn
+motors.
+"""
 FINAL_MOVES, FINALISTS = 24, 3
-"""Number of moves of the final round, and the largest number of candidates in it, besides the designed gains."""
+"""Number of moves of the final round, and the largest number of candidates in it, besides the
+designed gains.
+"""
 FINAL_SEED = 1_000_003
 """Difference between the seed of the final round and the seed of the search."""
 SEARCH_SCENE: Document = {"collisions": False, "physics": "fast", "ground": None}
@@ -71,7 +75,9 @@ class Tuning(NamedTuple):
     settings: Document
     """Seed, moves, options and versions, for the record."""
     rejected: str | None
-    """Criterion by which the designed gains beat all candidates, with both figures; None if a candidate was best."""
+    """Criterion by which the designed gains beat all candidates, with both figures; None if a
+    candidate was best.
+    """
 
 
 def tune(
@@ -93,7 +99,8 @@ def tune(
     progress: Callable[[Any], Any] | None = None,
     **runner_options: Any,
 ) -> Tuning:
-    """Search for gains of ``robot``. The result depends on the seed and not on the number of workers.
+    """Search for gains of ``robot``. The result depends on the seed and not on the number of
+    workers.
 
     Parameters
     ----------
@@ -108,20 +115,23 @@ def tune(
     per_joint
         Search for a factor of each joint's gains too, which needs more generations.
     weights
-        Of the terms of the cost. Default: 1 for a second of a step's settling time and 1 for the logarithm of the
-        following error.
+        Of the terms of the cost. Default: 1 for a second of a step's settling time and 1 for the
+        logarithm of the following error.
     moves
-        Default: :func:`batchpid.sim.tuning.moves.search_moves`, and FINAL_MOVES random ones in the final round. For
-        robots with actuators or a randomization, the search uses the tutorial's move and VARIED_MOVES random ones
-        (with drawn ``motors`` DRAWN_MOVES), because the hardest moves within the effort limits of the model are too
-        hard for such robots. Given moves replace them, with contacts, since they may touch something. There is then
-        no final round.
+        Default: :func:`batchpid.sim.tuning.moves.search_moves`, and FINAL_MOVES random ones in the
+            final round. For
+        robots with actuators or a randomization, the search uses the tutorial's move and
+        VARIED_MOVES random ones (with drawn ``motors`` DRAWN_MOVES), because the hardest moves
+        within the effort limits of the model are too hard for such robots. Given moves replace
+        them, with contacts, since they may touch something. There is then no final round.
     randomization
-        The robot of each move is drawn from it, the same for all candidates. None: the robot as described.
+        The robot of each move is drawn from it, the same for all candidates. None: the robot as
+        described.
     motors
         Actuators of which one is the true one, a row each, such as the draws of
-        :func:`batchpid.sim.identification.draw_motors`: every move is made with another row, the same for all
-        candidates, and the worst move counts as much as the mean. The controller knows the robot's own actuators.
+        :func:`batchpid.sim.identification.draw_motors`: every move is made with another row, the
+        same for all candidates, and the worst move counts as much as the mean. The controller knows
+        the robot's own actuators.
     workers, cluster
         Number of processes, or a cluster: as for :class:`batchpid.sim.Runner`.
     time_limit
@@ -129,8 +139,9 @@ def tune(
     progress
         Wraps the range of generations, e.g. ``tqdm.tqdm``; it may have ``set_postfix``.
     runner_options
-        More options of :class:`batchpid.sim.Runner`, e.g. ``physics="fast"``, for the final round. In the search,
-        robots with a fixed base and without a ``build`` have no collision shapes and "fast" physics.
+        More options of :class:`batchpid.sim.Runner`, e.g. ``physics="fast"``, for the final round.
+        In the search, robots with a fixed base and without a ``build`` have no collision shapes and
+        "fast" physics.
 
     Raises
     ------
@@ -146,25 +157,43 @@ def tune(
     population = integer("population", population, 4, 1000)
     seconds = number("seconds", seconds, 0.05, 600.0, "seconds")
     for name in {"params", "discretization"} & runner_options.keys():
-        problem, remedy = "is chosen by the search, which is for explicit gains", "bp.design_gains makes implicit gains"
+        problem, remedy = (
+            "is chosen by the search, which is for explicit gains",
+            "bp.design_gains makes implicit gains",
+        )
         raise InvalidArgumentError(name, problem, remedy=remedy)
     if motors is not None and runner_options.get("actuators") is not None:
-        remedy = "leave it out; the control knows the actuators of the robot: Robot.load(..., actuators=...)"
+        remedy = (
+            "leave it out; the control knows the actuators of the robot: Robot.load(...,"
+            " actuators=...)"
+        )
         raise InvalidArgumentError("actuators", "is given with motors", remedy=remedy)
     weights = Weights() if weights is None else weights
-    options: Document = {"substeps": SUBSTEPS, "workers": workers, "cluster": cluster} | runner_options
+    options: Document = {
+        "substeps": SUBSTEPS,
+        "workers": workers,
+        "cluster": cluster,
+    } | runner_options
 
     is_varied = randomization is not None or robot.actuators is not None or motors is not None
     unseen, scene = None, Document()
     if moves is None:
         unseen = random_moves(robot, FINAL_MOVES, seed + FINAL_SEED)
         count = VARIED_MOVES if motors is None else DRAWN_MOVES
-        moves = tutorial_move(robot) + random_moves(robot, count, seed) if is_varied else search_moves(robot, seed)
+        moves = (
+            tutorial_move(robot) + random_moves(robot, count, seed)
+            if is_varied
+            else search_moves(robot, seed)
+        )
         if robot.fixed_base and runner_options.get("build") is None:
             scene = SEARCH_SCENE
 
     def candidates(moves: Moves, headroom: float) -> Candidates:
-        options: Document = {"headroom": headroom, "varied": is_varied and motors is None, "motors": motors}
+        options: Document = {
+            "headroom": headroom,
+            "varied": is_varied and motors is None,
+            "motors": motors,
+        }
         return Candidates(robot, gain_units, per_joint, moves, seconds, weights, **options)
 
     searched = candidates(moves, 1.0 if is_varied else HEADROOM)
@@ -172,11 +201,17 @@ def tune(
     designs = None
     if is_varied:
         dt = float(runner_options.get("timestep", RunnerOptions.timestep))
-        delay = loop_delay(robot, randomization, dt + float(np.max(start.derivative_filter_time)), motors)
+        delay = loop_delay(
+            robot, randomization, dt + float(np.max(start.derivative_filter_time)), motors
+        )
         designs = searched.points(first_gains(delay))
     options = options | {"params": start}
-    with searched.runner(population, options | {"randomization": reseeded(randomization, seed)} | scene) as runner:
-        points, history = _evolve(searched, runner, seed, generations, population, designs, time_limit, progress)
+    with searched.runner(
+        population, options | {"randomization": reseeded(randomization, seed)} | scene
+    ) as runner:
+        points, history = _evolve(
+            searched, runner, seed, generations, population, designs, time_limit, progress
+        )
 
     # Final round: the designed gains against the candidates that beat them.
     costs = np.concatenate(history)
@@ -184,7 +219,9 @@ def tune(
     finalists = ranking[: ranking.index(0)] if 0 in ranking else ranking
     best, rejected = (finalists or [0])[0], None
     if not finalists:
-        rejected = f"cost in the search: best candidate {costs[1:].min():.4f}, designed {costs[0]:.4f}"
+        rejected = (
+            f"cost in the search: best candidate {costs[1:].min():.4f}, designed {costs[0]:.4f}"
+        )
     elif unseen is not None:
         final = candidates(unseen, 1.0)
         options = options | {"randomization": reseeded(randomization, seed + FINAL_SEED)}
@@ -192,15 +229,24 @@ def tune(
             judged = final.costs(runner, points[[0, *finalists]])
         best = [0, *finalists][int(np.argmin(judged))]
         if not best:
-            rejected = f"cost in the final: best candidate {min(judged[1:]):.4f}, designed {judged[0]:.4f}"
+            rejected = (
+                f"cost in the final: best candidate {min(judged[1:]):.4f}, designed {judged[0]:.4f}"
+            )
 
     settings: Document = {
         **robot.describe(),
         **{"seed": seed, "generations": len(history), "population": population, "seconds": seconds},
-        **{"gain_units": gain_units, "per_joint": per_joint, "weights": asdict(weights), "moves": list(moves.names)},
+        **{
+            "gain_units": gain_units,
+            "per_joint": per_joint,
+            "weights": asdict(weights),
+            "moves": list(moves.names),
+        },
         "randomization": None if randomization is None else randomization.to_dict(),
         **{name: _plain(value) for name, value in runner_options.items()},
-        "versions": package_versions(("batchpid", runner_options.get("engine", DEFAULT_ENGINE), "numpy", "cmaes")),
+        "versions": package_versions(
+            ("batchpid", runner_options.get("engine", DEFAULT_ENGINE), "numpy", "cmaes")
+        ),
     }
     params = searched.params(points[[best]])
     return Tuning(params, float(costs[best]), start, history[0][0], history, settings, rejected)
@@ -218,7 +264,8 @@ def _evolve(
 ) -> tuple[Float64, tuple[tuple[float, ...], ...]]:
     """Return all points (n, dimension), the first of which is 0, and their costs by generation.
 
-    ``designs`` (n, dimension) are candidates of the first generation too, and CMA-ES starts from the best of it.
+    ``designs`` (n, dimension) are candidates of the first generation too, and CMA-ES starts from
+    the best of it.
     """
     from cmaes import CMA
 
@@ -233,7 +280,9 @@ def _evolve(
     began = time.monotonic()
     bar = (progress or (lambda items: items))(range(generations))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MissedContactWarning)  # bad gains may leave the way of a move
+        warnings.simplefilter(
+            "ignore", MissedContactWarning
+        )  # bad gains may leave the way of a move
         for generation in bar:
             samples = np.array([optimizer.ask() for _ in range(population)])
             if generation == 0:

@@ -1,4 +1,6 @@
-"""Page on localhost that shows robots as they move, and films of recorded runs; see docs/view.md."""
+"""Page on localhost that shows robots as they move, and films of recorded runs; see
+docs/view.md.
+"""
 
 from batchpid.sim.view.page import View
 from batchpid.sim.view.playback import Playback

@@ -1,4 +1,6 @@
-"""Pictures and films of robots, drawn by Matplotlib: as shaded triangles, the farthest from the camera first."""
+"""Pictures and films of robots, drawn by Matplotlib: as shaded triangles, the farthest from the
+camera first.
+"""
 
 from __future__ import annotations
 
@@ -53,10 +55,14 @@ class Painter:
         half_x, half_y = scene.half_floor
         x, y = np.meshgrid(np.arange(-half_x, half_x, TILE), np.arange(-half_y, half_y, TILE))
         edges = TILE * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-        self._tiles = np.stack([x, y, np.full_like(x, scene.floor)], axis=-1).reshape(-1, 1, 3) + edges
+        self._tiles = (
+            np.stack([x, y, np.full_like(x, scene.floor)], axis=-1).reshape(-1, 1, 3) + edges
+        )
 
     def picture(self, qpos: Rows, base_pose: Rows | None = None) -> NDArray[np.uint8]:
-        """Return the picture (height, width, 3) in RGB of robots in poses as for :meth:`RobotScene.place`."""
+        """Return the picture (height, width, 3) in RGB of robots in poses as for
+        :meth:`RobotScene.place`.
+        """
         width, height = self._size
         figure = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor=_BACKGROUND)
         axes = figure.add_axes((0, 0, 1, 1))
@@ -65,7 +71,9 @@ class Painter:
         places, depth = self._project(self._tiles)
         tiles = list(places[np.flatnonzero((depth > _NEAREST).all(axis=1))])
         face = _FLOOR if self._scene.ground else "none"
-        axes.add_collection(PolyCollection(tiles, facecolors=face, edgecolors=_GRID, linewidths=0.8))
+        axes.add_collection(
+            PolyCollection(tiles, facecolors=face, edgecolors=_GRID, linewidths=0.8)
+        )
 
         corners = self._corners(self._scene.place(qpos, base_pose))
         places, depth = self._project(corners)
@@ -75,14 +83,20 @@ class Painter:
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         brightness = 0.55 + 0.45 * np.clip(normals @ LIGHT, 0, 1)
         shades = np.clip(self._colours * brightness[:, None], 0, 1)[order]
-        axes.add_collection(PolyCollection(list(places[order]), facecolors=shades, edgecolors=shades, linewidths=0.3))
+        axes.add_collection(
+            PolyCollection(
+                list(places[order]), facecolors=shades, edgecolors=shades, linewidths=0.3
+            )
+        )
 
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
     def _corners(self, poses: Float64) -> Float64:
-        """Return the corners (triangles, 3, 3) [m] of all robots for the ``poses`` of their surfaces."""
+        """Return the corners (triangles, 3, 3) [m] of all robots for the ``poses`` of their
+        surfaces.
+        """
         parts = []
         for surface, pose in zip(self._scene.surfaces, poses.swapaxes(0, 1), strict=True):
             vertices = rotate(pose[:, None, 3:], surface.vertices) + pose[:, None, :3]
@@ -99,7 +113,12 @@ class Painter:
 
 FORMATS = (".mp4", ".gif")
 _ENCODERS = {
-    ".mp4": ("-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"),  # which halves both sides for colours
+    ".mp4": (
+        "-vf",
+        "pad=ceil(iw/2)*2:ceil(ih/2)*2",
+        "-pix_fmt",
+        "yuv420p",
+    ),  # which halves both sides for colours
     ".gif": ("-vf", "split[a][b];[a]palettegen[p];[b][p]paletteuse", "-loop", "0"),
 }
 """ffmpeg's options for each format."""
@@ -131,7 +150,8 @@ def write_film(
     Raises
     ------
     InvalidArgumentError, RobotNotFoundError
-        An argument is out of range, the run has another number of joints, or its robot is not bundled.
+        An argument is out of range, the run has another number of joints, or its robot is not
+        bundled.
     MissingDependencyError
         The package imageio-ffmpeg is missing.
     BatchPIDError
@@ -159,12 +179,41 @@ def write_film(
     return path
 
 
-def encode(pictures: Iterable[NDArray[np.uint8]], path: Path, ffmpeg: str, size: tuple[int, int], fps: float) -> None:
-    """Write RGB ``pictures`` (height, width, 3) of ``size`` (width, height) to a film, by the program ``ffmpeg``."""
-    source = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "{}x{}".format(*size), "-r", f"{fps}", "-i", "-")
-    command = [ffmpeg, "-v", "error", *source, *_ENCODERS[path.suffix.lower()], "-y", f"file:{path}"]
+def encode(
+    pictures: Iterable[NDArray[np.uint8]],
+    path: Path,
+    ffmpeg: str,
+    size: tuple[int, int],
+    fps: float,
+) -> None:
+    """Write RGB ``pictures`` (height, width, 3) of ``size`` (width, height) to a film, by the
+    program ``ffmpeg``.
+    """
+    source = (
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-s",
+        "{}x{}".format(*size),
+        "-r",
+        f"{fps}",
+        "-i",
+        "-",
+    )
+    command = [
+        ffmpeg,
+        "-v",
+        "error",
+        *source,
+        *_ENCODERS[path.suffix.lower()],
+        "-y",
+        f"file:{path}",
+    ]
     with tempfile.TemporaryFile() as messages:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=messages)
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=messages
+        )
         assert process.stdin is not None
         try:
             for picture in pictures:
@@ -180,7 +229,9 @@ def encode(pictures: Iterable[NDArray[np.uint8]], path: Path, ffmpeg: str, size:
             status = process.wait()
         if status:
             messages.seek(0)
-            raise BatchPIDError(f"{path}: ffmpeg: {messages.read().decode(errors='replace').strip()}")
+            raise BatchPIDError(
+                f"{path}: ffmpeg: {messages.read().decode(errors='replace').strip()}"
+            )
 
 
 def film_rows(rollout: Rollout, fps: float) -> NDArray[np.int64]:

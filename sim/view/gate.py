@@ -1,6 +1,8 @@
-"""Gate of the page: a request needs this server as its Host, no other page as its Origin, and the token.
+"""Gate of the page: a request needs this server as its Host, no other page as its Origin, and the
+token.
 
-viser passes no options on to ``websockets.asyncio.server.serve``: :meth:`Gate.start` replaces it while viser starts.
+viser passes no options on to ``websockets.asyncio.server.serve``: :meth:`Gate.start` replaces it
+while viser starts.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ from batchpid.errors import BatchPIDError
 
 
 class Gate:
-    """Socket at ``host`` and ``port``, or at a free port if that is in use, and the rule for requests to it."""
+    """Socket at ``host`` and ``port``, or at a free port if that is in use, and the rule for
+    requests to it.
+    """
 
     def __init__(self, host: str, port: int) -> None:
         try:
@@ -36,7 +40,9 @@ class Gate:
             self._names.add(socket.gethostname().lower())
 
     def problem(self, hosts: list[str], origins: list[str], path: str) -> str | None:
-        """Return why a request is refused, or None. A site can let its name point here: hence the check of Host."""
+        """Return why a request is refused, or None. A site can let its name point here: hence the
+        check of Host.
+        """
         try:
             name = urlsplit(f"//{hosts[0]}").hostname or ""
         except (ValueError, IndexError):
@@ -46,7 +52,9 @@ class Gate:
             return "this server has another name; open the address that was printed"
         if origins not in ([], [f"http://{hosts[0]}"]):
             return "pages of other sites have no access"
-        if not secrets.compare_digest(path[1 : 1 + len(self.token)].encode(errors="replace"), self.token.encode()):
+        if not secrets.compare_digest(
+            path[1 : 1 + len(self.token)].encode(errors="replace"), self.token.encode()
+        ):
             return "the token is missing; open the address that was printed"
         return None
 
@@ -57,13 +65,17 @@ class Gate:
         def guarded(handler: Any, *_: Any, process_request: Any, **options: Any) -> Any:
             def process(connection: Any, request: Any) -> Any:
                 headers = request.headers
-                problem = self.problem(headers.get_all("Host"), headers.get_all("Origin"), request.path)
+                problem = self.problem(
+                    headers.get_all("Host"), headers.get_all("Origin"), request.path
+                )
                 if problem is not None:
                     return connection.respond(HTTPStatus.FORBIDDEN, f"{problem}\n")
                 request.path = request.path[1 + len(self.token) :] or "/"
                 response = process_request(connection, request)
                 if response is not None:
-                    response.headers["Referrer-Policy"] = "no-referrer"  # the address holds the token
+                    response.headers["Referrer-Policy"] = (
+                        "no-referrer"  # the address holds the token
+                    )
                 return response
 
             handlers.append(handler)

@@ -1,4 +1,6 @@
-"""Page that shows robots: their scene, charts of a joint, controls, and the loop that keeps real time."""
+"""Page that shows robots: their scene, charts of a joint, controls, and the loop that keeps real
+time.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ CHARTS_EVERY = 5
 
 
 class View(AbstractContextManager["View"]):
-    """Page that shows ``data``, served at ``host`` and ``port``, or at a free port, until :meth:`close`.
+    """Page that shows ``data``, served at ``host`` and ``port``, or at a free port, until
+    :meth:`close`.
 
     Only somebody who knows :attr:`url` can open it.
 
@@ -47,7 +50,9 @@ class View(AbstractContextManager["View"]):
         self.data = data
         gate = Gate(host, port)
         with redirect_stdout(io.StringIO()):  # viser's banner
-            make = partial(viser.ViserServer, host=host, port=gate.port, verbose=False, label="batchpid")
+            make = partial(
+                viser.ViserServer, host=host, port=gate.port, verbose=False, label="batchpid"
+            )
             self._server: Any = gate.start(make)
         self.port = gate.port
         """Port of the page."""
@@ -64,7 +69,9 @@ class View(AbstractContextManager["View"]):
         self.findings = summary(scene.findings)
         """Sentences on meshes that cannot be read."""
         self.panel = Panel(gui, data)
-        self._nodes = SceneNodes(self._server, scene, data.frame().info.sets_positions, self.panel.select)
+        self._nodes = SceneNodes(
+            self._server, scene, data.frame().info.sets_positions, self.panel.select
+        )
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
         charts = gui.add_panel()
@@ -127,15 +134,18 @@ _NO_SHADOW = {"cast_shadow": False, "receive_shadow": False}
 
 
 class SceneNodes:
-    """A ``scene`` on a viser ``server``, with the setpoint of a robot if ``sets_positions`` of joints.
+    """A ``scene`` on a viser ``server``, with the setpoint of a robot if ``sets_positions`` of
+    joints.
 
     ``select(robot)`` is called when a robot is clicked.
 
-    Every surface is one node, which is placed once for each robot. A frame is therefore two small arrays for each
-    surface, for any number of robots.
+    Every surface is one node, which is placed once for each robot. A frame is therefore two small
+    arrays for each surface, for any number of robots.
     """
 
-    def __init__(self, server: Any, scene: RobotScene, sets_positions: bool, select: Callable[[int], None]) -> None:
+    def __init__(
+        self, server: Any, scene: RobotScene, sets_positions: bool, select: Callable[[int], None]
+    ) -> None:
         import trimesh  # installed with viser
 
         self._server, self._scene = server, scene
@@ -155,8 +165,12 @@ class SceneNodes:
             plane_opacity=float(scene.ground),
             position=(0.0, 0.0, scene.floor),
         )
-        ring = trimesh.creation.annulus(0.30 * scene.reach, 0.335 * scene.reach, height=1e-3, sections=48)
-        self._ring = api.add_mesh_simple("/selected", ring.vertices, ring.faces, color=_SETPOINT_COLOUR, **_NO_SHADOW)
+        ring = trimesh.creation.annulus(
+            0.30 * scene.reach, 0.335 * scene.reach, height=1e-3, sections=48
+        )
+        self._ring = api.add_mesh_simple(
+            "/selected", ring.vertices, ring.faces, color=_SETPOINT_COLOUR, **_NO_SHADOW
+        )
         count = len(scene.positions)
         self._robots: list[Any] = []
         self._setpoints: list[Any] = []
@@ -168,7 +182,9 @@ class SceneNodes:
             self._robots.append(node)
             if sets_positions:
                 path, options = f"/setpoint/{index}", {"opacity": 0.22, **_NO_SHADOW}
-                self._setpoints.append(self._add_surface(path, surface, 1, _SETPOINT_COLOUR, **options))
+                self._setpoints.append(
+                    self._add_surface(path, surface, 1, _SETPOINT_COLOUR, **options)
+                )
         for node in self._robots:
             node.on_click(lambda event: select(event.instance_index))
         camera = server.initial_camera
@@ -185,7 +201,9 @@ class SceneNodes:
             if self._setpoints:
                 _place(self._setpoints, scene.poses(frame.setpoint[0, [env]], np.array([env])))
 
-    def _add_surface(self, path: str, surface: Surface, copies: int, colour: Any, **options: Any) -> Any:
+    def _add_surface(
+        self, path: str, surface: Surface, copies: int, colour: Any, **options: Any
+    ) -> Any:
         return self._server.scene.add_batched_meshes_simple(
             path,
             surface.vertices.astype(np.float32),
@@ -208,8 +226,13 @@ def _place(nodes: list[Any], poses: Float64) -> None:
 _MIN_RANGE = {"min": -0.012, "max": 0.012}
 """Smallest range of a vertical axis [rad, m, N m or N]: noise alone should not fill a chart."""
 _SCALES = {
-    "x": {"time": False, "range": (-HISTORY_SECONDS, 0.0)},  # without a fixed range the axis drifts in viser 1.1
-    "y": {"range": {end: {"pad": 0.1, "soft": soft, "mode": 1} for end, soft in _MIN_RANGE.items()}},
+    "x": {
+        "time": False,
+        "range": (-HISTORY_SECONDS, 0.0),
+    },  # without a fixed range the axis drifts in viser 1.1
+    "y": {
+        "range": {end: {"pad": 0.1, "soft": soft, "mode": 1} for end, soft in _MIN_RANGE.items()}
+    },
 }
 
 
@@ -221,7 +244,10 @@ class Charts:
 
         def chart(title: str, *series: Document) -> Any:
             return gui.add_uplot(
-                (np.array([-HISTORY_SECONDS, 0.0]), *[np.zeros(2)] * len(series)),  # flat until the first update
+                (
+                    np.array([-HISTORY_SECONDS, 0.0]),
+                    *[np.zeros(2)] * len(series),
+                ),  # flat until the first update
                 ({"label": "s"}, *series),
                 title=title,
                 scales=_SCALES,
@@ -232,7 +258,9 @@ class Charts:
             )
 
         setpoint = {"label": "setpoint", "stroke": "#4a82ff", "width": 1, "dash": [6, 4]}
-        self._position = chart("position", {"label": "qpos", "stroke": "#15803d", "width": 2}, setpoint)
+        self._position = chart(
+            "position", {"label": "qpos", "stroke": "#15803d", "width": 2}, setpoint
+        )
         self._effort = chart("effort", {"label": "effort", "stroke": "#15803d", "width": 2})
 
     def update(self, env: int, joint: int) -> None:
@@ -244,12 +272,20 @@ class Charts:
         described = self._data.robot.joints[joint]
         positions = history.qpos[:, env, joint]
         setpoints = history.setpoint[:, env, joint] if history.info.sets_positions else positions
-        self._draw(self._position, f"{described.name} [{described.unit}]", past, positions, setpoints)
-        self._draw(self._effort, f"effort [{described.effort_unit}]", past, history.effort[:, env, joint])
+        self._draw(
+            self._position, f"{described.name} [{described.unit}]", past, positions, setpoints
+        )
+        self._draw(
+            self._effort, f"effort [{described.effort_unit}]", past, history.effort[:, env, joint]
+        )
 
     @staticmethod
     def _draw(chart: Any, title: str, past: Float64, *curves: Rows) -> None:
         if chart.title != title:
             chart.title = title
-        # Smaller differences make a flat line jitter, and a number that is not finite would empty the chart.
-        chart.data = (past, *(np.nan_to_num(np.round(curve, 4).astype(np.float64)) for curve in curves))
+        # Smaller differences make a flat line jitter, and a number that is not finite would empty
+        # the chart.
+        chart.data = (
+            past,
+            *(np.nan_to_num(np.round(curve, 4).astype(np.float64)) for curve in curves),
+        )

@@ -1,4 +1,6 @@
-"""Controls of the page: motion, the watched joint, setpoints, gains. Requests are carried out between two frames."""
+"""Controls of the page: motion, the watched joint, setpoints, gains. Requests are carried out
+between two frames.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ ViewData = LiveSimulation | Playback
 
 
 class Panel:
-    """Controls of ``data`` in a viser ``gui``. viser calls back from other threads: their requests are queued."""
+    """Controls of ``data`` in a viser ``gui``. viser calls back from other threads: their requests
+    are queued.
+    """
 
     def __init__(self, gui: Any, data: ViewData) -> None:
         self._gui, self._data = gui, data
@@ -31,10 +35,14 @@ class Panel:
         self._names = short_names(data.robot)
         self._status = gui.add_markdown("starting ...")
         self._problem = ""
-        self._connect(gui.add_button_group("Motion", ("Run", "Pause", "Step", "Reset")), self._control_motion)
+        self._connect(
+            gui.add_button_group("Motion", ("Run", "Pause", "Step", "Reset")), self._control_motion
+        )
         self._speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
         if isinstance(data, Playback):
-            self._time = self._connect(gui.add_slider("Time [s]", 0.0, data.duration, data.period, 0.0), data.seek)
+            self._time = self._connect(
+                gui.add_slider("Time [s]", 0.0, data.duration, data.period, 0.0), data.seek
+            )
         self._robot = gui.add_slider("Robot", 0, max(1, data.num_envs - 1), 1, 0)
         self._robot.disabled = data.num_envs == 1
         self._joint = gui.add_dropdown("Joint", self._names)
@@ -67,7 +75,9 @@ class Panel:
         self._requests.put(partial(setattr, self._robot, "value", robot))
 
     def run_requests(self) -> bool:
-        """Carry out the requests of the pages; return whether there were any. The status names one that failed."""
+        """Carry out the requests of the pages; return whether there were any. The status names one
+        that failed.
+        """
         count = self._requests.qsize()
         for _ in range(count):
             self._problem = ""
@@ -82,7 +92,11 @@ class Panel:
         data, time = self._data, float(frame.time[0])
         lines = [
             f"**{data.num_envs} x {data.robot.name}**",
-            f"t = {time:.2f} s · {factor:.2f} x real time · {rate:.0f} frames/s" if self.frames_left else "paused",
+            (
+                f"t = {time:.2f} s · {factor:.2f} x real time · {rate:.0f} frames/s"
+                if self.frames_left
+                else "paused"
+            ),
             f"{int(frame.saturated.any(-1).sum())} saturated, {int((~frame.ok).sum())} diverged",
             self._problem,
         ]
@@ -91,7 +105,9 @@ class Panel:
             self._time.value = time
 
     def _connect(self, handle: Any, action: Callable[[Any], object]) -> Any:
-        """Request ``action(value)`` whenever a page, and not this program, changes a control; return its handle."""
+        """Request ``action(value)`` whenever a page, and not this program, changes a control;
+        return its handle.
+        """
 
         async def changed(event: Any) -> None:  # a coroutine, so that the changes stay in order
             if event.client is not None:
@@ -119,13 +135,17 @@ class Panel:
             else:
                 live.set_setpoint(poses[pose])
             for joint, slider in sliders.items():
-                slider.value = float(np.clip(live.setpoint[self.env, joint], slider.min, slider.max))
+                slider.value = float(
+                    np.clip(live.setpoint[self.env, joint], slider.min, slider.max)
+                )
 
         def move(joint: int, position: float) -> None:
             live.set_setpoint(position, joint=joint)
 
         self._connect(gui.add_button_group("Go to", (*poses, "random")), go_to)
-        for index in np.flatnonzero(robot.independent).tolist():  # followers move with their leaders
+        for index in np.flatnonzero(
+            robot.independent
+        ).tolist():  # followers move with their leaders
             joint = robot.joints[index]
             low = math.ceil(1e3 * max(joint.lower, -2 * math.pi)) / 1e3  # fewer digits to read
             high = math.floor(1e3 * min(joint.upper, 2 * math.pi)) / 1e3
@@ -155,15 +175,21 @@ class Panel:
             show()
 
         for gain in GAINS:
-            sliders[gain] = self._connect(gui.add_slider(gain, 0.0, 1.0, 0.001, 0.0), partial(change, gain))
+            sliders[gain] = self._connect(
+                gui.add_slider(gain, 0.0, 1.0, 0.001, 0.0), partial(change, gain)
+            )
         self._connect(gui.add_button_group("All joints", ("back to the first gains",)), restore)
         self._connect(self._joint, show)
         show()
 
 
 def short_names(robot: Robot) -> tuple[str, ...]:
-    """Return the joint names without the words that all of them begin with; a bare number keeps the word before."""
+    """Return the joint names without the words that all of them begin with; a bare number keeps the
+    word before.
+    """
     words = [name.split("_") for name in robot.joint_names]
     first, last = min(words), max(words)  # their common start is the common start of all names
     shared = next((k for k, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), 0)
-    return tuple("_".join(word[shared - (shared > 0 and word[shared].isdigit()) :]) for word in words)
+    return tuple(
+        "_".join(word[shared - (shared > 0 and word[shared].isdigit()) :]) for word in words
+    )

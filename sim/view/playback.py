@@ -20,7 +20,8 @@ HISTORY_SECONDS = 8.0
 class Playback:
     """Recorded run as the data of a page, from the first row to the last and then again.
 
-    ``robot`` is by default the bundled one of the run's name. Frames are ``period`` [s] apart, or a tick of the run.
+    ``robot`` is by default the bundled one of the run's name. Frames are ``period`` [s] apart, or a
+    tick of the run.
 
     Raises
     ------
@@ -30,7 +31,9 @@ class Playback:
         The robot of the run is not bundled.
     """
 
-    def __init__(self, rollout: Rollout, robot: Robot | None = None, *, period: float = 1 / 30) -> None:
+    def __init__(
+        self, rollout: Rollout, robot: Robot | None = None, *, period: float = 1 / 30
+    ) -> None:
         robot = Robot.load(rollout.info.robot) if robot is None else robot
         joints = rollout.qpos.shape[2]
         if joints != robot.dof:
@@ -59,7 +62,9 @@ class Playback:
 
     def advance(self) -> None:
         """Go to the next frame; after the last to the first."""
-        self._now = 0.0 if self._now >= self.duration else min(self._now + self.period, self.duration)
+        self._now = (
+            0.0 if self._now >= self.duration else min(self._now + self.period, self.duration)
+        )
 
     def seek(self, time: float) -> None:
         """Go to a time [s] since the first row."""

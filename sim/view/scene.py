@@ -27,19 +27,22 @@ _CAMERA_DIRECTION = np.array([-0.62, -0.80, 0.52]) / np.linalg.norm([-0.62, -0.8
 class RobotScene:
     """``count`` robots in a square around the origin, on a floor.
 
-    The floor is at height 0 if physics has a ``ground``, otherwise at the lowest point of the start pose. ``deviation``
-    [m] is the largest distance of a triangle from a round surface.
+    The floor is at height 0 if physics has a ``ground``, otherwise at the lowest point of the start
+    pose. ``deviation`` [m] is the largest distance of a triangle from a round surface.
     """
 
     def __init__(self, robot: Robot, count: int, ground: bool, deviation: float) -> None:
         self._tree = robot.rigid_tree
         self.ground = ground
         self.findings: list[Finding] = []
-        """Meshes that cannot be read. Their links are drawn by the collision shapes, or not at all."""
+        """Meshes that cannot be read. Their links are drawn by the collision shapes, or not at
+        all.
+        """
         self.surfaces = surfaces(robot, deviation, self.findings)
         """Coloured triangles of one robot."""
         self._links = [self._tree.index(surface.link) for surface in self.surfaces]
-        # The 95th percentile over seeded poses: a single stretched pose should not push all robots apart.
+        # The 95th percentile over seeded poses: a single stretched pose should not push all robots
+        # apart.
         samples = ts.link_poses(self._tree, robot.sample(200, seed=0))
         distances = np.linalg.norm(samples[..., :2], axis=-1).max(1)
         self.reach = max(0.3, float(np.quantile(distances, 0.95)))
@@ -64,10 +67,11 @@ class RobotScene:
         self._base = np.tile([0.0, 0, 0, 1, 0, 0, 0], (count, 1))
 
     def place(self, qpos: Rows, base_pose: Rows | None = None) -> Float64:
-        """Return the poses of the surfaces (count, surfaces, 7) [m] at the joint positions (count, dof) [rad or m].
+        """Return the poses of the surfaces (count, surfaces, 7) [m] at the joint positions (count,
+        dof) [rad or m].
 
-        ``base_pose`` (count, 7) are the poses of floating bases. A robot with a number that is not finite stays where
-        it was.
+        ``base_pose`` (count, 7) are the poses of floating bases. A robot with a number that is not
+        finite stays where it was.
         """
         finite = np.isfinite(qpos).all(1, keepdims=True)
         if base_pose is not None:
@@ -77,7 +81,9 @@ class RobotScene:
         return self.poses(self._qpos, np.arange(len(qpos)))
 
     def poses(self, qpos: Float64, robots: Rows) -> Float64:
-        """Return the poses of the surfaces (n, surfaces, 7) [m] of n ``robots`` at ``qpos`` (n, dof) [rad or m]."""
+        """Return the poses of the surfaces (n, surfaces, 7) [m] of n ``robots`` at ``qpos`` (n,
+        dof) [rad or m].
+        """
         links = ts.link_poses(self._tree, qpos)[:, self._links]
         poses = placed(self._base[robots][:, None], links)
         poses[..., :3] += self.positions[robots][:, None]

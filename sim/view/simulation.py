@@ -31,7 +31,8 @@ class LiveSimulation:
     period
         Simulated time between frames [s], rounded to whole sim steps.
     spread
-        Largest distance of a joint from the robot's start pose at the beginning [rad or m]; ``seed`` determines it.
+        Largest distance of a joint from the robot's start pose at the beginning [rad or m];
+        ``seed`` determines it.
     options
         Of :class:`batchpid.sim.Runner`: params, workers, engine, physics, compensate, timestep, ...
 
@@ -54,7 +55,9 @@ class LiveSimulation:
         self.robot = robot
         self.num_envs = integer("num_envs", num_envs, 1, MAX_ROBOTS)
         timestep = options.get("timestep", RunnerOptions.timestep)
-        substeps = max(1, round(number("period", period, timestep, 1.0, "seconds between frames") / timestep))
+        substeps = max(
+            1, round(number("period", period, timestep, 1.0, "seconds between frames") / timestep)
+        )
         self.period = substeps * timestep
         self._random = np.random.default_rng(seed)
         spread = number("spread", spread, 0.0, 10.0, "rad or m")
@@ -75,13 +78,21 @@ class LiveSimulation:
         self._frames.clear()
         self._observe(self._runner.reset(self.start), 0.0)
 
-    def set_setpoint(self, position: ArrayLike, *, joint: int | None = None, env: int | None = None) -> None:
-        """Set setpoints [rad or m]: of one joint or all, (dof,) or (envs, dof); of one env or all."""
-        self.setpoint[slice(None) if env is None else env, slice(None) if joint is None else joint] = position
+    def set_setpoint(
+        self, position: ArrayLike, *, joint: int | None = None, env: int | None = None
+    ) -> None:
+        """Set setpoints [rad or m]: of one joint or all, (dof,) or (envs, dof); of one env or
+        all.
+        """
+        self.setpoint[
+            slice(None) if env is None else env, slice(None) if joint is None else joint
+        ] = position
         self.setpoint = self.robot.coupled(self.setpoint)
 
     def randomize_setpoints(self) -> None:
-        """Draw a setpoint for each env, within the joint limits and 1 rad (or m) of the start pose."""
+        """Draw a setpoint for each env, within the joint limits and 1 rad (or m) of the start
+        pose.
+        """
         drawn = self.robot.start + self._random.uniform(-1.0, 1.0, self.setpoint.shape)
         self.set_setpoint(np.clip(drawn, self.robot.lower, self.robot.upper))
 
@@ -101,7 +112,9 @@ class LiveSimulation:
         self.params = self.params.replace(**{gain: gains})
 
     def frame(self) -> Rollout:
-        """Return the present state, with the setpoints of the next frame, as a rollout of one tick."""
+        """Return the present state, with the setpoints of the next frame, as a rollout of one
+        tick.
+        """
         return replace(self._frames[-1], setpoint=self.setpoint[None].copy())
 
     def history(self) -> Rollout:
@@ -119,4 +132,6 @@ class LiveSimulation:
 
     def _observe(self, observation: Observation, time: float) -> None:
         row = observation.map(lambda array: array[None])
-        self._frames.append(Rollout(np.array([time]), self.setpoint[None].copy(), row, self.period, self._info))
+        self._frames.append(
+            Rollout(np.array([time]), self.setpoint[None].copy(), row, self.period, self._info)
+        )

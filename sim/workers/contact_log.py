@@ -27,7 +27,9 @@ class MissedContact(NamedTuple):
     """Names of the two links; of one if it is with the ground."""
 
     def __str__(self) -> str:
-        what = " and ".join(map(repr, self.links)) + (" and the ground" if len(self.links) == 1 else "")
+        what = " and ".join(map(repr, self.links)) + (
+            " and the ground" if len(self.links) == 1 else ""
+        )
         return f"env {self.env}: {what} at {self.time:g} s"
 
 
@@ -37,7 +39,9 @@ class MissedContactLog:
     ``links`` returns the names of the links that overlap most at a pose (dof,).
     """
 
-    def __init__(self, num_envs: int, timestep: float, links: Callable[[Rows], tuple[str, ...]]) -> None:
+    def __init__(
+        self, num_envs: int, timestep: float, links: Callable[[Rows], tuple[str, ...]]
+    ) -> None:
         self.contacts: deque[MissedContact] = deque(maxlen=10_000)
         """Latest last."""
         self._timestep, self._links = timestep, links
@@ -59,6 +63,7 @@ class MissedContactLog:
     def message(self) -> str:
         """Return the text of a warning."""
         return (
-            f"without collisions robots went through what they would have touched: {self.contacts[0]}. Use "
-            "collisions=True, or other moves; see runner.missed_contacts for more, of which there is no further warning"
+            "without collisions robots went through what they would have touched:"
+            f" {self.contacts[0]}. Use collisions=True, or other moves; see runner.missed_contacts"
+            " for more, of which there is no further warning"
         )

@@ -1,7 +1,7 @@
 """Arrays in memory that a worker shares with its caller.
 
-The memory is an anonymous file (memfd), passed to the worker by file descriptor. The kernel frees it when the last
-process that uses it ends, even by a crash, so nothing is left behind in /dev/shm.
+The memory is an anonymous file (memfd), passed to the worker by file descriptor. The kernel frees
+it when the last process that uses it ends, even by a crash, so nothing is left behind in /dev/shm.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ _ALIGN = 64  # a cache line, so that two workers never write to the same one
 
 
 class SharedArrays(SingleOwner):
-    """Named arrays in one block of shared memory: a new one, or the existing one with file descriptor ``fd``."""
+    """Named arrays in one block of shared memory: a new one, or the existing one with file
+    descriptor ``fd``.
+    """
 
     def __init__(self, layout: Layout, fd: int | None = None) -> None:
         self.layout = layout

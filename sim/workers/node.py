@@ -1,8 +1,9 @@
 """Machines of a Ray cluster as workers of a pool.
 
-Ray finds the machines, starts one actor on each and carries the messages. The actor has a pool of worker processes for
-a slice of the envs. It is lost with its machine, with any of its workers, or when it does not answer in time; the
-caller's pool then replaces it, here or on another machine, as it replaces a worker process.
+Ray finds the machines, starts one actor on each and carries the messages. The actor has a pool of
+worker processes for a slice of the envs. It is lost with its machine, with any of its workers, or
+when it does not answer in time; the caller's pool then replaces it, here or on another machine, as
+it replaces a worker process.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from batchpid.sim.workers.requests import Build, Request, Start
 from batchpid.sim.workers.worker import Worker, WorkerLost, pickled
 
 NODE_STEPS = 25_000
-"""Sim steps times envs of a worker in one request to its node, at most, unless a tick has more: half a second."""
+"""Sim steps times envs of a worker in one request to its node, at most, unless a tick has more:
+half a second.
+"""
 
 
 class Machine(NamedTuple):
@@ -56,7 +59,9 @@ class Answer(NamedTuple):
     failure: Failure | None = None
     """Failure of the pool, in place of the result."""
     arrays: Arrays | None = None
-    """Output (ticks, envs, ...) of the ticks that were completed, if the request changes the observation."""
+    """Output (ticks, envs, ...) of the ticks that were completed, if the request changes the
+    observation.
+    """
 
 
 class Node:
@@ -68,7 +73,8 @@ class Node:
     def start(self, message: bytes, workers: int, address: str) -> Answer:
         """Start the pool; return a :class:`NodeInfo`.
 
-        ``message`` is pickled: the type of the pool, the :class:`Start` of its envs, and the most ticks of a request.
+        ``message`` is pickled: the type of the pool, the :class:`Start` of its envs, and the most
+        ticks of a request.
         """
         pool_type, start, ticks = pickle.loads(message)
 
@@ -127,7 +133,11 @@ class Cluster:
             remedy = "lower cpus_per_node, or add larger machines"
             raise InvalidArgumentError("cluster", f"has no machine of {least} CPUs", remedy=remedy)
         parts = split_in_shares(num_envs, [machine.workers for machine in machines])
-        used = [(envs, machine) for envs, machine in zip(parts, machines, strict=True) if envs.stop > envs.start]
+        used = [
+            (envs, machine)
+            for envs, machine in zip(parts, machines, strict=True)
+            if envs.stop > envs.start
+        ]
         self.slices = [envs for envs, _ in used]
         """Envs of each node."""
         self.widest = max(-(-(envs.stop - envs.start) // machine.workers) for envs, machine in used)
@@ -137,13 +147,20 @@ class Cluster:
         self._losses: Counter[str] = Counter()
 
     def replace(self, index: int) -> None:
-        """Choose another machine for a lost node, if there is one that has lost fewer. Raises WorkerError for none."""
+        """Choose another machine for a lost node, if there is one that has lost fewer. Raises
+        WorkerError for none.
+        """
         self._losses[self.machines[index].node_id] += 1
         nodes = Counter(machine.node_id for machine in self.machines)
         candidates = self._machines()
         if not candidates:
-            raise WorkerError(f"the cluster has no machine left for node {index}; restore a snapshot in a new Runner")
-        self.machines[index] = min(candidates, key=lambda one: (self._losses[one.node_id], nodes[one.node_id]))
+            raise WorkerError(
+                f"the cluster has no machine left for node {index}; restore a snapshot in a new"
+                " Runner"
+            )
+        self.machines[index] = min(
+            candidates, key=lambda one: (self._losses[one.node_id], nodes[one.node_id])
+        )
 
     def _machines(self) -> list[Machine]:
         """Return the machines, in descending order of CPUs."""
@@ -152,7 +169,9 @@ class Cluster:
             cpus = int(node["Resources"].get("CPU", 0))
             if node["Alive"] and cpus >= (least or 1):
                 machines.append(Machine(node["NodeID"], node["NodeManagerAddress"], least or cpus))
-        return sorted(machines, key=lambda machine: (-machine.workers, machine.address, machine.node_id))
+        return sorted(
+            machines, key=lambda machine: (-machine.workers, machine.address, machine.node_id)
+        )
 
 
 def _connect(options: Ray) -> Any:
@@ -175,14 +194,22 @@ def _connect(options: Ray) -> Any:
             raise
     if not ray.is_initialized():
         cpus = len(os.sched_getaffinity(0))
-        ray.init("local", num_cpus=cpus, include_dashboard=False, log_to_driver=False, configure_logging=False)
+        ray.init(
+            "local",
+            num_cpus=cpus,
+            include_dashboard=False,
+            log_to_driver=False,
+            configure_logging=False,
+        )
     return ray
 
 
 class NodeWorker(Worker):
     """Caller's end of a node."""
 
-    def __init__(self, start: Start, shared: SharedArrays, cluster: Cluster, pool_type: Any) -> None:
+    def __init__(
+        self, start: Start, shared: SharedArrays, cluster: Cluster, pool_type: Any
+    ) -> None:
         super().__init__(start, shared)
         self._cluster, self._arrays = cluster, Arrays.from_fields(shared.arrays)
         ticks = len(self._arrays.observation.ok)

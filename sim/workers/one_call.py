@@ -1,4 +1,6 @@
-"""Exclusive use of a runner by one call at a time; Ctrl-C waits until the request of the call is done."""
+"""Exclusive use of a runner by one call at a time; Ctrl-C waits until the request of the call is
+done.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +17,10 @@ from batchpid.errors import InUseError
 class OneCall:
     """Use of a runner by one call at a time, from :meth:`begin` to :meth:`end`.
 
-    In the main thread SIGINT is held back during the call: its handler, which may raise KeyboardInterrupt, is called in
-    :meth:`end`. So a request to the workers is completed, and so is the change of the runner's state. A second SIGINT
-    is not held back while :attr:`waits` is set; if its handler raises, the request is not completed, and the runner
-    must be closed.
+    In the main thread SIGINT is held back during the call: its handler, which may raise
+    KeyboardInterrupt, is called in :meth:`end`. So a request to the workers is completed, and so is
+    the change of the runner's state. A second SIGINT is not held back while :attr:`waits` is set;
+    if its handler raises, the request is not completed, and the runner must be closed.
     """
 
     def __init__(self) -> None:
@@ -35,7 +37,9 @@ class OneCall:
         return self._user != 0 or os.getpid() != self._owner
 
     def check(self) -> None:
-        """Raise InUseError if another call is in progress, or the runner belongs to another process."""
+        """Raise InUseError if another call is in progress, or the runner belongs to another
+        process.
+        """
         if self.in_use:
             raise self._refusal(threading.get_ident(), os.getpid())
 
@@ -44,11 +48,14 @@ class OneCall:
         me, process = threading.get_ident(), os.getpid()
         if self._user or process != self._owner:
             raise self._refusal(me, process)
-        # No function is called since the check, so no other thread and no signal handler can run in between.
+        # No function is called since the check, so no other thread and no signal handler can run in
+        # between.
         self._user = me
         self._handler = None
         self._is_held = False
-        if me == self._main and _signal.getsignal(SIGINT) is not None:  # None: it is not one of Python
+        if (
+            me == self._main and _signal.getsignal(SIGINT) is not None
+        ):  # None: it is not one of Python
             try:
                 self._handler = _signal.signal(SIGINT, self._on_interrupt)
             except BaseException:  # of the handler, for a SIGINT that came before

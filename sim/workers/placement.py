@@ -16,8 +16,9 @@ def split_in_shares(num_envs: int, shares: Sequence[int]) -> list[slice]:
 def pinned_cores(workers: int) -> list[int]:
     """Return one core for each worker if there are as many workers as cores; else none.
 
-    The kernel may wake two workers on the core of the parent and leave another core idle for milliseconds. Fewer
-    workers than cores are not pinned: several programs could pin their workers to the same cores.
+    The kernel may wake two workers on the core of the parent and leave another core idle for
+    milliseconds. Fewer workers than cores are not pinned: several programs could pin their workers
+    to the same cores.
     """
     cores = sorted(os.sched_getaffinity(0))
     return cores if workers == len(cores) else []

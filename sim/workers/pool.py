@@ -1,11 +1,12 @@
-"""Pool of workers, each with a slice of the envs. A lost worker is replaced, and the new one replays its requests.
+"""Pool of workers, each with a slice of the envs. A lost worker is replaced, and the new one
+replays its requests.
 
-Every request that changes the loops is kept until the next checkpoint, a snapshot of all envs. A new worker gets the
-last checkpoint and all later requests. At a checkpoint all workers rebuild their scenes
-(:mod:`batchpid.sim.loop.snapshot`), so the replayed envs are bit-identical.
+Every request that changes the loops is kept until the next checkpoint, a snapshot of all envs. A
+new worker gets the last checkpoint and all later requests. At a checkpoint all workers rebuild
+their scenes (:mod:`batchpid.sim.loop.snapshot`), so the replayed envs are bit-identical.
 
-A request that has begun must be completed. An exception other than WorkerLost, such as one from a signal handler,
-leaves the pool in an invalid state, and its owner must close it.
+A request that has begun must be completed. An exception other than WorkerLost, such as one from a
+signal handler, leaves the pool in an invalid state, and its owner must close it.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from batchpid.sim.workers.worker import LocalWorker, ProcessWorker, Worker, Work
 MAX_LOSSES = 5
 """Number of losses of one worker during the same request after which the pool gives up."""
 _MAX_STEPS = 8000
-"""Largest number of sim steps times envs of one request to a worker, except for one tick: a fifth of a second."""
+"""Largest number of sim steps times envs of one request to a worker, except for one tick: a fifth
+of a second.
+"""
 _CLOSED = "this Runner was closed during a call"
 
 
@@ -62,12 +65,17 @@ class Outcome(NamedTuple):
 class WorkerPool(SingleOwner):
     """Workers of a runner: processes, or with ``options.workers`` 0 the loop in this process.
 
-    The loops start with ``params``, and the workers with :meth:`open`. With ``options.cluster`` the workers are nodes.
-    Each node has a pool for its ``envs`` (default: all) and with requests of ``ticks`` at most.
+    The loops start with ``params``, and the workers with :meth:`open`. With ``options.cluster`` the
+    workers are nodes. Each node has a pool for its ``envs`` (default: all) and with requests of
+    ``ticks`` at most.
     """
 
     def __init__(
-        self, options: RunnerOptions, params: bp.PIDParams, envs: slice | None = None, ticks: int | None = None
+        self,
+        options: RunnerOptions,
+        params: bp.PIDParams,
+        envs: slice | None = None,
+        ticks: int | None = None,
     ) -> None:
         envs = slice(0, options.num_envs) if envs is None else envs
         num_envs, count = envs.stop - envs.start, options.workers
@@ -89,7 +97,9 @@ class WorkerPool(SingleOwner):
             slices = split_in_shares(num_envs, [1] * max(1, min(count or 0, num_envs)))
             widest, most_steps = -(-num_envs // len(slices)), _MAX_STEPS
         ticks = ticks or max(1, most_steps // (options.substeps * widest))
-        layout = Arrays.layout(ticks, num_envs, options.robot.dof, options.command.size, options.observed)
+        layout = Arrays.layout(
+            ticks, num_envs, options.robot.dof, options.command.size, options.observed
+        )
         self._shared = SharedArrays(layout)
         self.arrays = Arrays.from_fields(self._shared.arrays)
         """Input and output of a request (ticks, envs, ...)."""
@@ -109,7 +119,9 @@ class WorkerPool(SingleOwner):
             elif self.is_local:
                 self.workers.append(LocalWorker(start, self._shared))
             else:
-                self.workers.append(ProcessWorker(start, self._shared, cores[index] if cores else None))
+                self.workers.append(
+                    ProcessWorker(start, self._shared, cores[index] if cores else None)
+                )
 
     def open(self) -> None:
         """Start the workers and wait until all are ready."""
@@ -139,7 +151,8 @@ class WorkerPool(SingleOwner):
         return self.finish()
 
     def begin(self, request: Request) -> None:
-        """Send every worker its part of ``request``; :meth:`finish` waits for the end. Raises as :meth:`run`.
+        """Send every worker its part of ``request``; :meth:`finish` waits for the end. Raises as
+        :meth:`run`.
 
         A loop in this process executes it at once.
         """
@@ -155,9 +168,11 @@ class WorkerPool(SingleOwner):
             raise
 
     def finish(self) -> Outcome:
-        """Wait until every worker has executed the request, and return the outcome. Raises as :meth:`run`.
+        """Wait until every worker has executed the request, and return the outcome. Raises as
+        :meth:`run`.
 
-        It waits for one worker after another: to wake up for the first would take the core of one that still runs.
+        It waits for one worker after another: to wake up for the first would take the core of one
+        that still runs.
         """
         request = self._request
         results = []
@@ -198,7 +213,11 @@ class WorkerPool(SingleOwner):
         for worker in self.workers:
             worker.close()
         self.workers = []
-        for name in ("arrays", "ticks", "present"):  # views that would keep the memory and its descriptor
+        for name in (
+            "arrays",
+            "ticks",
+            "present",
+        ):  # views that would keep the memory and its descriptor
             vars(self).pop(name, None)
         self._shared.close()
 
@@ -232,4 +251,6 @@ class WorkerPool(SingleOwner):
             self.warnings.append(f"{cause}; replaced and replayed in {seconds:.1f} s")
             return result
         remedy = "run these envs with workers=0 to see why"
-        raise WorkerLost(f"{loss}; lost {self.max_losses} times during the same request: {remedy}") from loss
+        raise WorkerLost(
+            f"{loss}; lost {self.max_losses} times during the same request: {remedy}"
+        ) from loss

@@ -18,7 +18,9 @@ class Request(ABC):
     """Base of all requests, which are frozen dataclasses for all envs of a pool."""
 
     changes_loop = True
-    """True if the replacement of a lost worker repeats the request, and an error in it closes the pool."""
+    """True if the replacement of a lost worker repeats the request, and an error in it closes the
+    pool.
+    """
     ticks = 0
     """Ticks of the arrays that hold observations afterwards; 0: the observation does not change."""
     substeps = 10
@@ -29,7 +31,9 @@ class Request(ABC):
     """True if the ticks that every env completed before an error are kept."""
 
     def for_envs(self, envs: slice) -> Self:
-        """Return the part of some envs, of fields that are arrays (envs, ...) or have such a method."""
+        """Return the part of some envs, of fields that are arrays (envs, ...) or have such a
+        method.
+        """
 
         def part(value: Any) -> Any:
             if value is None:
@@ -42,7 +46,7 @@ class Request(ABC):
         """Return a copy that later writes to the caller's arrays do not change."""
         return deepcopy(self)
 
-    def write(self, arrays: Arrays, envs: slice) -> None:  # noqa: B027  (most requests travel in the message)
+    def write(self, arrays: Arrays, envs: slice) -> None:  # noqa: B027
         """Write the rows of some envs to the shared arrays (ticks, envs, ...)."""
 
     def encode(self, envs: slice) -> bytes:
@@ -70,7 +74,9 @@ class Start:
     params: bp.PIDParams
     """Params of these envs."""
     first_env: int = 0
-    """Number of the pool's first env within the runner; each node of a cluster has a pool for some of the envs."""
+    """Number of the pool's first env within the runner; each node of a cluster has a pool for some
+    of the envs.
+    """
 
     def build(self, arrays: Arrays) -> Loop:
         """Return the loop, with the shared arrays (ticks, envs, ...) of the pool's envs."""

@@ -1,4 +1,6 @@
-"""Main program of a worker process: build the loop, then serve the caller's requests until it closes the socket."""
+"""Main program of a worker process: build the loop, then serve the caller's requests until it
+closes the socket.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +27,20 @@ _SPIN_SECONDS = 2e-4
 
 
 def main() -> None:
-    """Serve, given the descriptors of the socket and of the shared memory as the last arguments of the program."""
+    """Serve, given the descriptors of the socket and of the shared memory as the last arguments of
+    the program.
+    """
     if sys.stderr is not None:
         faulthandler.enable()
-    # The caller holds the other end of the pipe at standard input. When it ends, the kernel kills this process, even in
-    # a call that no Python code interrupts.
+    # The caller holds the other end of the pipe at standard input. When it ends, the kernel kills
+    # this process, even in a call that no Python code interrupts.
     fcntl.fcntl(0, fcntl.F_SETOWN, os.getpid())
     fcntl.fcntl(0, fcntl.F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(0, fcntl.F_SETFL, os.O_ASYNC)
     channel, memory = map(int, sys.argv[-2:])
-    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the caller has ended
+    with contextlib.suppress(
+        EOFError, BrokenPipeError, ConnectionResetError
+    ):  # the caller has ended
         _serve(socket.socket(fileno=channel), memory)
     os._exit(0)  # nothing to save, and the engine's own cleanup can take long
 

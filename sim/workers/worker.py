@@ -1,9 +1,10 @@
 """Workers as the pool sees them: a loop in this process, or the caller's end of a worker process.
 
-A worker process is a fresh Python, which does not import the caller's ``__main__``: it works from notebooks and from
-scripts without a main guard. It shares with the caller a socket and a block of memory, both by file descriptor, and a
-pipe. When the worker dies, the caller sees the socket close; when the caller dies, the pipe closes, and the kernel
-kills the worker. Ctrl-C reaches the caller alone, since a worker is in another session.
+A worker process is a fresh Python, which does not import the caller's ``__main__``: it works from
+notebooks and from scripts without a main guard. It shares with the caller a socket and a block of
+memory, both by file descriptor, and a pipe. When the worker dies, the caller sees the socket close;
+when the caller dies, the pipe closes, and the kernel kills the worker. Ctrl-C reaches the caller
+alone, since a worker is in another session.
 """
 
 from __future__ import annotations
@@ -35,10 +36,17 @@ from batchpid.sim.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.requests import Build, Request, Start
 
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
+)
 ONE_THREAD |= {"NPROC": "1", "JAX_CPU_ENABLE_ASYNC_DISPATCH": "0", "JAX_PLATFORMS": "cpu"}
-"""Environment of a process whose BLAS uses one thread, and whose JAX computes on the CPU, on the caller's thread."""
-_PROGRAM = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); import batchpid.sim.workers.serve as s; s.main()"
+"""Environment of a process whose BLAS uses one thread, and whose JAX computes on the CPU, on the
+caller's thread.
+"""
+_PROGRAM = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); import batchpid.sim.workers.serve as"
+    " s; s.main()"
+)
 
 
 class WorkerLost(WorkerError):
@@ -46,7 +54,9 @@ class WorkerLost(WorkerError):
 
 
 class Worker(SingleOwner, ABC):
-    """Loop of some envs: :meth:`send` a request, then :meth:`receive` its result. The first request is a Build."""
+    """Loop of some envs: :meth:`send` a request, then :meth:`receive` its result. The first request
+    is a Build.
+    """
 
     pid: int | None = None
     """Process id; None: this process."""
@@ -75,16 +85,23 @@ class Worker(SingleOwner, ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Free the scenes, or end the process at once. May be called again, after an interrupt too."""
+        """Free the scenes, or end the process at once. May be called again, after an interrupt
+        too.
+        """
 
     @property
     def label(self) -> str:
         """Number, process and envs, for messages."""
         first, process = self._start.first_env, "" if self.pid is None else f"pid {self.pid}, "
-        return f"{self._start.index} ({process}envs {first + self.envs.start} to {first + self.envs.stop - 1})"
+        return (
+            f"{self._start.index} ({process}envs {first + self.envs.start} to"
+            f" {first + self.envs.stop - 1})"
+        )
 
     def limit(self, request: Request) -> float:
-        """Return the time after which the worker counts as stuck [s]; a sim step of an env takes about 20 us."""
+        """Return the time after which the worker counts as stuck [s]; a sim step of an env takes
+        about 20 us.
+        """
         steps = (request.ticks or 1) * request.substeps * (self.envs.stop - self.envs.start)
         return self._start.options.timeout + request.patience + 1e-3 * steps
 
@@ -117,14 +134,17 @@ class ProcessWorker(Worker):
     def __init__(self, start: Start, shared: SharedArrays, core: int | None = None) -> None:
         super().__init__(start, shared)
         self._core = core
-        # Once: a controller may change in the caller, and a replacement begins as the first worker did.
+        # Once: a controller may change in the caller, and a replacement begins as the first worker
+        # did.
         self._message = pickled((start, shared.layout), start.options)
         self._end = contextlib.ExitStack()
         """Ends the process and closes its files."""
 
     def open(self) -> None:
         paths = [path for path in sys.path if isinstance(path, str)]
-        paths.append(str(Path(__file__).parents[3]))  # where "" led to, before the caller changed the folder
+        paths.append(
+            str(Path(__file__).parents[3])
+        )  # where "" led to, before the caller changed the folder
         environment = os.environ | ONE_THREAD
         if native.obstacle():
             environment[native.SWITCH] = "0"  # one warning for all
@@ -135,7 +155,14 @@ class ProcessWorker(Worker):
                 descriptors = theirs.fileno(), self._shared.fd
                 self._process = process = subprocess.Popen(
                     # -P: without it the working folder comes first, and a json.py in it would run.
-                    [sys.executable, "-P", "-c", _PROGRAM, json.dumps(paths), *map(str, descriptors)],
+                    [
+                        sys.executable,
+                        "-P",
+                        "-c",
+                        _PROGRAM,
+                        json.dumps(paths),
+                        *map(str, descriptors),
+                    ],
                     stdin=subprocess.PIPE,
                     pass_fds=descriptors,
                     env=environment,
@@ -144,7 +171,9 @@ class ProcessWorker(Worker):
         assert process.stdin is not None
         self._end.callback(process.stdin.close)
         self._end.callback(process.wait)
-        self._end.callback(process.kill)  # in a forked child of the caller, whose child this is not, of no effect
+        self._end.callback(
+            process.kill
+        )  # in a forked child of the caller, whose child this is not, of no effect
         self._answers = self._socket.makefile("rb")
         self.pid = process.pid
         if self._core is not None:
@@ -156,7 +185,9 @@ class ProcessWorker(Worker):
         self._deadline = time.monotonic() + limit
         self._socket.settimeout(limit)
         try:
-            self._socket.sendall(self._message if type(request) is Build else request.encode(self.envs))
+            self._socket.sendall(
+                self._message if type(request) is Build else request.encode(self.envs)
+            )
         except OSError as error:
             self._raise_early(error)
             self._process.kill()  # receive() reports it
@@ -192,7 +223,8 @@ class ProcessWorker(Worker):
 
 
 def pickled(message: Any, options: RunnerOptions) -> bytes:
-    """Return the start message of a worker as bytes, with functions and classes that the worker cannot import.
+    """Return the start message of a worker as bytes, with functions and classes that the worker
+    cannot import.
 
     Raises
     ------
@@ -203,7 +235,10 @@ def pickled(message: Any, options: RunnerOptions) -> bytes:
         return cloudpickle.dumps(message)
     except Exception as error:
         raise InvalidArgumentError(
-            next((entry.name for entry in fields(options) if _refuses(getattr(options, entry.name))), "options"),
+            next(
+                (entry.name for entry in fields(options) if _refuses(getattr(options, entry.name))),
+                "options",
+            ),
             f"cannot be sent to a worker process: {error}",
             remedy="let it hold nothing that cannot be pickled, or pass workers=0",
         ) from error

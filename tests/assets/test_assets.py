@@ -1,4 +1,6 @@
-"""Bundled robots: the figures of their sources, the tutorial's settings, and shapes that do not touch each other."""
+"""Bundled robots: the figures of their sources, the tutorial's settings, and shapes that do not
+touch each other.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ ROBOTS = ("panda", "jaco2")
 TIMESTEP = 1 / 2000
 PI = np.pi
 
-# Effort and velocity limits, total mass and joint damping, as the sources named in assets/README.md state them.
+# Effort and velocity limits, total mass and joint damping, as the sources named in assets/README.md
+# state them.
 EFFORT = {
     "panda": [87] * 4 + [12] * 3 + [100] * 2,
     "jaco2": [40, 80, 40, 40, 20, 20, 20] + [2] * 6,
@@ -31,32 +34,47 @@ VELOCITY = {
 }
 LOWER = {
     "panda": [-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973, 0, 0],
-    "jaco2": [-2 * PI, PI * 47 / 180, -2 * PI, PI * 30 / 180, -2 * PI, PI * 65 / 180, -2 * PI] + [0] * 6,
+    "jaco2": (
+        [-2 * PI, PI * 47 / 180, -2 * PI, PI * 30 / 180, -2 * PI, PI * 65 / 180, -2 * PI] + [0] * 6
+    ),
 }
 UPPER = {
     "panda": [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973, 0.04, 0.04],
-    "jaco2": [2 * PI, PI * 313 / 180, 2 * PI, PI * 330 / 180, 2 * PI, PI * 295 / 180, 2 * PI] + [1.41] * 3 + [2] * 3,
+    "jaco2": (
+        [2 * PI, PI * 313 / 180, 2 * PI, PI * 330 / 180, 2 * PI, PI * 295 / 180, 2 * PI]
+        + [1.41] * 3
+        + [2] * 3
+    ),
 }
 DAMPING = {"panda": [0.003] * 7 + [0.3] * 2, "jaco2": [0] * 13}
 MASS = {"panda": 17.451901, "jaco2": 5.55724}
 
-START = {"panda": [0, 0, 0, -0.07, 0, 0, 0, 0, 0], "jaco2": [0, 3.14, 0, 3.14, 0, 3.14, 0] + [0] * 6}
+START = {
+    "panda": [0, 0, 0, -0.07, 0, 0, 0, 0, 0],
+    "jaco2": [0, 3.14, 0, 3.14, 0, 3.14, 0] + [0] * 6,
+}
 TARGET = {
     "panda": [1, 1, 1, -1, 1, 1, 1, 0.04, 0.04],
     "jaco2": [4.71, 2.84, 0.0, 0.75, 4.62, 4.48, 4.88] + [0] * 6,
 }
 GAINS = {
     "panda": [(40, 5, 2)] * 7 + [(0.1, 0, 0.02)] * 2,
-    "jaco2": [(40, 5, 2)] * 3 + [(20, 5, 2)] + [(5, 0.8, 2)] * 2 + [(5, 0.8, 0.4)] + [(0.1, 0, 0.02)] * 6,
+    "jaco2": (
+        [(40, 5, 2)] * 3 + [(20, 5, 2)] + [(5, 0.8, 2)] * 2 + [(5, 0.8, 0.4)] + [(0.1, 0, 0.02)] * 6
+    ),
 }
 
 
 def xml(name: str) -> etree._Element:
-    return etree.fromstring((importlib.resources.files("batchpid.assets") / f"{name}.urdf").read_bytes())
+    return etree.fromstring(
+        (importlib.resources.files("batchpid.assets") / f"{name}.urdf").read_bytes()
+    )
 
 
 def settings(name: str) -> dict:
-    return yaml.safe_load((importlib.resources.files("batchpid.assets") / f"{name}.yaml").read_text())
+    return yaml.safe_load(
+        (importlib.resources.files("batchpid.assets") / f"{name}.yaml").read_text()
+    )
 
 
 class World:
@@ -141,16 +159,22 @@ def test_limits_and_dynamics_are_those_of_the_sources(name: str) -> None:
 
 
 def test_sapien_orders_the_joints_as_the_file_does(name: str, world: World) -> None:
-    listed = [joint.get("name") for joint in xml(name).findall("joint") if joint.get("type") != "fixed"]
+    listed = [
+        joint.get("name") for joint in xml(name).findall("joint") if joint.get("type") != "fixed"
+    ]
     assert [joint.name for joint in world.joints] == listed == list(settings(name)["joints"])
     assert world.robot.dof == len(LOWER[name])
     np.testing.assert_allclose(
-        [joint.limits[0] for joint in world.joints], np.transpose([LOWER[name], UPPER[name]]), atol=1e-6
+        [joint.limits[0] for joint in world.joints],
+        np.transpose([LOWER[name], UPPER[name]]),
+        atol=1e-6,
     )
     np.testing.assert_allclose([joint.damping for joint in world.joints], DAMPING[name], rtol=1e-6)
 
 
-def test_the_total_mass_is_that_of_the_source_and_no_link_is_massless(name: str, world: World) -> None:
+def test_the_total_mass_is_that_of_the_source_and_no_link_is_massless(
+    name: str, world: World
+) -> None:
     masses = [link.mass for link in world.robot.links]
     assert sum(masses) == pytest.approx(MASS[name], abs=1e-6)
     assert min(masses) == pytest.approx(0.01 if name == "jaco2" else 0.015)
@@ -159,14 +183,26 @@ def test_the_total_mass_is_that_of_the_source_and_no_link_is_massless(name: str,
 def test_panda_passive_force_is_that_of_the_source(tmp_path: Path) -> None:
     # Expected values: SAPIEN 3.0.3 on the source description, without mimic and meshes.
     passive = World(xml("panda"), tmp_path).passive(
-        [0.3, -0.4, 0.5, -1.6, 0.7, 1.8, -0.9, 0.01, 0.03], [0.5, -1, 1.5, 0.8, -1.2, 2, -0.7, 0.05, -0.02]
+        [0.3, -0.4, 0.5, -1.6, 0.7, 1.8, -0.9, 0.01, 0.03],
+        [0.5, -1, 1.5, 0.8, -1.2, 2, -0.7, 0.05, -0.02],
     )
-    expected = [1.782364, -14.247656, -5.767752, 19.389013, 1.209106, 2.049891, -0.035392, 0.028486, -0.038695]
+    expected = [
+        1.782364,
+        -14.247656,
+        -5.767752,
+        19.389013,
+        1.209106,
+        2.049891,
+        -0.035392,
+        0.028486,
+        -0.038695,
+    ]
     np.testing.assert_allclose(passive, expected, atol=5e-5)
 
 
 def test_jaco2_passive_force_without_the_additions_is_that_of_the_source(tmp_path: Path) -> None:
-    # Expected values: SAPIEN 3.0.3 on the source description, which has neither finger 2 nor moving tips.
+    # Expected values: SAPIEN 3.0.3 on the source description, which has neither finger 2 nor moving
+    # tips.
     root = xml("jaco2")
     for element in root.findall("link") + root.findall("joint"):
         label = element.get("name")
@@ -175,9 +211,20 @@ def test_jaco2_passive_force_without_the_additions_is_that_of_the_source(tmp_pat
         elif element.tag == "joint" and "tip" in label:
             element.set("type", "fixed")
     passive = World(root, tmp_path).passive(
-        [0.3, 2.6, 0.5, 1.9, -0.7, 2.4, 0.9, 0.4, 0.8], [0.5, -1, 1.5, 0.8, -1.2, 2, -0.7, 0.6, -0.4]
+        [0.3, 2.6, 0.5, 1.9, -0.7, 2.4, 0.9, 0.4, 0.8],
+        [0.5, -1, 1.5, 0.8, -1.2, 2, -0.7, 0.6, -0.4],
     )
-    expected = [0.67722, 2.546988, -2.425809, 4.644617, 0.909402, 0.181891, 0.00139, 0.007114, -0.004496]
+    expected = [
+        0.67722,
+        2.546988,
+        -2.425809,
+        4.644617,
+        0.909402,
+        0.181891,
+        0.00139,
+        0.007114,
+        -0.004496,
+    ]
     np.testing.assert_allclose(passive, expected, atol=5e-5)
 
 
@@ -214,7 +261,9 @@ def test_jaco2_fingers_close_with_positive_angles(finger: int, tmp_path: Path) -
 
 def test_no_links_touch_at_start_or_target_or_between(name: str, world: World) -> None:
     start, target = np.array(START[name]), np.array(TARGET[name])
-    touching = {pair for a in np.linspace(0, 1, 21) for pair in world.touching(start + a * (target - start))}
+    touching = {
+        pair for a in np.linspace(0, 1, 21) for pair in world.touching(start + a * (target - start))
+    }
     assert touching == set()
 
 

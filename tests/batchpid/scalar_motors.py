@@ -1,4 +1,6 @@
-"""Guard, friction, motors and sensors on plain Python numbers, one joint at a time: slow, obvious oracles."""
+"""Guard, friction, motors and sensors on plain Python numbers, one joint at a time: slow, obvious
+oracles.
+"""
 
 from __future__ import annotations
 
@@ -38,15 +40,26 @@ class ScalarGuard:
             steps = 1
             while change * dt * steps * (steps + 1) / 2 < abs(error):
                 steps += 1
-            speed = math.copysign(abs(error) / (steps * dt) + (steps - 1) * change / 2, error) if error else 0.0
-        speed = within(within(speed, -self.rate, self.rate), self.speed - change, self.speed + change)
-        self.setpoint, self.speed = (target if speed == wanted else self.setpoint + dt * speed), speed
+            speed = (
+                math.copysign(abs(error) / (steps * dt) + (steps - 1) * change / 2, error)
+                if error
+                else 0.0
+            )
+        speed = within(
+            within(speed, -self.rate, self.rate), self.speed - change, self.speed + change
+        )
+        self.setpoint, self.speed = (
+            (target if speed == wanted else self.setpoint + dt * speed),
+            speed,
+        )
         return self.setpoint
 
 
 @dataclass
 class ScalarFriction:
-    """Friction of one joint that moves at ``velocity`` under ``effort``; ``gain`` is K and ``share`` w."""
+    """Friction of one joint that moves at ``velocity`` under ``effort``; ``gain`` is K and
+    ``share`` w.
+    """
 
     velocity: float
     effort: float
@@ -76,12 +89,18 @@ class ScalarFriction:
         return self.effort - self.viscous * velocity
 
 
-def friction_gains(mass: np.ndarray, viscous: np.ndarray, rubs: np.ndarray, dt: float) -> tuple[list, list]:
-    """Return K and w of the joints of one robot with a ``mass`` matrix; ``rubs`` says which joints have friction."""
+def friction_gains(
+    mass: np.ndarray, viscous: np.ndarray, rubs: np.ndarray, dt: float
+) -> tuple[list, list]:
+    """Return K and w of the joints of one robot with a ``mass`` matrix; ``rubs`` says which joints
+    have friction.
+    """
     inverse, joints = np.linalg.inv(mass + dt * np.diag(viscous)), range(len(mass))
     gains = []
     for j in joints:
-        correlations = [abs(inverse[i, j]) / math.sqrt(inverse[i, i] * inverse[j, j]) for i in joints if rubs[i]]
+        correlations = [
+            abs(inverse[i, j]) / math.sqrt(inverse[i, i] * inverse[j, j]) for i in joints if rubs[i]
+        ]
         gains.append(0.7 / (dt * inverse[j, j] * sum(correlations)) if rubs[j] else 0.0)
     return gains, [1 - dt * viscous[j] * inverse[j, j] for j in joints]
 
@@ -128,19 +147,25 @@ class ScalarMotor:
         late = self.late(self.efforts, self.command_delay / dt, 0.0, lambda a, b: a - b)
         motor = within(self.strength * late + self.bias, low, high)
         if self.lag > 0:
-            motor = within(self.delivered - math.expm1(-dt / self.lag) * (motor - self.delivered), low, high)
+            motor = within(
+                self.delivered - math.expm1(-dt / self.lag) * (motor - self.delivered), low, high
+            )
         self.delivered = motor
         return motor
 
     def measure(self, position: float, velocity: float, dt: float) -> tuple[float, float]:
         if self.backlash > 0:
-            behind = difference(self.measured[-1][0] if self.measured else self.start, position, self.continuous)
+            behind = difference(
+                self.measured[-1][0] if self.measured else self.start, position, self.continuous
+            )
             offset = within(behind, -self.backlash / 2, self.backlash / 2)
             position, velocity = position + offset, (velocity if offset != behind else 0.0)
         self.measured.append((position, velocity))
         positions, velocities = ([each[at] for each in self.measured] for at in (0, 1))
         steps = self.sensor_delay / dt
-        position = self.late(positions, steps, self.start, lambda a, b: difference(a, b, self.continuous))
+        position = self.late(
+            positions, steps, self.start, lambda a, b: difference(a, b, self.continuous)
+        )
         velocity = self.late(velocities, steps, 0.0, lambda a, b: a - b)
         return (
             rounded(position + self.position_offset, self.position_resolution),
@@ -148,7 +173,9 @@ class ScalarMotor:
         )
 
     def late(self, values: list, steps: float, before: float, less) -> float:
-        """Return the last of ``values`` as it was ``steps`` ago, interpolated; ``before`` the first it was that."""
+        """Return the last of ``values`` as it was ``steps`` ago, interpolated; ``before`` the first
+        it was that.
+        """
         whole = math.floor(steps + 1e-5)
         near, far = (values[-1 - k] if k < len(values) else before for k in (whole, whole + 1))
         share = steps - whole

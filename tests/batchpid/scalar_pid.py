@@ -1,4 +1,6 @@
-"""The law on plain Python numbers, one joint at a time: the slow, obvious oracle of the array law."""
+"""The law on plain Python numbers, one joint at a time: the slow, obvious oracle of the array
+law.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ from batchpid import PIDParams
 
 @dataclass
 class ScalarPID:
-    """One PID loop of one joint; the options are as in :func:`batchpid.make_params`, each a number or a name."""
+    """One PID loop of one joint; the options are as in :func:`batchpid.make_params`, each a number
+    or a name.
+    """
 
     kp: float
     ki: float = 0.0
@@ -50,7 +54,9 @@ class ScalarPID:
     ) -> float:
         """Return the effort after ``dt`` more seconds."""
         inputs = [setpoint, measurement, measurement_rate, setpoint_rate, feedforward]
-        if self.non_finite != "propagate" and not all(math.isfinite(x) for x in inputs if x is not None):
+        if self.non_finite != "propagate" and not all(
+            math.isfinite(x) for x in inputs if x is not None
+        ):
             return self.effort if self.non_finite == "hold" else 0.0
 
         error = self.difference(setpoint, measurement)
@@ -67,7 +73,9 @@ class ScalarPID:
 
         rate = -(moved / dt) if measurement_rate is None else -measurement_rate
         if setpoint_rate is not None:
-            weight = 1.0 if self.setpoint_weight_derivative is None else self.setpoint_weight_derivative
+            weight = (
+                1.0 if self.setpoint_weight_derivative is None else self.setpoint_weight_derivative
+            )
             rate += weight * setpoint_rate
         elif self.setpoint_weight_derivative is not None and self.setpoint is not None:
             rate += self.setpoint_weight_derivative * self.difference(setpoint, self.setpoint) / dt
@@ -87,9 +95,9 @@ class ScalarPID:
         if self.anti_windup == "conditional" and (self.unsaturated - effort) * error > 0:
             self.integral = before
         if self.anti_windup == "back_calculation":
-            self.integral += min(dt / self.tracking_time if self.tracking_time > 0 else 1.0, 1.0) * (
-                effort - self.unsaturated
-            )
+            self.integral += min(
+                dt / self.tracking_time if self.tracking_time > 0 else 1.0, 1.0
+            ) * (effort - self.unsaturated)
         self.integral = min(max(self.integral, self.integral_min), self.integral_max)
 
         self.measurement, self.setpoint, self.effort = measurement, setpoint, effort
@@ -108,7 +116,11 @@ def scalar_pids(params: PIDParams, num_envs: int) -> list[list[ScalarPID]]:
     options = {name: value for name, value in params.options().items() if name in known}
 
     def pick(value: Any, env: int, joint: int) -> Any:
-        return value if isinstance(value, str) else value.tolist()[env if value.shape[0] > 1 else 0][joint]
+        return (
+            value
+            if isinstance(value, str)
+            else value.tolist()[env if value.shape[0] > 1 else 0][joint]
+        )
 
     return [
         [

@@ -1,4 +1,6 @@
-"""Each effect of the actuators against its closed form, and against independent statements of its peers' formulas."""
+"""Each effect of the actuators against its closed form, and against independent statements of its
+peers' formulas.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +36,9 @@ def run_sensor(chosen, positions, velocities=None):
     speeds = np.gradient(positions, DT, axis=0) if velocities is None else velocities
     state, seen = actuators.init(chosen, positions[0], DT, qvel=speeds[0]), []
     for qpos, qvel in zip(positions, speeds, strict=True):
-        state, *measured = actuators.measure(chosen, state, read_only(qpos, float), read_only(qvel, float), DT)
+        state, *measured = actuators.measure(
+            chosen, state, read_only(qpos, float), read_only(qvel, float), DT
+        )
         seen.append(measured)
     return tuple(map(np.array, zip(*seen, strict=True)))
 
@@ -66,7 +70,9 @@ def test_the_lag_answers_a_step_by_an_exponential(lag, effort):
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=15)
 def test_the_envelope_is_that_of_isaac_lab_and_of_newton(seed):
-    """Their formulas stated again: of DCMotor with its clip of the speed, and of ClampingDCMotor."""
+    """Their formulas stated again: of DCMotor with its clip of the speed, and of
+    ClampingDCMotor.
+    """
     rng = np.random.default_rng(seed)
     stall, speed, limit = (10.0 ** rng.uniform(-1, 2, 50) for _ in range(3))
     effort, v = 3 * stall * rng.normal(size=50), 2 * speed * rng.normal(size=50)
@@ -75,17 +81,27 @@ def test_the_envelope_is_that_of_isaac_lab_and_of_newton(seed):
 
     corner = speed * (1 + limit / stall)
     u = np.clip(v, -corner, corner)
-    high, low = np.minimum(stall * (1 - u / speed), limit), np.maximum(stall * (-1 - u / speed), -limit)
-    np.testing.assert_allclose(ours, np.clip(effort, low, high), rtol=1e-12, atol=1e-12 * stall.max())
+    high, low = (
+        np.minimum(stall * (1 - u / speed), limit),
+        np.maximum(stall * (-1 - u / speed), -limit),
+    )
+    np.testing.assert_allclose(
+        ours, np.clip(effort, low, high), rtol=1e-12, atol=1e-12 * stall.max()
+    )
 
-    most, least = np.minimum(stall * (1 - v / speed), limit), np.maximum(stall * (-1 - v / speed), -limit)
+    most, least = (
+        np.minimum(stall * (1 - v / speed), limit),
+        np.maximum(stall * (-1 - v / speed), -limit),
+    )
     newton = np.minimum(np.maximum(effort, least), most)
     within = np.abs(v) <= corner
     np.testing.assert_allclose(ours[within], newton[within], rtol=1e-12, atol=1e-12 * stall.max())
 
 
 def test_the_lag_is_mujocos_exact_filter():
-    """Its activation, stated again, with the control clipped before and after (its ctrlrange and forcerange)."""
+    """Its activation, stated again, with the control clipped before and after (its ctrlrange and
+    forcerange).
+    """
     chosen, activation, expected = bp.make_actuators(1, lag=0.01, effort_limit=2.0), 0.0, []
     asked = np.random.default_rng(0).uniform(-2, 2, 50)
     for control in asked:
@@ -97,17 +113,30 @@ def test_the_lag_is_mujocos_exact_filter():
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=50)
 def test_the_command_limits_are_where_the_motor_clips(seed):
-    """Clipped to them a command has the same effect, and within them it has all of its effect, without delay or lag."""
+    """Clipped to them a command has the same effect, and within them it has all of its effect,
+    without delay or lag.
+    """
     rng, joints = np.random.default_rng(seed), 30
     strength = np.where(rng.random(joints) < 0.2, 0.0, rng.uniform(0.2, 3, joints))
     options = {"strength": strength, "bias": rng.normal(0, 5, joints)}
     options = {name: options[name] for name in options if rng.random() < 0.7}
-    line = {"saturation_effort": rng.uniform(1, 40, joints), "no_load_speed": rng.uniform(1, 5, joints)}
+    line = {
+        "saturation_effort": rng.uniform(1, 40, joints),
+        "no_load_speed": rng.uniform(1, 5, joints),
+    }
     table = np.sort(rng.uniform(-3, 3, (joints, 4))), rng.uniform(5, 30, (joints, 4))
-    shape = {"position_limit": table} if rng.random() < 0.5 else {"effort_limit": rng.uniform(1, 30, joints)}
+    shape = (
+        {"position_limit": table}
+        if rng.random() < 0.5
+        else {"effort_limit": rng.uniform(1, 30, joints)}
+    )
     static = bp.make_actuators(joints, **options, **(line if rng.random() < 0.5 else {}), **shape)
     late = static.replace(command_delay=0.01, lag=0.1)
-    asked, q, v = rng.normal(0, 100, (1, joints)), rng.normal(0, 2, (1, joints)), rng.normal(0, 3, (1, joints))
+    asked, q, v = (
+        rng.normal(0, 100, (1, joints)),
+        rng.normal(0, 2, (1, joints)),
+        rng.normal(0, 3, (1, joints)),
+    )
     ends = [
         actuators.command_limits(actuators.discretise(each, actuators.init(each, q, DT), DT), q, v)
         for each in (static, late)
@@ -125,7 +154,10 @@ def test_the_command_limits_are_where_the_motor_clips(seed):
 
 
 def test_without_an_envelope_no_command_is_clipped():
-    chosen, q = bp.make_actuators(2, strength=0.5, bias=1.0, lag=0.1, command_delay=0.1), np.zeros((3, 2))
+    chosen, q = (
+        bp.make_actuators(2, strength=0.5, bias=1.0, lag=0.1, command_delay=0.1),
+        np.zeros((3, 2)),
+    )
     k = actuators.discretise(chosen, actuators.init(chosen, q, DT), DT)
     assert actuators.command_limits(k, q, q) == (None, None)
 
@@ -133,21 +165,31 @@ def test_without_an_envelope_no_command_is_clipped():
 @given(ratio=st.floats(0.05, 0.95))
 @settings(max_examples=6)
 def test_backlash_has_the_describing_function_of_the_play(ratio):
-    """J.-J. Slotine and W. Li, Applied Nonlinear Control (1991), section 5.2.3, with half width b and amplitude A."""
+    """J.-J. Slotine and W. Li, Applied Nonlinear Control (1991), section 5.2.3, with half width b
+    and amplitude A.
+    """
     amplitude, count = 1.0, 600
     b = ratio * amplitude
     phase = 2 * np.pi * np.arange(2 * count) / count
-    seen, _ = run_sensor(bp.make_actuators(1, backlash=2 * b), (amplitude * np.sin(phase))[:, None, None])
+    seen, _ = run_sensor(
+        bp.make_actuators(1, backlash=2 * b), (amplitude * np.sin(phase))[:, None, None]
+    )
     period = seen[count:, 0, 0]
-    in_phase, quadrature = (2 / count * (period * wave(phase[count:])).sum() for wave in (np.sin, np.cos))
+    in_phase, quadrature = (
+        2 / count * (period * wave(phase[count:])).sum() for wave in (np.sin, np.cos)
+    )
     x = 2 * b / amplitude - 1
-    assert in_phase == pytest.approx(amplitude / np.pi * (np.pi / 2 - np.arcsin(x) - x * np.sqrt(1 - x**2)), abs=2e-3)
+    assert in_phase == pytest.approx(
+        amplitude / np.pi * (np.pi / 2 - np.arcsin(x) - x * np.sqrt(1 - x**2)), abs=2e-3
+    )
     assert quadrature == pytest.approx(4 * b / np.pi * (b / amplitude - 1), abs=2e-3)
 
 
 def test_noise_has_the_moments_of_a_normal_distribution():
     key = noise.keys(np.array([[1, 2]], np.uint32), np.arange(50), np.zeros(50), np)
-    both = noise.normals(key, np.arange(1000, dtype=np.uint32)[:, None] + np.zeros(50, np.uint32), 7, np.float64, np)
+    both = noise.normals(
+        key, np.arange(1000, dtype=np.uint32)[:, None] + np.zeros(50, np.uint32), 7, np.float64, np
+    )
     count = both[0].size
     for z in both:
         assert abs(z.mean()) < 4 / np.sqrt(count)
@@ -171,7 +213,10 @@ def test_noise_depends_on_seed_env_episode_and_step_alone():
     chosen = bp.make_actuators(3, position_noise=0.1, velocity_noise=0.2, seed=5)
 
     def measure(envs, episode=0, chosen=chosen):
-        state, rows = actuators.init(chosen, q[: len(envs)], DT, envs=np.array(envs), episode=episode), []
+        state, rows = (
+            actuators.init(chosen, q[: len(envs)], DT, envs=np.array(envs), episode=episode),
+            [],
+        )
         for _ in range(5):
             state, *seen = actuators.measure(chosen, state, q[: len(envs)], q[: len(envs)], DT)
             rows.append(seen)
@@ -180,14 +225,20 @@ def test_noise_depends_on_seed_env_episode_and_step_alone():
     all_four = measure([0, 1, 2, 3])
     np.testing.assert_array_equal(measure([2]), all_four[:, :, 2:3])
     assert len(np.unique(all_four)) > 0.98 * all_four.size
-    others = measure([2], episode=1), *(measure([2], chosen=chosen.replace(seed=seed)) for seed in (6, 5 + 2**32))
+    others = (
+        measure([2], episode=1),
+        *(measure([2], chosen=chosen.replace(seed=seed)) for seed in (6, 5 + 2**32)),
+    )
     for other in others:
         assert np.isin(other, all_four).mean() < 0.1
     np.testing.assert_allclose(all_four.std((0, 2, 3)), [0.1, 0.2], rtol=0.3)
 
 
 def test_noise_is_the_same_in_jax():
-    chosen, q = bp.make_actuators(3, position_noise=0.1, seed=5, dtype=np.float32), np.zeros((4, 3), np.float32)
+    chosen, q = (
+        bp.make_actuators(3, position_noise=0.1, seed=5, dtype=np.float32),
+        np.zeros((4, 3), np.float32),
+    )
     state = actuators.init(chosen, q, DT)
     traced = quick_jit(lambda key, step: noise.normals(key, step, 3, np.float32, jnp))
     for step in (state.step, state.step + np.uint32(7)):
@@ -197,7 +248,9 @@ def test_noise_is_the_same_in_jax():
 
 
 def accelerations(model, efforts, inertia=0.1):
-    """Return the accelerations of a joint from rest under ``efforts`` (steps,), and its speeds before the steps."""
+    """Return the accelerations of a joint from rest under ``efforts`` (steps,), and its speeds
+    before the steps.
+    """
     v, mass, rows = np.zeros((1, 1)), np.array([[[inertia]]]), []
     state = friction.init(model, v, v, mass, DT)
     for effort in efforts:
@@ -209,7 +262,9 @@ def accelerations(model, efforts, inertia=0.1):
 
 def test_friction_falls_with_the_speed_to_half_way_at_the_stribeck_velocity():
     one = np.ones((1, 1))
-    found, speed = accelerations(friction.Friction(one, None, 3 * one, 0.5 * one), np.full(400, 3.5))
+    found, speed = accelerations(
+        friction.Friction(one, None, 3 * one, 0.5 * one), np.full(400, 3.5)
+    )
     half = np.interp(0.5, speed, 3.5 - 0.1 * found)
     np.testing.assert_allclose([half, 3.5 - 0.1 * found[1]], [2.0, 3.0], rtol=2e-3)
     assert np.all(np.diff(found[2:]) >= 0)
@@ -218,9 +273,13 @@ def test_friction_falls_with_the_speed_to_half_way_at_the_stribeck_velocity():
 def test_friction_grows_with_the_effort_of_the_motor():
     one = np.ones((1, 1))
     for effort in (2.0, 8.0, -8.0):
-        found, _ = accelerations(friction.Friction(one, None, None, None, 0.1 * one), np.full(50, effort))
+        found, _ = accelerations(
+            friction.Friction(one, None, None, None, 0.1 * one), np.full(50, effort)
+        )
         np.testing.assert_allclose(0.1 * found[5:], np.sign(effort) * (0.9 * abs(effort) - 1.0))
-    found, speed = accelerations(friction.Friction(0 * one, None, None, None, 0.1 * one), np.zeros(50))
+    found, speed = accelerations(
+        friction.Friction(0 * one, None, None, None, 0.1 * one), np.zeros(50)
+    )
     assert not found.any()
     assert not speed.any()
 
@@ -261,12 +320,33 @@ def test_random_actuators_deliver_finite_efforts_within_the_limits(seed):
 
 def random_options(rng, envs, joints):
     """Return arguments of make_actuators for some random effects, over many decades."""
-    scales = {"command_delay": 0.01, "sensor_delay": 0.01, "lag": 0.01, "strength": 1, "bias": 1, "effort_limit": 30}
-    scales |= {"saturation_effort": 50, "no_load_speed": 3, "backlash": 0.01, "coulomb": 0.3, "viscous": 1}
-    scales |= {"armature": 0.1, "position_resolution": 1e-3, "velocity_resolution": 1e-2, "position_noise": 1e-3}
+    scales = {
+        "command_delay": 0.01,
+        "sensor_delay": 0.01,
+        "lag": 0.01,
+        "strength": 1,
+        "bias": 1,
+        "effort_limit": 30,
+    }
+    scales |= {
+        "saturation_effort": 50,
+        "no_load_speed": 3,
+        "backlash": 0.01,
+        "coulomb": 0.3,
+        "viscous": 1,
+    }
+    scales |= {
+        "armature": 0.1,
+        "position_resolution": 1e-3,
+        "velocity_resolution": 1e-2,
+        "position_noise": 1e-3,
+    }
     scales |= {"velocity_noise": 1e-2}
     chosen = {name for name in scales if rng.random() < 0.5}
     chosen |= {"saturation_effort", "no_load_speed"} if "no_load_speed" in chosen else set()
     chosen -= {"saturation_effort"} if "no_load_speed" not in chosen else set()
     shapes = [(), (joints,), (envs, joints)]
-    return {name: scales[name] * 10.0 ** rng.uniform(-2, 0.5, shapes[rng.integers(3)]) for name in sorted(chosen)}
+    return {
+        name: scales[name] * 10.0 ** rng.uniform(-2, 0.5, shapes[rng.integers(3)])
+        for name in sorted(chosen)
+    }

@@ -21,7 +21,9 @@ def same(first, second):
 @pytest.mark.parametrize("suffix", [".yaml", ".json"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_every_effect_survives_a_file(suffix, dtype, tmp_path):
-    actuators = bp.make_actuators(4, **ALL, coulomb=[0.0, 0.1, 0.2, 0.3], static=0.4, armature=0.1, dtype=dtype)
+    actuators = bp.make_actuators(
+        4, **ALL, coulomb=[0.0, 0.1, 0.2, 0.3], static=0.4, armature=0.1, dtype=dtype
+    )
     bp.save_actuators(tmp_path / f"a{suffix}", actuators, NAMES, about={"log": "chirp.csv"})
     loaded, names = bp.load_actuators(tmp_path / f"a{suffix}")
     assert names == NAMES
@@ -39,14 +41,12 @@ def test_random_actuators_survive_a_file(tmp_path_factory, seed, suffix):
 
 def test_a_file_written_by_hand(tmp_path):
     path = tmp_path / "a.yaml"
-    path.write_text(
-        """
+    path.write_text("""
 format: batchpid-actuators-1
 joints:
   elbow: {strength: 0.9, position_limit: [[0, 1, 2], [5, 6, 7]]}
   shoulder: {coulomb: [0.1, 0.2], position_limit: [[0, 1], [3, 4]]}
-"""
-    )
+""")
     actuators, names = bp.load_actuators(path, ["shoulder", "wrist", "elbow"])
     assert names == ["shoulder", "wrist", "elbow"]
     assert actuators.strength.tolist() == [[1.0, 1.0, 0.9]]

@@ -10,7 +10,9 @@ DT = 1 / 2000
 
 
 def test_a_neutral_value_is_off():
-    actuators = bp.make_actuators(2, command_delay=0.0, strength=1.0, bias=0.0, effort_limit=np.inf, armature=0.0)
+    actuators = bp.make_actuators(
+        2, command_delay=0.0, strength=1.0, bias=0.0, effort_limit=np.inf, armature=0.0
+    )
     assert all(leaf is None for leaf in actuators)
     assert actuators.is_ideal
     assert not bp.make_actuators(2, viscous=1.0).is_ideal

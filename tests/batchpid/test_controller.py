@@ -1,4 +1,6 @@
-"""BatchPID: checks of arguments, the state between calls, and agreement with the law on either backend."""
+"""BatchPID: checks of arguments, the state between calls, and agreement with the law on either
+backend.
+"""
 
 import subprocess
 import sys
@@ -11,7 +13,9 @@ from law_cases import DT, ENVS, JOINTS, LIMITED
 import batchpid as bp
 from batchpid import backends
 
-PARAMS = bp.make_params(JOINTS, **LIMITED, derivative_filter_time=0.02, anti_windup="back_calculation")
+PARAMS = bp.make_params(
+    JOINTS, **LIMITED, derivative_filter_time=0.02, anti_windup="back_calculation"
+)
 
 
 @pytest.fixture(params=["numpy", "jax"])
@@ -30,11 +34,15 @@ def test_jax_compiles_once_and_donates_the_state_but_no_input(inputs, x64, caplo
             before = pid.state
             pid.params = PARAMS.replace(kp=float(t))
             pid(inputs.setpoint[t], y)
-        first = [record.getMessage() for record in caplog.records if "Compiling" in record.getMessage()]
+        first = [
+            record.getMessage() for record in caplog.records if "Compiling" in record.getMessage()
+        ]
         pid.params = PARAMS.replace(deadband=0.1)
         pid(inputs.setpoint[0], y)
     assert first == []
-    assert any("Compiling" in record.getMessage() for record in caplog.records), "what compiles is logged"
+    assert any("Compiling" in record.getMessage() for record in caplog.records), (
+        "what compiles is logged"
+    )
     assert before.integral.is_deleted(), "the old state's buffers went into the new one"
     assert y.shape == np.asarray(y).shape, "the caller's array is alive"
 
@@ -101,7 +109,9 @@ def test_wrong_calls_are_refused_and_change_nothing(kind):
     with pytest.raises(bp.InvalidArgumentError, match="terms: are not kept"):
         _ = pid.terms
     assert pid.params is PARAMS
-    assert all(a is b is None or np.array_equal(a, b) for a, b in zip(before, pid.state, strict=True))
+    assert all(
+        a is b is None or np.array_equal(a, b) for a, b in zip(before, pid.state, strict=True)
+    )
 
 
 def test_a_missing_jax_is_named(monkeypatch):
@@ -111,23 +121,35 @@ def test_a_missing_jax_is_named(monkeypatch):
 
 
 def test_import_loads_no_optional_package():
-    code = "import sys, batchpid; print(sorted({'jax', 'sapien', 'matplotlib', 'tyro'} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+    code = (
+        "import sys, batchpid; print(sorted({'jax', 'sapien', 'matplotlib', 'tyro'} &"
+        " set(sys.modules)))"
+    )
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "[]\n"
+    )
 
 
 def test_a_large_batch_is_stepped_in_blocks_with_equal_results(monkeypatch, inputs):
     """In blocks of 1024 envs, the last of which repeats rows of the one before.
 
-    Through reset, track and a change of params, after which the overwritten state must not be in use.
+    Through reset, track and a change of params, after which the overwritten state must not be in
+    use.
     """
     monkeypatch.setattr(backends, "LARGE", 1000)
-    params = bp.make_params(JOINTS, **LIMITED, setpoint_weight=0.5, anti_windup="back_calculation", dtype=np.float32)
+    params = bp.make_params(
+        JOINTS, **LIMITED, setpoint_weight=0.5, anti_windup="back_calculation", dtype=np.float32
+    )
     efforts = {}
     for envs in (ENVS, 258 * ENVS):
         pid, efforts[envs] = bp.BatchPID(params, envs, DT, "jax"), []
         for t in range(10):
             r, y, ff = (
-                np.tile(x[t], (envs // ENVS, 1)) for x in (inputs.setpoint, inputs.measurement, inputs.feedforward)
+                np.tile(x[t], (envs // ENVS, 1))
+                for x in (inputs.setpoint, inputs.measurement, inputs.feedforward)
             )
             if t == 4:
                 pid.reset(y, np.arange(envs) % ENVS == 1)
@@ -137,7 +159,9 @@ def test_a_large_batch_is_stepped_in_blocks_with_equal_results(monkeypatch, inpu
                 pid.params = params.replace(kp=7.0)
             efforts[envs].append(pid(r, y, feedforward=ff))
         efforts[envs] = np.stack([np.asarray(each) for each in efforts[envs]])
-    np.testing.assert_allclose(efforts[258 * ENVS], np.tile(efforts[ENVS], (258, 1)), rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(
+        efforts[258 * ENVS], np.tile(efforts[ENVS], (258, 1)), rtol=1e-5, atol=1e-4
+    )
 
 
 def test_a_large_batch_returns_terms_on_request(monkeypatch):

@@ -26,7 +26,11 @@ def couplings(draw):
 def arrays(joints: int, seed: int = 0) -> tuple[np.ndarray, ...]:
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(3, joints, joints))
-    return rng.normal(size=(3, joints)), rng.normal(size=(3, joints)), root @ root.mT + np.eye(joints)
+    return (
+        rng.normal(size=(3, joints)),
+        rng.normal(size=(3, joints)),
+        root @ root.mT + np.eye(joints),
+    )
 
 
 @settings(max_examples=25)
@@ -57,14 +61,22 @@ def test_power_and_kinetic_energy_are_those_of_the_independent_joints(case):
     acting = coupling.efforts(u)
     assert not acting[:, ~coupling.independent].any()
     np.testing.assert_allclose((acting * v).sum(1), (u * v).sum(1), atol=1e-9)
-    whole, reduced = (np.einsum("ni,nij,nj->n", *rows) for rows in ((v, mass, v), (free, coupling.reduced(mass), free)))
+    whole, reduced = (
+        np.einsum("ni,nij,nj->n", *rows)
+        for rows in ((v, mass, v), (free, coupling.reduced(mass), free))
+    )
     np.testing.assert_allclose(whole, reduced, rtol=1e-9, atol=1e-9)
     embedded = coupling.mass_matrix(mass)
-    np.testing.assert_array_equal(embedded[:, coupling.independent][:, :, coupling.independent], coupling.reduced(mass))
+    np.testing.assert_array_equal(
+        embedded[:, coupling.independent][:, :, coupling.independent], coupling.reduced(mass)
+    )
     assert (np.linalg.eigvalsh(embedded) > 0).all()
     damping = np.abs(u[0])
     np.testing.assert_allclose(
-        coupling.reduced_damping(damping), np.diag(coupling.reduced(np.diag(damping))), rtol=1e-9, atol=1e-12
+        coupling.reduced_damping(damping),
+        np.diag(coupling.reduced(np.diag(damping))),
+        rtol=1e-9,
+        atol=1e-12,
     )
 
 
@@ -80,7 +92,10 @@ def test_figures_of_followers_are_those_of_their_leaders(case):
 def test_the_identity_returns_its_arguments():
     coupling, given = Coupling.of(3), object()
     assert coupling.is_identity
-    of_figures, of_matrices = ["of_independent", "of_leaders", "of_all"], ["mass_matrix", "reduced", "reduced_damping"]
+    of_figures, of_matrices = (
+        ["of_independent", "of_leaders", "of_all"],
+        ["mass_matrix", "reduced", "reduced_damping"],
+    )
     for name in ["positions", "rates", "efforts", *of_figures, *of_matrices]:
         assert getattr(coupling, name)(given) is given
     assert coupling.native() == {}
@@ -96,12 +111,23 @@ def test_a_loop_of_followers_is_refused():
 
 def test_repr_shows_the_laws():
     assert repr(Coupling.of(2)) == "Coupling(2 joints: no followers)"
-    assert repr(Coupling.of(2, [Follower(1, 0, -0.5, 0.1)])) == "Coupling(2 joints: q1 = -0.5 q0 + 0.1)"
+    assert (
+        repr(Coupling.of(2, [Follower(1, 0, -0.5, 0.1)]))
+        == "Coupling(2 joints: q1 = -0.5 q0 + 0.1)"
+    )
 
 
 @settings(max_examples=25)
 @given(couplings())
 def test_arrays_of_a_coupling_that_robots_share_are_read_only(case):
     coupling = case[0]
-    for name in ("leader", "multiplier", "offset", "independent", "matrix", "jacobian", "followers"):
+    for name in (
+        "leader",
+        "multiplier",
+        "offset",
+        "independent",
+        "matrix",
+        "jacobian",
+        "followers",
+    ):
         assert not getattr(coupling, name).flags.writeable

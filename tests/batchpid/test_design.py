@@ -40,14 +40,19 @@ def random_chain(seed, joints=4, poses=5):
 
 
 @given(
-    inertia=st.floats(1e-6, 1e3), hertz=st.floats(0.1, 20), zeta=st.floats(0.2, 2), ti=st.none() | st.floats(0.05, 5)
+    inertia=st.floats(1e-6, 1e3),
+    hertz=st.floats(0.1, 20),
+    zeta=st.floats(0.2, 2),
+    ti=st.none() | st.floats(0.05, 5),
 )
 def test_gains_follow_the_equations(inertia, hertz, zeta, ti):
     w = 2 * np.pi * hertz
     gains = pid_from_inertia([inertia], hertz, zeta, integral_time=ti)
     np.testing.assert_allclose(gains["kp"], inertia * w**2)
     np.testing.assert_allclose(gains["kd"], 2 * zeta * w * inertia)
-    np.testing.assert_allclose(gains["ki"], gains["kp"] / (3 * np.sqrt(3) / w if ti is None else ti))
+    np.testing.assert_allclose(
+        gains["ki"], gains["kp"] / (3 * np.sqrt(3) / w if ti is None else ti)
+    )
 
 
 def test_the_three_poles_coincide_by_default():
@@ -63,7 +68,9 @@ def test_own_damping_counts_towards_the_damping():
     np.testing.assert_allclose(damped["kd"], free["kd"] - w)
     np.testing.assert_allclose(damped["kp"], free["kp"])
     assert stuck["kd"] > 0  # never none at all
-    assert stuck["kp"] == pytest.approx(5 * free["kp"])  # stiff enough for what its damping holds back
+    assert stuck["kp"] == pytest.approx(
+        5 * free["kp"]
+    )  # stiff enough for what its damping holds back
 
 
 @settings(deadline=None, max_examples=25)
@@ -71,11 +78,15 @@ def test_own_damping_counts_towards_the_damping():
 def test_designed_gains_are_stable_at_every_pose(seed, units):
     robot = random_chain(seed)
     params = bp.design_gains(robot, gain_units=units)
-    tau, kp, ki, kd = (leaf[0] for leaf in (params.derivative_filter_time, params.kp, params.ki, params.kd))
+    tau, kp, ki, kd = (
+        leaf[0] for leaf in (params.derivative_filter_time, params.kp, params.ki, params.kd)
+    )
     mass = np.eye(4)[None] if units == "mass_matrix" else robot.mass
     assert stability_bound(mass, kp, kd, DT, filter_time=tau).ratio.max() <= 0.5 + 1e-9
     assert (spectral_radius(mass, kp, ki, kd, DT, filter_time=tau) < 1).all()
-    w = np.sqrt(kp / (np.diagonal(robot.mass, axis1=1, axis2=2).max(0) if units == "effort" else 1.0))
+    w = np.sqrt(
+        kp / (np.diagonal(robot.mass, axis1=1, axis2=2).max(0) if units == "effort" else 1.0)
+    )
     assert (tau <= np.maximum(0.3 / w, 4 * DT) * 1.01).all()
 
 

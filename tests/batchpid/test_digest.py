@@ -53,7 +53,11 @@ def described(value: Any) -> str:
     if isinstance(value, np.ndarray):
         return f"array({value.dtype}, {value.shape}, {value.tolist()})"
     if isinstance(value, dict):
-        return "{" + ", ".join(sorted(f"{key!r}: {described(part)}" for key, part in value.items())) + "}"
+        return (
+            "{"
+            + ", ".join(sorted(f"{key!r}: {described(part)}" for key, part in value.items()))
+            + "}"
+        )
     if isinstance(value, tuple | Record):
         parts = value if isinstance(value, tuple) else (value.first, value.second)
         return f"{type(value).__name__}({', '.join(map(described, parts))})"
@@ -82,7 +86,14 @@ def test_memory_layout_and_byte_order_do_not_matter():
     apart[::2, ::2] = table
     same = [np.asfortranarray(table), apart[::2, ::2], table.astype(">f8"), table[::-1][::-1]]
     assert {digest(each) for each in same} == {digest(table)}
-    different = [table.T, table.ravel(), table[None], table.astype(np.float32), table.astype(int), table.tolist()]
+    different = [
+        table.T,
+        table.ravel(),
+        table[None],
+        table.astype(np.float32),
+        table.astype(int),
+        table.tolist(),
+    ]
     assert len({digest(each) for each in [table, *different]}) == 7
 
 
@@ -93,13 +104,23 @@ def test_order_matters_in_sequences_alone():
 
 
 def test_values_do_not_run_into_each_other():
-    texts = [("ab", "c"), ("a", "bc"), (["ab"], "c"), ([], "ab", "c"), ("ab", None, "c"), (b"ab", "c"), ({"ab": "c"},)]
+    texts = [
+        ("ab", "c"),
+        ("a", "bc"),
+        (["ab"], "c"),
+        ([], "ab", "c"),
+        ("ab", None, "c"),
+        (b"ab", "c"),
+        ({"ab": "c"},),
+    ]
     parts = [(Pair("ab", "c"),), (Other("ab", "c"),), (Record("ab", "c"),)]
     alike = [*texts, *parts, (1,), (1.0,), (True,), (0.0,), (-0.0,), (None,), ()]
     assert len({digest(*values) for values in alike}) == len(alike)
 
 
-@pytest.mark.parametrize("value", [object(), len, np.array([object()]), np.zeros(2, "f8, f4"), np.longdouble(1), int])
+@pytest.mark.parametrize(
+    "value", [object(), len, np.array([object()]), np.zeros(2, "f8, f4"), np.longdouble(1), int]
+)
 def test_what_may_hide_content_is_refused(value):
     with pytest.raises(bp.InvalidArgumentError, match=r"values\[0\]\['k'\]\[1\].*no digest"):
         digest({"k": [1, value]})
@@ -119,7 +140,11 @@ def test_choices_equal_those_of_their_type_alone():
 
 def test_digests_are_the_same_in_another_process():
     make = "bp.make_params(2, [3.0, 1.0], non_finite='hold'), {'b': {'x', 'y', 'z'}, 'a': None}"
-    program = f"import batchpid as bp; from batchpid.arrays.digest import digest; print(digest({make}))"
+    program = (
+        f"import batchpid as bp; from batchpid.arrays.digest import digest; print(digest({make}))"
+    )
     environment = {"PYTHONPATH": ":".join(filter(None, sys.path)), "PYTHONHASHSEED": "7"}
-    out = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    out = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+    )
     assert out.stdout.split() == [digest(*eval(f"({make})"))]

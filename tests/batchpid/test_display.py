@@ -1,4 +1,6 @@
-"""Representations in a notebook: one to three lines, with the enabled options and the ranges of the values."""
+"""Representations in a notebook: one to three lines, with the enabled options and the ranges of the
+values.
+"""
 
 import jax
 import numpy as np
@@ -11,15 +13,26 @@ from batchpid.trajectories import minimum_jerk
 
 
 def test_params_show_the_options_that_are_on():
-    params = bp.make_params(7, [40, 50, 60, 70, 80, 87, 87], 5, 2, effort_limit=87, anti_windup="conditional")
-    assert repr(params) == (
-        "PIDParams(1 env, 7 joints, kp 40 to 87, ki 5, kd 2, effort_min -87, effort_max 87, conditional Everywhere)"
+    params = bp.make_params(
+        7, [40, 50, 60, 70, 80, 87, 87], 5, 2, effort_limit=87, anti_windup="conditional"
+    )
+    assert (
+        repr(params)
+        == "PIDParams(1 env, 7 joints, kp 40 to 87, ki 5, kd 2, effort_min -87, effort_max 87,"
+        " conditional Everywhere)"
     )
     limited = bp.make_params(
-        2, [[1.0], [2.0]], effort_max=3, integral_min=-1, integral_max=[1, 2], continuous=[True, False]
+        2,
+        [[1.0], [2.0]],
+        effort_max=3,
+        integral_min=-1,
+        integral_max=[1, 2],
+        continuous=[True, False],
     )
-    assert repr(limited) == (
-        "PIDParams(2 envs, 2 joints, kp 1 to 2, effort_max 3, integral_min -1, integral_max 1 to 2, continuous 0 to 1)"
+    assert (
+        repr(limited)
+        == "PIDParams(2 envs, 2 joints, kp 1 to 2, effort_max 3, integral_min -1, integral_max 1 to"
+        " 2, continuous 0 to 1)"
     )
     assert "gain_units PerMassMatrix" in repr(bp.make_params(2, 1.0, gain_units="mass_matrix"))
 
@@ -65,4 +78,7 @@ def test_trees_of_any_leaves_have_a_representation():
         assert type(tree).__name__ in repr(tree)
     seen = []
     jax.jit(lambda params: seen.append(repr(params)))(params)
-    assert seen == ["PIDParams(1 env, 2 joints, kp traced, effort_min traced, effort_max traced, continuous traced)"]
+    assert seen == [
+        "PIDParams(1 env, 2 joints, kp traced, effort_min traced, effort_max traced, continuous"
+        " traced)"
+    ]

@@ -14,7 +14,9 @@ def test_a_drive_with_a_moving_target_gives_the_effort_of_the_law(inputs):
         r, y, v = inputs.setpoint[t], inputs.measurement[t], inputs.measurement_rate[t]
         state, target = bp.drive_target(params, state, r, y, DT, measurement_rate=v)
         other, effort = bp.step(params, other, r, y, DT, measurement_rate=v)
-        np.testing.assert_allclose(np.clip(40.0 * (target - y) - 2.0 * v, -9, 9), effort, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(
+            np.clip(40.0 * (target - y) - 2.0 * v, -9, 9), effort, rtol=1e-12, atol=1e-12
+        )
 
 
 def test_without_stiffness_the_target_is_the_setpoint():
@@ -30,7 +32,9 @@ def test_without_stiffness_the_target_is_the_setpoint():
 
 @pytest.mark.parametrize("ki", [0.0, 20.0])
 def test_integral_action_removes_the_sag_under_load(ki):
-    """A mass on an implicit spring-damper under a constant load: PD leaves load/stiffness, PID nothing."""
+    """A mass on an implicit spring-damper under a constant load: PD leaves load/stiffness, PID
+    nothing.
+    """
     params = bp.make_params(1, 30.0, ki, 8.0, effort_limit=50.0, anti_windup="conditional")
     x, v = np.zeros((1, 1)), np.zeros((1, 1))
     state, setpoint = bp.init(params, x), np.ones((1, 1))

@@ -24,14 +24,18 @@ def dtypes(*trees):
 
 
 def run_of(xp, dtype, options, own):
-    """Return all states and results of the law, a guard and motors, on inputs of ``dtype`` under params of ``own``."""
+    """Return all states and results of the law, a guard and motors, on inputs of ``dtype`` under
+    params of ``own``.
+    """
     rows = np.random.default_rng(0).normal(size=(4, ENVS, JOINTS)) * 3
     r, y, v, u = (xp.asarray(row.astype(dtype)) for row in rows)
     params = bp.make_params(JOINTS, **options, dtype=own)
     state = bp.init(params, y)
     yield state
     yield from bp.step(params, state, r, y, DT)
-    stepped, terms = bp.step_terms(params, state, r, y, DT, measurement_rate=v, setpoint_rate=v, feedforward=u)
+    stepped, terms = bp.step_terms(
+        params, state, r, y, DT, measurement_rate=v, setpoint_rate=v, feedforward=u
+    )
     yield from (stepped, terms)
     yield bp.reset(params, stepped, y, xp.asarray(np.arange(ENVS) > 1))
     advanced, terms = bp.advance(bp.discretise(params, DT), state, r, y, v, v, u)
@@ -39,15 +43,21 @@ def run_of(xp, dtype, options, own):
     if params.ki is not None:
         yield bp.track(params, state, r, y, u)
     matrix = xp.asarray(np.tile(np.eye(JOINTS), (ENVS, 1, 1)).astype(dtype))
-    accelerations = bp.make_params(JOINTS, 4.0, 2.0, 1.0, gain_units="mass_matrix", effort_limit=1.0, dtype=own)
+    accelerations = bp.make_params(
+        JOINTS, 4.0, 2.0, 1.0, gain_units="mass_matrix", effort_limit=1.0, dtype=own
+    )
     law = bp.discretise(accelerations.replace(effort_rate_limit=9.0), DT)
     started = bp.init(accelerations.replace(effort_rate_limit=9.0), y)
     yield from (x for x in advance_with_mass_matrix(law, started, r, y, matrix, v, v, v, u)[:1])
-    yield convert_integral(started, accelerations, accelerations.replace(gain_units="effort"), matrix)
+    yield convert_integral(
+        started, accelerations, accelerations.replace(gain_units="effort"), matrix
+    )
     limits = bp.make_guard(JOINTS, rate=1.0, acceleration=5.0, dtype=own)
     yield (guarded := guards.init(limits, y))
     yield guards.advance(limits, guarded, r, DT)[0]
-    motors = bp.make_actuators(JOINTS, command_delay=0.02, sensor_delay=0.01, lag=0.1, backlash=0.1, dtype=own)
+    motors = bp.make_actuators(
+        JOINTS, command_delay=0.02, sensor_delay=0.01, lag=0.1, backlash=0.1, dtype=own
+    )
     yield (moved := bp.motors.init(motors, y, DT, qvel=v, effort=u))
     yield from bp.motors.deliver(motors, moved, u, y, v, DT)
     yield from bp.motors.measure(motors, moved, y, v, DT)
@@ -74,5 +84,10 @@ def test_operational_space():
     params = ts.make_osc_params(tree, integral_gain=1.0)
     state = ts.init(params, qpos)
     goal = ts.link_poses(tree, qpos, ["panda_hand"])[:, 0].astype(np.longdouble)
-    new, terms = ts.osc(ts.discretise(params, DT), state, ts.Tool(tree, "panda_hand"), ts.OSCInputs(goal, qpos, qpos))
+    new, terms = ts.osc(
+        ts.discretise(params, DT),
+        state,
+        ts.Tool(tree, "panda_hand"),
+        ts.OSCInputs(goal, qpos, qpos),
+    )
     assert dtypes(state, new, terms) == {"float64"}

@@ -5,17 +5,26 @@ import pickle
 
 import pytest
 
-from batchpid.errors import InvalidArgumentError, MissingDependencyError, RobotNotFoundError, WorkerError
+from batchpid.errors import (
+    InvalidArgumentError,
+    MissingDependencyError,
+    RobotNotFoundError,
+    WorkerError,
+)
 
 
 def test_a_message_names_argument_joint_env_value_and_remedy():
-    error = InvalidArgumentError("kp", "is negative", joint="elbow", env=3, value=-1.0, remedy="use numbers >= 0")
+    error = InvalidArgumentError(
+        "kp", "is negative", joint="elbow", env=3, value=-1.0, remedy="use numbers >= 0"
+    )
     assert str(error) == "kp, joint 'elbow', env 3: is negative (got -1.0); use numbers >= 0"
 
 
 def test_a_large_value_is_shortened():
     message = str(
-        InvalidArgumentError("robot", "must be a name", value=[list(range(10**4))] * 99, remedy="pass a name")
+        InvalidArgumentError(
+            "robot", "must be a name", value=[list(range(10**4))] * 99, remedy="pass a name"
+        )
     )
     assert len(message) < 300
     assert "..." in message
@@ -24,7 +33,9 @@ def test_a_large_value_is_shortened():
 @pytest.mark.parametrize(
     "error",
     [
-        InvalidArgumentError("kp", "is negative", joint="elbow", env=3, value=-1.0, remedy="use numbers >= 0"),
+        InvalidArgumentError(
+            "kp", "is negative", joint="elbow", env=3, value=-1.0, remedy="use numbers >= 0"
+        ),
         MissingDependencyError("jax", "backend='jax'", "jax"),
         RobotNotFoundError("no robot of that name"),
         WorkerError("worker 1 died"),

@@ -67,7 +67,20 @@ def test_every_file_is_written_by_the_atomic_writer():
             if not isinstance(node, ast.Call) or str(path.relative_to(root)) in NOT_FILES:
                 continue
             name = getattr(node.func, "attr", getattr(node.func, "id", ""))
-            last = node.args[-1].value if node.args and isinstance(node.args[-1], ast.Constant) else None
-            mode = last if name == "open" and isinstance(last, str) and set(last) <= set("rwax+bt") else "r"
+            last = (
+                node.args[-1].value
+                if node.args and isinstance(node.args[-1], ast.Constant)
+                else None
+            )
+            mode = (
+                last
+                if name == "open" and isinstance(last, str) and set(last) <= set("rwax+bt")
+                else "r"
+            )
             assert not set(mode) & set("wax+"), f"{path}:{node.lineno}"
-            assert name not in ("write_text", "write_bytes", "tofile", "imsave"), f"{path}:{node.lineno}"
+            assert name not in (
+                "write_text",
+                "write_bytes",
+                "tofile",
+                "imsave",
+            ), f"{path}:{node.lineno}"

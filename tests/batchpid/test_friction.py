@@ -1,4 +1,6 @@
-"""The friction model on robots that are equations: stability, stiction, energy, equality of NumPy and JAX."""
+"""The friction model on robots that are equations: stability, stiction, energy, equality of NumPy
+and JAX.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ DT = 1 / 2000
 
 
 def random_plant(seed):
-    """Mass matrix, Coulomb friction and damping of a robot of 1 to 7 coupled joints, of very different inertia."""
+    """Mass matrix, Coulomb friction and damping of a robot of 1 to 7 coupled joints, of very
+    different inertia.
+    """
     rng = np.random.default_rng(seed)
     joints = rng.integers(1, 8)
     basis, _ = np.linalg.qr(rng.normal(size=(joints, joints)))
@@ -26,7 +30,9 @@ def random_plant(seed):
 
 
 def simulate(mass, model, efforts, velocity=0.0, load=0.0):
-    """Return velocities and applied efforts (steps, envs, joints) under ``efforts`` (steps, envs, joints)."""
+    """Return velocities and applied efforts (steps, envs, joints) under ``efforts`` (steps, envs,
+    joints).
+    """
     v = np.zeros_like(efforts[0]) + velocity
     inverse = np.linalg.inv(mass + DT * model.viscous[..., None] * np.eye(v.shape[1]))
     state = friction.init(model, v, np.zeros_like(v), mass, DT)
@@ -46,7 +52,9 @@ def test_joints_come_to_rest_and_stay(seed):
     mass, model = random_plant(seed)
     rng = np.random.default_rng(seed)
     load = 0.9 * model.coulomb * rng.uniform(-1, 1, model.coulomb.shape)
-    stop = model.coulomb / np.diagonal(mass, axis1=1, axis2=2) * DT  # about the change of velocity in a step
+    stop = (
+        model.coulomb / np.diagonal(mass, axis1=1, axis2=2) * DT
+    )  # about the change of velocity in a step
     start = stop * rng.uniform(-3, 3, model.coulomb.shape)
     velocity, _ = simulate(mass, model, np.zeros((2500, *start.shape)), start, load)
     rubbing = model.coulomb[0] > 0
@@ -79,26 +87,38 @@ def test_a_joint_at_rest_holds_its_load_and_lets_go_above_its_friction(damping):
 
 
 def test_it_is_the_implicit_step_where_the_load_is_constant():
-    """M (v+ - v) = dt (tau - h - B v+ - f) with f in F Sgn(v+): v+ lies between the solutions for both ends of Sgn."""
+    """M (v+ - v) = dt (tau - h - B v+ - f) with f in F Sgn(v+): v+ lies between the solutions for
+    both ends of Sgn.
+    """
     inertia, damping, coulomb, load = 0.02, 3.0, 0.7, 0.2
-    mass, model = np.full((1, 1, 1), inertia), Friction(np.full((1, 1), coulomb), np.full((1, 1), damping))
+    mass, model = (
+        np.full((1, 1, 1), inertia),
+        Friction(np.full((1, 1), coulomb), np.full((1, 1), damping)),
+    )
     rng = np.random.default_rng(0)
     efforts = np.repeat(rng.normal(size=(40, 1, 1)), 50, axis=0)
     velocity, _ = simulate(mass, model, efforts, load=load)
     exact, v = [], 0.0
     for effort in efforts[:, 0, 0]:
-        ends = [(inertia * v + DT * (effort - load - sign * coulomb)) / (inertia + DT * damping) for sign in (1, -1)]
+        ends = [
+            (inertia * v + DT * (effort - load - sign * coulomb)) / (inertia + DT * damping)
+            for sign in (1, -1)
+        ]
         v = max(ends[0], 0.0) + min(ends[1], 0.0)
         exact.append(v)
     assert np.abs(velocity[:, 0, 0] - exact).max() < 0.02 * np.abs(exact).max()
 
 
 @pytest.mark.parametrize("viscous", [None, 4.0])
-@pytest.mark.parametrize(("damping", "stiffness"), [(0.0, 0.0), (30.0, 0.0), (0.0, 3e4), (30.0, 3e4)])
+@pytest.mark.parametrize(
+    ("damping", "stiffness"), [(0.0, 0.0), (30.0, 0.0), (0.0, 3e4), (30.0, 3e4)]
+)
 def test_it_takes_its_share_of_the_velocity_that_a_joint_would_have_without_a_change_of_effort(
     viscous, damping, stiffness
 ):
-    """Also where the simulator integrates a drive implicitly: the prediction is exact under a constant load."""
+    """Also where the simulator integrates a drive implicitly: the prediction is exact under a
+    constant load.
+    """
     inertia, load, (q, v) = 0.02, 0.3, (0.01, 0.2)
     model = Friction(np.full((1, 1), 1e6), None if viscous is None else np.full((1, 1), viscous))
     b = viscous or 0.0
@@ -114,18 +134,24 @@ def test_it_takes_its_share_of_the_velocity_that_a_joint_would_have_without_a_ch
         state, total = friction.advance(model, state, 0 * one, v * one)
         v, before = after(total[0, 0] + b * v), v
         if step:  # the first step has no velocity of a step before
-            np.testing.assert_allclose(v, (1 - friction.SHARE) * unchanged, rtol=1e-9, atol=1e-12 * abs(before))
+            np.testing.assert_allclose(
+                v, (1 - friction.SHARE) * unchanged, rtol=1e-9, atol=1e-12 * abs(before)
+            )
         q += DT * v
 
 
 def test_a_static_friction_holds_until_the_joint_yields_and_again_after_it_has_stopped():
     model = Friction(np.ones((1, 1)), np.zeros((1, 1)), np.full((1, 1), 2.0))
     levels, steps = (1.9, 2.1, 1.5, 0.0, 1.9), (100, 100, 100, 300, 100)
-    velocity, total = simulate(np.full((1, 1, 1), 0.01), model, np.repeat(levels, steps)[:, None, None])
+    velocity, total = simulate(
+        np.full((1, 1, 1), 0.01), model, np.repeat(levels, steps)[:, None, None]
+    )
     held, let_go, slides, stops, held_again = np.split(velocity[:, 0, 0], np.cumsum(steps)[:-1])
     assert (held == 0).all()
     assert let_go[-1] > 0
-    np.testing.assert_allclose(np.diff(slides), DT * (1.5 - 1.0) / 0.01, rtol=1e-9)  # the friction of motion
+    np.testing.assert_allclose(
+        np.diff(slides), DT * (1.5 - 1.0) / 0.01, rtol=1e-9
+    )  # the friction of motion
     assert stops[-1] < slides[-1]
     assert abs(stops[-1]) < 1e-9
     assert np.abs(held_again).max() < 1e-9
@@ -151,7 +177,9 @@ def test_envs_do_not_affect_each_other_and_are_reset_alone():
     together, _ = simulate(mass, model, efforts)
     for env in range(3):
         part = slice(env, env + 1)
-        alone, _ = simulate(mass[part], Friction(*(leaf[part] for leaf in model[:2])), efforts[:, part])
+        alone, _ = simulate(
+            mass[part], Friction(*(leaf[part] for leaf in model[:2])), efforts[:, part]
+        )
         np.testing.assert_array_equal(alone, together[:, part])
     fresh = friction.init(model, rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), mass, DT)
     old = friction.init(model, rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), mass, DT)
@@ -163,7 +191,9 @@ def test_envs_do_not_affect_each_other_and_are_reset_alone():
 def test_a_refresh_takes_another_mass_matrix_and_keeps_the_rest():
     rng, (mass, model) = np.random.default_rng(0), random_plant(1)
     velocity, load, effort = rng.normal(size=(3, 1, mass.shape[1]))
-    state, _ = friction.advance(model, friction.init(model, velocity, load, 3 * mass, DT), effort, velocity)
+    state, _ = friction.advance(
+        model, friction.init(model, velocity, load, 3 * mass, DT), effort, velocity
+    )
     fresh = friction.init(model, velocity, load, mass, DT)
     again = friction.refresh(model, state, mass, DT)
     for name in ("gain", "memory"):
@@ -183,7 +213,11 @@ def test_nothing_is_done_without_friction():
 @settings(max_examples=40, deadline=None)
 def test_compensation_never_exceeds_the_friction_it_works_against(seed):
     rng = np.random.default_rng(seed)
-    coulomb, error, rate = rng.uniform(0, 2, 4), rng.normal(size=(3, 4)) * 1e-3, rng.normal(size=(3, 4)) * 1e-3
+    coulomb, error, rate = (
+        rng.uniform(0, 2, 4),
+        rng.normal(size=(3, 4)) * 1e-3,
+        rng.normal(size=(3, 4)) * 1e-3,
+    )
     forward = friction.compensation(coulomb, error, rate, 1e-4)
     assert (np.abs(forward) <= coulomb).all()
     assert (forward * (error + 0.1 * rate) >= 0).all()  # the setpoint 0.1 s ahead
@@ -207,5 +241,6 @@ def test_a_joint_that_moves_begins_sliding_and_one_at_rest_sticking(seed):
         state = friction.init(model, velocity, 0 * velocity, mass, DT)
         before = state._replace(sliding=np.full_like(static, sliding))
         np.testing.assert_array_equal(
-            friction.advance(model, state, effort, velocity)[1], friction.advance(model, before, effort, velocity)[1]
+            friction.advance(model, state, effort, velocity)[1],
+            friction.advance(model, before, effort, velocity)[1],
         )

@@ -1,5 +1,6 @@
-"""The guard of setpoints: within its limits, without overshoot, in the shortest time; allowed setpoints pass
-unchanged."""
+"""The guard of setpoints: within its limits, without overshoot, in the shortest time; allowed
+setpoints pass unchanged.
+"""
 
 import numpy as np
 from hypothesis import given, settings
@@ -26,7 +27,11 @@ def run(limits, setpoints, start=0.0):
 @settings(max_examples=10)
 def test_limits_hold_whatever_is_asked(seed):
     rng = np.random.default_rng(seed)
-    lower, upper, rate, acceleration = -rng.uniform(0.1, 3, 4), rng.uniform(0.1, 3, 4), *rng.uniform(0.1, 20, (2, 4))
+    lower, upper, rate, acceleration = (
+        -rng.uniform(0.1, 3, 4),
+        rng.uniform(0.1, 3, 4),
+        *rng.uniform(0.1, 20, (2, 4)),
+    )
     limits = bp.make_guard(4, lower=lower, upper=upper, rate=rate, acceleration=acceleration)
     asked = np.repeat(rng.normal(0, 3, (30, 4)), rng.integers(1, 30, 30), axis=0)
     setpoint, speed, changed = run(limits, asked)
@@ -40,12 +45,18 @@ def test_limits_hold_whatever_is_asked(seed):
 
 @given(target=st.floats(-5, 5), rate=st.floats(0.5, 5), acceleration=st.floats(1, 50))
 @settings(max_examples=25)
-def test_a_constant_setpoint_is_reached_without_overshoot_in_the_shortest_time(target, rate, acceleration):
-    """Within three steps of the trapezoid of rates, or of the triangle that does not reach the largest rate."""
+def test_a_constant_setpoint_is_reached_without_overshoot_in_the_shortest_time(
+    target, rate, acceleration
+):
+    """Within three steps of the trapezoid of rates, or of the triangle that does not reach the
+    largest rate.
+    """
     way, ramp = abs(target), rate**2 / acceleration
     shortest = way / rate + rate / acceleration if way > ramp else 2 * np.sqrt(way / acceleration)
     steps = int(shortest / DT) + 10
-    setpoint, _, changed = run(bp.make_guard(1, rate=rate, acceleration=acceleration), np.full(steps, target))
+    setpoint, _, changed = run(
+        bp.make_guard(1, rate=rate, acceleration=acceleration), np.full(steps, target)
+    )
     assert not changed[-1]
     arrival = DT * (np.flatnonzero(changed).max(initial=-1) + 2)
     assert arrival <= shortest + 3 * DT + 1e-9

@@ -1,4 +1,6 @@
-"""The implicit law: against its equation solved numerically, its poles, and its stability at any time step."""
+"""The implicit law: against its equation solved numerically, its poles, and its stability at any
+time step.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def solved(f):
     accelerated=st.booleans(),
     seed=st.integers(0, 999),
 )
-def test_it_solves_the_law_at_the_end_of_the_step(gains, dt, b, c, measures, rated, accelerated, seed):
+def test_it_solves_the_law_at_the_end_of_the_step(
+    gains, dt, b, c, measures, rated, accelerated, seed
+):
     p = bp.make_params(1, *gains, setpoint_weight=b, setpoint_weight_derivative=c, **IMPLICIT)
     p_, i_, d_ = (0.0 if x is None else x for x in gains)
     b_, on_rate = 1.0 if b is None else b, (1.0 if rated else 0.0) if c is None else c
@@ -61,9 +65,15 @@ def test_it_solves_the_law_at_the_end_of_the_step(gains, dt, b, c, measures, rat
         known |= {"setpoint_rate": np.array([[slope]])} if rated else {}
         known |= {"setpoint_acceleration": np.array([[more]])} if accelerated else {}
         k = bp.discretise(p, dt)
-        state, terms = advance_with_mass_matrix(k, state, np.array([[r]]), np.array([[y]]), np.ones((1, 1, 1)), **known)
+        state, terms = advance_with_mass_matrix(
+            k, state, np.array([[r]]), np.array([[y]]), np.ones((1, 1, 1)), **known
+        )
         a = terms.effort
-        scale = abs(expected) + (abs(r) + abs(y) + dt * abs(v)) * (p_ + i_ * dt) + (abs(rate) + abs(v)) * d_
+        scale = (
+            abs(expected)
+            + (abs(r) + abs(y) + dt * abs(v)) * (p_ + i_ * dt)
+            + (abs(rate) + abs(v)) * d_
+        )
         assert abs(a.item() - expected) <= 1e-7 * (scale + abs(integral) + 1)
         v += dt * a.item()
         y += dt * v
@@ -111,7 +121,9 @@ def test_coupled_joints_arrive_at_any_time_step(w, dt):
     matrix = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(5)
     gains = {"kp": w**2, "ki": w**3 / 5.2, "kd": 2 * w, **IMPLICIT}
     steps = 100 + int(60 / (w * dt))
-    np.testing.assert_allclose(rollout(bp.make_params(5, **gains), matrix, dt, steps), 1.0, atol=1e-6)
+    np.testing.assert_allclose(
+        rollout(bp.make_params(5, **gains), matrix, dt, steps), 1.0, atol=1e-6
+    )
     if w * dt < 5:
         explicit = bp.make_params(5, **{**gains, "ki": 0.0, "discretization": "explicit"})
         assert (np.abs(rollout(explicit, matrix, dt, steps) - 1).max() < 1e-3) == (w * dt < 0.828)
@@ -120,7 +132,9 @@ def test_coupled_joints_arrive_at_any_time_step(w, dt):
 def test_a_load_is_learnt_by_the_integral():
     p = bp.make_params(2, 400.0, 2000.0, 40.0, integral_limit=30.0, **IMPLICIT)
     matrix = np.diag([2.0, 0.5])[None]
-    np.testing.assert_allclose(rollout(p, matrix, 0.05, passive=np.array([[-10.0, 3.0]])), 1.0, atol=1e-6)
+    np.testing.assert_allclose(
+        rollout(p, matrix, 0.05, passive=np.array([[-10.0, 3.0]])), 1.0, atol=1e-6
+    )
     soft = bp.make_params(2, 400.0, None, 40.0, **IMPLICIT)
     k = bp.discretise(soft, 0.05)
     offset = 1 - rollout(soft, matrix, 0.05, passive=np.array([[-10.0, 3.0]]))
@@ -163,7 +177,9 @@ def test_a_params_file_keeps_it():
     text = bp.dumps_params(p, ["a", "b"])
     assert "discretization: implicit" in text
     assert bp.loads_params(text)[0].discretization == p.discretization
-    old = bp.dumps_params(p.replace(discretization="explicit"), ["a", "b"]).replace("discretization: explicit\n", "")
+    old = bp.dumps_params(p.replace(discretization="explicit"), ["a", "b"]).replace(
+        "discretization: explicit\n", ""
+    )
     assert bp.loads_params(old)[0].discretization is None
 
 
@@ -172,7 +188,10 @@ def test_other_controllers_get_the_gains_of_their_time_step():
     per_step = 1 / (1 + 0.05 * 40 + 0.05**2 * 400)
     inertia, share = [2.0], pytest.approx(2 * 400 * per_step)
     text, differences = to_ros2_control(p, ["a"], 0.05, inertia=inertia)
-    assert any(each.startswith("discretization: gains of the explicit law at dt = 0.05 s") for each in differences)
+    assert any(
+        each.startswith("discretization: gains of the explicit law at dt = 0.05 s")
+        for each in differences
+    )
     assert float(re.search(r"\bp: ([\d.]+)", text)[1]) == share
     integral = to_ros2_control(p.replace(ki=10.0), ["a"], 0.05, inertia=inertia).differences
     assert any("lead of dt" in each for each in integral)

@@ -17,12 +17,21 @@ from batchpid.motors import friction
 
 def controller():
     """Return a controller with float32 params."""
-    options = {"ki": 3.0, "kd": 1.0, "effort_limit": [1.0, 2.0, 3.0], "derivative_filter_time": 0.01}
-    return bp.BatchPID(bp.make_params(3, [4.0, 5.0, 6.0], dtype=np.float32, **options), 2, 0.01, backend="jax")
+    options = {
+        "ki": 3.0,
+        "kd": 1.0,
+        "effort_limit": [1.0, 2.0, 3.0],
+        "derivative_filter_time": 0.01,
+    }
+    return bp.BatchPID(
+        bp.make_params(3, [4.0, 5.0, 6.0], dtype=np.float32, **options), 2, 0.01, backend="jax"
+    )
 
 
 def efforts(pid):
-    """Return the efforts of calls, resets and changes of params, with NaN among the measurements."""
+    """Return the efforts of calls, resets and changes of params, with NaN among the
+    measurements.
+    """
     rows, params = [], pid.params
     pid.reset(np.zeros((2, 3)))
     with jax.transfer_guard("allow"), jax.numpy_rank_promotion("allow"):
@@ -81,7 +90,11 @@ def test_a_change_of_settings_compiles_nothing_again(caplog):
 
 def test_the_callers_own_programs_keep_the_callers_settings():
     pid = bp.BatchPID(bp.make_params(2, 3.0), 1, 0.01, backend="jax")
-    with changed(jax_debug_nans=True, jax_numpy_rank_promotion="raise", jax_transfer_guard_host_to_device="disallow"):
+    with changed(
+        jax_debug_nans=True,
+        jax_numpy_rank_promotion="raise",
+        jax_transfer_guard_host_to_device="disallow",
+    ):
         pid(1.0, np.full((1, 2), np.nan))
         assert jax.config.jax_debug_nans
         assert jax.config.jax_numpy_rank_promotion == "raise"
@@ -100,17 +113,29 @@ def stepped(rows):
 
 @pytest.mark.parametrize("wide", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_pure_functions_obey_the_strict_modes(wide):
-    """All functions that programs of the caller may trace; functions of float32 stay in float32 under 64-bit types."""
+    """All functions that programs of the caller may trace; functions of float32 stay in float32
+    under 64-bit types.
+    """
 
     def run(rows, mask, mass):
         dtype = rows.dtype
-        params = bp.make_params(3, 5.0, ki=1.0, kd=0.1, effort_limit=3.0, integral_limit=2.0, dtype=dtype)
+        params = bp.make_params(
+            3, 5.0, ki=1.0, kd=0.1, effort_limit=3.0, integral_limit=2.0, dtype=dtype
+        )
         start = bp.init(params, rows)
         state, target = bp.drive_target(params, start, rows, rows, 0.01)
-        found = [state, target, bp.track(params, state, rows, rows, rows), bp.reset(params, state, rows, mask)]
+        found = [
+            state,
+            target,
+            bp.track(params, state, rows, rows, rows),
+            bp.reset(params, state, rows, mask),
+        ]
         model = friction.Friction(*(rows[:1] ** 2 for _ in range(3)))
         rubbing = friction.init(model, rows, rows, mass, 0.01)
-        found += [friction.advance(model, rubbing, rows, rows), actuators.reset(rubbing, rubbing, mask)]
+        found += [
+            friction.advance(model, rubbing, rows, rows),
+            actuators.reset(rubbing, rubbing, mask),
+        ]
         found += [friction.compensation(rows[:1] ** 2, rows, rows, rows[:1] ** 2)]
         motors = bp.make_actuators(
             3, command_delay=0.02, sensor_delay=0.01, strength=0.9, effort_limit=6.0, velocity_noise=1e-2, seed=1,

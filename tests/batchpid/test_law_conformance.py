@@ -1,4 +1,5 @@
-"""Every executor of the law agrees with a scalar controller (scalar_pid.py), for params of any combination of options.
+"""Every executor of the law agrees with a scalar controller (scalar_pid.py), for params of any
+combination of options.
 
 The native extension and the exported C are bit-identical to NumPy.
 """
@@ -20,16 +21,32 @@ from batchpid.export import to_c
 from tests.c_programs import COMPILERS, efforts_in_c
 
 RATES = ("measurement_rate", "setpoint_rate", "feedforward")
-GIVEN = [(), RATES, ("measurement_rate",), ("setpoint_rate",), ("measurement_rate", "setpoint_rate"), ("feedforward",)]
+GIVEN = [
+    (),
+    RATES,
+    ("measurement_rate",),
+    ("setpoint_rate",),
+    ("measurement_rate", "setpoint_rate"),
+    ("feedforward",),
+]
 
 
 def by_steps(params, inputs, step=bp.step, array=read_only):
-    """Return the efforts (steps, envs, joints) of ``step``; ``array`` makes its arrays, by default read-only ones."""
-    params = bp.PIDParams(*(array(x, params.dtype) if isinstance(x, np.ndarray) else x for x in params))
-    rows = [[None if x is None else array(x[t], params.dtype) for x in inputs] for t in range(len(inputs.setpoint))]
+    """Return the efforts (steps, envs, joints) of ``step``; ``array`` makes its arrays, by default
+    read-only ones.
+    """
+    params = bp.PIDParams(
+        *(array(x, params.dtype) if isinstance(x, np.ndarray) else x for x in params)
+    )
+    rows = [
+        [None if x is None else array(x[t], params.dtype) for x in inputs]
+        for t in range(len(inputs.setpoint))
+    ]
     state, efforts = bp.init(params, rows[0][1]), []
     for setpoint, measurement, *rates in rows:
-        state, effort = step(params, state, setpoint, measurement, DT, **dict(zip(RATES, rates, strict=True)))
+        state, effort = step(
+            params, state, setpoint, measurement, DT, **dict(zip(RATES, rates, strict=True))
+        )
         assert effort.dtype == params.dtype
         efforts.append(np.asarray(effort, float))
     return np.array(efforts)
@@ -41,8 +58,12 @@ def by_jax(params, inputs):
 
 def by_controller(params, inputs, backend="numpy"):
     pid = bp.BatchPID(params, inputs.setpoint.shape[1], DT, backend)
-    rows = zip(*(x if x is not None else [None] * len(inputs.setpoint) for x in inputs), strict=True)
-    efforts = np.array([pid(*(None if x is None else x.astype(params.dtype) for x in row)) for row in rows])
+    rows = zip(
+        *(x if x is not None else [None] * len(inputs.setpoint) for x in inputs), strict=True
+    )
+    efforts = np.array(
+        [pid(*(None if x is None else x.astype(params.dtype) for x in row)) for row in rows]
+    )
     assert efforts.dtype == params.dtype
     return efforts.astype(float)
 
@@ -64,7 +85,9 @@ def by_jaxs_controller(params, inputs):
 
 
 class Executor(NamedTuple):
-    """Function that returns the efforts (steps, envs, joints) of params under inputs, and its properties."""
+    """Function that returns the efforts (steps, envs, joints) of params under inputs, and its
+    properties.
+    """
 
     run: Any
     dtype: Any = np.float64
@@ -88,13 +111,23 @@ CASES = [(name, seed) for name, executor in EXECUTORS.items() for seed in range(
 
 
 def oracle(params, inputs):
-    """Return the efforts of scalar controllers, one per env and joint, and the sum of the magnitudes of their terms."""
+    """Return the efforts of scalar controllers, one per env and joint, and the sum of the
+    magnitudes of their terms.
+    """
     efforts, sizes = np.zeros((2, *inputs.setpoint.shape))
-    for (env, joint), pid in np.ndenumerate(np.array(scalar_pids(params, inputs.setpoint.shape[1]), object)):
+    for (env, joint), pid in np.ndenumerate(
+        np.array(scalar_pids(params, inputs.setpoint.shape[1]), object)
+    ):
         pid.start(inputs.measurement[0, env, joint])
         for t in range(len(efforts)):
-            now = {name: None if (x := getattr(inputs, name)) is None else x[t, env, joint] for name in RATES}
-            setpoint, measurement = inputs.setpoint[t, env, joint], inputs.measurement[t, env, joint]
+            now = {
+                name: None if (x := getattr(inputs, name)) is None else x[t, env, joint]
+                for name in RATES
+            }
+            setpoint, measurement = (
+                inputs.setpoint[t, env, joint],
+                inputs.measurement[t, env, joint],
+            )
             efforts[t, env, joint] = pid.step(setpoint, measurement, DT, **now)
             sizes[t, env, joint] = pid.size
     return efforts, sizes
@@ -127,7 +160,11 @@ def test_efforts_are_those_of_the_law_on_plain_numbers(name, seed, request):
 @pytest.mark.parametrize("given", GIVEN, ids=" ".join)
 def test_efforts_with_each_option_alone_on_any_inputs(options, given, inputs):
     params = bp.make_params(JOINTS, **options)
-    check(EXECUTORS["numpy"], params, Inputs(*inputs[:2], **{each: getattr(inputs, each) for each in given}))
+    check(
+        EXECUTORS["numpy"],
+        params,
+        Inputs(*inputs[:2], **{each: getattr(inputs, each) for each in given}),
+    )
 
 
 @pytest.mark.skipif(not COMPILERS, reason="no C compiler")
@@ -151,10 +188,16 @@ def test_terms_add_up_and_say_what_saturates(options, inputs):
     for t in range(20):
         now = params, state, inputs.setpoint[t], inputs.measurement[t], DT
         given = inputs.feedforward[t] if t % 2 else None
-        (_, alone), (state, terms) = (function(*now, feedforward=given) for function in (bp.step, bp.step_terms))
+        (_, alone), (state, terms) = (
+            function(*now, feedforward=given) for function in (bp.step, bp.step_terms)
+        )
         assert np.array_equal(alone, terms.effort)
-        assert np.array_equal(terms.feedforward, np.zeros_like(terms.effort) if given is None else given)
-        np.testing.assert_allclose(terms.p + terms.i + terms.d + terms.feedforward, terms.unsaturated, rtol=1e-12)
+        assert np.array_equal(
+            terms.feedforward, np.zeros_like(terms.effort) if given is None else given
+        )
+        np.testing.assert_allclose(
+            terms.p + terms.i + terms.d + terms.feedforward, terms.unsaturated, rtol=1e-12
+        )
         assert np.array_equal(terms.saturated, terms.effort != terms.unsaturated)
         assert terms.finite.all()
         saturated.append(terms.saturated)
@@ -167,7 +210,9 @@ def test_an_option_with_a_neutral_value_is_off():
     gains = {"kp": 3.0, "ki": 1.0, "kd": 0.2}
     limits = dict.fromkeys(("effort_limit", "effort_rate_limit", "integral_limit"), np.inf)
     zeros = dict.fromkeys(("derivative_filter_time", "setpoint_weight_derivative", "deadband"), 0.0)
-    neutral = bp.make_params(JOINTS, **gains, **limits, **zeros, setpoint_weight=1.0, continuous=False)
+    neutral = bp.make_params(
+        JOINTS, **gains, **limits, **zeros, setpoint_weight=1.0, continuous=False
+    )
     assert {name for name, leaf in neutral._asdict().items() if leaf is not None} == gains.keys()
 
 
@@ -177,13 +222,19 @@ def test_every_option_that_is_on_changes_the_efforts(options, inputs):
         pytest.skip("a plain PID")
     inputs = Inputs(inputs.setpoint, inputs.measurement)
     plain = bp.make_params(JOINTS, options["kp"], options["ki"], options["kd"])
-    assert not np.array_equal(by_steps(plain, inputs), by_steps(bp.make_params(JOINTS, **options), inputs))
+    assert not np.array_equal(
+        by_steps(plain, inputs), by_steps(bp.make_params(JOINTS, **options), inputs)
+    )
 
 
 def test_the_scalar_law_by_hand():
-    pid = ScalarPID(2.0, 3.0, 0.5, effort_max=2.1, anti_windup="back_calculation", tracking_time=0.2)
+    pid = ScalarPID(
+        2.0, 3.0, 0.5, effort_max=2.1, anti_windup="back_calculation", tracking_time=0.2
+    )
     pid.start(0.0)
-    assert pid.step(1.0, 0.0, 0.1) == 2.0, "output first, and no derivative at the first measurement"
+    assert pid.step(1.0, 0.0, 0.1) == 2.0, (
+        "output first, and no derivative at the first measurement"
+    )
     assert pid.integral == pytest.approx(0.3)
     assert pid.step(1.0, -0.1, 0.1) == 2.1
     assert pid.unsaturated == pytest.approx(2.2 + 0.3 + 0.5)

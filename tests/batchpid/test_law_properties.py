@@ -14,7 +14,15 @@ import batchpid as bp
 numbers = st.floats(-1e3, 1e3, allow_subnormal=False)
 runs = st.tuples(*[npst.arrays(float, (6, ENVS, JOINTS), elements=numbers)] * 3)
 cases = st.sampled_from(sorted(OPTIONS))
-TRACKED = ("pid", "mixed per env", "rate and limits", "filter", "setpoint weight", "continuous", "everything")
+TRACKED = (
+    "pid",
+    "mixed per env",
+    "rate and limits",
+    "filter",
+    "setpoint weight",
+    "continuous",
+    "everything",
+)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -22,7 +30,9 @@ def roll(params, r, y, ff=None, state=None):
     """Return the states and the terms of a run."""
     state, states, terms = bp.init(params, y[0]) if state is None else state, [], []
     for t in range(len(r)):
-        state, shown = bp.step_terms(params, state, r[t], y[t], DT, feedforward=None if ff is None else ff[t])
+        state, shown = bp.step_terms(
+            params, state, r[t], y[t], DT, feedforward=None if ff is None else ff[t]
+        )
         states.append(state)
         terms.append(shown)
     return states, terms
@@ -30,7 +40,8 @@ def roll(params, r, y, ff=None, state=None):
 
 def equal_bits(a, b):
     return all(
-        (x is None) == (y is None) and (x is None or x.tobytes() == y.tobytes()) for x, y in zip(a, b, strict=True)
+        (x is None) == (y is None) and (x is None or x.tobytes() == y.tobytes())
+        for x, y in zip(a, b, strict=True)
     )
 
 
@@ -39,12 +50,18 @@ def equal_bits(a, b):
 def test_the_integral_is_bounded_by_anti_windup(strategy, seed):
     """For an error of any duration, by the limits and the other terms."""
     rng, envs = np.random.default_rng(seed), 40
-    kp, ki, limit = rng.uniform(0, 10, (envs, 1)), rng.uniform(0.1, 50, (envs, 1)), rng.uniform(0.1, 10, (envs, 1))
+    kp, ki, limit = (
+        rng.uniform(0, 10, (envs, 1)),
+        rng.uniform(0.1, 50, (envs, 1)),
+        rng.uniform(0.1, 10, (envs, 1)),
+    )
     params = bp.make_params(1, kp, ki, effort_limit=limit, anti_windup=strategy)
     free = bp.make_params(1, kp, ki, effort_limit=limit)
     r, y = rng.uniform(-3, 3, (2, 300, envs, 1))
     r[:200] = np.abs(r[:200]) + 4
-    bounded, wound_up = (np.max([np.abs(s.integral) for s in roll(p, r, y)[0]], axis=0) for p in (params, free))
+    bounded, wound_up = (
+        np.max([np.abs(s.integral) for s in roll(p, r, y)[0]], axis=0) for p in (params, free)
+    )
     time = 0.0 if params.tracking_time is None else params.tracking_time
     most = {
         "clamp": limit,
@@ -63,21 +80,36 @@ def test_sharding_envs_changes_no_bit(case, run, cut, spread):
     shards = (slice(cut), slice(cut, None))
     parts = [bp.init(params.for_envs(rows), run[1][0][rows]) for rows in shards]
     for t in range(len(run[0])):
-        whole, terms = bp.advance(bp.discretise(params, DT), whole, run[0][t], run[1][t], feedforward=run[2][t])
+        whole, terms = bp.advance(
+            bp.discretise(params, DT), whole, run[0][t], run[1][t], feedforward=run[2][t]
+        )
         for n, rows in enumerate(shards):
-            k = bp.discretise(params.for_envs(rows), DT, len(terms.effort[rows]) if spread else None)
+            k = bp.discretise(
+                params.for_envs(rows), DT, len(terms.effort[rows]) if spread else None
+            )
             inputs = [x[t][rows] for x in run]
             parts[n], part = bp.advance(k, parts[n], *inputs[:2], feedforward=inputs[2])
             assert part.effort.tobytes() == terms.effort[rows].tobytes()
             assert equal_bits(parts[n], whole.for_envs(rows))
 
 
-@given(runs, st.sampled_from([np.nan, np.inf, -np.inf]), st.integers(0, 2), st.sampled_from(["zero", "hold"]))
+@given(
+    runs,
+    st.sampled_from([np.nan, np.inf, -np.inf]),
+    st.integers(0, 2),
+    st.sampled_from(["zero", "hold"]),
+)
 @settings(max_examples=40)
 def test_a_non_finite_input_affects_its_joint_alone(run, bad, which, policy):
-    """Its state is kept, its effort is 0 or the last, the mask marks it, and the others are bit-identical."""
+    """Its state is kept, its effort is 0 or the last, the mask marks it, and the others are
+    bit-identical.
+    """
     params = bp.make_params(
-        JOINTS, **LIMITED, anti_windup="back_calculation", derivative_filter_time=0.02, non_finite=policy
+        JOINTS,
+        **LIMITED,
+        anti_windup="back_calculation",
+        derivative_filter_time=0.02,
+        non_finite=policy,
     )
     hurt = [x.copy() for x in run]
     hurt[which][3, 1, 2] = bad
@@ -113,7 +145,8 @@ def test_without_the_option_a_nan_propagates_in_its_joint():
 
 @pytest.mark.quick_rows(3)
 @pytest.mark.parametrize(
-    "case", [case if case in TRACKED else pytest.param(case, marks=pytest.mark.slow) for case in OPTIONS]
+    "case",
+    [case if case in TRACKED else pytest.param(case, marks=pytest.mark.slow) for case in OPTIONS],
 )
 @given(runs, npst.arrays(float, (ENVS, JOINTS), elements=st.floats(-0.9, 0.9)), st.booleans())
 @settings(max_examples=20)
@@ -158,11 +191,17 @@ def test_a_change_of_ki_is_bumpless(run, ki):
 @pytest.mark.parametrize("turns", [-2, 1])
 @pytest.mark.parametrize(
     "options",
-    [{"kd": 0.5}, {"kd": 0.5, "setpoint_weight": 0.3, "setpoint_weight_derivative": 0.8}, {"setpoint_weight": 0.3}],
+    [
+        {"kd": 0.5},
+        {"kd": 0.5, "setpoint_weight": 0.3, "setpoint_weight_derivative": 0.8},
+        {"setpoint_weight": 0.3},
+    ],
     ids=str,
 )
 def test_whole_turns_of_a_continuous_joint_change_no_term(turns, options):
-    """Readings that jump by whole turns give the terms of readings that do not: no spike in P, I or D."""
+    """Readings that jump by whole turns give the terms of readings that do not: no spike in P, I or
+    D.
+    """
     params = bp.make_params(1, 3.0, 2.0, continuous=True, **options)
     rng = np.random.default_rng(3)
     y = np.cumsum(rng.uniform(0, 0.3, (60, 1, 1)), 0)
@@ -187,9 +226,13 @@ def test_a_constant_error_has_no_derivative_under_wrap(error, path):
 
 @pytest.mark.slow
 def test_recovery_from_saturation_overshoots_less_with_anti_windup():
-    """A double integrator with a weak motor: the textbook's case of windup; an env for each strategy."""
+    """A double integrator with a weak motor: the textbook's case of windup; an env for each
+    strategy.
+    """
     strategies = [["none"], ["clamp"], ["conditional"], ["back_calculation"]]
-    params = bp.make_params(1, 4.0, 3.0, 4.0, effort_limit=0.2, anti_windup=strategies, tracking_time=0.3)
+    params = bp.make_params(
+        1, 4.0, 3.0, 4.0, effort_limit=0.2, anti_windup=strategies, tracking_time=0.3
+    )
     x, v, peak = np.zeros((3, 4, 1))
     state = bp.init(params, x)
     for _ in range(6000):
@@ -232,7 +275,9 @@ def test_arguments_are_neither_written_to_nor_kept(case, run):
         for leaf in state:
             if leaf is not None:
                 leaf.setflags(write=False)
-        state, terms = bp.step_terms(params, state, buffers[0], buffers[1], DT, feedforward=buffers[2])
+        state, terms = bp.step_terms(
+            params, state, buffers[0], buffers[1], DT, feedforward=buffers[2]
+        )
         effort = terms.effort
         kept = effort.copy()
         effort += 1e6  # the caller's own, from here on
@@ -256,7 +301,9 @@ def test_decayed_filters_never_hold_denormal_numbers(dtype):
     zero, one = np.zeros((1, 1), dtype), np.ones((1, 1), dtype)
     state, _ = bp.step(params, bp.init(params, zero), zero, one, DT)
     tiny = np.finfo(dtype).tiny
-    state = state._replace(**{name: getattr(state, name) * tiny**0.9 for name in ("derivative", "integral")})
+    state = state._replace(
+        **{name: getattr(state, name) * tiny**0.9 for name in ("derivative", "integral")}
+    )
     for _ in range(400):
         state, _ = bp.step(params, state, one, one, DT)
         for leaf in (state.derivative, state.integral):
@@ -264,7 +311,8 @@ def test_decayed_filters_never_hold_denormal_numbers(dtype):
     assert abs(state.derivative) < np.sqrt(tiny)
 
 
-# -- Inputs ----------------------------------------------------------------------------------------------------------
+# -- Inputs
+# --------------------------------------------------------------------------------------------------
 
 Y = np.zeros((4, 3))
 PARAMS = bp.make_params(3, 40.0, 5.0, 2.0, effort_limit=10.0)
@@ -281,12 +329,16 @@ def test_lists_are_arrays():
     np.testing.assert_array_equal(fresh.measurement[:, 0], [2, 0, 0, 0])
 
 
-@pytest.mark.parametrize("dt", [DT, np.float64(DT), np.float32(DT), np.array(DT), np.full((4, 1), DT)])
+@pytest.mark.parametrize(
+    "dt", [DT, np.float64(DT), np.float32(DT), np.array(DT), np.full((4, 1), DT)]
+)
 def test_the_time_step_does_not_change_the_dtype(dt):
     params = bp.make_params(3, 40.0, 5.0, 2.0, dtype="float32")
     y = Y.astype(np.float32)
     state, effort = bp.step(params, bp.init(params, y), y + 1, y, dt)
-    assert {effort.dtype, *(leaf.dtype for leaf in state.leaves().values())} == {np.dtype(np.float32)}
+    assert {effort.dtype, *(leaf.dtype for leaf in state.leaves().values())} == {
+        np.dtype(np.float32)
+    }
 
 
 def test_jax_names_them_while_it_traces():

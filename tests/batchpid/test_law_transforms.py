@@ -1,4 +1,6 @@
-"""The law under every JAX transform; test_law_conformance.py compares the compiled law with NumPy's."""
+"""The law under every JAX transform; test_law_conformance.py compares the compiled law with
+NumPy's.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,9 @@ import batchpid as bp
 
 GAINS = ("kp", "ki", "kd")
 QUICK = ("mixed per env", "filter", "setpoint weight")
-GRADIENTS = [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in OPTIONS]
+GRADIENTS = [
+    case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in OPTIONS
+]
 
 
 @pytest.fixture(autouse=True)
@@ -43,8 +47,13 @@ def numpy_rollout(params, setpoint, measurement):
 
 
 def test_scan_vmap_and_grad(inputs, x64):
-    """Scan over time, vmap over the gains, grad with respect to every leaf; gradients of gains are compared below."""
-    numpy_params, tolerance = bp.make_params(JOINTS, **OPTIONS["mixed per env"]), {"rtol": 1e-12, "atol": 1e-11}
+    """Scan over time, vmap over the gains, grad with respect to every leaf; gradients of gains are
+    compared below.
+    """
+    numpy_params, tolerance = (
+        bp.make_params(JOINTS, **OPTIONS["mixed per env"]),
+        {"rtol": 1e-12, "atol": 1e-11},
+    )
     params, run = on_jax(numpy_params, np.float64), (inputs.setpoint, inputs.measurement)
     r, y = map(jnp.asarray, run)
 
@@ -66,11 +75,15 @@ def test_scan_vmap_and_grad(inputs, x64):
 
 @pytest.mark.parametrize("options", GRADIENTS, indirect=True)
 def test_gradients_equal_finite_differences(options, inputs, x64):
-    """Those of the law in NumPy. Away from saturation: the made-up run is scaled down, so that no limit is near."""
+    """Those of the law in NumPy. Away from saturation: the made-up run is scaled down, so that no
+    limit is near.
+    """
     options.pop("effort_rate_limit", None)
     params = bp.make_params(JOINTS, **options)
     if params.effort_min is not None:
-        params = params._replace(effort_min=100 * params.effort_min, effort_max=100 * params.effort_max)
+        params = params._replace(
+            effort_min=100 * params.effort_min, effort_max=100 * params.effort_max
+        )
     if params.deadband is not None:
         params = params._replace(deadband=1e-3 * params.deadband)
     run, weights = [x * 1e-3 for x in (inputs.setpoint, inputs.measurement)], inputs.feedforward
@@ -79,13 +92,16 @@ def test_gradients_equal_finite_differences(options, inputs, x64):
     @quick_jit
     @jax.grad
     def gradient_of(gains):
-        return jnp.sum(weights * rollout(on_jax(params, np.float64)._replace(**gains), *map(jnp.asarray, run)))
+        return jnp.sum(
+            weights * rollout(on_jax(params, np.float64)._replace(**gains), *map(jnp.asarray, run))
+        )
 
     gradient, h, rng = gradient_of(on_jax(gains, np.float64)), 1e-4, np.random.default_rng(0)
     for name, value in gains.items():
         shift = rng.normal(size=value.shape)
         up, down = (
-            np.sum(weights * numpy_rollout(params._replace(**{name: value + s * h * shift}), *run)) for s in (1, -1)
+            np.sum(weights * numpy_rollout(params._replace(**{name: value + s * h * shift}), *run))
+            for s in (1, -1)
         )
         slope = np.sum(gradient[name] * shift)
         np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-6, atol=1e-9)
@@ -96,7 +112,10 @@ def test_gradients_equal_finite_differences(options, inputs, x64):
 def test_gradients_survive_times_of_zero(zero, inputs, x64):
     times = {"derivative_filter_time": [0.0, 0.0, 0.1], "tracking_time": [0.0, 0.0, 0.1]}
     strategy = {"anti_windup": "back_calculation"} if zero == "tracking_time" else {}
-    params = on_jax(bp.make_params(JOINTS, 40, 5, 2, effort_limit=1.0, **{zero: times[zero]}, **strategy), np.float64)
+    params = on_jax(
+        bp.make_params(JOINTS, 40, 5, 2, effort_limit=1.0, **{zero: times[zero]}, **strategy),
+        np.float64,
+    )
     r, y = jnp.asarray(inputs.setpoint), jnp.asarray(inputs.measurement)
     gradients = quick_jit(jax.grad(lambda params: jnp.sum(rollout(params, r, y))))(params)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
@@ -117,7 +136,9 @@ def test_gains_may_be_traced_through_make_params_and_replace(build, inputs, x64)
     base = bp.make_params(JOINTS, 40.0, **options)
 
     def built(kp):
-        return bp.make_params(JOINTS, kp, **options) if build == "make_params" else base.replace(kp=kp)
+        return (
+            bp.make_params(JOINTS, kp, **options) if build == "make_params" else base.replace(kp=kp)
+        )
 
     def cost(kp):
         return jnp.mean(rollout(built(kp), r, y) ** 2)
@@ -129,7 +150,10 @@ def test_gains_may_be_traced_through_make_params_and_replace(build, inputs, x64)
     slopes = quick_jit(jax.vmap(jax.grad(cost)))(jnp.stack([kp, kp]))
     np.testing.assert_allclose(slopes[1], quick_jit(jax.grad(cost_of_leaf))(kp), rtol=1e-9)
     assert (slopes != 0).all()
-    assert jax.vmap(built)(jnp.stack([kp, 2 * kp])).kp.tolist() == [[kp.tolist()], [(2 * kp).tolist()]]
+    assert jax.vmap(built)(jnp.stack([kp, 2 * kp])).kp.tolist() == [
+        [kp.tolist()],
+        [(2 * kp).tolist()],
+    ]
 
 
 @pytest.mark.quick_rows(4)
@@ -137,7 +161,9 @@ def test_params_whose_leaves_are_all_traced_can_be_changed(options):
     """The arguments of a compiled function: replace gives the same result as outside."""
     params = bp.make_params(JOINTS, **options, dtype=np.float32)
     expected = params.replace(kp=2.0, effort_limit=3.0)
-    changed = quick_jit(lambda params, kp: params.replace(kp=kp, effort_limit=3.0))(params, jnp.float32(2.0))
+    changed = quick_jit(lambda params, kp: params.replace(kp=kp, effort_limit=3.0))(
+        params, jnp.float32(2.0)
+    )
     assert [type(leaf) for leaf in changed if isinstance(leaf, tuple)] == [
         type(leaf) for leaf in expected if isinstance(leaf, tuple)
     ]
@@ -158,13 +184,18 @@ def test_traced_gains_have_their_shapes_checked_and_give_the_params_their_dtype(
         gains(jnp.ones(3))
     with pytest.raises(bp.InvalidArgumentError, match=r"kd: has shape \(4, 2\), not \(5, 2\)"):
         gains(jnp.ones((5, 2)), kd=np.ones((4, 2)))
-    with pytest.raises(bp.InvalidArgumentError, match="kp: cannot be read as an array of numbers: its dtype is bool"):
+    with pytest.raises(
+        bp.InvalidArgumentError,
+        match="kp: cannot be read as an array of numbers: its dtype is bool",
+    ):
         gains(jnp.ones(2, bool))
 
 
 def test_an_option_that_is_traced_is_on():
     def build(value):
-        params = bp.make_params(2, 1.0, deadband=value, effort_limit=value, derivative_filter_time=value, kd=1.0)
+        params = bp.make_params(
+            2, 1.0, deadband=value, effort_limit=value, derivative_filter_time=value, kd=1.0
+        )
         return [leaf is None for leaf in params]
 
     traced = []
@@ -174,7 +205,9 @@ def test_an_option_that_is_traced_is_on():
 
 def test_numpy_and_traced_arguments_may_be_mixed(inputs, x64):
     """Each of params, state and inputs may be NumPy while another is traced."""
-    params = bp.make_params(JOINTS, 40.0, 5.0, 2.0, effort_limit=9.0, anti_windup="back_calculation")
+    params = bp.make_params(
+        JOINTS, 40.0, 5.0, 2.0, effort_limit=9.0, anti_windup="back_calculation"
+    )
     r, y = inputs.setpoint[0], inputs.measurement[0]
     state = bp.init(params, y)
     expected = bp.step(params, state, r, y + 0.1, DT)[1]

@@ -60,7 +60,9 @@ def test_critically_damped_rise_time_and_integrals():
 
 def test_first_order_is_resampled_to_the_same_figures_within_a_sample():
     fine, coarse = np.linspace(0, 5, 50_001), np.linspace(0, 5, 501)
-    figures = [step_metrics(t[1], [1.0], (1 - np.exp(-3 * t))[:, None, None]) for t in (fine, coarse)]
+    figures = [
+        step_metrics(t[1], [1.0], (1 - np.exp(-3 * t))[:, None, None]) for t in (fine, coarse)
+    ]
     assert figures[0].rise_time[0, 0] == pytest.approx(np.log(9) / 3, rel=1e-5)
     for a, b in zip(*figures, strict=True):
         np.testing.assert_allclose(a, b, rtol=2e-3, atol=1e-6)
@@ -99,10 +101,20 @@ def test_never_settling_is_inf_and_nan_spoils_only_its_own_joint():
     y[:, :, 0] = np.linspace(0, 1, 101)[:, None]
     y[60:, 1, 1] = np.nan
     effort = np.nan_to_num(y)
-    m = step_metrics(t[1], [1.0, 1.0], y, start=None, effort=effort, saturated=np.zeros_like(y, bool))
+    m = step_metrics(
+        t[1], [1.0, 1.0], y, start=None, effort=effort, saturated=np.zeros_like(y, bool)
+    )
     assert np.isinf(m.settling_time[0, 1])
     assert np.isinf(m.rise_time[0, 1])
-    for figure in (m.rise_time, m.overshoot, m.settling_time, m.steady_state_error, m.peak_deviation, m.iae, m.itae):
+    for figure in (
+        m.rise_time,
+        m.overshoot,
+        m.settling_time,
+        m.steady_state_error,
+        m.peak_deviation,
+        m.iae,
+        m.itae,
+    ):
         assert figure[1, 1] == np.inf
     alone = step_metrics(t[1], [1.0], y[:, :1, :1])
     assert alone.settling_time[0, 0] == m.settling_time[1, 0]
@@ -120,7 +132,9 @@ def test_continuous_joint_moves_the_short_way():
 
 def test_statistics_over_envs_leave_out_what_is_undefined():
     shape = (3, 1)
-    figures = [np.array([[1.0], [np.inf], [np.nan]])] + [np.zeros(shape)] * (len(StepMetrics._fields) - 1)
+    figures = [np.array([[1.0], [np.inf], [np.nan]])] + [np.zeros(shape)] * (
+        len(StepMetrics._fields) - 1
+    )
     m = StepMetrics(*figures)
     assert m.worst().rise_time[0] == np.inf
     assert m.over_envs(np.min).rise_time[0] == 1.0

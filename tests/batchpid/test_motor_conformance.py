@@ -1,4 +1,5 @@
-"""Every executor of guard, friction, motors and sensors agrees with scalar_motors.py, for any combination of options.
+"""Every executor of guard, friction, motors and sensors agrees with scalar_motors.py, for any
+combination of options.
 
 Executors are NumPy on read-only arrays, JAX, and native programs, which are bit-identical to NumPy.
 """
@@ -25,10 +26,14 @@ SHAPE = ENVS, JOINTS
 
 
 def drawn(rng, ranges, dtype):
-    """Return options of any combination, (envs, joints) each, in a third of the entries with the value that is off."""
+    """Return options of any combination, (envs, joints) each, in a third of the entries with the
+    value that is off.
+    """
     chosen = {name: each for name, each in ranges.items() if rng.random() < 0.7}
     return {
-        name: np.where(rng.random(SHAPE) < 0.3, off, on * rng.uniform(0.2, 1.0, SHAPE)).astype(dtype)
+        name: (
+            np.where(rng.random(SHAPE) < 0.3, off, on * rng.uniform(0.2, 1.0, SHAPE)).astype(dtype)
+        )
         for name, (off, on) in chosen.items()
     }
 
@@ -38,7 +43,12 @@ def entry(options, env, joint):
     return {name: value[env, joint].item() for name, value in options.items()}
 
 
-GUARD = {"lower": (-np.inf, -2.0), "upper": (np.inf, 2.0), "rate": (np.inf, 5.0), "acceleration": (np.inf, 60.0)}
+GUARD = {
+    "lower": (-np.inf, -2.0),
+    "upper": (np.inf, 2.0),
+    "rate": (np.inf, 5.0),
+    "acceleration": (np.inf, 60.0),
+}
 FRICTION = {"viscous": (0.0, 3.0), "static": (0.0, 3.0), "stribeck": (0.0, 0.5), "load": (0.0, 0.3)}
 MOTORS = {
     "command_delay": (0.0, 0.012),
@@ -85,7 +95,11 @@ class FrictionCase(GuardCase):
     """Joints with friction under efforts and velocities that change sign."""
 
     def __init__(self, rng, dtype):
-        self.options = {"coulomb": np.where(rng.random(SHAPE) < 0.3, 0.0, rng.uniform(0.2, 2, SHAPE)).astype(dtype)}
+        self.options = {
+            "coulomb": (
+                np.where(rng.random(SHAPE) < 0.3, 0.0, rng.uniform(0.2, 2, SHAPE)).astype(dtype)
+            )
+        }
         self.options |= drawn(rng, FRICTION, dtype)
         root = rng.normal(size=(ENVS, JOINTS, JOINTS))
         self.mass = (0.02 * (root @ root.transpose(0, 2, 1) + np.eye(JOINTS))).astype(dtype)
@@ -108,7 +122,9 @@ class FrictionCase(GuardCase):
         mass = self.mass[env].astype(float)
         gains, shares = friction_gains(mass, own.get("viscous", np.zeros(JOINTS)), rubs, DT)
         begin = self.start[env, joint].item(), self.load[env, joint].item()
-        options = entry(self.options, env, joint) | ({"slides": True} if "static" not in own else {})
+        options = entry(self.options, env, joint) | (
+            {"slides": True} if "static" not in own else {}
+        )
         scalar = ScalarFriction(*begin, gains[joint], shares[joint], **options)
         for row in self.rows(env, joint):
             yield (scalar.step(*row),)
@@ -121,14 +137,22 @@ class MotorCase(GuardCase):
     def __init__(self, rng, dtype):
         self.options = drawn(rng, MOTORS, dtype) | {"continuous": rng.random(SHAPE) < 0.4}
         if rng.random() < 0.6:
-            self.options |= {"saturation_effort": rng.uniform(5, 20, SHAPE), "no_load_speed": rng.uniform(2, 9, SHAPE)}
-        self.table = (np.array([-1.0, 0.0, 2.0]), np.array([4.0, 11.0, 6.0])) if rng.random() < 0.5 else ()
+            self.options |= {
+                "saturation_effort": rng.uniform(5, 20, SHAPE),
+                "no_load_speed": rng.uniform(2, 9, SHAPE),
+            }
+        self.table = (
+            (np.array([-1.0, 0.0, 2.0]), np.array([4.0, 11.0, 6.0])) if rng.random() < 0.5 else ()
+        )
         limit = {"position_limit": self.table} if self.table else {}
         self.model = bp.make_actuators(JOINTS, **self.options, **limit, dtype=dtype)
         velocity = 4 * rng.normal(size=(STEPS, *SHAPE))
         position = np.cumsum(0.1 * rng.normal(size=(STEPS + 1, *SHAPE)), axis=0)
         self.start = position[0].astype(dtype)
-        self.inputs = [each.astype(dtype) for each in (10 * rng.normal(size=(STEPS, *SHAPE)), position[1:], velocity)]
+        self.inputs = [
+            each.astype(dtype)
+            for each in (10 * rng.normal(size=(STEPS, *SHAPE)), position[1:], velocity)
+        ]
         self.samples = motors.init(self.model, self.start, DT)
 
     def begin(self, model, start):
@@ -143,14 +167,18 @@ class MotorCase(GuardCase):
 
     def oracle(self, env, joint):
         limit = {"position_limit": self.table} if self.table else {}
-        scalar = ScalarMotor(self.start[env, joint].item(), **entry(self.options, env, joint), **limit)
+        scalar = ScalarMotor(
+            self.start[env, joint].item(), **entry(self.options, env, joint), **limit
+        )
         for effort, qpos, qvel in self.rows(env, joint):
             seen = scalar.measure(qpos, qvel, DT)
             yield (*seen, scalar.deliver(effort, qpos, qvel, DT))
 
 
 def by_numpy(case, dtype):
-    model = type(case.model)(*(leaf if leaf is None else read_only(leaf, leaf.dtype) for leaf in case.model))
+    model = type(case.model)(
+        *(leaf if leaf is None else read_only(leaf, leaf.dtype) for leaf in case.model)
+    )
     state, found = case.begin(model, read_only(case.start, dtype)), []
     for row in zip(*case.inputs, strict=True):
         state, seen = case.step(model, state, *(read_only(each, dtype) for each in row))
@@ -169,7 +197,9 @@ def by_jax(case, dtype):
 
 
 def by_programs(case, dtype):
-    """Motors by their stages, as the control step runs them; guard and friction traced as a whole."""
+    """Motors by their stages, as the control step runs them; guard and friction traced as a
+    whole.
+    """
     state, found = case.begin(case.model, case.start), []
     if isinstance(case, MotorCase):
         k = motors.discretise(case.model, state, DT, ENVS)
@@ -184,13 +214,16 @@ def by_programs(case, dtype):
     def function(*arrays):
         rest = iter(arrays)
         model, begun = (
-            type(each)(*(None if leaf is None else next(rest) for leaf in each)) for each in (case.model, state)
+            type(each)(*(None if leaf is None else next(rest) for leaf in each))
+            for each in (case.model, state)
         )
         new, seen = case.step(model, begun, *rest)
         return [*(leaf for leaf in new if leaf is not None), *seen]
 
     inputs = len(kept) + len(case.inputs)
-    program = ArrayProgram(trace(function, len(constants), inputs, dtype), constants, inputs, SHAPE, dtype)
+    program = ArrayProgram(
+        trace(function, len(constants), inputs, dtype), constants, inputs, SHAPE, dtype
+    )
     for row in zip(*case.inputs, strict=True):
         results = program(*kept, *row)
         kept, seen = [each.copy() for each in results[: len(kept)]], results[len(kept) :]
@@ -200,12 +233,19 @@ def by_programs(case, dtype):
 
 CASES = {"guard": GuardCase, "friction": FrictionCase, "motors": MotorCase}
 EXECUTORS = {"numpy": (by_numpy, 12), "programs": (by_programs, 8), "jax": (by_jax, 1)}
-ROWS = [(case, name, seed) for case in CASES for name, (_, seeds) in EXECUTORS.items() for seed in range(seeds)]
+ROWS = [
+    (case, name, seed)
+    for case in CASES
+    for name, (_, seeds) in EXECUTORS.items()
+    for seed in range(seeds)
+]
 
 
 @pytest.mark.parametrize(("case", "name", "seed"), ROWS)
 def test_signals_are_those_of_plain_numbers(case, name, seed, request):
-    is_narrow = (name == "jax" or seed % 2) and case != "friction"  # which sticks or slides, by rounding
+    is_narrow = (
+        name == "jax" or seed % 2
+    ) and case != "friction"  # which sticks or slides, by rounding
     dtype = np.float32 if is_narrow else np.float64
     if name == "programs" and (obstacle() or dtype != np.float64):
         pytest.skip("there are no programs")
@@ -213,21 +253,33 @@ def test_signals_are_those_of_plain_numbers(case, name, seed, request):
         request.getfixturevalue("x64")
     made = CASES[case](np.random.default_rng(seed), dtype)
     run, _ = EXECUTORS[name]
-    found = [[np.broadcast_to(np.asarray(each, float), SHAPE) for each in row] for row in run(made, dtype)]
+    found = [
+        [np.broadcast_to(np.asarray(each, float), SHAPE) for each in row]
+        for row in run(made, dtype)
+    ]
     found = np.moveaxis(np.array(found), 0, 1)  # signals, steps, envs, joints
-    wanted = np.array([[list(made.oracle(env, joint)) for joint in range(JOINTS)] for env in range(ENVS)], float)
+    wanted = np.array(
+        [[list(made.oracle(env, joint)) for joint in range(JOINTS)] for env in range(ENVS)], float
+    )
     wanted = np.moveaxis(wanted, (3, 2), (0, 1))
-    tolerance = 1e-9 if dtype == np.float64 else 2e-3  # a resolution, or the last step to a setpoint, may round away
+    tolerance = (
+        1e-9 if dtype == np.float64 else 2e-3
+    )  # a resolution, or the last step to a setpoint, may round away
     np.testing.assert_allclose(found, wanted, rtol=tolerance, atol=tolerance)
     if name == "programs":
-        plain = [[np.broadcast_to(np.asarray(each, float), SHAPE) for each in row] for row in by_numpy(made, dtype)]
+        plain = [
+            [np.broadcast_to(np.asarray(each, float), SHAPE) for each in row]
+            for row in by_numpy(made, dtype)
+        ]
         np.testing.assert_array_equal(found, np.moveaxis(np.array(plain), 0, 1))
 
 
 @pytest.mark.skipif(bool(obstacle()), reason="there are no programs")
 def test_programs_of_stages_hold_for_their_coefficients_alone():
     qpos = np.zeros(SHAPE)
-    weak, strong = (bp.make_actuators(JOINTS, strength=strength, bias=0.1, lag=0.01) for strength in (0.5, 2.0))
+    weak, strong = (
+        bp.make_actuators(JOINTS, strength=strength, bias=0.1, lag=0.01) for strength in (0.5, 2.0)
+    )
     state = motors.init(weak, qpos, DT)
     k, other = (motors.discretise(each, state, DT, ENVS) for each in (weak, strong))
     stages = compiled_stages(k, SHAPE)

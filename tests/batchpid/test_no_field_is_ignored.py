@@ -1,4 +1,6 @@
-"""Every field of params, motors, guards and OSC params changes the result, is refused, or is a listed difference."""
+"""Every field of params, motors, guards and OSC params changes the result, is refused, or is a
+listed difference.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +22,19 @@ from batchpid.sim import Robot, to_mjcf
 
 DT, JOINTS = 0.01, ["a", "b", "c"]
 MIXED = ["back_calculation", "conditional", "none"]
-LIMITS = {"effort_min": [-30.0, -3.0, -2.0], "effort_max": [29.0, 3.5, 2.5], "integral_min": [-20.0, -1.5, -1.5]}
+LIMITS = {
+    "effort_min": [-30.0, -3.0, -2.0],
+    "effort_max": [29.0, 3.5, 2.5],
+    "integral_min": [-20.0, -1.5, -1.5],
+}
 LIMITS["integral_max"] = [18.0, 1.2, 1.2]
-DRIVE = {"kp": [9.0, 5.0, 3.0], "ki": [9.0, 9.0, 5.0], "kd": [2.0, 0.6, 0.3], "anti_windup": MIXED, **LIMITS}
+DRIVE = {
+    "kp": [9.0, 5.0, 3.0],
+    "ki": [9.0, 9.0, 5.0],
+    "kd": [2.0, 0.6, 0.3],
+    "anti_windup": MIXED,
+    **LIMITS,
+}
 DRIVE |= {"tracking_time": 0.05, "continuous": [True, False, True]}
 FULL = DRIVE | {
     "effort_rate_limit": [300.0, 100.0, 60.0],
@@ -32,7 +44,9 @@ FULL = DRIVE | {
     "deadband": 0.1,
 }
 rng = np.random.default_rng(0)
-SETPOINT = 4 * np.sin(np.arange(40)[:, None, None] * DT * np.array([9.0, 15.0, 21.0]) + rng.normal(size=(2, 3)))
+SETPOINT = 4 * np.sin(
+    np.arange(40)[:, None, None] * DT * np.array([9.0, 15.0, 21.0]) + rng.normal(size=(2, 3))
+)
 MEASURED = -0.5 * SETPOINT + 0.1 * rng.normal(size=SETPOINT.shape)
 SETPOINT[20, 1, 0] = np.nan
 TURNED = MEASURED + 2 * np.pi * (np.arange(40)[:, None, None] > 7) * [1, 0, 0]
@@ -51,21 +65,35 @@ CHOICES = {
 IMPLICIT = PLAIN.replace(gain_units="mass_matrix", discretization="implicit").discretization
 CHOICES["discretization"] = {"explicit": None, "implicit": IMPLICIT}
 DRIVE_LACKS = {
-    *("effort_rate_limit", "derivative_filter_time", "setpoint_weight", "setpoint_weight_derivative", "deadband"),
+    *(
+        "effort_rate_limit",
+        "derivative_filter_time",
+        "setpoint_weight",
+        "setpoint_weight_derivative",
+        "deadband",
+    ),
     "non_finite",
 }
 """Options of the law that a drive does not have."""
 
 
 def changes(params, choices):
-    """Yield a label, the field and the params for every field with another value: every other name of a choice."""
+    """Yield a label, the field and the params for every field with another value: every other name
+    of a choice.
+    """
     for name, leaf in params._asdict().items():
         for other, chosen in choices.get(name, {}).items():
             if type(chosen) is not type(leaf):
                 yield f"{name}={other}", name, params._replace(**{name: chosen})
         if isinstance(leaf, np.ndarray):
             is_mask = name in ("continuous", "conditional", "axes", "force_axes")
-            yield name, name, params._replace(**{name: 1 - leaf if is_mask else (leaf * 1.25).astype(leaf.dtype)})
+            yield (
+                name,
+                name,
+                params._replace(
+                    **{name: 1 - leaf if is_mask else (leaf * 1.25).astype(leaf.dtype)}
+                ),
+            )
 
 
 def outcome(function, *arguments):
@@ -112,7 +140,9 @@ LAWS = {
 @pytest.mark.filterwarnings("ignore:invalid value")
 @pytest.mark.parametrize("law", LAWS)
 def test_every_field_of_params_changes_the_efforts_or_is_refused(law):
-    """A choice without effect on the efforts of ``step``, such as an origin of no weight, may have none elsewhere."""
+    """A choice without effect on the efforts of ``step``, such as an origin of no weight, may have
+    none elsewhere.
+    """
     base = bp.make_params(3, **(DRIVE if law == "drive" else FULL))
     bases = {name: outcome(LAWS[name], base) for name in ("step", law)}
     tried = set()
@@ -141,7 +171,9 @@ def test_a_drives_target_is_next_to_the_measurement_on_continuous_joints():
 def test_coefficients_of_accelerations_need_the_robots_inertia():
     params, y = bp.make_params(2, 4.0, 1.0, 1.0, gain_units="mass_matrix"), np.zeros((1, 2))
     k, state = bp.discretise(params, DT), bp.init(params, y)
-    with pytest.raises(InvalidArgumentError, match=r"gain_units.*mass_matrix.*designed\('effort'\)"):
+    with pytest.raises(
+        InvalidArgumentError, match=r"gain_units.*mass_matrix.*designed\('effort'\)"
+    ):
         bp.advance(k, state, y, y)
     advance_with_mass_matrix(k, state, y, y, np.eye(2)[None])
 
@@ -150,7 +182,9 @@ INERTIA = [1.0, 0.5, 0.2]
 TARGETS = {
     "C": lambda p: to_c(p, DT),
     "trajectory": lambda p: to_ros2_control(p, JOINTS, DT, inertia=INERTIA),
-    "pid_controller": lambda p: to_ros2_control(p, JOINTS, DT, controller="pid_controller", inertia=INERTIA),
+    "pid_controller": lambda p: to_ros2_control(
+        p, JOINTS, DT, controller="pid_controller", inertia=INERTIA
+    ),
 }
 PART_OF = {name: "ki" for name in ("integral_min", "integral_max", "tracking_time", "conditional")}
 """Fields of a term, which its own difference contains."""
@@ -176,7 +210,9 @@ PART_OF_MOTORS = {"no_load_speed": "saturation_effort", "limit_positions": "posi
 PART_OF_MOTORS["limit_efforts"] = "position_limit"
 
 
-@pytest.mark.parametrize("line", [{}, {"saturation_effort": 9.0, "no_load_speed": 5.0, "lag": 0.01}], ids=["pid", "dc"])
+@pytest.mark.parametrize(
+    "line", [{}, {"saturation_effort": 9.0, "no_load_speed": 5.0, "lag": 0.01}], ids=["pid", "dc"]
+)
 def test_every_field_is_in_an_mjcf_or_a_difference(line, tmp_path):
     pytest.importorskip("mujoco")
     hinge, part_of = Robot.load(write(tmp_path, one_joint())), PART_OF | PART_OF_MOTORS
@@ -184,14 +220,22 @@ def test_every_field_is_in_an_mjcf_or_a_difference(line, tmp_path):
     def exported(params, motors):
         return to_mjcf(hinge, params, DT, actuators=motors, inertia=[1.0])
 
-    params, motors = bp.make_params(3, **FULL).for_joints([1]), bp.make_actuators(1, **line) if line else None
+    params, motors = (
+        bp.make_params(3, **FULL).for_joints([1]),
+        bp.make_actuators(1, **line) if line else None,
+    )
     full = bp.make_actuators(1, **MOTORS)._replace(seed=None, max_delay=None)
-    tried = [(name, (params, motors), (other, motors)) for _, name, other in changes(params, CHOICES)]
+    tried = [
+        (name, (params, motors), (other, motors)) for _, name, other in changes(params, CHOICES)
+    ]
     tried += [(name, (params, full), (params, other)) for _, name, other in changes(full, {})]
     for name, base, other in tried:
         plain = exported(*base)
         listed = {each.partition(":")[0] for each in plain.differences}
-        assert outcome(exported, *other) != plain or {LABELS.get(name, name), part_of.get(name)} & listed, name
+        assert (
+            outcome(exported, *other) != plain
+            or {LABELS.get(name, name), part_of.get(name)} & listed
+        ), name
 
 
 def delivered(actuators):
@@ -204,7 +248,9 @@ def delivered(actuators):
 
 
 def test_every_field_of_motors_and_sensors_changes_a_signal():
-    """Friction and armature are the simulator's; the length of the histories has no effect beyond the longest delay."""
+    """Friction and armature are the simulator's; the length of the histories has no effect beyond
+    the longest delay.
+    """
     own = {
         "command_delay": 0.013,
         "sensor_delay": 0.017,
@@ -227,10 +273,17 @@ def test_every_field_of_a_guard_changes_the_setpoint():
         return results
 
     base = bp.make_guard(
-        3, lower=-1.0, upper=[1.2, 1.5, 0.9], rate=20.0, acceleration=300.0, continuous=[True, False, False]
+        3,
+        lower=-1.0,
+        upper=[1.2, 1.5, 0.9],
+        rate=20.0,
+        acceleration=300.0,
+        continuous=[True, False, False],
     )
     plain = outcome(guarded, base)
-    assert [label for label, _, guard in changes(base, {}) if outcome(guarded, guard) == plain] == []
+    assert [
+        label for label, _, guard in changes(base, {}) if outcome(guarded, guard) == plain
+    ] == []
 
 
 AXES = {"axes": ("x", "rz"), "force_axes": ("y",)}
@@ -239,8 +292,12 @@ AXES = {"axes": ("x", "rz"), "force_axes": ("y",)}
 def test_every_field_of_osc_params_changes_the_efforts_or_is_refused():
     tree = planar((1.0, 0.8, 0.5, 0.4))
     options = {"integral_gain": 300.0, "integral_limit": 0.2, "limit_margin": 0.5}
-    options |= {name: [axis in chosen for axis in ts.osc_params.AXES] for name, chosen in AXES.items()}
-    tree = ts.RigidTree(**{**tree_fields(tree), "lower": [-3.0, -3.0, -3.0, -np.inf], "upper": [3.0] * 3 + [np.inf]})
+    options |= {
+        name: [axis in chosen for axis in ts.osc_params.AXES] for name, chosen in AXES.items()
+    }
+    tree = ts.RigidTree(
+        **{**tree_fields(tree), "lower": [-3.0, -3.0, -3.0, -np.inf], "upper": [3.0] * 3 + [np.inf]}
+    )
     q = np.array([[2.9, -2.8, 0.7, 9.0], [0.3, 0.4, 2.8, -9.0], [0.3, 0.4, 0.8, 9.0]])
     pose = ts.link_poses(tree, np.add(q, [[0.02], [0.3], [-0.3]]), ["tip"])[:, 0]
     base = ts.make_osc_params(

@@ -1,4 +1,6 @@
-"""make_params: broadcasting, options that are off, and errors that name option, joint, env and value."""
+"""make_params: broadcasting, options that are off, and errors that name option, joint, env and
+value.
+"""
 
 import copy
 import pickle
@@ -38,7 +40,11 @@ def test_options_build_the_same_params(options):
     params = bp.make_params(JOINTS, **options)
     for again in (bp.make_params(JOINTS, **params.options()), params.replace()):
         assert [type(leaf) for leaf in again] == [type(leaf) for leaf in params]
-        assert all(np.array_equal(a, b) for a, b in zip(params, again, strict=True) if isinstance(a, np.ndarray))
+        assert all(
+            np.array_equal(a, b)
+            for a, b in zip(params, again, strict=True)
+            if isinstance(a, np.ndarray)
+        )
 
 
 def test_replace_changes_the_given_options_alone():

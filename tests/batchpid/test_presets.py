@@ -27,7 +27,12 @@ def run(params, path, kicks=False):
 gain = st.floats(0, 50)
 
 
-@given(st.lists(st.tuples(st.floats(-10, 10), st.floats(-10, 10)), min_size=2, max_size=25), gain, gain, gain)
+@given(
+    st.lists(st.tuples(st.floats(-10, 10), st.floats(-10, 10)), min_size=2, max_size=25),
+    gain,
+    gain,
+    gain,
+)
 @settings(max_examples=25)
 def test_tutorial(path, kp, ki, kd):
     """SimplePID of SAPIEN's tutorial: it integrates first, and its last error is 0 at the start."""
@@ -64,7 +69,9 @@ def test_integral_gain_alone_with_back_calculation_is_finite():
 
 
 def test_a_refused_time_step_and_a_nan_leave_the_state_unchanged():
-    """A time step of 0 raises, a NaN is skipped, and neither has a later effect (control_toolbox #326)."""
+    """A time step of 0 raises, a NaN is skipped, and neither has a later effect (control_toolbox
+    #326).
+    """
     params = bp.make_params(1, 1.0, 2.0, 0.5, effort_limit=9.0, non_finite="hold")
     y = np.zeros((1, 1))
     state, _ = bp.step(params, bp.init(params, y), y + 1, y, DT)

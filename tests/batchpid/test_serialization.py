@@ -17,7 +17,10 @@ NAMES = ["shoulder", "elbow", "no"]  # "no" is a bool to careless YAML
 def same(a, b):
     return all(
         (x is y is None)
-        or (type(x) is type(y) and (not isinstance(x, np.ndarray) or (x.dtype == y.dtype and np.array_equal(x, y))))
+        or (
+            type(x) is type(y)
+            and (not isinstance(x, np.ndarray) or (x.dtype == y.dtype and np.array_equal(x, y)))
+        )
         for x, y in zip(a, b, strict=True)
     )
 
@@ -36,7 +39,10 @@ def test_every_option_survives_a_file_and_a_text(options, dtype, format, tmp_pat
 
 
 @settings(max_examples=20)
-@given(npst.arrays(float, (2, JOINTS), elements=st.floats(0, 1e300)), st.sampled_from([".yaml", ".json"]))
+@given(
+    npst.arrays(float, (2, JOINTS), elements=st.floats(0, 1e300)),
+    st.sampled_from([".yaml", ".json"]),
+)
 def test_numbers_survive_a_file_exactly(tmp_path_factory, gains, suffix):
     path = tmp_path_factory.mktemp("params") / f"params{suffix}"
     params = bp.make_params(JOINTS, gains)
@@ -58,14 +64,12 @@ def test_joints_are_matched_by_name(tmp_path):
 
 def test_a_file_written_by_hand(tmp_path):
     path = tmp_path / "params.yaml"
-    path.write_text(
-        """
+    path.write_text("""
 format: batchpid-params-1
 joints:
   a: {kp: 4, effort_max: 3}
   b: {kp: [1, 2.5], ki: 1.0e-3, anti_windup: conditional, continuous: true}
-"""
-    )
+""")
     params, names = bp.load_params(path)
     assert names == ["a", "b"]
     assert params.kp.tolist() == [[4, 1], [4, 2.5]]
@@ -79,7 +83,10 @@ joints:
     "text",
     [
         "!!python/object/apply:os.mkdir [{marker}]",
-        "format: batchpid-params-1\njoints: {{a: {{kp: !!python/object/apply:os.mkdir [{marker}]}}}}",
+        (
+            "format: batchpid-params-1\njoints: {{a: {{kp: !!python/object/apply:os.mkdir"
+            " [{marker}]}}}}"
+        ),
         "a: &a [1]\nb: *a",
     ],
 )
@@ -132,8 +139,24 @@ def test_about_survives_and_does_not_affect_the_params(tmp_path, suffix):
 @pytest.mark.parametrize(
     "value",
     [
-        *('!!int ""', "!!int _", "!!float _", "!!bool x", "!!timestamp x", "!!binary '=='", "!!omap [a]", "!!merge x"),
-        *("2001-13-45", "1e999", "1" + "0" * 5000, ".nan", "{<<: 1}", "!!python/object/apply:os.abort []"),
+        *(
+            '!!int ""',
+            "!!int _",
+            "!!float _",
+            "!!bool x",
+            "!!timestamp x",
+            "!!binary '=='",
+            "!!omap [a]",
+            "!!merge x",
+        ),
+        *(
+            "2001-13-45",
+            "1e999",
+            "1" + "0" * 5000,
+            ".nan",
+            "{<<: 1}",
+            "!!python/object/apply:os.abort []",
+        ),
         pytest.param("[" * 2_000, marks=pytest.mark.slow),
         *("{a: " * 2_000, "- " * 2_000, "? " * 2_000, "'" + "a\n" * 2_000, "!" * 2_000, "\x00"),
     ],

@@ -1,4 +1,6 @@
-"""Setpoints whose rate is given: followed with full weight, without a bump, through the turns of continuous joints."""
+"""Setpoints whose rate is given: followed with full weight, without a bump, through the turns of
+continuous joints.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ WEIGHTS = st.floats(0.0, 1.0)
 
 
 def follow(b, rates=True, steps=2000, **options):
-    """Return the errors (steps, envs) of joints of inertia 1 on the way of a sine, with setpoint weights b (envs,)."""
+    """Return the errors (steps, envs) of joints of inertia 1 on the way of a sine, with setpoint
+    weights b (envs,).
+    """
     params = bp.make_params(1, **GAINS, setpoint_weight=np.array(b)[:, None], **options)
     late = params.discretization is not None
     k = bp.discretise(params, DT)._replace(gain_units=None)
@@ -50,7 +54,9 @@ def test_to_begin_and_to_end_with_rates_makes_no_bump(b, seed, implicit, turns):
     k, rng = bp.discretise(params, DT)._replace(gain_units=None), np.random.default_rng(seed)
     y, r, rate = rng.normal(size=(3, 2, 3))
     state, _ = bp.advance(k, bp.init(params, y), r, y, setpoint_rate=rate)
-    (with_rate, given), (without, none) = (bp.advance(k, state, r, y, setpoint_rate=x) for x in (0 * rate, None))
+    (with_rate, given), (without, none) = (
+        bp.advance(k, state, r, y, setpoint_rate=x) for x in (0 * rate, None)
+    )
     for one, other in zip((*with_rate, *given), (*without, *none), strict=True):
         np.testing.assert_array_equal(one, other)
     _, rated = bp.advance(k, state, r, y, setpoint_rate=rate)
@@ -65,7 +71,8 @@ def test_a_continuous_joint_follows_through_its_turns(options):
     rng, shape = np.random.default_rng(0), (30, 2)
     weights = rng.uniform(0, 1, shape)
     wound, wrapped = (
-        bp.make_params(2, **GAINS, setpoint_weight=weights, continuous=turns, **options) for turns in (False, True)
+        bp.make_params(2, **GAINS, setpoint_weight=weights, continuous=turns, **options)
+        for turns in (False, True)
     )
     speed, start = rng.uniform(-40, 40, shape), rng.uniform(-3, 3, shape)
     behind = rng.normal(scale=0.05, size=(300, *shape))
@@ -76,7 +83,9 @@ def test_a_continuous_joint_follows_through_its_turns(options):
         rows = []
         for at, k in enumerate(both):
             turn = (lambda x: x) if at == 0 else (lambda x: (x + np.pi) % (2 * np.pi) - np.pi)
-            states[at], terms = bp.advance(k, states[at], turn(r), turn(r - behind[step]), setpoint_rate=speed)
+            states[at], terms = bp.advance(
+                k, states[at], turn(r), turn(r - behind[step]), setpoint_rate=speed
+            )
             rows.append(terms.effort)
         np.testing.assert_allclose(rows[1], rows[0], rtol=1e-9, atol=1e-6)
 

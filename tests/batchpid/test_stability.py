@@ -1,4 +1,6 @@
-"""The closed-form bound against the exact one-step matrix, and both against the law itself on a chain of masses."""
+"""The closed-form bound against the exact one-step matrix, and both against the law itself on a
+chain of masses.
+"""
 
 from __future__ import annotations
 
@@ -58,9 +60,14 @@ def test_the_simulated_law_is_stable_up_to_the_bound_and_diverges_above(filter_t
     mass = np.array([random_mass(rng, joints) for _ in factor])
     kd = np.diagonal(mass, axis1=1, axis2=2) * rng.uniform(0.2, 2, (len(mass), joints)) / DT
     kp = 20.0 * kd
-    ratio = [stability_bound(*each, DT, filter_time=filter_time).ratio for each in zip(mass, kp, kd, strict=True)]
+    ratio = [
+        stability_bound(*each, DT, filter_time=filter_time).ratio
+        for each in zip(mass, kp, kd, strict=True)
+    ]
     scale = (factor / ratio)[:, None]
-    params = bp.make_params(joints, kp * scale, None, kd * scale, derivative_filter_time=filter_time)
+    params = bp.make_params(
+        joints, kp * scale, None, kd * scale, derivative_filter_time=filter_time
+    )
     inverse = np.linalg.inv(mass)
     q = 1e-6 * rng.normal(size=(len(mass), joints))
     v, gone = np.zeros_like(q), np.zeros(len(mass), bool)
@@ -111,14 +118,18 @@ def test_the_least_damped_oscillation_of_one_joint(zeta, hertz, inertia):
 
 def test_the_oscillation_is_that_of_its_joint():
     mass = np.tile(np.diag([1.0, 2.0]), (3, 1, 1))
-    found = oscillation(mass, [40.0, 40.0], [0.0, 0.0], [[12.0, 0.5], [0.5, 12.0], [12.0, 12.0]], 1e-3)
+    found = oscillation(
+        mass, [40.0, 40.0], [0.0, 0.0], [[12.0, 0.5], [0.5, 12.0], [12.0, 12.0]], 1e-3
+    )
     np.testing.assert_allclose(found.participation[:2], [[0, 1], [1, 0]], atol=1e-9)
     assert (found.damping_ratio[:2] < 0.05).all()
     assert found.damping_ratio[2] > 0.5
 
 
 def test_an_integral_that_is_too_fast_rings_and_grows():
-    ratios = [oscillation([[1.0]], 40.0, ki, 4.0, 1e-3).damping_ratio for ki in (20.0, 120.0, 200.0)]
+    ratios = [
+        oscillation([[1.0]], 40.0, ki, 4.0, 1e-3).damping_ratio for ki in (20.0, 120.0, 200.0)
+    ]
     assert ratios[0] > ratios[1] > 0 > ratios[2]
 
 

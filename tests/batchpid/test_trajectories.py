@@ -10,7 +10,9 @@ from batchpid.trajectories import Trajectory, jerk_limited, minimum_jerk, trapez
 
 DT = 0.004
 LIMITS = {"max_velocity": [1.0, 2.0, np.inf], "max_acceleration": [3.0, 8.0, 5.0]}
-poses = st.lists(st.lists(st.floats(-3, 3), min_size=3, max_size=3), min_size=1, max_size=4).map(np.array)
+poses = st.lists(st.lists(st.floats(-3, 3), min_size=3, max_size=3), min_size=1, max_size=4).map(
+    np.array
+)
 MOVES = {
     "minimum_jerk": lambda a, b: minimum_jerk(a, b, DT, **LIMITS),
     "minimum_jerk_timed": lambda a, b: minimum_jerk(a, b, DT, duration=0.77),
@@ -23,7 +25,9 @@ each_move = pytest.mark.parametrize("move", MOVES.values(), ids=MOVES)
 
 
 def with_start(trajectory: Trajectory, start: np.ndarray) -> np.ndarray:
-    return np.concatenate([np.broadcast_to(start, trajectory.position.shape[1:])[None], trajectory.position])
+    return np.concatenate(
+        [np.broadcast_to(start, trajectory.position.shape[1:])[None], trajectory.position]
+    )
 
 
 @each_move
@@ -33,7 +37,9 @@ def with_start(trajectory: Trajectory, start: np.ndarray) -> np.ndarray:
 def test_a_move_ends_at_its_target_at_rest_and_stays_between(move, start, target):
     t = move(start, target)
     assert t.position.shape == (t.ticks, *start.shape)
-    np.testing.assert_allclose(t.position[-1], np.broadcast_to(target, start.shape), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        t.position[-1], np.broadcast_to(target, start.shape), rtol=0, atol=1e-12
+    )
     assert not t.velocity[-1].any()
     assert not t.acceleration[-1].any()
     low, high = np.minimum(start, target) - 1e-12, np.maximum(start, target) + 1e-12
@@ -67,8 +73,12 @@ def test_limits_are_kept_at_every_tick(name, start, target):
 def test_synchronised_joints_move_on_a_straight_line(name, start, target):
     t = MOVES[name](start, target[0])
     way = target[0] - start
-    done = np.divide(t.position - start, way, out=np.full_like(t.position, np.nan), where=np.abs(way) > 1e-3)
-    spread = np.nanmax(np.nan_to_num(done, nan=-1), -1) - np.nanmin(np.where(np.isnan(done), 2, done), -1)
+    done = np.divide(
+        t.position - start, way, out=np.full_like(t.position, np.nan), where=np.abs(way) > 1e-3
+    )
+    spread = np.nanmax(np.nan_to_num(done, nan=-1), -1) - np.nanmin(
+        np.where(np.isnan(done), 2, done), -1
+    )
     assert (spread < 1e-9).all()
 
 

@@ -1,6 +1,8 @@
-"""Misuse of the public functions: each wrong value is refused by an error that names its argument and a remedy.
+"""Misuse of the public functions: each wrong value is refused by an error that names its argument
+and a remedy.
 
-Wrong values for options of joints come from the declared fields. Other wrong values come from a table, by argument.
+Wrong values for options of joints come from the declared fields. Other wrong values come from a
+table, by argument.
 """
 
 from __future__ import annotations
@@ -30,12 +32,17 @@ def refused(argument, function, *arguments, **keywords):
     with pytest.raises(InvalidArgumentError) as caught:
         function(*arguments, **keywords)
     # A field, "params.kp", or a place in a text, "text: kp", may be named within its owner.
-    assert argument in (caught.value.argument, *caught.value.argument.split(": "), *caught.value.argument.split("."))
+    assert argument in (
+        caught.value.argument,
+        *caught.value.argument.split(": "),
+        *caught.value.argument.split("."),
+    )
     assert caught.value.remedy
     return caught.value
 
 
-# -- Options of joints, from the declared fields ---------------------------------------------------------------------
+# -- Options of joints, from the declared fields
+# ---------------------------------------------------------------------
 
 OPTIONS = [
     *((bp.make_params, {"kp": 1.0, "ki": 1.0}, name, field) for name, field in LAW_FIELDS.items()),
@@ -44,7 +51,10 @@ OPTIONS = [
 ]
 
 NEEDS = {"tracking_time": {"anti_windup": "back_calculation", "effort_limit": 1.0}}
-NEEDS |= {name: {"saturation_effort": 1.0, "no_load_speed": 1.0} for name in ("saturation_effort", "no_load_speed")}
+NEEDS |= {
+    name: {"saturation_effort": 1.0, "no_load_speed": 1.0}
+    for name in ("saturation_effort", "no_load_speed")
+}
 """Options without which an option is refused."""
 
 
@@ -55,13 +65,21 @@ def outside(field):
     return [math.nan, *low, *high, *([] if math.isinf(field.neutral) else [math.inf])]
 
 
-@pytest.mark.parametrize(("make", "base", "name", "field"), OPTIONS, ids=lambda each: each if type(each) is str else "")
+@pytest.mark.parametrize(
+    ("make", "base", "name", "field"), OPTIONS, ids=lambda each: each if type(each) is str else ""
+)
 def test_options_of_joints(make, base, name, field):
     def error(value):
         both = (
-            {"saturation_effort": 1.0, "no_load_speed": 1.0} if name in ("saturation_effort", "no_load_speed") else {}
+            {"saturation_effort": 1.0, "no_load_speed": 1.0}
+            if name in ("saturation_effort", "no_load_speed")
+            else {}
         )
-        back = {"anti_windup": "back_calculation", "effort_limit": 1.0} if name == "tracking_time" else {}
+        back = (
+            {"anti_windup": "back_calculation", "effort_limit": 1.0}
+            if name == "tracking_time"
+            else {}
+        )
         return refused(name, make, 2, **(base | both | back | {name: value}), joint_names=NAMES)
 
     if name != "anti_windup":
@@ -72,12 +90,18 @@ def test_options_of_joints(make, base, name, field):
         for value in ("much", True):
             error(value)
         for value in outside(field):
-            found = error([[1.0, 1.0], [1.0, value]] if field.high >= 1 else [[0.1, 0.1], [0.1, value]])
+            found = error(
+                [[1.0, 1.0], [1.0, value]] if field.high >= 1 else [[0.1, 0.1], [0.1, value]]
+            )
             assert (found.joint, found.env) == ("elbow", 1)
             assert found.value == value or math.isnan(value)
 
 
-CHOICES = [name for name, each in inspect.signature(bp.make_params).parameters.items() if type(each.default) is str]
+CHOICES = [
+    name
+    for name, each in inspect.signature(bp.make_params).parameters.items()
+    if type(each.default) is str
+]
 
 
 @pytest.mark.parametrize("name", CHOICES)
@@ -121,7 +145,11 @@ COMBINATIONS = [
     (ts.make_osc_params, "effort_min", {"effort_min": 1.0, "effort_max": 0.0}),
     (ts.make_osc_params, "effort_limit", {"effort_limit": 1.0, "effort_max": 2.0}),
     (ts.make_osc_params, "position_error_limit", {"position_error_limit": -1.0}),
-    (ts.make_osc_params, "effort_min", {"stiffness": np.ones((3, 6)), "effort_limit": np.ones((2, 2))}),
+    (
+        ts.make_osc_params,
+        "effort_min",
+        {"stiffness": np.ones((3, 6)), "effort_limit": np.ones((2, 2))},
+    ),
     (ts.make_osc_params, "integral_gain", {"integral_gain": -1.0}),
     (ts.make_osc_params, "integral_limit", {"integral_gain": 1.0, "integral_limit": math.nan}),
     (ts.make_osc_params, "integral_limit", {"integral_limit": 1.0}),
@@ -134,13 +162,25 @@ COMBINATIONS = [
     (bp.drive_target, "measurement_rate", {"measurement_rate": np.ones((1, 3))}),
     (bp.drive_target, "params.deadband", {"params": bp.make_params(2, 4.0, deadband=0.1)}),
     (batchpid.export.to_c, "params", {"params": bp.make_params(2, np.ones((2, 2)))}),
-    (batchpid.export.to_c, "inputs", {"params": bp.make_params(2, 1.0, measurement_rate="measured"), "inputs": ()}),
+    (
+        batchpid.export.to_c,
+        "inputs",
+        {"params": bp.make_params(2, 1.0, measurement_rate="measured"), "inputs": ()},
+    ),
     (batchpid.export.to_c, "inputs", {"inputs": ("velocity",)}),
     (batchpid.export.to_c, "prefix", {"prefix": "a-b"}),
     (batchpid.export.to_c, "tree", {"tree": planar((1.0,))}),
-    (batchpid.export.to_ros2_control, "inertia", {"params": bp.make_params(2, 1.0, gain_units="mass_matrix")}),
+    (
+        batchpid.export.to_ros2_control,
+        "inertia",
+        {"params": bp.make_params(2, 1.0, gain_units="mass_matrix")},
+    ),
     (batchpid.export.to_ros2_control, "inertia", {"inertia": [0.0, 1.0]}),
-    (batchpid.export.to_ros2_control, "effort_min", {"params": bp.make_params(2, 1.0, effort_min=2, effort_max=2)}),
+    (
+        batchpid.export.to_ros2_control,
+        "effort_min",
+        {"params": bp.make_params(2, 1.0, effort_min=2, effort_max=2)},
+    ),
     (trajectories.minimum_jerk, "duration", {"duration": None}),
     (trajectories.minimum_jerk, "duration", {"duration": 1.0, "max_velocity": 1.0}),
     (trajectories.minimum_jerk, "max_velocity", {"max_velocity": [1.0, math.inf]}),
@@ -164,19 +204,53 @@ COMBINATIONS = [
     (ts.inverse_kinematics, "starts", {"starts": 0}),
     (ts.inverse_kinematics, "rotation_tolerance", {"rotation_tolerance": 0.0}),
     (ts.inverse_kinematics, "on_failure", {"on_failure": "ignore"}),
-    (ts.inverse_kinematics, "start", {"pose": np.tile(np.eye(7)[3], (3, 1)), "start": np.zeros((2, 2))}),
+    (
+        ts.inverse_kinematics,
+        "start",
+        {"pose": np.tile(np.eye(7)[3], (3, 1)), "start": np.zeros((2, 2))},
+    ),
     (ts.make_osc_params, "tree", {"tree": "panda"}),
 ]
 
 
 PLACES = [
-    (bp.make_actuators, "position_limit", {"position_limit": ([0.0, 1.0], [1.0, math.inf])}, {"joint": 0}, math.inf),
-    (bp.make_actuators, "position_limit", {"position_limit": ([0.0, 1.0], [1.0, -2.0])}, {"joint": 0}, -2.0),
-    (bp.make_actuators, "position_limit", {"position_limit": ([0.0, 2.0, 1.0], [1.0] * 3)}, {"joint": 0}, 1.0),
+    (
+        bp.make_actuators,
+        "position_limit",
+        {"position_limit": ([0.0, 1.0], [1.0, math.inf])},
+        {"joint": 0},
+        math.inf,
+    ),
+    (
+        bp.make_actuators,
+        "position_limit",
+        {"position_limit": ([0.0, 1.0], [1.0, -2.0])},
+        {"joint": 0},
+        -2.0,
+    ),
+    (
+        bp.make_actuators,
+        "position_limit",
+        {"position_limit": ([0.0, 2.0, 1.0], [1.0] * 3)},
+        {"joint": 0},
+        1.0,
+    ),
     (ts.make_osc_params, "stiffness", {"stiffness": [1, 1, -1, 1, 1, 1]}, {"entry": "z"}, -1.0),
     (ts.make_osc_params, "smallest_eigenvalue", {"smallest_eigenvalue": 0.0}, {"entry": "s0"}, 0.0),
-    (ts.make_osc_params, "rotation_error_limit", {"rotation_error_limit": -1.0}, {"entry": "norm"}, -1.0),
-    (ts.make_osc_params, "posture_stiffness", {"posture_stiffness": [1.0, -1.0]}, {"joint": "joint2"}, -1.0),
+    (
+        ts.make_osc_params,
+        "rotation_error_limit",
+        {"rotation_error_limit": -1.0},
+        {"entry": "norm"},
+        -1.0,
+    ),
+    (
+        ts.make_osc_params,
+        "posture_stiffness",
+        {"posture_stiffness": [1.0, -1.0]},
+        {"joint": "joint2"},
+        -1.0,
+    ),
     (ts.inverse_kinematics, "pose", {"pose": 2 * np.ones((1, 7))}, {"entry": "qw"}, 4.0),
     (ts.inverse_kinematics, "point", {"point": [0.0, math.inf, 0.0]}, {"entry": "y"}, math.inf),
 ]
@@ -194,13 +268,15 @@ def test_an_error_names_the_entry_and_its_value(function, argument, changes, pla
 
 
 @pytest.mark.parametrize(
-    ("function", "argument", "changes"), [pytest.param(*row, id=f"{row[0].__name__}-{row[1]}") for row in COMBINATIONS]
+    ("function", "argument", "changes"),
+    [pytest.param(*row, id=f"{row[0].__name__}-{row[1]}") for row in COMBINATIONS],
 )
 def test_options_that_do_not_go_together(function, argument, changes):
     refused(argument, function, **needed(function, changes) | changes)
 
 
-# -- Other arguments, by their names ---------------------------------------------------------------------------------
+# -- Other arguments, by their names
+# ---------------------------------------------------------------------------------
 
 MODULES = (bp, batchpid.export, ts, motors, friction, guard, metrics, trajectories)
 Y, TREE = np.zeros((1, 2)), planar()
@@ -250,7 +326,13 @@ WRONG = {
     "point": [0.1, [0.1], [0.1, 0.2]],
     "qpos": [np.zeros((1, 3)), "here"],
     "qvel": [np.zeros((1, 3))],
-    "measurement": [np.zeros((4, 5)), "here", 1j * Y, [["1", "2"]], np.array([["2020-01-01"] * 2], "datetime64")],
+    "measurement": [
+        np.zeros((4, 5)),
+        "here",
+        1j * Y,
+        [["1", "2"]],
+        np.array([["2020-01-01"] * 2], "datetime64"),
+    ],
     "setpoint": [np.zeros((1, 3)), "there"],
     "effort": [np.ones((1, 3))],
     **{name: [np.ones((1, 3))] for name in ("measurement_rate", "setpoint_rate", "feedforward")},
@@ -263,7 +345,11 @@ WRONG["timestep"] = WRONG["dt"]
 
 def public(module):
     """Yield the public callables of a module."""
-    own = (name for name, each in vars(module).items() if getattr(each, "__module__", None) == module.__name__)
+    own = (
+        name
+        for name, each in vars(module).items()
+        if getattr(each, "__module__", None) == module.__name__
+    )
     for name in getattr(module, "__all__", [name for name in own if not name.startswith("_")]):
         each = getattr(module, name)
         if callable(each) and not (isinstance(each, type) and issubclass(each, Exception | tuple)):
@@ -279,7 +365,11 @@ def needed(function, more=(), module=None):
     values = VALUES | OWN.get(module, {}) | {"duration": 1.0, "dt": 0.01, "timestep": 0.01}
     values |= {"setpoint": np.ones((9, 1, 2))} if function is metrics.step_metrics else {}
     parameters = inspect.signature(function).parameters.items()
-    required = {name for name, each in parameters if each.default is each.empty and each.kind is not each.VAR_KEYWORD}
+    required = {
+        name
+        for name, each in parameters
+        if each.default is each.empty and each.kind is not each.VAR_KEYWORD
+    }
     required |= {"dt"} if function is bp.track else set()
     if function is trajectories.minimum_jerk and not more:
         required |= {"duration"}
@@ -289,7 +379,9 @@ def needed(function, more=(), module=None):
 STEPS, BY_TYPE = {"dt", "timestep"}, {"params", "tree"}
 CORE = {"batchpid.motors", "batchpid.motors.guard", "batchpid.motors.friction"}
 HOT = {"advance", "discretise", "osc", "init", "reset", "track"}
-"""Functions of a control loop besides the law's, which check only time steps and types of params."""
+"""Functions of a control loop besides the law's, which check only time steps and types of
+params.
+"""
 
 
 def checked(module, name, function):
@@ -323,13 +415,21 @@ def test_arguments_of_every_public_function(module, function, argument):
 def test_an_unknown_option_is_answered_with_the_nearest():
     params, actuators = bp.make_params(2, 1.0), bp.make_actuators(2, lag=0.01)
     for function in (bp.make_params, bp.make_actuators):
-        assert "'effort_limit'" in refused("efort_limit", function, **needed(function), efort_limit=3.0).remedy
-    for function in (params.replace, actuators.replace, lambda **options: bp.presets.tutorial(2, **options)):
+        assert (
+            "'effort_limit'"
+            in refused("efort_limit", function, **needed(function), efort_limit=3.0).remedy
+        )
+    for function in (
+        params.replace,
+        actuators.replace,
+        lambda **options: bp.presets.tutorial(2, **options),
+    ):
         assert "'effort_limit'" in refused("efort_limit", function, efort_limit=3.0).remedy
     assert "joints, kp, ki, kd" in refused("zzzzzzz", bp.make_params, 2, kp=1.0, zzzzzzz=1).remedy
 
 
-# -- Texts -----------------------------------------------------------------------------------------------------------
+# -- Texts
+# --------------------------------------------------------------------------------------------------
 
 PID = '{"format": "batchpid-params-1", "joints": {"elbow": {%s}}}'
 MOTOR = "format: batchpid-actuators-1\njoints: {elbow: {%s}}"
@@ -340,17 +440,31 @@ TEXTS = [
     (PID % '"kd": 1.0', "joints", "elbow"),
     (PID % '"kp": 1.0, "kq": 2.0', "kq", "elbow"),
     (PID % '"kp": 1.0, "kp": 2.0', "text", None),
-    *((PID % f'"kp": {value}', "kp", "elbow") for value in ("-1.0", '"nan"', '"1e3"', "true", "null", "[[1.0]]", "[]")),
+    *(
+        (PID % f'"kp": {value}', "kp", "elbow")
+        for value in ("-1.0", '"nan"', '"1e3"', "true", "null", "[[1.0]]", "[]")
+    ),
     (PID % f'"kp": 1{"0" * 400}', "kp", "elbow"),
     (PID % '"kp": 1.0, "anti_windup": "magic"', "anti_windup", "elbow"),
-    ('{"format": "batchpid-params-1", "non_finite": [], "joints": {"a": {"kp": 1.0}}}', "non_finite", None),
-    ('{"format": "batchpid-params-1", "dtype": "object", "joints": {"a": {"kp": 1.0}}}', "dtype", None),
+    (
+        '{"format": "batchpid-params-1", "non_finite": [], "joints": {"a": {"kp": 1.0}}}',
+        "non_finite",
+        None,
+    ),
+    (
+        '{"format": "batchpid-params-1", "dtype": "object", "joints": {"a": {"kp": 1.0}}}',
+        "dtype",
+        None,
+    ),
     ('{"format": "batchpid-params-1", "about": 3, "joints": {"a": {"kp": 1.0}}}', "about", None),
     ("format: batchpid-params-1\njoints: {elbow: {kp: 1}}", "text", None),
     (MOTOR % "kp: 1", "kp", "elbow"),
     (MOTOR % "strength: strong", "strength", "elbow"),
     (MOTOR % "strength: -1", "strength", "elbow"),
-    *((MOTOR % f"position_limit: {value}", "position_limit", "elbow") for value in ("[1, 2]", "[[0], [1, 2]]")),
+    *(
+        (MOTOR % f"position_limit: {value}", "position_limit", "elbow")
+        for value in ("[1, 2]", "[[0], [1, 2]]")
+    ),
     (MOTOR % "position_limit: [[1, 0], [1, 2]]", "position_limit", "elbow"),
     ("format: batchpid-actuators-1\njoints: {shoulder: {}}", "text", None),
     ("format: batchpid-actuators-1\njoints: {elbow: [1]}", "joints", "elbow"),
@@ -363,8 +477,14 @@ TEXTS = [
 @pytest.mark.parametrize(("text", "key", "joint"), TEXTS, ids=range(len(TEXTS)))
 def test_texts(text, key, joint, tmp_path):
     """As a text and as a file, whose error names the file."""
-    is_motor = "actuators" in text or text in ("- 1", "format: [") or text.endswith("{elbow: {kp: 1}}")
-    read, load = (motors.loads_actuators, bp.load_actuators) if is_motor else (bp.loads_params, bp.load_params)
+    is_motor = (
+        "actuators" in text or text in ("- 1", "format: [") or text.endswith("{elbow: {kp: 1}}")
+    )
+    read, load = (
+        (motors.loads_actuators, bp.load_actuators)
+        if is_motor
+        else (bp.loads_params, bp.load_params)
+    )
     names = [["elbow"]] if is_motor else []
     assert refused(key, read, text, *names).joint == joint
     for suffix in (".yaml", ".json")[: 1 if is_motor else 2]:

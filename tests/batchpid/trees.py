@@ -33,7 +33,11 @@ def tree_of(name: str | int) -> RigidTree:
 def tool_of(name: str | int) -> str:
     """Return a link at the end of the longest chain of joints."""
     tree = tree_of(name)
-    return max(tree.links, key=lambda link: tree.chain(link).sum()) if isinstance(name, int) else TOOLS[name]
+    return (
+        max(tree.links, key=lambda link: tree.chain(link).sum())
+        if isinstance(name, int)
+        else TOOLS[name]
+    )
 
 
 TOOLS = {"panda": "panda_hand", "jaco2": "j2s7s300_link_7"}
@@ -45,8 +49,12 @@ def states(tree: RigidTree, rows: int, seed: int = 0) -> tuple[np.ndarray, np.nd
     return rng.uniform(low, high, (rows, tree.dof)), rng.normal(size=(rows, tree.dof))
 
 
-def planar(lengths: tuple[float, ...] = (1.0, 1.0), gravity: tuple[float, ...] = (0.0, 0.0, 0.0)) -> RigidTree:
-    """Return an arm in the plane: links along x with their mass of 1 kg in the middle, joints about z."""
+def planar(
+    lengths: tuple[float, ...] = (1.0, 1.0), gravity: tuple[float, ...] = (0.0, 0.0, 0.0)
+) -> RigidTree:
+    """Return an arm in the plane: links along x with their mass of 1 kg in the middle, joints about
+    z.
+    """
     count = len(lengths) + 2
     at = np.zeros((count, 3))
     at[2:, 0] = lengths
@@ -70,8 +78,13 @@ def planar(lengths: tuple[float, ...] = (1.0, 1.0), gravity: tuple[float, ...] =
 
 
 def serial() -> RigidTree:
-    """Return an arm of six joints, yaw, pitch, pitch, roll, pitch, roll, with links of 0.3 m and 2 kg along z."""
-    axes = np.array([[0, 0, 1], [0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1], [0, 0, 1]], float)
+    """Return an arm of six joints, yaw, pitch, pitch, roll, pitch, roll, with links of 0.3 m and 2
+    kg along z.
+    """
+    axes = np.array(
+        [[0, 0, 1], [0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1], [0, 0, 1]],
+        float,
+    )
     mass = np.array([0.0, *[2.0] * 6, 0.0])
     return RigidTree(
         links=("base", *(f"link{n}" for n in range(1, 7)), "tip"),
@@ -90,7 +103,9 @@ def serial() -> RigidTree:
 
 
 def offset_wrist() -> RigidTree:
-    """Return a massless arm of six joints with three parallel axes, an offset wrist, and a full turn of each joint."""
+    """Return a massless arm of six joints with three parallel axes, an offset wrist, and a full
+    turn of each joint.
+    """
     return RigidTree(
         links=("base", *(f"link{n}" for n in range(1, 7)), "tip"),
         parent=np.arange(-1, 7),
@@ -109,7 +124,19 @@ def offset_wrist() -> RigidTree:
             ]
         ),
         wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (8, 1)),
-        axis=np.array([[0, 0, 1], [0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1]], float),
+        axis=np.array(
+            [
+                [0, 0, 1],
+                [0, 0, 1],
+                [0, 1, 0],
+                [0, 1, 0],
+                [0, 1, 0],
+                [0, 0, 1],
+                [0, 1, 0],
+                [0, 0, 1],
+            ],
+            float,
+        ),
         mass=np.zeros(8),
         center=np.zeros((8, 3)),
         inertia=np.zeros((8, 3, 3)),

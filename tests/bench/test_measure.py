@@ -60,7 +60,9 @@ def test_peers_reach_the_same_place_in_every_round(workload, name):
     finally:
         peer.close()
     assert seconds > 0
-    assert peer.env_steps == workload.ticks * workload.substeps * (workload.num_envs if name == "mujoco" else 1)
+    assert peer.env_steps == workload.ticks * workload.substeps * (
+        workload.num_envs if name == "mujoco" else 1
+    )
     workload.check_motion(name, final)
     np.testing.assert_array_equal(again, final)
 

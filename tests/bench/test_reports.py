@@ -16,9 +16,15 @@ def lines_of(comparisons, disabled):
 
 
 def test_the_last_lines_say_what_was_compared_with_what():
-    ratios = [("panda", "closed loop", "tutorial", 3.1, None), ("panda", "closed loop", "bare engine", 0.92, 0.76)]
+    ratios = [
+        ("panda", "closed loop", "tutorial", 3.1, None),
+        ("panda", "closed loop", "bare engine", 0.92, 0.76),
+    ]
     title, head, *rows = lines_of(ratios, disabled=False)
     assert "compared" in title
     assert head == "panda: closed loop over"
-    assert [row.split(maxsplit=1) for row in rows] == [["3.10", "tutorial"], ["0.92", "bare engine  (floor 0.76)"]]
+    assert [row.split(maxsplit=1) for row in rows] == [
+        ["3.10", "tutorial"],
+        ["0.92", "bare engine  (floor 0.76)"],
+    ]
     assert not lines_of(ratios, disabled=True)

@@ -33,7 +33,9 @@ def test_draw(tmp_path):
         (new / f"{name}.json").write_text(json.dumps({"machine": figures["machine"]} | case))
     draw = load_script("draw")
     draw.main(draw.Options(new, docs))
-    assert (docs / "performance.md").read_text() == (ROOT / "docs/performance.md").read_text(), "run bench/draw.py"
+    assert (docs / "performance.md").read_text() == (ROOT / "docs/performance.md").read_text(), (
+        "run bench/draw.py"
+    )
     assert json.loads((docs / "performance.json").read_text()) == figures
     assert (docs / "images/performance.png").stat().st_size > 10_000
 

@@ -1,4 +1,6 @@
-"""The Runner follows SAPIEN's tutorial as written: one scene, one Python object a joint, float64."""
+"""The Runner follows SAPIEN's tutorial as written: one scene, one Python object a joint,
+float64.
+"""
 
 import numpy as np
 from tutorial import TutorialLoop
@@ -25,10 +27,14 @@ class SimplePIDs:
 
 
 def test_runner_follows_the_tutorials_loop():
-    """Along a smooth move, since the derivative of a first error would drive joints to the speeds that PhysX limits."""
+    """Along a smooth move, since the derivative of a first error would drive joints to the speeds
+    that PhysX limits.
+    """
     robot = Robot.load("panda", dissipation="sapien")
     settings = robot.settings
-    setpoints = minimum_jerk(settings.start, settings.target, dt=1 / settings.rate_hz, duration=1.0).position
+    setpoints = minimum_jerk(
+        settings.start, settings.target, dt=1 / settings.rate_hz, duration=1.0
+    ).position
     loop, recorded = TutorialLoop(robot, settings.start), []
     for setpoint in setpoints:
         loop.target = setpoint

@@ -55,7 +55,9 @@ def test_every_example_is_tested():
     ("robot", "joint", "seconds"),
     [("jaco2", "j2s7s300_joint_4", "1.5"), ("panda", "panda_joint2", "4")],
 )
-def test_an_uncompensated_drive_keeps_an_error_that_compensation_removes(run, robot, joint, seconds):
+def test_an_uncompensated_drive_keeps_an_error_that_compensation_removes(
+    run, robot, joint, seconds
+):
     drive = ("drive_robot.py", robot, "--num-envs", "1", "--use-internal-drive", "--seconds")
     assert errors(run(*drive, "1.5", "--compensate", "none"))[joint] > 0.1
     assert errors(run(*drive, seconds))[joint] < 0.02
@@ -76,7 +78,11 @@ def test_drive_and_pid_together_are_an_error(run):
 
 
 def test_the_boxes_of_hello_world_fall_to_the_ground(run):
-    rows = [line.split() for line in run("hello_world.py").splitlines() if re.match(r" +\d\.\d\d ", line)]
+    rows = [
+        line.split()
+        for line in run("hello_world.py").splitlines()
+        if re.match(r" +\d\.\d\d ", line)
+    ]
     first, last = ([float(z) for z in row[1:]] for row in (rows[0], rows[-1]))
     assert first == pytest.approx([0.5, 0.6, 0.7, 0.8])
     assert last == pytest.approx([0, 0, 0, 0], abs=5e-3)
@@ -93,7 +99,9 @@ def test_list_joints_lists_every_joint(run):
 @pytest.mark.usefixtures("one_process")
 def test_a_profile_is_followed_with_less_error_than_a_step(run):
     text = run("follow_trajectory.py")
-    worst = {row[:14].strip(): float(row[14:].split()[2]) for row in text.splitlines() if " mrad " in row}
+    worst = {
+        row[:14].strip(): float(row[14:].split()[2]) for row in text.splitlines() if " mrad " in row
+    }
     assert set(worst) >= {"trapezoidal", "minimum jerk", "step"}
     assert max(worst["minimum jerk"], worst["trapezoidal"]) < 1 < 500 < worst["step"]  # mrad
 
@@ -102,7 +110,11 @@ def test_a_profile_is_followed_with_less_error_than_a_step(run):
 def test_the_integral_removes_the_error_of_an_uncompensated_drive(run, tmp_path):
     picture = tmp_path / "errors.png"
     text = run("steady_state.py", "--seconds", "3", "--picture", str(picture))
-    errors = {row[:32].strip(): [float(e) for e in row[32:].split()] for row in text.splitlines() if "compensat" in row}
+    errors = {
+        row[:32].strip(): [float(e) for e in row[32:].split()]
+        for row in text.splitlines()
+        if "compensat" in row
+    }
     assert max(errors["drive (20, 5), no compensation"]) > 0.3
     assert max(errors["PID, no compensation"]) < 2e-3
     assert max(errors["PID, compensated"]) < 1e-3
@@ -112,7 +124,11 @@ def test_the_integral_removes_the_error_of_an_uncompensated_drive(run, tmp_path)
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["torque", "servo", "velocity", "mit"])
 def test_the_motor_of_each_kind_of_controller_is_identified(run, tmp_path, kind):
-    (line,) = [each for each in run("real_logs.py", "--out", str(tmp_path)).splitlines() if f"{kind}." in each]
+    (line,) = [
+        each
+        for each in run("real_logs.py", "--out", str(tmp_path)).splitlines()
+        if f"{kind}." in each
+    ]
     words = [*line.split()[1:], "--out", str(tmp_path / "motors.yaml")]
     assert not main(words)
     module = runpy.run_path(str(EXAMPLES / "real_logs.py"))
@@ -126,7 +142,9 @@ def test_the_motor_of_each_kind_of_controller_is_identified(run, tmp_path, kind)
 
 
 def test_the_gait_of_the_quadruped_walks(run):
-    distances = [float(number) for number in re.findall(r"\d\.\d+", run("walk.py").partition("walked")[2])]
+    distances = [
+        float(number) for number in re.findall(r"\d\.\d+", run("walk.py").partition("walked")[2])
+    ]
     assert len(distances) == 4
     assert min(distances) > 0.1
 
@@ -134,7 +152,9 @@ def test_the_gait_of_the_quadruped_walks(run):
 def test_the_reward_of_walking_is_the_one_that_is_documented(monkeypatch):
     monkeypatch.syspath_prepend(EXAMPLES)
     task = runpy.run_path(str(EXAMPLES / "walk.py"))["WalkVectorEnv"]
-    envs = task(3, engine="mujoco", physics="fast", timestep=1 / 500, workers=0, max_episode_steps=None)
+    envs = task(
+        3, engine="mujoco", physics="fast", timestep=1 / 500, workers=0, max_episode_steps=None
+    )
     envs.reset(seed=4)
     random, last = np.random.default_rng(0), np.zeros((3, 12))
     for _ in range(5):
@@ -146,11 +166,15 @@ def test_the_reward_of_walking_is_the_one_that_is_documented(monkeypatch):
         tilt, command = turn.apply([0.0, 0.0, 1.0]), observation[:, 9:12]
         expected = np.exp(-((command - velocity)[:, :2] ** 2).sum(1) / 0.1)
         expected += 0.5 * np.exp(-((command - rate)[:, 2] ** 2) / 0.25)
-        expected -= velocity[:, 2] ** 2 + 0.02 * (rate[:, :2] ** 2).sum(1) + 2 * (1 - tilt[:, 2] ** 2)
+        expected -= (
+            velocity[:, 2] ** 2 + 0.02 * (rate[:, :2] ** 2).sum(1) + 2 * (1 - tilt[:, 2] ** 2)
+        )
         expected -= 1e-4 * (seen.effort**2).sum(1) + 0.01 * ((action - last) ** 2).sum(1)
         np.testing.assert_allclose(reward, expected, atol=1e-4)
         last = action
-    envs.runner.reset(base_pose=[[0, 0, 0.31, 1, 0, 0, 0], [0, 0, 0.1, 1, 0, 0, 0], [0, 0, 0.6, 0.85, 0.53, 0, 0]])
+    envs.runner.reset(
+        base_pose=[[0, 0, 0.31, 1, 0, 0, 0], [0, 0, 0.1, 1, 0, 0, 0], [0, 0, 0.6, 0.85, 0.53, 0, 0]]
+    )
     assert envs.step(np.zeros((3, 12)))[2].tolist() == [False, True, True]  # it lies, or is tilted
     envs.close()
 
@@ -181,7 +205,20 @@ def test_stable_baselines3_trains(run):
 
 
 needs_training = pytest.mark.skipif(importlib.util.find_spec("optax") is None, reason="needs Optax")
-SMALL = ("--num-envs", "4", "--workers", "0", "--episode", "5", "--steps", "8", "--updates", "2", "--minibatches", "2")
+SMALL = (
+    "--num-envs",
+    "4",
+    "--workers",
+    "0",
+    "--episode",
+    "5",
+    "--steps",
+    "8",
+    "--updates",
+    "2",
+    "--minibatches",
+    "2",
+)
 
 
 @needs_training
@@ -200,7 +237,9 @@ def test_a_short_training_ends_with_a_picture(run, tmp_path):
 def test_a_short_training_to_walk_ends_with_a_picture_and_a_recording(run, tmp_path):
     pytest.importorskip("mujoco")
     files = ("--picture", str(tmp_path / "curve.png"), "--record", str(tmp_path / "walk.h5"))
-    text = run("train_walk.py", *SMALL, "--epochs", "1", "--time", "0.2", "--evaluated", "4", *files)
+    text = run(
+        "train_walk.py", *SMALL, "--epochs", "1", "--time", "0.2", "--evaluated", "4", *files
+    )
     assert "of 4 robots walk for 0.2 s" in text
     assert (tmp_path / "curve.png").stat().st_size > 10_000
     assert read_recording(tmp_path / "walk.h5").base_pose.shape == (10, 4, 7)
@@ -253,10 +292,17 @@ def test_a_log_of_mujoco_is_written_with_the_params_that_drove_it(run, tmp_path)
     assert {name.partition(":")[0] for name in header[1:]} == {"setpoint", "qpos"}
     assert (tmp_path / "log.params.yaml").is_file()
     truth, names = bp.load_actuators(tmp_path / "log.truth.yaml")
-    rows = {row.split()[0]: row.split()[1:] for row in said.splitlines() if row.startswith("panda_")}
+    rows = {
+        row.split()[0]: row.split()[1:] for row in said.splitlines() if row.startswith("panda_")
+    }
     assert list(rows) == names
-    for joint, row in enumerate([*rows.values()][:7]):  # the fingers have less damping than their URDF says
-        written = [getattr(truth, kind)[0, joint] for kind in ("armature", "viscous", "coulomb", "strength", "bias")]
+    for joint, row in enumerate(
+        [*rows.values()][:7]
+    ):  # the fingers have less damping than their URDF says
+        written = [
+            getattr(truth, kind)[0, joint]
+            for kind in ("armature", "viscous", "coulomb", "strength", "bias")
+        ]
         written[1] += load_bundled("panda").damping[joint]
         assert [float(value) for value in row] == pytest.approx(written, rel=1e-3)
     assert f"delay of the commands: {1e3 * truth.command_delay[0, 0]:.4g} ms" in said
@@ -267,7 +313,11 @@ NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
 
 def shown(notebook):
     """Return the formats of all outputs of a notebook, in order."""
-    return [list(output.get("data", {})) for cell in notebook.cells for output in cell.get("outputs", [])]
+    return [
+        list(output.get("data", {}))
+        for cell in notebook.cells
+        for output in cell.get("outputs", [])
+    ]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
@@ -289,15 +339,31 @@ def test_a_notebook_runs_and_shows_what_is_stored(path):
     notebook = formats.read(path, as_version=4)
     stored = shown(notebook)
     for cell in notebook.cells:
-        cell.source = cell.source.replace("(8, robot.dof)", "(2, robot.dof)").replace("num_envs=8", "num_envs=2")
-    notebook.cells.append(formats.v4.new_code_cell("assert np.abs(good.qpos[-1] - goal).max() < 1e-3"))
-    client.NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(path.parent)}}).execute()
+        cell.source = cell.source.replace("(8, robot.dof)", "(2, robot.dof)").replace(
+            "num_envs=8", "num_envs=2"
+        )
+    notebook.cells.append(
+        formats.v4.new_code_cell("assert np.abs(good.qpos[-1] - goal).max() < 1e-3")
+    )
+    client.NotebookClient(
+        notebook, timeout=120, resources={"metadata": {"path": str(path.parent)}}
+    ).execute()
     assert shown(notebook) == stored
 
 
 @pytest.mark.usefixtures("one_process")
 def test_chunks_that_have_a_file_are_not_run_again(run, tmp_path):
-    flags = ("chunks.py", "--num-envs", "3", "--chunk", "2", "--seconds", "0.05", "--folder", str(tmp_path))
+    flags = (
+        "chunks.py",
+        "--num-envs",
+        "3",
+        "--chunk",
+        "2",
+        "--seconds",
+        "0.05",
+        "--folder",
+        str(tmp_path),
+    )
     said = run(*flags)
     first = (tmp_path / "0.h5").stat().st_mtime_ns
     (tmp_path / "2.h5").unlink()

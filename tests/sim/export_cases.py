@@ -44,7 +44,9 @@ def random_params(draw):
     if "tracking_time" in chosen:
         chosen.discard("anti_windup")
     columns = {
-        name: draw(OPTION[name] if name in SHARED else st.lists(OPTION[name], min_size=3, max_size=3))
+        name: draw(
+            OPTION[name] if name in SHARED else st.lists(OPTION[name], min_size=3, max_size=3)
+        )
         for name in chosen
     }
     if "clamp" in columns.get("anti_windup", ()):
@@ -60,8 +62,19 @@ def random_params(draw):
     return bp.make_params(3, draw(st.lists(number, min_size=3, max_size=3)), **columns)
 
 
-NEUTRAL = {"ki": 0.0, "kd": 0.0, "effort_min": -math.inf, "effort_max": math.inf, "effort_rate_limit": math.inf}
-NEUTRAL |= {"integral_min": -math.inf, "integral_max": math.inf, "setpoint_weight": 1.0, "tracking_time": math.inf}
+NEUTRAL = {
+    "ki": 0.0,
+    "kd": 0.0,
+    "effort_min": -math.inf,
+    "effort_max": math.inf,
+    "effort_rate_limit": math.inf,
+}
+NEUTRAL |= {
+    "integral_min": -math.inf,
+    "integral_max": math.inf,
+    "setpoint_weight": 1.0,
+    "tracking_time": math.inf,
+}
 
 
 def values(params, name):

@@ -1,4 +1,6 @@
-"""Arms of nine joints with a feature each: mimic and continuous joints, massless links, armature, a floating base."""
+"""Arms of nine joints with a feature each: mimic and continuous joints, massless links, armature, a
+floating base.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ from batchpid.sim import Robot
 AXES = ("0 0 1", "0 1 0", "1 0 0", "0 1 0", "0 0 1", "1 0 0", "0 1 0", "0 0 1", "0 1 0")
 WIDE = '<limit lower="-9" upper="9" effort="80" velocity="9"/>'
 TURNED = 6.1
-"""Start position of continuous joints, from which a move of 0.3 rad passes 2 pi, where SAPIEN's positions wrap."""
+"""Start position of continuous joints, from which a move of 0.3 rad passes 2 pi, where SAPIEN's
+positions wrap.
+"""
 
 FEATURES: dict[str, dict] = {
     "mimic": {"mimics": {3: (1, -0.5, 0.1)}},
@@ -24,13 +28,21 @@ FEATURES: dict[str, dict] = {
     "continuous": {"types": {0: "continuous", 4: "continuous"}},
     "continuous mimic": {"types": {3: "continuous"}, "mimics": {3: (1, -1.5, 0.0)}},
     "mimic of a continuous joint": {"types": {1: "continuous"}, "mimics": {3: (1, 0.25, -1.3)}},
-    "sliding mimic of a continuous joint": {"types": {1: "continuous", 3: "prismatic"}, "mimics": {3: (1, 0.02, -0.1)}},
-    "whole turns of a continuous joint": {"types": {1: "continuous"}, "mimics": {3: (1, -1.0, 6.3)}},
+    "sliding mimic of a continuous joint": {
+        "types": {1: "continuous", 3: "prismatic"},
+        "mimics": {3: (1, 0.02, -0.1)},
+    },
+    "whole turns of a continuous joint": {
+        "types": {1: "continuous"},
+        "mimics": {3: (1, -1.0, 6.3)},
+    },
     "massless links": {"massless": (2, 5)},
     "armature": {"armature": 0.02},
     "floating base": {"fixed_base": False},
 }
-"""Types of joints other than revolute, mimic joints (leader, multiplier, offset), links without mass, ..."""
+"""Types of joints other than revolute, mimic joints (leader, multiplier, offset), links without
+mass, ...
+"""
 
 
 def joints_of(feature: str) -> set[int]:
@@ -55,10 +67,16 @@ def robot_with(*features: str, folder: Path | None = None) -> Robot:
     massless = {link for feature in chosen for link in feature.get("massless", ())}
     parts, above = [f'<link name="base">{inertial(40.0, 2.0)}</link>'], "base"
     for k, axis in enumerate(AXES):
-        law = '<mimic joint="j{}" multiplier="{}" offset="{}"/>'.format(*mimics[k]) if k in mimics else ""
+        law = (
+            '<mimic joint="j{}" multiplier="{}" offset="{}"/>'.format(*mimics[k])
+            if k in mimics
+            else ""
+        )
         place = f'<origin xyz="{0.0 if k in massless else 0.2} 0 0.05"/><axis xyz="{axis}"/>'
         ends = f'<parent link="{above}"/><child link="l{k}"/>{place}{WIDE}{law}'
-        parts.append(f'<link name="l{k}">{"" if k in massless else inertial(0.8, 0.006, 0.1)}</link>')
+        parts.append(
+            f'<link name="l{k}">{"" if k in massless else inertial(0.8, 0.006, 0.1)}</link>'
+        )
         parts.append(f'<joint name="j{k}" type="{types.get(k, "revolute")}">{ends}</joint>')
         above = f"l{k}"
     armature = max(feature.get("armature", 0.0) for feature in chosen)

@@ -10,11 +10,13 @@ import numpy as np
 from batchpid.sim import Observation
 
 
-def assert_identical(first: Any, second: Any, envs: Any = slice(None), skip: Collection[str] = ()) -> None:
+def assert_identical(
+    first: Any, second: Any, envs: Any = slice(None), skip: Collection[str] = ()
+) -> None:
     """Raise AssertionError unless the fields of ``second`` are bit-identical in ``first``.
 
-    Both are observations, rollouts or recordings. ``envs`` selects the envs to compare, ``skip`` names fields that may
-    differ.
+    Both are observations, rollouts or recordings. ``envs`` selects the envs to compare, ``skip``
+    names fields that may differ.
     """
     rows = (*[slice(None)] * (second.ok.ndim - 1), envs)
     seen = {name for name in Observation._fields if getattr(second, name) is not None}

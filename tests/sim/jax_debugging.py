@@ -29,7 +29,9 @@ def changed(**values):
     """Change settings of the process, as jax.config.update does, within a block."""
     # In another thread, where the contexts of this one do not hide the settings of the process.
     with ThreadPoolExecutor(1) as thread:
-        before = thread.submit(lambda: {name: getattr(jax.config, name) for name in values}).result()
+        before = thread.submit(
+            lambda: {name: getattr(jax.config, name) for name in values}
+        ).result()
     try:
         for name, value in values.items():
             jax.config.update(name, value)

@@ -15,7 +15,9 @@ from batchpid.sim import MujocoSolver, Physics, Randomization, Robot, RunnerKeyw
 
 
 def label(value):
-    """Return a name of a case without addresses and temporary folders, so that it is the same in every process."""
+    """Return a name of a case without addresses and temporary folders, so that it is the same in
+    every process.
+    """
     return re.sub(r" at 0x[0-9a-f]+|path='[^']*'", "", str(value))
 
 
@@ -91,12 +93,17 @@ VALUES = {
 """Values of options to try, besides those that their types list."""
 
 TYPES = get_type_hints(RunnerKeywords)
-DECLARED = {name: hint.__metadata__[-1] for name, hint in get_type_hints(RunnerKeywords, include_extras=True).items()}
+DECLARED = {
+    name: hint.__metadata__[-1]
+    for name, hint in get_type_hints(RunnerKeywords, include_extras=True).items()
+}
 """Where each option is kept and shown."""
 
 
 def option_values(name):
-    """Return the values of an option to try: the values that its type lists, and its row of VALUES."""
+    """Return the values of an option to try: the values that its type lists, and its row of
+    VALUES.
+    """
     return [*listed(TYPES.get(name)), *VALUES.get(name, [])]
 
 
@@ -106,9 +113,17 @@ def listed(kind):
         return [True, False] if kind is bool else [None]
     if get_origin(kind) is Literal:
         return [*get_args(kind)]
-    return [each for part in get_args(kind) for each in listed(part)] if get_origin(kind) in (Union, UnionType) else []
+    return (
+        [each for part in get_args(kind) for each in listed(part)]
+        if get_origin(kind) in (Union, UnionType)
+        else []
+    )
 
 
 def is_slow(name, value):
     """Return whether a value needs compilations or processes."""
-    return value == "jax" if name == "backend" else name in ("workers", "cluster") and value not in (0, None)
+    return (
+        value == "jax"
+        if name == "backend"
+        else name in ("workers", "cluster") and value not in (0, None)
+    )

@@ -1,4 +1,6 @@
-"""Bundled robots by name, for tests that are parametrized by name; the fixtures panda and jaco2 are these objects."""
+"""Bundled robots by name, for tests that are parametrized by name; the fixtures panda and jaco2 are
+these objects.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +14,15 @@ RUBBING = "panda with friction"
 
 @functools.cache
 def load_bundled(name: str) -> Robot:
-    """Return the bundled robot of that name, loaded once per process; RUBBING is a panda with friction and damping."""
+    """Return the bundled robot of that name, loaded once per process; RUBBING is a panda with
+    friction and damping.
+    """
     if name != RUBBING:
         return Robot.load(name)
     panda = Robot.load("panda")
     rows = zip(panda.joints, (0.5, 0.0, 0.2, 0.1, 0.3, 0.1, 0.05, 0.5, 0.0), strict=True)
-    joints = tuple(dataclasses.replace(joint, friction=friction, damping=2 * friction) for joint, friction in rows)
+    joints = tuple(
+        dataclasses.replace(joint, friction=friction, damping=2 * friction)
+        for joint, friction in rows
+    )
     return dataclasses.replace(panda, joints=joints)

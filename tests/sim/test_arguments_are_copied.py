@@ -38,7 +38,9 @@ def scribble(value):
 
 def own(leaves):
     """Return named leaves in arrays that can be written to."""
-    return type(leaves)(*(np.array(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves))
+    return type(leaves)(
+        *(np.array(leaf) if isinstance(leaf, np.ndarray) else leaf for leaf in leaves)
+    )
 
 
 def limits(robot=ROBOT):
@@ -54,7 +56,9 @@ def gains(kp):
 
 
 def execute(runner, command, rng, disturb):
-    """Execute a command on arrays that are overwritten afterwards, if ``disturb``; return its result."""
+    """Execute a command on arrays that are overwritten afterwards, if ``disturb``; return its
+    result.
+    """
     setpoint = np.clip(ROBOT.start + rng.uniform(-0.1, 0.1, (3, N, DOF)), ROBOT.lower, ROBOT.upper)
     arrays = SimpleNamespace(
         setpoint=setpoint[0],
@@ -67,14 +71,18 @@ def execute(runner, command, rng, disturb):
     )
     result = None
     if command == "step":
-        result = runner.step(arrays.setpoint, setpoint_rate=arrays.rate, feedforward=arrays.feedforward)
+        result = runner.step(
+            arrays.setpoint, setpoint_rate=arrays.rate, feedforward=arrays.feedforward
+        )
     elif command == "send":
         runner.send(arrays.setpoint, setpoint_rate=arrays.rate, feedforward=arrays.feedforward)
         if disturb:
             scribble(vars(arrays))
         result = runner.recv()
     elif command == "rollout":
-        result = runner.rollout(arrays.setpoints, progress=lambda ticks: between(ticks, arrays, disturb))
+        result = runner.rollout(
+            arrays.setpoints, progress=lambda ticks: between(ticks, arrays, disturb)
+        )
     elif command == "reset":
         result = runner.reset(arrays.setpoint, arrays.rate, arrays.mask)
     elif command == "params":
@@ -100,11 +108,17 @@ def run(commands, seed, workers, disturb):
     """Return the results of the commands, then those after a lost worker."""
     rng = np.random.default_rng(seed)
     given_ = SimpleNamespace(
-        params=gains(30.0), guard=limits(), actuators=motors(), speed_limit=np.full((1, DOF), 50.0), control="pid"
+        params=gains(30.0),
+        guard=limits(),
+        actuators=motors(),
+        speed_limit=np.full((1, DOF), 50.0),
+        control="pid",
     )
     names = {f"panda_joint{joint}": Uniform(0.0, 0.1) for joint in (1, 2)}
     randomization = Randomization(friction=names, params={"kp": names})
-    with Runner(ROBOT, N, workers=workers, substeps=3, randomization=randomization, **vars(given_)) as runner:
+    with Runner(
+        ROBOT, N, workers=workers, substeps=3, randomization=randomization, **vars(given_)
+    ) as runner:
         if disturb:
             scribble(vars(given_))
             names.clear()
@@ -119,11 +133,19 @@ COMMANDS = ("step", "send", "rollout", "reset", "params", "actuators", "snapshot
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning", "ignore::batchpid.sim.SetpointWarning")
+@pytest.mark.filterwarnings(
+    "ignore::batchpid.sim.RecoveryWarning", "ignore::batchpid.sim.SetpointWarning"
+)
 @settings(max_examples=4, deadline=None)
-@given(commands=st.permutations(COMMANDS), seed=st.integers(0, 2**32 - 1), workers=st.sampled_from([0, 1]))
+@given(
+    commands=st.permutations(COMMANDS),
+    seed=st.integers(0, 2**32 - 1),
+    workers=st.sampled_from([0, 1]),
+)
 def test_a_runner_keeps_nothing_of_the_callers(commands, seed, workers):
-    for ours, theirs in zip(*(run(commands, seed, workers, disturb) for disturb in (False, True)), strict=True):
+    for ours, theirs in zip(
+        *(run(commands, seed, workers, disturb) for disturb in (False, True)), strict=True
+    ):
         if isinstance(ours, tuple):
             for one, other in zip(ours, theirs, strict=True):
                 np.testing.assert_array_equal(one, other)
@@ -132,7 +154,9 @@ def test_a_runner_keeps_nothing_of_the_callers(commands, seed, workers):
 
 
 def test_a_runner_keeps_params_and_options_read_only():
-    with Runner(ROBOT, 1, workers=0, params=gains(30.0), guard=limits(), actuators=motors()) as runner:
+    with Runner(
+        ROBOT, 1, workers=0, params=gains(30.0), guard=limits(), actuators=motors()
+    ) as runner:
         for leaves in (runner.params, runner.options.guard, runner.actuators):
             assert not any(leaf.flags.writeable for leaf in leaves if isinstance(leaf, np.ndarray))
 
@@ -163,7 +187,9 @@ LAWS = {
 @settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), rates=st.booleans(), data=st.data())
 def test_a_controller_keeps_nothing_of_the_callers(law, backend, seed, rates, data):
-    calls = data.draw(st.lists(st.sampled_from(["call", "reset", "track", "params"]), min_size=3, max_size=6))
+    calls = data.draw(
+        st.lists(st.sampled_from(["call", "reset", "track", "params"]), min_size=3, max_size=6)
+    )
     efforts = [efforts_of(law, backend, calls, seed, rates, disturb) for disturb in (False, True)]
     np.testing.assert_array_equal(*efforts)
 
@@ -173,7 +199,9 @@ def efforts_of(law, backend, calls, seed, rates, disturb):
     envs, joints = 128, 4  # JAX takes over large and aligned arrays without a copy
 
     def draw():
-        gains_ = bp.make_params(joints, kp=rng.uniform(1, 9, (envs, joints)), ki=2.0, kd=0.5, **LAWS[law])
+        gains_ = bp.make_params(
+            joints, kp=rng.uniform(1, 9, (envs, joints)), ki=2.0, kd=0.5, **LAWS[law]
+        )
         return own(gains_)
 
     params = draw()
@@ -221,10 +249,18 @@ def test_the_functions_of_law_guard_and_actuators_keep_nothing(law, seed):
     state = bp.reset(params, state, rows[2], np.array([True, False, True]))
     kept = (state, effort, guard, motor, delivered, qpos, qvel)
     copies = [
-        np.array(leaf) for part in kept for leaf in (part if isinstance(part, tuple) else (part,)) if leaf is not None
+        np.array(leaf)
+        for part in kept
+        for leaf in (part if isinstance(part, tuple) else (part,))
+        if leaf is not None
     ]
     scribble(rows)
-    after = [leaf for part in kept for leaf in (part if isinstance(part, tuple) else (part,)) if leaf is not None]
+    after = [
+        leaf
+        for part in kept
+        for leaf in (part if isinstance(part, tuple) else (part,))
+        if leaf is not None
+    ]
     for one, other in zip(copies, after, strict=True):
         np.testing.assert_array_equal(one, other)
 

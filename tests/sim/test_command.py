@@ -1,4 +1,6 @@
-"""Commands that are not one number for each joint: the position (x, y) of a two-link arm, through the whole program."""
+"""Commands that are not one number for each joint: the position (x, y) of a two-link arm, through
+the whole program.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +28,16 @@ from batchpid.sim.tuning import step_response_metrics
 from tests.sim.tiny_urdf import INERTIAL, joint, link, robot, write
 
 N, LENGTH = 5, 1.0
-"""Envs, and length of each link [m]; both joints turn about y, and the arm hangs up along z at 0."""
+"""Envs, and length of each link [m]; both joints turn about y, and the arm hangs up along z at
+0.
+"""
 XY = CommandSpec(("x", "z"), ("m", "m"), lower=(0.3, 0.3), upper=(1.2, 1.2), neutral=(0.8, 0.8))
 
 
 class Cartesian:
-    """PD of both joints toward the elbow-up solution of the inverse kinematics of (x, z), in NumPy or JAX."""
+    """PD of both joints toward the elbow-up solution of the inverse kinematics of (x, z), in NumPy
+    or JAX.
+    """
 
     def __init__(self, command=XY):
         self.command = command
@@ -88,7 +94,9 @@ def goals(num_envs=N):
 
 
 def make(arm, control=None, num_envs=N, **options):
-    return Runner(arm, num_envs, control=control or Cartesian(), **({"workers": 0, "substeps": 20} | options))
+    return Runner(
+        arm, num_envs, control=control or Cartesian(), **({"workers": 0, "substeps": 20} | options)
+    )
 
 
 def run(arm, control=None, ticks=30, **options):
@@ -96,7 +104,8 @@ def run(arm, control=None, ticks=30, **options):
         return runner.rollout(np.broadcast_to(goals(), (ticks, N, 2)))
 
 
-# -- the control reaches its setpoint, whatever runs it ---------------------------------------------------------------
+# -- the control reaches its setpoint, whatever runs it
+# ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize("backend", ["numpy", pytest.param("jax", marks=pytest.mark.slow)])
@@ -108,10 +117,14 @@ def test_the_tool_reaches_its_command_in_any_number_of_workers(arm, backend):
     np.testing.assert_allclose(tool(rollout.qpos[-1].astype(float)), goals(), atol=2e-3)
     assert rollout.setpoint.shape == (200, N, 2)
     workers = {"numpy": 2, "jax": 1}[backend]
-    assert_identical(run(arm, ticks=20, workers=workers, **options), rollout.for_ticks(slice(0, 20)))
+    assert_identical(
+        run(arm, ticks=20, workers=workers, **options), rollout.for_ticks(slice(0, 20))
+    )
 
 
-@pytest.mark.parametrize(("more", "backend"), [(0, "numpy"), (1, "numpy"), (5, "numpy"), (5, "jax")])
+@pytest.mark.parametrize(
+    ("more", "backend"), [(0, "numpy"), (1, "numpy"), (5, "numpy"), (5, "jax")]
+)
 def test_a_command_has_any_size(arm, more, backend):
     if backend == "jax":
         pytest.importorskip("jax")
@@ -124,8 +137,13 @@ def test_a_command_has_any_size(arm, more, backend):
 
 
 def test_followers_do_not_enter_a_command(tmp_path):
-    """The efforts that a controller returns for followers act on leaders; setpoints are passed on as they are."""
-    mimic = '<limit lower="-3" upper="3" effort="200" velocity="9"/><mimic joint="elbow" multiplier="-1"/>'
+    """The efforts that a controller returns for followers act on leaders; setpoints are passed on
+    as they are.
+    """
+    mimic = (
+        '<limit lower="-3" upper="3" effort="200" velocity="9"/><mimic joint="elbow"'
+        ' multiplier="-1"/>'
+    )
     limit = mimic.partition("<mimic")[0]
     text = robot(
         *(link(name, INERTIAL) for name in ("base", "upper", "lower", "finger")),
@@ -159,7 +177,8 @@ def test_one_number_is_a_command_too(arm):
         assert runner.command == CommandSpec(("height",))
 
 
-# -- errors and warnings ----------------------------------------------------------------------------------------------
+# -- errors and warnings
+# ----------------------------------------------------------------------------------------------
 
 
 def test_a_spec_fills_in_units_bounds_and_neutral():
@@ -179,7 +198,12 @@ def test_limits_and_guard_are_for_joint_positions(arm):
 
 def test_commands_of_joints_have_their_names_and_units(panda):
     position, effort = ("rad",) * 7 + ("m", "m"), ("N m",) * 7 + ("N", "N")
-    for control, units in (("pid", position), ("drive", position), ("effort", effort), (OfJoints(), position)):
+    for control, units in (
+        ("pid", position),
+        ("drive", position),
+        ("effort", effort),
+        (OfJoints(), position),
+    ):
         options = RunnerOptions(panda, 1, control=control)
         assert options.command == CommandSpec(panda.joint_names, units)
         assert options.own_command is None
@@ -188,7 +212,8 @@ def test_commands_of_joints_have_their_names_and_units(panda):
         assert info.units_of("qvel") == ("rad/s",) * 7 + ("m/s", "m/s")
 
 
-# -- faults -----------------------------------------------------------------------------------------------------------
+# -- faults
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.quick_rows(1)
@@ -203,11 +228,21 @@ def test_a_fault_names_the_entry_and_is_contained(arm, on_fault, backend, worker
     bad[1, 5] = np.nan
     bad[3, 0] = np.inf
     good = np.where(np.isfinite(bad), bad, 1.0)
-    options = {"on_fault": on_fault, "on_invalid_input": "contain", "backend": backend, "workers": workers}
-    with make(arm, Shapes(4), **options) as runner, make(arm, Shapes(4), **{**options, "workers": 0}) as sound:
+    options = {
+        "on_fault": on_fault,
+        "on_invalid_input": "contain",
+        "backend": backend,
+        "workers": workers,
+    }
+    with (
+        make(arm, Shapes(4), **options) as runner,
+        make(arm, Shapes(4), **{**options, "workers": 0}) as sound,
+    ):
         runner.step(good)
         sound.step(good)
-        with pytest.warns(FaultWarning, match="env 1, entry 'number 5': the setpoint given for it is not finite"):
+        with pytest.warns(
+            FaultWarning, match="env 1, entry 'number 5': the setpoint given for it is not finite"
+        ):
             failed = runner.step(bad)
         expected = sound.step(good)
         np.testing.assert_array_equal(failed.ok, [True, False, True, False, True])
@@ -247,7 +282,9 @@ def test_a_failed_env_has_the_neutral_setpoint(arm):
     control = Noting()
     with make(arm, control, on_invalid_input="contain") as runner, pytest.warns(FaultWarning):
         runner.step(np.where(np.arange(N)[:, None] == 2, np.nan, goals()))
-    np.testing.assert_array_equal(control.last, np.where(np.arange(N)[:, None] == 2, XY.neutral, goals()))
+    np.testing.assert_array_equal(
+        control.last, np.where(np.arange(N)[:, None] == 2, XY.neutral, goals())
+    )
 
 
 def test_nan_efforts_of_a_failed_env_are_contained(arm):
@@ -260,7 +297,10 @@ def test_nan_efforts_of_a_failed_env_are_contained(arm):
 
     for on_fault in ("hold", "reset"):
         control = Unclipped(("x", "z"))
-        with make(arm, control, on_invalid_input="contain", on_fault=on_fault) as runner, make(arm, control) as sound:
+        with (
+            make(arm, control, on_invalid_input="contain", on_fault=on_fault) as runner,
+            make(arm, control) as sound,
+        ):
             with pytest.warns(FaultWarning):
                 seen = runner.step(np.where(np.arange(N)[:, None] == 2, np.nan, goals()))
             seen, expected = runner.step(goals()), (sound.step(goals()), sound.step(goals()))[1]
@@ -269,10 +309,12 @@ def test_nan_efforts_of_a_failed_env_are_contained(arm):
             assert np.isfinite(seen.qpos).all()
 
 
-# -- snapshots --------------------------------------------------------------------------------------------------------
+# -- snapshots
+# --------------------------------------------------------------------------------------------------
 
 
-# -- recordings, plots, view ------------------------------------------------------------------------------------------
+# -- recordings, plots, view
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -287,7 +329,11 @@ def rollout(arm):
 def test_recordings_hold_names_and_units(rollout, tmp_path):
     read = read_recording(write_recording(rollout, tmp_path / "run.h5"))
     assert_identical(read, rollout)
-    assert read.info.command == rollout.info.command == CommandSpec(("x", "z", "gain <b>"), ("m", "m", ""))
+    assert (
+        read.info.command
+        == rollout.info.command
+        == CommandSpec(("x", "z", "gain <b>"), ("m", "m", ""))
+    )
     assert read.setpoint.shape == (12, N, 3)
     assert not read.info.sets_positions
     assert read.for_envs([1, 2]).setpoint.shape == (12, 2, 3)
@@ -303,7 +349,9 @@ def test_plots_draw_entries_in_axes_of_their_own(rollout, tmp_path):
     np.testing.assert_array_equal([line.get_ydata() for line in lines], rollout.setpoint[..., 1].T)
     assert plots.save(figure, tmp_path / "picture.png").is_file()
     for other in (plots.efforts(rollout), plots.comparison(rollout, rollout)):
-        assert [axes.get_title(loc="left") for axes in other.axes if axes.get_title(loc="left")] == titles[:2]
+        assert [
+            axes.get_title(loc="left") for axes in other.axes if axes.get_title(loc="left")
+        ] == titles[:2]
 
 
 def test_a_recording_plays_back(arm, rollout):
@@ -318,12 +366,16 @@ def test_a_recording_plays_back(arm, rollout):
 
 def test_identification_and_metrics_refuse_such_runs(arm, rollout):
     path = write_recording(rollout, "run.h5")
-    for call in (lambda: step_response_metrics(arm, rollout, np.zeros((N, 2))), lambda: identify(arm, [path])):
+    for call in (
+        lambda: step_response_metrics(arm, rollout, np.zeros((N, 2))),
+        lambda: identify(arm, [path]),
+    ):
         with pytest.raises(InvalidArgumentError, match="not of joints"):
             call()
 
 
-# -- Gymnasium --------------------------------------------------------------------------------------------------------
+# -- Gymnasium
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("actions", ["setpoint", "increment"])
@@ -332,7 +384,9 @@ def test_gymnasium_actions_are_commands_within_their_bounds(arm, actions):
     from batchpid.sim.gym import ReachVectorEnv
 
     increment = {"max_increment": [0.05, 0.1]} if actions == "increment" else {}
-    env = ReachVectorEnv(3, arm, actions=actions, control=Cartesian(), workers=0, max_episode_steps=4, **increment)
+    env = ReachVectorEnv(
+        3, arm, actions=actions, control=Cartesian(), workers=0, max_episode_steps=4, **increment
+    )
     given = []
     send = env.runner.send
     env.runner.send = lambda setpoint, **more: given.append(setpoint) or send(setpoint, **more)
@@ -346,7 +400,9 @@ def test_gymnasium_actions_are_commands_within_their_bounds(arm, actions):
     else:
         np.testing.assert_allclose(given[0], [[0.85, 0.7]] * 3)
         np.testing.assert_allclose(given[3], [[1.0, 0.4]] * 3)
-        np.testing.assert_allclose(given[5], [[0.85, 0.7]] * 3)  # from the neutral setpoint of the next episode
+        np.testing.assert_allclose(
+            given[5], [[0.85, 0.7]] * 3
+        )  # from the neutral setpoint of the next episode
     with pytest.raises(InvalidArgumentError, match="actions, entry 'z', env 2"):
         env.step(np.array([[0, 0], [0, 0], [0, np.nan]]))
     env.close()

@@ -1,8 +1,10 @@
-"""Every feature, in each engine, gives the same results on every path: native code, NumPy, XLA, workers, snapshots, ...
+"""Every feature, in each engine, gives the same results on every path: native code, NumPy, XLA,
+workers, snapshots, ...
 
-A case is a feature (options of a Runner, in :data:`FEATURES`) in an engine. Its program is a rollout in which one env
-fails, a reset of some envs, a snapshot, and another rollout. Each path of :data:`PATHS` runs this program in another
-way, and compares the results with :func:`reference`: native code in this process.
+A case is a feature (options of a Runner, in :data:`FEATURES`) in an engine. Its program is a
+rollout in which one env fails, a reset of some envs, a snapshot, and another rollout. Each path of
+:data:`PATHS` runs this program in another way, and compares the results with :func:`reference`:
+native code in this process.
 """
 
 from __future__ import annotations
@@ -26,7 +28,16 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import LogUniform, Normal, Randomization, Robot, Runner, RunnerKeywords, Snapshot, Uniform
+from batchpid.sim import (
+    LogUniform,
+    Normal,
+    Randomization,
+    Robot,
+    Runner,
+    RunnerKeywords,
+    Snapshot,
+    Uniform,
+)
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
 
 N, TICKS, SPLIT, FAILING = 5, 5, 3, 2
@@ -35,19 +46,28 @@ RESET = np.arange(N) % 2 == 0
 ENGINES = ("sapien", "mujoco")
 pytestmark = [
     pytest.mark.usefixtures("small_groups"),
-    pytest.mark.filterwarnings("ignore::UserWarning"),  # of faults, lost workers, missed contacts and past bounds
+    pytest.mark.filterwarnings(
+        "ignore::UserWarning"
+    ),  # of faults, lost workers, missed contacts and past bounds
 ]
 
 
 class Damped:
-    """Controller of the caller's own, for NumPy and JAX: a PD whose damping grows with the number of its sim steps."""
+    """Controller of the caller's own, for NumPy and JAX: a PD whose damping grows with the number
+    of its sim steps.
+    """
 
     def init(self, robot: Any, num_envs: int) -> Any:
         return {"steps": np.zeros(num_envs), "last": (np.zeros((num_envs, robot.dof)), None)}
 
     def __call__(self, state: Any, setpoint: Any, qpos: Any, qvel: Any, passive: Any) -> Any:
         steps = state["steps"] + 1
-        effort = passive + 8.0 * (setpoint - qpos) - (1 + 0.01 * steps[:, None]) * qvel + 0.1 * state["last"][0]
+        effort = (
+            passive
+            + 8.0 * (setpoint - qpos)
+            - (1 + 0.01 * steps[:, None]) * qvel
+            + 0.1 * state["last"][0]
+        )
         return {"steps": steps, "last": (setpoint - qpos, None)}, effort
 
 
@@ -64,27 +84,66 @@ class Feature(NamedTuple):
     exact: bool = False
     """Whether results are bit-identical with and without native code, instead of close."""
     alike: bool = True
-    """Whether the engines agree on the motion: not in contact, nor under large efforts or drives at their limits."""
+    """Whether the engines agree on the motion: not in contact, nor under large efforts or drives at
+    their limits.
+    """
 
 
 EFFORTS = {"kp": 20.0, "ki": 5.0, "kd": 2.0}
 LAW = EFFORTS | {
-    **{"derivative_filter_time": 2e-3, "setpoint_weight": 0.7, "deadband": 1e-3, "effort_rate_limit": 5e3},
-    **{"anti_windup": "back_calculation", "tracking_time": 0.05, "integral_limit": 2.0, "effort_limit": 4.0},
+    **{
+        "derivative_filter_time": 2e-3,
+        "setpoint_weight": 0.7,
+        "deadband": 1e-3,
+        "effort_rate_limit": 5e3,
+    },
+    **{
+        "anti_windup": "back_calculation",
+        "tracking_time": 0.05,
+        "integral_limit": 2.0,
+        "effort_limit": 4.0,
+    },
 }
 SIGNALS = {"command_delay": 2e-3, "lag": 1e-3, "strength": 0.9, "bias": 0.1, "effort_limit": 6.0}
-SENSORS = {"sensor_delay": 1e-3, "position_offset": 0.01, "backlash": 1e-3, "position_resolution": 1e-4}
+SENSORS = {
+    "sensor_delay": 1e-3,
+    "position_offset": 0.01,
+    "backlash": 1e-3,
+    "position_resolution": 1e-4,
+}
 NOISE = {"position_noise": 1e-5, "velocity_noise": 1e-3, "velocity_resolution": 1e-3}
-LINE = {"saturation_effort": 8.0, "no_load_speed": 3.0, "position_limit": ([-1.0, 0.0, 1.0], [6.0, 9.0, 5.0])}
-FRICTION = {"coulomb": 0.2, "static": 0.3, "stribeck": 0.05, "load_friction": 0.05, "viscous": 0.1, "armature": 0.02}
+LINE = {
+    "saturation_effort": 8.0,
+    "no_load_speed": 3.0,
+    "position_limit": ([-1.0, 0.0, 1.0], [6.0, 9.0, 5.0]),
+}
+FRICTION = {
+    "coulomb": 0.2,
+    "static": 0.3,
+    "stribeck": 0.05,
+    "load_friction": 0.05,
+    "viscous": 0.1,
+    "armature": 0.02,
+}
 DRAWN = {
-    **{"payload": Uniform(0, 0.5), "link_mass": Uniform(0.7, 1.3, operation="scale"), "qvel": Normal(0, 0.1)},
-    **{"center_of_mass": Uniform(-0.01, 0.01), "friction": Uniform(0, 0.1), "damping": Uniform(0, 0.1)},
+    **{
+        "payload": Uniform(0, 0.5),
+        "link_mass": Uniform(0.7, 1.3, operation="scale"),
+        "qvel": Normal(0, 0.1),
+    },
+    **{
+        "center_of_mass": Uniform(-0.01, 0.01),
+        "friction": Uniform(0, 0.1),
+        "damping": Uniform(0, 0.1),
+    },
     **{"armature": LogUniform(1e-3, 0.05), "qpos": Uniform(-0.1, 0.1)},
     "actuators": {"command_delay": Uniform(0, 3e-3, shared=True), "coulomb": Uniform(0, 0.1)},
 }
 PUSHES = {
-    **{"push": {"vx": Uniform(0.1, 0.5), "wz": Uniform(-1, 1)}, "push_interval": Uniform(0.01, 0.03)},
+    **{
+        "push": {"vx": Uniform(0.1, 0.5), "wz": Uniform(-1, 1)},
+        "push_interval": Uniform(0.01, 0.03),
+    },
     "gravity": {"x": Uniform(-1, 1), "z": Uniform(-1, 1)},
 }
 GUARD = bp.make_guard(2, rate=0.5, acceleration=20.0)
@@ -92,7 +151,11 @@ SAPIEN, MUJOCO = ENGINES[:1], ENGINES[1:]
 
 
 def motors(*effects: dict[str, Any], joints: int = 2) -> dict[str, Any]:
-    return {"actuators": bp.make_actuators(joints, **{name: value for each in effects for name, value in each.items()})}
+    return {
+        "actuators": bp.make_actuators(
+            joints, **{name: value for each in effects for name, value in each.items()}
+        )
+    }
 
 
 FEATURES: dict[str, Feature] = {
@@ -100,7 +163,13 @@ FEATURES: dict[str, Feature] = {
     "accelerations": Feature(accelerations=True),
     "gains in efforts": Feature(params=EFFORTS, exact=True),
     "implicit law": Feature(
-        params={"gain_units": "mass_matrix", "discretization": "implicit", "kp": 4e3, "ki": 1e4, "kd": 120.0}
+        params={
+            "gain_units": "mass_matrix",
+            "discretization": "implicit",
+            "kp": 4e3,
+            "ki": 1e4,
+            "kd": 120.0,
+        }
     ),
     "every option of the law": Feature(params=LAW, exact=True),
     "drive": Feature({"control": "drive"}, exact=True),
@@ -114,11 +183,15 @@ FEATURES: dict[str, Feature] = {
     "sensors": Feature(motors(SENSORS)),
     "noise": Feature(motors(NOISE), repeats=False),
     "friction": Feature(motors(FRICTION)),
-    "friction under a drive": Feature({"control": "drive", **motors({"coulomb": 0.2, "armature": 0.02})}),
+    "friction under a drive": Feature(
+        {"control": "drive", **motors({"coulomb": 0.2, "armature": 0.02})}
+    ),
     "friction under osc": Feature({"control": "osc", **motors({"coulomb": 0.2, "lag": 1e-3})}),
     "friction that the controller knows": Feature({"robot": "worn"}),
     "randomization": Feature({"randomization": Randomization(**DRAWN, seed=3)}),
-    "a randomized drive": Feature({"control": "drive", "randomization": Randomization(payload=Uniform(0.1, 0.5))}),
+    "a randomized drive": Feature(
+        {"control": "drive", "randomization": Randomization(payload=Uniform(0.1, 0.5))}
+    ),
     "compensation of gravity alone": Feature({"compensate": "gravity"}),
     "no compensation": Feature({"compensate": "none", "physics": "fast"}),
     "no collisions": Feature({"collisions": False, "ground": False}),
@@ -128,33 +201,58 @@ FEATURES: dict[str, Feature] = {
     "links in contact": Feature({"robot": "jaco2", "control": "effort"}, exact=True, alike=False),
     "mimic joints": Feature({"robot": "chain of mimics"}),
     "mimic joints under a drive": Feature({"robot": "mimic", "control": "drive"}, alike=False),
-    "mimic joints with motors": Feature({"robot": "sliding mimic", **motors(SIGNALS, FRICTION, joints=9)}),
+    "mimic joints with motors": Feature(
+        {"robot": "sliding mimic", **motors(SIGNALS, FRICTION, joints=9)}
+    ),
     "turning mimic joints": Feature({"robot": "sliding mimic of a continuous joint"}),
     "continuous joints": Feature({"robot": "continuous"}),
     "armature": Feature({"robot": "armature"}),
     "floating base": Feature({"robot": "floating base"}),
-    "floating base under efforts": Feature({"robot": "floating base", "control": "effort"}, alike=False),
+    "floating base under efforts": Feature(
+        {"robot": "floating base", "control": "effort"}, alike=False
+    ),
     "pushes": Feature({"robot": "floating base", "randomization": Randomization(**PUSHES)}),
 }
 
 
 def random_feature(seed: int) -> Feature:
-    """Return a control with about half of the effects of motors and sensors, and other options at random."""
+    """Return a control with about half of the effects of motors and sensors, and other options at
+    random.
+    """
     rng = np.random.default_rng(seed)
     control = ("pid", "effort", "drive")[seed % 3]
     effects = SIGNALS | SENSORS | LINE | FRICTION
-    chosen = {name: value for name, value in effects.items() if rng.random() < 0.5 and name != "no_load_speed"}
+    chosen = {
+        name: value
+        for name, value in effects.items()
+        if rng.random() < 0.5 and name != "no_load_speed"
+    }
     if "saturation_effort" in chosen:
         chosen["no_load_speed"] = LINE["no_load_speed"]
     if not {"coulomb", "static"} <= chosen.keys():
-        chosen = {name: value for name, value in chosen.items() if name not in ("static", "stribeck")}
+        chosen = {
+            name: value for name, value in chosen.items() if name not in ("static", "stribeck")
+        }
     if control == "drive":
         chosen = {name: value for name, value in chosen.items() if name in ("coulomb", "armature")}
-    options = {"control": control, "compensate": str(rng.choice(["gravity+coriolis+friction", "gravity", "none"]))}
-    options |= motors(chosen) | ({"guard": GUARD} if control != "effort" and rng.random() < 0.5 else {})
+    options = {
+        "control": control,
+        "compensate": str(rng.choice(["gravity+coriolis+friction", "gravity", "none"])),
+    }
+    options |= motors(chosen) | (
+        {"guard": GUARD} if control != "effort" and rng.random() < 0.5 else {}
+    )
     if rng.random() < 0.5:
-        options["randomization"] = Randomization(payload=Uniform(0.0, 0.5), friction=Uniform(0.0, 0.1))
-    law = {"pid": {name: value for name, value in LAW.items() if name not in ("anti_windup", "tracking_time")}}
+        options["randomization"] = Randomization(
+            payload=Uniform(0.0, 0.5), friction=Uniform(0.0, 0.1)
+        )
+    law = {
+        "pid": {
+            name: value
+            for name, value in LAW.items()
+            if name not in ("anti_windup", "tracking_time")
+        }
+    }
     return Feature(options, law.get(control))
 
 
@@ -192,21 +290,28 @@ def make(case: tuple[str, str], num_envs: int = N, **more: Any) -> Runner:
 
 
 def commands(case: tuple[str, str], runner: Runner) -> dict[str, np.ndarray]:
-    """Return the commands of a rollout (TICKS, envs, ...), which are the same for an env in any number of envs."""
+    """Return the commands of a rollout (TICKS, envs, ...), which are the same for an env in any
+    number of envs.
+    """
     rng, robot, envs = np.random.default_rng(0), runner.robot, runner.num_envs
     start = runner.observe()
     noise, slope, extra = rng.uniform(-1, 1, (3, TICKS, N, robot.dof))[:, :, :envs]
     if runner.control == "effort":
         setpoint = 0.3 * noise * np.minimum(robot.effort_limit, 50.0)
     elif start.tool_pose is None:
-        setpoint = robot.coupled(np.clip(robot.start + 0.2 * noise, robot.lower + 1e-3, robot.upper - 1e-3))
+        setpoint = robot.coupled(
+            np.clip(robot.start + 0.2 * noise, robot.lower + 1e-3, robot.upper - 1e-3)
+        )
     else:
         setpoint = np.tile(start.tool_pose.astype(float), (TICKS, 1, 1))
         setpoint[..., :2] += 0.02 * noise[..., :2]
     given = {"setpoints": setpoint}
     if runner.control in ("pid", "drive"):
         size = 6 if start.tool_pose is not None else robot.dof  # a pose has a twist
-        given |= {"setpoint_rates": 0.1 * np.tile(slope[..., :1], size), "feedforwards": 0.1 * extra}
+        given |= {
+            "setpoint_rates": 0.1 * np.tile(slope[..., :1], size),
+            "feedforwards": 0.1 * extra,
+        }
     if FEATURES[case[0]].accelerations:
         given["setpoint_accelerations"] = slope
     if envs > FAILING:
@@ -241,8 +346,12 @@ def second_half(runner: Runner, given: dict[str, np.ndarray], rollout: Any) -> t
     return second, runner.snapshot(), runner.faults, runner.missed_contacts, poses
 
 
-def program(runner: Runner, case: tuple[str, str], rollout: Any = None, disturb: Any = None) -> Result:
-    """Run the program; ``disturb`` is called with the runner between the snapshot and the second rollout."""
+def program(
+    runner: Runner, case: tuple[str, str], rollout: Any = None, disturb: Any = None
+) -> Result:
+    """Run the program; ``disturb`` is called with the runner between the snapshot and the second
+    rollout.
+    """
     rollout = rollout or (lambda runner, given: runner.rollout(**given))
     given = commands(case, runner)
     first = rollout(runner, part(given, slice(SPLIT)))
@@ -265,7 +374,9 @@ def reference(case: tuple[str, str], backend: str = "numpy") -> Result:
 
 
 def leaves(value: Any, path: str = "") -> Any:
-    """Yield the arrays and numbers of a result with their paths in it; of a snapshot, states, params and steps."""
+    """Yield the arrays and numbers of a result with their paths in it; of a snapshot, states,
+    params and steps.
+    """
     if value is None or isinstance(value, str | bool | int | float | np.ndarray):
         yield path, value
     elif isinstance(value, Snapshot):
@@ -273,7 +384,9 @@ def leaves(value: Any, path: str = "") -> Any:
     elif isinstance(value, dict):
         yield from (leaf for name, each in value.items() for leaf in leaves(each, f"{path}.{name}"))
     elif isinstance(value, list | tuple):
-        yield from (leaf for number, each in enumerate(value) for leaf in leaves(each, f"{path}.{number}"))
+        yield from (
+            leaf for number, each in enumerate(value) for leaf in leaves(each, f"{path}.{number}")
+        )
 
 
 def check_equal(ours: Result, theirs: Result) -> None:
@@ -297,7 +410,8 @@ def check_close(ours: Result, theirs: Result, atol: float) -> None:
     assert [fault[:2] for fault in ours.faults] == [fault[:2] for fault in theirs.faults]
 
 
-# -- paths -------------------------------------------------------------------------------------------------------------
+# -- paths
+# --------------------------------------------------------------------------------------------------
 
 
 def in_python(case: tuple[str, str]) -> None:
@@ -334,7 +448,10 @@ def tick_by_tick(case: tuple[str, str]) -> None:
     with make(case) as runner:
         result = program(runner, case, rollout)
     expected = reference(case)
-    check_equal(result, expected._replace(first=expected.first.observation, second=expected.second.observation))
+    check_equal(
+        result,
+        expected._replace(first=expected.first.observation, second=expected.second.observation),
+    )
 
 
 def alone(case: tuple[str, str]) -> None:
@@ -353,7 +470,9 @@ def restored(case: tuple[str, str]) -> None:
         given = commands(case, runner)
         runner.rollout(**part(given, slice(2)))
         runner.restore(Snapshot.load(path))
-        second, end, *_, poses = second_half(runner, given, lambda runner, given: runner.rollout(**given))
+        second, end, *_, poses = second_half(
+            runner, given, lambda runner, given: runner.rollout(**given)
+        )
     check_equal(expected._replace(second=second, end=end, poses=poses), expected)
 
 
@@ -372,13 +491,17 @@ def again(case: tuple[str, str]) -> None:
 def in_workers(case: tuple[str, str]) -> None:
     """Two workers, one of which is killed and replaced."""
     with make(case, workers=2) as runner:
-        result = program(runner, case, disturb=lambda runner: os.kill(runner.pids[1], signal.SIGKILL))
+        result = program(
+            runner, case, disturb=lambda runner: os.kill(runner.pids[1], signal.SIGKILL)
+        )
         assert runner.recoveries == 1
     check_equal(result, reference(case))
 
 
 def in_xla(case: tuple[str, str]) -> None:
-    """The law in XLA is close to NumPy, and bit-identical in a worker; a feature that it lacks is refused."""
+    """The law in XLA is close to NumPy, and bit-identical in a worker; a feature that it lacks is
+    refused.
+    """
     try:
         make(case, backend="jax").close()
     except InvalidArgumentError as error:
@@ -395,9 +518,21 @@ def in_the_other_engine(case: tuple[str, str]) -> None:
     check_close(reference(case), reference((case[0], "sapien")), 1e-3)
 
 
-PATHS = (in_python, in_numpy, tick_by_tick, alone, restored, again, in_workers, in_xla, in_the_other_engine)
+PATHS = (
+    in_python,
+    in_numpy,
+    tick_by_tick,
+    alone,
+    restored,
+    again,
+    in_workers,
+    in_xla,
+    in_the_other_engine,
+)
 QUICK = {in_workers: 5, in_xla: 50}
-"""Interval of the quick cases of a path; the others are slow. Other paths have every feature, in one engine, quick."""
+"""Interval of the quick cases of a path; the others are slow. Other paths have every feature, in
+one engine, quick.
+"""
 
 
 def rows() -> Iterator[Any]:
@@ -408,10 +543,16 @@ def rows() -> Iterator[Any]:
                     continue
                 if path is in_the_other_engine and (not feature.alike or engine == "sapien"):
                     continue
-                every = QUICK.get(path, 2 if len(feature.engines) > 1 and path is not in_the_other_engine else 1)
-                is_quick = (number + ENGINES.index(engine) + (path_number if every == 2 else 0)) % every == 0
+                every = QUICK.get(
+                    path, 2 if len(feature.engines) > 1 and path is not in_the_other_engine else 1
+                )
+                is_quick = (
+                    number + ENGINES.index(engine) + (path_number if every == 2 else 0)
+                ) % every == 0
                 marks = () if is_quick else pytest.mark.slow
-                yield pytest.param(path, (name, engine), id=f"{path.__name__}-{name}-{engine}", marks=marks)
+                yield pytest.param(
+                    path, (name, engine), id=f"{path.__name__}-{name}-{engine}", marks=marks
+                )
 
 
 @pytest.mark.parametrize(("path", "case"), [*rows()])

@@ -1,4 +1,6 @@
-"""Contact forces and wrenches of links: equal in both engines, in observations, recordings and snapshots."""
+"""Contact forces and wrenches of links: equal in both engines, in observations, recordings and
+snapshots.
+"""
 
 from __future__ import annotations
 
@@ -68,14 +70,19 @@ def test_contact_forces_of_a_standing_robot_carry_its_weight(stool, engine):
 
 
 def test_both_engines_report_the_same_forces(stool):
-    forces = [stand(stool, engine, 120).contact_force[-1, 0, :, 2] for engine in ("sapien", "mujoco")]
+    forces = [
+        stand(stool, engine, 120).contact_force[-1, 0, :, 2] for engine in ("sapien", "mujoco")
+    ]
     np.testing.assert_allclose(*forces, atol=0.01 * WEIGHT)
 
 
 def test_a_wrench_holds_the_links_behind_it(stool, engine):
     """Foot on the ground: its weight, the contact force, and the wrench of the leg cancel."""
     rollout = stand(stool, engine, wrenches=["foot1", "leg1"])
-    force, wrench = rollout.contact_force[-1, 0, 1].astype(float), rollout.wrench[-1, 0].astype(float)
+    force, wrench = (
+        rollout.contact_force[-1, 0, 1].astype(float),
+        rollout.wrench[-1, 0].astype(float),
+    )
     turned = np.array([[np.cos(0.5), np.sin(0.5), 0], [-np.sin(0.5), np.cos(0.5), 0], [0, 0, 1]])
     expected = -(turned @ force) + [0, 0, 0.1 * GRAVITY]
     np.testing.assert_allclose(wrench[0, :3], expected, atol=0.05)
@@ -84,8 +91,12 @@ def test_a_wrench_holds_the_links_behind_it(stool, engine):
 
 
 def test_nothing_touches_in_free_fall(stool, engine):
-    with make_runner(stool, engine, wrenches=["leg0"], control="effort", compensate="none") as runner:
-        begin = runner.reset(base_pose=[0, 0, 2.0, 0.9, 0.1, 0.2, 0.3], base_twist=[0.1, 0, 0, 1.0, 2.0, 3.0])
+    with make_runner(
+        stool, engine, wrenches=["leg0"], control="effort", compensate="none"
+    ) as runner:
+        begin = runner.reset(
+            base_pose=[0, 0, 2.0, 0.9, 0.1, 0.2, 0.3], base_twist=[0.1, 0, 0, 1.0, 2.0, 3.0]
+        )
         assert not begin.contact_force.any()
         fall = runner.rollout(np.zeros((10, 4)))
     assert not fall.contact_force.any()
@@ -110,7 +121,9 @@ def test_forces_are_recorded_and_the_same_in_workers(stool, engine, tmp_path):
         alone = runner.rollout(table[12:])
     with make_runner(stool, engine, workers=2, **options) as runner:
         runner.restore(type(kept).load(tmp_path / "kept.npz"))
-        np.testing.assert_array_equal(runner.observe().contact_force, kept.states.sensors["contact_force"])
+        np.testing.assert_array_equal(
+            runner.observe().contact_force, kept.states.sensors["contact_force"]
+        )
         with Recorder(tmp_path / "run.h5", runner):
             assert_identical(alone, runner.rollout(table[12:]))
     again = read_recording(tmp_path / "run.h5")

@@ -23,7 +23,9 @@ def hinge(tmp_path):
 
 def refuses(value, advice=""):
     for make in COPIES:
-        with pytest.raises(NotCopyableError, match=f"a {type(value).__name__} can be neither .*{re.escape(advice)}"):
+        with pytest.raises(
+            NotCopyableError, match=f"a {type(value).__name__} can be neither .*{re.escape(advice)}"
+        ):
             make(value)
 
 

@@ -1,8 +1,9 @@
-"""Damaged files of every kind: read with their present content, or refused by an error that names the file.
+"""Damaged files of every kind: read with their present content, or refused by an error that names
+the file.
 
-Bytes, keys, values and lengths are changed at random. A file with the same content as the original gives the same
-value. A file with other content gives another value or is refused, so that no part of a file is ignored. A missing key
-has its default.
+Bytes, keys, values and lengths are changed at random. A file with the same content as the original
+gives the same value. A file with other content gives another value or is refused, so that no part
+of a file is ignored. A missing key has its default.
 """
 
 from __future__ import annotations
@@ -31,8 +32,13 @@ from batchpid.sim.tuning import load_randomization, random_moves
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of unusual values
 JOINTS = list(ARM.joint_names)
-PARAMS = ARM.params(kp=[[40.0, 20.0], [30.0, 10.0]], ki=5.0, kd=2.0, effort_limit=87.0, anti_windup="conditional")
-DRAWN = {"payload": {"uniform": [0.0, 0.3]}, "params": {"kp": {"log_uniform": [0.5, 2.0], "operation": "scale"}}}
+PARAMS = ARM.params(
+    kp=[[40.0, 20.0], [30.0, 10.0]], ki=5.0, kd=2.0, effort_limit=87.0, anti_windup="conditional"
+)
+DRAWN = {
+    "payload": {"uniform": [0.0, 0.3]},
+    "params": {"kp": {"log_uniform": [0.5, 2.0], "operation": "scale"}},
+}
 SHORT = {"workers": 0, "engine": "mujoco", "substeps": 4}
 
 
@@ -63,25 +69,73 @@ def write_run(path: Path) -> None:
 
 MOVES = random_moves(ARM, 1, 0)
 KINDS = {
-    "params.yaml": Kind(lambda path: bp.save_params(path, PARAMS, JOINTS), lambda path: bp.load_params(path, JOINTS)),
-    "params.json": Kind(lambda path: bp.save_params(path, PARAMS, JOINTS), lambda path: bp.load_params(path, JOINTS)),
+    "params.yaml": Kind(
+        lambda path: bp.save_params(path, PARAMS, JOINTS), lambda path: bp.load_params(path, JOINTS)
+    ),
+    "params.json": Kind(
+        lambda path: bp.save_params(path, PARAMS, JOINTS), lambda path: bp.load_params(path, JOINTS)
+    ),
     "motors.yaml": Kind(
-        lambda path: bp.save_actuators(path, MOTORS, JOINTS), lambda path: bp.load_actuators(path, JOINTS)
+        lambda path: bp.save_actuators(path, MOTORS, JOINTS),
+        lambda path: bp.load_actuators(path, JOINTS),
     ),
     "drawn.yaml": Kind(
-        lambda path: path.write_text(yaml.safe_dump(DRAWN)), lambda path: load_randomization(path, ARM).to_dict()
+        lambda path: path.write_text(yaml.safe_dump(DRAWN)),
+        lambda path: load_randomization(path, ARM).to_dict(),
     ),
     "log.csv": Kind(write_table, lambda path: read_logs(ARM, [path])),
     "motion.csv": Kind(
-        lambda path: write_table(path, "setpoint_rate"), lambda path: read_setpoints(ARM, path, timestep=1e-3)
+        lambda path: write_table(path, "setpoint_rate"),
+        lambda path: read_setpoints(ARM, path, timestep=1e-3),
     ),
     "snapshot.npz": Kind(write_run, Snapshot.load),
 }
 
 
-SNIPPETS = [b"", b"nan", b"inf", b"-1", b"1e999", b"0", b'"', b"'", b"{", b"]", b":", b",", b"\n", b"#", b"- a", b"*a"]
-SNIPPETS += [b"\0", b"\xff\xfe", b"9" * 400, b"[" * 2000, b"!!python/object/apply:os.getcwd []", b"<<", b"true"]
-LEAVES = [None, True, -1.0, 0.7, 3, float("nan"), float("inf"), 1e300, 10**400, "", "nan", "other", [], {}, [[1.0]]]
+SNIPPETS = [
+    b"",
+    b"nan",
+    b"inf",
+    b"-1",
+    b"1e999",
+    b"0",
+    b'"',
+    b"'",
+    b"{",
+    b"]",
+    b":",
+    b",",
+    b"\n",
+    b"#",
+    b"- a",
+    b"*a",
+]
+SNIPPETS += [
+    b"\0",
+    b"\xff\xfe",
+    b"9" * 400,
+    b"[" * 2000,
+    b"!!python/object/apply:os.getcwd []",
+    b"<<",
+    b"true",
+]
+LEAVES = [
+    None,
+    True,
+    -1.0,
+    0.7,
+    3,
+    float("nan"),
+    float("inf"),
+    1e300,
+    10**400,
+    "",
+    "nan",
+    "other",
+    [],
+    {},
+    [[1.0]],
+]
 CELLS = ["", "nan", "inf", "-5", "0.123", "1e999", "x", "1 rad", '"', "time"]
 NUMBERS = [np.nan, np.inf, -np.inf, 0.0, 0.123, 1e38, -1.0, 2.0**31 - 1]
 
@@ -108,7 +162,11 @@ def decoded(suffix: str, content: bytes) -> Any:
         with np.load(io.BytesIO(content)) as file:
             return dict(file)
     if suffix == ".csv":
-        lines = [line for line in content.decode().splitlines() if line.strip() and not line.lstrip().startswith("#")]
+        lines = [
+            line
+            for line in content.decode().splitlines()
+            if line.strip() and not line.lstrip().startswith("#")
+        ]
         return [[_number(cell.strip()) for cell in line.split(",")] for line in lines]
     return yaml.safe_load(content) if suffix == ".yaml" else json.loads(content)
 
@@ -127,17 +185,29 @@ def encoded(suffix: str, tree: Any) -> bytes:
         return file.getvalue()
     if suffix == ".csv":
         return "\n".join(",".join(map(str, row)) for row in tree).encode()
-    return (yaml.safe_dump(tree, sort_keys=False) if suffix == ".yaml" else json.dumps(tree)).encode()
+    return (
+        yaml.safe_dump(tree, sort_keys=False) if suffix == ".yaml" else json.dumps(tree)
+    ).encode()
 
 
 @st.composite
 def changed_bytes(draw: st.DrawFn, content: bytes) -> bytes:
-    """Draw a copy of the content with a flipped bit, or a part replaced, repeated, removed or cut off."""
+    """Draw a copy of the content with a flipped bit, or a part replaced, repeated, removed or cut
+    off.
+    """
     start, length = draw(st.integers(0, len(content) - 1)), draw(st.integers(0, 30))
-    before, part, after = content[:start], content[start : start + length], content[start + length :]
+    before, part, after = (
+        content[:start],
+        content[start : start + length],
+        content[start + length :],
+    )
     match draw(st.sampled_from(["flip", "replace", "repeat", "remove", "cut"])):
         case "flip":
-            return before + bytes([content[start] ^ 1 << draw(st.integers(0, 7))]) + content[start + 1 :]
+            return (
+                before
+                + bytes([content[start] ^ 1 << draw(st.integers(0, 7))])
+                + content[start + 1 :]
+            )
         case "replace":
             return before + draw(st.sampled_from(SNIPPETS)) + after
         case "repeat":
@@ -156,7 +226,9 @@ def cast(value: Any, dtype: Any) -> Any:
 def holds(part: Any, whole: Any) -> bool:
     """Return whether ``part`` equals ``whole`` except for missing keys."""
     if isinstance(part, dict) and isinstance(whole, dict):
-        return part.keys() <= whole.keys() and all(holds(each, whole[key]) for key, each in part.items())
+        return part.keys() <= whole.keys() and all(
+            holds(each, whole[key]) for key, each in part.items()
+        )
     if isinstance(part, list) and isinstance(whole, list):
         return len(part) == len(whole) and all(map(holds, part, whole))
     return bool(part == whole)
@@ -169,11 +241,18 @@ def changed_tree(draw: st.DrawFn, tree: Any, leaves: list) -> Any:
         match draw(st.sampled_from(["entry", "dtype", "shorter", "longer"])):
             case "entry":
                 changed = tree.copy()
-                changed.flat[draw(st.integers(0, tree.size - 1))] = cast(draw(st.sampled_from(NUMBERS)), tree.dtype)
+                changed.flat[draw(st.integers(0, tree.size - 1))] = cast(
+                    draw(st.sampled_from(NUMBERS)), tree.dtype
+                )
                 return changed
             case "dtype":
                 return cast(
-                    tree, "U2" if tree.dtype.kind == "U" else draw(st.sampled_from(["f8", "f4", "i8", "?", "U4"]))
+                    tree,
+                    (
+                        "U2"
+                        if tree.dtype.kind == "U"
+                        else draw(st.sampled_from(["f8", "f4", "i8", "?", "U4"]))
+                    ),
                 )
             case "shorter":
                 return tree.reshape(-1)[: draw(st.integers(0, tree.size - 1))]
@@ -205,26 +284,35 @@ def good(request, tmp_path):
 
 
 def repeats(here: list, there: list) -> bool:
-    """Return whether a table is another one with rows repeated, which a log leaves out with a warning."""
+    """Return whether a table is another one with rows repeated, which a log leaves out with a
+    warning.
+    """
     return [row for at, row in enumerate(here) if at == 0 or row != here[at - 1]] == there
 
 
 def check(good, content: bytes) -> None:
-    """Check that a file with ``content`` is refused with its name in the error, or read with the right value."""
+    """Check that a file with ``content`` is refused with its name in the error, or read with the
+    right value.
+    """
     kind, path, original, value = good
     is_binary = path.suffix == ".npz"
     path.write_bytes(content)
     try:
         here, there = (plain(decoded(path.suffix, each)) for each in (content, original))
-        same, may_be = here == there, holds(here, there) or (path.suffix == ".csv" and repeats(here, there))
-    except Exception:  # no tree: a text file must be refused, and a binary file may have the original's value
+        same, may_be = (
+            here == there,
+            holds(here, there) or (path.suffix == ".csv" and repeats(here, there)),
+        )
+    except (
+        Exception
+    ):  # no tree: a text file must be refused, and a binary file may have the original's value
         same, may_be = is_binary, is_binary
     try:
         found = plain(kind.read(path))
     except BatchPIDError as error:
         assert path.name in str(error)  # noqa: PT017
     except FileNotFoundError as error:
-        assert error.filename not in (None, str(path))  # noqa: PT017  # of another file, whose name is in this one
+        assert error.filename not in (None, str(path))  # of another file, whose name is in this one  # noqa: PT017
     else:
         assert same or found != value or may_be
         assert found == value or not same

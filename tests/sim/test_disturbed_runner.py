@@ -32,7 +32,9 @@ DISTURBANCES = ("none", "none", "kill", "kill all", "stop", "ctrl-c")
 
 
 def make(workers: int, **options: Any) -> Runner:
-    return Runner(ROBOT, N, workers=workers, params=ROBOT.params(), substeps=SUBSTEPS, timeout=3.0, **options)
+    return Runner(
+        ROBOT, N, workers=workers, params=ROBOT.params(), substeps=SUBSTEPS, timeout=3.0, **options
+    )
 
 
 def exchange(runner: Runner, setpoints: Any) -> Any:
@@ -52,7 +54,9 @@ def go_back(runner: Runner, setpoints: Any) -> Any:
 
 
 COMMANDS: dict[str, Callable[[Runner, Any], Any]] = {
-    "step": lambda runner, setpoints: runner.step(setpoints[0], feedforward=setpoints[1], substeps=7),
+    "step": lambda runner, setpoints: runner.step(
+        setpoints[0], feedforward=setpoints[1], substeps=7
+    ),
     "exchange": exchange,
     "rollout": lambda runner, setpoints: runner.rollout(setpoints).observation,
     "reset": lambda runner, setpoints: runner.reset(NEAR, mask=setpoints[0, :, 0] > 0),
@@ -74,14 +78,21 @@ def later(seconds: float, act: Callable[[], object]):
         timer.join()
 
 
-def run_interrupted(runner: Runner, model: Runner, command: Callable[[Runner], Any], seconds: float) -> None:
+def run_interrupted(
+    runner: Runner, model: Runner, command: Callable[[Runner], Any], seconds: float
+) -> None:
     """Run a command under Ctrl-C: afterwards it is done, or nothing has changed."""
     before, copy = runner.snapshot(), model.snapshot()
-    with contextlib.suppress(KeyboardInterrupt), later(seconds, partial(os.kill, os.getpid(), signal.SIGINT)):
+    with (
+        contextlib.suppress(KeyboardInterrupt),
+        later(seconds, partial(os.kill, os.getpid(), signal.SIGINT)),
+    ):
         command(runner)
     expected = command(model)
     seen = runner.observe()
-    is_done = np.array_equal(seen.qpos, expected.qpos) and np.array_equal(runner.params.kp, model.params.kp)
+    is_done = np.array_equal(seen.qpos, expected.qpos) and np.array_equal(
+        runner.params.kp, model.params.kp
+    )
     if not is_done:
         assert runner.time == before.steps * runner.timestep
         runner.restore(before)
@@ -90,7 +101,9 @@ def run_interrupted(runner: Runner, model: Runner, command: Callable[[Runner], A
 
 
 def run_program(seed: int, length: int, engine: Any) -> None:
-    """Run random commands, each of them disturbed or not, and compare with a runner in this process."""
+    """Run random commands, each of them disturbed or not, and compare with a runner in this
+    process.
+    """
     chance, draw = random.Random(seed), np.random.default_rng(seed)
     with make(2, engine=engine) as runner, make(0, engine=engine) as model:
         pids = {*runner.pids}
@@ -108,7 +121,9 @@ def run_program(seed: int, length: int, engine: Any) -> None:
                 continue
             number = signal.SIGSTOP if kind == "stop" else signal.SIGKILL
             lost = runner.pids if kind == "kill all" else (chance.choice(runner.pids),)
-            act = (lambda: None) if kind == "none" else (lambda: [send(pid, number) for pid in lost])  # noqa: B023
+            act = (
+                (lambda: None) if kind == "none" else (lambda: [send(pid, number) for pid in lost])  # noqa: B023
+            )
             with later(seconds, act):
                 seen = command(runner)
             assert_identical(command(model), seen)
@@ -126,7 +141,9 @@ def count_open() -> tuple[int, int]:
 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.RecoveryWarning")
-@pytest.mark.parametrize("seed", [0, *[pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, PROGRAMS)]])
+@pytest.mark.parametrize(
+    "seed", [0, *[pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, PROGRAMS)]]
+)
 def test_commands_in_any_order_under_disturbances(seed, monkeypatch):
     monkeypatch.setattr("batchpid.sim.runner.CHECKPOINT_STEPS", 40)
     before = count_open()
@@ -159,7 +176,10 @@ def test_a_lost_worker_is_named_and_the_others_stay():
     with make(2) as runner:
         lost, other = runner.pids
         send(lost, signal.SIGKILL)
-        with pytest.warns(RecoveryWarning, match=rf"worker 0 \(pid {lost}, envs 0 to 1\) died \(Killed\); replaced"):
+        with pytest.warns(
+            RecoveryWarning,
+            match=rf"worker 0 \(pid {lost}, envs 0 to 1\) died \(Killed\); replaced",
+        ):
             runner.step(NEAR)
         assert runner.recoveries == 1
         assert runner.pids[1] == other

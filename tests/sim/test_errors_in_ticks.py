@@ -1,4 +1,6 @@
-"""An error in the middle of a tick closes the runner: the same error, time and recording for any number of workers."""
+"""An error in the middle of a tick closes the runner: the same error, time and recording for any
+number of workers.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ MARKS = np.repeat(np.arange(float(ENVS))[:, None], ROBOT.dof, 1)
 
 
 class FailsLater:
-    """Controller that fails in some envs, each at a sim step; an env knows its number by its setpoint."""
+    """Controller that fails in some envs, each at a sim step; an env knows its number by its
+    setpoint.
+    """
 
     def __init__(self, failures, kind="raises"):
         self.failures, self.kind = failures, kind
@@ -70,7 +74,9 @@ def run(runner, way):
 
 def outcome(workers, controller, *, kill=False, way="rollout", **options):
     """Return the error of a run, and the remaining state of the runner."""
-    with Runner(ROBOT, ENVS, workers=workers, control=controller, substeps=SUBSTEPS, timeout=20.0, **options) as runner:
+    with Runner(
+        ROBOT, ENVS, workers=workers, control=controller, substeps=SUBSTEPS, timeout=20.0, **options
+    ) as runner:
         recorder = runner.recorder = ListRecorder()
         if kill and workers:
             runner.step(MARKS)
@@ -98,7 +104,11 @@ def assert_same(first, second):
 @settings(max_examples=2, deadline=None)
 @given(
     workers=st.sampled_from([1, 2]),
-    failures=st.lists(st.tuples(st.integers(0, ENVS - 1), st.integers(1, SUBSTEPS * TICKS)), min_size=1, max_size=3),
+    failures=st.lists(
+        st.tuples(st.integers(0, ENVS - 1), st.integers(1, SUBSTEPS * TICKS)),
+        min_size=1,
+        max_size=3,
+    ),
     kind=st.sampled_from(["raises", "raises an error of ours", "wrong shape", "no pair"]),
     way=st.sampled_from(["rollout", "step", "send"]),
 )
@@ -109,7 +119,9 @@ def test_any_number_of_workers_ends_in_the_same_error_and_state(workers, failure
     first = min(step for _, step in failures)
     assert one[0] is ControllerError
     assert f"in sim step {first} (" in one[1]
-    assert one[2] == pytest.approx((first - 1) // SUBSTEPS * SUBSTEPS / 2000)  # the whole ticks before
+    assert one[2] == pytest.approx(
+        (first - 1) // SUBSTEPS * SUBSTEPS / 2000
+    )  # the whole ticks before
     assert len(one[4]) == (first - 1) // SUBSTEPS
 
 
@@ -123,7 +135,10 @@ def test_a_lost_worker_does_not_change_the_error():
 @pytest.mark.parametrize("workers", [0, 1])
 def test_the_controllers_own_traceback_is_shown(workers):
     runner = Runner(ROBOT, 2, workers=workers, control=FailsLater([(1, 3)]), substeps=SUBSTEPS)
-    with runner, pytest.raises(ControllerError, match="FailsLater raised ZeroDivisionError: mark 1") as info:
+    with (
+        runner,
+        pytest.raises(ControllerError, match="FailsLater raised ZeroDivisionError: mark 1") as info,
+    ):
         runner.step(MARKS[:2])
     error = info.value
     assert isinstance(error, InvalidArgumentError)

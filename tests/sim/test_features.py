@@ -1,4 +1,6 @@
-"""Each feature of a robot with each control and engine: it reaches its goal, or is refused by name."""
+"""Each feature of a robot with each control and engine: it reaches its goal, or is refused by
+name.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,11 @@ from batchpid.sim.tuning import tune
 from batchpid.trajectories import minimum_jerk
 from tests.c_programs import COMPILERS, TABLE, compiled
 
-PAIRS = [pair for pair in itertools.combinations(FEATURES, 2) if not joints_of(pair[0]) & joints_of(pair[1])]
+PAIRS = [
+    pair
+    for pair in itertools.combinations(FEATURES, 2)
+    if not joints_of(pair[0]) & joints_of(pair[1])
+]
 CONTROLS = ["pid", "drive", "osc"]
 REFUSED = {"floating base": {"osc"}}
 """Controls that refuse a feature; all others have to reach their goal."""
@@ -70,14 +76,18 @@ def check(features: tuple[str, ...], command: str, engine: str) -> None:
 
 
 def in_both_engines(*names):
-    """Return rows of a parametrized test with an engine each: of the two rows of a case one is quick."""
+    """Return rows of a parametrized test with an engine each: of the two rows of a case one is
+    quick.
+    """
     for number, name in enumerate(names):
         for engine in ("sapien", "mujoco"):
             is_quick = (number % 2 == 0) == (engine == "sapien")
             yield pytest.param(name, engine, marks=() if is_quick else pytest.mark.slow)
 
 
-@pytest.mark.parametrize(("case", "engine"), [*in_both_engines(*itertools.product(FEATURES, CONTROLS))], ids=str)
+@pytest.mark.parametrize(
+    ("case", "engine"), [*in_both_engines(*itertools.product(FEATURES, CONTROLS))], ids=str
+)
 def test_every_feature_reaches_its_goal_under_every_control_or_is_refused(case, engine):
     feature, command = case
     check((feature,), command, engine)
@@ -86,12 +96,16 @@ def test_every_feature_reaches_its_goal_under_every_control_or_is_refused(case, 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 @pytest.mark.parametrize(("features", "command"), list(itertools.product(PAIRS, CONTROLS)), ids=str)
-def test_every_pair_of_features_reaches_its_goal_under_every_control_or_is_refused(features, command, engine):
+def test_every_pair_of_features_reaches_its_goal_under_every_control_or_is_refused(
+    features, command, engine
+):
     check(features, command, engine)
 
 
 @pytest.mark.parametrize("native", ["0", "1"])
-@pytest.mark.parametrize("feature", [feature for feature, given in FEATURES.items() if "mimics" in given])
+@pytest.mark.parametrize(
+    "feature", [feature for feature, given in FEATURES.items() if "mimics" in given]
+)
 def test_kinematics_and_dynamics_are_those_of_the_leaders(feature, native, monkeypatch):
     monkeypatch.setenv("BATCHPID_NATIVE", native)
     robot = robot_with(feature)
@@ -107,7 +121,11 @@ def test_kinematics_and_dynamics_are_those_of_the_leaders(feature, native, monke
     effort = ts.inverse_dynamics(tree, qpos, qvel, qacc)
     close(effort[:, own], ts.inverse_dynamics(free, qpos, qvel, qacc) @ g)
     close(ts.forward_dynamics(tree, qpos, qvel, effort), qacc)
-    for unused in (ts.jacobian(tree, qpos, "l8")[..., ~own], ts.bias(tree, qpos, qvel)[:, ~own], effort[:, ~own]):
+    for unused in (
+        ts.jacobian(tree, qpos, "l8")[..., ~own],
+        ts.bias(tree, qpos, qvel)[:, ~own],
+        effort[:, ~own],
+    ):
         assert not unused.any()
     goal = ts.link_poses(tree, qpos, ["l8"])[:, 0]
     found = ts.inverse_kinematics(tree, "l8", goal, robot.coupled(qpos + 0.1))
@@ -125,7 +143,9 @@ def test_every_feature_is_followed_along_a_trajectory(feature, engine):
         seen = runner.rollout(move.position, setpoint_rates=move.velocity)
     left = seen.qpos[:, 0] - move.position
     left = np.where(robot.continuous, left - 2 * np.pi * np.rint(left / (2 * np.pi)), left)
-    assert np.abs(left[:, robot.independent]).max() < (1e-3 if robot.fixed_base else 0.03)  # a free base moves away
+    assert np.abs(left[:, robot.independent]).max() < (
+        1e-3 if robot.fixed_base else 0.03
+    )  # a free base moves away
 
 
 @pytest.mark.parametrize(("feature", "engine"), [*in_both_engines(*FEATURES)])
@@ -134,7 +154,9 @@ def test_every_feature_reaches_its_goal_by_efforts(feature, engine):
     robot = robot_with(feature)
     start, goal = poses(robot)
     pid = bp.BatchPID(robot.designed("effort").replace(measurement_rate="difference"), 1, 1 / 2000)
-    with Runner(robot, 1, workers=0, engine=engine, ground=False, control="effort", substeps=1) as runner:
+    with Runner(
+        robot, 1, workers=0, engine=engine, ground=False, control="effort", substeps=1
+    ) as runner:
         seen = runner.reset(start)
         pid.reset(seen.qpos.astype(float))
         for _ in range(3000):
@@ -154,10 +176,15 @@ def test_every_feature_is_in_an_exported_description(feature, kind, tmp_path):
     path.write_text(exported.text)
     other = Robot.load(path, fixed_base=robot.fixed_base)
     assert other.joint_names == robot.joint_names
-    assert (other.fixed_base, tuple(other.continuous)) == (robot.fixed_base, tuple(robot.continuous))
+    assert (other.fixed_base, tuple(other.continuous)) == (
+        robot.fixed_base,
+        tuple(robot.continuous),
+    )
     qpos = robot.coupled(np.random.default_rng(0).normal(size=(4, robot.dof)))
     np.testing.assert_allclose(other.coupled(qpos), qpos, atol=1e-6)
-    np.testing.assert_allclose(other.mass_matrix(qpos), robot.mass_matrix(qpos), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        other.mass_matrix(qpos), robot.mass_matrix(qpos), rtol=1e-5, atol=1e-6
+    )
 
 
 @pytest.mark.slow
@@ -211,7 +238,9 @@ def test_every_feature_is_in_the_dynamics_of_the_c_header(feature, tmp_path):
     qpos, qvel = robot.coupled(rng.normal(size=(4, n))), rng.normal(size=(4, n))
     try:
         tree = robot.kinematic_tree()
-        header = to_c(robot.params(kp=1.0), 1 / 2000, joint_names=robot.joint_names, prefix="arm", tree=tree)
+        header = to_c(
+            robot.params(kp=1.0), 1 / 2000, joint_names=robot.joint_names, prefix="arm", tree=tree
+        )
     except BatchPIDError:
         if feature != "floating base":
             raise
@@ -219,7 +248,13 @@ def test_every_feature_is_in_the_dynamics_of_the_c_header(feature, tmp_path):
     assert feature != "floating base"
     (tmp_path / "arm.h").write_text(header.text)
     binary = compiled(tmp_path, TABLE.format(n=n, t="double"), "-std=c99", "-O1")
-    ran = subprocess.run([binary], input=np.hstack([qpos, qvel]).tobytes(), capture_output=True, check=True)
+    ran = subprocess.run(
+        [binary], input=np.hstack([qpos, qvel]).tobytes(), capture_output=True, check=True
+    )
     found = np.frombuffer(ran.stdout).reshape(4, -1)
-    expected = ts.mass_matrix(tree, qpos).reshape(4, -1), ts.bias(tree, qpos, qvel), ts.gravity(tree, qpos)
+    expected = (
+        ts.mass_matrix(tree, qpos).reshape(4, -1),
+        ts.bias(tree, qpos, qvel),
+        ts.gravity(tree, qpos),
+    )
     np.testing.assert_allclose(found, np.hstack(expected), rtol=1e-9, atol=1e-9)

@@ -1,4 +1,6 @@
-"""Robots with a floating base: its pose and twist in observations, resets, recordings and snapshots."""
+"""Robots with a floating base: its pose and twist in observations, resets, recordings and
+snapshots.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def engine(request):
 def test_it_starts_on_the_ground_and_stands(quadruped, engine):
     with Runner(quadruped, 2, params=quadruped.params(**GAINS), workers=0, engine=engine) as runner:
         start = runner.observe()
-        np.testing.assert_allclose(start.base_pose, np.tile([0, 0, 0.35, 1, 0, 0, 0], (2, 1)), atol=1e-6)
+        np.testing.assert_allclose(
+            start.base_pose, np.tile([0, 0, 0.35, 1, 0, 0, 0], (2, 1)), atol=1e-6
+        )
         rollout = runner.rollout(np.tile(quadruped.start, (50, 1)))
     weight = (10.0 + 4 * 0.3) * GRAVITY
     pressed = -rollout.effort[-1] + 0.3 * GRAVITY  # of each leg on the ground
@@ -71,14 +75,24 @@ def test_a_pose_of_the_legs_sets_the_height(quadruped, engine):
         found = runner.reset(base_pose=given).base_pose
         np.testing.assert_allclose(found[:, 3:], [[1, 0, 0, 0], [0, 0, 0, -1]], atol=1e-6)
         np.testing.assert_allclose(found[:, :3], given[:, :3], atol=1e-6)
-    with Runner(quadruped, 1, params=quadruped.params(**GAINS), workers=0, engine=engine, ground=False) as runner:
+    with Runner(
+        quadruped, 1, params=quadruped.params(**GAINS), workers=0, engine=engine, ground=False
+    ) as runner:
         np.testing.assert_allclose(runner.observe().base_pose[0, :3], 0, atol=1e-7)
 
 
 def test_the_twist_is_that_of_the_root_link_in_the_world(quadruped, engine):
-    """In free flight its center of mass moves on a parabola; the origin of the trunk turns about it."""
+    """In free flight its center of mass moves on a parabola; the origin of the trunk turns about
+    it.
+    """
     pose, twist = [0, 0, 0, 0.8, 0.6, 0, 0], [1.0, 0, 0, 2.0, 4.0, 8.0]
-    options = {"workers": 0, "engine": engine, "compensate": "none", "substeps": 1, "control": "effort"}
+    options = {
+        "workers": 0,
+        "engine": engine,
+        "compensate": "none",
+        "substeps": 1,
+        "control": "effort",
+    }
     options["ground"] = False
     with Runner(quadruped, 1, **options) as runner:
         begin = runner.reset(base_pose=pose, base_twist=twist)
@@ -97,7 +111,12 @@ def test_the_twist_is_that_of_the_root_link_in_the_world(quadruped, engine):
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 def test_an_env_that_fails_is_placed_where_it_began(quadruped, engine):
-    options = {"params": quadruped.params(**GAINS), "workers": 0, "engine": engine, "on_invalid_input": "contain"}
+    options = {
+        "params": quadruped.params(**GAINS),
+        "workers": 0,
+        "engine": engine,
+        "on_invalid_input": "contain",
+    }
     with Runner(quadruped, 2, on_fault="reset", **options) as runner:
         runner.reset(base_pose=[0, 0, 0.36, 1, 0, 0, 0])
         bad = np.tile(quadruped.start, (2, 1))
@@ -120,9 +139,20 @@ class Counted(Uniform):
 
 
 def test_a_push_changes_the_twist_of_the_base_at_a_tick(quadruped, engine):
-    push = {"vx": Uniform(0.5, 1.0), "vy": Uniform(-1, 1), "wx": Uniform(2, 3), "wz": Uniform(-2, 2)}
+    push = {
+        "vx": Uniform(0.5, 1.0),
+        "vy": Uniform(-1, 1),
+        "wx": Uniform(2, 3),
+        "wz": Uniform(-2, 2),
+    }
     randomization = Randomization(push=push, push_interval=Counted(0.055, 0.055))
-    options = {"control": "effort", "compensate": "none", "workers": 0, "ground": False, "engine": engine}
+    options = {
+        "control": "effort",
+        "compensate": "none",
+        "workers": 0,
+        "ground": False,
+        "engine": engine,
+    }
     with Runner(quadruped, 2, randomization=randomization, **options) as runner:
         runner.reset(base_pose=[0, 0, 0, 0.9, 0.1, 0.3, 0.2])
         still = runner.rollout(np.zeros((6, 4)))
@@ -133,11 +163,15 @@ def test_a_push_changes_the_twist_of_the_base_at_a_tick(quadruped, engine):
         assert (after[:, 0] - before[:, 0] > 0.49).all()
         assert (after[:, 3] > 1.9).all()
         assert np.ptp(after[:, 0]) > 1e-3
-        assert np.abs(runner.rollout(np.zeros((4, 4))).base_twist[-1, :, 0] - after[:, 0]).max() < 0.2
+        assert (
+            np.abs(runner.rollout(np.zeros((4, 4))).base_twist[-1, :, 0] - after[:, 0]).max() < 0.2
+        )
 
 
 def test_a_block_slides_down_a_slope_as_it_should(tmp_path, engine):
-    """Tilted gravity makes a slope: the acceleration is g (sin a - mu cos a), the force of friction mu m g cos a."""
+    """Tilted gravity makes a slope: the acceleration is g (sin a - mu cos a), the force of friction
+    mu m g cos a.
+    """
     path = tmp_path / "block.urdf"
     path.write_text(BLOCK)
     block = Robot.load(path, fixed_base=False)
@@ -147,15 +181,23 @@ def test_a_block_slides_down_a_slope_as_it_should(tmp_path, engine):
         gravity={axis: Uniform(value, value) for axis, value in down.items()},
         ground_friction=Uniform(friction, friction, operation="abs"),
     )
-    options = {"params": block.params(kp=200, ki=0, kd=5), "randomization": world, "contacts": ["block"]}
+    options = {
+        "params": block.params(kp=200, ki=0, kd=5),
+        "randomization": world,
+        "contacts": ["block"],
+    }
     with Runner(block, 1, workers=0, engine=engine, **options) as runner:
         slide = runner.rollout(np.tile(block.start, (60, 1)))
     speeds = slide.base_twist[20:, 0, 0].astype(float)
     found = (speeds[-1] - speeds[0]) / (slide.time[-1] - slide.time[20])
-    np.testing.assert_allclose(found, GRAVITY * (np.sin(angle) - friction * np.cos(angle)), rtol=0.01)
+    np.testing.assert_allclose(
+        found, GRAVITY * (np.sin(angle) - friction * np.cos(angle)), rtol=0.01
+    )
     normal = 2.1 * GRAVITY * np.cos(angle)
     np.testing.assert_allclose(
-        slide.contact_force[30:, 0].mean((0, 1)), [-friction * normal, 0, normal], atol=0.01 * normal
+        slide.contact_force[30:, 0].mean((0, 1)),
+        [-friction * normal, 0, normal],
+        atol=0.01 * normal,
     )
 
 
@@ -170,9 +212,16 @@ BLOCK = """<robot name="block">
 
 
 def test_gravity_is_compensated_as_if_the_base_were_held(quadruped, engine):
-    """Each leg is carried by its own effort, however the trunk stands; Coriolis forces of a turning base included."""
+    """Each leg is carried by its own effort, however the trunk stands; Coriolis forces of a turning
+    base included.
+    """
     with Runner(
-        quadruped, 1, params=quadruped.params(kp=0, ki=0, kd=0), workers=0, engine=engine, ground=False
+        quadruped,
+        1,
+        params=quadruped.params(kp=0, ki=0, kd=0),
+        workers=0,
+        engine=engine,
+        ground=False,
     ) as runner:
         for pose in ([0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 1, 0, 0], [0, 0, 0, 0.8, 0.6, 0, 0]):
             runner.reset(base_pose=pose)
@@ -220,7 +269,10 @@ def test_designed_gains_carry_the_base(tmp_path, engine):
 @pytest.mark.parametrize("kind", ["floating", "planar"])
 def test_a_free_joint_at_the_root_makes_a_floating_base(tmp_path, kind):
     path = tmp_path / "table.urdf"
-    free = f'<link name="world"/><joint name="free" type="{kind}"><parent link="world"/><child link="trunk"/></joint>'
+    free = (
+        f'<link name="world"/><joint name="free" type="{kind}"><parent link="world"/><child'
+        ' link="trunk"/></joint>'
+    )
     path.write_text(TABLE.replace("</robot>", free + "</robot>"))
     table, held = Robot.load(path), Robot.load(path, fixed_base=True)
     assert (table.fixed_base, held.fixed_base) == (False, True)
@@ -230,8 +282,12 @@ def test_a_free_joint_at_the_root_makes_a_floating_base(tmp_path, kind):
     assert "joint-type" in {each.code for each in held.check()}
     assert ("joint-type" in {each.code for each in table.check()}) == (kind == "planar")
     origin = '<origin xyz="1 2 .7" rpy="0 0 1.5707963"/>'
-    path.write_text(path.read_text().replace('<child link="trunk"/>', f'<child link="trunk"/>{origin}'))
-    with Runner(Robot.load(path), 1, params=table.params(**GAINS), workers=0, engine="mujoco") as runner:
+    path.write_text(
+        path.read_text().replace('<child link="trunk"/>', f'<child link="trunk"/>{origin}')
+    )
+    with Runner(
+        Robot.load(path), 1, params=table.params(**GAINS), workers=0, engine="mujoco"
+    ) as runner:
         pose = runner.observe().base_pose[0]
     np.testing.assert_allclose(pose, [1, 2, 0.7, np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-6)
 

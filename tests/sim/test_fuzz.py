@@ -1,4 +1,6 @@
-"""Public entry points with invalid arguments raise an error of the project that names the argument."""
+"""Public entry points with invalid arguments raise an error of the project that names the
+argument.
+"""
 
 from __future__ import annotations
 
@@ -41,11 +43,59 @@ class Odd:
 
 
 NUMBERS = [0, 1, -1, 2, 10**9, -(10**9), 10**400, 0.0, -0.0, 0.5, -1.5, 1e-308, 1e300, -1e300]
-NUMBERS += [*map(float, ("nan", "inf", "-inf")), np.float32(3), np.int8(-4), np.float64("nan"), np.bool_(True)]
-OTHERS = [None, True, False, "", "panda", "pid", "x" * 1000, b"bytes", "1.5", "nan", (), [], {}, set(), object(), Odd()]
-OTHERS += [len, int, 1j, range(3), [None], ["a"] * DOF, [[1.0], [1.0, 2.0]], {"kp": 1}, PARAMS, slice(1), ...]
+NUMBERS += [
+    *map(float, ("nan", "inf", "-inf")),
+    np.float32(3),
+    np.int8(-4),
+    np.float64("nan"),
+    np.bool_(True),
+]
+OTHERS = [
+    None,
+    True,
+    False,
+    "",
+    "panda",
+    "pid",
+    "x" * 1000,
+    b"bytes",
+    "1.5",
+    "nan",
+    (),
+    [],
+    {},
+    set(),
+    object(),
+    Odd(),
+]
+OTHERS += [
+    len,
+    int,
+    1j,
+    range(3),
+    [None],
+    ["a"] * DOF,
+    [[1.0], [1.0, 2.0]],
+    {"kp": 1},
+    PARAMS,
+    slice(1),
+    ...,
+]
 OTHERS += [NotImplemented]
-SHAPES = [(), (0,), (1,), (DOF,), (DOF + 1,), (N, DOF), (DOF, N), (N, 1), (1, DOF), (0, DOF), (N, 0), (N + 1, DOF)]
+SHAPES = [
+    (),
+    (0,),
+    (1,),
+    (DOF,),
+    (DOF + 1,),
+    (N, DOF),
+    (DOF, N),
+    (N, 1),
+    (1, DOF),
+    (0, DOF),
+    (N, 0),
+    (N + 1, DOF),
+]
 SHAPES += [(3, N, DOF), (3, DOF), (1, 1, 1), (2, 2, 2, 2), (0, N, DOF), (N,)]
 DTYPES = ["f8", "f4", "f2", "i8", "i1", "u1", "?", "c16", "O", "U3", "M8[s]"]
 
@@ -178,18 +228,31 @@ MEASURED = {
     "feedforward": ARRAY,
 }
 MATRIX = np.eye(DOF)
-BOUND = {"mass_matrix": MATRIX, "kp": 1.0, "kd": 1.0, "dt": 1e-3, "filter_time": 0.0, "damping": 0.0}
+BOUND = {
+    "mass_matrix": MATRIX,
+    "kp": 1.0,
+    "kd": 1.0,
+    "dt": 1e-3,
+    "filter_time": 0.0,
+    "damping": 0.0,
+}
 
 # name: (function, valid arguments)
 ENTRIES: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "make_params": (bp.make_params, GOOD_PARAMS),
-    "BatchPID": (make_controller, {"params": PARAMS, "num_envs": N, "dt": 1e-3, "backend": "numpy"}),
+    "BatchPID": (
+        make_controller,
+        {"params": PARAMS, "num_envs": N, "dt": 1e-3, "backend": "numpy"},
+    ),
     "BatchPID.__call__": (lambda **kwargs: controller("__call__", **kwargs), MEASURED),
     "BatchPID.reset": (
         lambda **kwargs: controller("reset", **kwargs),
         {"measurement": ARRAY, "mask": np.ones(N, bool)},
     ),
-    "BatchPID.track": (lambda **kwargs: controller("track", **kwargs), MEASURED | {"effort": ARRAY}),
+    "BatchPID.track": (
+        lambda **kwargs: controller("track", **kwargs),
+        MEASURED | {"effort": ARRAY},
+    ),
     "stability_bound": (bp.stability_bound, BOUND),
     "spectral_radius": (bp.spectral_radius, BOUND | {"ki": 1.0}),
     "load_params": (load_params, {"path": None, "joint_names": ROBOT.joint_names}),
@@ -207,7 +270,13 @@ ENTRIES: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Robot.designed": (ROBOT.designed, {"gain_units": "effort"}),
     "Robot.check": (
         ROBOT.check,
-        {"params": PARAMS, "qpos": ROBOT.start, "setpoint": ROBOT.start, "timestep": 1e-3, "control": "pid"},
+        {
+            "params": PARAMS,
+            "qpos": ROBOT.start,
+            "setpoint": ROBOT.start,
+            "timestep": 1e-3,
+            "control": "pid",
+        },
     ),
     "Runner": (make_runner, GOOD_RUNNER),
     "Snapshot.load": (Snapshot.load, {"path": "none.npz"}),
@@ -227,7 +296,10 @@ def attempt(data: Any, call: Callable[..., Any], good: dict[str, Any]) -> bool:
 
     If it did not, it has raised an error of the project that names one of the replaced arguments.
     """
-    names = data.draw(st.lists(st.sampled_from(sorted(good)), min_size=1, max_size=2, unique=True), label="replaced")
+    names = data.draw(
+        st.lists(st.sampled_from(sorted(good)), min_size=1, max_size=2, unique=True),
+        label="replaced",
+    )
     bad = {}
     for name in names:
         value = data.draw(anything, label=name)

@@ -49,10 +49,21 @@ MODES += [pytest.param(mode, marks=pytest.mark.slow) for mode in AutoresetMode i
 @pytest.mark.parametrize("actions", ["increment", pytest.param("setpoint", marks=pytest.mark.slow)])
 def test_the_vector_env_is_bit_identical_to_gymnasiums_vector_of_single_envs(mode, actions):
     """Equal observations, rewards, flags and infos through time limits, success and resets."""
-    drawn = Randomization(payload=Uniform(0, 1), qvel=Uniform(-0.1, 0.1), params={"kp": Uniform(-5, 5)})
-    options = {"actions": actions, "terminate_on_success": True, "tolerance": 3.6, "randomization": drawn}
-    ours = gymnasium.make_vec(ID, num_envs=3, workers=0, autoreset_mode=mode, max_episode_steps=4, **options)
-    theirs = SyncVectorEnv([lambda: gymnasium.make(ID, max_episode_steps=4, **options)] * 3, autoreset_mode=mode)
+    drawn = Randomization(
+        payload=Uniform(0, 1), qvel=Uniform(-0.1, 0.1), params={"kp": Uniform(-5, 5)}
+    )
+    options = {
+        "actions": actions,
+        "terminate_on_success": True,
+        "tolerance": 3.6,
+        "randomization": drawn,
+    }
+    ours = gymnasium.make_vec(
+        ID, num_envs=3, workers=0, autoreset_mode=mode, max_episode_steps=4, **options
+    )
+    theirs = SyncVectorEnv(
+        [lambda: gymnasium.make(ID, max_episode_steps=4, **options)] * 3, autoreset_mode=mode
+    )
     assert ours.unwrapped.spec.id == "batchpid/Reach-v0"
     assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
     assert ours.observation_space == theirs.observation_space
@@ -90,7 +101,9 @@ def same(ours, theirs):
         )
 
     assert set(ours[-1]) == set(theirs[-1])
-    return data_equivalence(ours[:-1], theirs[:-1], exact=True) and str(plain(ours[-1])) == str(plain(theirs[-1]))
+    return data_equivalence(ours[:-1], theirs[:-1], exact=True) and str(plain(ours[-1])) == str(
+        plain(theirs[-1])
+    )
 
 
 def test_steps_that_are_begun_and_waited_for_are_bit_identical_to_steps():
@@ -128,7 +141,9 @@ def test_a_failed_env_terminates_with_a_finite_observation_and_begins_again(pand
 def test_gymnasiums_vector_wrappers_wrap_the_vector_env():
     from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
-    env = RecordEpisodeStatistics(NormalizeObservation(gymnasium.make_vec(ID, num_envs=2, max_episode_steps=3)))
+    env = RecordEpisodeStatistics(
+        NormalizeObservation(gymnasium.make_vec(ID, num_envs=2, max_episode_steps=3))
+    )
     env.reset(seed=0)
     for _ in range(3):
         *_, info = env.step(env.action_space.sample())
@@ -156,7 +171,13 @@ def test_closing_a_single_env_closes_its_runner():
 
 
 def test_actions_and_observations_are_those_of_independent_joints(tmp_path):
-    follower = joint("right", "base", "r", inner=LIMIT + '<mimic joint="left" multiplier="-0.5"/>', origin="0 -1 1")
+    follower = joint(
+        "right",
+        "base",
+        "r",
+        inner=LIMIT + '<mimic joint="left" multiplier="-0.5"/>',
+        origin="0 -1 1",
+    )
     parts = link("base"), link("l"), link("r"), follower, joint("left", "base", "l", origin="0 1 1")
     hand = Robot.load(write(tmp_path, robot(*parts)))
     env = ReachVectorEnv(2, hand, workers=0)
@@ -177,16 +198,22 @@ TURNS = np.arange(-3, 4)
 
 @pytest.fixture(scope="module")
 def carousel(tmp_path_factory):
-    """Envs of a robot whose first joint is continuous, whose second cannot move, and whose third has a range."""
+    """Envs of a robot whose first joint is continuous, whose second cannot move, and whose third
+    has a range.
+    """
     still = LIMIT.replace('lower="-1" upper="1"', 'lower="0.5" upper="0.5"')
     joints = (
         joint("turn", "base", "a", "continuous", '<limit effort="50" velocity="9"/>'),
         joint("still", "a", "b", inner=still),
         joint("bend", "b", "c"),
     )
-    path = write(tmp_path_factory.mktemp("carousel"), robot(*map(link, ("base", "a", "b", "c")), *joints))
+    path = write(
+        tmp_path_factory.mktemp("carousel"), robot(*map(link, ("base", "a", "b", "c")), *joints)
+    )
     options = {"actions": "increment", "workers": 0, "collisions": False, "max_increment": 0.05}
-    envs = ReachVectorEnv(len(TURNS), Robot.load(path), max_episode_steps=None, tolerance=0.01, **options)
+    envs = ReachVectorEnv(
+        len(TURNS), Robot.load(path), max_episode_steps=None, tolerance=0.01, **options
+    )
     yield envs
     envs.close()
 
@@ -301,7 +328,9 @@ def test_refused_calls_name_their_argument_and_the_env_goes_on():
 def test_increments_are_followed_closely():
     """After half a second of constant increments, joints are at most 20 ms behind the setpoint."""
     rate = 0.25  # [rad/s]
-    envs = ReachVectorEnv(1, actions="increment", workers=0, collisions=False, max_increment=rate / 50)
+    envs = ReachVectorEnv(
+        1, actions="increment", workers=0, collisions=False, max_increment=rate / 50
+    )
     start = envs.reset(seed=3)[0][0, :7].astype(float)
     action = np.array([[1.0, -1, 1, -1, 1, 1, -1, 0, 0]])
     for _ in range(50):

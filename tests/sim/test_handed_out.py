@@ -46,9 +46,18 @@ def check(value):
 
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory):
-    follower = joint("right", "base", "r", inner=LIMIT + '<mimic joint="left" multiplier="-0.5"/>', origin="0 -1 1")
+    follower = joint(
+        "right",
+        "base",
+        "r",
+        inner=LIMIT + '<mimic joint="left" multiplier="-0.5"/>',
+        origin="0 -1 1",
+    )
     parts = link("base"), link("l"), link("r"), follower, joint("left", "base", "l", origin="0 1 1")
-    return Robot.load(write(tmp_path_factory.mktemp("hand"), robot(*parts)), actuators=bp.make_actuators(2, lag=0.01))
+    return Robot.load(
+        write(tmp_path_factory.mktemp("hand"), robot(*parts)),
+        actuators=bp.make_actuators(2, lag=0.01),
+    )
 
 
 def test_of_a_robot(panda, hand):
@@ -95,7 +104,9 @@ def test_faults_are_immutable(hand):
 
 
 def test_of_a_controller():
-    pid = bp.BatchPID(bp.make_params(2, kp=1.0, ki=1.0, kd=1.0, effort_rate_limit=5.0), 3, 1e-3, terms=True)
+    pid = bp.BatchPID(
+        bp.make_params(2, kp=1.0, ki=1.0, kd=1.0, effort_rate_limit=5.0), 3, 1e-3, terms=True
+    )
     pid(np.ones((3, 2)), np.zeros((3, 2)))
     check(pid)
     with pytest.raises(ValueError, match="read-only"):

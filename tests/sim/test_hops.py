@@ -15,7 +15,9 @@ CALLS, LEVELS = 27, 6
 
 
 def python_calls(act):
-    """Return the number of Python calls of ``act`` in this thread, itself not counted, and the deepest level."""
+    """Return the number of Python calls of ``act`` in this thread, itself not counted, and the
+    deepest level.
+    """
     depths, level = [], 0
 
     def on_event(frame, event, argument):
@@ -35,7 +37,11 @@ def python_calls(act):
 
 
 def test_calls_are_counted():
-    assert python_calls(lambda: np.median(np.zeros(3)))[0] > python_calls(lambda: pytest.approx)[0] == 0
+    assert (
+        python_calls(lambda: np.median(np.zeros(3)))[0]
+        > python_calls(lambda: pytest.approx)[0]
+        == 0
+    )
 
 
 @pytest.mark.parametrize(("shape", "more"), [((64, PANDA.dof), 0), ((PANDA.dof,), 1)])

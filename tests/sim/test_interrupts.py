@@ -43,7 +43,11 @@ def make(workers, *steps):
 @pytest.mark.parametrize("workers", [0, 1])
 def test_ctrl_c_in_a_tick_is_raised_when_it_is_done(workers, tmp_path):
     before = signal.getsignal(signal.SIGINT)
-    with make(workers, SUBSTEPS + 2) as runner, make(0) as model, Recorder(tmp_path / "run.h5", runner) as recorder:
+    with (
+        make(workers, SUBSTEPS + 2) as runner,
+        make(0) as model,
+        Recorder(tmp_path / "run.h5", runner) as recorder,
+    ):
         runner.step(NEAR)
         with pytest.raises(KeyboardInterrupt):
             runner.step(NEAR)
@@ -122,7 +126,9 @@ def test_an_exception_of_another_signal_handler_closes_the_runner():
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, TimeoutError, MemoryError])
 def test_an_exception_within_a_sim_step_reaches_the_caller(error, monkeypatch):
-    """Native code returns to Python for sensors, since Python drops exceptions of functions that C calls."""
+    """Native code returns to Python for sensors, since Python drops exceptions of functions that C
+    calls.
+    """
     pytest.importorskip("sapien")
     from batchpid.sim.engine.sapien.link_sensors import LinkSensors
 
@@ -147,7 +153,9 @@ def test_calls_in_another_thread_leave_ctrl_c_to_the_main_thread():
     seen = []
     with make(0) as runner:
         runner.step(NEAR)
-        thread = threading.Thread(target=lambda: seen.append((runner.step(NEAR), signal.getsignal(signal.SIGINT))))
+        thread = threading.Thread(
+            target=lambda: seen.append((runner.step(NEAR), signal.getsignal(signal.SIGINT)))
+        )
         thread.start()
         thread.join()
     assert seen[0][0].ok.all()

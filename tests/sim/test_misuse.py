@@ -1,4 +1,6 @@
-"""Calls of a runner from the wrong place or moment raise an error that says so, and change nothing."""
+"""Calls of a runner from the wrong place or moment raise an error that says so, and change
+nothing.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def on_alarm():
 
 
 def memory_files():
-    """Return the number of this process's descriptors of memory that it shares with workers, or with itself."""
+    """Return the number of this process's descriptors of memory that it shares with workers, or
+    with itself.
+    """
     links = (os.readlink(path) for path in Path("/proc/self/fd").iterdir() if path.is_symlink())
     return sum(link.startswith("/memfd:batchpid") for link in links)
 
@@ -126,7 +130,9 @@ def test_another_thread_may_close_the_runner(panda):
 
 
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
-@pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning")  # of JAX, which other tests may have loaded
+@pytest.mark.filterwarnings(
+    "ignore:os.fork:RuntimeWarning"
+)  # of JAX, which other tests may have loaded
 def test_a_call_from_a_forked_child_raises(runner, panda):
     before = runner.step(panda.settings.target)
     read, write = os.pipe()

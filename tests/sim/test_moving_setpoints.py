@@ -1,4 +1,6 @@
-"""Trajectories under the default gains: robots follow them with rates, and a warning names rates that are missing."""
+"""Trajectories under the default gains: robots follow them with rates, and a warning names rates
+that are missing.
+"""
 
 from __future__ import annotations
 
@@ -43,12 +45,18 @@ def test_default_gains_follow_a_trajectory(name, engine, gains):
     start, move = moves(robot)
     options = {"engine": engine, "params": robot.designed() if gains == "designed" else None}
     error = {}
-    for kind, given in {"steps": {"rates": False}, "rates": {}, "accelerations": {"accelerations": True}}.items():
+    for kind, given in {
+        "steps": {"rates": False},
+        "rates": {},
+        "accelerations": {"accelerations": True},
+    }.items():
         seen = follow(robot, start, move, **given, **options)
         off = seen.qpos - move.position
         error[kind] = np.abs(off).max()
         way = move.position[-1] - start
-        over = (off[-20:] * np.sign(way)).max(0)[np.abs(way) > 0.05] / np.abs(way[np.abs(way) > 0.05])
+        over = (off[-20:] * np.sign(way)).max(0)[np.abs(way) > 0.05] / np.abs(
+            way[np.abs(way) > 0.05]
+        )
         assert kind == "steps" or over.max() < 0.01
     assert error["steps"] > 0.1
     assert error["rates"] < 0.002
@@ -57,7 +65,9 @@ def test_default_gains_follow_a_trajectory(name, engine, gains):
 
 @QUIET
 def test_accelerations_make_a_short_move_no_worse():
-    """Where the rate is at its largest, the acceleration at the tick's end is far from its mean over the tick."""
+    """Where the rate is at its largest, the acceleration at the tick's end is far from its mean
+    over the tick.
+    """
     panda = load_bundled("panda")
     start, _ = moves(panda, 1)
     target = start - np.repeat([0.05, 0.0], [7, 2])
@@ -94,13 +104,17 @@ def test_every_control_carries_the_setpoint_on(options, engine):
     start, move = moves(panda, seed=1)
     params = {
         None: None,
-        "implicit": panda.designed().replace(discretization="implicit", derivative_filter_time=None),
+        "implicit": (
+            panda.designed().replace(discretization="implicit", derivative_filter_time=None)
+        ),
         "effort": panda.params(kp=300.0, ki=50.0, kd=30.0),
     }[options.get("params")]
     options = {**options, "params": params, "engine": engine}
     ours = follow(panda, start, move, **options)
     lagging = follow(panda, start, move, rates=False, **options)
-    assert np.abs(ours.qpos - move.position).max() < 0.6 * np.abs(lagging.qpos - move.position).max()
+    assert (
+        np.abs(ours.qpos - move.position).max() < 0.6 * np.abs(lagging.qpos - move.position).max()
+    )
 
 
 def test_the_rates_of_increments_have_no_acceleration():
@@ -108,13 +122,17 @@ def test_the_rates_of_increments_have_no_acceleration():
     panda = load_bundled("panda")
     rng = np.random.default_rng(0)
     start = np.tile(panda.settings.target, (N, 1))
-    position = start + np.cumsum(rng.uniform(-0.01, 0.01, (20, N, panda.dof)) * (np.arange(9) < 7), axis=0)
+    position = start + np.cumsum(
+        rng.uniform(-0.01, 0.01, (20, N, panda.dof)) * (np.arange(9) < 7), axis=0
+    )
     rate = np.diff(position, axis=0, prepend=start[None]) / DT
     runs = []
     for acceleration in (None, 0 * rate, 1 + 0 * rate):
         with Runner(panda, N, workers=0, collisions=False) as runner:
             runner.reset(start)
-            runs.append(runner.rollout(position, setpoint_rates=rate, setpoint_accelerations=acceleration))
+            runs.append(
+                runner.rollout(position, setpoint_rates=rate, setpoint_accelerations=acceleration)
+            )
     np.testing.assert_array_equal(runs[0].qpos, runs[1].qpos)
     assert np.abs(runs[2].qpos - runs[0].qpos).max() > 1e-3
 
@@ -126,8 +144,12 @@ def test_a_setpoint_at_rest_with_an_acceleration_gives_its_effort():
     for given in (0 * acceleration, acceleration):
         with Runner(panda, 1, workers=0, collisions=False, substeps=1) as runner:
             runner.reset(start)
-            efforts.append(runner.step(start, setpoint_rate=0 * start, setpoint_acceleration=given).effort[0])
-    np.testing.assert_allclose(np.subtract(*efforts[::-1]), panda.mass_matrix(start)[0] @ acceleration, rtol=0.02)
+            efforts.append(
+                runner.step(start, setpoint_rate=0 * start, setpoint_acceleration=given).effort[0]
+            )
+    np.testing.assert_allclose(
+        np.subtract(*efforts[::-1]), panda.mass_matrix(start)[0] @ acceleration, rtol=0.02
+    )
 
 
 def test_it_warns_once_of_setpoints_that_move_without_rates():
@@ -146,6 +168,9 @@ def test_it_warns_once_of_setpoints_that_move_without_rates():
         (path, np.gradient(path, DT, axis=0), None),
         (path, None, panda.params(kp=300.0, ki=50.0, kd=30.0)),
     ):
-        with Runner(panda, 2, workers=0, params=params, collisions=False) as runner, warnings.catch_warnings():
+        with (
+            Runner(panda, 2, workers=0, params=params, collisions=False) as runner,
+            warnings.catch_warnings(),
+        ):
             warnings.simplefilter("error", MovingSetpointWarning)
             runner.rollout(setpoints, setpoint_rates=rates)

@@ -91,12 +91,16 @@ def test_every_field_of_a_rollout_is_joined_or_has_to_be_the_same(name, rollout)
 
 
 def with_events(rollout):
-    """Return a rollout of 3 envs with a fault in each of the first two ticks, and a redraw in the second and third."""
+    """Return a rollout of 3 envs with a fault in each of the first two ticks, and a redraw in the
+    second and third.
+    """
     time, tick = rollout.time, rollout.tick
     faults = tuple([Fault(env, 2, time[env], "panda_joint1", "setpoint", "hold") for env in (0, 1)])
     redraws = (Redraw(time[1], 2, 2, 1), Redraw(time[2], 1, 1, 1))
     episodes = np.array([[0, 0], [1, 0], [2, 0]])
-    info = dataclasses.replace(rollout.info, faults=faults, redraws=redraws, draws={}, episodes=episodes)
+    info = dataclasses.replace(
+        rollout.info, faults=faults, redraws=redraws, draws={}, episodes=episodes
+    )
     return dataclasses.replace(rollout, info=info, feedforward=np.full(rollout.qpos.shape, tick))
 
 
@@ -107,7 +111,9 @@ def test_events_of_some_envs_have_their_new_numbers(rollout):
     assert [redraw.env for redraw in part.info.redraws] == [0, 1]
     assert part.feedforward.shape == part.qpos.shape
     assert rollout.for_envs(slice(0, 1)).info.redraws == ()
-    assert [fault.env for fault in rollout.for_envs(np.array([False, True, True])).info.faults] == [0]
+    assert [fault.env for fault in rollout.for_envs(np.array([False, True, True])).info.faults] == [
+        0
+    ]
 
 
 def test_some_ticks_begin_where_those_before_have_ended(rollout):

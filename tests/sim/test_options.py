@@ -19,7 +19,14 @@ from robots import load_bundled
 
 import batchpid as bp
 from batchpid.errors import MissingDependencyError
-from batchpid.sim import RunInfo, Runner, RunnerKeywords, RunnerOptions, read_recording, write_recording
+from batchpid.sim import (
+    RunInfo,
+    Runner,
+    RunnerKeywords,
+    RunnerOptions,
+    read_recording,
+    write_recording,
+)
 from batchpid.sim.cli import parse
 from batchpid.sim.engine.protocol import SceneSpec
 
@@ -39,22 +46,35 @@ def test_every_keyword_is_an_option_and_is_shown_with_its_default():
 
 def test_a_missing_jax_is_named_with_its_extra_before_a_worker_starts(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax", None)
-    with pytest.raises(MissingDependencyError, match=r"backend='jax' needs the package 'jax'.*batchpid\[jax\]"):
+    with pytest.raises(
+        MissingDependencyError, match=r"backend='jax' needs the package 'jax'.*batchpid\[jax\]"
+    ):
         Runner(PANDA, 1, backend="jax")
 
 
 def test_a_flag_of_an_option_has_its_default_and_reaches_the_runner():
     given = parse(["rollout"]).runner.options()
     flags = {each.name: each.default for each in fields(RunnerKeywords) if DECLARED[each.name].flag}
-    assert given == {name: value for name, value in flags.items() if name != "ground"}, "on or off, or neither"
+    assert given == {name: value for name, value in flags.items() if name != "ground"}, (
+        "on or off, or neither"
+    )
     words = ["--no-collisions", "--ground", "off", "--workers", "2", "--backend", "jax"]
     given = parse(["rollout", *words]).runner.options()
-    assert (given["collisions"], given["ground"], given["workers"], given["backend"]) == (False, False, 2, "jax")
+    assert (given["collisions"], given["ground"], given["workers"], given["backend"]) == (
+        False,
+        False,
+        2,
+        "jax",
+    )
 
 
 def test_every_option_is_documented_where_it_is_declared():
     body = ast.parse(inspect.getsource(RunnerKeywords)).body[0].body
-    pairs = {one.target.id: next_one for one, next_one in pairwise(body) if isinstance(one, ast.AnnAssign)}
+    pairs = {
+        one.target.id: next_one
+        for one, next_one in pairwise(body)
+        if isinstance(one, ast.AnnAssign)
+    }
     assert pairs.keys() == {each.name for each in fields(RunnerKeywords)}
     assert not [name for name, text in pairs.items() if not isinstance(text, ast.Expr)]
 
@@ -64,14 +84,27 @@ def test_commands_and_recordings_take_switches_from_their_declaration():
     switches = [each.name for each in fields(RunnerKeywords) if isinstance(each.default, bool)]
     assert "collisions" in switches
     root = Path(inspect.getfile(RunnerKeywords)).parent
-    texts = {path.name: path.read_text() for folder in ("cli", "recording") for path in (root / folder).glob("*.py")}
+    texts = {
+        path.name: path.read_text()
+        for folder in ("cli", "recording")
+        for path in (root / folder).glob("*.py")
+    }
     assert {"rollout.py", "recording_files.py"} <= texts.keys()
-    named = [(path, name) for path, text in texts.items() for name in switches if re.search(rf"\b{name}\b", text)]
+    named = [
+        (path, name)
+        for path, text in texts.items()
+        for name in switches
+        if re.search(rf"\b{name}\b", text)
+    ]
     assert named == []
 
 
 def test_an_option_without_a_field_in_recordings_is_kept_among_their_options(tmp_path, monkeypatch):
-    annotations = {name: kind for name, kind in RunInfo.__annotations__.items() if name not in ("ground", "tool")}
+    annotations = {
+        name: kind
+        for name, kind in RunInfo.__annotations__.items()
+        if name not in ("ground", "tool")
+    }
     monkeypatch.setattr(RunInfo, "__annotations__", annotations)
     kept = RunnerOptions(PANDA, 2).values_for("recording")
     assert kept["options"] == {"ground": PANDA.has_ground, "tool": None}
@@ -84,8 +117,14 @@ def test_an_option_without_a_field_in_recordings_is_kept_among_their_options(tmp
 
 
 def test_options_are_plain_values_of_their_documented_type():
-    options = RunnerOptions(PANDA, np.int64(2), substeps=np.int8(3), timestep=np.float32(1e-3), speed_limit=2)
-    assert (type(options.num_envs), type(options.substeps), type(options.timestep)) == (int, int, float)
+    options = RunnerOptions(
+        PANDA, np.int64(2), substeps=np.int8(3), timestep=np.float32(1e-3), speed_limit=2
+    )
+    assert (type(options.num_envs), type(options.substeps), type(options.timestep)) == (
+        int,
+        int,
+        float,
+    )
     np.testing.assert_array_equal(options.speed_limit, np.full(PANDA.dof, 2.0))
 
 
@@ -96,7 +135,11 @@ def test_defaults_are_resolved():
     guarded = RunnerOptions(PANDA, 2, guard=True, collisions=False)
     assert guarded.ground is False
     np.testing.assert_array_equal(guarded.guard.upper, PANDA.guard().upper)
-    assert RunnerOptions(PANDA, 2, guard=False).guard is RunnerOptions(PANDA, 2, guard=None).guard is None
+    assert (
+        RunnerOptions(PANDA, 2, guard=False).guard
+        is RunnerOptions(PANDA, 2, guard=None).guard
+        is None
+    )
 
 
 def test_options_cannot_be_changed():

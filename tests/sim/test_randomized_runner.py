@@ -1,4 +1,6 @@
-"""Runner with a randomization: draws at resets, bit-identity, snapshots, recovery and recordings."""
+"""Runner with a randomization: draws at resets, bit-identity, snapshots, recovery and
+recordings.
+"""
 
 import warnings
 
@@ -31,7 +33,10 @@ EVERYTHING = Randomization(
     armature=LogUniform(1e-3, 0.05),
     qpos=Uniform(-0.1, 0.1),
     qvel=Normal(0, 0.1),
-    params={"kp": LogUniform(0.5, 2, operation="scale"), "kd": Choice([1.0, 1.1], operation="scale", shared=True)},
+    params={
+        "kp": LogUniform(0.5, 2, operation="scale"),
+        "kd": Choice([1.0, 1.1], operation="scale", shared=True),
+    },
     actuators={
         "command_delay": Uniform(0, 0.003, shared=True),
         "sensor_delay": Choice([0.0, 0.001]),
@@ -44,7 +49,9 @@ PANDA = load_bundled("panda")
 
 
 def make(robot=PANDA, num_envs=N, **options):
-    return Runner(robot, num_envs, **{"workers": 0, "randomization": EVERYTHING, "substeps": 10, **options})
+    return Runner(
+        robot, num_envs, **{"workers": 0, "randomization": EVERYTHING, "substeps": 10, **options}
+    )
 
 
 def setpoints(robot=PANDA, num_envs=N, ticks=TICKS):
@@ -62,7 +69,9 @@ def episodes(runner, num_envs=N):
 
 def test_limits_by_position_are_drawn_for_each_joint_of_each_env():
     points = np.linspace(PANDA.lower, PANDA.upper, 3).T
-    actuators = bp.make_actuators(PANDA.dof, position_limit=(points, np.tile([5.0, 8.0, 4.0], (PANDA.dof, 1))))
+    actuators = bp.make_actuators(
+        PANDA.dof, position_limit=(points, np.tile([5.0, 8.0, 4.0], (PANDA.dof, 1)))
+    )
     scale = Randomization(seed=1, actuators={"limit_efforts": Uniform(0.1, 1, operation="scale")})
     runs = []
     for options in ({}, {"workers": 2}):

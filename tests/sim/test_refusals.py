@@ -36,7 +36,9 @@ SAPIENS_OWN = dataclasses.replace(ARM, dissipation="sapien")
 
 
 class Hold:
-    """Controller that only compensates the passive force; ``more`` are further attributes, such as ``command``."""
+    """Controller that only compensates the passive force; ``more`` are further attributes, such as
+    ``command``.
+    """
 
     def __init__(self, **more: Any) -> None:
         vars(self).update(more)
@@ -56,7 +58,8 @@ def named(call: Callable[[], Any]) -> str:
     return str(caught.value.argument)
 
 
-# -- each option by itself ---------------------------------------------------------------------------------------------
+# -- each option by itself
+# ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["robot", "num_envs", "params", *RunnerKeywords.__annotations__])
@@ -74,7 +77,8 @@ def test_values_of_no_use_are_refused_for_every_option(name: str) -> None:
     assert {*refused} == {name}
 
 
-# -- options that exclude each other -----------------------------------------------------------------------------------
+# -- options that exclude each other
+# -----------------------------------------------------------------------------------
 
 MOTORS = bp.make_actuators(DOF, strength=0.9)
 PUSHES = {"push": Uniform(0, 1), "push_interval": Uniform(1, 2)}
@@ -117,22 +121,37 @@ RUNNERS: list[tuple[dict[str, Any], str]] = [
     ({"randomization": Randomization(**PUSHES)}, "push"),
     ({"robot": FREE, "randomization": Randomization(push=Uniform(0, 1))}, "push_interval"),
     (
-        {"robot": FREE, "randomization": Randomization(push=Uniform(0, 1), push_interval=Uniform(0, 1))},
+        {
+            "robot": FREE,
+            "randomization": Randomization(push=Uniform(0, 1), push_interval=Uniform(0, 1)),
+        },
         "push_interval",
     ),
-    ({"robot": FREE, "randomization": Randomization(push={"vq": Uniform(0, 1)}, push_interval=Uniform(1, 2))}, "push"),
-    ({"randomization": Randomization(ground_friction=Uniform(0, 1)), "collisions": False}, "ground_friction"),
+    (
+        {
+            "robot": FREE,
+            "randomization": Randomization(push={"vq": Uniform(0, 1)}, push_interval=Uniform(1, 2)),
+        },
+        "push",
+    ),
+    (
+        {"randomization": Randomization(ground_friction=Uniform(0, 1)), "collisions": False},
+        "ground_friction",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("options", "argument"), RUNNERS, ids=label)
-def test_options_that_do_not_go_together_are_refused_by_name(options: dict[str, Any], argument: str) -> None:
+def test_options_that_do_not_go_together_are_refused_by_name(
+    options: dict[str, Any], argument: str
+) -> None:
     options = {"robot": ARM, "num_envs": N, **options}
     options.setdefault("workers", None if "cluster" in options else 0)
     assert argument in named(lambda: Runner(**options))
 
 
-# -- calls of a runner -------------------------------------------------------------------------------------------------
+# -- calls of a runner
+# -------------------------------------------------------------------------------------------------
 
 ROW, ROWS, NAN = np.zeros(DOF), np.zeros((N, DOF)), np.array([[0.0, 0.0], [np.nan, 0.0]])
 CALLS: list[tuple[str, dict[str, Any], str]] = [
@@ -144,7 +163,11 @@ CALLS: list[tuple[str, dict[str, Any], str]] = [
     ("step", {"setpoint": ROW, "feedforward": NAN}, "feedforward"),
     ("step", {"setpoint": ROW, "feedforward": np.zeros(3)}, "feedforward"),
     ("step", {"setpoint": ROW, "setpoint_acceleration": ROW}, "setpoint_acceleration"),
-    ("step", {"setpoint": ROW, "setpoint_rate": ROW, "setpoint_acceleration": np.zeros(3)}, "setpoint_acceleration"),
+    (
+        "step",
+        {"setpoint": ROW, "setpoint_rate": ROW, "setpoint_acceleration": np.zeros(3)},
+        "setpoint_acceleration",
+    ),
     ("step", {"setpoint": ROW, "substeps": 0}, "substeps"),
     ("send", {"setpoint": NAN}, "setpoint"),
     ("rollout", {"setpoints": ROW}, "setpoints"),
@@ -174,7 +197,9 @@ def runner() -> Any:
 
 
 def call(runner: Runner, name: str, arguments: dict[str, Any]) -> str:
-    """Make a wrong call; check that it changes nothing, and return the name of the argument in its error."""
+    """Make a wrong call; check that it changes nothing, and return the name of the argument in its
+    error.
+    """
     before, time = runner.observe(), runner.time
     act = (lambda: setattr(runner, name, arguments["value"])) if "value" in arguments else None
     argument = named(act or (lambda: getattr(runner, name)(**arguments)))
@@ -185,7 +210,9 @@ def call(runner: Runner, name: str, arguments: dict[str, Any]) -> str:
 
 
 @pytest.mark.parametrize(("name", "arguments", "argument"), CALLS, ids=label)
-def test_a_refused_call_names_its_argument(runner: Runner, name: str, arguments: dict[str, Any], argument: str) -> None:
+def test_a_refused_call_names_its_argument(
+    runner: Runner, name: str, arguments: dict[str, Any], argument: str
+) -> None:
     assert argument.removesuffix("s") in call(runner, name, arguments)
 
 
@@ -198,19 +225,25 @@ def test_a_refused_call_names_its_argument(runner: Runner, name: str, arguments:
         *(({"seed": seed}, "seed") for seed in (-1, 0.5, [1, 2, 3], [-1] * N)),
     ],
 )
-def test_a_refused_reset_of_a_floating_base_names_its_argument(arguments: dict[str, Any], argument: str) -> None:
+def test_a_refused_reset_of_a_floating_base_names_its_argument(
+    arguments: dict[str, Any], argument: str
+) -> None:
     drawn = Randomization(payload=Uniform(0, 1))
     with Runner(FREE, N, workers=0, engine="mujoco", ground=False, randomization=drawn) as runner:
         assert call(runner, "reset", arguments) == argument
 
 
-@pytest.mark.parametrize("options", [{"params": ARM.params(kp=9.0)}, {"control": "drive"}, {"control": "effort"}])
+@pytest.mark.parametrize(
+    "options", [{"params": ARM.params(kp=9.0)}, {"control": "drive"}, {"control": "effort"}]
+)
 def test_an_acceleration_that_no_gain_uses_is_refused(options: dict[str, Any]) -> None:
     with Runner(ARM, N, workers=0, **options) as runner:
         given = {"setpoint_rate": ROW, "setpoint_acceleration": ROW}
         assert call(runner, "step", {"setpoint": ROW, **given}) == "setpoint_acceleration"
         given = {f"{name}s": rows[None] for name, rows in given.items()}
-        assert call(runner, "rollout", {"setpoints": ROW[None], **given}) == "setpoint_accelerations"
+        assert (
+            call(runner, "rollout", {"setpoints": ROW[None], **given}) == "setpoint_accelerations"
+        )
 
 
 def test_a_refused_command_of_entries_names_the_entry() -> None:
@@ -220,7 +253,12 @@ def test_a_refused_command_of_entries_names_the_entry() -> None:
     with Runner(ARM, N, workers=0, control=control) as runner:
         with pytest.raises(InvalidArgumentError) as caught:
             runner.step(bad)
-        assert (caught.value.argument, caught.value.entry, caught.value.joint, caught.value.env) == (
+        assert (
+            caught.value.argument,
+            caught.value.entry,
+            caught.value.joint,
+            caught.value.env,
+        ) == (
             "setpoint",
             "z",
             None,
@@ -235,7 +273,8 @@ def test_a_refused_command_of_entries_names_the_entry() -> None:
         assert runner.step(np.zeros(3)).ok.all()
 
 
-# -- constructors ------------------------------------------------------------------------------------------------------
+# -- constructors
+# --------------------------------------------------------------------------------------------------
 
 MADE: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     *(

@@ -40,7 +40,9 @@ def test_a_drive_is_given_the_bundled_gains_or_designed_ones(panda, hinge):
     bundled = params_of(panda, "drive")
     assert (bundled.kp == panda.settings.drive_stiffness).all()
     assert (bundled.kd == panda.settings.drive_damping).all()
-    designed = hinge.designed("effort").replace(ki=0.0, setpoint_weight=None, derivative_filter_time=None)
+    designed = hinge.designed("effort").replace(
+        ki=0.0, setpoint_weight=None, derivative_filter_time=None
+    )
     assert same(params_of(hinge, "drive"), designed)
 
 
@@ -74,14 +76,17 @@ def test_a_floating_robot_needs_no_params():
 def test_its_repr_fits_two_lines(panda):
     with Runner(panda, 2, params=panda.params(), workers=0) as runner:
         runner.step(panda.start)
-        assert repr(runner) == (
-            "Runner(panda, 2 envs, in this process, control 'pid', compensate 'gravity+coriolis+friction',\n"
-            "       physics 'accurate', timestep 0.0005 s, 20 substeps, at 0.01 s)"
+        assert (
+            repr(runner) == "Runner(panda, 2 envs, in this process, control 'pid', compensate"
+            " 'gravity+coriolis+friction',\n       physics 'accurate', timestep 0.0005 s, 20"
+            " substeps, at 0.01 s)"
         )
     assert "closed" in repr(runner)
 
 
-@pytest.mark.parametrize("progress", [lambda ticks: ticks[:2], lambda ticks: ticks[::-1], lambda ticks: [*ticks] * 2])
+@pytest.mark.parametrize(
+    "progress", [lambda ticks: ticks[:2], lambda ticks: ticks[::-1], lambda ticks: [*ticks] * 2]
+)
 def test_every_tick_is_run_whatever_shows_the_progress(hinge, progress, monkeypatch):
     setpoints = np.linspace(0, 0.2, 5)[:, None]
     with Runner(hinge, 1, workers=0) as runner, Runner(hinge, 1, workers=0) as other:

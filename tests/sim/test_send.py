@@ -14,7 +14,9 @@ from batchpid.sim import RecoveryWarning, Runner
 
 ROBOT = load_bundled("panda")
 SETPOINTS = np.clip(
-    ROBOT.start + np.random.default_rng(0).uniform(-0.2, 0.2, (6, 6, ROBOT.dof)), ROBOT.lower, ROBOT.upper
+    ROBOT.start + np.random.default_rng(0).uniform(-0.2, 0.2, (6, 6, ROBOT.dof)),
+    ROBOT.lower,
+    ROBOT.upper,
 )
 
 

@@ -1,4 +1,6 @@
-"""Hours of simulated time: memory stays flat, and two halves joined by a snapshot equal the whole."""
+"""Hours of simulated time: memory stays flat, and two halves joined by a snapshot equal the
+whole.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ import pytest
 from batchpid.sim import Recorder, Runner, Snapshot, read_recording
 
 SECONDS = float(os.environ.get("BATCHPID_SOAK_SECONDS", "30"))
-# These are 4 million env steps, and half of them again: some minutes. An hour of simulated time takes hours.
+# These are 4 million env steps, and half of them again: some minutes. An hour of simulated time
+# takes hours.
 TIMESTEP = float(os.environ.get("BATCHPID_SOAK_TIMESTEP", str(1 / 2000)))
 PHYSICS = os.environ.get("BATCHPID_SOAK_PHYSICS", "accurate")
 NUM_ENVS, TICK = 64, 0.1
@@ -25,7 +28,9 @@ def memory(runner):
 
 
 def digest_of_ticks(runner, first, last, after_tick=lambda tick: None):
-    """Run ticks ``first`` to ``last`` of one long program, with resets and changes of gains; hash the observations."""
+    """Run ticks ``first`` to ``last`` of one long program, with resets and changes of gains; hash
+    the observations.
+    """
     digest, robot = hashlib.sha256(), runner.robot
     middle, reach = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 4
     phase = np.linspace(0, 2 * np.pi, NUM_ENVS)[:, None] + np.arange(robot.dof)
@@ -64,7 +69,10 @@ def test_hours_leave_memory_flat_and_two_halves_make_a_whole(panda, tmp_path):
         assert runner.recoveries == 0
     early = max(size for tick, size in used.items() if ticks // 10 <= tick < ticks // 4)
     late = max(size for tick, size in used.items() if tick >= 3 * ticks // 4)
-    print(f"memory: {early / 2**20:.1f} MiB early, {late / 2**20:.1f} MiB late, {ticks} ticks of {NUM_ENVS} envs")
+    print(
+        f"memory: {early / 2**20:.1f} MiB early, {late / 2**20:.1f} MiB late, {ticks} ticks of"
+        f" {NUM_ENVS} envs"
+    )
     # It takes some minutes until all that stays has been touched.
     warming_up = 0 if ticks >= 30_000 else 8 << 20
     assert late <= 1.02 * early + warming_up

@@ -1,4 +1,6 @@
-"""StabilityWarning: a runner says once that its gains pass the stability bound, of which joint and by how much."""
+"""StabilityWarning: a runner says once that its gains pass the stability bound, of which joint and
+by how much.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ BAD, GOOD = {"kp": 10.0, "ki": 0.0, "kd": [1.0, 5e4]}, {"kp": 10.0, "ki": 0.0, "
 
 @pytest.fixture
 def arm(tmp_path):
-    return Robot.load(write(tmp_path, robot(*map(link, "abc"), joint("one", "a", "b"), joint("two", "b", "c"))))
+    return Robot.load(
+        write(tmp_path, robot(*map(link, "abc"), joint("one", "a", "b"), joint("two", "b", "c")))
+    )
 
 
 def warned(call):
@@ -59,7 +63,9 @@ def test_the_env_is_named_and_the_remedy_works(arm):
     runner.close()
     assert "joint 'one', env 3" in message
     scale = float(message.split("use at most ")[1].split(" times")[0])
-    runner, none = warned(lambda: make(arm, 5, params=arm.params(kp=10.0 * scale, ki=0.0, kd=kd * scale)))
+    runner, none = warned(
+        lambda: make(arm, 5, params=arm.params(kp=10.0 * scale, ki=0.0, kd=kd * scale))
+    )
     runner.close()
     assert none == []
 
@@ -88,7 +94,9 @@ def test_there_is_none_within_the_bound_and_where_it_does_not_hold(arm, options)
 
 @pytest.mark.parametrize("late", ["command_delay", "sensor_delay"])
 def test_motors_that_are_late_lower_the_bound(arm, late):
-    """Gains within the bound of ideal motors; the env with late motors is named, and the remedy works."""
+    """Gains within the bound of ideal motors; the env with late motors is named, and the remedy
+    works.
+    """
     delays = np.zeros((3, 2))
     delays[2] = 0.01
     bad, motors = {"kp": 500.0, "ki": 0.0, "kd": 300.0}, bp.make_actuators(2, **{late: delays})

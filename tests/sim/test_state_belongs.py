@@ -50,7 +50,9 @@ NAMES = [each.name for each in fields(RunnerOptions)]
 
 def quick(name):
     """Return the values for random pairs."""
-    return [each for each in option_values(name) if name != "workers" and not is_slow(name, each)] or [BASE[name]]
+    return [
+        each for each in option_values(name) if name != "workers" and not is_slow(name, each)
+    ] or [BASE[name]]
 
 
 def go_on(runner):
@@ -95,7 +97,9 @@ def went_on(chosen):
 def changed(ours, theirs):
     """Return the names of options with other values."""
     given, other = (BASE | each for each in (ours, theirs))
-    return [name for name in given.keys() | other if given.get(name, ...) is not other.get(name, ...)]
+    return [
+        name for name in given.keys() | other if given.get(name, ...) is not other.get(name, ...)
+    ]
 
 
 def check(ours, theirs, before=None):
@@ -132,7 +136,9 @@ def panda():
 
 def test_every_option_is_kept_or_has_a_role_apart():
     for each in fields(RunnerOptions):
-        assert ("snapshot" in DECLARED[each.name].kept) != (DECLARED[each.name].role is not None), each.name
+        assert ("snapshot" in DECLARED[each.name].kept) != (DECLARED[each.name].role is not None), (
+            each.name
+        )
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -147,7 +153,9 @@ def test_every_option_is_kept_or_has_a_role_apart():
 def test_a_snapshot_is_refused_or_goes_on_as_before_under_each_value_of_each_option(name, index):
     """The snapshot is made under the value before it, the last one for the first."""
     before, value = option_values(name)[index - 1], option_values(name)[index]
-    number, context = next(each for each in enumerate(CONTEXTS) if is_possible({**each[1], name: value}))
+    number, context = next(
+        each for each in enumerate(CONTEXTS) if is_possible({**each[1], name: value})
+    )
     if is_possible({**context, name: before}):
         check({**context, name: before}, {**context, name: value})
     else:
@@ -157,11 +165,17 @@ def test_a_snapshot_is_refused_or_goes_on_as_before_under_each_value_of_each_opt
 def test_each_option_has_a_value_to_try_besides_its_default():
     """A new option needs a line in VALUES, unless its type lists its values."""
     default = {each.name: each.default for each in fields(RunnerOptions)}
-    assert not [name for name in NAMES if {repr(each) for each in option_values(name)} <= {repr(default[name])}]
+    assert not [
+        name
+        for name in NAMES
+        if {repr(each) for each in option_values(name)} <= {repr(default[name])}
+    ]
 
 
 PAIRS = st.lists(st.sampled_from(NAMES), min_size=1, max_size=2, unique=True).flatmap(
-    lambda names: st.tuples(*[st.fixed_dictionaries({name: st.sampled_from(quick(name)) for name in names})] * 2)
+    lambda names: st.tuples(
+        *[st.fixed_dictionaries({name: st.sampled_from(quick(name)) for name in names})] * 2
+    )
 )
 
 
@@ -188,7 +202,10 @@ def test_a_snapshot_of_another_controller_is_refused(panda, other):
         runner.reset(POSTURE)
         snapshot = runner.snapshot()
         runner.restore(snapshot)
-    with osc_runner(panda, **other) as runner, pytest.raises(InvalidArgumentError, match=r"controller|tool"):
+    with (
+        osc_runner(panda, **other) as runner,
+        pytest.raises(InvalidArgumentError, match=r"controller|tool"),
+    ):
         runner.restore(snapshot)
 
 
@@ -220,7 +237,9 @@ def test_a_drawn_start_is_the_first_setpoint(mode):
 GIVEN = {"gain_units": ["mass_matrix"], "measurement_rate": ["measured"]}
 
 
-@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in GIVEN.items() for value in values])
+@pytest.mark.parametrize(
+    ("name", "value"), [(name, value) for name, values in GIVEN.items() for value in values]
+)
 def test_the_pure_law_refuses_what_it_is_not_given(name, value):
     params = bp.make_params(2, 4.0, 1.0, 1.0, **{name: value})
     y = np.zeros((1, 2))
@@ -229,7 +248,9 @@ def test_the_pure_law_refuses_what_it_is_not_given(name, value):
     def call():
         return bp.BatchPID(params, 1, 0.01)(y, y)
 
-    calls = [lambda f=f: f(params, state, y, y, 0.01) for f in (bp.step, bp.step_terms, bp.drive_target)]
+    calls = [
+        lambda f=f: f(params, state, y, y, 0.01) for f in (bp.step, bp.step_terms, bp.drive_target)
+    ]
     for each in (*calls, lambda: bp.track(params, state, y, y, y, dt=0.01), call):
         with pytest.raises(InvalidArgumentError, match=name):
             each()

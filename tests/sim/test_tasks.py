@@ -75,7 +75,9 @@ def hinge(tmp_path_factory):
 
 @pytest.fixture
 def swings(hinge):
-    envs = Swing(3, hinge, workers=0, rate_hz=100.0, autoreset_mode="SameStep", max_episode_steps=20)
+    envs = Swing(
+        3, hinge, workers=0, rate_hz=100.0, autoreset_mode="SameStep", max_episode_steps=20
+    )
     yield envs
     envs.close()
 
@@ -89,7 +91,9 @@ def test_a_task_is_defined_by_its_hooks(swings):
         observation, reward, terminated, truncated, info = swings.step(actions)
         assert swings.action.ravel().tolist() == [3.0, -3.0, 0.0]
         final = np.where(info.get("_final_obs", np.zeros(3, bool)), 0, observation[:, 0])
-        np.testing.assert_allclose(reward[final != 0], (final - [0.09, 0.09, 0.0])[final != 0], atol=1e-6)
+        np.testing.assert_allclose(
+            reward[final != 0], (final - [0.09, 0.09, 0.0])[final != 0], atol=1e-6
+        )
         ends |= {(env, "terminated") for env in np.flatnonzero(terminated)}
         ends |= {(env, "truncated") for env in np.flatnonzero(truncated)}
         assert (info["success"] == (observation[:, 0] > 0.2)).all()
@@ -167,7 +171,9 @@ def test_setpoints_are_steps_unless_a_task_gives_their_rates(hinge, task):
                 seen = runner.reset()
                 setpoint = seen.qpos.astype(float)
             observation, *_ = envs.step(actions)
-            np.testing.assert_array_equal(observation, np.concatenate([seen.qpos, seen.qvel], axis=1))
+            np.testing.assert_array_equal(
+                observation, np.concatenate([seen.qpos, seen.qvel], axis=1)
+            )
     assert np.abs(observation[:, 1]).min() > 0
     envs.close()
 
@@ -196,7 +202,9 @@ def test_options_that_a_task_chooses_are_refused(hinge):
 
 
 def test_torchrl_wraps_tasks_that_do_not_reset_themselves(hinge):
-    """Its GymWrapper resets ended envs by ``options["reset_mask"]``, and keeps the last observation of an episode."""
+    """Its GymWrapper resets ended envs by ``options["reset_mask"]``, and keeps the last observation
+    of an episode.
+    """
     library = pytest.importorskip("torchrl.envs")
     from torchrl.envs.utils import check_env_specs
 
@@ -208,5 +216,7 @@ def test_torchrl_wraps_tasks_that_do_not_reset_themselves(hinge):
     assert run.batch_size == (2, 6)
     assert run["next", "truncated"][..., 0].int().tolist() == [[0, 0, 0, 1, 0, 0]] * 2
     assert (run["next", "observation"][:, 2] == run["observation"][:, 3]).all()
-    assert (run["next", "observation"][:, 3] != run["observation"][:, 4]).all()  # the last one, and the next first one
+    assert (
+        run["next", "observation"][:, 3] != run["observation"][:, 4]
+    ).all()  # the last one, and the next first one
     envs.close()

@@ -14,10 +14,21 @@ import pytest
 
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import FaultWarning, Randomization, Robot, Rollout, Runner, Uniform, read_recording, write_recording
+from batchpid.sim import (
+    FaultWarning,
+    Randomization,
+    Robot,
+    Rollout,
+    Runner,
+    Uniform,
+    read_recording,
+    write_recording,
+)
 from tests.sim.tiny_urdf import write
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*outside the joint limits", "ignore:setpoint moves in every tick")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:.*outside the joint limits", "ignore:setpoint moves in every tick"
+)
 
 
 def bar(length: float, mass: float = 1.0) -> str:
@@ -25,25 +36,36 @@ def bar(length: float, mass: float = 1.0) -> str:
     moments = f'ixx="0.001" iyy="{mass * length**2 / 12:.6f}" izz="{mass * length**2 / 12:.6f}"'
     place = f'<origin xyz="{length / 2} 0 0"/>'
     return (
-        f'<inertial>{place}<mass value="{mass}"/><inertia {moments} ixy="0" ixz="0" iyz="0"/></inertial>'
-        f'<collision>{place}<geometry><box size="{length - 0.06} 0.05 0.05"/></geometry></collision>'
+        f'<inertial>{place}<mass value="{mass}"/><inertia {moments} ixy="0" ixz="0"'
+        f' iyz="0"/></inertial><collision>{place}<geometry><box size="{length - 0.06} 0.05'
+        ' 0.05"/></geometry></collision>'
     )
 
 
-def arm(axis: str = "0 1 0", effort: float = 60.0, friction: float = 0.0, fixed_base: bool = True) -> Robot:
-    """Return an arm of three bars, 0.3 m each, that turn about y, 0.5 m above its base; ``axis`` is the elbow's."""
+def arm(
+    axis: str = "0 1 0", effort: float = 60.0, friction: float = 0.0, fixed_base: bool = True
+) -> Robot:
+    """Return an arm of three bars, 0.3 m each, that turn about y, 0.5 m above its base; ``axis`` is
+    the elbow's.
+    """
     mass = '<mass value="50"/><inertia ixx="9" iyy="9" izz="9" ixy="0" ixz="0" iyz="0"/>'
     parts = [f'<link name="base"><inertial>{mass}</inertial></link>']
-    for number, (name, turns) in enumerate([("shoulder", "0 1 0"), ("elbow", axis), ("wrist", "0 1 0")]):
+    for number, (name, turns) in enumerate(
+        [("shoulder", "0 1 0"), ("elbow", axis), ("wrist", "0 1 0")]
+    ):
         above, at = ("base", "0 0 0.5") if number == 0 else (f"bar{number}", "0.3 0 0")
         parts.append(f'<link name="bar{number + 1}">{bar(0.3)}</link>')
         parts.append(
-            f'<joint name="{name}" type="revolute"><parent link="{above}"/><child link="bar{number + 1}"/>'
-            f'<origin xyz="{at}"/><axis xyz="{turns}"/><dynamics friction="{friction}" damping="0.02"/>'
-            f'<limit lower="-3" upper="3" effort="{effort if name == "elbow" else 60}" velocity="9"/></joint>'
+            f'<joint name="{name}" type="revolute"><parent link="{above}"/><child'
+            f' link="bar{number + 1}"/><origin xyz="{at}"/><axis xyz="{turns}"/><dynamics'
+            f' friction="{friction}" damping="0.02"/><limit lower="-3" upper="3"'
+            f' effort="{effort if name == "elbow" else 60}" velocity="9"/></joint>'
         )
     with tempfile.TemporaryDirectory() as folder:
-        return Robot.load(write(Path(folder), f'<robot name="arm">{"".join(parts)}</robot>'), fixed_base=fixed_base)
+        return Robot.load(
+            write(Path(folder), f'<robot name="arm">{"".join(parts)}</robot>'),
+            fixed_base=fixed_base,
+        )
 
 
 class Case(NamedTuple):
@@ -140,7 +162,9 @@ def test_a_run_that_settles_has_no_findings():
 
 def test_links_that_touch_are_named_on_a_floating_base():
     """The robot falls freely, so that its motors need no effort against gravity."""
-    case = CASES["links that touch"]._replace(robot={"fixed_base": False}, options={"ground": False})
+    case = CASES["links that touch"]._replace(
+        robot={"fixed_base": False}, options={"ground": False}
+    )
     first = run(case, "mujoco").findings()[0]
     assert (first.code, first.joint) == ("touching", None)
     assert "bar1" in first.detail
@@ -158,17 +182,25 @@ def test_without_collisions_there_is_no_contact_to_name():
 
 def test_causes_are_in_the_order_of_the_rules():
     """Two envs are pressed into the ground, and one has a setpoint beyond a limit."""
-    setpoints = np.tile([[0.7, 0.3, 0.0], [0.0, 0.0, -3.4], [0.7, 0.3, 0.0], [0.0, 0.0, 0.1]], (200, 1, 1))
+    setpoints = np.tile(
+        [[0.7, 0.3, 0.0], [0.0, 0.0, -3.4], [0.7, 0.3, 0.0], [0.0, 0.0, 0.1]], (200, 1, 1)
+    )
     with Runner(arm(), 4, workers=0, engine="mujoco") as runner:
         found = runner.rollout(setpoints).findings()
-    assert [(each.code, sorted(each.envs)) for each in found] == [("setpoint-limits", [1]), ("touching", [0, 2])]
+    assert [(each.code, sorted(each.envs)) for each in found] == [
+        ("setpoint-limits", [1]),
+        ("touching", [0, 2]),
+    ]
     assert "env 0 and 1 more" in str(found[1]) or "env 2 and 1 more" in str(found[1])
 
 
 def test_an_input_that_is_not_finite_is_the_cause():
     setpoints = np.zeros((20, 2, 3))
     setpoints[7, 1, 2] = np.nan
-    with Runner(arm(), 2, workers=0, engine="mujoco", on_invalid_input="contain") as runner, pytest.warns(FaultWarning):
+    with (
+        Runner(arm(), 2, workers=0, engine="mujoco", on_invalid_input="contain") as runner,
+        pytest.warns(FaultWarning),
+    ):
         (found,) = runner.rollout(setpoints).findings()
     assert (found.code, found.envs, found.detail) == ("failed", (1,), "wrist: setpoint")
     assert found.time == pytest.approx(0.07, abs=0.011)
@@ -203,7 +235,9 @@ def test_a_joint_at_its_turning_point_is_not_blocked(kp):
     with Runner(robot, 1, workers=0, engine="mujoco", params=params, ground=False) as runner:
         rollout = runner.rollout(np.tile([0.0, 0.3, 0.0], (200, 1)))
     for ticks in range(30, 200, 10):
-        assert "blocked" not in {each.code for each in rollout.for_ticks(slice(0, ticks)).findings()}
+        assert "blocked" not in {
+            each.code for each in rollout.for_ticks(slice(0, ticks)).findings()
+        }
 
 
 def test_joints_at_their_place_do_not_keep_a_tool_from_its_pose(panda):
@@ -218,7 +252,9 @@ def test_joints_at_their_place_do_not_keep_a_tool_from_its_pose(panda):
 def test_a_drive_that_is_too_weak():
     robot = arm(effort=3.0)
     params = robot.params(kp=500.0, kd=50.0)
-    with Runner(robot, 1, workers=0, engine="mujoco", params=params, control="drive", compensate="none") as runner:
+    with Runner(
+        robot, 1, workers=0, engine="mujoco", params=params, control="drive", compensate="none"
+    ) as runner:
         found = runner.rollout(np.tile([0.0, -0.5, 0.0], (200, 1))).findings()
     assert ("effort-limit", "elbow") in [(each.code, each.joint) for each in found]
 

@@ -1,4 +1,6 @@
-"""Everything but SAPIEN's own works with MuJoCo where SAPIEN is not installed, and a run in MuJoCo never imports it."""
+"""Everything but SAPIEN's own works with MuJoCo where SAPIEN is not installed, and a run in MuJoCo
+never imports it.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,9 @@ with Runner(panda, 1, workers=0) as runner:
 
 
 def run(program):
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout + done.stderr
 

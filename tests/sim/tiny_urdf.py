@@ -6,7 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-INERTIAL = '<inertial><mass value="1"/><inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial>'
+INERTIAL = (
+    '<inertial><mass value="1"/><inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0"'
+    ' izz="0.1"/></inertial>'
+)
 LIMIT = '<limit lower="-1" upper="1" effort="10" velocity="2"/>'
 
 
@@ -14,7 +17,14 @@ def link(name: str, inner: str = INERTIAL) -> str:
     return f'<link name="{name}">{inner}</link>'
 
 
-def joint(name: str, parent: str, child: str, kind: str = "revolute", inner: str = LIMIT, origin: str = "0 0 1") -> str:
+def joint(
+    name: str,
+    parent: str,
+    child: str,
+    kind: str = "revolute",
+    inner: str = LIMIT,
+    origin: str = "0 0 1",
+) -> str:
     return (
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
         f'<origin xyz="{origin}"/><axis xyz="0 1 0"/>{inner}</joint>'
@@ -30,7 +40,9 @@ def one_joint(inner: str = LIMIT, kind: str = "revolute", arm: str = INERTIAL) -
 
 
 def random_tree(rng: np.random.Generator, links: int) -> list[str]:
-    """Return the parts of a robot with ``links`` links, named l0, l1, ..., random joints, half of them fixed."""
+    """Return the parts of a robot with ``links`` links, named l0, l1, ..., random joints, half of
+    them fixed.
+    """
 
     def text(values: np.ndarray) -> str:
         return " ".join(map(str, values))
@@ -39,15 +51,23 @@ def random_tree(rng: np.random.Generator, links: int) -> list[str]:
     limit = '<limit lower="-9" upper="9" effort="10" velocity="2"/>'
     for number in range(1, links):
         a = rng.normal(size=(3, 3))
-        tensor = 0.02 * ((np.trace(a @ a.T) + 1) * np.eye(3) - a @ a.T)  # of a body: each moment less than the others
-        keys = zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), tensor[np.triu_indices(3)], strict=True)
+        tensor = 0.02 * (
+            (np.trace(a @ a.T) + 1) * np.eye(3) - a @ a.T
+        )  # of a body: each moment less than the others
+        keys = zip(
+            ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), tensor[np.triu_indices(3)], strict=True
+        )
         inertia = " ".join(f'{key}="{value}"' for key, value in keys)
-        origin = f'<origin xyz="{text(rng.uniform(-0.2, 0.2, 3))}" rpy="{text(rng.uniform(-3, 3, 3))}"/>'
+        origin = (
+            f'<origin xyz="{text(rng.uniform(-0.2, 0.2, 3))}" rpy="{text(rng.uniform(-3, 3, 3))}"/>'
+        )
         mass = f'<mass value="{rng.uniform(0.5, 2.0)}"/><inertia {inertia}/>'
         parts.append(link(f"l{number}", f"<inertial>{origin}{mass}</inertial>"))
         kind = rng.choice(["fixed", "fixed", "revolute", "prismatic"]) if number > 1 else "revolute"
         ends = f'<parent link="l{rng.integers(number)}"/><child link="l{number}"/>'
-        origin = f'<origin xyz="{text(rng.uniform(-1, 1, 3))}" rpy="{text(rng.uniform(-3, 3, 3))}"/>'
+        origin = (
+            f'<origin xyz="{text(rng.uniform(-1, 1, 3))}" rpy="{text(rng.uniform(-3, 3, 3))}"/>'
+        )
         axis = f'<axis xyz="{text(rng.uniform(-1, 1, 3))}"/>'
         parts.append(f'<joint name="j{number}" type="{kind}">{ends}{origin}{axis}{limit}</joint>')
     return parts

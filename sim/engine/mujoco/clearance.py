@@ -1,7 +1,9 @@
-"""Tables for native proofs that shapes of a robot do not touch (``clearance.h``), of models built from URDFs.
+"""Tables for native proofs that shapes of a robot do not touch (``clearance.h``), of models built
+from URDFs.
 
-Such a model has one joint a body, through the body's origin, shapes of the kinds in ``clearance.h``, and no moving
-bodies but the robot's. Models of MJCF files can hold any element, so MuJoCo checks all of their contacts.
+Such a model has one joint a body, through the body's origin, shapes of the kinds in
+``clearance.h``, and no moving bodies but the robot's. Models of MJCF files can hold any element, so
+MuJoCo checks all of their contacts.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ from batchpid.sim.engine.native.interface import Clearance
 Arrays = dict[str, NDArray[Any]]
 
 _BEYOND = 0.01
-"""Distance beyond its limits up to which a sliding joint's arms are valid [m]: MuJoCo's limits are soft."""
+"""Distance beyond its limits up to which a sliding joint's arms are valid [m]: MuJoCo's limits are
+soft.
+"""
 _NO_CONTACT = int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _NEVER = 1 << 30
 """Age without a proof: NEVER in ``clearance.h``."""
@@ -30,14 +34,18 @@ _MOST_NEAR = 16
 """MOST_NEAR in ``clearance.h``."""
 _POINTERS = "body_geomnum", "body_contype", "body_conaffinity"
 _BEGINNING = 4096
-"""Number of bytes at the start of ``mjModel`` that are searched for its options; ``mjModel`` is larger."""
+"""Number of bytes at the start of ``mjModel`` that are searched for its options; ``mjModel`` is
+larger.
+"""
 
 
 @lru_cache(maxsize=8)
 def shape_tables(robot: RobotMj) -> Arrays | None:
-    """Return the tables of shapes and pairs for ``Clearance`` in ``clearance.h``, the same for every robot.
+    """Return the tables of shapes and pairs for ``Clearance`` in ``clearance.h``, the same for
+    every robot.
 
-    None if there are no proofs: no shapes can touch, or the fields to change are not found in this version of MuJoCo.
+    None if there are no proofs: no shapes can touch, or the fields to change are not found in this
+    version of MuJoCo.
     """
     model = robot.model
     pairs = touching_pairs(model)
@@ -48,7 +56,9 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
     at = arms > 0
     meshes = model.geom_dataid
     hulls = np.zeros((model.ngeom, 2), np.int32)
-    hulls[meshes >= 0] = np.stack([model.mesh_vertadr, model.mesh_vertnum], axis=1)[meshes[meshes >= 0]]
+    hulls[meshes >= 0] = np.stack([model.mesh_vertadr, model.mesh_vertnum], axis=1)[
+        meshes[meshes >= 0]
+    ]
     return {
         "kinds": model.geom_type.astype(np.int32),
         "sizes": model.geom_size.astype(float),
@@ -65,10 +75,11 @@ def shape_tables(robot: RobotMj) -> Arrays | None:
 
 
 def touching_pairs(model: MjModel) -> NDArray[np.int32]:
-    """Return the pairs of shapes (pairs, 2), by number, that MuJoCo checks for contact; the ground comes first.
+    """Return the pairs of shapes (pairs, 2), by number, that MuJoCo checks for contact; the ground
+    comes first.
 
-    MuJoCo ignores bodies that are welded together, a body and its parent unless the parent is the world, and excluded
-    bodies ("Collision detection" in MuJoCo's documentation).
+    MuJoCo ignores bodies that are welded together, a body and its parent unless the parent is the
+    world, and excluded bodies ("Collision detection" in MuJoCo's documentation).
     """
     pairs = np.column_stack(np.triu_indices(model.ngeom, 1))
     bodies = model.geom_bodyid[pairs]
@@ -79,13 +90,16 @@ def touching_pairs(model: MjModel) -> NDArray[np.int32]:
     return pairs[(welded[:, 0] != welded[:, 1]) & ~related & ~excluded].astype(np.int32)
 
 
-def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return bounds of the closing speed of pairs of bodies per unit speed of each way (pairs, ways) [m or 1].
+def _arms(
+    robot: RobotMj, pairs: NDArray[np.intp]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return bounds of the closing speed of pairs of bodies per unit speed of each way (pairs,
+    ways) [m or 1].
 
-    A way is a joint; a floating base adds its displacement and its rotation. The bounds hold within a range of joint
-    positions (2, dof), which is returned, too. A body's shapes and children are balls around points of the body; the
-    ball of a child contains everything that moves with it, at any pose. A way that moves both bodies of a pair, or
-    neither, does not change their distance.
+    A way is a joint; a floating base adds its displacement and its rotation. The bounds hold within
+    a range of joint positions (2, dof), which is returned, too. A body's shapes and children are
+    balls around points of the body; the ball of a child contains everything that moves with it, at
+    any pose. A way that moves both bodies of a pair, or neither, does not change their distance.
     """
     model, dof = robot.model, len(robot.qvel)
     travel = np.tile([[-np.inf], [np.inf]], (1, dof))
@@ -119,9 +133,11 @@ def _arms(robot: RobotMj, pairs: NDArray[np.intp]) -> tuple[NDArray[np.float64],
 
 @cache
 def places() -> tuple[int, ...] | None:
-    """Return the offsets of ``opt.disableflags`` and of the pointers :data:`_POINTERS` in ``mjModel`` [bytes].
+    """Return the offsets of ``opt.disableflags`` and of the pointers :data:`_POINTERS` in
+    ``mjModel`` [bytes].
 
-    The flags are found by a change of one of them, the pointers by their values. None if one is ambiguous.
+    The flags are found by a change of one of them, the pointers by their values. None if one is
+    ambiguous.
     """
     model = mujoco.MjModel.from_xml_string("<mujoco/>")
     before = ctypes.string_at(model._address, _BEGINNING)
@@ -129,20 +145,27 @@ def places() -> tuple[int, ...] | None:
     after = ctypes.string_at(model._address, _BEGINNING)
     flags = [place for place in range(_BEGINNING) if before[place] != after[place]]
     addresses = [getattr(model, name).ctypes.data for name in _POINTERS]
-    offsets = [(8 * np.flatnonzero(np.frombuffer(after, np.uint64) == address)).tolist() for address in addresses]
+    offsets = [
+        (8 * np.flatnonzero(np.frombuffer(after, np.uint64) == address)).tolist()
+        for address in addresses
+    ]
     is_clear = len(flags) == 1 and flags[0] % 4 == 0 and all(len(words) == 1 for words in offsets)
     return (flags[0], *(words[0] for words in offsets)) if is_clear else None
 
 
 class GroupClearance:
-    """Clearances of robots in MuJoCo, for native code; ``kinematics`` is the address of ``mj_kinematics``.
+    """Clearances of robots in MuJoCo, for native code; ``kinematics`` is the address of
+    ``mj_kinematics``.
 
-    ``tables`` come from :func:`shape_tables`; ``models`` and ``data`` have one entry for each robot. Native code
-    disables contacts in a model during a part of each sim step, so groups that share a model must take turns. A reset
-    of a robot needs no call, because a jump of its positions counts as motion of its joints.
+    ``tables`` come from :func:`shape_tables`; ``models`` and ``data`` have one entry for each
+    robot. Native code disables contacts in a model during a part of each sim step, so groups that
+    share a model must take turns. A reset of a robot needs no call, because a jump of its positions
+    counts as motion of its joints.
     """
 
-    def __init__(self, tables: Arrays, kinematics: int, models: Sequence[Any], data: Sequence[Any], dof: int) -> None:
+    def __init__(
+        self, tables: Arrays, kinematics: int, models: Sequence[Any], data: Sequence[Any], dof: int
+    ) -> None:
         robots = len(data)
         pairs = len(tables["pairs"])
         bodies = models[0].nbody
@@ -155,7 +178,10 @@ class GroupClearance:
         }
         arrays: Arrays = {name: np.array(rows, np.uint64) for name, rows in addresses.items()}
         arrays |= tables | {name: np.zeros((robots, ways)) for name in ("moved", "rate")}
-        arrays |= {"last": np.zeros((robots, dof + 7 * floats)), "open": np.zeros((robots, bodies), np.int8)}
+        arrays |= {
+            "last": np.zeros((robots, dof + 7 * floats)),
+            "open": np.zeros((robots, bodies), np.int8),
+        }
         arrays |= {"left": np.zeros((robots, pairs), np.uint16), "wait": np.ones(robots, np.int32)}
         arrays |= {name: np.zeros(bodies, np.int32) for name in ("no_shapes", "some_types")}
         arrays["brief"] = np.zeros(robots, np.int8)

@@ -1,8 +1,9 @@
 """Working memory of packs in MuJoCo, which the packs of a loop use in turn.
 
-A ``mujoco.MjData`` takes half a megabyte, of which a hundred numbers are the state of a robot. So the packs of a loop,
-which runs them one after another, share as many as the largest of them needs. A pack that is not at work keeps the rows
-of its states; back at work it computes the rest by ``mj_step1``, with the same result to the last bit.
+A ``mujoco.MjData`` takes half a megabyte, of which a hundred numbers are the state of a robot. So
+the packs of a loop, which runs them one after another, share as many as the largest of them needs.
+A pack that is not at work keeps the rows of its states; back at work it computes the rest by
+``mj_step1``, with the same result to the last bit.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ def rest(model: MjModel, data: Any) -> None:
 
 
 class DataPool:
-    """``mujoco.MjData`` of ``robot`` for one pack at a time, and the model of robots without variation.
+    """``mujoco.MjData`` of ``robot`` for one pack at a time, and the model of robots without
+    variation.
 
     The model is a copy, since native code disables and enables its contacts within a sim step.
     """
@@ -62,14 +64,23 @@ class DataPool:
         return np.tile(self._initial, (size, 1))
 
     def take(self, user: User) -> list[Any]:
-        """Return the data of the robots of ``user``, in their states; another user's states are kept in its rows."""
+        """Return the data of the robots of ``user``, in their states; another user's states are
+        kept in its rows.
+        """
         if self._user is not user:
             if self._user is not None:
-                for model, each, row in zip(self._user.models, self._taken, self._user.rows, strict=True):
+                for model, each, row in zip(
+                    self._user.models, self._taken, self._user.rows, strict=True
+                ):
                     mujoco.mj_getState(model, each, row, STATE)
             self._user, self._taken = user, self._new(len(user.rows))
-            sound = np.all(np.abs(user.rows[:, POSITIONS : POSITIONS + self.robot.model.nq]) <= FARTHEST, axis=1)
-            for model, each, row, finite in zip(user.models, self._taken, user.rows, sound.tolist(), strict=True):
+            sound = np.all(
+                np.abs(user.rows[:, POSITIONS : POSITIONS + self.robot.model.nq]) <= FARTHEST,
+                axis=1,
+            )
+            for model, each, row, finite in zip(
+                user.models, self._taken, user.rows, sound.tolist(), strict=True
+            ):
                 mujoco.mj_setState(model, each, row, STATE)
                 if finite:
                     mujoco.mj_step1(model, each)

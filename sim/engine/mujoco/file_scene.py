@@ -1,8 +1,9 @@
 """Scene of an MJCF file for MuJoCo: the file itself, in place of a robot built from a URDF.
 
-Actuators, sensors, keyframes, and the gravity compensation of the robot's bodies are removed. Friction, damping and
-armature of the robot's joints are set later. The runner sets time step, integrator, solver and gravity. All other
-elements are unchanged, friction and impedance of contacts and limits included.
+Actuators, sensors, keyframes, and the gravity compensation of the robot's bodies are removed.
+Friction, damping and armature of the robot's joints are set later. The runner sets time step,
+integrator, solver and gravity. All other elements are unchanged, friction and impedance of contacts
+and limits included.
 """
 
 from __future__ import annotations
@@ -29,14 +30,26 @@ REMOVED = ("tuples", "sensors", "actuators", "keys", "cameras", "lights")
 """Elements of a file that a scene does not have."""
 
 
-_OF_CONTACTS = "material", "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"
+_OF_CONTACTS = (
+    "material",
+    "condim",
+    "priority",
+    "friction",
+    "solmix",
+    "solref",
+    "solimp",
+    "margin",
+    "gap",
+)
 """Attributes of a geom that a default class may set, for contacts and for its appearance."""
 _EVERYTHING = 2**31 - 1
 """Mask of a geom that collides with every geom that collides at all."""
 
 
 class BodyFrame(NamedTuple):
-    """Frame of a simulated link in the frame of its body, and the numbers of the bodies welded to this body."""
+    """Frame of a simulated link in the frame of its body, and the numbers of the bodies welded to
+    this body.
+    """
 
     position: Float64
     wxyz: Float64
@@ -46,9 +59,10 @@ class BodyFrame(NamedTuple):
 class FileScene(NamedTuple):
     """``mujoco.MjSpec`` of a file.
 
-    ``names`` has the body of each simulated link, ``frames`` the frame of the link in this body, ``root`` the body of a
-    floating base, or "". ``own`` (2, dof) is armature and damping that the file's joints have in addition to the
-    robot's description, in which leaders include their followers.
+    ``names`` has the body of each simulated link, ``frames`` the frame of the link in this body,
+    ``root`` the body of a floating base, or "". ``own`` (2, dof) is armature and damping that the
+    file's joints have in addition to the robot's description, in which leaders include their
+    followers.
     """
 
     scene: MjSpec
@@ -67,9 +81,13 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
     scene, model = compiled.scene, compiled.model
     if model is None or content_of(Path(file.path)) != file.content:
         problem = compiled.problem or "it has another content"
-        raise RobotError(f"{file.path}: has changed since the robot was loaded: {problem}; load the robot again")
+        raise RobotError(
+            f"{file.path}: has changed since the robot was loaded: {problem}; load the robot again"
+        )
     names = Names(model)
-    Tree(model, names, Path(file.path), spec.fixed_base, [])  # removes bodies that are not of the robot
+    Tree(
+        model, names, Path(file.path), spec.fixed_base, []
+    )  # removes bodies that are not of the robot
     robot = {body: name for body, name in names.bodies.items() if names.is_of_robot(body)}
     for joint in scene.joints:
         joint.name = names.joints.get(joint.id, joint.name)
@@ -93,22 +111,33 @@ def file_scene(spec: SceneSpec, file: MjcfFile) -> FileScene:
     _set_pairs(scene, spec.ignored, {*robot.values()})
     number = {name: joint for joint, name in names.joints.items()}
     dofs = model.jnt_dofadr[[number[joint.name] for joint in spec.joints]]
-    terms = np.array([_of_followers(table[dofs], spec) for table in (model.dof_armature, model.dof_damping)])
+    terms = np.array(
+        [_of_followers(table[dofs], spec) for table in (model.dof_armature, model.dof_damping)]
+    )
     bodies, frames = _frames(model, robot, spec)
     return FileScene(scene, bodies, frames, root, terms)
 
 
 def check_links(spec: SceneSpec, file: MjcfFile, links: Iterable[str]) -> None:
-    """Raise RobotError for a link that MuJoCo does not have: several joints of one body have links between them."""
+    """Raise RobotError for a link that MuJoCo does not have: several joints of one body have links
+    between them.
+    """
     placements = place_links(spec.urdf, spec.separate)
     for link in links:
         if placements[link].link not in file.bodies:
-            problem = f"link {link!r} lies between two joints of one body, and is no body of its own in MuJoCo"
-            raise RobotError(f"{file.path}: {problem}; name the link of the body for sensors and payloads")
+            problem = (
+                f"link {link!r} lies between two joints of one body, and is no body of its own in"
+                " MuJoCo"
+            )
+            raise RobotError(
+                f"{file.path}: {problem}; name the link of the body for sensors and payloads"
+            )
 
 
 def set_ground(scene: MjSpec, ground: bool) -> None:
-    """Switch contacts with the planes of the world on or off. For on, a scene without planes gets one at height 0."""
+    """Switch contacts with the planes of the world on or off. For on, a scene without planes gets
+    one at height 0.
+    """
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     planes = [
         plane_shape
@@ -116,7 +145,10 @@ def set_ground(scene: MjSpec, ground: bool) -> None:
         if plane_shape.type == plane and (plane_shape.contype or plane_shape.conaffinity)
     ]
     if ground and not planes:
-        added, plain = scene.worldbody.add_geom(type=plane, size=[0, 0, 1]), mujoco.MjSpec().worldbody.add_geom()
+        added, plain = (
+            scene.worldbody.add_geom(type=plane, size=[0, 0, 1]),
+            mujoco.MjSpec().worldbody.add_geom(),
+        )
         for name in _OF_CONTACTS:  # the file's default class would apply otherwise
             setattr(added, name, getattr(plain, name))
         added.contype = added.conaffinity = _EVERYTHING
@@ -128,7 +160,10 @@ def _start(model: MjModel) -> Document:
     """Return the keyframe of the start: "home" in the file, or its reference pose."""
     if (key := home(model)) is None:
         return {"qpos": model.qpos0, "qvel": np.zeros(model.nv)}
-    return {name: getattr(model, f"key_{name}")[key].ravel() for name in ("qpos", "qvel", "mpos", "mquat")}
+    return {
+        name: getattr(model, f"key_{name}")[key].ravel()
+        for name in ("qpos", "qvel", "mpos", "mquat")
+    }
 
 
 def _set_pairs(scene: MjSpec, ignored: Iterable[tuple[str, str]], robot: set[str]) -> None:
@@ -141,8 +176,11 @@ def _set_pairs(scene: MjSpec, ignored: Iterable[tuple[str, str]], robot: set[str
             scene.add_exclude(bodyname1=first, bodyname2=second)
 
 
-def _frames(model: MjModel, robot: dict[int, str], spec: SceneSpec) -> tuple[dict[str, str], dict[str, BodyFrame]]:
-    """Return the body of each simulated link and the frame of the link in it; of merged bodies the first counts.
+def _frames(
+    model: MjModel, robot: dict[int, str], spec: SceneSpec
+) -> tuple[dict[str, str], dict[str, BodyFrame]]:
+    """Return the body of each simulated link and the frame of the link in it; of merged bodies the
+    first counts.
 
     A body's link has the body's axes, and its origin at the anchor of the body's last hinge.
     """
@@ -164,9 +202,13 @@ def _frames(model: MjModel, robot: dict[int, str], spec: SceneSpec) -> tuple[dic
 
 
 def _of_followers(values: Float64, spec: SceneSpec) -> Float64:
-    """Return the armature or damping (dof,) that moves from leaders to their followers: d_f and -m^2 d_f."""
+    """Return the armature or damping (dof,) that moves from leaders to their followers: d_f and
+    -m^2 d_f.
+    """
     coupling, own = coupling_of(spec.joints), np.zeros(len(values))
     follower = coupling.followers
     own[follower] = values[follower]
-    np.subtract.at(own, coupling.leader[follower], coupling.multiplier[follower] ** 2 * values[follower])
+    np.subtract.at(
+        own, coupling.leader[follower], coupling.multiplier[follower] ** 2 * values[follower]
+    )
     return own

@@ -13,11 +13,17 @@ from batchpid.arrays.array_types import MjModel, MjSpec
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.merging import place_links
 
-_FOUND_AND_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND) | 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
+_FOUND_AND_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND) | 1 << int(
+    mujoco.mjtConDataField.mjCONDATA_FORCE
+)
 _NET_FORCE = 3
-"""Reduction mode of MuJoCo's contact sensor: net force of all contacts, along the axes of the world."""
+"""Reduction mode of MuJoCo's contact sensor: net force of all contacts, along the axes of the
+world.
+"""
 _CONTACT, _WRENCH = 4, 6
-"""Numbers of values: contacts and force on the other body of a contact sensor; force and torque of a wrench."""
+"""Numbers of values: contacts and force on the other body of a contact sensor; force and torque of
+a wrench.
+"""
 
 
 def contact_bodies(spec: SceneSpec) -> list[str]:
@@ -26,26 +32,37 @@ def contact_bodies(spec: SceneSpec) -> list[str]:
     return [bodies[link].link for link in spec.contacts or ()]
 
 
-def add_link_sensors(scene: MjSpec, spec: SceneSpec, names: dict[str, str], frames: Mapping[str, Any]) -> None:
+def add_link_sensors(
+    scene: MjSpec, spec: SceneSpec, names: dict[str, str], frames: Mapping[str, Any]
+) -> None:
     """Add sensors for the links of ``spec.contacts`` and ``spec.wrenches``.
 
-    ``names`` are the bodies of the links, ``frames`` the frames of links that differ from the frames of their bodies.
+    ``names`` are the bodies of the links, ``frames`` the frames of links that differ from the
+    frames of their bodies.
     """
     kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
     for link in dict.fromkeys(contact_bodies(spec)):
         for part in _parts(scene.body(names[link]), {*names.values()}):
-            sensor = scene.add_sensor(type=kinds.mjSENS_CONTACT, objtype=objects.mjOBJ_BODY, objname=part.name)
+            sensor = scene.add_sensor(
+                type=kinds.mjSENS_CONTACT, objtype=objects.mjOBJ_BODY, objname=part.name
+            )
             sensor.intprm[:3] = _FOUND_AND_FORCE, _NET_FORCE, 1
     for link in spec.wrenches or ():
         site = f"{link} (wrench)"
-        place = {} if (frame := frames.get(link)) is None else {"pos": frame.position, "quat": frame.wxyz}
+        place = (
+            {}
+            if (frame := frames.get(link)) is None
+            else {"pos": frame.position, "quat": frame.wxyz}
+        )
         scene.body(names[link]).add_site(name=site, **place)
         for kind in (kinds.mjSENS_FORCE, kinds.mjSENS_TORQUE):
             scene.add_sensor(type=kind, objtype=objects.mjOBJ_SITE, objname=site)
 
 
 def _parts(body: Any, others: set[str]) -> Iterator[Any]:
-    """Yield the body of a link, and its descendants that belong to the same link, since ``others`` lacks them."""
+    """Yield the body of a link, and its descendants that belong to the same link, since ``others``
+    lacks them.
+    """
     yield body
     for child in body.bodies:
         if child.name not in others:
@@ -53,20 +70,26 @@ def _parts(body: Any, others: set[str]) -> Iterator[Any]:
 
 
 class MujocoLinkSensors:
-    """Indices of the sensors of ``spec`` in the ``size`` sensor values of ``model``; ``bodies`` by link."""
+    """Indices of the sensors of ``spec`` in the ``size`` sensor values of ``model``; ``bodies`` by
+    link.
+    """
 
     def __init__(self, spec: SceneSpec, model: MjModel, bodies: dict[str, int]) -> None:
         ids = model.sensor_objid[model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT]
         owners = ids.copy()
         while (lower := ~np.isin(owners, [*bodies.values()])).any():
             owners[lower] = model.body_parentid[owners[lower]]
-        self._rows: Sequence[Any] = [np.flatnonzero(np.equal(owners, bodies[link])) for link in contact_bodies(spec)]
+        self._rows: Sequence[Any] = [
+            np.flatnonzero(np.equal(owners, bodies[link])) for link in contact_bodies(spec)
+        ]
         self._contacts = len(owners)
         self._wrenches = len(spec.wrenches or ())
         self.size = int(model.nsensordata)
 
     def quantities(self, values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """Return the quantities of :meth:`batchpid.sim.engine.protocol.EnginePack.take_sensed` for values (M, size)."""
+        """Return the quantities of :meth:`batchpid.sim.engine.protocol.EnginePack.take_sensed` for
+        values (M, size).
+        """
         of_contacts, of_wrenches = np.split(values, [_CONTACT * self._contacts], axis=1)
         found = {}
         if self._rows:

@@ -1,4 +1,5 @@
-"""Actuators of an MJCF file: MuJoCo's PID, its DC motor, or a plain motor, for each independent joint.
+"""Actuators of an MJCF file: MuJoCo's PID, its DC motor, or a plain motor, for each independent
+joint.
 
 ``<pid>`` (MuJoCo 3.12 and later), with position q, inputs r, r' and ff, setpoint g and integral A::
 
@@ -7,19 +8,21 @@
     effort  = kp (g - q) + ki A + kv (r' - q') + ff
     A      <- A + dt (g - q)        while |A| < imax, or towards 0
 
-``<dcmotor>`` has the same effort u, without posrange, and clamps the integral: min(max(A, -Imax), Imax). Its supply
-voltage is 1 V here. The stall effort S and the no-load speed v0 give the torque-speed line, and the time constant T of
-the winding gives the lag::
+``<dcmotor>`` has the same effort u, without posrange, and clamps the integral: min(max(A, -Imax),
+Imax). Its supply voltage is 1 V here. The stall effort S and the no-load speed v0 give the
+torque-speed line, and the time constant T of the winding gives the lag::
 
     i       = min(max(u, S (-1 - q'/v0)), S (1 - q'/v0))
     effort <- effort + (1 - exp(-dt/T)) (i - effort)
 
-A plain motor is a ``<general>`` actuator, where x is the delayed input u(t - delay), or that after a first-order lag::
+A plain motor is a ``<general>`` actuator, where x is the delayed input u(t - delay), or that after
+a first-order lag::
 
     effort  = gainprm x + biasprm
 
-Limits of the effort are the joints' (``actuatorfrcrange``): each joint has one actuator. (MuJoCo's documentation: XML
-reference, actuator; "DC Motor Model". All were compared with MuJoCo 4.0 step by step.)
+Limits of the effort are the joints' (``actuatorfrcrange``): each joint has one actuator. (MuJoCo's
+documentation: XML reference, actuator; "DC Motor Model". All were compared with MuJoCo 4.0 step by
+step.)
 """
 
 from __future__ import annotations
@@ -40,7 +43,8 @@ _INPUTS = {"input": "pos vel ff"}
 
 
 class MjcfActuators:
-    """Actuators of the ``independent`` joints, of the law or of its motors alone, with their differences in ``drive``.
+    """Actuators of the ``independent`` joints, of the law or of its motors alone, with their
+    differences in ``drive``.
 
     Attributes
     ----------
@@ -52,14 +56,19 @@ class MjcfActuators:
         Mask (joints,) of the joints with a rate-limited setpoint.
     """
 
-    def __init__(self, drive: Drive, independent: NDArray[np.bool_], is_law: bool, guard: Guard | None) -> None:
+    def __init__(
+        self, drive: Drive, independent: NDArray[np.bool_], is_law: bool, guard: Guard | None
+    ) -> None:
         self._drive = drive
         self._independent = independent
         self.is_law = is_law
         limit = drive.motor("effort_limit", math.inf)
         low, high = drive.value("effort_min", -math.inf), drive.value("effort_max", math.inf)
         self.effort_range = np.array([np.maximum(low, -limit), np.minimum(high, limit)]).T
-        self._stall, self._speed = drive.motor("saturation_effort", math.inf), drive.motor("no_load_speed", math.inf)
+        self._stall, self._speed = (
+            drive.motor("saturation_effort", math.inf),
+            drive.motor("no_load_speed", math.inf),
+        )
         self._lag, self._strength = drive.motor("lag"), drive.motor("strength", 1.0)
         self._has_line = np.isfinite(self._stall) & (self._strength > 0)
         self._is_dcmotor = self._has_line | (is_law & (self._lag > 0))
@@ -81,7 +90,9 @@ class MjcfActuators:
         low, high = self.effort_range[joint].tolist()
         if low >= high:
             problem = "must be below effort_max for MuJoCo"
-            raise InvalidArgumentError("effort_min", problem, joint=name, value=low, remedy="widen the limits")
+            raise InvalidArgumentError(
+                "effort_min", problem, joint=name, value=low, remedy="widen the limits"
+            )
         element = {"name": name, "joint": name}
         if delay := drive.motor("command_delay")[joint]:
             samples = math.ceil(delay / drive.dt) + 2
@@ -91,35 +102,56 @@ class MjcfActuators:
         if self.is_law:
             return "pid", element | self._pid(joint)
         bias = drive.motor("bias")[joint]
-        element |= {"gainprm": _text(self._strength[joint]), "biastype": "affine", "biasprm": _text(bias)}
+        element |= {
+            "gainprm": _text(self._strength[joint]),
+            "biastype": "affine",
+            "biasprm": _text(bias),
+        }
         if lag := self._lag[joint]:
             element |= {"dyntype": "filterexact", "dynprm": _text(lag), "actearly": "true"}
         return "general", element
 
     def _gains(self, joint: int) -> dict[str, float]:
-        """Return gains, and limits of the setpoint's rate and of the integral of the error; 0 for none."""
+        """Return gains, and limits of the setpoint's rate and of the integral of the error; 0 for
+        none.
+        """
         drive = self._drive
         limit = self._drive.integral_limit[joint]
         rate = self._rate[joint]
         kp, ki, kv = (float(drive.value(name)[joint]) for name in ("kp", "ki", "kd"))
         ki = ki if limit > 0 else 0.0
         imax = limit / ki if ki and math.isfinite(limit) else 0.0
-        return {"kp": kp, "ki": ki, "kv": kv, "slewmax": rate if math.isfinite(rate) else 0.0, "imax": imax}
+        return {
+            "kp": kp,
+            "ki": ki,
+            "kv": kv,
+            "slewmax": rate if math.isfinite(rate) else 0.0,
+            "imax": imax,
+        }
 
     def _pid(self, joint: int) -> dict[str, str]:
-        element = {key: _text(value) for key, value in self._gains(joint).items() if value or key == "kp"} | _INPUTS
+        element = {
+            key: _text(value) for key, value in self._gains(joint).items() if value or key == "kp"
+        } | _INPUTS
         lower = self._lower[joint]
-        ends = lower, max(self._upper[joint], np.nextafter(lower, math.inf))  # MuJoCo: lower < upper
+        ends = (
+            lower,
+            max(self._upper[joint], np.nextafter(lower, math.inf)),
+        )  # MuJoCo: lower < upper
         if np.isfinite(ends).any():
             element["posrange"] = _text(*np.clip(ends, -FAR, FAR))
         return element
 
     def _dcmotor(self, joint: int) -> dict[str, str]:
-        arm = 1.0 if self.is_law else float(self._strength[joint])  # the gear, by which the motor's efforts are divided
+        arm = (
+            1.0 if self.is_law else float(self._strength[joint])
+        )  # the gear, by which the motor's efforts are divided
         element, voltage = {"motorconst": "1 1", "resistance": "1"}, 0.0
         if self._has_line[joint]:
             voltage = 1.0
-            element = {"nominal": _text(voltage, self._stall[joint] / arm, self._speed[joint] * arm)}
+            element = {
+                "nominal": _text(voltage, self._stall[joint] / arm, self._speed[joint] * arm)
+            }
         gains = self._gains(joint).values() if self.is_law else [0.0] * 5
         element |= _INPUTS if self.is_law else {"input": "ff", "gear": _text(arm)}
         element["controller"] = _text(*gains, voltage)
@@ -138,24 +170,48 @@ class MjcfActuators:
         drive.lack_motors(written if self.is_law else written | {"strength", "bias"})
         limit = drive.motor("effort_limit", math.inf)
         is_weak = np.abs(self.effort_range).min(1) < limit
-        limited, places = np.isfinite(self.effort_range).any(1), np.isfinite([self._lower, self._upper]).any(0)
+        limited, places = (
+            np.isfinite(self.effort_range).any(1),
+            np.isfinite([self._lower, self._upper]).any(0),
+        )
         guarded, turns = self.has_rate | places, self.has_rate & continuous
         late, biased = drive.motor("command_delay") > 0, drive.motor("bias") != 0
         law, dcmotor = np.full(len(limit), self.is_law), self._is_dcmotor
         for joints, text in (
-            (law & late, "command_delay: of the inputs, which are 0 at first, not of the effort: the law is not late"),
+            (
+                law & late,
+                (
+                    "command_delay: of the inputs, which are 0 at first, not of the effort: the law"
+                    " is not late"
+                ),
+            ),
             (dcmotor & biased & ~law, "bias: none in a dcmotor"),
             (np.isfinite(self._stall) & ~line, "saturation_effort: none without strength"),
             (
                 lags & limited,
-                "lag: before effort_limit, not after it, so that the effort stays at its limit for longer",
+                (
+                    "lag: before effort_limit, not after it, so that the effort stays at its limit"
+                    " for longer"
+                ),
             ),
-            (lags & line, "lag: an effort that lags behind the speed may pass the torque-speed line"),
-            (line & is_weak, "saturation_effort: beyond its line the motor brakes within the law's limits alone"),
-            (np.isfinite(self._acceleration), "guard: the acceleration of the setpoint is not limited"),
+            (
+                lags & line,
+                "lag: an effort that lags behind the speed may pass the torque-speed line",
+            ),
+            (
+                line & is_weak,
+                "saturation_effort: beyond its line the motor brakes within the law's limits alone",
+            ),
+            (
+                np.isfinite(self._acceleration),
+                "guard: the acceleration of the setpoint is not limited",
+            ),
             (dcmotor & places, "guard: a dcmotor has no limits of the position alone"),
             (turns, "guard: setpoints do not go the short way round"),
-            (guarded & (drive.value("kd") > 0), "guard: of the position input; the velocity input is as given"),
+            (
+                guarded & (drive.value("kd") > 0),
+                "guard: of the position input; the velocity input is as given",
+            ),
         ):
             if (joints := joints & self._independent).any():
                 drive.append(f"{text}: {drive.listed_names(joints)}")

@@ -1,7 +1,7 @@
 """MJCF of the simulated robot, with the law or its motors in MuJoCo's own actuators.
 
-The equations are in :mod:`batchpid.sim.engine.mujoco.mjcf_actuators`. ``<pid>`` is this package's law with the measured
-velocity and ``integration="output_first"``, without anti-windup.
+The equations are in :mod:`batchpid.sim.engine.mujoco.mjcf_actuators`. ``<pid>`` is this package's
+law with the measured velocity and ``integration="output_first"``, without anti-windup.
 """
 
 from __future__ import annotations
@@ -43,20 +43,23 @@ def to_mjcf(
 ) -> Exported:
     """Return the MJCF of ``robot``, one actuator for each independent joint, and its differences.
 
-    Bodies are the rigid bodies that are simulated here, with repaired inertias, convex shapes, pairs that do not
-    collide, joint limits, damping, Coulomb friction and armature; followers are tied to their leaders by constraints.
-    Each actuator of the law has three inputs in ``ctrl``: position, velocity and feedforward. The keyframe "home" has
-    the start pose as positions of base and joints, position inputs and rate-limited setpoints.
+    Bodies are the rigid bodies that are simulated here, with repaired inertias, convex shapes,
+    pairs that do not collide, joint limits, damping, Coulomb friction and armature; followers are
+    tied to their leaders by constraints. Each actuator of the law has three inputs in ``ctrl``:
+    position, velocity and feedforward. The keyframe "home" has the start pose as positions of base
+    and joints, position inputs and rate-limited setpoints.
 
     Parameters
     ----------
     params
-        Of one env: (1, joints), all joints. None: the motors alone; the input in ``ctrl`` is the effort asked for.
+        Of one env: (1, joints), all joints. None: the motors alone; the input in ``ctrl`` is the
+        effort asked for.
     dt
         Time step of the simulation, and so of the control [s].
     actuators
-        Motors of one env. Their armature, friction, effort limit, torque-speed line, lag and command delay are written;
-        with the law the delay acts on the inputs. Strength and bias are written for motors alone.
+        Motors of one env. Their armature, friction, effort limit, torque-speed line, lag and
+        command delay are written; with the law the delay acts on the inputs. Strength and bias are
+        written for motors alone.
     guard
         Limits of the law's setpoints, for one env. Those of position and rate are written.
     inertia
@@ -65,8 +68,8 @@ def to_mjcf(
     Raises
     ------
     InvalidArgumentError
-        Params, actuators or guard for several envs, gains per mass matrix without ``inertia``, or a guard without
-        params.
+        Params, actuators or guard for several envs, gains per mass matrix without ``inertia``, or a
+        guard without params.
     RobotError
         MuJoCo cannot build the robot.
     """
@@ -74,7 +77,9 @@ def to_mjcf(
     if guard is not None:
         check_guard(guard, 1, robot.joint_names)
         if params is None:
-            raise InvalidArgumentError("guard", "limits setpoints of a law", remedy="pass params, or leave it out")
+            raise InvalidArgumentError(
+                "guard", "limits setpoints of a law", remedy="pass params, or leave it out"
+            )
     drive = Drive(law, robot.joint_names, dt, inertia, actuators)
     spec = SceneSpec(
         robot.urdf,
@@ -87,7 +92,8 @@ def to_mjcf(
         fixed_base=robot.fixed_base,
         engine="mujoco",
     )
-    # The bodies are those that the engine simulates; inertias and efforts are then written with all their digits.
+    # The bodies are those that the engine simulates; inertias and efforts are then written with all
+    # their digits.
     inertias = body_inertias(spec.urdf, spec.separate)
     scene, names = robot_spec(spec, inertias)
     scene.modelname, scene.option.disableflags = robot.name, 0
@@ -95,7 +101,13 @@ def to_mjcf(
         _set_inertia(scene.body(name), inertias[link], link, drive)
     motors = MjcfActuators(drive, robot.independent, params is not None, guard)
     motors.compare(robot.continuous)
-    _set_joints(scene, robot, drive, added_friction(own_friction(spec), drive.actuators), motors.effort_range)
+    _set_joints(
+        scene,
+        robot,
+        drive,
+        added_friction(own_friction(spec), drive.actuators),
+        motors.effort_range,
+    )
     try:
         scene.compile()
         root = _exact(scene)
@@ -108,8 +120,13 @@ def to_mjcf(
     etree.SubElement(etree.SubElement(root, "keyframe"), "key", _start(model, robot, motors))
     etree.indent(root)
     if robot.mjcf is not None:
-        drive.append("scene: the robot alone, without objects, tendons, springs and equalities of its MJCF file")
-    head = "".join(f"<!-- differs: {' '.join(text.split()).replace('--', '- -')} -->\n" for text in drive)
+        drive.append(
+            "scene: the robot alone, without objects, tendons, springs and equalities of its MJCF"
+            " file"
+        )
+    head = "".join(
+        f"<!-- differs: {' '.join(text.split()).replace('--', '- -')} -->\n" for text in drive
+    )
     return Exported(f"{head}{etree.tostring(root, encoding='unicode')}\n", tuple(drive))
 
 
@@ -127,7 +144,11 @@ def _set_joints(
 ) -> None:
     """Set damping, friction, armature and effort limits of the joints, and tie the followers."""
     rows = {"damping": friction.viscous, "frictionloss": friction.coulomb}
-    tables = {field: np.broadcast_to(leaf, (1, robot.dof))[0] for field, leaf in rows.items() if leaf is not None}
+    tables = {
+        field: np.broadcast_to(leaf, (1, robot.dof))[0]
+        for field, leaf in rows.items()
+        if leaf is not None
+    }
     for at, name in enumerate(robot.joint_names):
         joint = scene.joint(name)
         joint.armature = drive.motor("armature")[at]
@@ -140,11 +161,16 @@ def _set_joints(
     for follower in coupling.followers:
         tie = scene.add_equality(type=mujoco.mjtEq.mjEQ_JOINT)
         tie.objtype = mujoco.mjtObj.mjOBJ_JOINT
-        tie.name1, tie.name2 = robot.joint_names[follower], robot.joint_names[coupling.leader[follower]]
+        tie.name1, tie.name2 = (
+            robot.joint_names[follower],
+            robot.joint_names[coupling.leader[follower]],
+        )
         figures = [coupling.offset[follower], coupling.multiplier[follower]]
         tie.data = np.pad(figures, (0, len(tie.data) - 2))
     if np.any(tables.get("frictionloss", 0)):
-        drive.append("friction: a soft constraint in MuJoCo, in which a joint creeps below its friction")
+        drive.append(
+            "friction: a soft constraint in MuJoCo, in which a joint creeps below its friction"
+        )
     if names := [robot.joint_names[joint] for joint in coupling.followers]:
         drive.append(f"followers: soft constraints in MuJoCo: {', '.join(names)}")
 
@@ -165,22 +191,36 @@ def _start(model: MjModel, robot: RobotDescription, motors: MjcfActuators) -> di
         if motors.has_rate[at]:  # the setpoint is the first of the states
             act[model.actuator_actadr[actuator]] = robot.start[at]
     columns = {"qpos": qpos, "ctrl": ctrl, "act": act}
-    return {"name": "home"} | {key: " ".join(map(repr, row.tolist())) for key, row in columns.items() if row.any()}
+    return {"name": "home"} | {
+        key: " ".join(map(repr, row.tolist())) for key, row in columns.items() if row.any()
+    }
 
 
 def _exact(scene: MjSpec) -> Any:
-    """Return the XML of a compiled scene, with all digits of the dynamics, of which MuJoCo writes six."""
+    """Return the XML of a compiled scene, with all digits of the dynamics, of which MuJoCo writes
+    six.
+    """
     root = etree.fromstring(scene.to_xml().encode())
-    _write(root.find("option"), {"timestep": scene.option.timestep, "gravity": scene.option.gravity})
+    _write(
+        root.find("option"), {"timestep": scene.option.timestep, "gravity": scene.option.gravity}
+    )
     for element in root.iterfind("worldbody//body"):
         body = scene.body(element.get("name"))
         _write(element, {"pos": body.pos, "quat": body.quat})
-        figures = {"pos": body.ipos, "quat": body.iquat, "mass": body.mass, "diaginertia": body.inertia}
+        figures = {
+            "pos": body.ipos,
+            "quat": body.iquat,
+            "mass": body.mass,
+            "diaginertia": body.inertia,
+        }
         _write(element.find("inertial"), figures)
     for element in root.iterfind("worldbody//joint[@name]"):
         joint = scene.joint(element.get("name"))
         fields = ("axis", "range", "actuatorfrcrange", "armature", "damping", "frictionloss")
-        _write(element, {field: getattr(joint, field.replace("actuatorfrc", "actfrc")) for field in fields})
+        _write(
+            element,
+            {field: getattr(joint, field.replace("actuatorfrc", "actfrc")) for field in fields},
+        )
     for element, tie in zip(root.findall("equality/joint"), scene.equalities, strict=True):
         _write(element, {"polycoef": tie.data})
     return root

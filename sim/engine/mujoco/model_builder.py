@@ -1,14 +1,16 @@
 r"""Robots as MuJoCo's models.
 
-Each simulated link of the robot (rigid bodies, with fixed joints merged) is a body in the frame of its joint. Masses
-and inertias come from the URDF, in double precision; meshes are convex hulls, as in SAPIEN. A body whose links collide
-with another body in part has one body without mass for each link with shapes, since MuJoCo excludes pairs of bodies.
+Each simulated link of the robot (rigid bodies, with fixed joints merged) is a body in the frame of
+its joint. Masses and inertias come from the URDF, in double precision; meshes are convex hulls, as
+in SAPIEN. A body whose links collide with another body in part has one body without mass for each
+link with shapes, since MuJoCo excludes pairs of bodies.
 
-MuJoCo does not compute damping and Coulomb friction: the loop applies them as efforts, in the same way for every
-engine, with the damping's share dt d in the armature, which makes it implicit (:mod:`batchpid.motors.friction`).
+MuJoCo does not compute damping and Coulomb friction: the loop applies them as efforts, in the same
+way for every engine, with the damping's share dt d in the armature, which makes it implicit
+(:mod:`batchpid.motors.friction`).
 
-A robot of an MJCF file is the file's model (:mod:`batchpid.sim.engine.mujoco.file_scene`), in which MuJoCo computes the
-damping of the file.
+A robot of an MJCF file is the file's model (:mod:`batchpid.sim.engine.mujoco.file_scene`), in which
+MuJoCo computes the damping of the file.
 """
 
 from __future__ import annotations
@@ -44,9 +46,15 @@ LARGEST_FORCE = 1e10
 _NARROWEST = 1e-9
 """Smallest range of a limited joint [rad or m]: MuJoCo requires a positive one."""
 _HARD = (0.99, 0.999, 1e-4, 0.5, 2.0)
-"""Impedance of joint limits (MuJoCo's solimp): nearly all of the acceleration that violates a limit is cancelled."""
-_NOT_KEPT = sum(int(getattr(mujoco.mjtEnableBit, f"mjENBL_{name}", 0)) for name in ("SLEEP", "ENERGY", "FWDINV"))
-"""Parts that a file cannot enable: a snapshot does not hold what sleeps, and nobody reads the others."""
+"""Impedance of joint limits (MuJoCo's solimp): nearly all of the acceleration that violates a limit
+is cancelled.
+"""
+_NOT_KEPT = sum(
+    int(getattr(mujoco.mjtEnableBit, f"mjENBL_{name}", 0)) for name in ("SLEEP", "ENERGY", "FWDINV")
+)
+"""Parts that a file cannot enable: a snapshot does not hold what sleeps, and nobody reads the
+others.
+"""
 _FARTHEST = 1e10
 """Limit in place of an infinite one on one side [rad or m]."""
 
@@ -75,7 +83,8 @@ class RobotMj:
 
 @lru_cache(maxsize=8)
 def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
-    """Return the model of ``spec``, with a drive of every joint if asked; the same object for equal arguments.
+    """Return the model of ``spec``, with a drive of every joint if asked; the same object for equal
+    arguments.
 
     Raises
     ------
@@ -93,7 +102,10 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
     except ValueError as error:
         raise _refusal(error) from error
     bodies = {link: model.body(name).id for link, name in names.items()}
-    for link, body in bodies.items():  # the compiler refuses some inertias that both engines simulate
+    for (
+        link,
+        body,
+    ) in bodies.items():  # the compiler refuses some inertias that both engines simulate
         model.body_inertia[body] = np.linalg.eigh(inertias[link].tensor)[0]
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return RobotMj(model, *_places(model, spec), bodies, base=None if spec.fixed_base else (0, 0))
@@ -102,16 +114,22 @@ def robot_model(spec: SceneSpec, drives: bool = False) -> RobotMj:
 def _places(model: MjModel, spec: SceneSpec) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the indices of the joints in MuJoCo's qpos and qvel."""
     joints = [model.joint(joint.name) for joint in spec.joints]
-    qpos, qvel = (np.array([getattr(joint, name)[0] for joint in joints]) for name in ("qposadr", "dofadr"))
+    qpos, qvel = (
+        np.array([getattr(joint, name)[0] for joint in joints]) for name in ("qposadr", "dofadr")
+    )
     return qpos, qvel
 
 
 def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
-    """Return the model of a file, with the damping of the robot's joints, and without their friction and motors."""
+    """Return the model of a file, with the damping of the robot's joints, and without their
+    friction and motors.
+    """
     found = file_scene(spec, file)
     scene, off = found.scene, mujoco.mjtDisableBit
     option = scene.option
-    option.disableflags &= ~(off.mjDSBL_GRAVITY | off.mjDSBL_ACTUATION | off.mjDSBL_CLAMPCTRL | off.mjDSBL_SENSOR)
+    option.disableflags &= ~(
+        off.mjDSBL_GRAVITY | off.mjDSBL_ACTUATION | off.mjDSBL_CLAMPCTRL | off.mjDSBL_SENSOR
+    )
     option.enableflags &= ~_NOT_KEPT
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     _set_options(scene, spec)
@@ -143,7 +161,8 @@ def _file_model(spec: SceneSpec, file: MjcfFile, drives: bool) -> RobotMj:
 def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[Any, dict[str, str]]:
     """Return the ``mujoco.MjSpec`` of ``spec``, and the name of the body of each simulated link.
 
-    The bodies have the links' mass and center from ``inertias``; their inertia tensors are placeholders.
+    The bodies have the links' mass and center from ``inertias``; their inertia tensors are
+    placeholders.
 
     Raises RobotError if MuJoCo refuses a part of the robot.
     """
@@ -162,17 +181,23 @@ def robot_spec(spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> tuple[An
 
 
 def _refusal(error: ValueError) -> RobotError:
-    return RobotError(f"MuJoCo cannot build the robot: {' '.join(str(error).split())}; correct the URDF")
+    return RobotError(
+        f"MuJoCo cannot build the robot: {' '.join(str(error).split())}; correct the URDF"
+    )
 
 
 def _unused(name: str, taken: Collection[str]) -> str:
-    """Return ``name``, or that with the first number after it that makes a name outside ``taken``."""
+    """Return ``name``, or that with the first number after it that makes a name outside
+    ``taken``.
+    """
     numbered = (f"{name}_{number}" for number in count(2))
     return name if name not in taken else next(each for each in numbered if each not in taken)
 
 
 def principal_inertia(inertia: SpatialInertia) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return principal moments (3,) [kg m^2] and the rotation of the principal axes (4,), in the axes of the body."""
+    """Return principal moments (3,) [kg m^2] and the rotation of the principal axes (4,), in the
+    axes of the body.
+    """
     moments, axes = np.linalg.eigh(inertia.tensor)
     wxyz = np.empty(4)
     mujoco.mju_mat2Quat(wxyz, (axes * np.linalg.det(axes)).ravel())  # a rotation, not a reflection
@@ -185,16 +210,22 @@ def _set_options(scene: MjSpec, spec: SceneSpec) -> None:
     option.timestep, option.gravity = spec.timestep, spec.gravity
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     option.iterations, option.tolerance = solver.iterations, solver.tolerance
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if solver.elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.cone = (
+        mujoco.mjtCone.mjCONE_ELLIPTIC if solver.elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
+    )
     # A diverged env must stay visible: the loop suspends or resets it, and reports it.
     option.disableflags |= off.mjDSBL_AUTORESET | off.mjDSBL_ACTUATION
 
 
-def _add_links(scene: MjSpec, spec: SceneSpec, inertias: dict[str, SpatialInertia]) -> dict[str, str]:
+def _add_links(
+    scene: MjSpec, spec: SceneSpec, inertias: dict[str, SpatialInertia]
+) -> dict[str, str]:
     """Add the simulated links of ``spec`` as bodies; return the name of the body of each."""
     root = etree.fromstring(simulated(spec.urdf, spec.separate).urdf.encode())
     above = {joint.find("child").get("link"): joint for joint in root.findall("joint")}
-    names = {link: _unused("world_link", inertias) if link == "world" else link for link in inertias}
+    names = {
+        link: _unused("world_link", inertias) if link == "world" else link for link in inertias
+    }
     limits = {joint.name: (joint.lower, joint.upper) for joint in spec.joints}
     damping = {joint.name: joint.damping for joint in spec.joints}
     continuous = {joint.name for joint in spec.joints if joint.continuous}
@@ -205,7 +236,10 @@ def _add_links(scene: MjSpec, spec: SceneSpec, inertias: dict[str, SpatialInerti
             return added[link]
         inertia, joint = inertias[link], above.get(link)
         moments, wxyz = principal_inertia(inertia)
-        parent, origin = scene.worldbody if joint is None else add(joint.find("parent").get("link")), None
+        parent, origin = (
+            scene.worldbody if joint is None else add(joint.find("parent").get("link")),
+            None,
+        )
         if joint is not None:
             origin = joint.find("origin")
         body = parent.add_body(
@@ -246,7 +280,10 @@ def _add_links(scene: MjSpec, spec: SceneSpec, inertias: dict[str, SpatialInerti
 def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
     """Add the collision shapes, the pairs of bodies that do not collide, and the ground."""
     shapes = link_shapes(spec.urdf, spec.separate)
-    owners = {link: list(dict.fromkeys(shape.owner for shape in of_link)) for link, of_link in shapes.items()}
+    owners = {
+        link: list(dict.fromkeys(shape.owner for shape in of_link))
+        for link, of_link in shapes.items()
+    }
     ignored = {frozenset(pair) for pair in spec.ignored}
     solid, split = [link for link in owners if owners[link]], set[str]()
     for first, second in combinations(solid, 2):
@@ -260,7 +297,9 @@ def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
             bodies[owner] = _unused(f"{owner} (shapes)", taken)
             taken.add(bodies[owner])
             scene.body(names[link]).add_body(name=bodies[owner])
-    pairs_of_bodies = {frozenset(bodies[owner] for owner in pair) for pair in ignored if pair <= set(bodies)}
+    pairs_of_bodies = {
+        frozenset(bodies[owner] for owner in pair) for pair in ignored if pair <= set(bodies)
+    }
     for first, second in sorted(sorted(pair) for pair in pairs_of_bodies if len(pair) == 2):
         scene.add_exclude(bodyname1=first, bodyname2=second)
     for of_link in shapes.values():
@@ -271,21 +310,30 @@ def _add_shapes(scene: MjSpec, spec: SceneSpec, names: dict[str, str]) -> None:
 
 
 def _add_drives(scene: MjSpec, spec: SceneSpec) -> None:
-    """Add an actuator for each joint, in their order: effort = ctrl + bias (1, q, q'), between its limits."""
+    """Add an actuator for each joint, in their order: effort = ctrl + bias (1, q, q'), between its
+    limits.
+    """
     scene.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     scene.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for joint in spec.joints:
-        actuator = scene.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator = scene.add_actuator(
+            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+        )
         actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
         actuator.forcelimited, actuator.forcerange = True, [-LARGEST_FORCE, LARGEST_FORCE]
 
 
 def _contact(spec: SceneSpec) -> Document:
-    return {"friction": [CONTACT_FRICTION, 0.005, 0.0001], "solref": [spec.physics.contact_time, 1.0]}
+    return {
+        "friction": [CONTACT_FRICTION, 0.005, 0.0001],
+        "solref": [spec.physics.contact_time, 1.0],
+    }
 
 
 def set_inertia(model: MjModel, robot: RobotMj, link: str, inertia: SpatialInertia) -> None:
-    """Give a simulated link in a ``mujoco.MjModel`` this inertia, in the link's frame; ``mj_setConst`` comes next."""
+    """Give a simulated link in a ``mujoco.MjModel`` this inertia, in the link's frame;
+    ``mj_setConst`` comes next.
+    """
     body, welded = robot.bodies[link], tuple[int, ...]()
     if link in robot.frames:
         position, turn, welded = robot.frames[link]
@@ -294,6 +342,7 @@ def set_inertia(model: MjModel, robot: RobotMj, link: str, inertia: SpatialInert
     model.body_mass[body], model.body_ipos[body] = inertia.mass, inertia.center
     model.body_iquat[body], model.body_inertia[body] = wxyz, moments
     model.body_mass[[*welded]], model.body_inertia[[*welded]] = 0.0, 0.0
-    # Without the compiler's shortcuts for centers of mass at the body's origin, and bodies that are moved by one joint.
+    # Without the compiler's shortcuts for centers of mass at the body's origin, and bodies that are
+    # moved by one joint.
     model.body_sameframe[body], model.body_simple[body] = 0, 0
     model.dof_simplenum[:] = 0

@@ -21,7 +21,13 @@ from batchpid.sim.engine.model_pack import ModelPack
 from batchpid.sim.engine.mujoco.data_pool import STATE, DataPool, rest
 from batchpid.sim.engine.mujoco.file_scene import check_links
 from batchpid.sim.engine.mujoco.link_sensors import MujocoLinkSensors
-from batchpid.sim.engine.mujoco.model_builder import FLOATING, LARGEST_FORCE, RobotMj, robot_model, set_inertia
+from batchpid.sim.engine.mujoco.model_builder import (
+    FLOATING,
+    LARGEST_FORCE,
+    RobotMj,
+    robot_model,
+    set_inertia,
+)
 from batchpid.sim.engine.mujoco.mujoco_step import MujocoStep, obstacle
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.engine.native_model import NativeModel
@@ -67,7 +73,9 @@ class MujocoPack(ModelPack):
         self._actuators: Actuators | None = None
         coupling, viscous = coupling_of(spec.joints), self.friction.viscous
         if not coupling.is_identity and spec.mjcf is None:  # else MuJoCo has the file's equalities
-            self._constraint = ConstraintEfforts(size, coupling, np.zeros(self.dof, bool), spec.timestep)
+            self._constraint = ConstraintEfforts(
+                size, coupling, np.zeros(self.dof, bool), spec.timestep
+            )
             self._constraint.implicit[...] = spec.timestep * (0.0 if viscous is None else viscous)
             if self.steps_natively:
                 reads = spec.fixed_base and self.steps_read_force(True, True)
@@ -117,7 +125,8 @@ class MujocoPack(ModelPack):
             model = self.models[row] = copy.copy(model)
         return model
 
-    # -- reading -----------------------------------------------------------------------------------------------
+    # -- reading
+    # ----------------------------------------------------------------------------------------------
 
     def read_qpos(self, dtype: DType = np.float64) -> Rows:
         return np.array([data.qpos[self._at] for data in self._data], dtype)
@@ -140,7 +149,8 @@ class MujocoPack(ModelPack):
         """Model of the forces in the equations of motion of the joints, for constraint efforts."""
         return NativeModel(self.spec, "fixed" if self.spec.fixed_base else "free")
 
-    # -- stepping ----------------------------------------------------------------------------------------------
+    # -- stepping
+    # ----------------------------------------------------------------------------------------------
 
     def write_qf(self, effort: Rows) -> None:
         self.qf[...] = effort
@@ -156,7 +166,9 @@ class MujocoPack(ModelPack):
         if self._constraint is not None:
             effort = self._constraint.apply(self.qf, self.read_qpos(), self.read_qvel())
         handler = mujoco.get_mju_user_warning()
-        mujoco.set_mju_user_warning(lambda message: None)  # the loop finds states that are not finite
+        mujoco.set_mju_user_warning(
+            lambda message: None
+        )  # the loop finds states that are not finite
         try:
             everyone = self._data
             for row in np.flatnonzero(~self._suspended):
@@ -189,38 +201,63 @@ class MujocoPack(ModelPack):
     def _make_step(
         self, reads_force: bool, speed_limit: NDArray[np.float64] | None, drives: bool = False
     ) -> MujocoStep:
-        constraint, arrays = None if self._constraint is None else self._constraint.address, (self.qf, self._suspended)
+        constraint, arrays = (
+            None if self._constraint is None else self._constraint.address,
+            (self.qf, self._suspended),
+        )
         moving = (self._stiffness, self._rate_gain) if drives else None
         return MujocoStep(
-            *(self._robot, self.models, lambda: self._data, *arrays, reads_force, speed_limit, constraint, moving),
+            *(
+                self._robot,
+                self.models,
+                lambda: self._data,
+                *arrays,
+                reads_force,
+                speed_limit,
+                constraint,
+                moving,
+            ),
             sensed=self._sensed,
         )
 
     def update_constraint(self, rows: Any = slice(None)) -> None:
         if self._constraint is not None:
-            if self.spec.fixed_base:  # the bias is the passive force, with the bits that native steps read
+            if (
+                self.spec.fixed_base
+            ):  # the bias is the passive force, with the bits that native steps read
                 bias = self.passive_force(True, True)
             else:
                 state = self.read_qpos(), self.read_qvel(), True, True, self.read_base_motion()
                 natively, model = self.steps_natively, self._bias_model
-                bias = model.passive_force(*state) if natively else passive_force(self._tree, *state)
+                bias = (
+                    model.passive_force(*state) if natively else passive_force(self._tree, *state)
+                )
             self._constraint.update(self.joint_mass_matrix, self.read_qpos(), bias, rows)
 
-    # -- changes -----------------------------------------------------------------------------------------------
+    # -- changes
+    # ----------------------------------------------------------------------------------------------
 
     def read_base(self) -> Float64:
         rows = self._bases()
-        rows[:, 10:] = turned_back(inverse(rows[:, 3:7]), rows[:, 10:])  # MuJoCo's are in the body's axes
+        rows[:, 10:] = turned_back(
+            inverse(rows[:, 3:7]), rows[:, 10:]
+        )  # MuJoCo's are in the body's axes
         return rows
 
     def _bases(self) -> Float64:
-        """Return pose and velocities of the bodies of floating bases (M, 13), angular ones in the body's axes."""
+        """Return pose and velocities of the bodies of floating bases (M, 13), angular ones in the
+        body's axes.
+        """
         qpos, qvel = self._robot.base or (0, 0)
         parts = slice(qpos, qpos + FLOATING + 1), slice(qvel, qvel + FLOATING)
-        return np.array([np.concatenate([data.qpos[parts[0]], data.qvel[parts[1]]]) for data in self._data])
+        return np.array(
+            [np.concatenate([data.qpos[parts[0]], data.qvel[parts[1]]]) for data in self._data]
+        )
 
     def strays(self) -> NDArray[np.bool_]:
-        """Return the robots (M,) whose base, or an object of the file, is beyond FARTHEST or not finite."""
+        """Return the robots (M,) whose base, or an object of the file, is beyond FARTHEST or not
+        finite.
+        """
         if self._robot.model.nq == self.dof:
             return np.zeros(self.size, bool)
         return ~np.array([np.abs(data.qpos).max() <= FARTHEST for data in self._data])
@@ -244,8 +281,12 @@ class MujocoPack(ModelPack):
             data[row].qvel[at + 3 : at + FLOATING] += turn.T @ twist[3:]
         self._evaluate(rows)
 
-    def write_state(self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None) -> None:
-        """Place robots ``rows``: positions and velocities (len(rows), dof), zero efforts, the root at ``base``."""
+    def write_state(
+        self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None
+    ) -> None:
+        """Place robots ``rows``: positions and velocities (len(rows), dof), zero efforts, the root
+        at ``base``.
+        """
         everyone, floats = self._data, self._robot.base is not None
         bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else base.copy()
         at, moves = self._robot.base or (0, 0)
@@ -255,7 +296,9 @@ class MujocoPack(ModelPack):
             ctrl = data.ctrl.copy()
             rest(self.models[row], data)
             if floats:
-                data.qpos[at : at + FLOATING + 1], data.qvel[moves : moves + FLOATING] = np.split(root, [FLOATING + 1])
+                data.qpos[at : at + FLOATING + 1], data.qvel[moves : moves + FLOATING] = np.split(
+                    root, [FLOATING + 1]
+                )
             data.qpos[self._robot.qpos], data.qvel[self._robot.qvel] = position, velocity
             data.ctrl[:] = ctrl
             self.qf[row] = 0.0
@@ -276,14 +319,18 @@ class MujocoPack(ModelPack):
         tables = {name: np.broadcast_to(table, self.qf.shape) for name, table in values.items()}
         for row in range(self.size) if rows is None else rows:
             for name, table in tables.items():
-                if not np.array_equal(getattr(self.models[row], name)[self._robot.qvel], table[row]):
+                if not np.array_equal(
+                    getattr(self.models[row], name)[self._robot.qvel], table[row]
+                ):
                     model = self._own_model(row)
                     getattr(model, name)[self._robot.qvel] = table[row]
                     mujoco.mj_setConst(model, self._scratch)
         self._share()
 
     def _share(self) -> None:
-        """Return to one shared model if neither masses nor worlds nor armature nor drives of the robots differ."""
+        """Return to one shared model if neither masses nor worlds nor armature nor drives of the
+        robots differ.
+        """
         first = self.models[0]
         if (
             not self._masses.added
@@ -324,12 +371,17 @@ class MujocoPack(ModelPack):
 
     @cached_property
     def _rubbing(self) -> tuple[Any, Any, float]:
-        """Masks of the shapes of robot and ground, and of the pairs of these, and the friction of the ground."""
+        """Masks of the shapes of robot and ground, and of the pairs of these, and the friction of
+        the ground.
+        """
         robot, file = self._robot, self.spec.mjcf
         model = robot.model
         if file is None:
             return slice(None), slice(None), CONTACT_FRICTION
-        bodies = {*robot.bodies.values(), *(body for frame in robot.frames.values() for body in frame.welded)} - {0}
+        bodies = {
+            *robot.bodies.values(),
+            *(body for frame in robot.frames.values() for body in frame.welded),
+        } - {0}
         is_ground = (model.geom_bodyid == 0) & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
         shapes = np.isin(model.geom_bodyid, [*bodies]) | is_ground
         return shapes, shapes[model.pair_geom1] & shapes[model.pair_geom2], file.friction
@@ -347,8 +399,9 @@ class MujocoPack(ModelPack):
     def write_drive(self, stiffness: Rows, damping: Rows, force_limit: Rows) -> None:
         """Set the drive of every joint; each argument broadcasts to (M, dof).
 
-        They are MuJoCo's actuators, implicit in the time step dt as PhysX's are: with the velocity v+ after it, the
-        effort kp (r - q - dt v+) + kd (r' - v+) is a drive's with stiffness kp and implicit damping kd + dt kp.
+        They are MuJoCo's actuators, implicit in the time step dt as PhysX's are: with the velocity
+        v+ after it, the effort kp (r - q - dt v+) + kd (r' - v+) is a drive's with stiffness kp and
+        implicit damping kd + dt kp.
         """
         if self._robot.model.nu == 0:
             states = self.read_state()
@@ -360,7 +413,9 @@ class MujocoPack(ModelPack):
         self._stiffness, self._rate_gain = (
             np.broadcast_to(table, self.qf.shape).copy() for table in (stiffness, damping)
         )
-        gains = np.stack([-self._stiffness, -self._rate_gain - self.spec.timestep * self._stiffness], axis=2)
+        gains = np.stack(
+            [-self._stiffness, -self._rate_gain - self.spec.timestep * self._stiffness], axis=2
+        )
         for row in range(self.size):
             model = self.models[row]
             if not (
@@ -379,7 +434,8 @@ class MujocoPack(ModelPack):
         for data, row in zip(self._data, values, strict=True):
             data.ctrl[:] = row
 
-    # -- snapshots ---------------------------------------------------------------------------------------------
+    # -- snapshots
+    # ---------------------------------------------------------------------------------------------
 
     def state_sizes(self) -> list[int]:
         """Return the number of values in the state of each robot."""
@@ -407,7 +463,9 @@ class MujocoPack(ModelPack):
         self.models = []
 
     def _release(self) -> None:
-        """Give back all that fits the present kind of model alone: working memory, and data made for its size."""
+        """Give back all that fits the present kind of model alone: working memory, and data made
+        for its size.
+        """
         self._pool.leave(self)
         self._own_step = None
         for name in ("_scratch", "_rubbing"):

@@ -1,9 +1,9 @@
 """Sim step of robots in MuJoCo as one native call, of the same kind as SAPIEN's.
 
-Robots are stepped by MuJoCo's public functions ``mj_step2`` (from velocities to the next state) and ``mj_step1`` (all
-that follows from that state alone, so also gravity and Coriolis forces). Collision detection takes half of a sim step
-of a robot with meshes, and usually finds no contact: native code proves, from tables of the shapes, that they do not
-touch (``clearance.h``).
+Robots are stepped by MuJoCo's public functions ``mj_step2`` (from velocities to the next state) and
+``mj_step1`` (all that follows from that state alone, so also gravity and Coriolis forces).
+Collision detection takes half of a sim step of a robot with meshes, and usually finds no contact:
+native code proves, from tables of the shapes, that they do not touch (``clearance.h``).
 """
 
 from __future__ import annotations
@@ -31,10 +31,18 @@ FUNCTIONS = {
     "set_log_handler": "mju_setLogHandler",
     "kinematics": "mj_kinematics",
 }
-"""Functions of MuJoCo's library, by field of the structures in :mod:`batchpid.sim.engine.native.interface`."""
+"""Functions of MuJoCo's library, by field of the structures in
+:mod:`batchpid.sim.engine.native.interface`.
+"""
 CLOCK = "mjcb_time"
 """Variable of the library that holds its clock."""
-FIELDS = {"qpos": "qpos", "qvel": "qvel", "applied": "qfrc_applied", "bias": "qfrc_bias", "ctrl": "ctrl"}
+FIELDS = {
+    "qpos": "qpos",
+    "qvel": "qvel",
+    "applied": "qfrc_applied",
+    "bias": "qfrc_bias",
+    "ctrl": "ctrl",
+}
 FIELDS |= {"sensors": "sensordata"}
 """Arrays of ``mujoco.MjData``, by field."""
 
@@ -54,11 +62,14 @@ def obstacle() -> str:
 
 @cache
 def functions() -> dict[str, int] | None:
-    """Return the addresses of functions and clock by field; None if this version of MuJoCo lacks one of them."""
+    """Return the addresses of functions and clock by field; None if this version of MuJoCo lacks
+    one of them.
+    """
     try:
         library = ctypes.CDLL(str(mujoco_library()))
         addresses = {
-            field: ctypes.cast(getattr(library, name), ctypes.c_void_p).value for field, name in FUNCTIONS.items()
+            field: ctypes.cast(getattr(library, name), ctypes.c_void_p).value
+            for field, name in FUNCTIONS.items()
         }
         addresses["clock"] = ctypes.addressof(ctypes.c_void_p.in_dll(library, CLOCK))
         data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
@@ -78,7 +89,8 @@ class MujocoStep(NativeStep):
     models
         Of each robot.
     take_data
-        Function that returns the ``mujoco.MjData`` of each robot, the same at every call, in its state.
+        Function that returns the ``mujoco.MjData`` of each robot, the same at every call, in its
+        state.
     qf, skip
         Efforts last applied (robots, dof), and the robots that are not stepped (robots,).
     reads_force
@@ -110,15 +122,29 @@ class MujocoStep(NativeStep):
         found, data = functions(), take_data()
         assert found is not None
         addresses = dict(found)
-        kinematics, shapes = addresses.pop("kinematics"), None if robot.is_file else shape_tables(robot)
-        clearance = None if shapes is None else GroupClearance(shapes, kinematics, models, data, qf.shape[1])
+        kinematics, shapes = (
+            addresses.pop("kinematics"),
+            None if robot.is_file else shape_tables(robot),
+        )
+        clearance = (
+            None
+            if shapes is None
+            else GroupClearance(shapes, kinematics, models, data, qf.shape[1])
+        )
         tables = {
             "models": [model._address for model in models],
             "data": [scene._address for scene in data],
-            **{field: [getattr(scene, name).ctypes.data for scene in data] for field, name in FIELDS.items()},
+            **{
+                field: [getattr(scene, name).ctypes.data for scene in data]
+                for field, name in FIELDS.items()
+            },
         }
         arrays: dict[str, Rows] = {name: np.array(rows, np.uint64) for name, rows in tables.items()}
-        arrays |= {"qpos_at": robot.qpos.astype(np.int64), "qvel_at": robot.qvel.astype(np.int64), "qf": qf}
+        arrays |= {
+            "qpos_at": robot.qpos.astype(np.int64),
+            "qvel_at": robot.qvel.astype(np.int64),
+            "qf": qf,
+        }
         arrays["sensed"] = sensed
         if drives is not None:
             arrays |= zip(("stiffness", "rate_gain"), drives, strict=True)
@@ -140,6 +166,8 @@ class MujocoStep(NativeStep):
         )
 
     def prepare(self) -> int:
-        """Return the address of the group, for a call of the extension or of XLA; the robots are in their states."""
+        """Return the address of the group, for a call of the extension or of XLA; the robots are in
+        their states.
+        """
         self._take_data()
         return super().prepare()

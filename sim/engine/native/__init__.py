@@ -1,6 +1,7 @@
 """Native extensions: programs on arrays, dynamics of many robots, and calls into the engines.
 
-Where they are not used, and with the environment variable ``BATCHPID_NATIVE=0``, Python does the same work.
+Where they are not used, and with the environment variable ``BATCHPID_NATIVE=0``, Python does the
+same work.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ __all__ = ["SWITCH", "describe_calls", "extension", "obstacle"]
 
 
 def obstacle() -> str:
-    """Return why native code is not used, "" if it is; further reasons are :meth:`Engine.native_obstacle`."""
+    """Return why native code is not used, "" if it is; further reasons are
+    :meth:`Engine.native_obstacle`.
+    """
     return availability.obstacle(*EXTENSIONS.values())
 
 
@@ -26,7 +29,8 @@ def describe_calls(engine: str, obstacle: str) -> str:
 
 
 def extension(name: str) -> Any:
-    """Return the extension ``name`` of :data:`interface.EXTENSIONS`; errors as :func:`batchpid.native.extensions.load`.
+    """Return the extension ``name`` of :data:`interface.EXTENSIONS`; errors as
+    :func:`batchpid.native.extensions.load`.
 
     It does not depend on :func:`obstacle`.
     """

@@ -1,7 +1,8 @@
 """Interface between Python and the native extensions: files, flags and tables.
 
-The C++ code repeats these tables: see :mod:`batchpid.native.extensions`. ``setup.py`` imports this module without its
-package, so it may import only that module, others that it lists before this one, and the standard library.
+The C++ code repeats these tables: see :mod:`batchpid.native.extensions`. ``setup.py`` imports this
+module without its package, so it may import only that module, others that it lists before this one,
+and the standard library.
 """
 
 from __future__ import annotations
@@ -27,13 +28,26 @@ SYMBOLS = (
 BASES = ("fixed", "free", "held")
 """Kinds of the base of a :class:`ModelStruct`, as Base in model.h."""
 STATUS = ("not_finite", "too_fast", "failed", "no_noise", "sense")
-"""Bits of the status of a sim step: reasons to stop a loop over sim steps, as Status in sim_step.h."""
-STAGES = ("program", "force", "inertia", "mass_matrix", "controller", "targets", "constraint", "engine")
+"""Bits of the status of a sim step: reasons to stop a loop over sim steps, as Status in
+sim_step.h.
+"""
+STAGES = (
+    "program",
+    "force",
+    "inertia",
+    "mass_matrix",
+    "controller",
+    "targets",
+    "constraint",
+    "engine",
+)
 """Kinds of a :class:`Stage`."""
 TRANSFERS = ("read", "write_floats", "write_bytes")
 """Kinds of a :class:`Transfer`."""
 FARTHEST = 1e6
-"""Largest position of a joint [rad or m], as in sim_step.h. A robot beyond it has failed: its state is float32."""
+"""Largest position of a joint [rad or m], as in sim_step.h. A robot beyond it has failed: its state
+is float32.
+"""
 
 
 class Group(ctypes.Structure):
@@ -58,7 +72,10 @@ class Clearance(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("kinematics", "models", "places", "turns")),
         *((name, ctypes.c_void_p) for name in ("kinds", "sizes", "radii", "hulls", "vertices")),
-        *((name, ctypes.c_void_p) for name in ("pairs", "bodies", "arms", "arm_ways", "begins", "travel")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("pairs", "bodies", "arms", "arm_ways", "begins", "travel")
+        ),
         *(
             (name, ctypes.c_void_p)
             for name in ("last", "moved", "left", "rate", "wait", "age", "brief", "near", "open")
@@ -76,7 +93,10 @@ class Mujoco(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("step1", "step2", "set_log_handler", "clock")),
         *((name, ctypes.c_void_p) for name in ("models", "data")),
-        *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("qpos", "qvel", "applied", "bias", "qpos_at", "qvel_at", "qf")
+        ),
         *((name, ctypes.c_void_p) for name in ("ctrl", "stiffness", "rate_gain")),
         *((name, ctypes.c_void_p) for name in ("clearance", "sensors", "sensed")),
         *((name, ctypes.c_int64) for name in ("sensor_size", "base_qpos", "base_qvel")),
@@ -87,8 +107,14 @@ class Constraint(ctypes.Structure):
     """Constraint of coupled joints, as Constraint in constraint.h."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("response", "push", "passive", "followers", "leaders")),
-        *((name, ctypes.c_void_p) for name in ("multiplier", "offset", "wraps", "unwrapped", "asked", "wrong", "free")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("response", "push", "passive", "followers", "leaders")
+        ),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("multiplier", "offset", "wraps", "unwrapped", "asked", "wrong", "free")
+        ),
         *((name, ctypes.c_void_p) for name in ("model", "implicit", "force")),
         ("rate_gain", ctypes.c_double),
         ("position_gain", ctypes.c_double),
@@ -112,7 +138,10 @@ class Refresh(ctypes.Structure):
     """Constants of the friction model, as Refresh in refresh.h."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("model", "armature", "coulomb", "viscous", "damping", "stiffness")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("model", "armature", "coulomb", "viscous", "damping", "stiffness")
+        ),
         *((name, ctypes.c_void_p) for name in ("leader", "multiplier")),
         ("timestep", ctypes.c_double),
         ("share", ctypes.c_double),
@@ -135,7 +164,10 @@ class Tick(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("stages", "transfers")),
-        *((name, ctypes.c_void_p) for name in ("qpos", "qvel", "passive", "before", "pose", "rate", "qf")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("qpos", "qvel", "passive", "before", "pose", "rate", "qf")
+        ),
         *((name, ctypes.c_void_p) for name in ("tree", "bodies", "armature", "damping")),
         *((name, ctypes.c_void_p) for name in ("leader", "multiplier", "matrix", "control")),
         *((name, ctypes.c_void_p) for name in ("measured_force", "read_force", "refresh")),
@@ -150,7 +182,9 @@ class Tick(ctypes.Structure):
 
 
 class Transfer(ctypes.Structure):
-    """Copy between the arrays of a tick and a table with an entry for each tick, as Transfer in tick.h."""
+    """Copy between the arrays of a tick and a table with an entry for each tick, as Transfer in
+    tick.h.
+    """
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("table", "row")),
@@ -160,7 +194,15 @@ class Transfer(ctypes.Structure):
 
 
 _NAMES = (
-    *("gateway.cpp", "gateway.h", "model.h", "mujoco_step.h", "clearance.h", "constraint.h", "refresh.h"),
+    *(
+        "gateway.cpp",
+        "gateway.h",
+        "model.h",
+        "mujoco_step.h",
+        "clearance.h",
+        "constraint.h",
+        "refresh.h",
+    ),
     *("sim_step.h", "tick.h", "xla_call.h", "interface.py"),
 )
 

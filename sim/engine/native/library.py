@@ -1,4 +1,6 @@
-"""SAPIEN's shared library: whether native code can call it, and the functions that the gateway calls."""
+"""SAPIEN's shared library: whether native code can call it, and the functions that the gateway
+calls.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +16,16 @@ from batchpid.sim.engine.native.interface import SYMBOLS
 TESTED = ("3.0.3",)
 """Versions of SAPIEN that native code calls; tests/sim/test_conformance.py must pass with each.
 
-The gateway repeats the layout of two types of SAPIEN (gateway.h). No header promises it, and the names of the
-functions do not contain the type that they return: a version that changes it would corrupt memory.
+The gateway repeats the layout of two types of SAPIEN (gateway.h). No header promises it, and the
+names of the functions do not contain the type that they return: a version that changes it would
+corrupt memory.
 """
 
 
 def import_sapien() -> Any:
-    """Return the module ``sapien``, imported without its warnings about things that are not used here."""
+    """Return the module ``sapien``, imported without its warnings about things that are not used
+    here.
+    """
     with warnings.catch_warnings():
         # Without a system Vulkan SAPIEN warns that it falls back to its own; nothing here renders.
         warnings.filterwarnings("ignore", message=".*libvulkan.*")
@@ -46,8 +51,14 @@ def obstacle() -> str:
 def functions() -> tuple[int, ...]:
     """Return the addresses of the exported functions; AttributeError names one that is missing."""
     folder = Path(import_sapien().__file__).parent
-    paths = [path for place in (folder, folder.parent / "sapien.libs") for path in place.glob("libsapien*.so*")]
+    paths = [
+        path
+        for place in (folder, folder.parent / "sapien.libs")
+        for path in place.glob("libsapien*.so*")
+    ]
     if len(paths) != 1:
         raise OSError("libsapien.so is missing, or there is more than one")
     library = ctypes.CDLL(str(paths[0]))
-    return tuple(ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value or 0 for symbol in SYMBOLS)
+    return tuple(
+        ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value or 0 for symbol in SYMBOLS
+    )

@@ -31,7 +31,9 @@ def _registered() -> str:
 
     for name, address in native.extension("_gateway").xla_functions().items():
         try:
-            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.c_void_p(address)), platform="cpu")
+            jax.ffi.register_ffi_target(
+                name, jax.ffi.pycapsule(ctypes.c_void_p(address)), platform="cpu"
+            )
         except Exception as error:  # JAX promises no type
             return f"JAX {jax.__version__} does not take the extension's functions: {error}"
     return ""
@@ -61,14 +63,18 @@ def sim_step(address: Any, step: Any, effort: Array) -> tuple[Any, Any, Any, Any
     obstacle()  # registers the function in this process
     like = jax.ShapeDtypeStruct(effort.shape, effort.dtype)
     results = (like, like, like, jax.ShapeDtypeStruct((), np.int32))
-    qpos, qvel, passive, status = jax.ffi.ffi_call("batchpid_sim_step", results)(address, step, effort)
+    qpos, qvel, passive, status = jax.ffi.ffi_call("batchpid_sim_step", results)(
+        address, step, effort
+    )
     return qpos, qvel, passive, status
 
 
 def mass_matrix(tree: Any, bodies: Any, qpos: Array) -> Array:
-    """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof) in a program of JAX.
+    """Return the mass matrices (..., dof, dof) [kg m^2 or kg] at ``qpos`` (..., dof) in a program
+    of JAX.
 
-    ``tree`` (dof, 2) and ``bodies`` (dof, 25) are arrays of :attr:`batchpid.task_space.RigidTree.tables`.
+    ``tree`` (dof, 2) and ``bodies`` (dof, 25) are arrays of
+    :attr:`batchpid.task_space.RigidTree.tables`.
 
     Raises
     ------
@@ -79,7 +85,10 @@ def mass_matrix(tree: Any, bodies: Any, qpos: Array) -> Array:
 
     if reason := obstacle():
         problem = f"is an array of JAX, for which the mass matrix needs native code ({reason})"
-        remedy = "use batchpid.task_space.mass_matrix(robot.kinematic_tree(), qpos), or an array of NumPy"
+        remedy = (
+            "use batchpid.task_space.mass_matrix(robot.kinematic_tree(), qpos), or an array of"
+            " NumPy"
+        )
         raise InvalidArgumentError("qpos", problem, remedy=remedy)
     result = jax.ShapeDtypeStruct((*qpos.shape, qpos.shape[-1]), qpos.dtype)
     call = jax.ffi.ffi_call("batchpid_mass_matrix", result, vmap_method="sequential")

@@ -1,4 +1,6 @@
-"""SAPIEN: packs of scenes, dynamics, contacts. No other room imports SAPIEN, except to draw pictures."""
+"""SAPIEN: packs of scenes, dynamics, contacts. No other room imports SAPIEN, except to draw
+pictures.
+"""
 
 from batchpid.sim.engine.native.library import import_sapien
 

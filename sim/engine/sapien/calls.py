@@ -1,8 +1,9 @@
 """Calls into SAPIEN for all robots of a pack: reads, efforts, and steps of their systems.
 
-Native calls are one call of the extension for all robots. The extension calls functions that SAPIEN's shared library
-exports, so that it compiles without SAPIEN. It depends on the layout of two of SAPIEN's types, which SAPIEN does not
-guarantee: see :data:`batchpid.sim.engine.native.library.TESTED`.
+Native calls are one call of the extension for all robots. The extension calls functions that
+SAPIEN's shared library exports, so that it compiles without SAPIEN. It depends on the layout of two
+of SAPIEN's types, which SAPIEN does not guarantee: see
+:data:`batchpid.sim.engine.native.library.TESTED`.
 """
 
 from __future__ import annotations
@@ -24,12 +25,16 @@ from batchpid.sim.engine.native_model import NativeStep
 class PythonCalls:
     """One Python call for each robot and quantity, as arrays (M, dof) in SAPIEN's order, SI units.
 
-    ``qf`` (M, dof) of float32 are the efforts that :meth:`write_qf` applies, except to the robots of ``skip`` (M,). No
-    call follows :meth:`close`. The native calls are tested against these.
+    ``qf`` (M, dof) of float32 are the efforts that :meth:`write_qf` applies, except to the robots
+    of ``skip`` (M,). No call follows :meth:`close`. The native calls are tested against these.
     """
 
     def __init__(
-        self, robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_]
+        self,
+        robots: Sequence[Any],
+        systems: Sequence[Any],
+        qf: NDArray[np.float32],
+        skip: NDArray[np.bool_],
     ) -> None:
         # Bound methods and kept row views: looking them up, or slicing, costs as much as the calls.
         self._shape = qf.shape
@@ -49,7 +54,9 @@ class PythonCalls:
         return np.concatenate([get() for get in self._get_qvel], dtype=dtype).reshape(self._shape)
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: DType) -> Rows:
-        """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new array."""
+        """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new
+        array.
+        """
         forces = [compute(gravity, coriolis) for compute in self._passive_force]
         return np.concatenate(forces, dtype=dtype).reshape(self._shape)
 
@@ -73,7 +80,9 @@ class PythonCalls:
 
 
 _ABI = b"system_libstdcpp_gxx_abi_1xxx_use_cxx11_abi_1"
-_capsule_name = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(("PyCapsule_GetName", ctypes.pythonapi))
+_capsule_name = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)(
+    ("PyCapsule_GetName", ctypes.pythonapi)
+)
 _capsule_pointer = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
     ("PyCapsule_GetPointer", ctypes.pythonapi)
 )
@@ -83,10 +92,17 @@ class NativeCalls:
     """Calls of :class:`PythonCalls`, each for all robots at once; RuntimeError if SAPIEN fails."""
 
     def __init__(
-        self, robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_]
+        self,
+        robots: Sequence[Any],
+        systems: Sequence[Any],
+        qf: NDArray[np.float32],
+        skip: NDArray[np.bool_],
     ) -> None:
         self._objects = [*robots], [*systems]  # kept alive, since the gateway has their pointers
-        pointers = [[pointer(item, kind) for item in items] for kind, items in (("robot", robots), ("system", systems))]
+        pointers = [
+            [pointer(item, kind) for item in items]
+            for kind, items in (("robot", robots), ("system", systems))
+        ]
         self._native = extension("_gateway")
         self.gateway = self._native.gateway(functions(), *pointers, qf.shape[1])
         self.qf, self.skip = qf, skip
@@ -104,7 +120,9 @@ class NativeCalls:
         return rows
 
     def passive_force(self, gravity: bool, coriolis: bool, dtype: DType) -> Rows:
-        """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new array."""
+        """Return the efforts that cancel gravity and Coriolis and centrifugal forces, a new
+        array.
+        """
         rows = np.empty(self.qf.shape, dtype)
         self._native.passive_force(self.gateway, rows, gravity, coriolis)
         return rows
@@ -126,7 +144,11 @@ EngineCalls = PythonCalls | NativeCalls
 
 
 def engine_calls(
-    robots: Sequence[Any], systems: Sequence[Any], qf: NDArray[np.float32], skip: NDArray[np.bool_], native: bool
+    robots: Sequence[Any],
+    systems: Sequence[Any],
+    qf: NDArray[np.float32],
+    skip: NDArray[np.bool_],
+    native: bool,
 ) -> EngineCalls:
     """Return native calls, or Python's; both take the arguments before ``native``."""
     make = NativeCalls if robots and native else PythonCalls
@@ -138,10 +160,14 @@ def pointer(wrapper: Any, kind: str) -> int:
 
     It comes by pybind11's conduit, which checks type and ABI.
     """
-    capsule = wrapper._pybind11_conduit_v1_(_ABI, extension("_gateway").type_info(kind), b"raw_pointer_ephemeral")
+    capsule = wrapper._pybind11_conduit_v1_(
+        _ABI, extension("_gateway").type_info(kind), b"raw_pointer_ephemeral"
+    )
     if capsule is None:
         problem = f"SAPIEN's {kind} is not of the type that the extension was made for"
-        raise RuntimeError(f"{problem}; install SAPIEN from PyPI, or set {SWITCH}=0 for Python calls")
+        raise RuntimeError(
+            f"{problem}; install SAPIEN from PyPI, or set {SWITCH}=0 for Python calls"
+        )
     return _capsule_pointer(capsule, _capsule_name(capsule))
 
 
@@ -149,7 +175,8 @@ _SENSE = 1 << STATUS.index("sense")
 
 
 class SapienStep(NativeStep):
-    """Sim step of the robots of a pack: apply efforts, step, read, and check whether a robot has failed.
+    """Sim step of the robots of a pack: apply efforts, step, read, and check whether a robot has
+    failed.
 
     Parameters
     ----------
@@ -168,8 +195,9 @@ class SapienStep(NativeStep):
     joints
         Joints of all robots, if the targets of their drives move within a tick.
     sense
-        Function that reads the sensors of the links after a sim step, or None. Native code returns to Python for it
-        after each sim step, since Python drops exceptions of functions that C calls.
+        Function that reads the sensors of the links after a sim step, or None. Native code returns
+        to Python for it after each sim step, since Python drops exceptions of functions that C
+        calls.
     """
 
     def __init__(
@@ -206,7 +234,9 @@ class SapienStep(NativeStep):
         )
 
     def prepare(self) -> int:
-        """Return the address of the group, for a call of the extension or of XLA that does a sim step."""
+        """Return the address of the group, for a call of the extension or of XLA that does a sim
+        step.
+        """
         self._stepped[...] = True
         return super().prepare()
 

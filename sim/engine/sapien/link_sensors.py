@@ -1,7 +1,8 @@
 """Sensors of links in SAPIEN: contact forces, and wrenches between a link and its parent.
 
-PhysX reports the normal forces of contacts, but not their friction. So the net contact force F on a body of mass m is
-computed from the velocity v of its center of mass, gravity g, and the forces in its joints, which PhysX reports::
+PhysX reports the normal forces of contacts, but not their friction. So the net contact force F on a
+body of mass m is computed from the velocity v of its center of mass, gravity g, and the forces in
+its joints, which PhysX reports::
 
     F = m (dv/dt - g) - (force of the parent on it) + (its forces on its children)
 """
@@ -19,20 +20,32 @@ from batchpid.sim.robot.merging import place_links
 
 
 class LinkSensors:
-    """Sums of the sensors of ``spec`` over sim steps. ``robots`` and ``systems`` are a pack's own lists."""
+    """Sums of the sensors of ``spec`` over sim steps. ``robots`` and ``systems`` are a pack's own
+    lists.
+    """
 
     def __init__(self, spec: SceneSpec, robots: list[Any], systems: list[Any]) -> None:
         self._robots = robots
         self._systems = systems
         self._spec = spec
-        bodies, links = place_links(spec.urdf, spec.separate), [link.name for link in robots[0].links]
+        bodies, links = (
+            place_links(spec.urdf, spec.separate),
+            [link.name for link in robots[0].links],
+        )
         self._contacts = [links.index(bodies[link].link) for link in spec.contacts or ()]
         self._wrenches = [links.index(link) for link in spec.wrenches or ()]
-        parents = [None if joint.parent_link is None else joint.parent_link.name for joint in robots[0].joints]
-        self._children = {at: [i for i, name in enumerate(parents) if name == links[at]] for at in self._contacts}
+        parents = [
+            None if joint.parent_link is None else joint.parent_link.name
+            for joint in robots[0].joints
+        ]
+        self._children = {
+            at: [i for i, name in enumerate(parents) if name == links[at]] for at in self._contacts
+        }
         self._roots = {at for at, name in enumerate(parents) if name is None}
         self._velocities = np.zeros((len(robots), len(self._contacts), 3))
-        self._parts: list[Any] = [None] * len(robots)  # links, joints, numbers of the links by entity, and gravity
+        self._parts: list[Any] = [None] * len(
+            robots
+        )  # links, joints, numbers of the links by entity, and gravity
         self._sums: dict[str, Float64] = {}
         self.take()
         self.place(range(len(robots)))
@@ -40,7 +53,11 @@ class LinkSensors:
     def take(self) -> dict[str, Float64]:
         """Return the sums since the last call, and set them to 0."""
         before, (size, contacts, _) = self._sums, self._velocities.shape
-        shapes = {"contact_force": (contacts, 3), "touching": (contacts,), "wrench": (len(self._wrenches), 6)}
+        shapes = {
+            "contact_force": (contacts, 3),
+            "touching": (contacts,),
+            "wrench": (len(self._wrenches), 6),
+        }
         self._sums = {name: np.zeros((size, *shape)) for name, shape in shapes.items() if shape[0]}
         return before
 
@@ -56,7 +73,9 @@ class LinkSensors:
 
     def _read_velocities(self, row: int) -> Float64:
         links, *_ = self._parts[row]
-        return np.array([links[at].get_linear_velocity() for at in self._contacts], np.float64).reshape(-1, 3)
+        return np.array(
+            [links[at].get_linear_velocity() for at in self._contacts], np.float64
+        ).reshape(-1, 3)
 
     def add(self) -> None:
         """Add the sensors of all robots after a sim step."""
@@ -97,13 +116,17 @@ class LinkSensors:
 
 
 def _in_link(joint: Any, force: Float32) -> Float64:
-    """Transform a force and torque (6,) from the frame of a joint to the frame of its link, about the link's origin."""
+    """Transform a force and torque (6,) from the frame of a joint to the frame of its link, about
+    the link's origin.
+    """
     placed = joint.pose_in_child.to_transformation_matrix().astype(np.float64)
     axes, linear = placed[:3, :3], placed[:3, :3] @ force[:3]
     return np.concatenate([linear, axes @ force[3:] + np.cross(placed[:3, 3], linear)])
 
 
 def _in_world(link: Any, joint: Any, force: Float32) -> Float64:
-    """Return the force (6,) of a joint's parent on its link along the axes of the world, without the torque."""
+    """Return the force (6,) of a joint's parent on its link along the axes of the world, without
+    the torque.
+    """
     axes = (link.entity_pose * joint.pose_in_child).to_transformation_matrix()[:3, :3]
     return axes.astype(np.float64) @ force[:3]

@@ -1,12 +1,13 @@
 """Pack of scenes in one process, read and written as arrays.
 
-A pack is M scenes, each with one robot and a PhysX system. PhysX solves the contacts of a system in an order that
-depends on everything in the system, so robots that share one would not move bit-identically to a robot alone.
+A pack is M scenes, each with one robot and a PhysX system. PhysX solves the contacts of a system in
+an order that depends on everything in the system, so robots that share one would not move
+bit-identically to a robot alone.
 
-The engine takes changed payloads, masses, centers of mass and friction while a robot exists, and then moves
-bit-identically to a robot that was built with them. The loop uses only the members of
-:class:`batchpid.sim.engine.protocol.EnginePack` and its capabilities. Longer than 350 lines because that is the whole
-interface between loop and engine.
+The engine takes changed payloads, masses, centers of mass and friction while a robot exists, and
+then moves bit-identically to a robot that was built with them. The loop uses only the members of
+:class:`batchpid.sim.engine.protocol.EnginePack` and its capabilities. Longer than 350 lines because
+that is the whole interface between loop and engine.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ class Pack(ModelPack):
     Attributes
     ----------
     robots, systems
-        SAPIEN's articulation and PhysX system of each scene; a robot that is placed may be rebuilt in a new system.
+        SAPIEN's articulation and PhysX system of each scene; a robot that is placed may be rebuilt
+        in a new system.
     qf
         Efforts last written, in the engine's precision, without the efforts of a coupling.
     friction
@@ -79,7 +81,8 @@ class Pack(ModelPack):
         self._frames: list[tuple[Pose, Pose] | None] = []
         self.systems = [self._system(row) for row in range(size)]
         built = [self._build(row, system) for row, system in enumerate(self.systems)]
-        # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in silence.
+        # SAPIEN frees a scene's robot with the Python Scene, and then steps an empty world in
+        # silence.
         self._scenes, self.robots = map(list, zip(*built, strict=True))
         self._stepped = np.zeros(size, bool)  # robots that did a sim step since they were built
         self._contents = []
@@ -88,7 +91,8 @@ class Pack(ModelPack):
                 envs = enumerate(self._scenes, start=first_env)
                 frames = [link_frames(spec, robot) for robot in self.robots]
                 self._contents = [
-                    SceneContent(spec, spec.build, scene, env, frames[env - first_env]) for env, scene in envs
+                    SceneContent(spec, spec.build, scene, env, frames[env - first_env])
+                    for env, scene in envs
                 ]
         self._damping = np.array([[joint.damping for joint in self.robots[0].active_joints]])
         self.qf = np.zeros((size, self.dof), np.float32)
@@ -99,10 +103,14 @@ class Pack(ModelPack):
             continuous = np.array([joint.continuous for joint in spec.joints])
             self._turning = np.flatnonzero(continuous)
             self._constraint = ConstraintEfforts(size, coupling, continuous, spec.timestep, self.qf)
-            self._constraint.implicit[...] = [[joint.armature[0] for joint in self.robots[0].active_joints]]
+            self._constraint.implicit[...] = [
+                [joint.armature[0] for joint in self.robots[0].active_joints]
+            ]
             if self.steps_natively:
                 self._constraint.use(self._joint_model, None)
-        self._sensors = LinkSensors(spec, self.robots, self.systems) if spec.contacts or spec.wrenches else None
+        self._sensors = (
+            LinkSensors(spec, self.robots, self.systems) if spec.contacts or spec.wrenches else None
+        )
         self._bind()
         if variation is not None:
             self.write_joints(None)
@@ -113,7 +121,9 @@ class Pack(ModelPack):
         return new_system(self.spec, None if gravity is None else gravity[row])
 
     def _build(self, row: int, system: Any) -> tuple[Any, Any]:
-        """Return a new scene in ``system`` and the robot in it, for ``row``, with its masses and friction."""
+        """Return a new scene in ``system`` and the robot in it, for ``row``, with its masses and
+        friction.
+        """
         scene, robot = build_scene(self.spec, system)
         self._change_masses(robot, row)
         if self._variation.ground_friction is not None:
@@ -127,7 +137,11 @@ class Pack(ModelPack):
         robots = self.robots
         self._joints = [joint for robot in robots for joint in robot.active_joints]
         self._calls = engine_calls(
-            robots, self.systems, self._joint_qf[: len(robots)], self._suspended[: len(robots)], self.steps_natively
+            robots,
+            self.systems,
+            self._joint_qf[: len(robots)],
+            self._suspended[: len(robots)],
+            self.steps_natively,
         )
 
     def step(self) -> None:
@@ -146,7 +160,8 @@ class Pack(ModelPack):
         return self._calls
 
     def steps_read_force(self, gravity: bool, coriolis: bool) -> bool:
-        # To compute a force, PhysX overwrites the joint forces that the sensors read after the step.
+        # To compute a force, PhysX overwrites the joint forces that the sensors read after the
+        # step.
         return self.spec.fixed_base and self._is_model and self._sensors is None
 
     def compiled_step(
@@ -165,16 +180,20 @@ class Pack(ModelPack):
     def update_constraint(self, rows: Any = slice(None)) -> None:
         if self._constraint is not None:
             passive = self._calls.passive_force(True, True, np.float64)
-            self._constraint.update(self.joint_mass_matrix, self._calls.qpos(np.float64), passive, rows)
+            self._constraint.update(
+                self.joint_mass_matrix, self._calls.qpos(np.float64), passive, rows
+            )
 
     @cached_property
     def _tree(self) -> RigidTree:  # type: ignore[override]
         return scene_tree(self.spec)
 
     def _renew(self, rows: Sequence[int]) -> None:
-        """Rebuild the robots ``rows`` in new systems, in which earlier contacts have no influence on the next ones.
+        """Rebuild the robots ``rows`` in new systems, in which earlier contacts have no influence
+        on the next ones.
 
-        Robots without shapes have no contacts. Scenes with user content stay, because ``build`` is called only once.
+        Robots without shapes have no contacts. Scenes with user content stay, because ``build`` is
+        called only once.
         """
         used = [row for row in rows if self._stepped[row]]
         has_shapes = any(link.collision_shapes for link in self.robots[0].links)
@@ -184,7 +203,8 @@ class Pack(ModelPack):
     def _rebuild(self, rows: Sequence[int]) -> None:
         """Build the robots ``rows`` again, in new systems, with the drives that they have."""
         drives = [[_read_drive(joint) for joint in self.robots[row].active_joints] for row in rows]
-        # First the old robots are freed: new ones in other memory make every later sim step a tenth slower.
+        # First the old robots are freed: new ones in other memory make every later sim step a tenth
+        # slower.
         self._calls.close()
         self._joints = []
         for row in rows:
@@ -194,7 +214,9 @@ class Pack(ModelPack):
             self.systems[row] = self._system(row)
         for row, settings in zip(rows, drives, strict=True):
             self._scenes[row], robot = self._build(row, self.systems[row])
-            for joint, (drive, target, rate, armature) in zip(robot.active_joints, settings, strict=True):
+            for joint, (drive, target, rate, armature) in zip(
+                robot.active_joints, settings, strict=True
+            ):
                 joint.set_drive_properties(*drive)
                 joint.set_drive_target(target)
                 joint.set_drive_velocity_target(rate)
@@ -241,7 +263,9 @@ class Pack(ModelPack):
     def push(self, rows: Sequence[int], twists: Float64) -> None:
         bases = self.read_base()[rows]
         bases[:, 7:] += twists
-        for row, base in zip(rows, self._moved_to_origin(rows, bases, 1.0).astype(np.float32), strict=True):
+        for row, base in zip(
+            rows, self._moved_to_origin(rows, bases, 1.0).astype(np.float32), strict=True
+        ):
             _, moving, turning = np.split(base, [7, 10])
             self.robots[row].set_root_linear_velocity(moving)
             self.robots[row].set_root_angular_velocity(turning)
@@ -249,12 +273,15 @@ class Pack(ModelPack):
             self._sensors.place(rows)
 
     def _moved_to_origin(self, rows: Sequence[int], roots: Float64, sign: float) -> Float64:
-        """Return ``roots`` (n, 13) of robots ``rows`` with the velocity of the link's origin for that of its center of
-        mass, or back.
+        """Return ``roots`` (n, 13) of robots ``rows`` with the velocity of the link's origin for
+        that of its center of mass, or back.
 
-        PhysX gives the velocity of the center of mass c: v_c = v + w x (R c), subtracted with ``sign`` -1.
+        PhysX gives the velocity of the center of mass c: v_c = v + w x (R c), subtracted with
+        ``sign`` -1.
         """
-        centers = np.array([self.robots[row].links[0].cmass_local_pose.p for row in rows], np.float64).reshape(-1, 3)
+        centers = np.array(
+            [self.robots[row].links[0].cmass_local_pose.p for row in rows], np.float64
+        ).reshape(-1, 3)
         arm = (matrix_of(roots[:, 3:7]) @ centers[..., None])[..., 0]
         velocity = roots[:, 7:10] + sign * np.cross(roots[:, 10:], arm)
         return np.concatenate([roots[:, :7], velocity, roots[:, 10:]], axis=1)
@@ -262,11 +289,17 @@ class Pack(ModelPack):
     def take_sensed(self) -> dict[str, Float64]:
         return {} if self._sensors is None else self._sensors.take()
 
-    def write_state(self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None) -> None:
-        """Place robots ``rows``: positions and velocities (len(rows), dof), the root at ``base``; their efforts become
-        zero, and the content of their scenes is reset.
+    def write_state(
+        self, rows: Sequence[int], qpos: Rows, qvel: Rows, base: Float64 | None = None
+    ) -> None:
+        """Place robots ``rows``: positions and velocities (len(rows), dof), the root at ``base``;
+        their efforts become zero, and the content of their scenes is reset.
         """
-        bases = np.tile(_ORIGIN, (len(rows), 1)) if base is None else self._moved_to_origin(rows, base, 1.0)
+        bases = (
+            np.tile(_ORIGIN, (len(rows), 1))
+            if base is None
+            else self._moved_to_origin(rows, base, 1.0)
+        )
         self._place(rows, qpos, qvel, bases.astype(np.float32))
         self.update_constraint(list(rows))  # within a tick, the robots may have failed
 
@@ -308,13 +341,18 @@ class Pack(ModelPack):
                 shape.set_physical_material(material)
 
     def _change_masses(self, robot: Any, row: int) -> None:
-        """Set the masses of a robot, and restore the frames of its joints, which this moves by rounding."""
+        """Set the masses of a robot, and restore the frames of its joints, which this moves by
+        rounding.
+        """
         if not self._masses.added:
             return
         if not self._frames:  # as built, before a mass has moved them
             moves = [joint.parent_link is not None for joint in robot.joints]
             pairs = zip(robot.joints, moves, strict=True)
-            self._frames = [(joint.pose_in_parent, joint.pose_in_child) if move else None for joint, move in pairs]
+            self._frames = [
+                (joint.pose_in_parent, joint.pose_in_child) if move else None
+                for joint, move in pairs
+            ]
         inertias = self._masses.of_robot(row)
         for link in robot.links:
             if link.name in inertias:
@@ -325,19 +363,23 @@ class Pack(ModelPack):
                 joint.set_pose_in_child(frames[1])
 
     def state_sizes(self) -> list[int]:
-        """Return the number of values in the state of each scene: of the robot, and of its content."""
+        """Return the number of values in the state of each scene: of the robot, and of its
+        content.
+        """
         robot = 2 * self.dof + ROOT_SIZE + self._turning.size
         return [robot + content.size for content in self._contents] or [robot] * self.size
 
     def read_state(self) -> NDArray[np.float64]:
-        """Return the state of each scene (M, values): qpos, qvel, root, positions without jumps of coupled
-        continuous joints, content, then NaN.
+        """Return the state of each scene (M, values): qpos, qvel, root, positions without jumps of
+        coupled continuous joints, content, then NaN.
         """
         sizes = self.state_sizes()
         states = np.full((self.size, max(sizes)), np.nan)
         for row, robot in enumerate(self.robots):
             content = [scene.read() for scene in self._contents[row : row + 1]]
-            turned = [] if self._constraint is None else self._constraint.unwrapped[row, self._turning]
+            turned = (
+                [] if self._constraint is None else self._constraint.unwrapped[row, self._turning]
+            )
             parts = robot.get_qpos(), robot.get_qvel(), read_root(robot), turned, *content
             states[row, : sizes[row]] = np.concatenate(parts)
         return states
@@ -366,16 +408,22 @@ class Pack(ModelPack):
     def write_joints(self, actuators: Actuators | None, rows: Sequence[int] | None = None) -> None:
         values = np.broadcast_to(self._add_joints(actuators), self.qf.shape).astype(np.float32)
         for row in range(self.size) if rows is None else rows:
-            for joint, value in zip(self.robots[row].active_joints, values[row, :, None], strict=True):
+            for joint, value in zip(
+                self.robots[row].active_joints, values[row, :, None], strict=True
+            ):
                 joint.set_armature(value)
 
     def write_drive(self, stiffness: Rows, damping: Rows, force_limit: Rows) -> None:
         """Set PhysX's internal PD drive of every joint; each argument broadcasts to (M, dof).
 
-        Where the engine simulates the URDF's joint damping, which is drive damping too, it is added to ``damping``.
+        Where the engine simulates the URDF's joint damping, which is drive damping too, it is added
+        to ``damping``.
         """
         limit = np.minimum(force_limit, np.finfo(np.float32).max)
-        tables = (np.broadcast_to(table, self.qf.shape).flat for table in (stiffness, damping + self._damping, limit))
+        tables = (
+            np.broadcast_to(table, self.qf.shape).flat
+            for table in (stiffness, damping + self._damping, limit)
+        )
         for joint, *values in zip(self._joints, *tables, strict=True):
             joint.set_drive_properties(*map(float, values), "force")
 
@@ -395,7 +443,9 @@ class Pack(ModelPack):
 
 
 def _read_drive(joint: Any) -> tuple[tuple[Any, ...], float, float, Float32]:
-    """Return the drive's properties, targets of position and velocity, and the armature of one of SAPIEN's joints."""
+    """Return the drive's properties, targets of position and velocity, and the armature of one of
+    SAPIEN's joints.
+    """
     properties = joint.stiffness, joint.damping, joint.force_limit, joint.drive_mode
     return properties, joint.drive_target, joint.drive_velocity_target, joint.armature
 

@@ -1,8 +1,9 @@
-"""Scenes that need no render device, and the content that the user's ``build`` function adds to them.
+"""Scenes that need no render device, and the content that the user's ``build`` function adds to
+them.
 
-Mirrored collision meshes have separate builders. A URDF mirrors a mesh by a negative scale. PhysX requires positive
-scales of convex meshes, SAPIEN passes on any scale, and the process ends with a segmentation fault once two such shapes
-touch. The mirrored vertices make a sound mesh.
+Mirrored collision meshes have separate builders. A URDF mirrors a mesh by a negative scale. PhysX
+requires positive scales of convex meshes, SAPIEN passes on any scale, and the process ends with a
+segmentation fault once two such shapes touch. The mirrored vertices make a sound mesh.
 """
 
 from __future__ import annotations
@@ -59,10 +60,14 @@ class _LinkBuilder(LinkBuilder):
 def _attach(link: Any, record: CollisionShapeRecord, groups: list[int]) -> None:
     try:
         hull = _hull(record.filename)
-    except RuntimeError:  # a mesh that SAPIEN cannot read: a shape less than asked for, which build_scene reports
+    except (
+        RuntimeError
+    ):  # a mesh that SAPIEN cannot read: a shape less than asked for, which build_scene reports
         return
     scale = np.abs(record.scale)
-    shape = PhysxCollisionShapeConvexMesh(hull * np.sign(record.scale).astype(np.float32), scale, record.material)
+    shape = PhysxCollisionShapeConvexMesh(
+        hull * np.sign(record.scale).astype(np.float32), scale, record.material
+    )
     shape.local_pose = record.pose
     shape.set_collision_groups(groups)
     shape.set_density(record.density)
@@ -73,29 +78,39 @@ def _attach(link: Any, record: CollisionShapeRecord, groups: list[int]) -> None:
 
 @lru_cache(maxsize=256)
 def _hull(filename: str) -> NDArray[np.float32]:
-    """Return the vertices (n, 3) of the convex hull of a mesh file, unscaled; SAPIEN, too, reads a file only once."""
-    shape = PhysxCollisionShapeConvexMesh(preprocess_mesh_file(filename), (1, 1, 1), get_default_material())
+    """Return the vertices (n, 3) of the convex hull of a mesh file, unscaled; SAPIEN, too, reads a
+    file only once.
+    """
+    shape = PhysxCollisionShapeConvexMesh(
+        preprocess_mesh_file(filename), (1, 1, 1), get_default_material()
+    )
     vertices = np.array(shape.vertices)
     vertices.setflags(write=False)
     return vertices
 
 
 Frames = Mapping[str, tuple[sapien.Entity, sapien.Pose | None]]
-"""Links of a robot by name: the entity that each is part of, and its pose in that, None for the same."""
+"""Links of a robot by name: the entity that each is part of, and its pose in that, None for the
+same.
+"""
 
 
 class _HeadlessBuilder(ActorBuilder):
-    """Actor builder whose ``add_*_visual`` methods do nothing: a visual would need a render device."""
+    """Actor builder whose ``add_*_visual`` methods do nothing: a visual would need a render
+    device.
+    """
 
 
 class HeadlessScene(sapien.Scene):
-    """Scene in ``system``, or in a new PhysX system under the present settings, that needs no render device.
+    """Scene in ``system``, or in a new PhysX system under the present settings, that needs no
+    render device.
 
     Visuals and lights are left out, so that code written for a screen runs.
     """
 
     def __init__(self, system: PhysxCpuSystem | None = None) -> None:
-        # Without a list of systems SAPIEN builds a render system, which fails without a device, or ends the process.
+        # Without a list of systems SAPIEN builds a render system, which fails without a device, or
+        # ends the process.
         super().__init__([PhysxCpuSystem() if system is None else system])
 
     def create_articulation_builder(self) -> Any:
@@ -111,18 +126,23 @@ for _name in dir(ActorBuilder):
     if _name.startswith("add_") and "visual" in _name:
         setattr(_HeadlessBuilder, _name, lambda self, *_, **__: self)
 for _name in dir(sapien.Scene):
-    if _name.startswith(("add_", "set_")) and any(word in _name for word in ("light", "environment_map")):
+    if _name.startswith(("add_", "set_")) and any(
+        word in _name for word in ("light", "environment_map")
+    ):
         setattr(HeadlessScene, _name, lambda self, *_, **__: None)
 
 
 class SceneContent:
     """Content that ``build`` added to the scene of env ``env``.
 
-    ``watched`` are the entities that ``build`` returned, each with the pose of a frame in it or None; ``size`` is the
-    number of values in the state. ``links`` are the links of the scene's robot.
+    ``watched`` are the entities that ``build`` returned, each with the pose of a frame in it or
+    None; ``size`` is the number of values in the state. ``links`` are the links of the scene's
+    robot.
     """
 
-    def __init__(self, spec: SceneSpec, build: Build, scene: SapienScene, env: int, links: Frames) -> None:
+    def __init__(
+        self, spec: SceneSpec, build: Build, scene: SapienScene, env: int, links: Frames
+    ) -> None:
         before = {entity.per_scene_id for entity in scene.entities}  # the robot and the ground
         self.watched = _call(build, scene, env, links)
         if not spec.collisions:
@@ -144,7 +164,9 @@ class SceneContent:
         self.write(self._start)
 
     def read(self, at_rest: bool = False) -> NDArray[np.float32]:
-        """Return the state of everything that moves (size,), with zero velocities if ``at_rest``."""
+        """Return the state of everything that moves (size,), with zero velocities if
+        ``at_rest``.
+        """
 
         def velocity(values: Array) -> Array:
             return np.zeros_like(values) if at_rest else values
@@ -152,14 +174,27 @@ class SceneContent:
         parts: list[Any] = [np.zeros(0, np.float32)]
         for entity, body in self._bodies:
             pose = entity.get_pose()
-            parts += [pose.p, pose.q, velocity(body.get_linear_velocity()), velocity(body.get_angular_velocity())]
+            parts += [
+                pose.p,
+                pose.q,
+                velocity(body.get_linear_velocity()),
+                velocity(body.get_angular_velocity()),
+            ]
         for robot in self._articulations:
             root = read_root(robot)
-            parts += [root[:7], velocity(root[7:]), robot.get_qpos(), velocity(robot.get_qvel()), robot.get_qf()]
+            parts += [
+                root[:7],
+                velocity(root[7:]),
+                robot.get_qpos(),
+                velocity(robot.get_qvel()),
+                robot.get_qf(),
+            ]
         return np.concatenate(parts, dtype=np.float32)
 
     def write(self, state: NDArray[np.float32]) -> None:
-        """Put everything that moves into the state that :meth:`read` returned; values beyond ``size`` are ignored."""
+        """Put everything that moves into the state that :meth:`read` returned; values beyond
+        ``size`` are ignored.
+        """
         values = iter(np.asarray(state, np.float32))
 
         def take(count: int) -> NDArray[np.float32]:
@@ -178,7 +213,9 @@ class SceneContent:
             robot.set_qf(take(robot.dof))
 
     def poses(self) -> NDArray[np.float32]:
-        """Return the poses of the watched entities (watched, 7): x, y, z [m] and the quaternion w, x, y, z."""
+        """Return the poses of the watched entities (watched, 7): x, y, z [m] and the quaternion w,
+        x, y, z.
+        """
         frames = [(entity.get_pose(), frame) for entity, frame in self.watched]
         poses = [pose if frame is None else pose * frame for pose, frame in frames]
         rows = [np.concatenate([pose.p, pose.q]) for pose in poses]
@@ -186,7 +223,9 @@ class SceneContent:
 
 
 def _refuse_shapes(scene: SapienScene, env: int) -> None:
-    """Raise InvalidArgumentError if an entity of ``scene``, which belongs to env ``env``, has a collision shape."""
+    """Raise InvalidArgumentError if an entity of ``scene``, which belongs to env ``env``, has a
+    collision shape.
+    """
     for entity in scene.entities:
         for component in entity.components:
             if getattr(component, "collision_shapes", ()):
@@ -198,8 +237,12 @@ def _refuse_shapes(scene: SapienScene, env: int) -> None:
                 )
 
 
-def _call(build: Build, scene: SapienScene, env: int, links: Frames) -> list[tuple[sapien.Entity, sapien.Pose | None]]:
-    """Return the entities and frames that ``build`` returns; its errors become an InvalidArgumentError."""
+def _call(
+    build: Build, scene: SapienScene, env: int, links: Frames
+) -> list[tuple[sapien.Entity, sapien.Pose | None]]:
+    """Return the entities and frames that ``build`` returns; its errors become an
+    InvalidArgumentError.
+    """
     try:
         returned = build(scene, env)
     except Exception as error:
@@ -207,7 +250,8 @@ def _call(build: Build, scene: SapienScene, env: int, links: Frames) -> list[tup
         where = traceback.extract_tb(error.__traceback__)[-1]
         raise InvalidArgumentError(
             "build",
-            f"raised {type(error).__name__}: {error} (in {where.name}, {where.filename}:{where.lineno})",
+            f"raised {type(error).__name__}: {error} (in {where.name},"
+            f" {where.filename}:{where.lineno})",
             env=env,
             remedy="correct the function; try it with workers=0 for the whole traceback",
         ) from error

@@ -1,7 +1,8 @@
-"""Compilation of an MJCF file by MuJoCo, without the geoms that add neither shape nor mass, and without missing meshes.
+"""Compilation of an MJCF file by MuJoCo, without the geoms that add neither shape nor mass, and
+without missing meshes.
 
-MuJoCo refuses a file that names a mesh that is missing or cannot be read. A geom of that mesh can be left out only if
-the mass of its body does not depend on it.
+MuJoCo refuses a file that names a mesh that is missing or cannot be read. A geom of that mesh can
+be left out only if the mass of its body does not depend on it.
 
 The bodies and joints of the model get the names of the links and joints that they become.
 """
@@ -27,15 +28,19 @@ _ERRORS = (ValueError, mujoco.FatalError)
 """Errors of MuJoCo's parser and compiler."""
 
 
-if mujoco.get_mju_user_warning() is None:  # else MuJoCo appends warnings to a file in the working folder, too
+if (
+    mujoco.get_mju_user_warning() is None
+):  # else MuJoCo appends warnings to a file in the working folder, too
     mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))
 
 
 class Attempt(NamedTuple):
-    """Model of a file, or None with MuJoCo's reason; collision meshes whose geoms are left out, with the reason.
+    """Model of a file, or None with MuJoCo's reason; collision meshes whose geoms are left out,
+    with the reason.
 
-    ``scene`` is the ``mujoco.MjSpec`` that was compiled, ``is_whole`` says whether the whole file was. ``weighing`` are
-    the bodies whose mass depends on a geom that is left out, each with the mesh.
+    ``scene`` is the ``mujoco.MjSpec`` that was compiled, ``is_whole`` says whether the whole file
+    was. ``weighing`` are the bodies whose mass depends on a geom that is left out, each with the
+    mesh.
     """
 
     scene: MjSpec
@@ -46,22 +51,33 @@ class Attempt(NamedTuple):
     problem: str = ""
 
 
-def compile_file(path: Path, fixed_base: bool, missing_meshes: str, findings: list[Finding]) -> Attempt:
+def compile_file(
+    path: Path, fixed_base: bool, missing_meshes: str, findings: list[Finding]
+) -> Attempt:
     """Return the compiled model of a file, with the collision meshes that it is without.
 
-    Raises RobotError if MuJoCo refuses the file, a missing mesh has an unknown mass, or missing meshes are refused.
+    Raises RobotError if MuJoCo refuses the file, a missing mesh has an unknown mass, or missing
+    meshes are refused.
     """
-    lean = attempt(path, fixed_base, False)  # without geoms that are only drawn: their meshes take time to read
+    lean = attempt(
+        path, fixed_base, False
+    )  # without geoms that are only drawn: their meshes take time to read
     if lean.model is not None and not lean.missing and not lean.weighing:
         return lean
-    whole = attempt(path, fixed_base, True)  # something may refer to a removed geom, and a missing file be elsewhere
+    whole = attempt(
+        path, fixed_base, True
+    )  # something may refer to a removed geom, and a missing file be elsewhere
     if whole.model is not None:
         return whole
     if lean.weighing:
         listed = ", ".join(f"mesh {mesh} of body {body!r}" for mesh, body in lean.weighing)
-        remedy = "restore the file, or give the body an <inertial>, with which the mesh may be missing"
+        remedy = (
+            "restore the file, or give the body an <inertial>, with which the mesh may be missing"
+        )
         remedy += ' (unless inertiafromgeom is "true")'
-        raise RobotError(f"{path}: the mass of a body is unknown without its mesh: {listed}; {remedy}")
+        raise RobotError(
+            f"{path}: the mass of a body is unknown without its mesh: {listed}; {remedy}"
+        )
     names = ", ".join(lean.missing)
     if names and missing_meshes == "error":
         remedy = "restore the files, or pass missing_meshes='skip' to simulate without"
@@ -69,12 +85,16 @@ def compile_file(path: Path, fixed_base: bool, missing_meshes: str, findings: li
     if lean.model is None:
         raise RobotError(_refusal(path, whole.problem))
     text = f"collision meshes not found, simulated without: {names}"
-    findings.append(Finding("warning", "missing-mesh", text, "put the files where the MJCF names them"))
+    findings.append(
+        Finding("warning", "missing-mesh", text, "put the files where the MJCF names them")
+    )
     return lean
 
 
 def attempt(path: Path, fixed_base: bool, is_whole: bool) -> Attempt:
-    """Return a compilation of the whole file, or without geoms that are only drawn and geoms of missing meshes."""
+    """Return a compilation of the whole file, or without geoms that are only drawn and geoms of
+    missing meshes.
+    """
     left_out: tuple[Any, Any] = (), ()
     scene = None
     try:
@@ -86,8 +106,12 @@ def attempt(path: Path, fixed_base: bool, is_whole: bool) -> Attempt:
         return Attempt(scene, None, is_whole, *left_out, " ".join(str(error).split()))
 
 
-def _strip(spec: Any, path: Path, fixed_base: bool) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
-    """Remove textures, geoms that add neither shape nor mass, and those of missing meshes; return the latter."""
+def _strip(
+    spec: Any, path: Path, fixed_base: bool
+) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
+    """Remove textures, geoms that add neither shape nor mass, and those of missing meshes; return
+    the latter.
+    """
     paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     absent = {}
     for mesh in spec.meshes:
@@ -115,13 +139,21 @@ def _strip(spec: Any, path: Path, fixed_base: bool) -> tuple[tuple[str, ...], tu
             geom.contype = 0
             geom.conaffinity = 0
             geom.mass = 0.0
-            for pair in [each for each in spec.pairs if geom.name in (each.geomname1, each.geomname2) and geom.name]:
+            for pair in [
+                each
+                for each in spec.pairs
+                if geom.name in (each.geomname1, each.geomname2) and geom.name
+            ]:
                 spec.delete(pair)
         elif geom.meshname:
             used.add(geom.meshname)
     for site in spec.sites:
         site.material = ""
-    for each in [*spec.materials, *spec.textures, *(mesh for mesh in spec.meshes if mesh.name not in used)]:
+    for each in [
+        *spec.materials,
+        *spec.textures,
+        *(mesh for mesh in spec.meshes if mesh.name not in used),
+    ]:
         spec.delete(each)
     return tuple(missing), tuple(weighing)
 
@@ -130,8 +162,16 @@ def _weighs(spec: Any, geom: Any) -> bool:
     """Return whether the mass of a geom's body depends on the geom."""
     inferred = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     low, high = spec.compiler.inertiagrouprange
-    weightless = geom.mass == 0 or (math.isnan(geom.mass) and geom.density == 0) or not low <= geom.group <= high
-    return (inferred or not geom.parent.explicitinertial) and not weightless and geom.parent.parent is not None
+    weightless = (
+        geom.mass == 0
+        or (math.isnan(geom.mass) and geom.density == 0)
+        or not low <= geom.group <= high
+    )
+    return (
+        (inferred or not geom.parent.explicitinertial)
+        and not weightless
+        and geom.parent.parent is not None
+    )
 
 
 def _moves(body: Any) -> bool:
@@ -147,7 +187,11 @@ def _missing(path: Path) -> str | None:
         with open(path, "rb") as file:
             return LFS_PROBLEM if file.read(len(LFS_POINTER)) == LFS_POINTER else None
     except OSError as error:
-        return "not found" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+        return (
+            "not found"
+            if isinstance(error, FileNotFoundError)
+            else f"cannot be read: {error.strerror}"
+        )
 
 
 def _refusal(path: Path, problem: str) -> str:
@@ -173,9 +217,11 @@ def label(element: Any) -> str:
 
 
 class Names:
-    """Names of the ``bodies`` and of the hinges and slides among the ``joints``, by their numbers in the model.
+    """Names of the ``bodies`` and of the hinges and slides among the ``joints``, by their numbers
+    in the model.
 
-    A body or joint without a name gets one of its number. :meth:`leave_out` removes the joints of other objects.
+    A body or joint without a name gets one of its number. :meth:`leave_out` removes the joints of
+    other objects.
     """
 
     def __init__(self, model: MjModel) -> None:
@@ -184,9 +230,14 @@ class Names:
         self._roots = model.body_rootid
         self._left_out: set[int] = set()
         given = [model.body(body).name for body in range(1, model.nbody)]
-        self._links, self._joints = {"world", *given}, {model.joint(joint).name for joint in range(model.njnt)}
+        self._links, self._joints = (
+            {"world", *given},
+            {model.joint(joint).name for joint in range(model.njnt)},
+        )
         self.bodies = {0: "world"}
-        self.bodies |= {body: name or self.new_link(f"body{body}") for body, name in enumerate(given, start=1)}
+        self.bodies |= {
+            body: name or self.new_link(f"body{body}") for body, name in enumerate(given, start=1)
+        }
         self.joints = {
             joint: model.joint(joint).name or self.new_joint(f"joint{joint}")
             for joint in range(model.njnt)
@@ -200,10 +251,16 @@ class Names:
     def leave_out(self, bodies: set[int]) -> None:
         """Remove the joints of ``bodies``, children of the world, and of the bodies below them."""
         self._left_out = bodies
-        self.joints = {joint: name for joint, name in self.joints.items() if self.is_of_robot(self._bodies[joint])}
+        self.joints = {
+            joint: name
+            for joint, name in self.joints.items()
+            if self.is_of_robot(self._bodies[joint])
+        }
 
     def is_of_robot(self, body: Any) -> bool:
-        """Return whether a body, or the world, was kept: neither left out nor below a body that was left out."""
+        """Return whether a body, or the world, was kept: neither left out nor below a body that was
+        left out.
+        """
         return int(self._roots[body]) not in self._left_out
 
     def new_link(self, name: str) -> str:

@@ -1,4 +1,6 @@
-"""Reader of MJCF files: MuJoCo compiles them, and the model becomes a URDF with motors and a start pose."""
+"""Reader of MJCF files: MuJoCo compiles them, and the model becomes a URDF with motors and a start
+pose.
+"""
 
 from __future__ import annotations
 
@@ -52,8 +54,9 @@ class Mjcf(NamedTuple):
 def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> Mjcf:
     """Return the content of the MJCF file at ``path`` as the robot ``name``.
 
-    For the other arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError if MuJoCo refuses the file, it has a
-    ball joint or several robots, a missing mesh has an unknown mass, or missing meshes are refused.
+    For the other arguments see :meth:`batchpid.sim.Robot.load`. Raises RobotError if MuJoCo refuses
+    the file, it has a ball joint or several robots, a missing mesh has an unknown mass, or missing
+    meshes are refused.
     """
     findings: list[Finding] = []
     compiled = compile_file(path, fixed_base, missing_meshes, findings)
@@ -71,7 +74,9 @@ def read_mjcf(path: Path, name: str, fixed_base: bool, missing_meshes: str) -> M
     at = model.jnt_qposadr[model.body_jntadr[tree.base]] if tree.base and not fixed_base else None
     base = None if at is None else tuple(pose[at : at + 7].tolist())
     file = _file(path, compiled, names, fixed_base)
-    return Mjcf(tree.root, excluded_pairs(model, tree.solid), motors, start, base, tuple(findings), file)
+    return Mjcf(
+        tree.root, excluded_pairs(model, tree.solid), motors, start, base, tuple(findings), file
+    )
 
 
 def home(model: MjModel) -> int | None:
@@ -108,10 +113,11 @@ def _file(path: Path, compiled: Attempt, names: Names, fixed_base: bool) -> Mjcf
 
 
 def content_of(path: Path) -> str:
-    """Return the digest of an MJCF file and of all files that it names: included models, meshes, height fields, ...
+    """Return the digest of an MJCF file and of all files that it names: included models, meshes,
+    height fields, ...
 
-    MuJoCo looks for a file in the folder of the file that names it, or in a folder of its ``<compiler>``. A missing
-    file is left out: if MuJoCo needs it, the compilation fails.
+    MuJoCo looks for a file in the folder of the file that names it, or in a folder of its
+    ``<compiler>``. A missing file is left out: if MuJoCo needs it, the compilation fails.
     """
     names = set[str]()
     folders = set[Path]()
@@ -123,63 +129,128 @@ def content_of(path: Path) -> str:
             for key, name in element.items():
                 if (key == "value" or key.startswith("file")) and name not in names:
                     names |= {name, Path(name).name}
-                    included = [model.parent / name, path.parent / name] if element.tag in ("include", "model") else []
+                    included = (
+                        [model.parent / name, path.parent / name]
+                        if element.tag in ("include", "model")
+                        else []
+                    )
                     models += [file for file in included if file.is_file() and file not in models]
-    files = {(name, file) for name in names for folder in folders if os.path.isfile(file := folder / name)}
-    return digest(path.read_bytes(), sorted((name, digest(file.read_bytes())) for name, file in files))
+    files = {
+        (name, file)
+        for name in names
+        for folder in folders
+        if os.path.isfile(file := folder / name)
+    }
+    return digest(
+        path.read_bytes(), sorted((name, digest(file.read_bytes())) for name, file in files)
+    )
 
 
 def _in_radians(model: MjModel, names: Names) -> list[Finding]:
-    """Return a finding if all limited hinges have ranges within 3.2 degrees, as if radians were read as degrees."""
-    hinges = [joint for joint in names.joints if model.jnt_limited[joint] and not names.is_slide(joint)]
+    """Return a finding if all limited hinges have ranges within 3.2 degrees, as if radians were
+    read as degrees.
+    """
+    hinges = [
+        joint for joint in names.joints if model.jnt_limited[joint] and not names.is_slide(joint)
+    ]
     if not hinges or np.abs(model.jnt_range[hinges]).max() > np.deg2rad(3.2):
         return []
-    text = "the ranges of all hinges are tiny: angles of an MJCF file are in degrees unless it says otherwise"
-    return [Finding("warning", "limits", text, 'add <compiler angle="radian"/> if the file is in radians')]
+    text = (
+        "the ranges of all hinges are tiny: angles of an MJCF file are in degrees unless it says"
+        " otherwise"
+    )
+    return [
+        Finding(
+            "warning", "limits", text, 'add <compiler angle="radian"/> if the file is in radians'
+        )
+    ]
 
 
 def _unused(model: MjModel, names: Names, key: int | None) -> list[Finding]:
-    """Return findings for content that is not simulated, apart from motors, couplings, shapes and keyframe ``key``."""
+    """Return findings for content that is not simulated, apart from motors, couplings, shapes and
+    keyframe ``key``.
+    """
     found = []
-    counts = {"site": model.nsite, "sensor": model.nsensor, "camera": model.ncam, "skin": model.nskin}
+    counts = {
+        "site": model.nsite,
+        "sensor": model.nsensor,
+        "camera": model.ncam,
+        "skin": model.nskin,
+    }
     counts["keyframe"] = model.nkey - (key is not None)
     if listed := [f"{count} {kind}{'s' * (count > 1)}" for kind, count in counts.items() if count]:
         text = f"elements that the simulation does not use are left out: {', '.join(listed)}"
         found.append(Finding("note", "unknown-element", text, "expect no effect"))
     option = model.opt
     if tuple(option.gravity) != GRAVITY:
-        text = f"gravity {tuple(option.gravity.tolist())} of the file is not used: {GRAVITY} m/s^2 is"
+        text = (
+            f"gravity {tuple(option.gravity.tolist())} of the file is not used: {GRAVITY} m/s^2 is"
+        )
         found.append(Finding("warning", "option", text, "expect other loads"))
     ours, others = (
-        [name.lower() for name in flags if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}", 0)]
+        [
+            name.lower()
+            for name in flags
+            if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}", 0)
+        ]
         for flags in (_OURS, _OTHERS)
     )
     if ours:
         text = f"<flag> of the file is not used, which disables: {', '.join(ours)}"
-        found.append(Finding("warning", "option", text, "expect all of these to act; remove them from the file"))
+        found.append(
+            Finding(
+                "warning", "option", text, "expect all of these to act; remove them from the file"
+            )
+        )
     if option.enableflags & int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)):
-        found.append(Finding("note", "option", "no body falls asleep, as the file has it", "expect slower steps"))
+        found.append(
+            Finding(
+                "note", "option", "no body falls asleep, as the file has it", "expect slower steps"
+            )
+        )
     special = {
         f"the absence of what <flag> disables: {', '.join(others)}": others,
         "drag of the medium (<option density= viscosity=>)": option.density or option.viscosity,
         "flexible bodies": model.nflex,
     }
     remedy = "expect another motion in SAPIEN"
-    found += [Finding("warning", "option", f"{ALONE} {text}", remedy) for text, there in special.items() if there]
+    found += [
+        Finding("warning", "option", f"{ALONE} {text}", remedy)
+        for text, there in special.items()
+        if there
+    ]
     for joint, name in names.joints.items():
-        if model.jnt_stiffness[joint] or np.any(getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[joint]):
-            text, remedy = f"{ALONE} the spring of the joint", "in SAPIEN add its effort in a controller"
-            detail = f"{model.jnt_stiffness[joint]:g} {'N/m' if names.is_slide(joint) else 'N m/rad'}"
+        if model.jnt_stiffness[joint] or np.any(
+            getattr(model, "jnt_stiffnesspoly", np.zeros((model.njnt, 1)))[joint]
+        ):
+            text, remedy = (
+                f"{ALONE} the spring of the joint",
+                "in SAPIEN add its effort in a controller",
+            )
+            detail = (
+                f"{model.jnt_stiffness[joint]:g} {'N/m' if names.is_slide(joint) else 'N m/rad'}"
+            )
             found.append(Finding("warning", "spring", text, remedy, name, detail=detail))
-        if np.any(getattr(model, "dof_dampingpoly", np.zeros((model.nv, 1)))[model.jnt_dofadr[joint]]):
+        if np.any(
+            getattr(model, "dof_dampingpoly", np.zeros((model.nv, 1)))[model.jnt_dofadr[joint]]
+        ):
             text = f"{ALONE} damping that grows with the speed, SAPIEN its linear part"
-            found.append(Finding("warning", "dynamics", text, "give the damping at the speeds of interest", name))
+            found.append(
+                Finding(
+                    "warning", "dynamics", text, "give the damping at the speeds of interest", name
+                )
+            )
     for body in np.flatnonzero(model.body_gravcomp):
-        text, remedy = "gravity compensation of this body (gravcomp) is not simulated", "let the controller compensate"
+        text, remedy = (
+            "gravity compensation of this body (gravcomp) is not simulated",
+            "let the controller compensate",
+        )
         if names.is_of_robot(body):
             found.append(Finding("note", "gravcomp", text, remedy, link=names.bodies[int(body)]))
     for body in np.flatnonzero(model.body_plugin >= 0):
         text = f"{ALONE} the plugin of the body"
         remedy = "in SAPIEN expect the body to be rigid and to move freely"
-        found.append(Finding("warning", "unknown-element", text, remedy, link=names.bodies[int(body)]))
+        found.append(
+            Finding("warning", "unknown-element", text, remedy, link=names.bodies[int(body)])
+        )
     return found

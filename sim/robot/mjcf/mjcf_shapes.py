@@ -1,7 +1,8 @@
-"""Collision shapes of a compiled MJCF file, and the pairs of links that its masks and exclusions keep apart.
+"""Collision shapes of a compiled MJCF file, and the pairs of links that its masks and exclusions
+keep apart.
 
-A mesh collides as its convex hull, in MuJoCo and in PhysX. Hulls of meshes and ellipsoids are written to
-``batchpid/meshes`` in the user's cache folder, named by their content.
+A mesh collides as its convex hull, in MuJoCo and in PhysX. Hulls of meshes and ellipsoids are
+written to ``batchpid/meshes`` in the user's cache folder, named by their content.
 """
 
 from __future__ import annotations
@@ -41,11 +42,14 @@ def _paired(model: MjModel) -> set[int]:
 
 
 def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair, ...]:
-    """Return the pairs of links with shapes that never collide: excluded, or by the masks of all their geoms.
+    """Return the pairs of links with shapes that never collide: excluded, or by the masks of all
+    their geoms.
 
     ``solid`` maps bodies with shapes to their links. Bodies that are welded together do not count.
     """
-    excluded = {frozenset((int(each) >> 16, int(each) & 0xFFFF)) for each in model.exclude_signature}
+    excluded = {
+        frozenset((int(each) >> 16, int(each) & 0xFFFF)) for each in model.exclude_signature
+    }
     geoms: dict[int, list[int]] = defaultdict(list)
     for geom in range(model.ngeom):
         if can_collide(model, geom):
@@ -60,9 +64,12 @@ def excluded_pairs(model: MjModel, solid: dict[int, str]) -> tuple[DisabledPair,
         if pair in paired or pair in excluded:
             return pair in paired
         types, affinities = (
-            [field[geoms[body]] for body in (first, second)] for field in (model.geom_contype, model.geom_conaffinity)
+            [field[geoms[body]] for body in (first, second)]
+            for field in (model.geom_contype, model.geom_conaffinity)
         )
-        return bool(np.any(types[0][:, None] & affinities[1]) or np.any(types[1][:, None] & affinities[0]))
+        return bool(
+            np.any(types[0][:, None] & affinities[1]) or np.any(types[1][:, None] & affinities[0])
+        )
 
     return tuple(
         DisabledPair(solid[first], solid[second], "User")
@@ -81,7 +88,8 @@ class ShapeWriter:
         self._files: dict[int, Path] = {}  # by number of the mesh
 
     def write(self, body: int, link: etree._Element, anchor: NDArray[np.float64]) -> bool:
-        """Write the shapes of a body, whose link has its origin at ``anchor``; return whether there are any.
+        """Write the shapes of a body, whose link has its origin at ``anchor``; return whether there
+        are any.
 
         Raises RobotError if the hull of a mesh cannot be written.
         """
@@ -104,7 +112,9 @@ class ShapeWriter:
         """Report the shapes of a body that is not part of the robot."""
         first = int(self._model.body_geomadr[body])
         solid = [
-            geom for geom in range(first, first + int(self._model.body_geomnum[body])) if can_collide(self._model, geom)
+            geom
+            for geom in range(first, first + int(self._model.body_geomnum[body]))
+            if can_collide(self._model, geom)
         ]
         others = [geom for geom in solid if int(self._model.geom_type[geom]) != PLANE]
         for geom in sorted({*solid} - {*others}):
@@ -122,9 +132,12 @@ class ShapeWriter:
             self._found("note", None, text, "SAPIEN has a ground at height 0")
         else:
             remedy = (
-                "SAPIEN has a ground at height 0 instead: add the plane with build= of Runner, or pass ground=False"
+                "SAPIEN has a ground at height 0 instead: add the plane with build= of Runner, or"
+                " pass ground=False"
             )
-            where = f"{text}, at height {height:g} m" if x == y == 0 else f"{text}, which is not level"
+            where = (
+                f"{text}, at height {height:g} m" if x == y == 0 else f"{text}, which is not level"
+            )
             self._found("warning", None, where, remedy)
 
     def _geometry(self, geom: int, body: int) -> etree._Element | None:
@@ -144,13 +157,23 @@ class ShapeWriter:
             return etree.Element("mesh", filename=str(self._files[mesh]))
         if kind == _KIND.mjGEOM_ELLIPSOID:
             text = "an ellipsoid collides in SAPIEN as a polyhedron inscribed in it"
-            self._found("note", body, text, "expect its surface up to 3 % of the radii farther inside")
+            self._found(
+                "note", body, text, "expect its surface up to 3 % of the radii farther inside"
+            )
             return etree.Element("mesh", filename=str(_write_mesh(*_ellipsoid(size))))
         if body == 0 and kind == PLANE:
             self._plane(geom)
         else:
-            name = f"{'a plane' if kind == PLANE else 'a height field'} ({label(self._model.geom(geom))})"
-            self._found("warning", body, f"{name} is a shape in MuJoCo alone", "in SAPIEN add it with build=")
+            name = (
+                f"{'a plane' if kind == PLANE else 'a height field'}"
+                f" ({label(self._model.geom(geom))})"
+            )
+            self._found(
+                "warning",
+                body,
+                f"{name} is a shape in MuJoCo alone",
+                "in SAPIEN add it with build=",
+            )
         return None
 
     def _found(self, severity: str, body: int | None, text: str, remedy: str) -> None:
@@ -164,7 +187,8 @@ def text_of(values: ArrayLike) -> str:
 
 
 def _hull(model: MjModel, mesh: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return vertices (n, 3) [m] and triangles (m, 3) of the convex hull of a mesh, or of the mesh if it has none.
+    """Return vertices (n, 3) [m] and triangles (m, 3) of the convex hull of a mesh, or of the mesh
+    if it has none.
 
     The hull's graph has the layout of ``mesh_graph`` in MuJoCo's mjmodel.h.
     """
@@ -174,7 +198,9 @@ def _hull(model: MjModel, mesh: int) -> tuple[NDArray[np.float32], NDArray[np.in
         first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
         return vertices, model.mesh_face[first : first + count].astype(np.int64)
     corners, triangles = model.mesh_graph[begin : begin + 2].tolist()
-    begin += 2 + 3 * corners + 3 * triangles  # the triangles come last: after two counts, vertices and edges
+    begin += (
+        2 + 3 * corners + 3 * triangles
+    )  # the triangles come last: after two counts, vertices and edges
     kept, faces = np.unique(model.mesh_graph[begin : begin + 3 * triangles], return_inverse=True)
     return vertices[kept], faces.reshape(-1, 3).astype(np.int64)
 
@@ -184,7 +210,10 @@ def _ellipsoid(radii: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray
     polar = np.linspace(0, np.pi, _PARALLELS)[1:-1, None]
     angle = np.arange(_MERIDIANS) * 2 * np.pi / _MERIDIANS
     rings = np.stack(
-        np.broadcast_arrays(np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle), np.cos(polar)), -1
+        np.broadcast_arrays(
+            np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle), np.cos(polar)
+        ),
+        -1,
     )
     vertices = np.concatenate([rings.reshape(-1, 3), [[0, 0, 1], [0, 0, -1]]]) * radii
     index = np.arange(len(rings) * _MERIDIANS).reshape(len(rings), _MERIDIANS)
@@ -192,7 +221,9 @@ def _ellipsoid(radii: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray
     sides = [(index[:-1], index[1:], after[1:]), (index[:-1], after[1:], after[:-1])]
     top, bottom = np.full(_MERIDIANS, index.size), np.full(_MERIDIANS, index.size + 1)
     sides += [(top, index[0], after[0]), (bottom, after[-1], index[-1])]
-    return vertices.astype(np.float32), np.concatenate([np.stack(side, -1).reshape(-1, 3) for side in sides])
+    return vertices.astype(np.float32), np.concatenate(
+        [np.stack(side, -1).reshape(-1, 3) for side in sides]
+    )
 
 
 def _write_mesh(vertices: NDArray[np.float32], faces: NDArray[np.int64]) -> Path:
@@ -200,7 +231,9 @@ def _write_mesh(vertices: NDArray[np.float32], faces: NDArray[np.int64]) -> Path
     lines = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices.tolist()]
     lines += ["f {} {} {}".format(*face) for face in (faces + 1).tolist()]
     content = ("\n".join(lines) + "\n").encode()
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "batchpid", "meshes")
+    folder = Path(
+        os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "batchpid", "meshes"
+    )
     path = folder / f"{digest(content)[:32]}.obj"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -208,5 +241,7 @@ def _write_mesh(vertices: NDArray[np.float32], faces: NDArray[np.int64]) -> Path
             write_atomically(path, content)
     except OSError as error:
         problem = f"{path}: cannot be written: {error.strerror}"
-        raise RobotError(f"{problem}; set XDG_CACHE_HOME to a folder for the hulls of meshes") from error
+        raise RobotError(
+            f"{problem}; set XDG_CACHE_HOME to a folder for the hulls of meshes"
+        ) from error
     return path

@@ -1,13 +1,14 @@
 r"""Bodies and joints of a compiled MJCF file as the links and joints of a URDF.
 
-Masses and inertias are taken from the compiled bodies. A hinge with anchor p, axis a and reference angle q0 moves its
-body by Trans(p) Rot(a, q - q0) Trans(-p), so that the link of the URDF, whose origin is the anchor, is at::
+Masses and inertias are taken from the compiled bodies. A hinge with anchor p, axis a and reference
+angle q0 moves its body by Trans(p) Rot(a, q - q0) Trans(-p), so that the link of the URDF, whose
+origin is the anchor, is at::
 
     origin = X Trans(p) Rot(a, -q0)        link = origin Rot(a, q)        body = link Trans(-p)
 
-with X the pose of the body before this joint, in the link below; a slide moves by Trans(a (q - q0)), with p = 0.
-Several joints of one body become a chain of links, of which the last has the mass. (MuJoCo's documentation,
-"Computation", kinematic tree.)
+with X the pose of the body before this joint, in the link below; a slide moves by Trans(a (q -
+q0)), with p = 0. Several joints of one body become a chain of links, of which the last has the
+mass. (MuJoCo's documentation, "Computation", kinematic tree.)
 """
 
 from __future__ import annotations
@@ -30,19 +31,23 @@ from batchpid.task_space.rotations import about, multiply, rotate, to_rpy
 from batchpid.task_space.spatial_inertia import rotation_matrix
 
 NO_MASS = 1e-9
-"""Mass [kg] of a link with shapes and without mass: a URDF reader would give it the mass of its shapes."""
+"""Mass [kg] of a link with shapes and without mass: a URDF reader would give it the mass of its
+shapes.
+"""
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 class Tree:
     """Links and joints of the robot in ``model``, as elements of ``root``.
 
-    ``base`` is the body of the root, 0 for the world. ``solid`` is the name of the link of each body that has shapes.
-    The joints of other objects are removed from ``names``. Raises RobotError if there is a ball joint, or more than one
-    robot.
+    ``base`` is the body of the root, 0 for the world. ``solid`` is the name of the link of each
+    body that has shapes. The joints of other objects are removed from ``names``. Raises RobotError
+    if there is a ball joint, or more than one robot.
     """
 
-    def __init__(self, model: MjModel, names: Names, path: Path, fixed_base: bool, findings: list[Finding]) -> None:
+    def __init__(
+        self, model: MjModel, names: Names, path: Path, fixed_base: bool, findings: list[Finding]
+    ) -> None:
         self._model = model
         self._names = names
         self._path = path
@@ -72,10 +77,14 @@ class Tree:
             above = int(self._model.body_parentid[body])
             if body == base or (above in parents and body not in left_out):
                 parents[body] = self._names.bodies[body]
-                self._write_body(body, parent if body == base else parents[above], motors, couplings)
+                self._write_body(
+                    body, parent if body == base else parents[above], motors, couplings
+                )
 
     def _find_base(self, fixed_base: bool) -> tuple[int, set[int]]:
-        """Return the body of the root, 0 for the world, and the bodies directly in the world that are left out."""
+        """Return the body of the root, 0 for the world, and the bodies directly in the world that
+        are left out.
+        """
         model, names = self._model, self._names.bodies
         tops = {body for body in range(1, model.nbody) if model.body_parentid[body] == 0}
         free, balls = (
@@ -83,23 +92,38 @@ class Tree:
             for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
         )
         moving = {int(model.body_rootid[model.jnt_bodyid[joint]]) for joint in self._names.joints}
-        soft = {int(body) for body in getattr(model, "flex_vertbodyid", ()) if not model.body_geomnum[body]} & tops
+        soft = {
+            int(body)
+            for body in getattr(model, "flex_vertbodyid", ())
+            if not model.body_geomnum[body]
+        } & tops
         moving -= soft  # three slides for each vertex of a flexible body
         if driven := moving & roots_of_actuators(model):
             moving -= (moving & free) - driven
         floating = moving & free
         if len(floating) > 1 or (floating and moving - free):
             listed = ", ".join(repr(names[body]) for body in sorted(moving))
-            raise RobotError(f"{self._path}: holds several robots, {listed}; leave one of them in the file")
+            raise RobotError(
+                f"{self._path}: holds several robots, {listed}; leave one of them in the file"
+            )
         left_out = {body for body in tops if model.body_mocapid[body] >= 0} | (free - moving)
-        left_out |= (tops - floating if floating else set()) | (balls - moving if moving else set()) | soft
+        left_out |= (
+            (tops - floating if floating else set()) | (balls - moving if moving else set()) | soft
+        )
         for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_BALL):
             of_body = int(model.jnt_bodyid[joint])
             if model.body_rootid[of_body] not in left_out:
-                problem = f"the ball joint {model.joint(joint).name!r} has no single position to control"
-                raise RobotError(f"{self._path}: body {names[of_body]!r}: {problem}; replace it by three hinges")
+                problem = (
+                    f"the ball joint {model.joint(joint).name!r} has no single position to control"
+                )
+                raise RobotError(
+                    f"{self._path}: body {names[of_body]!r}: {problem}; replace it by three hinges"
+                )
         for body in sorted(left_out - soft):
-            text, remedy = f"is apart from the robot: {ALONE} it", "in SAPIEN add it with build= of Runner"
+            text, remedy = (
+                f"is apart from the robot: {ALONE} it",
+                "in SAPIEN add it with build= of Runner",
+            )
             self._findings.append(Finding("note", "loose-link", text, remedy, link=names[body]))
         if floating:
             if fixed_base:
@@ -110,14 +134,25 @@ class Tree:
         only, *others = sorted(tops - left_out) or [0]
         pose = [*model.body_pos[only], *model.body_quat[only]]
         scenery = any(
-            model.geom_bodyid[geom] == 0 and model.geom_type[geom] != PLANE and can_collide(model, geom)
+            model.geom_bodyid[geom] == 0
+            and model.geom_type[geom] != PLANE
+            and can_collide(model, geom)
             for geom in range(model.ngeom)
         )
-        alone = not others and not scenery and not model.body_jntnum[only] and pose == [0, 0, 0, 1, 0, 0, 0]
+        alone = (
+            not others
+            and not scenery
+            and not model.body_jntnum[only]
+            and pose == [0, 0, 0, 1, 0, 0, 0]
+        )
         return (only if alone else 0), left_out
 
-    def _write_body(self, body: int, parent: str | None, motors: Motors, couplings: Couplings) -> None:
-        """Write the link of a body, and the joints between it and the link ``parent``; None for the root."""
+    def _write_body(
+        self, body: int, parent: str | None, motors: Motors, couplings: Couplings
+    ) -> None:
+        """Write the link of a body, and the joints between it and the link ``parent``; None for the
+        root.
+        """
         model, name = self._model, self._names.bodies[body]
         joints = [joint for joint in self._names.joints if model.jnt_bodyid[joint] == body]
         above = int(model.body_parentid[body])
@@ -136,7 +171,10 @@ class Tree:
             else:
                 kind = "revolute" if model.jnt_limited[joint] else "continuous"
                 anchor = model.jnt_pos[joint].copy()
-                place, turn = place + rotate(turn, anchor), multiply(turn, about(axis, np.asarray(-rest)))
+                place, turn = (
+                    place + rotate(turn, anchor),
+                    multiply(turn, about(axis, np.asarray(-rest))),
+                )
             link = name
             if joint != joints[-1]:
                 link = self._names.new_link(f"{name}_{own}")
@@ -149,23 +187,34 @@ class Tree:
         self._anchors[body] = anchor
         self._write_content(body, name, self._link(name))
 
-    def _write_motion(self, element: etree._Element, joint: int, motors: Motors, couplings: Couplings) -> None:
+    def _write_motion(
+        self, element: etree._Element, joint: int, motors: Motors, couplings: Couplings
+    ) -> None:
         """Write axis, limits, friction and damping, and coupling of a joint."""
         model = self._model
         name = self._names.joints[joint]
         dof = self._model.jnt_dofadr[joint]
         etree.SubElement(element, "axis", xyz=text_of(model.jnt_axis[joint]))
-        lower, upper = model.jnt_range[joint].tolist() if model.jnt_limited[joint] else (-np.inf, np.inf)
+        lower, upper = (
+            model.jnt_range[joint].tolist() if model.jnt_limited[joint] else (-np.inf, np.inf)
+        )
         limit = etree.SubElement(element, "limit", lower=repr(lower), upper=repr(upper))
         if np.isfinite(motors.effort_limit[name]):
             limit.set("effort", repr(motors.effort_limit[name]))
         if name in motors.rate:
             limit.set("velocity", repr(float(motors.rate[name])))
-        damping, friction = model.dof_damping[dof] + motors.damping[name], model.dof_frictionloss[dof]
-        etree.SubElement(element, "dynamics", damping=repr(float(damping)), friction=repr(float(friction)))
+        damping, friction = (
+            model.dof_damping[dof] + motors.damping[name],
+            model.dof_frictionloss[dof],
+        )
+        etree.SubElement(
+            element, "dynamics", damping=repr(float(damping)), friction=repr(float(friction))
+        )
         if name in couplings:
             leader, multiplier, offset = couplings[name]
-            etree.SubElement(element, "mimic", joint=leader, multiplier=repr(multiplier), offset=repr(offset))
+            etree.SubElement(
+                element, "mimic", joint=leader, multiplier=repr(multiplier), offset=repr(offset)
+            )
 
     def _write_content(self, body: int, name: str, link: etree._Element) -> None:
         """Write inertia and shapes of a body to its link."""
@@ -190,7 +239,13 @@ class Tree:
         return etree.SubElement(self.root, "link", name=name)
 
     def _joint(
-        self, name: str, kind: str, parent: str, child: str, place: NDArray[np.float64], turn: NDArray[np.float64]
+        self,
+        name: str,
+        kind: str,
+        parent: str,
+        child: str,
+        place: NDArray[np.float64],
+        turn: NDArray[np.float64],
     ) -> etree._Element:
         element = etree.SubElement(self.root, "joint", name=name, type=kind)
         etree.SubElement(element, "parent", link=parent)

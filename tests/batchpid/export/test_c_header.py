@@ -1,4 +1,6 @@
-"""The exported C header computes the same efforts as the law in NumPy, bit by bit, and the robot's dynamics."""
+"""The exported C header computes the same efforts as the law in NumPy, bit by bit, and the robot's
+dynamics.
+"""
 
 from __future__ import annotations
 
@@ -59,9 +61,13 @@ def efforts_in_numpy(params, columns, guard=None):
 
 
 def motion(seed: int, joints: int, dtype, names, steps: int = 100) -> dict[str, np.ndarray]:
-    """Return random columns (steps, joints), with jumps, and with NaN where the law has an answer to it."""
+    """Return random columns (steps, joints), with jumps, and with NaN where the law has an answer
+    to it.
+    """
     rng = np.random.default_rng(seed)
-    columns = {name: rng.normal(0, 2, (steps, joints)) for name in ("setpoint", "measurement", *names)}
+    columns = {
+        name: rng.normal(0, 2, (steps, joints)) for name in ("setpoint", "measurement", *names)
+    }
     columns["measurement"] = np.cumsum(columns["measurement"], axis=0) * 0.05
     if "mass_matrix" in names:
         root = rng.normal(0, 1, (steps, joints, joints))
@@ -74,12 +80,23 @@ def settings_of_a_law(draw) -> tuple[bp.PIDParams, dict, list[str]]:
     numbers = st.floats(0, 50, width=32)
     row = st.lists(numbers, min_size=joints, max_size=joints)
     options = {"kp": draw(row)}
-    for name in ("ki", "kd", "derivative_filter_time", "setpoint_weight", "setpoint_weight_derivative", "deadband"):
+    for name in (
+        "ki",
+        "kd",
+        "derivative_filter_time",
+        "setpoint_weight",
+        "setpoint_weight_derivative",
+        "deadband",
+    ):
         if draw(st.booleans()):
-            options[name] = np.array(draw(row)) * (0.001 if name in ("derivative_filter_time", "deadband") else 1)
+            options[name] = np.array(draw(row)) * (
+                0.001 if name in ("derivative_filter_time", "deadband") else 1
+            )
     if draw(st.booleans()):
         options["effort_limit"] = np.array(draw(row)) + 0.1
-        options["anti_windup"] = draw(st.sampled_from(["none", "clamp", "conditional", "back_calculation"]))
+        options["anti_windup"] = draw(
+            st.sampled_from(["none", "clamp", "conditional", "back_calculation"])
+        )
         if options["anti_windup"] == "back_calculation":
             options["tracking_time"] = 0.1
     for name, unit in (("effort_rate_limit", 100.0), ("integral_limit", 0.1)):
@@ -102,7 +119,9 @@ def settings_of_a_law(draw) -> tuple[bp.PIDParams, dict, list[str]]:
     inputs += [each for each in ("setpoint_rate", "feedforward") if draw(st.booleans())]
     guard = None
     if draw(st.booleans()):
-        guard = bp.make_guard(joints, lower=-1.5, upper=1.5, rate=3.0, acceleration=20.0, dtype=dtype)
+        guard = bp.make_guard(
+            joints, lower=-1.5, upper=1.5, rate=3.0, acceleration=20.0, dtype=dtype
+        )
     extra = [] if units == "effort" else [units]
     return params, {"guard": guard, "inputs": inputs, "prefix": "arm"}, [*inputs, *extra]
 
@@ -115,7 +134,9 @@ def check_random_settings(folder, data, compiler, steps, *flags):
         columns["measurement"][steps // 3, 0] = np.nan
         columns["setpoint"][steps // 2, -1] = np.inf
     expected = efforts_in_numpy(params, columns, options["guard"])
-    np.testing.assert_array_equal(in_c(folder, params, options, columns, *flags, compiler=compiler), expected)
+    np.testing.assert_array_equal(
+        in_c(folder, params, options, columns, *flags, compiler=compiler), expected
+    )
 
 
 @pytest.mark.quick_rows(1)
@@ -138,7 +159,14 @@ def test_sanitizers_find_nothing(tmp_path):
     params = bp.make_params(
         8,
         **SINGLE["everything"]
-        | {"kp": 1.0, "ki": 2.0, "kd": 0.1, "effort_limit": 3.0, "anti_windup": "conditional", "continuous": True},
+        | {
+            "kp": 1.0,
+            "ki": 2.0,
+            "kd": 0.1,
+            "effort_limit": 3.0,
+            "anti_windup": "conditional",
+            "continuous": True,
+        },
     )
     columns = motion(2, 8, np.float64, ("feedforward",))
     try:
@@ -157,7 +185,12 @@ def test_it_compiles_as_cpp_and_neither_allocates_nor_keeps_global_state(tmp_pat
     tree = planar((1.0, 1.0))
     (tmp_path / "law.h").write_text(to_c(params, DT, joint_names=tree.joint_names, tree=tree).text)
     guard = bp.make_guard(3, lower=-1.5, upper=1.5, rate=3.0, acceleration=20.0)
-    whole = {"effort_limit": 3.0, "effort_rate_limit": 9.0, "anti_windup": "conditional", "gain_units": "mass_matrix"}
+    whole = {
+        "effort_limit": 3.0,
+        "effort_rate_limit": 9.0,
+        "anti_windup": "conditional",
+        "gain_units": "mass_matrix",
+    }
     every = to_c(bp.make_params(3, **SINGLE["everything"]), DT, guard=guard, prefix="every")
     matrix = to_c(bp.make_params(3, 4.0, 2.0, 0.1, **whole), DT, prefix="matrix")
     (tmp_path / "every.h").write_text(every.text + matrix.text)
@@ -171,27 +204,43 @@ def test_it_compiles_as_cpp_and_neither_allocates_nor_keeps_global_state(tmp_pat
         "  batchpid_mass_matrix(x, x + 2); batchpid_bias(x, x, x); }\n"
     )
     subprocess.run(["g++", *STRICT, "-O2", "-c", "law.cpp"], cwd=tmp_path, check=True)
-    listed = subprocess.run(["nm", "law.o"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    listed = subprocess.run(
+        ["nm", "law.o"], cwd=tmp_path, capture_output=True, text=True, check=True
+    ).stdout
     # Nothing undefined but mathematics (malloc would be), and no data that can change.
-    assert not re.search(r" U (?!sincos|sin|cos|sqrt|__stack_chk_fail|_GLOBAL)| [BbDd] ", listed), listed
+    assert not re.search(r" U (?!sincos|sin|cos|sqrt|__stack_chk_fail|_GLOBAL)| [BbDd] ", listed), (
+        listed
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "dtype"),
-    [pytest.param("panda", np.float64, marks=pytest.mark.slow), (0, np.float64), ("planar", np.float32)],
+    [
+        pytest.param("panda", np.float64, marks=pytest.mark.slow),
+        (0, np.float64),
+        ("planar", np.float32),
+    ],
 )
 def test_the_dynamics_of_the_robot(name, dtype, tmp_path):
     tree = planar(gravity=(0.0, -9.81, 0.0)) if name == "planar" else tree_of(name)
     tree = dataclasses.replace(tree, armature=np.linspace(0, 0.2, tree.dof))
     params, n = bp.make_params(tree.dof, 1.0, dtype=dtype), tree.dof
-    (tmp_path / "arm.h").write_text(to_c(params, DT, joint_names=tree.joint_names, prefix="arm", tree=tree).text)
+    (tmp_path / "arm.h").write_text(
+        to_c(params, DT, joint_names=tree.joint_names, prefix="arm", tree=tree).text
+    )
     q, v = (each.astype(dtype) for each in states(tree, 20))
     flags = SANITIZED if name == "panda" else ("-std=c99", "-O2")
-    binary = compiled(tmp_path, TABLE.format(n=n, t="double" if dtype == np.float64 else "float"), *flags)
-    ran = subprocess.run([binary], input=np.hstack([q, v]).tobytes(), capture_output=True, check=True)
+    binary = compiled(
+        tmp_path, TABLE.format(n=n, t="double" if dtype == np.float64 else "float"), *flags
+    )
+    ran = subprocess.run(
+        [binary], input=np.hstack([q, v]).tobytes(), capture_output=True, check=True
+    )
     found = np.frombuffer(ran.stdout, dtype).reshape(20, -1)
     wide = [each.astype(np.float64) for each in (q, v)]
     parts = mass_matrix(tree, wide[0]).reshape(20, -1), bias(tree, *wide), gravity(tree, wide[0])
     for at, expected in zip(np.split(found, [n * n, n * n + n], axis=1), parts, strict=True):
         size = max(np.abs(expected).max(), 1.0)
-        np.testing.assert_allclose(at, expected, rtol=0, atol=(1e-12 if dtype == np.float64 else 1e-5) * size)
+        np.testing.assert_allclose(
+            at, expected, rtol=0, atol=(1e-12 if dtype == np.float64 else 1e-5) * size
+        )

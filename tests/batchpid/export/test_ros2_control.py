@@ -1,4 +1,6 @@
-"""Parameters of ros2_control: the target's law against this one, and params that are written or listed."""
+"""Parameters of ros2_control: the target's law against this one, and params that are written or
+listed.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +20,20 @@ CONTROLLERS = ("joint_trajectory_controller", "pid_controller")
 
 
 def target_effort(gains, memory, error, rate, desired_rate, dt):
-    """One step of control_toolbox's PID with a feedforward of the desired velocity, on one joint."""
+    """One step of control_toolbox's PID with a feedforward of the desired velocity, on one
+    joint.
+    """
     u = gains["p"] * error + memory["i"] + gains["d"] * rate
     command = min(max(u, gains["u_clamp_min"]), gains["u_clamp_max"])
     strategy = gains["antiwindup_strategy"]
     if abs(error) > gains["error_deadband"]:
         if strategy == "back_calculation" and gains["i"] != 0:
-            memory["i"] += dt * (gains["i"] * error + (command - u) / gains["tracking_time_constant"])
+            memory["i"] += dt * (
+                gains["i"] * error + (command - u) / gains["tracking_time_constant"]
+            )
         elif strategy == "none" or (
-            strategy == "conditional_integration" and not (abs(u - command) > 2.3e-16 and error * u > 0)
+            strategy == "conditional_integration"
+            and not (abs(u - command) > 2.3e-16 and error * u > 0)
         ):
             memory["i"] += dt * gains["i"] * error
     memory["i"] = min(max(memory["i"], gains["i_clamp_min"]), gains["i_clamp_max"])
@@ -39,7 +46,9 @@ def gains_of(text, controller):
 
 
 def motion(two, steps=150):
-    """A setpoint (steps, joints) and a measurement, with their rates; without rates they begin at one point."""
+    """A setpoint (steps, joints) and a measurement, with their rates; without rates they begin at
+    one point.
+    """
     t = np.arange(steps)[:, None] * DT
     w, far = np.array([3.0, 7.0, 11.0]), np.array([1.0, 0.5, 2.0])
     setpoint, measurement = far * np.sin(w * t) + 0.03 * two, 0.7 * far * np.sin(0.8 * w * t)
@@ -55,7 +64,9 @@ def target_run(text, controller, two):
             error, last = r[j] - y[j], memory[joint]["last"]
             rate = r_rate[j] - y_rate[j] if two else (error - last) / DT
             memory[joint]["last"] = error
-            efforts[at, j] = target_effort(own, memory[joint], error, rate, r_rate[j] if two else 0.0, DT)
+            efforts[at, j] = target_effort(
+                own, memory[joint], error, rate, r_rate[j] if two else 0.0, DT
+            )
     return efforts
 
 
@@ -76,19 +87,32 @@ EXPRESSIBLE = {
     "integral limit": {"integral_limit": 0.2},
     "clamp": {"effort_limit": 2.0, "anti_windup": "clamp"},
     "conditional": {"effort_limit": 2.0, "anti_windup": "conditional"},
-    "back calculation": {"effort_limit": 2.0, "anti_windup": "back_calculation", "tracking_time": [0.1, 0.5, 0.02]},
+    "back calculation": {
+        "effort_limit": 2.0,
+        "anti_windup": "back_calculation",
+        "tracking_time": [0.1, 0.5, 0.02],
+    },
     "mixed": {"effort_limit": 2.0, "anti_windup": ["back_calculation", "conditional", "none"]},
 }
 
 
 @pytest.mark.parametrize("case", EXPRESSIBLE)
-@pytest.mark.parametrize(("controller", "two"), [*((each, True) for each in CONTROLLERS), ("pid_controller", False)])
+@pytest.mark.parametrize(
+    ("controller", "two"), [*((each, True) for each in CONTROLLERS), ("pid_controller", False)]
+)
 def test_the_targets_law_gives_the_same_efforts(controller, two, case):
     own = {"measurement_rate": "measured"} if two else {"setpoint_weight_derivative": 1.0}
-    params = bp.make_params(3, [40.0, 20.0, 0.5], [50.0, 5.0, 2.0], [2.0, 0.3, 0.02], **EXPRESSIBLE[case], **own)
+    params = bp.make_params(
+        3, [40.0, 20.0, 0.5], [50.0, 5.0, 2.0], [2.0, 0.3, 0.02], **EXPRESSIBLE[case], **own
+    )
     exported = to_ros2_control(params, JOINTS, DT, controller=controller)
-    assert {each.partition(":")[0] for each in exported.differences} <= {"effort_limit", "anti_windup"}
-    np.testing.assert_allclose(target_run(exported.text, controller, two), run(params, two), rtol=0, atol=1e-11)
+    assert {each.partition(":")[0] for each in exported.differences} <= {
+        "effort_limit",
+        "anti_windup",
+    }
+    np.testing.assert_allclose(
+        target_run(exported.text, controller, two), run(params, two), rtol=0, atol=1e-11
+    )
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
@@ -96,7 +120,9 @@ def test_a_derivative_weight_is_a_feedforward_of_the_velocity(controller):
     own = {"setpoint_weight_derivative": [1.0, 0.3, 0.0], "measurement_rate": "measured"}
     params = bp.make_params(3, [40.0, 20.0, 0.5], 1.0, [2.0, 0.3, 0.02], **own)
     exported = to_ros2_control(params, JOINTS, DT, controller=controller)
-    np.testing.assert_allclose(target_run(exported.text, controller, True), run(params, True), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(
+        target_run(exported.text, controller, True), run(params, True), rtol=0, atol=1e-11
+    )
 
 
 def test_the_file_is_that_of_a_controller_manager():
@@ -108,10 +134,16 @@ def test_the_file_is_that_of_a_controller_manager():
     }
     body = document["arm"]["ros__parameters"]
     assert body.pop("gains").keys() == set(JOINTS)
-    assert body == {"joints": JOINTS, "command_interfaces": ["effort"], "state_interfaces": ["position", "velocity"]}
+    assert body == {
+        "joints": JOINTS,
+        "command_interfaces": ["effort"],
+        "state_interfaces": ["position", "velocity"],
+    }
 
 
-GAINS = dict.fromkeys(("p", "i", "d", "u_clamp_max", "u_clamp_min", "i_clamp_max", "i_clamp_min"), float)
+GAINS = dict.fromkeys(
+    ("p", "i", "d", "u_clamp_max", "u_clamp_min", "i_clamp_max", "i_clamp_min"), float
+)
 GAINS |= {"antiwindup_strategy": ("back_calculation", "conditional_integration", "none")}
 GAINS |= {"tracking_time_constant": float, "error_deadband": float}
 SCHEMA = {
@@ -128,8 +160,10 @@ SCHEMA = {
         "gains": GAINS | {"feedforward_gain": float, "angle_wraparound": bool},
     },
 }
-"""Types, or values, of the parameters that the files use, after those that generate_parameter_library declares in
-ros2_controllers 6.9. Its lists are not empty and without repetition, its doubles refuse integers."""
+"""Types, or values, of the parameters that the files use, after those that
+generate_parameter_library declares in ros2_controllers 6.9. Its lists are not empty and without
+repetition, its doubles refuse integers.
+"""
 
 
 def fits(value, kind):
@@ -138,7 +172,11 @@ def fits(value, kind):
     if isinstance(kind, tuple) and isinstance(value, str):
         return value in kind
     entry = kind[0] if isinstance(kind, list) else kind
-    return isinstance(value, list) and len(set(value)) == len(value) > 0 and all(fits(each, entry) for each in value)
+    return (
+        isinstance(value, list)
+        and len(set(value)) == len(value) > 0
+        and all(fits(each, entry) for each in value)
+    )
 
 
 def check_schema(text, controller):
@@ -161,7 +199,12 @@ def check_schema(text, controller):
 def test_the_schema_refuses_what_the_target_refuses():
     text = to_ros2_control(bp.make_params(3, 1.0), JOINTS, DT).text
     check_schema(text, CONTROLLERS[0])
-    for before, after in (("p: 1.0", "p: 1"), ("p: 1.0", "q: 1.0"), ("none", "legacy"), ("[effort]", "[torque]")):
+    for before, after in (
+        ("p: 1.0", "p: 1"),
+        ("p: 1.0", "q: 1.0"),
+        ("none", "legacy"),
+        ("[effort]", "[torque]"),
+    ):
         assert before in text
         with pytest.raises(AssertionError):
             check_schema(text.replace(before, after), CONTROLLERS[0])
@@ -185,7 +228,9 @@ def test_every_gain_is_written_or_listed(params, controller):
         if params.gain_units is not None and not name.startswith("effort"):
             expected = expected * inertia
         if name not in listed:
-            assert [rows[joint][key] for joint in JOINTS] == pytest.approx(expected, rel=tolerance), name
+            assert [rows[joint][key] for joint in JOINTS] == pytest.approx(
+                expected, rel=tolerance
+            ), name
 
 
 @given(random_params(), st.sampled_from(CONTROLLERS))
@@ -193,11 +238,14 @@ def test_every_gain_is_written_or_listed(params, controller):
 def test_params_without_a_listed_difference_have_the_targets_efforts(params, controller):
     params = params.replace(gain_units="effort", dtype=np.float64)
     exported = to_ros2_control(params, JOINTS, DT, controller=controller)
-    # Without a feedforward, u_clamp is the effort limit; the motion has no error of exactly 0, and none of half a turn.
+    # Without a feedforward, u_clamp is the effort limit; the motion has no error of exactly 0, and
+    # none of half a turn.
     same = ("effort_limit", "continuous: taken", "anti_windup: back-calculation is left out")
     if not all(each.startswith(same) for each in exported.differences):
         return
     two = controller == "joint_trajectory_controller" or params.measurement_rate is not None
     ours = run(params, two)
     atol = 1e-9 * max(1.0, np.abs(ours).max())
-    np.testing.assert_allclose(target_run(exported.text, controller, two), ours, rtol=1e-9, atol=atol)
+    np.testing.assert_allclose(
+        target_run(exported.text, controller, two), ours, rtol=1e-9, atol=atol
+    )

@@ -1,4 +1,6 @@
-"""Programs of array functions give the bytes of NumPy, for all shapes of inputs and any number of threads."""
+"""Programs of array functions give the bytes of NumPy, for all shapes of inputs and any number of
+threads.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_compiled_law import bits, numbers
 
-from batchpid.arrays.elementwise import matrix_vector, push_history, read_history, row_minimum, take_columns
+from batchpid.arrays.elementwise import (
+    matrix_vector,
+    push_history,
+    read_history,
+    row_minimum,
+    take_columns,
+)
 from batchpid.motors import delay
 from batchpid.native import array_program
 from batchpid.native.array_program import ArrayProgram
@@ -30,11 +38,25 @@ def assert_identical(ours, theirs):
 
 
 def every_operation(a, b, c, matrix):
-    """Apply all operations of programs to arrays (rows, columns) and a matrix for each row; return the results."""
+    """Apply all operations of programs to arrays (rows, columns) and a matrix for each row; return
+    the results.
+    """
     xp = a.__array_namespace__()
     masks = a > b, a >= b, a < b, a <= b, a == b, a != b, xp.isfinite(a)
     some = (a > b) & (b < c), (a > b) | (b < c), ~(a > b)
-    numbers = a + b, a - b, a * b, a / b, -a, abs(a), xp.rint(a), xp.ceil(a), xp.floor(a), xp.sqrt(a), xp.sign(a)
+    numbers = (
+        a + b,
+        a - b,
+        a * b,
+        a / b,
+        -a,
+        abs(a),
+        xp.rint(a),
+        xp.ceil(a),
+        xp.floor(a),
+        xp.sqrt(a),
+        xp.sign(a),
+    )
     pairs = a * b + c, a + b * c, a + b - c, (a - b) * c, xp.minimum(xp.maximum(a, b), c)
     ends = xp.maximum(a, b), xp.minimum(a, b), xp.maximum(b, a), xp.minimum(b, a)
     across = xp.zeros_like(a) + row_minimum(a), matrix_vector(matrix, b)
@@ -42,7 +64,9 @@ def every_operation(a, b, c, matrix):
 
 
 def history_operations(places, history, a, b):
-    """Push ``a`` and ``b``, side by side, to ``history``; return its numbers at ``places`` (rows, columns)."""
+    """Push ``a`` and ``b``, side by side, to ``history``; return its numbers at ``places`` (rows,
+    columns).
+    """
     return [read_history(push_history(history, a, b), places)]
 
 
@@ -56,11 +80,16 @@ def columns_of(columns, a, b):
 def test_every_operation_on_inputs_of_every_shape(shape, dtype, seed, data):
     rng, (rows, columns) = np.random.default_rng(seed), shape
     shapes = st.sampled_from([shape, (1, columns), (rows, 1), (1, 1)])
-    inputs = [numbers(rng, shape, 0.2, dtype), *(numbers(rng, data.draw(shapes), 0.2, dtype) for _ in range(2))]
+    inputs = [
+        numbers(rng, shape, 0.2, dtype),
+        *(numbers(rng, data.draw(shapes), 0.2, dtype) for _ in range(2)),
+    ]
     inputs.append(numbers(rng, (*shape, columns), 0.01, dtype))
     wide = [*np.broadcast_arrays(*inputs[:3]), inputs[3]]
     with mock.patch.object(array_program, "NUMBERS_PER_THREAD", 64):
-        program = ArrayProgram(trace(every_operation, 0, 4, dtype), (), 4, shape, dtype, data.draw(st.integers(1, 4)))
+        program = ArrayProgram(
+            trace(every_operation, 0, 4, dtype), (), 4, shape, dtype, data.draw(st.integers(1, 4))
+        )
     with np.errstate(all="ignore"):
         assert_identical(program(*inputs), every_operation(*wide))
 
@@ -144,7 +173,10 @@ def test_results_may_be_written_over_inputs_that_are_read_later():
 def test_histories_are_changed_in_place(shape, samples, is_pair, seed, threads):
     rng, (rows, columns) = np.random.default_rng(seed), shape
     history = rng.normal(size=(rows, samples, (1 + is_pair) * columns))
-    late = [delay.discretise(rng.uniform(0, samples, shape), 1.0, history, at) for at in (0, columns)[: 1 + is_pair]]
+    late = [
+        delay.discretise(rng.uniform(0, samples, shape), 1.0, history, at)
+        for at in (0, columns)[: 1 + is_pair]
+    ]
     constants = [leaf for each in late for leaf in (*each.index, each.fraction)]
 
     def function(*arrays):
@@ -160,7 +192,9 @@ def test_histories_are_changed_in_place(shape, samples, is_pair, seed, threads):
     for _ in range(3):
         values = rng.normal(size=(1 + is_pair, *shape))
         theirs = push_history(theirs, *values)
-        assert_identical(program(ours, *values), [delay.read(theirs, each, None, np) for each in late])
+        assert_identical(
+            program(ours, *values), [delay.read(theirs, each, None, np) for each in late]
+        )
         assert_identical([ours], [theirs])
 
 
@@ -185,7 +219,8 @@ def test_histories_that_do_not_fit_are_refused():
         ArrayProgram(traced, [places], 2, value.shape)(history, history.ravel()[:12].reshape(4, 3))
 
 
-# -- Traces ----------------------------------------------------------------------------------------------------------
+# -- Traces
+# --------------------------------------------------------------------------------------------------
 
 
 def test_an_operation_that_programs_do_not_have_is_an_error():
@@ -206,7 +241,9 @@ def test_a_trace_holds_what_its_results_need_and_no_more():
 
 
 def test_literals_of_a_trace_keep_their_sign():
-    assert [repr(number) for number in trace(lambda x: [x + 0.0, x + -0.0, x + 0.0], 0, 1).literals] == ["0.0", "-0.0"]
+    assert [
+        repr(number) for number in trace(lambda x: [x + 0.0, x + -0.0, x + 0.0], 0, 1).literals
+    ] == ["0.0", "-0.0"]
 
 
 def test_what_depends_on_constants_alone_is_a_prelude():

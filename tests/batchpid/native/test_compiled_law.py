@@ -1,4 +1,6 @@
-"""BatchPID by the native extension: the bytes of NumPy for all options, inputs, shapes and numbers of threads."""
+"""BatchPID by the native extension: the bytes of NumPy for all options, inputs, shapes and numbers
+of threads.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,11 @@ def params_of(joints, options, dtype):
     try:
         return bp.make_params(joints, **options, dtype=dtype)
     except InvalidArgumentError as error:
-        options = {name: value for name, value in options.items() if name not in (error.argument, "anti_windup")}
+        options = {
+            name: value
+            for name, value in options.items()
+            if name not in (error.argument, "anti_windup")
+        }
         return params_of(joints, options, dtype)
 
 
@@ -59,7 +65,11 @@ def in_numpy(*arguments, **options):
 
 def bits(leaf):
     """Return dtype, shape and bits of an array, with one NaN for all."""
-    return None if leaf is None else (leaf.dtype, leaf.shape, np.where(np.isnan(leaf), np.nan, leaf).tobytes())
+    return (
+        None
+        if leaf is None
+        else (leaf.dtype, leaf.shape, np.where(np.isnan(leaf), np.nan, leaf).tobytes())
+    )
 
 
 def numbers(rng, shape, odd, dtype):
@@ -80,12 +90,16 @@ def numbers(rng, shape, odd, dtype):
     st.integers(0, 2**32),
     st.data(),
 )
-def test_a_native_controller_is_bit_identical_to_numpy(options, joints, envs, dtype, odd, terms, seed, data):
+def test_a_native_controller_is_bit_identical_to_numpy(
+    options, joints, envs, dtype, odd, terms, seed, data
+):
     rng, shape = np.random.default_rng(seed), (envs, joints)
     if data.draw(st.booleans(), "gains of each env"):
         options = {**options, "kp": rng.uniform(1, 50, shape)}
     params = params_of(joints, options, dtype)
-    setpoint_shape = data.draw(st.sampled_from([shape, (1, joints), (joints,), (envs, 1), ()]), "setpoint")
+    setpoint_shape = data.draw(
+        st.sampled_from([shape, (1, joints), (joints,), (envs, 1), ()]), "setpoint"
+    )
     present = data.draw(st.tuples(*[st.booleans()] * 3), "optional inputs")
     ours = bp.BatchPID(params, envs, DT, terms=terms)
     theirs = in_numpy(params, envs, DT, terms=terms)
@@ -109,7 +123,10 @@ def test_a_native_controller_is_bit_identical_to_numpy(options, joints, envs, dt
 def test_threads_of_a_large_batch_give_the_bytes_of_numpy(threads):
     params, rng = bp.make_params(9, **EVERYTHING), np.random.default_rng(0)
     shape = 60_001, 9  # numbers of four threads
-    ours, theirs = bp.BatchPID(params, shape[0], DT, threads=threads), in_numpy(params, shape[0], DT)
+    ours, theirs = (
+        bp.BatchPID(params, shape[0], DT, threads=threads),
+        in_numpy(params, shape[0], DT),
+    )
     for _ in range(2):
         y = rng.normal(size=shape)
         np.testing.assert_array_equal(ours(1.0, y), theirs(1.0, y))
@@ -117,7 +134,11 @@ def test_threads_of_a_large_batch_give_the_bytes_of_numpy(threads):
 
 def both(options=EVERYTHING, envs=5, joints=3):
     params = bp.make_params(joints, **options)
-    return bp.BatchPID(params, envs, DT), in_numpy(params, envs, DT), np.random.default_rng(0).normal(size=(9, envs, 3))
+    return (
+        bp.BatchPID(params, envs, DT),
+        in_numpy(params, envs, DT),
+        np.random.default_rng(0).normal(size=(9, envs, 3)),
+    )
 
 
 @needs_extension
@@ -142,7 +163,9 @@ def test_efforts_and_states_do_not_change_under_the_caller():
         np.testing.assert_array_equal(array, before)
 
 
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda pid: pickle.loads(pickle.dumps(pid))])
+@pytest.mark.parametrize(
+    "copied", [copy.copy, copy.deepcopy, lambda pid: pickle.loads(pickle.dumps(pid))]
+)
 def test_a_copy_goes_its_own_way(copied):
     ours, theirs, y = both()
     for step in range(3):
@@ -155,7 +178,9 @@ def test_a_copy_goes_its_own_way(copied):
         np.testing.assert_array_equal(ours(y[8], y[step]), theirs(y[8], y[step]))
     state = ours.state
     other.reset(y[0])
-    assert all(a is b is None or np.array_equal(a, b) for a, b in zip(state, ours.state, strict=True))
+    assert all(
+        a is b is None or np.array_equal(a, b) for a, b in zip(state, ours.state, strict=True)
+    )
 
 
 def test_reset_track_and_other_params_take_effect_in_between():
@@ -168,13 +193,17 @@ def test_reset_track_and_other_params_take_effect_in_between():
         lambda pid: pid.reset(y[3], np.arange(5) < 2, keep_integral=True),
         lambda pid: pid.track(y[8, :1], y[4], 3.0, y[5, :1]),
         lambda pid: setattr(pid, "params", pid.params.replace(kp=9.0, effort_rate_limit=300.0)),
-        lambda pid: setattr(pid, "params", pid.params.replace(anti_windup="conditional", effort_rate_limit=None)),
+        lambda pid: setattr(
+            pid, "params", pid.params.replace(anti_windup="conditional", effort_rate_limit=None)
+        ),
     ):
         for pid in (ours, theirs):
             act(pid)
         for step in range(3):
             np.testing.assert_array_equal(ours(y[8], y[step]), theirs(y[8], y[step]))
-            np.testing.assert_array_equal(ours(2.0, y[step], feedforward=y[6]), theirs(2.0, y[step], feedforward=y[6]))
+            np.testing.assert_array_equal(
+                ours(2.0, y[step], feedforward=y[6]), theirs(2.0, y[step], feedforward=y[6])
+            )
     assert not np.array_equal(before.integral, ours.state.integral)
 
 
@@ -185,7 +214,9 @@ def test_reset_track_and_other_params_take_effect_in_between():
         lambda rows: rows.astype(np.float32).astype(rows.dtype.newbyteorder()),
         lambda rows: rows.view(np.dtype(float, metadata={"unit": "rad"})),
         lambda rows: np.concatenate([rows, rows], axis=1)[:, : rows.shape[1]],
-        lambda rows: np.frombuffer(b"...." + rows.tobytes(), np.uint8)[4:].view(float).reshape(rows.shape),
+        lambda rows: (
+            np.frombuffer(b"...." + rows.tobytes(), np.uint8)[4:].view(float).reshape(rows.shape)
+        ),
         lambda rows: rows.view(np.recarray),
         lambda rows: rows.tolist(),
     ],
@@ -195,7 +226,9 @@ def test_inputs_may_be_any_arrays(change):
     ours, theirs, y = both()
     for step in range(4):
         one = change(np.float32(y[step]).astype(float))
-        np.testing.assert_array_equal(ours(y[8], one, feedforward=one), theirs(y[8], one, feedforward=one))
+        np.testing.assert_array_equal(
+            ours(y[8], one, feedforward=one), theirs(y[8], one, feedforward=one)
+        )
 
 
 def test_out_may_be_an_input_or_overlap_with_one():

@@ -21,7 +21,9 @@ from batchpid.native.task_space_extension import TASK_SPACE
 from batchpid.sim.engine.native.interface import EXTENSIONS
 
 needs_extension = pytest.mark.skipif(bool(obstacle()), reason="there is no native code")
-needs_sources = pytest.mark.skipif(not (ROOT / PROGRAM.files[0]).is_file(), reason="a wheel has no C++ files")
+needs_sources = pytest.mark.skipif(
+    not (ROOT / PROGRAM.files[0]).is_file(), reason="a wheel has no C++ files"
+)
 ALL = {each.module: each for each in (PROGRAM, TASK_SPACE, *EXTENSIONS.values())}
 
 
@@ -39,7 +41,10 @@ def fresh(monkeypatch):
 
 def steps():
     """Return the efforts of a few steps of a new controller, and whether it is native."""
-    rng, pid = np.random.default_rng(0), bp.BatchPID(bp.make_params(3, 4.0, 5.0, 0.1, effort_limit=9.0), 4, 0.01)
+    rng, pid = (
+        np.random.default_rng(0),
+        bp.BatchPID(bp.make_params(3, 4.0, 5.0, 0.1, effort_limit=9.0), 4, 0.01),
+    )
     return [pid(*rng.normal(size=(2, 4, 3))).tobytes() for _ in range(5)], pid.native
 
 
@@ -72,7 +77,10 @@ def test_the_files_are_all_that_are_included_and_the_tables(name):
         file = pending.pop()
         included.add(file)
         found = re.findall(r'#include "(.*)"', file.read_text())
-        pending += [((ROOT if each.startswith("batchpid/") else file.parent) / each).resolve() for each in found]
+        pending += [
+            ((ROOT if each.startswith("batchpid/") else file.parent) / each).resolve()
+            for each in found
+        ]
     files = {(ROOT / file).resolve() for file in ALL[name].files}
     assert included == {file for file in files if file.suffix != ".py"}
     assert any(file.suffix == ".py" for file in files)
@@ -84,7 +92,9 @@ def other_file(monkeypatch, changed):
     monkeypatch.setattr(
         extensions.Extension,
         "digests",
-        lambda self: [each + ("0" if each.partition("=")[0].endswith(changed) else "") for each in real(self)],
+        lambda self: [
+            each + ("0" if each.partition("=")[0].endswith(changed) else "") for each in real(self)
+        ],
     )
 
 
@@ -107,7 +117,9 @@ def test_a_stale_extension_is_one_warning_and_numpy_does_the_work(monkeypatch, f
 
 
 @needs_extension
-def test_without_sources_the_tables_decide_and_the_remedy_is_a_new_installation(monkeypatch, tmp_path):
+def test_without_sources_the_tables_decide_and_the_remedy_is_a_new_installation(
+    monkeypatch, tmp_path
+):
     real = extensions.Extension.digests
     tables = tmp_path / "batchpid/native/operations.py"
     tables.parent.mkdir(parents=True)
@@ -117,7 +129,9 @@ def test_without_sources_the_tables_decide_and_the_remedy_is_a_new_installation(
     assert load(PROGRAM).run
     load.cache_clear()
     tables.write_text("other")
-    with pytest.warns(RuntimeWarning, match=r"\(batchpid/native/operations.py\); install batchpid again"):
+    with pytest.warns(
+        RuntimeWarning, match=r"\(batchpid/native/operations.py\); install batchpid again"
+    ):
         assert obstacle()
 
 

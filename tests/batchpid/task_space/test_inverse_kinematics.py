@@ -25,8 +25,12 @@ def check(tree, link, pose, found):
     """Check that every success is one, and the errors that are reported."""
     reached = ts.link_poses(tree, found.qpos, [link])[:, 0]
     error = frames.pose_error(pose, reached)
-    np.testing.assert_allclose(np.linalg.norm(error[:, :3], axis=1), found.position_error, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(error[:, 3:], axis=1), found.rotation_error, atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.norm(error[:, :3], axis=1), found.position_error, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(error[:, 3:], axis=1), found.rotation_error, atol=1e-12
+    )
     good = (found.position_error <= 1e-5) & (found.rotation_error <= 1e-4)
     np.testing.assert_array_equal(good, found.success)
     assert ((found.qpos >= tree.lower) & (found.qpos <= tree.upper)).all()
@@ -55,13 +59,19 @@ def test_joints_with_a_full_turn_pass_their_limits_and_are_turned_back():
 
 @pytest.mark.parametrize("name", [*TOOLS, "six joints"])
 def test_five_steps_suffice_from_nearby(name):
-    """From 0.3 rad away; without the acceleration, and with a bias of 1e-5 of the damping, for 98 % of them."""
+    """From 0.3 rad away; without the acceleration, and with a bias of 1e-5 of the damping, for 98 %
+    of them.
+    """
     tree, tool = (serial(), "tip") if name == "six joints" else (tree_of(name), TOOLS[name])
     rng, chain = np.random.default_rng(5), tree.chain(tool)
-    qpos = rng.uniform(np.maximum(tree.lower, -np.pi), np.minimum(tree.upper, np.pi), (1000, tree.dof))
+    qpos = rng.uniform(
+        np.maximum(tree.lower, -np.pi), np.minimum(tree.upper, np.pi), (1000, tree.dof)
+    )
     pose, way = ts.link_poses(tree, qpos, [tool])[:, 0], chain * rng.normal(size=qpos.shape)
     near = qpos + 0.3 * way / np.linalg.norm(way, axis=1, keepdims=True)
-    found = ts.inverse_kinematics(tree, tool, pose, near, starts=1, iterations=5, on_failure="return")
+    found = ts.inverse_kinematics(
+        tree, tool, pose, near, starts=1, iterations=5, on_failure="return"
+    )
     check(tree, tool, pose, found)
     assert found.success.mean() >= 0.99
 
@@ -84,7 +94,9 @@ def test_the_result_of_an_env_does_not_depend_on_the_others():
     assert not whole.success[3]
     assert (whole.start > 0).any()
     for rows in (slice(3, 4), slice(0, 5), slice(8, 12)):
-        part = ts.inverse_kinematics(tree, TOOLS["panda"], pose[rows], start, starts=5, on_failure="return")
+        part = ts.inverse_kinematics(
+            tree, TOOLS["panda"], pose[rows], start, starts=5, on_failure="return"
+        )
         for few, all_rows in zip(part, whole, strict=True):
             np.testing.assert_array_equal(few, all_rows[rows])
 
@@ -105,7 +117,9 @@ def test_a_failure_is_not_silent():
     tree = tree_of("panda")
     pose, qpos = reachable("panda", 3)
     pose[1, 0] += 2.0
-    with pytest.warns(ts.InverseKinematicsWarning, match=r"pose, env 1: was not reached in 1 of 3 envs: .* mm and"):
+    with pytest.warns(
+        ts.InverseKinematicsWarning, match=r"pose, env 1: was not reached in 1 of 3 envs: .* mm and"
+    ):
         found = ts.inverse_kinematics(tree, "panda_hand", pose, qpos, starts=2)
     np.testing.assert_array_equal(found.success, [True, False, True])
     with pytest.raises(InvalidArgumentError, match="check that it is in reach") as caught:

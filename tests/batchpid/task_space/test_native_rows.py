@@ -39,14 +39,21 @@ def assert_same(found, wanted, tolerance):
 def test_sine_and_cosine_are_exact_to_the_last_bits_at_any_angle(angles):
     at = np.array(angles)[:, None]
     jacobian = ts.jacobian(planar((1.0,)), at, "tip")
-    np.testing.assert_allclose(jacobian[:, :2], np.stack([-np.sin(at), np.cos(at)], axis=1), rtol=0, atol=3e-16)
+    np.testing.assert_allclose(
+        jacobian[:, :2], np.stack([-np.sin(at), np.cos(at)], axis=1), rtol=0, atol=3e-16
+    )
     for row in range(len(at)):
-        np.testing.assert_array_equal(ts.jacobian(planar((1.0,)), at[row : row + 1], "tip")[0], jacobian[row])
+        np.testing.assert_array_equal(
+            ts.jacobian(planar((1.0,)), at[row : row + 1], "tip")[0], jacobian[row]
+        )
 
 
 @settings(max_examples=25)
 @given(
-    name=st.sampled_from(TREES), rows=st.integers(0, 9), seed=st.integers(0, 2**31), pointed=st.sampled_from([0, 1, 2])
+    name=st.sampled_from(TREES),
+    rows=st.integers(0, 9),
+    seed=st.integers(0, 2**31),
+    pointed=st.sampled_from([0, 1, 2]),
 )
 def test_kinematics_and_dynamics(name, rows, seed, pointed):
     tree, tool = tree_of(name), tool_of(name)
@@ -65,7 +72,9 @@ def test_kinematics_and_dynamics(name, rows, seed, pointed):
         lambda: ts.link_poses(tree, qpos[:, None]),
     ):
         assert_same(*both(function), 1e-12)
-    for leaf, other in zip(*both(lambda: ts.task_dynamics(tree, qpos, qvel, link, point=point)), strict=True):
+    for leaf, other in zip(
+        *both(lambda: ts.task_dynamics(tree, qpos, qvel, link, point=point)), strict=True
+    ):
         assert_same(leaf, other, 1e-12)
 
 
@@ -94,15 +103,24 @@ def test_the_law(name, rows, seed, axes, forces, frame, smallest, extras, limit,
     options |= {"limit_margin": 0.5} if avoids else {}
     options |= {"discretization": "implicit"} if seed % 2 else {}
     stiffness = rng.uniform(50, 200, (1 if seed % 3 else rows, 6))
-    params = ts.make_osc_params(tree, stiffness=stiffness, damping=20.0, smallest_eigenvalue=smallest, **options)
+    params = ts.make_osc_params(
+        tree, stiffness=stiffness, damping=20.0, smallest_eigenvalue=smallest, **options
+    )
     names = "twist", "acceleration", "wrench", "feedforward"
     given = {
         key: rng.normal(size=(rows, tree.dof if key == "feedforward" else 6))
         for bit, key in enumerate(names)
         if extras >> bit & 1
     }
-    state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape), rng.normal(size=(rows, 6)) if learns else None)
-    inputs = ts.discretise(params, 1e-3), state, ts.Tool(tree, tool), ts.OSCInputs(goal, qpos, qvel, **given)
+    state = ts.OSCState(
+        qpos + 0.1 * rng.normal(size=qpos.shape), rng.normal(size=(rows, 6)) if learns else None
+    )
+    inputs = (
+        ts.discretise(params, 1e-3),
+        state,
+        ts.Tool(tree, tool),
+        ts.OSCInputs(goal, qpos, qvel, **given),
+    )
     (new, found), (plain, wanted) = both(lambda: ts.osc(*inputs))
     after, alone = ts.osc(*inputs, wanted=("effort",))
     np.testing.assert_array_equal(alone.effort, found.effort)
@@ -117,7 +135,10 @@ def test_the_law(name, rows, seed, axes, forces, frame, smallest, extras, limit,
     for key in ("error", "wrench", "task", "posture", "unsaturated", "effort"):
         assert_same(getattr(found, key), getattr(wanted, key), tolerance)
     for key in ("task", "posture"):  # the share of an effort of 1e-15 N m may be 0 or 1
-        parts = [getattr(terms, f"{key}_share")[:, None] * getattr(terms, key) for terms in (found, wanted)]
+        parts = [
+            getattr(terms, f"{key}_share")[:, None] * getattr(terms, key)
+            for terms in (found, wanted)
+        ]
         assert_same(*parts, 10 * tolerance)
 
 
@@ -151,7 +172,9 @@ def test_inverse_kinematics(name, rows, seed, distance, iterations, pointed, nar
         assert_same(getattr(found, leaf), getattr(wanted, leaf), tolerance)
     more = np.abs(found.iterations - wanted.iterations)
     assert not more[wanted.success].any()
-    assert (more <= 1).all()  # at a limit, a last step that gains nothing is taken or not, by rounding
+    assert (
+        more <= 1
+    ).all()  # at a limit, a last step that gains nothing is taken or not, by rounding
 
 
 def test_a_row_is_the_same_in_any_company():
@@ -180,8 +203,13 @@ def test_a_step_with_a_tree_has_the_bytes_of_its_two_parts(seed):
     params = ts.make_osc_params(tree, effort_limit=60.0, frame=("world", "tool")[seed % 2])
     k, state, point = ts.discretise(params, 1 / 500), ts.init(params, qpos), rng.normal(size=3)
     goal = ts.link_poses(tree, qpos, [link])[:, 0] + 0.1 * rng.normal(size=(6, 7))
-    inputs, dynamics = ts.OSCInputs(goal, qpos, qvel), ts.task_dynamics(tree, qpos, qvel, link, point=point)
-    (_, whole), (_, parts) = (ts.osc(k, state, each, inputs) for each in (ts.Tool(tree, link, point), dynamics))
+    inputs, dynamics = (
+        ts.OSCInputs(goal, qpos, qvel),
+        ts.task_dynamics(tree, qpos, qvel, link, point=point),
+    )
+    (_, whole), (_, parts) = (
+        ts.osc(k, state, each, inputs) for each in (ts.Tool(tree, link, point), dynamics)
+    )
     np.testing.assert_array_equal(whole.effort, parts.effort)
 
 

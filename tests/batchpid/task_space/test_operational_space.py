@@ -1,4 +1,6 @@
-"""Operational-space control: the accelerations it asks for, closed loops, singular poses, saturation."""
+"""Operational-space control: the accelerations it asks for, closed loops, singular poses,
+saturation.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ HAND = "panda_hand"
 
 
 def terms_of(params, state, goal, qpos, qvel, dynamics, **options):
-    return ts.osc(ts.discretise(params, DT), state, dynamics, ts.OSCInputs(goal, qpos, qvel, **options))[1]
+    return ts.osc(
+        ts.discretise(params, DT), state, dynamics, ts.OSCInputs(goal, qpos, qvel, **options)
+    )[1]
 
 
 def accelerations(d, effort):
@@ -28,7 +32,9 @@ def accelerations(d, effort):
 
 
 def moved_by(d, chain, effort):
-    """Return the acceleration J M_cc^-1 u of the tool by efforts of the chain, where the other joints are held."""
+    """Return the acceleration J M_cc^-1 u of the tool by efforts of the chain, where the other
+    joints are held.
+    """
     mass = d.mass_matrix[:, chain][:, :, chain]
     return (d.jacobian[..., chain] @ np.linalg.solve(mass, effort[:, chain, None]))[..., 0]
 
@@ -45,8 +51,17 @@ def test_the_tool_has_the_acceleration_and_fingers_their_own(name, link, frame):
     qpos, qvel = states(tree, rows)
     rng = np.random.default_rng(1)
     goal, twist, acceleration = goals(tree, link)(rows), *rng.normal(size=(2, rows, 6))
-    stiffness, damping, limit = rng.uniform(50, 200, (rows, 6)), rng.uniform(10, 20, (rows, 6)), 1e-6
-    options = {"stiffness": stiffness, "damping": damping, "smallest_eigenvalue": limit, "frame": frame}
+    stiffness, damping, limit = (
+        rng.uniform(50, 200, (rows, 6)),
+        rng.uniform(10, 20, (rows, 6)),
+        1e-6,
+    )
+    options = {
+        "stiffness": stiffness,
+        "damping": damping,
+        "smallest_eigenvalue": limit,
+        "frame": frame,
+    }
     params = ts.make_osc_params(tree, posture_stiffness=30.0, **options)
     state = ts.OSCState(qpos + 0.1 * rng.normal(size=qpos.shape))
     d = ts.task_dynamics(tree, qpos, qvel, link)
@@ -97,7 +112,9 @@ def test_saturation_scales_the_task_first_and_then_the_posture(seed, tight):
     terms = terms_of(params, state, goal, qpos, 0.1 * qvel, d)
     chain = tree.chain(HAND)
     base = (terms.unsaturated - terms.task - terms.posture)[:, chain]
-    task, posture, effort, limit = (x[:, chain] for x in (terms.task, terms.posture, terms.effort, limit))
+    task, posture, effort, limit = (
+        x[:, chain] for x in (terms.task, terms.posture, terms.effort, limit)
+    )
     s1, s2 = terms.task_share[:, None], terms.posture_share[:, None]
     able = (np.abs(base) <= limit).all(1)
     assert (np.abs(effort) <= limit * (1 + 1e-12)).all()
@@ -123,7 +140,9 @@ def test_a_row_does_not_depend_on_the_others_and_nan_stays_alone():
 
         def terms_for(chosen, params=params):
             part = ts.OSCState(state.posture[chosen])
-            return terms_of(params, part, goal[chosen], qpos[chosen], qvel[chosen], ts.Tool(tree, HAND))
+            return terms_of(
+                params, part, goal[chosen], qpos[chosen], qvel[chosen], ts.Tool(tree, HAND)
+            )
 
         terms = terms_for(slice(None))
         effort = terms.effort
@@ -145,7 +164,9 @@ def test_a_selected_force_is_that_of_the_wrench():
     axes = np.array([True, True, False, True, True, False])
     wrench, chain = np.array([0.0, 0.0, -20.0, 0.0, 0.0, 0.0]), tree.chain(HAND)
     for frame in ("world", "tool"):
-        params = ts.make_osc_params(tree, axes=axes, force_axes=[False, False, True] + [False] * 3, frame=frame)
+        params = ts.make_osc_params(
+            tree, axes=axes, force_axes=[False, False, True] + [False] * 3, frame=frame
+        )
         inputs = params, ts.OSCState(qpos + 0.3 * chain), d.pose, qpos, 0 * qpos, d
         terms = terms_of(*inputs, wrench=np.tile(wrench, (rows, 1)))
         np.testing.assert_allclose(terms.wrench, np.tile(wrench, (rows, 1)), atol=1e-9)

@@ -1,4 +1,6 @@
-"""Closed loops of operational-space control against analytic motion, at a wall, and through singular poses."""
+"""Closed loops of operational-space control against analytic motion, at a wall, and through
+singular poses.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ HAND = TOOLS["panda"]
 
 
 def poses(tree, link, count, seed=0):
-    """Return joint positions near START (count, dof) whose mobility has no eigenvalue below 0.05."""
+    """Return joint positions near START (count, dof) whose mobility has no eigenvalue below
+    0.05.
+    """
     rng = np.random.default_rng(seed)
     qpos = START + np.array([0.5] * 7 + [0.0] * 2) * rng.uniform(-1, 1, (20 * count, tree.dof))
     j, mass, c = ts.jacobian(tree, qpos, link), ts.mass_matrix(tree, qpos), tree.chain(link)
@@ -23,12 +27,32 @@ def poses(tree, link, count, seed=0):
     return qpos[np.linalg.eigvalsh(mobility)[:, 0] > 0.05][:count]
 
 
-def run(tree, link, params, qpos, goal, steps, dt, *, known=lambda d, q: d, change=None, outside=None, **given):
-    """Return errors (steps, envs, 6), efforts, and the last positions of a closed loop, exact but for its time step.
+def run(
+    tree,
+    link,
+    params,
+    qpos,
+    goal,
+    steps,
+    dt,
+    *,
+    known=lambda d, q: d,
+    change=None,
+    outside=None,
+    **given,
+):
+    """Return errors (steps, envs, 6), efforts, and the last positions of a closed loop, exact but
+    for its time step.
 
-    ``known`` changes the dynamics that the law knows, ``change`` its effort; ``outside`` is a wrench on the tool.
+    ``known`` changes the dynamics that the law knows, ``change`` its effort; ``outside`` is a
+    wrench on the tool.
     """
-    k, q, v, state = ts.discretise(params, dt), qpos.copy(), np.zeros_like(qpos), ts.init(params, qpos)
+    k, q, v, state = (
+        ts.discretise(params, dt),
+        qpos.copy(),
+        np.zeros_like(qpos),
+        ts.init(params, qpos),
+    )
     errors, efforts = [], []
     for n in range(steps):
         d = ts.task_dynamics(tree, q, v, link)
@@ -46,9 +70,11 @@ def run(tree, link, params, qpos, goal, steps, dt, *, known=lambda d, q: d, chan
 
 
 def test_moves_of_10_cm_are_analytic_and_every_term_is_needed():
-    """e = e0 (1 + w t) exp(-w t) from eight regular poses: to 0.25 mm, and to 0.1 mm from the time step's recursion.
+    """e = e0 (1 + w t) exp(-w t) from eight regular poses: to 0.25 mm, and to 0.1 mm from the time
+    step's recursion.
 
-    Without J' q', without Coriolis forces, or with a posture that is not projected, the tool is off by 2 mm or more.
+    Without J' q', without Coriolis forces, or with a posture that is not projected, the tool is off
+    by 2 mm or more.
     """
     tree, steps, each = tree_of("panda"), 800, 8
     rng, chain = np.random.default_rng(1), tree.chain(HAND)
@@ -85,7 +111,9 @@ def test_moves_of_10_cm_are_analytic_and_every_term_is_needed():
 
 
 def decay(steps):
-    """Return the errors (steps, 1, 1) of a unit mass on a spring of 150 / s^2, critically damped, at DT."""
+    """Return the errors (steps, 1, 1) of a unit mass on a spring of 150 / s^2, critically damped,
+    at DT.
+    """
     e, rate, errors = 1.0, 0.0, np.empty((steps, 1, 1))
     for n in range(steps):
         errors[n] = e
@@ -120,7 +148,9 @@ def test_the_null_space_does_not_accelerate_the_tool():
 
 
 def test_near_a_singularity_damping_of_the_posture_enters_the_task_and_springs_do_not():
-    """With an eigenvalue s = s0/2, along its eigenvector: 1 - s^2/s0^2 of the damping, nothing of the springs."""
+    """With an eigenvalue s = s0/2, along its eigenvector: 1 - s^2/s0^2 of the damping, nothing of
+    the springs.
+    """
     tree, rng = tree_of("panda"), np.random.default_rng(0)
     qpos, c = poses(tree, HAND, 8), tree.chain(HAND)
     d = ts.task_dynamics(tree, qpos, 0 * qpos, HAND)
@@ -157,9 +187,13 @@ def test_the_force_on_a_wall_is_the_one_asked_for():
     assert np.abs(errors[-1][:, axes]).max() < 1e-3
 
 
-@pytest.mark.parametrize("name", ["straight elbow", pytest.param("aligned wrist", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["straight elbow", pytest.param("aligned wrist", marks=pytest.mark.slow)]
+)
 def test_a_setpoint_out_of_reach_for_2_s_and_back(name):
-    """At most 0.01 N m of chatter per step while it is out of reach, and 0.05 mm after the return."""
+    """At most 0.01 N m of chatter per step while it is out of reach, and 0.05 mm after the
+    return.
+    """
     dt = 1 / 500
     if name == "straight elbow":
         tree, link, qpos, way = tree_of("panda"), HAND, START[None], [0.5, 0, 0]

@@ -1,4 +1,6 @@
-"""Integral, limits of joints, implicit gains, bumpless transfer and presets of operational-space control."""
+"""Integral, limits of joints, implicit gains, bumpless transfer and presets of operational-space
+control.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ HAND = TOOLS["panda"]
 
 
 def run(tree, link, params, qpos, goal, steps, dt, *, load=0.0, state=None, bias=None):
-    """Return the errors of the pose (steps, envs, 6), the last state, positions and velocities of a closed loop.
+    """Return the errors of the pose (steps, envs, 6), the last state, positions and velocities of a
+    closed loop.
 
     ``load`` (envs, 6) is a wrench on the tool that the law does not know.
     """
@@ -30,7 +33,11 @@ def run(tree, link, params, qpos, goal, steps, dt, *, load=0.0, state=None, bias
         state, terms = ts.osc(k, state, d, ts.OSCInputs(goal, q, v))
         errors.append(frames.pose_error(goal, d.pose))
         outside = (d.jacobian * np.broadcast_to(load, (len(q), 6))[..., None]).sum(1)
-        v = v + dt * np.linalg.solve(d.mass_matrix, (terms.effort - d.bias + outside)[..., None])[..., 0]
+        v = (
+            v
+            + dt
+            * np.linalg.solve(d.mass_matrix, (terms.effort - d.bias + outside)[..., None])[..., 0]
+        )
         q = q + dt * v
     return np.array(errors), state, q, v
 
@@ -40,7 +47,9 @@ def test_an_integral_learns_a_load_that_the_model_does_not_know():
     tree, qpos = tree_of("panda"), np.tile(START, (2, 1))
     goal, load = ts.link_poses(tree, qpos, [HAND])[:, 0], np.array([0, 0, -20.0, 0, 1.0, 0])
     gains = {"stiffness": 400.0, "posture_stiffness": 40.0}
-    without, *_ = run(tree, HAND, ts.make_osc_params(tree, **gains), qpos, goal, 800, 1 / 500, load=load)
+    without, *_ = run(
+        tree, HAND, ts.make_osc_params(tree, **gains), qpos, goal, 800, 1 / 500, load=load
+    )
     assert np.abs(without[-1, :, 2]).min() > 5e-3
     for extra in ({}, {"discretization": "implicit", "frame": "tool"}):
         params = ts.make_osc_params(tree, integral_gain=2000.0, **gains, **extra)
@@ -53,11 +62,16 @@ def test_an_integral_learns_a_load_that_the_model_does_not_know():
 
 
 def test_the_integral_does_not_wind_up():
-    """It does not grow while efforts are at their limits or the pose is out of reach, and shrinks at once."""
+    """It does not grow while efforts are at their limits or the pose is out of reach, and shrinks
+    at once.
+    """
     tree = planar()
     qpos = np.array([[0.3, 0.8]] * 2)
     params = ts.make_osc_params(
-        tree, axes=[True, True, *[False] * 4], integral_gain=500.0, effort_limit=[[0.05], [1e3]] * np.ones((2, 2))
+        tree,
+        axes=[True, True, *[False] * 4],
+        integral_gain=500.0,
+        effort_limit=[[0.05], [1e3]] * np.ones((2, 2)),
     )
     near = ts.link_poses(tree, qpos, ["tip"])[:, 0]
     far = np.add(near, [3.0, 0, 0, 0, 0, 0, 0])
@@ -91,7 +105,9 @@ def test_joints_keep_away_from_their_limits_within_the_null_space():
     np.testing.assert_array_equal(ends[None], ends[0.0])
     assert 0.2 < ends[0.3][0, 5] - tree.lower[5] < 0.35
     fingers = ~tree.chain(HAND)
-    np.testing.assert_allclose(ends[0.3][:, fingers], qpos[:, fingers], atol=1e-6)  # of the setpoint, not of the chain
+    np.testing.assert_allclose(
+        ends[0.3][:, fingers], qpos[:, fingers], atol=1e-6
+    )  # of the setpoint, not of the chain
 
 
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
@@ -104,7 +120,11 @@ def test_implicit_gains_are_stable_at_100_hz(name, w):
     ends = {}
     for how in ("explicit", "implicit"):
         params = ts.make_osc_params(
-            tree, stiffness=w * w, posture_stiffness=100.0, discretization=how, smallest_eigenvalue=1e-3
+            tree,
+            stiffness=w * w,
+            posture_stiffness=100.0,
+            discretization=how,
+            smallest_eigenvalue=1e-3,
         )
         with np.errstate(all="ignore"):
             ends[how] = np.abs(run(tree, link, params, qpos, goal, 150, 1 / 100)[0][-1]).max()
@@ -113,12 +133,20 @@ def test_implicit_gains_are_stable_at_100_hz(name, w):
 
 
 def test_implicit_gains_act_on_the_end_of_the_step():
-    """One decoupled axis: a = kp (r+ - y+) + kd (V+ - v+) + V' + I+, with y+ and v+ at the end of the step."""
+    """One decoupled axis: a = kp (r+ - y+) + kd (V+ - v+) + V' + I+, with y+ and v+ at the end of
+    the step.
+    """
     tree, dt, rng = tree_of("panda"), 0.02, np.random.default_rng(0)
     qpos, qvel = states(tree, 5)
     kp, kd, ki = 300.0, 30.0, 900.0
-    options = {"position_error_limit": np.inf, "rotation_error_limit": np.inf, "smallest_eigenvalue": 1e-9}
-    params = ts.make_osc_params(tree, stiffness=kp, damping=kd, integral_gain=ki, discretization="implicit", **options)
+    options = {
+        "position_error_limit": np.inf,
+        "rotation_error_limit": np.inf,
+        "smallest_eigenvalue": 1e-9,
+    }
+    params = ts.make_osc_params(
+        tree, stiffness=kp, damping=kd, integral_gain=ki, discretization="implicit", **options
+    )
     d = ts.task_dynamics(tree, qpos, qvel, HAND)
     goal, twist, acc = d.pose.copy(), *rng.normal(size=(2, 5, 6))
     goal[:, :3] += 0.05 * rng.normal(size=(5, 3))
@@ -132,7 +160,9 @@ def test_implicit_gains_act_on_the_end_of_the_step():
     end = e - dt * v - dt**2 * a
     wanted = kp * end + kd * (twist - v - dt * a) + acc + share * state.integral + ki * dt * end
     np.testing.assert_allclose(a, wanted, rtol=1e-8, atol=1e-6)
-    np.testing.assert_allclose(share * (new.integral - state.integral), ki * dt * (e - dt * twist), atol=1e-9)
+    np.testing.assert_allclose(
+        share * (new.integral - state.integral), ki * dt * (e - dt * twist), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("how", ["explicit", "implicit"])
@@ -142,7 +172,13 @@ def test_transfer_from_a_joint_pid_and_back_is_bumpless(how):
     d = ts.task_dynamics(tree, qpos, 0.1 * qvel, HAND)
     pid = bp.make_params(tree.dof, 400.0, 50.0, 40.0)
     state, effort = bp.step(
-        pid, bp.init(pid, qpos), qpos + 0.1, qpos, dt, measurement_rate=0.1 * qvel, feedforward=d.bias
+        pid,
+        bp.init(pid, qpos),
+        qpos + 0.1,
+        qpos,
+        dt,
+        measurement_rate=0.1 * qvel,
+        feedforward=d.bias,
     )
     options = {"damping": 30.0, "discretization": how, "smallest_eigenvalue": 1e-6}
     params = ts.make_osc_params(tree, integral_gain=0.0, **options)
@@ -155,7 +191,9 @@ def test_transfer_from_a_joint_pid_and_back_is_bumpless(how):
     joint = bp.track(pid, state, qpos, qpos, again, measurement_rate=0.1 * qvel, feedforward=d.bias)
     _, back = bp.step(pid, joint, qpos, qpos, dt, measurement_rate=0.1 * qvel, feedforward=d.bias)
     np.testing.assert_allclose(back, again, atol=1e-9)
-    stiffer = params._replace(stiffness=2 * params.stiffness, posture_stiffness=3 * params.posture_stiffness)
+    stiffer = params._replace(
+        stiffness=2 * params.stiffness, posture_stiffness=3 * params.posture_stiffness
+    )
     found = ts.track(stiffer, after, *inputs, again, dt, d)
     _, terms = ts.osc(ts.discretise(stiffer, dt), found, d, ts.OSCInputs(*inputs))
     np.testing.assert_allclose(terms.effort, again, atol=1e-6)
@@ -167,8 +205,16 @@ def test_jax_computes_the_same(x64):
     tree, dt = dataclasses.replace(planar((1.0, 0.8, 0.5)), lower=-3.0, upper=3.0), 1 / 300
     qpos, qvel = states(tree, 5)
     qpos[0, 0] = 2.99
-    goal, options = ts.link_poses(tree, qpos + 0.1, ["tip"])[:, 0], {"axes": [True, True, *[False] * 4]}
-    options |= {"integral_gain": [300.0] * 6, "integral_limit": 0.2, "limit_margin": 0.5, "effort_limit": 30.0}
+    goal, options = (
+        ts.link_poses(tree, qpos + 0.1, ["tip"])[:, 0],
+        {"axes": [True, True, *[False] * 4]},
+    )
+    options |= {
+        "integral_gain": [300.0] * 6,
+        "integral_limit": 0.2,
+        "limit_margin": 0.5,
+        "effort_limit": 30.0,
+    }
     params = ts.make_osc_params(tree, **options, discretization="implicit")
     state = ts.init(params, qpos)._replace(integral=np.full((5, 6), 0.1))
 

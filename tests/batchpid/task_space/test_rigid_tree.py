@@ -36,7 +36,10 @@ def test_mujoco_computes_the_same(case, native, monkeypatch):
     spec = mujoco.MjSpec.from_string(robot.urdf)
     spec.compiler.fusestatic, spec.compiler.discardvisual = False, True
     model = spec.compile()
-    data, columns = mujoco.MjData(model), [model.joint(name).qposadr[0] for name in tree.joint_names]
+    data, columns = (
+        mujoco.MjData(model),
+        [model.joint(name).qposadr[0] for name in tree.joint_names],
+    )
     body, dof = model.body(tool).id, tree.dof
     qpos, qvel = states(tree, 40)
     found = (
@@ -77,16 +80,23 @@ def test_jacobian_and_its_rate_are_derivatives(case):
     def place(sign):
         pose = ts.link_poses(tree, qpos + sign * step * qvel, [tool])[:, 0]
         turn = frames.matrix_of(pose[:, 3:])
-        return np.concatenate([turn, (pose[:, :3] + frames.rotate(turn, POINT))[..., None]], axis=-1)
+        return np.concatenate(
+            [turn, (pose[:, :3] + frames.rotate(turn, POINT))[..., None]], axis=-1
+        )
 
     velocity = (ts.jacobian(tree, qpos, tool, point=POINT) * qvel[:, None]).sum(-1)
     rate = ts.jacobian_rate(tree, qpos, qvel, tool, point=POINT)
-    np.testing.assert_allclose(rate, ((moved(1) - moved(-1)) / (2 * step) * qvel[:, None]).sum(-1), atol=1e-7)
+    np.testing.assert_allclose(
+        rate, ((moved(1) - moved(-1)) / (2 * step) * qvel[:, None]).sum(-1), atol=1e-7
+    )
     between = frames.pose_error(frames.pose_of(place(1)), frames.pose_of(place(-1))) / (2 * step)
     np.testing.assert_allclose(velocity, between, atol=1e-7)
     turn = frames.matrix_of(ts.link_poses(tree, qpos, [tool])[:, 0, 3:])
     for world, in_tool in (
-        (velocity, (ts.jacobian(tree, qpos, tool, point=POINT, frame="tool") * qvel[:, None]).sum(-1)),
+        (
+            velocity,
+            (ts.jacobian(tree, qpos, tool, point=POINT, frame="tool") * qvel[:, None]).sum(-1),
+        ),
         (rate, ts.jacobian_rate(tree, qpos, qvel, tool, point=POINT, frame="tool")),
     ):
         np.testing.assert_allclose(frames.rotate(turn, in_tool[:, :3]), world[:, :3], atol=1e-12)
@@ -94,7 +104,9 @@ def test_jacobian_and_its_rate_are_derivatives(case):
 
 
 def test_efforts_are_those_of_the_energies(case):
-    """Lagrange: d/dt (M q') - dT/dq + dU/dq = h at q'' = 0, with T = q' M q' / 2 and U the work against gravity."""
+    """Lagrange: d/dt (M q') - dT/dq + dU/dq = h at q'' = 0, with T = q' M q' / 2 and U the work
+    against gravity.
+    """
     tree, _, _ = case
     qpos, qvel = states(tree, 5)
     step = 1e-5
@@ -103,15 +115,21 @@ def test_efforts_are_those_of_the_energies(case):
     def kinetic(q):
         return (qvel[:, None] * ts.mass_matrix(tree, q) * qvel[:, :, None]).sum((1, 2)) / 2
 
-    rate = (ts.mass_matrix(tree, qpos + step * qvel) - ts.mass_matrix(tree, qpos - step * qvel)) / (2 * step)
-    slope = np.stack([(kinetic(qpos + n) - kinetic(qpos - n)) / (2 * step) for n in nudges], axis=-1)
+    rate = (ts.mass_matrix(tree, qpos + step * qvel) - ts.mass_matrix(tree, qpos - step * qvel)) / (
+        2 * step
+    )
+    slope = np.stack(
+        [(kinetic(qpos + n) - kinetic(qpos - n)) / (2 * step) for n in nudges], axis=-1
+    )
     coriolis = ts.bias(tree, qpos, qvel) - ts.gravity(tree, qpos)
     wanted = (rate * qvel[:, None]).sum(-1) - slope
     np.testing.assert_allclose(coriolis, wanted, atol=1e-8 * np.abs(wanted).max())
     centers = [ts.link_poses(tree, qpos + sign * n) for n in nudges for sign in (1, -1)]
     place = [frames.rotate(frames.matrix_of(p[..., 3:]), tree.center) + p[..., :3] for p in centers]
     energy = np.stack([-(p @ tree.gravity * tree.mass).sum(-1) for p in place], axis=-1)
-    np.testing.assert_allclose(ts.gravity(tree, qpos), (energy[:, ::2] - energy[:, 1::2]) / (2 * step), atol=1e-6)
+    np.testing.assert_allclose(
+        ts.gravity(tree, qpos), (energy[:, ::2] - energy[:, 1::2]) / (2 * step), atol=1e-6
+    )
 
 
 def test_inverse_and_forward_dynamics_undo_each_other(case):
@@ -123,7 +141,9 @@ def test_inverse_and_forward_dynamics_undo_each_other(case):
     back = ts.inverse_dynamics(tree, qpos, qvel, acceleration)
     np.testing.assert_allclose(back, effort, atol=1e-11 * np.abs(ts.bias(tree, qpos, qvel)).max())
     matrix = ts.mass_matrix(tree, qpos)
-    np.testing.assert_allclose(back, (matrix * acceleration[:, None]).sum(-1) + ts.bias(tree, qpos, qvel), atol=1e-10)
+    np.testing.assert_allclose(
+        back, (matrix * acceleration[:, None]).sum(-1) + ts.bias(tree, qpos, qvel), atol=1e-10
+    )
 
 
 def functions(tree, tool):
@@ -178,7 +198,9 @@ def test_the_dynamics_are_those_of_the_engine():
     robot, tree = robot_of("panda"), tree_of("panda")
     qpos, qvel = states(tree, 5)
     wanted = robot.dynamics().inverse_dynamics(qpos, qvel, 0 * qpos)
-    np.testing.assert_allclose(ts.bias(tree, qpos, qvel), wanted, atol=2e-4)  # SAPIEN rounds masses to float32
+    np.testing.assert_allclose(
+        ts.bias(tree, qpos, qvel), wanted, atol=2e-4
+    )  # SAPIEN rounds masses to float32
     np.testing.assert_allclose(ts.mass_matrix(tree, qpos), robot.mass_matrix(qpos), atol=1e-5)
 
 
@@ -209,7 +231,9 @@ def test_the_mass_of_collision_shapes_is_sapiens_and_a_floating_base_is_refused(
     tree = Robot.load(write(tmp_path, text)).kinematic_tree()
     np.testing.assert_allclose(tree.mass[1], 6, rtol=1e-6)
     np.testing.assert_allclose(tree.inertia[1].diagonal(), [0.065, 0.05, 0.025], rtol=1e-6)
-    with pytest.raises(RobotError, match=r"need a kinematic tree.*fixed_base=True, or control its joints"):
+    with pytest.raises(
+        RobotError, match=r"need a kinematic tree.*fixed_base=True, or control its joints"
+    ):
         Robot.load("panda", fixed_base=False).kinematic_tree()
     with pytest.raises(InvalidArgumentError, match="did you mean 'gravity'"):
         robot_of("panda").kinematic_tree(gravty=0)

@@ -1,4 +1,6 @@
-"""Solutions, bounded inverses and eigenvalues of small symmetric matrices against numpy.linalg, row by row."""
+"""Solutions, bounded inverses and eigenvalues of small symmetric matrices against numpy.linalg, row
+by row.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ from batchpid.task_space import symmetric
 
 
 def matrices(seed, rows, size, spread=1.0):
-    """Return positive definite matrices with eigenvalues between 10^-spread and 10^spread, and these."""
+    """Return positive definite matrices with eigenvalues between 10^-spread and 10^spread, and
+    these.
+    """
     rng = np.random.default_rng(seed)
     axes = np.linalg.qr(rng.normal(size=(rows, size, size)))[0]
     values = 10 ** rng.uniform(-spread, spread, (rows, size))
@@ -24,10 +28,14 @@ def matrices(seed, rows, size, spread=1.0):
 def test_solutions_are_those_of_linalg(seed, size):
     matrix, _ = matrices(seed, 5, size)
     right = np.random.default_rng(seed).normal(size=(5, size, 3))
-    np.testing.assert_allclose(symmetric.solve(matrix, right), np.linalg.solve(matrix, right), rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(
+        symmetric.solve(matrix, right), np.linalg.solve(matrix, right), rtol=1e-8, atol=1e-8
+    )
     factor = symmetric.whitened(matrix, right)
     np.testing.assert_allclose(
-        symmetric.gram(factor, factor), right.transpose(0, 2, 1) @ symmetric.solve(matrix, right), atol=1e-8
+        symmetric.gram(factor, factor),
+        right.transpose(0, 2, 1) @ symmetric.solve(matrix, right),
+        atol=1e-8,
     )
 
 
@@ -37,8 +45,12 @@ def test_eigenvalues_are_those_of_linalg(seed, size):
     matrix, wanted = matrices(seed, 4, size, spread=4.0)
     values, vectors = symmetric.eigen(matrix)
     np.testing.assert_allclose(np.sort(values), np.sort(wanted), rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose((vectors * values[:, None]) @ vectors.transpose(0, 2, 1), matrix, atol=1e-6)
-    np.testing.assert_allclose(vectors.transpose(0, 2, 1) @ vectors, np.tile(np.eye(size), (4, 1, 1)), atol=1e-13)
+    np.testing.assert_allclose(
+        (vectors * values[:, None]) @ vectors.transpose(0, 2, 1), matrix, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        vectors.transpose(0, 2, 1) @ vectors, np.tile(np.eye(size), (4, 1, 1)), atol=1e-13
+    )
 
 
 @settings(max_examples=25)
@@ -54,7 +66,9 @@ def test_the_bounded_inverse_changes_small_eigenvalues_only(seed, singular):
     found, near = symmetric.bounded_inverse(matrix, s0)
     values, axes = np.linalg.eigh(matrix)
     bounded = np.where(values >= s0, 1 / np.maximum(values, s0), np.maximum(values, 0) / s0**2)
-    np.testing.assert_allclose(found, (axes * bounded[:, None]) @ axes.transpose(0, 2, 1), atol=1e-9)
+    np.testing.assert_allclose(
+        found, (axes * bounded[:, None]) @ axes.transpose(0, 2, 1), atol=1e-9
+    )
     np.testing.assert_array_equal(near, (values < s0).any(1))
     assert np.linalg.norm(found, 2, axis=(1, 2)).max() <= 1 / s0 + 1e-9
 
@@ -62,7 +76,9 @@ def test_the_bounded_inverse_changes_small_eigenvalues_only(seed, singular):
 def test_it_is_continuous_where_the_bound_begins():
     s0 = 0.02
     for size in (1, 3, 6):
-        matrix = np.stack([np.diag([s0 * share, *[1.0] * (size - 1)]) for share in (1 - 1e-9, 1, 1 + 1e-9)])
+        matrix = np.stack(
+            [np.diag([s0 * share, *[1.0] * (size - 1)]) for share in (1 - 1e-9, 1, 1 + 1e-9)]
+        )
         found, near = symmetric.bounded_inverse(matrix, s0)
         np.testing.assert_allclose(found[:, 0, 0], 1 / s0, rtol=1e-6)
         np.testing.assert_array_equal(near, [True, False, False])
@@ -77,7 +93,9 @@ def test_the_smooth_bounded_inverse_has_a_continuous_derivative(seed):
     np.testing.assert_array_equal(first, symmetric.bounded_inverse(matrix, s0)[0])
     np.testing.assert_array_equal(found[~near], first[~near])
     values, axes = np.linalg.eigh(matrix)
-    smooth = np.where(values >= s1, 1 / np.maximum(values, s1), values * (2 - (values / s1) ** 2) / s1**2)
+    smooth = np.where(
+        values >= s1, 1 / np.maximum(values, s1), values * (2 - (values / s1) ** 2) / s1**2
+    )
     np.testing.assert_allclose(found, (axes * smooth[:, None]) @ axes.transpose(0, 2, 1), atol=1e-9)
     step = 1e-5
     around = s1 * np.array([1 - 2 * step, 1 - step, 1, 1 + step, 1 + 2 * step])
@@ -92,7 +110,9 @@ def test_a_row_has_the_same_bits_alone_and_in_any_batch(size):
     for function in (
         lambda rows: symmetric.whitened(matrix[rows], right[rows]),
         lambda rows: symmetric.solve(matrix[rows], right[rows]),
-        lambda rows: np.concatenate(symmetric.bounded_inverse(matrix[rows], 0.1, 0.05)[:2], axis=-1),
+        lambda rows: np.concatenate(
+            symmetric.bounded_inverse(matrix[rows], 0.1, 0.05)[:2], axis=-1
+        ),
     ):
         whole = function(slice(None))
         for row in range(64):
@@ -107,9 +127,15 @@ def test_rows_without_a_result_are_nan_and_leave_the_others_their_bits():
     matrix, _ = matrices(0, 30, 6, spread=3.0)
     right = np.random.default_rng(0).normal(size=(30, 6, 2))
     good = np.delete(np.arange(30), [4, 5, 6])
-    wanted = symmetric.whitened(matrix, right)[good], *(each[good] for each in symmetric.bounded_inverse(matrix, 0.1))
+    wanted = (
+        symmetric.whitened(matrix, right)[good],
+        *(each[good] for each in symmetric.bounded_inverse(matrix, 0.1)),
+    )
     matrix[4], matrix[5, 0, 0], matrix[6] = np.nan, np.inf, np.diag([1.0, 1.0, -1.0, 1.0, 0.0, 1.0])
-    factor, (found, near) = symmetric.whitened(matrix, right), symmetric.bounded_inverse(matrix, 0.1)
+    factor, (found, near) = (
+        symmetric.whitened(matrix, right),
+        symmetric.bounded_inverse(matrix, 0.1),
+    )
     for each, rows in zip((factor, found, near), wanted, strict=True):
         np.testing.assert_array_equal(each[good], rows)
     assert np.isnan(factor[4:7]).all()

@@ -8,14 +8,20 @@ from batchpid.sim.cli import main
 
 
 @pytest.fixture(autouse=True)
-def working_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run each test in an empty folder, so that it neither uses nor adds files of the checkout, such as out/."""
+def working_folder(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Run each test in an empty folder, so that it neither uses nor adds files of the checkout,
+    such as out/.
+    """
     monkeypatch.chdir(tmp_path_factory.mktemp("working"))
 
 
 @pytest.fixture
 def batchpid(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Function that runs a command line in this process and returns (exit status, stdout, stderr)."""
+    """Function that runs a command line in this process and returns (exit status, stdout,
+    stderr).
+    """
 
     def run(*arguments: object) -> tuple[int, str, str]:
         try:

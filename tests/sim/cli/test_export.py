@@ -15,10 +15,24 @@ MIMIC = joint("b", "y", "z", "revolute", LIMIT + '<mimic joint="a" multiplier="0
 
 def test_the_header_is_that_of_the_function(batchpid, tmp_path):
     out = tmp_path / "panda.h"
-    words = ("export", "panda", "--gains", "tuned", "--timestep", 0.001, "--limits", "--prefix", "arm", "--out", out)
+    words = (
+        "export",
+        "panda",
+        "--gains",
+        "tuned",
+        "--timestep",
+        0.001,
+        "--limits",
+        "--prefix",
+        "arm",
+        "--out",
+        out,
+    )
     status, said, _ = batchpid(*words)
     panda = Robot.load("panda")
-    exported = to_c(panda.tuned(), 0.001, joint_names=panda.joint_names, guard=panda.guard(), prefix="arm")
+    exported = to_c(
+        panda.tuned(), 0.001, joint_names=panda.joint_names, guard=panda.guard(), prefix="arm"
+    )
     assert (status, out.read_text()) == (0, exported.text)
     assert said == f"written: {out}: tuned gains of 9 joints at 1000 Hz\n"
 
@@ -26,12 +40,21 @@ def test_the_header_is_that_of_the_function(batchpid, tmp_path):
 def test_followers_are_reported_and_refused_with_strict(batchpid, tmp_path):
     names = ("x", "y", "z")
     path = write(
-        tmp_path, robot(*(link(name, INERTIAL) for name in names), joint("a", "x", "y", "revolute", LIMIT), MIMIC)
+        tmp_path,
+        robot(
+            *(link(name, INERTIAL) for name in names),
+            joint("a", "x", "y", "revolute", LIMIT),
+            MIMIC,
+        ),
     )
     status, said, _ = batchpid("export", path, "--out", tmp_path / "arm.h")
     assert status == 0
     assert said.startswith("differs: b: followers are joints of their own")
-    assert (tmp_path / "arm.h").read_text().startswith("/* differs: b: followers are joints of their own")
+    assert (
+        (tmp_path / "arm.h")
+        .read_text()
+        .startswith("/* differs: b: followers are joints of their own")
+    )
     status, _, complaint = batchpid("export", path, "--out", tmp_path / "strict.h", "--strict")
     assert status == 2
     assert "followers" in complaint
@@ -40,8 +63,13 @@ def test_followers_are_reported_and_refused_with_strict(batchpid, tmp_path):
 
 def test_controllers_of_ros2_control_are_written(batchpid, tmp_path):
     out = tmp_path / "controllers.yaml"
-    status, said, _ = batchpid("export", "panda", "--to", "ros2_control", "--prefix", "arm", "--limits", "--out", out)
-    assert (status, said.splitlines()[-1]) == (0, f"written: {out}: tuned gains of 9 joints at 1000 Hz")
+    status, said, _ = batchpid(
+        "export", "panda", "--to", "ros2_control", "--prefix", "arm", "--limits", "--out", out
+    )
+    assert (status, said.splitlines()[-1]) == (
+        0,
+        f"written: {out}: tuned gains of 9 joints at 1000 Hz",
+    )
     listed = {line.split(":")[1].strip() for line in said.splitlines()[:-1]}
     assert {"gain_units", "guard", "effort_limit"} <= listed
     assert all(f"# {line}\n" in out.read_text() for line in said.splitlines()[:-1])
@@ -55,23 +83,39 @@ def test_controllers_of_ros2_control_are_written(batchpid, tmp_path):
 def test_followers_are_left_out_of_controllers(batchpid, tmp_path):
     names = ("x", "y", "z")
     path = write(
-        tmp_path, robot(*(link(name, INERTIAL) for name in names), joint("a", "x", "y", "revolute", LIMIT), MIMIC)
+        tmp_path,
+        robot(
+            *(link(name, INERTIAL) for name in names),
+            joint("a", "x", "y", "revolute", LIMIT),
+            MIMIC,
+        ),
     )
     out = tmp_path / "controllers.yaml"
     status, said, _ = batchpid("export", path, "--to", "ros2_control", "--out", out)
     assert status == 0
     assert "differs: b: followers are not in the file" in said
-    assert "joints: [a]" in " ".join(out.read_text().split()) or "joints:\n    - a\n" in out.read_text()
+    assert (
+        "joints: [a]" in " ".join(out.read_text().split())
+        or "joints:\n    - a\n" in out.read_text()
+    )
 
 
 def test_a_repaired_urdf_is_written_with_its_changes(batchpid, tmp_path):
-    path = write(tmp_path, robot(link("x"), link("y"), joint("a", "x", "y", "revolute", LIMIT.replace("-1", "3"))))
+    path = write(
+        tmp_path,
+        robot(link("x"), link("y"), joint("a", "x", "y", "revolute", LIMIT.replace("-1", "3"))),
+    )
     status, said, _ = batchpid("export", path, "--to", "urdf", "--out", tmp_path / "again.urdf")
     assert status == 0
     assert said.startswith("differs: joint 'a' (3, 1): limits are swapped; swap them\nwritten: ")
-    assert "<!-- differs: joint 'a' (3, 1): limits are swapped; swap them -->" in (tmp_path / "again.urdf").read_text()
+    assert (
+        "<!-- differs: joint 'a' (3, 1): limits are swapped; swap them -->"
+        in (tmp_path / "again.urdf").read_text()
+    )
     assert Robot.load(tmp_path / "again.urdf", strict=True).joints == Robot.load(path).joints
-    status, _, complaint = batchpid("export", path, "--to", "urdf", "--out", tmp_path / "b.urdf", "--strict")
+    status, _, complaint = batchpid(
+        "export", path, "--to", "urdf", "--out", tmp_path / "b.urdf", "--strict"
+    )
     assert (status, "swapped" in complaint) == (2, True)
     status, _, complaint = batchpid("export", path, "--to", "urdf", "--gains", "designed")
     assert (status, "gains: has no effect with --to urdf" in complaint) == (2, True)
@@ -86,9 +130,23 @@ def test_the_robot_is_written_for_mujoco(batchpid, tmp_path):
     assert "<!-- differs: guard" in out.read_text()
     model = mujoco.MjModel.from_xml_path(str(out))
     assert (model.nq, model.nu, model.opt.timestep) == (9, 27, 0.0005)
-    status, said, _ = batchpid("export", "panda", "--to", "mjcf", "--motors", "--force", "--out", out)
+    status, said, _ = batchpid(
+        "export", "panda", "--to", "mjcf", "--motors", "--force", "--out", out
+    )
     assert (status, said.splitlines()[-1]) == (0, f"written: {out}: motors of 9 joints")
     assert mujoco.MjModel.from_xml_path(str(out)).nu == 9
     assert (
-        batchpid("export", "panda", "--to", "mjcf", "--motors", "--gains", "designed", "--out", out, "--force")[0] == 2
+        batchpid(
+            "export",
+            "panda",
+            "--to",
+            "mjcf",
+            "--motors",
+            "--gains",
+            "designed",
+            "--out",
+            out,
+            "--force",
+        )[0]
+        == 2
     )

@@ -1,4 +1,6 @@
-"""Flags of all commands, from their parsers: one name has one meaning, and a mistake is answered by the command."""
+"""Flags of all commands, from their parsers: one name has one meaning, and a mistake is answered by
+the command.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ def actions(command: str) -> list[argparse.Action]:
 
 def flags(command: str) -> dict[str, str]:
     """Return the flags of a command, with the kind of value that each takes."""
-    return {name: str(action.metavar) for action in actions(command) for name in action.option_strings}
+    return {
+        name: str(action.metavar) for action in actions(command) for name in action.option_strings
+    }
 
 
 def choices(command: str) -> set[str]:
@@ -68,13 +72,26 @@ def test_a_wrong_flag_is_answered_with_the_help_of_its_command(command, batchpid
     assert (status, said) == (2, "")
     assert "--wrong-flag" in complaint
     assert f"batchpid {command} --help" in complaint
-    assert not [other for other in COMMANDS if other != command and f"batchpid {other} " in complaint]
+    assert not [
+        other for other in COMMANDS if other != command and f"batchpid {other} " in complaint
+    ]
 
 
 @pytest.mark.parametrize(("command", "flag"), output_flags())
-def test_an_output_without_a_folder_is_refused_before_the_run(command, flag, files, batchpid, tmp_path, monkeypatch):  # noqa: F811
+def test_an_output_without_a_folder_is_refused_before_the_run(
+    command,
+    flag,
+    files,  # noqa: F811
+    batchpid,
+    tmp_path,
+    monkeypatch,
+):
     monkeypatch.chdir(files)
-    path = tmp_path / "missing" / f"a{OUT.get(command, SUFFIXES[flag]) if flag == 'out' else SUFFIXES[flag]}"
+    path = (
+        tmp_path
+        / "missing"
+        / f"a{OUT.get(command, SUFFIXES[flag]) if flag == 'out' else SUFFIXES[flag]}"
+    )
     status, said, complaint = batchpid(*WORDS[command], f"--{flag}", path)
     assert (status, said) == (2, "")
     assert complaint.splitlines()[-1].endswith(f"mkdir -p {path.parent}")
@@ -91,7 +108,9 @@ BAD = {
     "NAME": ("nothing",),
     "NAME|FILE": ("nothing",),
 }
-"""Bad values of a flag, by the kind of value that it takes. Any text is good for the other kinds."""
+"""Bad values of a flag, by the kind of value that it takes. Any text is good for the other
+kinds.
+"""
 SHORT = {
     "demo": ("demo", "--num-envs", 1, "--workers", 0, "--seconds", 0.02),
     "rollout": ("rollout", "arm.urdf", "--num-envs", 1, "--workers", 0, "--seconds", 0.02),
@@ -106,12 +125,24 @@ def bad_values(command: str) -> list[tuple[str, str, str]]:
     found = []
     for flag, kind in flags(command).items():
         kind = kind.replace("{None}|", "").partition(" [NAME|FILE")[0]
-        found += [(command, flag, bad) for bad in (("other",) if flag in choices(command) else BAD.get(kind, ()))]
+        found += [
+            (command, flag, bad)
+            for bad in (("other",) if flag in choices(command) else BAD.get(kind, ()))
+        ]
     return found
 
 
-@pytest.mark.parametrize(("command", "flag", "bad"), [row for command in COMMANDS for row in bad_values(command)])
-def test_a_bad_value_is_answered_by_the_name_of_its_flag(command, flag, bad, files, batchpid, monkeypatch):  # noqa: F811
+@pytest.mark.parametrize(
+    ("command", "flag", "bad"), [row for command in COMMANDS for row in bad_values(command)]
+)
+def test_a_bad_value_is_answered_by_the_name_of_its_flag(
+    command,
+    flag,
+    bad,
+    files,  # noqa: F811
+    batchpid,
+    monkeypatch,
+):
     monkeypatch.chdir(files)
     before = written(files)
     status, _, complaint = batchpid(*(WORDS | SHORT)[command], flag, bad)
@@ -155,7 +186,13 @@ def written(folder: Path) -> set[Path]:
         ("view --play nothing.h5", "there is no such file"),
     ],
 )
-def test_flags_that_contradict_each_other_are_answered_in_one_line(words, message, files, batchpid, monkeypatch):  # noqa: F811
+def test_flags_that_contradict_each_other_are_answered_in_one_line(
+    words,
+    message,
+    files,  # noqa: F811
+    batchpid,
+    monkeypatch,
+):
     monkeypatch.chdir(files)
     before = written(Path())
     status, said, complaint = batchpid(*words.split())

@@ -21,7 +21,9 @@ PENDULUM = """<robot name="pendulum"><link name="base"/>
 
 @pytest.fixture
 def log(tmp_path):
-    """Robot, a recording of it with a motor of 0.9 of its strength, and the params that drove it: files."""
+    """Robot, a recording of it with a motor of 0.9 of its strength, and the params that drove it:
+    files.
+    """
     (tmp_path / "pendulum.urdf").write_text(PENDULUM)
     robot = Robot.load(tmp_path / "pendulum.urdf")
     gains, motion = robot.designed("effort"), excite(robot, 1.0, lowest=1.0, rate=200)
@@ -31,7 +33,11 @@ def log(tmp_path):
         runner.reset(motion.position[0])
         rollout = runner.rollout(motion.position)
     bp.save_params(tmp_path / "gains.yaml", gains, robot.joint_names)
-    return tmp_path / "pendulum.urdf", write_recording(rollout, tmp_path / "run.h5"), tmp_path / "gains.yaml"
+    return (
+        tmp_path / "pendulum.urdf",
+        write_recording(rollout, tmp_path / "run.h5"),
+        tmp_path / "gains.yaml",
+    )
 
 
 def test_motors_are_written_for_other_commands(batchpid, log, tmp_path):
@@ -42,14 +48,22 @@ def test_motors_are_written_for_other_commands(batchpid, log, tmp_path):
     assert status == 0, error
     assert "hinge" in said
     document = json.loads(details.read_text())
-    assert set(document["intervals"]["hinge"]) == {"armature", "damping", "friction", "strength", "bias"}
+    assert set(document["intervals"]["hinge"]) == {
+        "armature",
+        "damping",
+        "friction",
+        "strength",
+        "bias",
+    }
     assert document["held_out_error"][1] < 0.1 * document["held_out_error"][0]
     actuators = Robot.load(robot, actuators=out).actuators
     assert actuators.strength[0, 0] == pytest.approx(0.9, rel=0.1)
     assert (tmp_path / "motors-fit.png").exists()
 
 
-def test_a_fit_that_leaves_too_much_of_the_error_ends_in_no_file(batchpid, log, tmp_path, monkeypatch):
+def test_a_fit_that_leaves_too_much_of_the_error_ends_in_no_file(
+    batchpid, log, tmp_path, monkeypatch
+):
     """--force writes the file all the same."""
     monkeypatch.setattr("batchpid.sim.identification.result.EXPLAINS", 0.0)
     robot, recording, gains = log

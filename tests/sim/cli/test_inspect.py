@@ -75,23 +75,41 @@ def test_one_cause_is_one_sentence(batchpid, tmp_path):
 
 def test_pairs_that_do_not_collide_are_counted_and_listed_on_request(batchpid):
     out = batchpid("inspect", "panda")[1]
-    assert "Ground at height 0. 12 pairs of links excluded from collision: 12 'Adjacent' (--all)." in out
+    assert (
+        "Ground at height 0. 12 pairs of links excluded from collision: 12 'Adjacent' (--all)."
+        in out
+    )
     assert "panda_link0 - panda_link1" not in out
-    assert "Do not collide, 'Adjacent': panda_link0 - panda_link1, " in batchpid("inspect", "panda", "--all")[1]
+    assert (
+        "Do not collide, 'Adjacent': panda_link0 - panda_link1, "
+        in batchpid("inspect", "panda", "--all")[1]
+    )
 
 
 def test_masses_and_their_sources(batchpid, tmp_path):
-    """Of <inertial>, repaired, of the shapes at SAPIEN's density, or none; light links on request."""
+    """Of <inertial>, repaired, of the shapes at SAPIEN's density, or none; light links on
+    request.
+    """
     box = '<collision><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
     repaired = INERTIAL.replace('ixx="0.1"', 'ixx="0"')
     speck = INERTIAL.replace('value="1"', 'value="1e-6"')
-    parts = link("base"), link("arm", box), link("hand", repaired), link("frame", ""), link("speck", speck)
+    parts = (
+        link("base"),
+        link("arm", box),
+        link("hand", repaired),
+        link("frame", ""),
+        link("speck", speck),
+    )
     ends = [("base", "arm"), ("arm", "hand"), ("hand", "frame"), ("hand", "speck")]
-    joints = [joint(f"j{k}", *pair, *(("fixed", "") if k > 1 else ())) for k, pair in enumerate(ends)]
+    joints = [
+        joint(f"j{k}", *pair, *(("fixed", "") if k > 1 else ())) for k, pair in enumerate(ends)
+    ]
     path = write(tmp_path, robot(*parts, *joints))
     out = batchpid("inspect", path)[1]
     assert "5 links, 8 kg, " in out
-    rows = {line.split()[0]: line.split(maxsplit=3)[1:] for line in out.splitlines() if " kg  " in line}
+    rows = {
+        line.split()[0]: line.split(maxsplit=3)[1:] for line in out.splitlines() if " kg  " in line
+    }
     assert rows == {
         "base": ["1", "kg", "<inertial>"],
         "arm": ["6", "kg", "collision shapes at 1000 kg/m^3"],

@@ -88,15 +88,22 @@ def test_every_command_is_a_frozen_dataclass_with_help(name, batchpid):
     assert status == 0
     assert " ".join(command.__doc__.split()) in " ".join(out.split())
     flags = fields_of(name).keys() - {"weights", "meshes"}  # their fields are flags
-    assert all(f"-{flag}".replace("_", "-") in out or flag.upper() in out for flag in flags)  # --flag or --no-flag
+    assert all(
+        f"-{flag}".replace("_", "-") in out or flag.upper() in out for flag in flags
+    )  # --flag or --no-flag
 
 
 @pytest.mark.parametrize("name", [name for name in cli.COMMANDS if "robot" in fields_of(name)])
 def test_the_robot_is_positional_and_its_meshes_may_be_missing(name):
     recording = ["run.h5"] if "recording" in fields_of(name) else []
-    parsed = cli.parse([name, *recording, "jaco2", "--missing-meshes", "error", "--package-dirs", "a", "b"])
+    parsed = cli.parse(
+        [name, *recording, "jaco2", "--missing-meshes", "error", "--package-dirs", "a", "b"]
+    )
     assert parsed.robot == "jaco2"
-    assert vars(parsed.meshes) == {"missing_meshes": "error", "package_dirs": (Path("a"), Path("b"))}
+    assert vars(parsed.meshes) == {
+        "missing_meshes": "error",
+        "package_dirs": (Path("a"), Path("b")),
+    }
 
 
 @pytest.mark.parametrize("name", ["meshes", "seed", "randomize"])
@@ -174,7 +181,10 @@ def test_a_reader_that_ends_is_a_status_without_a_line(tmp_path):
 def test_ctrl_c_ends_a_command_in_one_line_and_its_processes(seconds, tmp_path):
     words = ["demo", "--num-envs", "2", "--workers", "2", "--seconds", "1000"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "batchpid", *words], stderr=subprocess.PIPE, stdout=subprocess.PIPE, cwd=tmp_path
+        [sys.executable, "-m", "batchpid", *words],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        cwd=tmp_path,
     )
     assert "2 robots in" in process.stdout.readline().decode()  # the packages are imported
     time.sleep(seconds)

@@ -33,7 +33,10 @@ OUT = {"rollout": ".h5", "excite": ".csv", "export": ".h"}
 
 def output_flags() -> list[tuple[str, str]]:
     """Return every flag of every command that names an output file."""
-    names = {name: {field.name for field in dataclasses.fields(command)} for name, command in COMMANDS.items()}
+    names = {
+        name: {field.name for field in dataclasses.fields(command)}
+        for name, command in COMMANDS.items()
+    }
     return [(name, flag) for name, flags in names.items() for flag in SUFFIXES if flag in flags]
 
 
@@ -54,17 +57,26 @@ def empty_pictures(monkeypatch):
     for name in ("step_responses", "efforts", "comparison"):
         monkeypatch.setattr(f"batchpid.sim.plots.{name}", lambda *_, **__: None)
     monkeypatch.setattr(
-        "batchpid.sim.plots.save", lambda _, path: (path.parent.mkdir(exist_ok=True), path.touch()) and path
+        "batchpid.sim.plots.save",
+        lambda _, path: (path.parent.mkdir(exist_ok=True), path.touch()) and path,
     )
 
 
 @pytest.mark.parametrize(("name", "flag"), output_flags())
-def test_an_existing_output_is_refused_before_the_run(name, flag, files, batchpid, tmp_path, monkeypatch):
+def test_an_existing_output_is_refused_before_the_run(
+    name, flag, files, batchpid, tmp_path, monkeypatch
+):
     monkeypatch.chdir(files)
     suffix = OUT.get(name, SUFFIXES[flag]) if flag == "out" else SUFFIXES[flag]
     (path := tmp_path / f"kept{suffix}").write_text("kept")
-    others = [(f"--{each}", tmp_path / f"new{SUFFIXES[each]}") for command, each in output_flags() if command == name]
-    others = [word for option in others if option[0] not in (f"--{flag}", "--out") for word in option]
+    others = [
+        (f"--{each}", tmp_path / f"new{SUFFIXES[each]}")
+        for command, each in output_flags()
+        if command == name
+    ]
+    others = [
+        word for option in others if option[0] not in (f"--{flag}", "--out") for word in option
+    ]
     status, said, complaint = batchpid(*WORDS[name], *others, f"--{flag}", path)
     assert (status, said) == (2, "")
     assert complaint.splitlines()[-1].startswith(f"batchpid: {flag}: exists already (got '{path}')")
@@ -105,27 +117,47 @@ def test_the_demo_can_be_repeated_for_another_robot_and_with_force(batchpid, tmp
     assert "out/panda-demo.png" in complaint
     assert batchpid("demo", *SHORT, "--force")[0] == 0
     assert batchpid("demo", "jaco2", *SHORT)[0] == 0
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"panda-demo.png", "jaco2-demo.png"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "panda-demo.png",
+        "jaco2-demo.png",
+    }
 
 
-INPUTS = {"gains": "a.yaml", "actuators": "a.yaml", "randomize": "a.yaml", "trajectory": "m.csv", "versus": "run.h5"}
+INPUTS = {
+    "gains": "a.yaml",
+    "actuators": "a.yaml",
+    "randomize": "a.yaml",
+    "trajectory": "m.csv",
+    "versus": "run.h5",
+}
 """Flags of files to read, besides those in WORDS."""
 
 
 @pytest.mark.parametrize("make", [os.symlink, os.link])
 @pytest.mark.parametrize(("name", "flag"), output_flags())
-def test_a_file_that_a_command_reads_is_never_replaced(name, flag, make, files, batchpid, tmp_path, monkeypatch):
+def test_a_file_that_a_command_reads_is_never_replaced(
+    name, flag, make, files, batchpid, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     names = {field.name for field in dataclasses.fields(COMMANDS[name])}
-    words = [*WORDS[name], *(word for each, file in INPUTS.items() if each in names for word in (f"--{each}", file))]
+    words = [
+        *WORDS[name],
+        *(word for each, file in INPUTS.items() if each in names for word in (f"--{each}", file)),
+    ]
     read = {file for file in words if str(file).endswith((".urdf", ".yaml", ".csv", ".h5"))}
     for file in read:
         (tmp_path / file).write_text("kept")
     for file in read:
-        path = tmp_path / f"output{OUT.get(name, SUFFIXES[flag]) if flag == 'out' else SUFFIXES[flag]}"
+        path = (
+            tmp_path / f"output{OUT.get(name, SUFFIXES[flag]) if flag == 'out' else SUFFIXES[flag]}"
+        )
         make(tmp_path / file, path)
         status, said, complaint = batchpid(*words, f"--{flag}", path, "--force")
-        assert (status, said, f"batchpid: {flag}: is a file to read" in complaint) == (2, "", True), complaint
+        assert (status, said, f"batchpid: {flag}: is a file to read" in complaint) == (
+            2,
+            "",
+            True,
+        ), complaint
         assert (tmp_path / file).read_text() == "kept"
         path.unlink()
 
@@ -140,13 +172,19 @@ def test_an_export_does_not_replace_its_robot(target, file, batchpid, tmp_path):
 
 def test_no_two_outputs_are_one_file(files, batchpid, tmp_path):
     same = tmp_path / "a.json"
-    _, _, complaint = batchpid("identify", files / "arm.urdf", files / "run.h5", "--out", same, "--json", same)
+    _, _, complaint = batchpid(
+        "identify", files / "arm.urdf", files / "run.h5", "--out", same, "--json", same
+    )
     assert "json: is another output of this run" in complaint
 
 
 def test_make_can_repeat_its_runs():
     makefile = (Path(__file__).parents[3] / "Makefile").read_text().replace("\\\n", "")
-    runs = [line.partition(" -m batchpid ")[2].split() for line in makefile.splitlines() if " -m batchpid " in line]
+    runs = [
+        line.partition(" -m batchpid ")[2].split()
+        for line in makefile.splitlines()
+        if " -m batchpid " in line
+    ]
     assert {words[0] for words in runs} == {"demo"}
     assert all("--force" in words for words in runs)
     demo = next(words for words in runs if words[0] == "demo")

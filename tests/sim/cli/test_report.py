@@ -13,7 +13,9 @@ TICKS, ENVS = 200, 5
 
 
 def first_order_lag(panda, setpoint, time_constant=0.05):
-    """Return a rollout in which every joint of every env moves to ``setpoint`` as a first-order lag."""
+    """Return a rollout in which every joint of every env moves to ``setpoint`` as a first-order
+    lag.
+    """
     time = 0.01 * np.arange(1, TICKS + 1)
     start = np.broadcast_to(panda.start, (ENVS, panda.dof))
     target = np.broadcast_to(setpoint, (TICKS, ENVS, panda.dof))
@@ -38,13 +40,19 @@ def first_order_lag(panda, setpoint, time_constant=0.05):
 
 def report_of(panda, rollout):
     """Return the lines of the report, and those of the table by joint."""
-    lines = report.run_report(SimpleNamespace(robot=panda, timestep=5e-4), rollout, 1.0).splitlines()
-    return lines, {name: next(line for line in lines if line.startswith(name)) for name in panda.joint_names}
+    lines = report.run_report(
+        SimpleNamespace(robot=panda, timestep=5e-4), rollout, 1.0
+    ).splitlines()
+    return lines, {
+        name: next(line for line in lines if line.startswith(name)) for name in panda.joint_names
+    }
 
 
 def test_a_run_that_settles(panda):
     lines, table = report_of(panda, first_order_lag(panda, panda.settings.target))
-    assert all("0.20 s / 0.20 s" in row for row in table.values())  # exp(-t / 0.05) falls below 2 % after 0.196 s
+    assert all(
+        "0.20 s / 0.20 s" in row for row in table.values()
+    )  # exp(-t / 0.05) falls below 2 % after 0.196 s
     assert lines[-1] == "Every joint of every env settled within 2 s to 2 % of its move."
 
 
@@ -59,7 +67,9 @@ def test_one_joint_that_rings_and_one_that_overshoots(panda):
     (line,) = [line for line in lines if line.startswith("NOT SETTLED")]
     assert "panda_joint1 (1)" in line
     assert "panda_joint6" not in line
-    assert next(line for line in lines if line.startswith("WHY")).startswith("WHY: joint 'panda_joint1': ")
+    assert next(line for line in lines if line.startswith("WHY")).startswith(
+        "WHY: joint 'panda_joint1': "
+    )
 
 
 def test_envs_that_failed_are_named_even_if_they_are_held_at_a_finite_pose(panda):
@@ -73,6 +83,8 @@ def test_envs_that_failed_are_named_even_if_they_are_held_at_a_finite_pose(panda
 
 
 def test_the_speed_is_env_steps_and_real_time_factors():
-    assert report.speed_line(64, 2.0, 1 / 2000, 4.0) == (
-        "64,000 env-steps/s: 2 s of 64 robots in 4.00 s; real-time factor 0.5 per robot, 32 in total"
+    assert (
+        report.speed_line(64, 2.0, 1 / 2000, 4.0)
+        == "64,000 env-steps/s: 2 s of 64 robots in 4.00 s; real-time factor 0.5 per robot, 32 in"
+        " total"
     )

@@ -47,7 +47,9 @@ def test_the_file_holds_the_rollout_of_a_runner_with_the_same_gains(saved, tmp_p
 
 
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
-def test_start_poses_are_near_and_within_limits_and_do_not_depend_on_their_number(name, batchpid, saved):
+def test_start_poses_are_near_and_within_limits_and_do_not_depend_on_their_number(
+    name, batchpid, saved
+):
     robot, short = Robot.load(name), ("--workers", 0, "--engine", "mujoco", "--seconds", 0.01)
     poses, more, other = (
         saved(name, "--num-envs", envs, "--seed", seed, short=short)[0].info.start
@@ -128,17 +130,25 @@ def test_picture(batchpid, tmp_path):
 @pytest.mark.parametrize("command", ["demo", "rollout"])
 def test_the_figures_are_those_of_the_table(command, batchpid, tmp_path):
     files = ("--json", tmp_path / "a.json", "--picture", tmp_path / "a.svg")
-    status, said, error = batchpid(command, "--num-envs", 3, "--workers", 0, "--seconds", 1.2, *files)
+    status, said, error = batchpid(
+        command, "--num-envs", 3, "--workers", 0, "--seconds", 1.2, *files
+    )
     assert status == 0, error
     figures = json.loads((tmp_path / "a.json").read_text())
-    assert (figures["robot"], figures["num_envs"], figures["seconds"], figures["failed"]) == ("panda", 3, 1.2, [])
+    assert (figures["robot"], figures["num_envs"], figures["seconds"], figures["failed"]) == (
+        "panda",
+        3,
+        1.2,
+        [],
+    )
     row = figures["joints"]["panda_joint4"]
     line = next(line for line in said.splitlines() if line.startswith("panda_joint4"))
     assert f" {max(row['steady_state_error']):.2g} " in line
     assert f" {max(row['settling_time']):.2f} s" in line
 
 
-# -- trajectories ------------------------------------------------------------------------------------------------------
+# -- trajectories
+# --------------------------------------------------------------------------------------------------
 
 ONE = ("--num-envs", 1, "--workers", 0)
 
@@ -150,16 +160,28 @@ def motion(panda):
     return minimum_jerk(panda.start, there, 0.005, duration=0.4)
 
 
-OF_TRAJECTORY = {"setpoint": "position", "setpoint_rate": "velocity", "setpoint_acceleration": "acceleration"}
+OF_TRAJECTORY = {
+    "setpoint": "position",
+    "setpoint_rate": "velocity",
+    "setpoint_acceleration": "acceleration",
+}
 
 
 def csv(robot, motion, *further, start=True, delimiter=",", end="\n", header="{}"):
-    """Return setpoints and ``further`` quantities of a motion as CSV, with a row at time 0 for ``robot.start``."""
+    """Return setpoints and ``further`` quantities of a motion as CSV, with a row at time 0 for
+    ``robot.start``.
+    """
     tables = [getattr(motion, OF_TRAJECTORY[name]) for name in ("setpoint", *further)]
-    names = [header.format(f"{key}:{name}") for key in ("setpoint", *further) for name in robot.joint_names]
+    names = [
+        header.format(f"{key}:{name}")
+        for key in ("setpoint", *further)
+        for name in robot.joint_names
+    ]
     rows = np.hstack([motion.time[:, None], *tables])
     if start:
-        rows = np.vstack([np.concatenate([[0], robot.start, np.zeros(robot.dof * len(further))]), rows])
+        rows = np.vstack(
+            [np.concatenate([[0], robot.start, np.zeros(robot.dof * len(further))]), rows]
+        )
     cells = [[header.format("time"), *names], *([f"{cell:.9g}" for cell in row] for row in rows)]
     return "".join(delimiter.join(row) + end for row in cells)
 
@@ -178,7 +200,9 @@ def following_errors(report):
 
 
 @pytest.mark.parametrize("source", ["from the file", "central differences of the rows"])
-def test_a_trajectory_is_followed_as_by_a_runner_with_its_rates(saved, tmp_path, panda, motion, source):
+def test_a_trajectory_is_followed_as_by_a_runner_with_its_rates(
+    saved, tmp_path, panda, motion, source
+):
     path, further = tmp_path / "motion.csv", ["setpoint_rate"] if source == "from the file" else []
     path.write_text(csv(panda, motion, *further))
     run, said = saved("--trajectory", path, "--spread", 0, short=ONE)
@@ -224,7 +248,9 @@ def test_files_of_other_programs_read_as_those_of_this_one(saved, tmp_path, pand
     runs = []
     for form in ({}, style):
         path = tmp_path / "motion.csv"
-        path.write_bytes(csv(panda, motion, "setpoint_rate", "setpoint_acceleration", **form).encode("utf-8-sig"))
+        path.write_bytes(
+            csv(panda, motion, "setpoint_rate", "setpoint_acceleration", **form).encode("utf-8-sig")
+        )
         runs.append(saved("--trajectory", path, "--engine", "mujoco", short=ONE)[0].arrays())
     for name, rows in runs[0].items():
         np.testing.assert_array_equal(rows, runs[1][name])
@@ -248,11 +274,26 @@ def test_changes_beyond_the_velocity_limits_are_steps(batchpid, tmp_path, panda)
 
 
 def test_rates_take_the_short_way_round_and_followers_need_no_column(saved, tmp_path):
-    follower = joint("right", "base", "r", inner=LIMIT + '<mimic joint="left" multiplier="-0.5"/>', origin="0 -1 1")
-    turning = joint("turn", "base", "t", "continuous", '<limit effort="50" velocity="9"/>', origin="0 3 1")
-    parts = (*map(link, ("base", "l", "r", "t")), follower, joint("left", "base", "l", origin="0 1 1"), turning)
+    follower = joint(
+        "right",
+        "base",
+        "r",
+        inner=LIMIT + '<mimic joint="left" multiplier="-0.5"/>',
+        origin="0 -1 1",
+    )
+    turning = joint(
+        "turn", "base", "t", "continuous", '<limit effort="50" velocity="9"/>', origin="0 3 1"
+    )
+    parts = (
+        *map(link, ("base", "l", "r", "t")),
+        follower,
+        joint("left", "base", "l", origin="0 1 1"),
+        turning,
+    )
     arm, path = write(tmp_path, robot(*parts)), tmp_path / "motion.csv"
-    path.write_text("time,setpoint:left,setpoint:turn\n0,0.1,3.13\n0.01,0.12,-3.13\n0.02,0.14,-3.11\n")
+    path.write_text(
+        "time,setpoint:left,setpoint:turn\n0,0.1,3.13\n0.01,0.12,-3.13\n0.02,0.14,-3.11\n"
+    )
     run, said = saved(arm, "--trajectory", path, short=ONE)
     assert "too fast" not in said
     right, turn = (run.info.joint_names.index(name) for name in ("right", "turn"))
@@ -286,20 +327,47 @@ def in_column(column, function):
     [
         (cut(lambda lines: lines.pop(20)), "line 21: time is 0.1 s, and not 0.095 s; .*resample"),
         (in_column(0, lambda cell: str(1000 * float(cell))), "rows every 5 s; .*seconds"),
-        (in_column(0, lambda cell: str(0.0033 + float(cell))), "line 2: the first row is at 0.0033 s; begin at 0"),
-        (in_column(0, lambda cell: str(0.74 * float(cell))), "rows every 0.0037 s, .*use --timestep 0.0005285714"),
-        (in_column(4, lambda cell: str(57.3 * float(cell))), "panda_joint4' is outside .*got -.*within -3.07"),
-        (in_column(3, lambda cell: "nan"), "line 2, column 'setpoint:panda_joint3' is empty or not finite"),
-        (in_column(12, lambda cell: "fast"), "line 2, column 'setpoint_rate:panda_joint3' is not a number"),
-        (cut(lambda lines: lines[0].__setitem__(3, "qpos:panda_joint3")), "unknown column 'qpos:panda_joint3'"),
-        (cut(lambda lines: lines[0].__setitem__(3, " setpoint: panda_joint1")), "'setpoint:panda_joint1' twice"),
-        (cut(lambda lines: [line.pop(3) for line in lines]), "column setpoint:panda_joint3: is missing"),
+        (
+            in_column(0, lambda cell: str(0.0033 + float(cell))),
+            "line 2: the first row is at 0.0033 s; begin at 0",
+        ),
+        (
+            in_column(0, lambda cell: str(0.74 * float(cell))),
+            "rows every 0.0037 s, .*use --timestep 0.0005285714",
+        ),
+        (
+            in_column(4, lambda cell: str(57.3 * float(cell))),
+            "panda_joint4' is outside .*got -.*within -3.07",
+        ),
+        (
+            in_column(3, lambda cell: "nan"),
+            "line 2, column 'setpoint:panda_joint3' is empty or not finite",
+        ),
+        (
+            in_column(12, lambda cell: "fast"),
+            "line 2, column 'setpoint_rate:panda_joint3' is not a number",
+        ),
+        (
+            cut(lambda lines: lines[0].__setitem__(3, "qpos:panda_joint3")),
+            "unknown column 'qpos:panda_joint3'",
+        ),
+        (
+            cut(lambda lines: lines[0].__setitem__(3, " setpoint: panda_joint1")),
+            "'setpoint:panda_joint1' twice",
+        ),
+        (
+            cut(lambda lines: [line.pop(3) for line in lines]),
+            "column setpoint:panda_joint3: is missing",
+        ),
         (cut(lambda lines: lines.__delitem__(slice(2, None))), "line 2: the only row is at 0 s"),
         (
             lambda text: text.replace(",", ";").replace(".", ","),
             "line 2, column 'time' is not a number .*decimal point",
         ),
-        (lambda text: text.replace("setpoint_rate", "setpoint_acceleration"), "accelerations need the rates"),
+        (
+            lambda text: text.replace("setpoint_rate", "setpoint_acceleration"),
+            "accelerations need the rates",
+        ),
     ],
 )
 def test_a_wrong_trajectory_is_refused(batchpid, tmp_path, panda, motion, change, message):
@@ -322,7 +390,9 @@ def test_a_wrong_trajectory_is_refused(batchpid, tmp_path, panda, motion, change
         (("--control", "drive"), "setpoint_accelerations: is for gains in accelerations"),
     ],
 )
-def test_flags_that_contradict_a_trajectory_are_refused(batchpid, tmp_path, panda, motion, flags, message):
+def test_flags_that_contradict_a_trajectory_are_refused(
+    batchpid, tmp_path, panda, motion, flags, message
+):
     path = tmp_path / "motion.csv"
     path.write_text(csv(panda, motion, "setpoint_rate", "setpoint_acceleration"))
     status, _, error = batchpid("rollout", "--trajectory", path, *ONE, *flags)

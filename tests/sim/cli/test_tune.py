@@ -16,7 +16,18 @@ from batchpid.sim.tuning import Weights, random_moves
 
 pytest.importorskip("cmaes")
 
-SHORT = ("--generations", 1, "--population", 4, "--seconds", 0.1, "--workers", 0, "--physics", "fast")
+SHORT = (
+    "--generations",
+    1,
+    "--population",
+    4,
+    "--seconds",
+    0.1,
+    "--workers",
+    0,
+    "--physics",
+    "fast",
+)
 
 
 @pytest.fixture(autouse=True)
@@ -25,21 +36,37 @@ def few_moves(monkeypatch):
     monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
     monkeypatch.setattr("batchpid.sim.tuning.search.VARIED_MOVES", 1)
     monkeypatch.setattr(
-        "batchpid.sim.cli.run.random_moves", lambda robot, moves, seed: random_moves(robot, min(moves, 1), seed)
+        "batchpid.sim.cli.run.random_moves",
+        lambda robot, moves, seed: random_moves(robot, min(moves, 1), seed),
     )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_worse", [False, True])
-def test_tune_writes_the_better_gains_with_settings_and_a_command_that_works(is_worse, batchpid, tmp_path, monkeypatch):
-    """Settings have the types of their options: text "False" would be true to any program that reads it."""
+def test_tune_writes_the_better_gains_with_settings_and_a_command_that_works(
+    is_worse, batchpid, tmp_path, monkeypatch
+):
+    """Settings have the types of their options: text "False" would be true to any program that
+    reads it.
+    """
     monkeypatch.chdir(tmp_path)
     drawback = "chatter: tuned 3, designed 2"
-    monkeypatch.setattr("batchpid.sim.tuning.evaluation.Evaluation.drawback", lambda *_: drawback if is_worse else None)
+    monkeypatch.setattr(
+        "batchpid.sim.tuning.evaluation.Evaluation.drawback",
+        lambda *_: drawback if is_worse else None,
+    )
     robot = Robot.load(write(tmp_path, one_joint(), "my arm.urdf"))
     Path("payload.yaml").write_text("payload: {uniform: [0, 0.5]}")
     bp.save_actuators("motors.yaml", bp.make_actuators(1, command_delay=0.001), robot.joint_names)
-    flags = ("--no-collisions", "--actuators", "motors.yaml", "--randomize", "payload.yaml", "--out", "gains.yaml")
+    flags = (
+        "--no-collisions",
+        "--actuators",
+        "motors.yaml",
+        "--randomize",
+        "payload.yaml",
+        "--out",
+        "gains.yaml",
+    )
     status, said, error = batchpid("tune", "my arm.urdf", *SHORT, *flags)
     assert status == 0, error
     assert (f"the tuned ones are rejected: {drawback}." in said) == is_worse
@@ -48,7 +75,9 @@ def test_tune_writes_the_better_gains_with_settings_and_a_command_that_works(is_
     assert {"seed": 0, "collisions": False, "physics": "fast"}.items() <= about.items()
     assert {"sapien", "numpy", "cmaes"} <= about["versions"].keys()
     assert not [name for name, value in about.items() if value in ("True", "False", "None")]
-    assert (bp.load_params("gains.yaml")[0].kp == robot.designed().kp).all() or about["gains"] == "tuned"
+    assert (bp.load_params("gains.yaml")[0].kp == robot.designed().kp).all() or about[
+        "gains"
+    ] == "tuned"
     assert (tmp_path / "gains-tune.png").stat().st_size > 5_000
     command = shlex.split(said.splitlines()[-1].removeprefix("next: "))
     assert command[:5] == ["batchpid", "rollout", "my arm.urdf", "--gains", "gains.yaml"]
@@ -62,7 +91,9 @@ def test_compare_lists_each_set_and_draws_the_first_two(batchpid, tmp_path):
     bp.save_params(tmp_path / "mine.yaml", robot.params(kp=1.0, ki=0.0, kd=0.1), robot.joint_names)
     picture = tmp_path / "two.png"
     flags = ("--moves", 1, "--seconds", 1.2, "--workers", 0, "--picture", picture)
-    status, said, _ = batchpid("compare", "--gains", "tuned", tmp_path / "mine.yaml", "drive:30,6", *flags)
+    status, said, _ = batchpid(
+        "compare", "--gains", "tuned", tmp_path / "mine.yaml", "drive:30,6", *flags
+    )
     assert status == 0
     rows = {line.split("  ")[0]: line for line in said.splitlines() if " of 2" in line}
     assert rows.keys() == {"tuned", "mine.yaml", "drive (30, 6)"}
@@ -78,7 +109,9 @@ def test_compare_runs_each_set_in_both_engines(drawn, batchpid, tmp_path, reques
     pytest.importorskip("mujoco.batch")
     picture = tmp_path / "two.png"
     flags = ("--moves", 1, "--seconds", 0.9, "--workers", 0, "--picture", picture)
-    status, said, error = batchpid("compare", "--gains", "tuned", "--engine", "sapien", "mujoco", *flags)
+    status, said, error = batchpid(
+        "compare", "--gains", "tuned", "--engine", "sapien", "mujoco", *flags
+    )
     assert status == 0, error
     rows = {line.split("  ")[0]: line.split()[2:7] for line in said.splitlines() if " of 2" in line}
     assert rows.keys() == {"tuned, SAPIEN", "tuned, MuJoCo"}
@@ -86,7 +119,9 @@ def test_compare_runs_each_set_in_both_engines(drawn, batchpid, tmp_path, reques
     difference = re.search(r"tuned, SAPIEN / tuned, MuJoCo: (\S+) rad", said)
     assert 0 < float(difference[1]) < 1e-2
     assert max(map(len, said.splitlines())) <= 120
-    assert rows["tuned, SAPIEN"] == rows["tuned, MuJoCo"]  # settling times in hundredths of a second
+    assert (
+        rows["tuned, SAPIEN"] == rows["tuned, MuJoCo"]
+    )  # settling times in hundredths of a second
     assert not drawn or picture.stat().st_size > 10_000
 
 

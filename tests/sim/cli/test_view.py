@@ -22,7 +22,9 @@ def write(path, robot="panda", envs=1, **changed):
     zeros = np.zeros((2, envs, panda.dof), np.float32)
     seen = Observation(zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool), zeros > 0)
     info = replace(panda.run_info(), robot=robot, **changed)
-    return write_recording(Rollout(np.array([0.1, 0.2]), zeros.astype(float), seen, tick=0.1, info=info), path)
+    return write_recording(
+        Rollout(np.array([0.1, 0.2]), zeros.astype(float), seen, tick=0.1, info=info), path
+    )
 
 
 def test_ctrl_c_ends_it_with_status_0(batchpid, monkeypatch):
@@ -56,7 +58,10 @@ def test_the_first_64_of_many_recorded_robots_are_shown(batchpid, tmp_path):
 def test_a_mesh_that_cannot_be_read_is_named(batchpid, tmp_path):
     """And a robot without ground is drawn, over a grid."""
     (tmp_path / "<b>.stl").write_text("version https://git-lfs.github.com/spec/v1")
-    seen = [f'<visual><geometry><mesh filename="{name}"/></geometry></visual>' for name in ("no.stl", "&lt;b>.stl")]
+    seen = [
+        f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
+        for name in ("no.stl", "&lt;b>.stl")
+    ]
     box = '<collision><geometry><box size="1 1 1"/></geometry></collision>'
     parts = (
         link("base", INERTIAL + seen[0]),
@@ -81,18 +86,26 @@ def test_a_port_in_use_is_named_with_the_next(batchpid):
     assert f"port {port} is in use; the page is at " in said
 
 
-def test_a_run_of_another_robot_with_the_name_of_a_bundled_one_is_not_shown_as_that(batchpid, tmp_path):
+def test_a_run_of_another_robot_with_the_name_of_a_bundled_one_is_not_shown_as_that(
+    batchpid, tmp_path
+):
     run = write(tmp_path / "my run.h5", urdf=load_bundled("panda").urdf.replace("0.333", "0.433"))
-    said = "robot: 'panda' of the recording is another one than the bundled robot of that name; name its URDF: batchpid"
+    said = (
+        "robot: 'panda' of the recording is another one than the bundled robot of that name; name"
+        " its URDF: batchpid"
+    )
     assert f"{said} view PATH/TO/ROBOT.urdf --play '{run}'" in batchpid("view", "--play", run)[2]
-    assert f"{said} plot '{run}' PATH/TO/ROBOT.urdf --film a.gif" in batchpid("plot", run, "--film", "a.gif")[2]
+    assert (
+        f"{said} plot '{run}' PATH/TO/ROBOT.urdf --film a.gif"
+        in batchpid("plot", run, "--film", "a.gif")[2]
+    )
 
 
 def test_a_run_of_a_robot_that_is_not_bundled_asks_for_its_urdf(batchpid, tmp_path):
     run = write(tmp_path / "run.h5", robot="arm")
     assert (
-        "robot: 'arm' of the recording is not bundled; name its URDF: batchpid view PATH/TO/ROBOT.urdf --play"
-        in batchpid("view", "--play", run)[2]
+        "robot: 'arm' of the recording is not bundled; name its URDF: batchpid view"
+        " PATH/TO/ROBOT.urdf --play" in batchpid("view", "--play", run)[2]
     )
     path = tmp_path / "arm.urdf"
     path.write_text(load_bundled("panda").path.read_text())

@@ -1,4 +1,6 @@
-"""MuJoCo's contacts with and without proofs of clearance: proofs skip no contact, so the motion is the same."""
+"""MuJoCo's contacts with and without proofs of clearance: proofs skip no contact, so the motion is
+the same.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from tiny_urdf import random_tree, robot, write
 from batchpid.sim import Robot, Runner
 
 mujoco = pytest.importorskip("mujoco.batch")
-pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning", "ignore::batchpid.sim.FaultWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::batchpid.sim.StabilityWarning", "ignore::batchpid.sim.FaultWarning"
+)
 KINDS = (
     '<sphere radius="0.2"/>',
     '<box size="0.1 0.3 0.5"/>',
@@ -21,7 +25,10 @@ KINDS = (
     '<capsule radius="0.1" length="0.4"/>',
     '<mesh filename="hull.obj"/>',
 )
-HULL = "v 0 0 0\nv 0.4 0 0\nv 0 0.3 0\nv 0 0 0.5\nv 0.2 0.2 0.2\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 5\nf 2 5 4\nf 3 4 5\n"
+HULL = (
+    "v 0 0 0\nv 0.4 0 0\nv 0 0.3 0\nv 0 0 0.5\nv 0.2 0.2 0.2\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 5\nf"
+    " 2 5 4\nf 3 4 5\n"
+)
 
 
 def shaped_tree(seed, folder, **options):
@@ -32,18 +39,31 @@ def shaped_tree(seed, folder, **options):
     for number, part in enumerate(parts):
         if part.startswith("<link"):
             place = '<origin xyz="{} {} {}" rpy="{} {} {}"/>'.format(*rng.uniform(-0.5, 0.5, 6))
-            shape = f"<collision>{place}<geometry>{KINDS[number % len(KINDS)]}</geometry></collision>"
+            shape = (
+                f"<collision>{place}<geometry>{KINDS[number % len(KINDS)]}</geometry></collision>"
+            )
             parts[number] = part.replace("</link>", shape + "</link>")
     return Robot.load(write(folder, robot(*parts)), **options)
 
 
 def motion(of, monkeypatch, proofs, ticks=30, **options):
-    """Return rollouts of 4 robots from random poses under random efforts, with a reset of two between them."""
+    """Return rollouts of 4 robots from random poses under random efforts, with a reset of two
+    between them.
+    """
     rng, envs = np.random.default_rng(1), 4
     monkeypatch.setenv("BATCHPID_NATIVE", str(int(proofs)))
     starts = rng.uniform(np.maximum(of.lower, -3.0), np.minimum(of.upper, 3.0), (envs, of.dof))
-    efforts = np.tile(rng.normal(size=(envs, of.dof)) * np.minimum(of.effort_limit, 20), (ticks, 1, 1))
-    given = {"engine": "mujoco", "workers": 0, "control": "effort", "compensate": "none", "substeps": 10, **options}
+    efforts = np.tile(
+        rng.normal(size=(envs, of.dof)) * np.minimum(of.effort_limit, 20), (ticks, 1, 1)
+    )
+    given = {
+        "engine": "mujoco",
+        "workers": 0,
+        "control": "effort",
+        "compensate": "none",
+        "substeps": 10,
+        **options,
+    }
     with Runner(of, envs, **given) as runner:
         base = {} if of.fixed_base else {"base_pose": [0, 0, 1.5, 1, 0, 0, 0]}
         runner.reset(starts, **base)
@@ -54,7 +74,12 @@ def motion(of, monkeypatch, proofs, ticks=30, **options):
 
 CASES = [
     *(("panda", True, ground) for ground in (False, True)),
-    *((seed, fixed, ground) for seed in (0, 1) for fixed in (True, False) for ground in (False, True)),
+    *(
+        (seed, fixed, ground)
+        for seed in (0, 1)
+        for fixed in (True, False)
+        for ground in (False, True)
+    ),
     pytest.param("jaco2", True, True, marks=pytest.mark.slow),
     *(pytest.param(seed, False, True, marks=pytest.mark.slow) for seed in range(2, 12)),
 ]
@@ -64,10 +89,16 @@ CASES = [
 @pytest.mark.parametrize(("name", "fixed_base", "ground"), CASES)
 def test_a_motion_is_the_same_without_proofs(name, fixed_base, ground, tmp_path, monkeypatch):
     """Without native code MuJoCo looks for contacts in every step."""
-    of = load_bundled(name) if isinstance(name, str) else shaped_tree(name, tmp_path, fixed_base=fixed_base)
+    of = (
+        load_bundled(name)
+        if isinstance(name, str)
+        else shaped_tree(name, tmp_path, fixed_base=fixed_base)
+    )
     ours, theirs = (motion(of, monkeypatch, proofs, ground=ground) for proofs in (True, False))
     for one, other in zip(ours, theirs, strict=True):
         assert_identical(one, other)
     if fixed_base and not ground:
         poses = np.concatenate([each.qpos.reshape(-1, of.dof) for each in theirs])
-        assert of.dynamics(ground=False).in_contact(poses, 0.02).any(), "no links come near each other"
+        assert of.dynamics(ground=False).in_contact(poses, 0.02).any(), (
+            "no links come near each other"
+        )

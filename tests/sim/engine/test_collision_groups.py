@@ -14,7 +14,9 @@ DEFAULT = (1, 1, 0, 0)
 
 
 def graphs(largest, density):
-    """Return a strategy of graphs: the bodies, the pairs to ignore and the pairs that may be either."""
+    """Return a strategy of graphs: the bodies, the pairs to ignore and the pairs that may be
+    either.
+    """
 
     @st.composite
     def draw_graph(draw):
@@ -22,7 +24,11 @@ def graphs(largest, density):
         rng = np.random.default_rng(draw(st.integers(0, 2**32)))
         share = draw(st.floats(0, density))
         pairs = [frozenset(pair) for pair in combinations(bodies, 2)]
-        return bodies, {p for p in pairs if rng.random() < share}, {p for p in pairs if rng.random() < 0.1}
+        return (
+            bodies,
+            {p for p in pairs if rng.random() < share},
+            {p for p in pairs if rng.random() < 0.1},
+        )
 
     return draw_graph()
 
@@ -57,7 +63,9 @@ def test_no_pair_is_ignored_that_should_touch_however_large_the_graph(graph):
 @settings(max_examples=15, deadline=None)
 def test_any_62_pairs_are_represented_however_many_bodies(count, seed):
     bodies, rng = [f"b{n}" for n in range(count)], np.random.default_rng(seed)
-    assert not check(bodies, {frozenset(rng.choice(bodies, 2, replace=False)) for _ in range(62)}, set())
+    assert not check(
+        bodies, {frozenset(rng.choice(bodies, 2, replace=False)) for _ in range(62)}, set()
+    )
 
 
 @given(graphs(7, 1.0), st.integers(0, 2**32))
@@ -76,5 +84,11 @@ def test_physx_reports_the_contacts_that_the_words_say(graph, seed):
         builder.set_initial_pose(sapien.Pose(rng.uniform(-0.1, 0.1, 3)))
         names[builder.build(name=name)] = name
     scene.step()
-    seen = {frozenset(names[body.entity] for body in contact.bodies) for contact in scene.get_contacts()}
-    assert seen == {frozenset(pair) for pair in combinations(words, 2) if may_touch(words[pair[0]], words[pair[1]])}
+    seen = {
+        frozenset(names[body.entity] for body in contact.bodies) for contact in scene.get_contacts()
+    }
+    assert seen == {
+        frozenset(pair)
+        for pair in combinations(words, 2)
+        if may_touch(words[pair[0]], words[pair[1]])
+    }

@@ -1,4 +1,6 @@
-"""Robots without collision shapes: the same free motion, and the contacts that they would have had."""
+"""Robots without collision shapes: the same free motion, and the contacts that they would have
+had.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +18,9 @@ TICKS = 15
 
 @pytest.fixture(scope="module")
 def falling(tmp_path_factory):
-    """A robot without <inertial>, on a column 0.3 m high, that falls over: its arm is then below the ground."""
+    """A robot without <inertial>, on a column 0.3 m high, that falls over: its arm is then below
+    the ground.
+    """
     path = tmp_path_factory.mktemp("falling") / "falling.urdf"
     limit = '<limit lower="-3" upper="3" effort="10" velocity="2"/>'
     arm = BOX.replace("<geometry>", '<origin xyz="0 0 0.5"/><geometry>')
@@ -58,7 +62,9 @@ def test_free_motion_is_bit_identical_to_that_of_the_shaped_robot(name, options)
 def test_masses_and_inertias_stay(falling):
     """Those of 4 kg (1000 kg/m^3) at 0.5 m, not the 1e-6 kg of a link without shapes."""
     options = {"control": "effort", "compensate": "none", "ground": False}
-    shaped, bare = (roll_out(falling, [[0.5]], [1.0], collisions=given, **options)[0] for given in (True, False))
+    shaped, bare = (
+        roll_out(falling, [[0.5]], [1.0], collisions=given, **options)[0] for given in (True, False)
+    )
     np.testing.assert_allclose(bare.qpos, shaped.qpos, rtol=1e-5)
     assert 0.1 < bare.qpos[-1, 0, 0] - 0.5 < 1.0
 
@@ -79,9 +85,13 @@ def test_missed_contacts_are_those_found_by_looking_at_every_tick(name):
 
 
 def test_one_warning_names_envs_and_links(falling):
-    with Runner(falling, 3, workers=0, collisions=False, compensate="none", control="effort") as runner:
+    with Runner(
+        falling, 3, workers=0, collisions=False, compensate="none", control="effort"
+    ) as runner:
         runner.reset([[0.0], [1.5], [0.0]])
-        with pytest.warns(MissedContactWarning, match=r"env 1: 'arm' and the ground at 0\.\d* s\. ") as caught:
+        with pytest.warns(
+            MissedContactWarning, match=r"env 1: 'arm' and the ground at 0\.\d* s\. "
+        ) as caught:
             runner.rollout(np.zeros((40, 1)))
         assert len(caught) == 1
         assert runner.observe().ok.all()
@@ -93,6 +103,8 @@ def test_one_warning_names_envs_and_links(falling):
 
 
 def test_content_without_shapes_is_allowed(panda):
-    with Runner(panda, 2, workers=0, collisions=False, build=lambda scene, env: "panda_hand") as runner:
+    with Runner(
+        panda, 2, workers=0, collisions=False, build=lambda scene, env: "panda_hand"
+    ) as runner:
         runner.step(panda.settings.target)
         assert runner.poses().shape == (2, 1, 7)

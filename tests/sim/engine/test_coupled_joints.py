@@ -19,16 +19,32 @@ def body(name: str, mass: float, at: str = "0 0 0.1", shape: str = "") -> str:
 
 
 def hinge(
-    name: str, parent: str, child: str, axis: str, origin: str, inner: str = FREE_LIMIT, kind: str = "revolute"
+    name: str,
+    parent: str,
+    child: str,
+    axis: str,
+    origin: str,
+    inner: str = FREE_LIMIT,
+    kind: str = "revolute",
 ) -> str:
-    ends = f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{origin}"/><axis xyz="{axis}"/>'
+    ends = (
+        f'<parent link="{parent}"/><child link="{child}"/><origin xyz="{origin}"/><axis'
+        f' xyz="{axis}"/>'
+    )
     return f'<joint name="{name}" type="{kind}">{ends}{inner}</joint>'
 
 
 def arm(
-    folder, multiplier: float = -1.0, offset: float = 0.0, fixed: bool = False, joints: int = 7, finger: float = 0.02
+    folder,
+    multiplier: float = -1.0,
+    offset: float = 0.0,
+    fixed: bool = False,
+    joints: int = 7,
+    finger: float = 0.02,
 ) -> Robot:
-    """Return an arm with two sliding fingers and a claw on the first, all moved by the first finger or all fixed."""
+    """Return an arm with two sliding fingers and a claw on the first, all moved by the first finger
+    or all fixed.
+    """
     parts = [body("base", 5.0), *(body(f"l{i}", 4.0 - 0.4 * i) for i in range(joints))]
     for i in range(joints):
         parent = f"l{i - 1}" if i else "base"
@@ -37,15 +53,31 @@ def arm(
     wide = '<limit lower="-9" upper="9" effort="5" velocity="9"/>'
     law = f'{wide}<mimic joint="left" multiplier="{multiplier}" offset="{offset}"/>'
     claw = f'{wide}<mimic joint="right" multiplier="20" offset="0.3"/>'  # a chain of followers
-    parts += [body(name, finger, "0 0 0.03") for name in ("left_pad", "right_pad")] + [body("claw", finger, "0.02 0 0")]
+    parts += [body(name, finger, "0 0 0.03") for name in ("left_pad", "right_pad")] + [
+        body("claw", finger, "0.02 0 0")
+    ]
     for name, parent, child, origin, inner, kind in (
         ("left", wrist, "left_pad", "0 0.05 0.2", slide, "prismatic"),
         ("right", wrist, "right_pad", "0 -0.05 0.2", law, "prismatic"),
         ("curl", "left_pad", "claw", "0 0 0.05", claw, "revolute"),
     ):
-        parts.append(hinge(name, parent, child, "0 1 0", origin, "" if fixed else inner, "fixed" if fixed else kind))
+        parts.append(
+            hinge(
+                name,
+                parent,
+                child,
+                "0 1 0",
+                origin,
+                "" if fixed else inner,
+                "fixed" if fixed else kind,
+            )
+        )
     return Robot.load(
-        write(folder, f'<robot name="arm">{"".join(parts)}</robot>', "fixed.urdf" if fixed else "arm.urdf")
+        write(
+            folder,
+            f'<robot name="arm">{"".join(parts)}</robot>',
+            "fixed.urdf" if fixed else "arm.urdf",
+        )
     )
 
 
@@ -62,11 +94,15 @@ def constraint_error(robot: Robot, qpos: np.ndarray) -> float:
         (0.5, 0.01, "accurate"),
     ],
 )
-def test_fast_moves_keep_the_coupling_and_settle_as_with_the_gripper_fixed(multiplier, offset, physics, tmp_path):
+def test_fast_moves_keep_the_coupling_and_settle_as_with_the_gripper_fixed(
+    multiplier, offset, physics, tmp_path
+):
     goal = np.array([0.8, -0.9, 0.7, 1.2, -1.0, 0.8, 1.1])
     courses = []
     for robot in (arm(tmp_path, multiplier, offset), arm(tmp_path, fixed=True)):
-        target = goal if robot.coupling.is_identity else np.array([*goal, 0.03, 7.0, -7.0])  # a follower's is not used
+        target = (
+            goal if robot.coupling.is_identity else np.array([*goal, 0.03, 7.0, -7.0])
+        )  # a follower's is not used
         with Runner(
             robot,
             1,
@@ -111,7 +147,9 @@ def test_the_coupled_mass_is_that_of_two_bodies_by_hand(tmp_path):
 
 @pytest.mark.parametrize("physics", ["accurate", pytest.param("fast", marks=pytest.mark.slow)])
 def test_free_motion_is_that_of_the_reduced_equations(physics, tmp_path):
-    """Unforced swing under gravity: the engine against the coupled forward dynamics at a finer step."""
+    """Unforced swing under gravity: the engine against the coupled forward dynamics at a finer
+    step.
+    """
     robot = arm(tmp_path, joints=3)
     dynamics, free, still = robot.dynamics(), robot.independent, np.zeros((1, robot.dof))
     q, v = robot.coupled([[0.3, 0.5, -0.4, 0.02, 0, 0]]), still.copy()
@@ -145,20 +183,34 @@ def add_post(scene, env):
 @pytest.mark.parametrize("physics", [pytest.param("accurate", marks=pytest.mark.slow), "fast"])
 def test_reset_puts_followers_in_place_and_a_blocked_follower_holds_its_leader(physics, tmp_path):
     """The right finger closes on a post; the left one touches nothing."""
-    pad = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.02 0.01 0.06"/></geometry></collision>'
+    pad = (
+        '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.02 0.01'
+        ' 0.06"/></geometry></collision>'
+    )
     slide = '<limit lower="0" upper="0.08" effort="20" velocity="1"/>'
     parts = [
         body("base", 1.0),
         *(body(name, 0.02, "0 0 0.03", pad) for name in ("left_pad", "right_pad")),
         hinge("left", "base", "left_pad", "0 -1 0", "0 0.2 0", slide, "prismatic"),
-        hinge("right", "base", "right_pad", "0 1 0", "0 -0.06 0", f'{slide}<mimic joint="left"/>', "prismatic"),
+        hinge(
+            "right",
+            "base",
+            "right_pad",
+            "0 1 0",
+            "0 -0.06 0",
+            f'{slide}<mimic joint="left"/>',
+            "prismatic",
+        ),
     ]
     gripper = Robot.load(write(tmp_path, f'<robot name="gripper">{"".join(parts)}</robot>'))
-    with Runner(gripper, 1, control="effort", workers=0, physics=physics, ground=False, build=add_post) as runner:
+    with Runner(
+        gripper, 1, control="effort", workers=0, physics=physics, ground=False, build=add_post
+    ) as runner:
         np.testing.assert_array_equal(runner.reset([0.01, 5.0]).qpos[0], np.float32([0.01, 0.01]))
         rollout = runner.rollout(np.tile([10.0, 0.0], (50, 1)))
     assert rollout.ok.all()
-    # Surfaces meet at 0.045; half of 10 N goes through the coupling, whose stiffness is m / (8 dt^2).
+    # Surfaces meet at 0.045; half of 10 N goes through the coupling, whose stiffness is m / (8
+    # dt^2).
     np.testing.assert_allclose(rollout.qpos[-10:, 0], 0.045, atol=2e-3)
     assert np.ptp(rollout.qpos[-10:, 0], axis=0).max() < 1e-4
 
@@ -170,28 +222,51 @@ def test_free_fall_is_that_of_mujocos_equality_constraint(tmp_path):
     spec = mujoco.MjSpec.from_string(robot.urdf)
     for joint in robot.joints:
         if joint.mimic is not None:
-            equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT)
+            equality = spec.add_equality(
+                type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT
+            )
             equality.name1, equality.name2 = joint.name, joint.mimic.joint
-            equality.data[:5], equality.solref = [joint.mimic.offset, joint.mimic.multiplier, 0, 0, 0], [2e-4, 1]
+            equality.data[:5], equality.solref = (
+                [joint.mimic.offset, joint.mimic.multiplier, 0, 0, 0],
+                [2e-4, 1],
+            )
     model = spec.compile()
     model.opt.timestep = 5e-5
-    data, columns = mujoco.MjData(model), [model.joint(name).qposadr[0] for name in robot.joint_names]
+    data, columns = (
+        mujoco.MjData(model),
+        [model.joint(name).qposadr[0] for name in robot.joint_names],
+    )
     start = robot.coupled([0.3, 0.5, -0.4, 0.3, 0.02, 0, 0])
     data.qpos[columns] = start
     with Runner(
-        robot, 1, control="effort", compensate="none", workers=0, ground=False, substeps=80, timestep=1 / 16000
+        robot,
+        1,
+        control="effort",
+        compensate="none",
+        workers=0,
+        ground=False,
+        substeps=80,
+        timestep=1 / 16000,
     ) as runner:
         runner.reset(start)
         qpos = runner.rollout(np.zeros((40, robot.dof))).qpos[-1, 0]
     for _ in range(4000):
         mujoco.mj_step(model, data)
-    np.testing.assert_allclose(qpos[robot.independent], data.qpos[columns][robot.independent], atol=1e-4)
+    np.testing.assert_allclose(
+        qpos[robot.independent], data.qpos[columns][robot.independent], atol=1e-4
+    )
 
 
 def test_actuators_and_guard_act_on_leaders_and_keep_the_coupling(tmp_path):
     robot = arm(tmp_path, multiplier=0.5, offset=0.01, joints=3)
     followers = ~robot.independent
-    options = {"bias": 0.05, "strength": 0.9, "coulomb": 0.1, "armature": 0.05, "command_delay": 0.001}
+    options = {
+        "bias": 0.05,
+        "strength": 0.9,
+        "coulomb": 0.1,
+        "armature": 0.05,
+        "command_delay": 0.001,
+    }
     actuators = bp.make_actuators(robot.dof, **options, position_noise=1e-5)
     target = np.clip(robot.start + 0.3, robot.lower, robot.upper)
     with Runner(robot, 2, workers=0, actuators=actuators, guard=True) as runner:
@@ -202,4 +277,6 @@ def test_actuators_and_guard_act_on_leaders_and_keep_the_coupling(tmp_path):
     assert np.abs(rollout.qpos[-1] - robot.start).max() > 0.05
     assert not rollout.effort[..., followers].any()
     assert constraint_error(robot, rollout.qpos) < 1e-4
-    np.testing.assert_array_equal(rollout.guarded[..., robot.joint_names.index("right")], rollout.guarded[..., 3])
+    np.testing.assert_array_equal(
+        rollout.guarded[..., robot.joint_names.index("right")], rollout.guarded[..., 3]
+    )

@@ -42,7 +42,13 @@ def test_rows_of_no_env(engine, floats):
     robot = Robot.load("quadruped", fixed_base=not floats)
     engine = load_engine(engine)
     spec = SceneSpec(
-        robot.urdf, (), robot.joints, 1e-3, engine.physics["accurate"], fixed_base=not floats, engine=engine.name
+        robot.urdf,
+        (),
+        robot.joints,
+        1e-3,
+        engine.physics["accurate"],
+        fixed_base=not floats,
+        engine=engine.name,
     )
     varied = Variation(payload=np.full(2, 0.3), ground_friction=np.full(2, 0.7))
     pack = engine.make_pack(spec, 2, variation=varied, carrier=robot.links[-1].name)

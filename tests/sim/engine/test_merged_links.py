@@ -1,4 +1,6 @@
-"""Merged links: the same motion as unmerged, with payloads, observed links and disabled pairs by name."""
+"""Merged links: the same motion as unmerged, with payloads, observed links and disabled pairs by
+name.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +12,27 @@ import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Randomization, Robot, Runner, Uniform
 
-BOX = '<collision><origin xyz="0.1 0 0" rpy="0.3 0 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
+BOX = (
+    '<collision><origin xyz="0.1 0 0" rpy="0.3 0 0"/><geometry><box size="0.1 0.2'
+    ' 0.3"/></geometry></collision>'
+)
 CAPSULE = '<collision><geometry><capsule radius="0.05" length="0.2"/></geometry></collision>'
 
 
 def arm(tool: str = INERTIAL) -> str:
     """Return an arm with a camera on a bent bracket, and a tool whose mass ``tool`` gives."""
     return robot(
-        *(link("base"), link("upper", INERTIAL + CAPSULE), link("lower", INERTIAL + CAPSULE), link("bracket", "")),
-        *(link("camera", tool), joint("j1", "base", "upper"), joint("j2", "upper", "lower", origin="0 0 0.5")),
+        *(
+            link("base"),
+            link("upper", INERTIAL + CAPSULE),
+            link("lower", INERTIAL + CAPSULE),
+            link("bracket", ""),
+        ),
+        *(
+            link("camera", tool),
+            joint("j1", "base", "upper"),
+            joint("j2", "upper", "lower", origin="0 0 0.5"),
+        ),
         joint("f1", "lower", "bracket", "fixed", '<origin xyz="0 0 0.3" rpy="0.4 0.5 0.6"/>'),
         joint("f2", "bracket", "camera", "fixed", '<origin xyz="0.2 0 0" rpy="1 0 0"/>'),
     )
@@ -44,7 +58,9 @@ def motion(of: Robot, ticks: int = 30, **options) -> np.ndarray:
 @pytest.mark.parametrize("seed", [0, 3])
 def test_motion_of_random_trees_is_that_of_all_links(seed, physics, tmp_path):
     tree = load(tmp_path, robot(*random_tree(np.random.default_rng(seed), 9)))
-    ours, theirs = (motion(tree, physics=physics, wrenches=links) for links in (None, fixed_links(tree)))
+    ours, theirs = (
+        motion(tree, physics=physics, wrenches=links) for links in (None, fixed_links(tree))
+    )
     assert np.ptp(theirs, axis=0).max() > 0.1
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-4)
 
@@ -88,18 +104,38 @@ PAIRS = [("arm", "side"), ("tip", "side"), ("arm", "back"), ("tip", "back"), ("s
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 @pytest.mark.parametrize("left_out", range(5))
 def test_exactly_the_pairs_that_an_srdf_disables_do_not_touch(left_out, engine, tmp_path):
-    """Of three bodies that overlap, one of two links; each pair of links in turn is left to touch."""
+    """Of three bodies that overlap, one of two links; each pair of links in turn is left to
+    touch.
+    """
     box = INERTIAL + '<collision><geometry><box size="0.4 0.4 0.4"/></geometry></collision>'
-    weld = '<joint name="weld" type="fixed"><parent link="arm"/><child link="tip"/><origin xyz="0 0 0.1"/></joint>'
-    parts = [link("base", INERTIAL), link("arm", box), link("tip", box), weld, link("side", box), link("back", box)]
+    weld = (
+        '<joint name="weld" type="fixed"><parent link="arm"/><child link="tip"/><origin xyz="0 0'
+        ' 0.1"/></joint>'
+    )
+    parts = [
+        link("base", INERTIAL),
+        link("arm", box),
+        link("tip", box),
+        weld,
+        link("side", box),
+        link("back", box),
+    ]
     places = {"arm": "0 0 1", "side": "0 0 1", "back": "0.1 0 1.1"}
     parts += [joint(child, "base", child, origin=origin) for child, origin in places.items()]
     pairs = [pair for pair in PAIRS if pair != PAIRS[left_out]]
-    text = "".join(f'<disable_collisions link1="{one}" link2="{two}" reason="Default"/>' for one, two in pairs)
+    text = "".join(
+        f'<disable_collisions link1="{one}" link2="{two}" reason="Default"/>' for one, two in pairs
+    )
     write(tmp_path, f'<robot name="r">{text}</robot>', "test.srdf")
     loaded = Robot.load(write(tmp_path, robot(*parts)), self_collision="urdf")
     names = ["arm", "side", "back"]
-    options = {"control": "effort", "ground": False, "workers": 0, "engine": engine, "contacts": names}
+    options = {
+        "control": "effort",
+        "ground": False,
+        "workers": 0,
+        "engine": engine,
+        "contacts": names,
+    }
     with Runner(loaded, 1, **options) as runner:
         touching = runner.step(np.zeros(3), substeps=1).touching[0]
     expected = {"arm" if name == "tip" else name for name in PAIRS[left_out]}

@@ -42,16 +42,23 @@ def test_the_loaded_model_has_the_dynamics_of_the_robot(name):
         matrix = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, matrix)
         np.testing.assert_allclose(
-            matrix[np.ix_(columns, columns)], oracle.mass_matrix(qpos[None])[0], rtol=1e-10, atol=1e-12
+            matrix[np.ix_(columns, columns)],
+            oracle.mass_matrix(qpos[None])[0],
+            rtol=1e-10,
+            atol=1e-12,
         )
         bias = oracle.inverse_dynamics(qpos[None], qvel[None], 0 * qpos[None])[0]
         np.testing.assert_allclose(data.qfrc_bias[columns], bias, rtol=1e-9, atol=1e-10)
     for each in loaded.joints:
         held = model.joint(each.name)
         assert (held.damping[0], held.frictionloss[0]) == (each.damping, each.friction)
-        assert bool(held.limited[0]) == (not each.continuous and np.isfinite([each.lower, each.upper]).any())
+        assert bool(held.limited[0]) == (
+            not each.continuous and np.isfinite([each.lower, each.upper]).any()
+        )
         if held.limited[0]:
-            np.testing.assert_allclose(held.range, np.clip([each.lower, each.upper], -1e10, 1e10), rtol=1e-12)
+            np.testing.assert_allclose(
+                held.range, np.clip([each.lower, each.upper], -1e10, 1e10), rtol=1e-12
+            )
 
 
 def test_the_actuators_compute_the_law_with_limits_and_feedforward():
@@ -71,7 +78,11 @@ def test_the_actuators_compute_the_law_with_limits_and_feedforward():
         rate, feedforward = np.cos(0.03 * step) * np.ones(9), 0.5 * np.sin(0.02 * step) * np.ones(9)
         data.ctrl[:] = np.stack([wanted, rate, feedforward], axis=1).ravel()
         q, v = data.qpos[None].copy(), data.qvel[None].copy()
-        rates = {"measurement_rate": v, "setpoint_rate": rate[None], "feedforward": feedforward[None]}
+        rates = {
+            "measurement_rate": v,
+            "setpoint_rate": rate[None],
+            "feedforward": feedforward[None],
+        }
         state, effort = bp.step(params, state, wanted[None], q, DT, **rates)
         mujoco.mj_step(model, data)
         np.testing.assert_allclose(data.qfrc_actuator, effort[0], rtol=0, atol=1e-9)
@@ -89,7 +100,13 @@ def test_the_file_moves_as_the_runner_does(effects):
     model = model_of(exported)
     data, goal = mujoco.MjData(model), 0.5 * (loaded.start + loaded.settings.target)
     mujoco.mj_resetDataKeyframe(model, data, 0)
-    options = {"workers": 0, "timestep": DT, "substeps": 1, "engine": "mujoco", "compensate": "gravity+coriolis"}
+    options = {
+        "workers": 0,
+        "timestep": DT,
+        "substeps": 1,
+        "engine": "mujoco",
+        "compensate": "gravity+coriolis",
+    }
     with Runner(loaded, 1, params=params, actuators=motors, **options) as runner:
         runner.reset()
         for _ in range(200):
@@ -110,8 +127,12 @@ def test_motors_friction_and_followers_are_written(tmp_path):
         joint("b", "y", "z", inner=mimic),
     ]
     loaded = Robot.load(write(tmp_path, robot(*parts)))
-    motors = bp.make_actuators(2, armature=0.02, coulomb=0.5, viscous=0.1, effort_limit=6.0, lag=0.001)
-    exported = to_mjcf(loaded, plain(loaded, effort_limit=10.0, anti_windup="conditional"), DT, actuators=motors)
+    motors = bp.make_actuators(
+        2, armature=0.02, coulomb=0.5, viscous=0.1, effort_limit=6.0, lag=0.001
+    )
+    exported = to_mjcf(
+        loaded, plain(loaded, effort_limit=10.0, anti_windup="conditional"), DT, actuators=motors
+    )
     listed = [each.partition(":")[0] for each in exported.differences]
     assert listed == ["anti_windup", "lag", "friction", "followers"]
     model = model_of(exported)
@@ -131,7 +152,9 @@ def test_motors_friction_and_followers_are_written(tmp_path):
 
 def test_an_inertia_of_no_body_is_replaced_and_listed(tmp_path):
     impossible = INERTIAL.replace('izz="0.1"', 'izz="0.3"')
-    loaded = Robot.load(write(tmp_path, robot(link("x"), link("y", impossible), joint("a", "x", "y"))))
+    loaded = Robot.load(
+        write(tmp_path, robot(link("x"), link("y", impossible), joint("a", "x", "y")))
+    )
     exported = to_mjcf(loaded, plain(loaded), DT)
     (said,) = exported.differences
     assert said.startswith("inertia: of the body that is nearest to link 'y'")
@@ -141,14 +164,21 @@ def test_an_inertia_of_no_body_is_replaced_and_listed(tmp_path):
 
 def test_bad_requests_are_refused():
     loaded = Robot.load("panda")
-    for params in (plain(loaded).replace(gain_units="mass_matrix"), plain(loaded, effort_min=1.0, effort_max=1.0)):
+    for params in (
+        plain(loaded).replace(gain_units="mass_matrix"),
+        plain(loaded, effort_min=1.0, effort_max=1.0),
+    ):
         with pytest.raises(InvalidArgumentError):
             to_mjcf(loaded, params, DT)
 
 
 def test_the_motors_alone_deliver_what_the_actuators_do():
     loaded = Robot.load("panda")
-    effects = {"strength": np.linspace(0.8, 1.1, 9), "bias": np.linspace(-0.5, 0.5, 9), "armature": 0.05}
+    effects = {
+        "strength": np.linspace(0.8, 1.1, 9),
+        "bias": np.linspace(-0.5, 0.5, 9),
+        "armature": 0.05,
+    }
     motors = bp.make_actuators(9, **effects, command_delay=np.linspace(0, 0.0041, 9), coulomb=0.1)
     for own in (motors.replace(effort_limit=3.0), motors.replace(lag=0.003)):
         exported = to_mjcf(loaded, None, DT, actuators=own)
@@ -158,7 +188,9 @@ def test_the_motors_alone_deliver_what_the_actuators_do():
         data, state, limited = mujoco.MjData(model), motor_model.init(own, np.zeros((1, 9)), DT), 0
         for step in range(240):
             asked = 4 * np.sin(0.05 * step + np.arange(9))
-            state, effort = motor_model.deliver(own, state, asked[None], data.qpos[None], data.qvel[None], DT)
+            state, effort = motor_model.deliver(
+                own, state, asked[None], data.qpos[None], data.qvel[None], DT
+            )
             data.ctrl[:] = asked
             mujoco.mj_step(model, data)
             if step > 150:  # before, delays and lags remember other efforts
@@ -176,14 +208,19 @@ EFFECTS = {"pid": {}, "line": LINE, "both": LINE | {"lag": 0.004}, "lag": {"lag"
 def arm_motion(step, joints=9):
     """Return inputs that move the arm, saturate its motors and wind its integral."""
     phase = np.arange(joints)
-    wanted, rate = 0.5 * np.sign(np.sin(0.02 * step + phase)) + 0.4 * np.sin(0.05 * step), np.cos(0.03 * step + phase)
+    wanted, rate = (
+        0.5 * np.sign(np.sin(0.02 * step + phase)) + 0.4 * np.sin(0.05 * step),
+        np.cos(0.03 * step + phase),
+    )
     return wanted, rate, 0.5 * np.sin(0.02 * step) * np.ones(joints)
 
 
 @pytest.mark.parametrize(
     ("guarded", "effects"),
     [
-        pytest.param(guarded, EFFECTS[name], id=f"{guarded}-{name}", marks=() if quick else pytest.mark.slow)
+        pytest.param(
+            guarded, EFFECTS[name], id=f"{guarded}-{name}", marks=() if quick else pytest.mark.slow
+        )
         for guarded, names in ((False, ("pid", "both")), (True, ("line", "lag")))
         for name, quick in ((each, each in names) for each in EFFECTS)
     ],
@@ -217,7 +254,11 @@ def test_the_actuators_compute_the_law_the_guard_and_the_motors(effects, guarded
         if guard is not None:
             guard_state, _ = guard_model.advance(guard, guard_state, setpoint, DT)
             setpoint = guard_state.setpoint
-        rates = {"measurement_rate": v, "setpoint_rate": rate[None], "feedforward": feedforward[None]}
+        rates = {
+            "measurement_rate": v,
+            "setpoint_rate": rate[None],
+            "feedforward": feedforward[None],
+        }
         state, asked = bp.step(params, state, setpoint, q, DT, **rates)
         effort = asked
         if motors is not None:
@@ -233,7 +274,9 @@ def test_the_actuators_compute_the_law_the_guard_and_the_motors(effects, guarded
 
 
 def test_limits_of_the_effort_act_beside_a_line():
-    """One-sided limits are the joint's own; where the law's are narrower than the motor's, overspeed is listed."""
+    """One-sided limits are the joint's own; where the law's are narrower than the motor's,
+    overspeed is listed.
+    """
     loaded = Robot.load("panda")
     motors = bp.make_actuators(9, effort_limit=4.0, **LINE)
     even = to_mjcf(loaded, plain(loaded, effort_limit=4.0), DT, actuators=motors)
@@ -252,7 +295,11 @@ def test_limits_of_the_effort_act_beside_a_line():
         wanted, rate, feedforward = arm_motion(step)
         data.ctrl[:] = np.stack([wanted, rate, feedforward], axis=1).ravel()
         q, v = data.qpos[None].copy(), data.qvel[None].copy()
-        rates = {"measurement_rate": v, "setpoint_rate": rate[None], "feedforward": feedforward[None]}
+        rates = {
+            "measurement_rate": v,
+            "setpoint_rate": rate[None],
+            "feedforward": feedforward[None],
+        }
         law, asked = bp.step(params, law, wanted[None], q, DT, **rates)
         state, effort = motor_model.deliver(motors, state, asked, q, v, DT)
         mujoco.mj_step(model, data)
@@ -265,7 +312,9 @@ def test_limits_of_the_effort_act_beside_a_line():
 def test_the_motors_alone_have_their_line_and_strength():
     loaded = Robot.load("panda")
     effects = {"strength": np.linspace(0.7, 1.2, 9), "command_delay": 0.0015, "effort_limit": 5.0}
-    motors = bp.make_actuators(9, saturation_effort=np.r_[np.linspace(4, 9, 8), np.inf], no_load_speed=2.0, **effects)
+    motors = bp.make_actuators(
+        9, saturation_effort=np.r_[np.linspace(4, 9, 8), np.inf], no_load_speed=2.0, **effects
+    )
     exported = to_mjcf(loaded, None, DT, actuators=motors)
     assert exported.differences == ()
     model = model_of(exported)
@@ -280,7 +329,9 @@ def test_the_motors_alone_have_their_line_and_strength():
         np.testing.assert_allclose(data.qfrc_actuator, effort[0], rtol=0, atol=1e-9)
         clipped += (np.abs(effort[0]) < 4.99).sum()
     assert 500 < clipped < 2700
-    lost = to_mjcf(loaded, None, DT, actuators=motors.replace(bias=0.5, strength=np.r_[0.0, np.ones(8)])).differences
+    lost = to_mjcf(
+        loaded, None, DT, actuators=motors.replace(bias=0.5, strength=np.r_[0.0, np.ones(8)])
+    ).differences
     assert [each.partition(":")[0] for each in lost] == ["bias", "saturation_effort"]
 
 
@@ -297,7 +348,9 @@ def test_a_guard_is_written_or_listed():
     accelerated = guard._replace(acceleration=np.full((1, 9), 2.0))
     (said,) = to_mjcf(loaded, params, DT, guard=accelerated).differences
     assert said.startswith("guard: the acceleration of the setpoint is not limited: panda_joint1, ")
-    (said,) = to_mjcf(loaded, params, DT, guard=guard, actuators=bp.make_actuators(9, lag=0.01)).differences
+    (said,) = to_mjcf(
+        loaded, params, DT, guard=guard, actuators=bp.make_actuators(9, lag=0.01)
+    ).differences
     assert said.startswith("guard: a dcmotor has no limits of the position alone: panda_joint1, ")
     with pytest.raises(InvalidArgumentError, match="guard"):
         to_mjcf(loaded, None, DT, guard=guard)
@@ -308,9 +361,14 @@ def test_a_locked_joint_may_be_guarded(tmp_path):
     locked = LIMIT.replace('lower="-1"', 'lower="1"')
     assert 'lower="1" upper="1"' in locked
     loaded = Robot.load(
-        write(tmp_path, robot(link("x", INERTIAL), link("y", INERTIAL), joint("a", "x", "y", inner=locked)))
+        write(
+            tmp_path,
+            robot(link("x", INERTIAL), link("y", INERTIAL), joint("a", "x", "y", inner=locked)),
+        )
     )
-    low, high = model_of(to_mjcf(loaded, plain(loaded), DT, guard=loaded.guard())).actuator_ctrlrange[0]
+    low, high = model_of(
+        to_mjcf(loaded, plain(loaded), DT, guard=loaded.guard())
+    ).actuator_ctrlrange[0]
     assert low == 1.0
     assert high == np.nextafter(1.0, 2.0)
 
@@ -323,33 +381,53 @@ def test_a_robot_read_from_its_file_is_written_with_the_same_actuators(tmp_path)
         "effort_limit": np.linspace(3, 9, 9),
     }
     params = bp.make_params(9, np.linspace(5, 80, 9), kd=2.0, measurement_rate="measured", **gains)
-    line = {"saturation_effort": np.r_[4.0, 8.0, [np.inf] * 7], "no_load_speed": np.r_[2.0, 3.0, [np.inf] * 7]}
+    line = {
+        "saturation_effort": np.r_[4.0, 8.0, [np.inf] * 7],
+        "no_load_speed": np.r_[2.0, 3.0, [np.inf] * 7],
+    }
     motors = bp.make_actuators(9, lag=np.r_[0, 0.007, 0.007, [0] * 6], armature=0.1, **line)
     exported = to_mjcf(loaded, params, DT, actuators=motors, guard=loaded.guard())
     (path := tmp_path / "arm.xml").write_text(exported.text)
     other = Robot.load(path)
     assert [each.code for each in other.repairs] == ["collision"]  # its floor
     again = to_mjcf(other, other.mjcf_gains(), DT, actuators=other.actuators, guard=other.guard())
-    actuators = [text[text.index("<actuator>") : text.index("</actuator>")] for text in (exported.text, again.text)]
+    actuators = [
+        text[text.index("<actuator>") : text.index("</actuator>")]
+        for text in (exported.text, again.text)
+    ]
     assert actuators[0].count("<dcmotor") == 3
     assert actuators[0] == actuators[1]
 
 
 LINKS = [link(name, INERTIAL) for name in "wxyz"]
-CHAIN = [*LINKS, *(joint(name, *ends) for name, ends in zip(JOINTS, ("wx", "xy", "yz"), strict=True))]
+CHAIN = [
+    *LINKS,
+    *(joint(name, *ends) for name, ends in zip(JOINTS, ("wx", "xy", "yz"), strict=True)),
+]
 
 
 @given(random_params(), st.integers(0, 2**32 - 1))
 @settings(max_examples=20, deadline=None)
 def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
     params = params.replace(kp=params.kp + 1.0)  # a file without any stiffness has no servos
-    folder, inertia, rng = tmp_path_factory.mktemp("chain"), np.array([2.0, 1.0, 0.5]), np.random.default_rng(seed)
+    folder, inertia, rng = (
+        tmp_path_factory.mktemp("chain"),
+        np.array([2.0, 1.0, 0.5]),
+        np.random.default_rng(seed),
+    )
     chain = Robot.load(write(folder, robot(*CHAIN)))
-    motors = {"armature": rng.uniform(0.01, 1, 3), "coulomb": rng.uniform(0, 1, 3), "viscous": rng.uniform(0, 1, 3)}
+    motors = {
+        "armature": rng.uniform(0.01, 1, 3),
+        "coulomb": rng.uniform(0, 1, 3),
+        "viscous": rng.uniform(0, 1, 3),
+    }
     has_line, has_lag, has_rate = rng.random((3, 3)) < 0.4
     line = {"saturation_effort": rng.uniform(1, 99, 3), "no_load_speed": rng.uniform(0.1, 9, 3)}
     line = {name: np.where(has_line, value, np.inf) for name, value in line.items()}
-    lag, rate = np.where(has_lag, rng.uniform(1e-4, 0.1, 3), 0.0), np.where(has_rate, rng.uniform(0.1, 9, 3), np.inf)
+    lag, rate = (
+        np.where(has_lag, rng.uniform(1e-4, 0.1, 3), 0.0),
+        np.where(has_rate, rng.uniform(0.1, 9, 3), np.inf),
+    )
     dc, guard = has_line | has_lag, bp.make_guard(3, rate=rate)
     assert list(chain.joint_names) == JOINTS
     own = bp.make_actuators(3, **motors, **line, lag=lag)
@@ -357,8 +435,13 @@ def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
     (folder / "chain.xml").write_text(exported.text)
     other = Robot.load(folder / "chain.xml")
     back, listed = other.mjcf_gains(), {each.partition(":")[0] for each in exported.differences}
-    scale, tolerance = 1.0 if params.gain_units is None else inertia, 1e-12 if params.dtype == np.float64 else 1e-6
-    limit = scale * np.minimum(-np.array(values(params, "integral_min")), values(params, "integral_max"))
+    scale, tolerance = (
+        1.0 if params.gain_units is None else inertia,
+        1e-12 if params.dtype == np.float64 else 1e-6,
+    )
+    limit = scale * np.minimum(
+        -np.array(values(params, "integral_min")), values(params, "integral_max")
+    )
     kept = (np.array(values(params, "ki")) > 0) & (limit > 0)
     for name in ("kp", "ki", "kd"):
         wanted = np.array(values(params, name)) * scale
@@ -366,7 +449,9 @@ def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
             assert ((limit > 0) | (wanted == 0)).all() or "integral_limit" in listed
             wanted = np.where(limit > 0, wanted, 0.0)
         np.testing.assert_allclose(values(back, name), wanted, rtol=tolerance)
-    np.testing.assert_allclose(np.array(values(back, "integral_max"))[kept], limit[kept], rtol=tolerance)
+    np.testing.assert_allclose(
+        np.array(values(back, "integral_max"))[kept], limit[kept], rtol=tolerance
+    )
     uneven = -np.array(values(params, "integral_min")) != values(params, "integral_max")
     assert not (np.isfinite(limit) & (~dc | uneven) & kept).any() or "integral_limit" in listed
     model = model_of(exported)
@@ -376,12 +461,27 @@ def test_a_round_trip_loses_only_what_is_listed(tmp_path_factory, params, seed):
     np.testing.assert_allclose([joint.velocity_limit for joint in other.joints], rate, rtol=1e-12)
     for name, was in (line | {"lag": lag}).items():
         leaf = getattr(other.actuators, name)
-        np.testing.assert_allclose((0.0 if name == "lag" else np.inf) if leaf is None else leaf[0], was, rtol=1e-12)
-    found = {"armature": other.actuators.armature[0], "coulomb": other.friction, "viscous": other.damping}
+        np.testing.assert_allclose(
+            (0.0 if name == "lag" else np.inf) if leaf is None else leaf[0], was, rtol=1e-12
+        )
+    found = {
+        "armature": other.actuators.armature[0],
+        "coulomb": other.friction,
+        "viscous": other.damping,
+    }
     for name, was in motors.items():
         np.testing.assert_allclose(found[name], was, rtol=1e-12)
-    lost = {"effort_rate_limit", "setpoint_weight", "deadband", "continuous", "non_finite", "gain_units"}
-    lost |= {"setpoint_weight_derivative", "derivative_filter_time"} if params.kd is not None else set()
+    lost = {
+        "effort_rate_limit",
+        "setpoint_weight",
+        "deadband",
+        "continuous",
+        "non_finite",
+        "gain_units",
+    }
+    lost |= (
+        {"setpoint_weight_derivative", "derivative_filter_time"} if params.kd is not None else set()
+    )
     assert {name for name in lost if getattr(params, name) is not None} == listed & lost
 
 

@@ -1,4 +1,6 @@
-"""Scenes of MJCF files in MuJoCo: all that a file holds moves as the file says, and belongs to the state of an env."""
+"""Scenes of MJCF files in MuJoCo: all that a file holds moves as the file says, and belongs to the
+state of an env.
+"""
 
 import dataclasses
 from itertools import pairwise
@@ -17,9 +19,14 @@ from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation  # noqa: E402
 from batchpid.sim.randomization.fields import nominal_values  # noqa: E402
 
-pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::batchpid.sim.StabilityWarning", "ignore:.*setpoint.*limits"
+)
 
-OPTION = '<option timestep="0.0005" cone="elliptic" iterations="100" tolerance="1e-8"/><compiler angle="radian"/>'
+OPTION = (
+    '<option timestep="0.0005" cone="elliptic" iterations="100" tolerance="1e-8"/><compiler'
+    ' angle="radian"/>'
+)
 BAR = '<geom type="capsule" fromto="0 0 0 {}" size=".01" contype="0" conaffinity="0"/>'
 FOUR_BAR = f"""
 <mujoco model="four_bar">{OPTION}
@@ -101,7 +108,9 @@ def efforts(robot, ticks, scale=0.3):
 
 
 def in_mujoco(robot, model, rows, substeps):
-    """Return the poses of all bodies (ticks, bodies, 7) in MuJoCo's own steps of a model, from its start."""
+    """Return the poses of all bodies (ticks, bodies, 7) in MuJoCo's own steps of a model, from its
+    start.
+    """
     data, poses = mujoco.MjData(model), []
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -116,7 +125,9 @@ def in_mujoco(robot, model, rows, substeps):
 
 
 def run(runner, rows):
-    """Return the poses of the file's bodies (ticks, envs, bodies, 7) under setpoints (ticks, dof)."""
+    """Return the poses of the file's bodies (ticks, envs, bodies, 7) under setpoints (ticks,
+    dof).
+    """
     poses = []
     for row in rows:
         runner.step(row)
@@ -128,11 +139,15 @@ def run(runner, rows):
 def test_moves_as_the_file_says(load, name):
     robot = load(TEXTS[name], self_collision="urdf")
     rows, model = efforts(robot, 40), mujoco.MjModel.from_xml_string(TEXTS[name])
-    with Runner(robot, 2, workers=0, engine="mujoco", control="effort", compensate="none", substeps=10) as runner:
+    with Runner(
+        robot, 2, workers=0, engine="mujoco", control="effort", compensate="none", substeps=10
+    ) as runner:
         ours = run(runner, rows)
     theirs = in_mujoco(robot, model, rows, 10)
     assert np.ptp(theirs, axis=0).max() > 0.03
-    np.testing.assert_allclose(ours, np.broadcast_to(theirs[:, None], ours.shape), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        ours, np.broadcast_to(theirs[:, None], ours.shape), rtol=0, atol=1e-10
+    )
 
 
 @pytest.mark.parametrize("control", ["pid", "drive"])
@@ -144,7 +159,9 @@ def test_the_law_drives_the_joints_and_the_arm_pushes_the_cube(load, control):
         for _ in range(200):
             obs = runner.step([0.5, 0.1, 0.0])
         after = runner.bodies(["cube"])
-    assert np.abs(obs.qpos - [0.5, 0.1, 0.0]).max() < (0.05 if control == "pid" else 0.1)  # a drive has no integral
+    assert np.abs(obs.qpos - [0.5, 0.1, 0.0]).max() < (
+        0.05 if control == "pid" else 0.1
+    )  # a drive has no integral
     assert np.linalg.norm((after - before)[0, 0, :2]) > 0.01
 
 
@@ -232,7 +249,9 @@ def test_a_closed_loop_has_no_tree(load):
         assert runner.params.gain_units is None
         for _ in range(50):
             obs = runner.step(np.zeros(3))
-        poses = dict(zip(("coupler", "rocker"), runner.bodies(["coupler", "rocker"])[0], strict=True))
+        poses = dict(
+            zip(("coupler", "rocker"), runner.bodies(["coupler", "rocker"])[0], strict=True)
+        )
     assert obs.ok.all()
     ends = []
     for name, end in (("coupler", [0.3, 0, 0.1]), ("rocker", [0.0, 0, 0.2])):
@@ -246,7 +265,10 @@ def test_what_a_scene_does_not_have_is_refused(load):
     robot = load(ARM)
     with pytest.raises(InvalidArgumentError, match=r"collisions.*cube, chest"):
         Runner(robot, 1, workers=0, engine="mujoco", collisions=False)
-    with Runner(robot, 1, workers=0, engine="mujoco") as runner, pytest.raises(InvalidArgumentError, match="'ball'"):
+    with (
+        Runner(robot, 1, workers=0, engine="mujoco") as runner,
+        pytest.raises(InvalidArgumentError, match="'ball'"),
+    ):
         runner.bodies(["ball"])
     with (
         Runner(load(GRIPPER), 1, workers=0, engine="sapien") as runner,
@@ -269,9 +291,12 @@ def test_what_a_scene_does_not_have_is_refused(load):
 
 @pytest.mark.parametrize("wrenches", [None, ["tip"]])
 def test_masses_and_damping_vary(load, wrenches):
-    """A randomized robot moves as the file with other numbers, also where several bodies are one link."""
+    """A randomized robot moves as the file with other numbers, also where several bodies are one
+    link.
+    """
     tip = (
-        '<body name="tip" pos=".2 0 0" quat=".9 .1 .3 0"><inertial pos=".01 0 .02" mass="{}" diaginertia="{}"/></body>'
+        '<body name="tip" pos=".2 0 0" quat=".9 .1 .3 0"><inertial pos=".01 0 .02" mass="{}"'
+        ' diaginertia="{}"/></body>'
     )
     arm = ARM.replace(f"{LINK}</body>", f"{LINK}{{}}</body>")
     robot = load(arm.format(tip.format(0.2, "1e-4 2e-4 2.5e-4")))
@@ -279,12 +304,16 @@ def test_masses_and_damping_vary(load, wrenches):
     model = mujoco.MjModel.from_xml_string(heavy.replace('damping=".2"', 'damping=".4"'))
     twice = Uniform(2.0, 2.0, operation="scale")
     varied = Randomization(link_mass={"tip": twice}, damping=twice)
-    rows = efforts(robot, 15)  # without contacts, whose softness in MuJoCo depends on how mass is divided among bodies
+    rows = efforts(
+        robot, 15
+    )  # without contacts, whose softness in MuJoCo depends on how mass is divided among bodies
     options = {"control": "effort", "compensate": "none", "substeps": 10, "randomization": varied}
     with Runner(robot, 2, workers=0, engine="mujoco", wrenches=wrenches, **options) as runner:
         ours = run(runner, rows)
     theirs = in_mujoco(robot, model, rows, 10)
-    np.testing.assert_allclose(ours, np.broadcast_to(theirs[:, None], ours.shape), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        ours, np.broadcast_to(theirs[:, None], ours.shape), rtol=0, atol=1e-8
+    )
 
 
 WALKER = """
@@ -296,13 +325,24 @@ WALKER = """
 
 
 def test_a_floating_base_behind_an_object(load):
-    """Pose and twist of a base are those of its link, wherever MuJoCo has them, and in both engines the same."""
+    """Pose and twist of a base are those of its link, wherever MuJoCo has them, and in both engines
+    the same.
+    """
     robot = load(WALKER, fixed_base=False)
     pose, twist = [0.1, 0.2, 3.0, 0.8, 0.0, 0.6, 0.0], [0.3, 0.1, 0.2, 1.0, 2.0, 3.0]
     seen = []
-    cases = ("mujoco", "none"), ("sapien", "none"), ("mujoco", "gravity+coriolis"), ("rebuilt", "gravity+coriolis")
+    cases = (
+        ("mujoco", "none"),
+        ("sapien", "none"),
+        ("mujoco", "gravity+coriolis"),
+        ("rebuilt", "gravity+coriolis"),
+    )
     for engine, compensate in cases:
-        options = {"engine": "sapien" if engine == "sapien" else "mujoco", "compensate": compensate, "ground": False}
+        options = {
+            "engine": "sapien" if engine == "sapien" else "mujoco",
+            "compensate": compensate,
+            "ground": False,
+        }
         shown = dataclasses.replace(robot, mjcf=None) if engine == "rebuilt" else robot
         with Runner(shown, 1, workers=0, control="effort", **options) as runner:
             obs = runner.reset(base_pose=pose, base_twist=twist)
@@ -322,11 +362,15 @@ def test_gains_of_the_law_are_those_of_the_user(load):
     """The file's own servos do nothing."""
     servo = ARM.replace('<motor joint="turn"/>', '<position joint="turn" kp="1000"/>')
     robot, poses = load(servo), []
-    with Runner(robot, 1, workers=0, engine="mujoco", params=robot.params(kp=0.0), compensate="none") as runner:
+    with Runner(
+        robot, 1, workers=0, engine="mujoco", params=robot.params(kp=0.0), compensate="none"
+    ) as runner:
         for _ in range(5):
             runner.step([1.0, 0.2, 0.2])
         poses.append(runner.bodies(["upper"]))
-    with Runner(load(ARM), 1, workers=0, engine="mujoco", control="effort", compensate="none") as runner:
+    with Runner(
+        load(ARM), 1, workers=0, engine="mujoco", control="effort", compensate="none"
+    ) as runner:
         for _ in range(5):
             runner.step(np.zeros(3))
         poses.append(runner.bodies(["upper"]))
@@ -334,13 +378,23 @@ def test_gains_of_the_law_are_those_of_the_user(load):
 
 
 def test_the_planes_of_the_file_are_the_ground(load):
-    """A floor below an arm that reaches under height 0 stays, and the runner's ground stands in for a missing one."""
+    """A floor below an arm that reaches under height 0 stays, and the runner's ground stands in for
+    a missing one.
+    """
     low = ARM.replace('type="plane"', 'type="plane" pos="0 0 -.5"').replace(
         '<body name="post">', '<body name="post" pos="0 0 -.2">'
     )
     heights = {}
-    for name, text, options in (("file", low, {}), ("off", low, {"ground": False}), ("ours", ARM, {})):
-        text = text if name != "ours" else text.replace('<geom name="floor" type="plane" size="1 1 .1"/>', "")
+    for name, text, options in (
+        ("file", low, {}),
+        ("off", low, {"ground": False}),
+        ("ours", ARM, {}),
+    ):
+        text = (
+            text
+            if name != "ours"
+            else text.replace('<geom name="floor" type="plane" size="1 1 .1"/>', "")
+        )
         with Runner(load(text), 1, workers=0, engine="mujoco", **options) as runner:
             for _ in range(100):
                 runner.step(runner.robot.start)
@@ -360,22 +414,44 @@ def test_an_error_of_mujoco_closes_the_runner(load):
 
 def random_file(rng):
     """Return an MJCF text of an arm with up to three joints a body that falls onto its floor."""
-    flag = rng.choice(["", '<flag contact="disable"/>', '<flag override="enable"/>', '<flag filterparent="disable"/>'])
-    option = OPTION.replace("/>", f' o_margin=".05" o_solref=".02 1" o_solimp=".9 .95 .001 .5 2">{flag}</option>', 1)
+    flag = rng.choice(
+        [
+            "",
+            '<flag contact="disable"/>',
+            '<flag override="enable"/>',
+            '<flag filterparent="disable"/>',
+        ]
+    )
+    option = OPTION.replace(
+        "/>", f' o_margin=".05" o_solref=".02 1" o_solimp=".9 .95 .001 .5 2">{flag}</option>', 1
+    )
     margin = rng.choice(["", 'margin=".03" gap=".01"'], p=[0.8, 0.2])
     bodies, count = "", 0
     for number in range(3):
         joints = ""
         for _ in range(rng.integers(number == 0, 4)):
             axis, slides = " ".join(map(str, rng.normal(size=3).round(2))), rng.random() < 0.4
-            kind = 'type="slide" range="-.1 .1"' if slides else f'type="hinge" pos="{rng.choice([0, -0.2])} 0 0"'
+            kind = (
+                'type="slide" range="-.1 .1"'
+                if slides
+                else f'type="hinge" pos="{rng.choice([0, -0.2])} 0 0"'
+            )
             ref = rng.choice([0, 0.3, 2])
-            joints += f'<joint name="j{count}" {kind} axis="{axis}" ref="{ref}" damping="{20 if slides else 0.02}"/>'
+            joints += (
+                f'<joint name="j{count}" {kind} axis="{axis}" ref="{ref}"'
+                f' damping="{20 if slides else 0.02}"/>'
+            )
             count += 1
         place = "0 0 .3" if number == 0 else ".25 0 0"
-        bodies += f'<body pos="{place}">{joints}<geom type="capsule" size=".04" fromto="0 0 0 .2 0 0" {margin}/>'
+        bodies += (
+            f'<body pos="{place}">{joints}<geom type="capsule" size=".04" fromto="0 0 0 .2 0 0"'
+            f" {margin}/>"
+        )
     world = f"<worldbody><geom type='plane' size='1 1 1'/>{bodies}{3 * '</body>'}</worldbody>"
-    return f"<mujoco>{option}{world}<keyframe><key name='home' qpos='{count * '0 '}'/></keyframe></mujoco>"
+    return (
+        f"<mujoco>{option}{world}<keyframe><key name='home'"
+        f" qpos='{count * '0 '}'/></keyframe></mujoco>"
+    )
 
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.MissedContactWarning")
@@ -389,7 +465,12 @@ def test_random_files_in_contact_move_as_in_mujoco(load, monkeypatch, seed):
     rows, seen = np.zeros((80, robot.dof)), []
     for native in (1, 0):
         monkeypatch.setenv("BATCHPID_NATIVE", str(native))
-        options = {"control": "effort", "compensate": "none", "substeps": 20, "collisions": collides}
+        options = {
+            "control": "effort",
+            "compensate": "none",
+            "substeps": 20,
+            "collisions": collides,
+        }
         with Runner(robot, 1, workers=0, engine="mujoco", **options) as runner:
             seen.append(run(runner, rows)[:, 0])
     np.testing.assert_array_equal(*seen)
@@ -397,14 +478,23 @@ def test_random_files_in_contact_move_as_in_mujoco(load, monkeypatch, seed):
 
 
 def test_a_snapshot_holds_the_integration_state(load):
-    """Also what a keyframe places, and what a run may change: mocap bodies, equality constraints, user data."""
+    """Also what a keyframe places, and what a run may change: mocap bodies, equality constraints,
+    user data.
+    """
     robot = load(
-        ARM.replace("<worldbody>", '<size nuserdata="2"/><worldbody><body name="target" mocap="true"/>')
+        ARM.replace(
+            "<worldbody>", '<size nuserdata="2"/><worldbody><body name="target" mocap="true"/>'
+        )
         .replace('<key name="home"', '<key name="home" mpos=".3 0 .35"')
-        .replace("<actuator>", '<equality><weld body1="cube" body2="lid" active="false"/></equality><actuator>')
+        .replace(
+            "<actuator>",
+            '<equality><weld body1="cube" body2="lid" active="false"/></equality><actuator>',
+        )
     )
     whole, kept = int(mujoco.mjtState.mjSTATE_INTEGRATION), []
-    spec = SceneSpec(robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf)
+    spec = SceneSpec(
+        robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf
+    )
     packs = [ENGINE.make_pack(spec, 2) for _ in range(2)]
     rng = np.random.default_rng(0)
     for data in packs[0]._data:
@@ -423,18 +513,26 @@ def test_a_snapshot_holds_the_integration_state(load):
 
 BLOCK = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 OPENED = {
-    "scene.xml": """<mujoco><compiler meshdir="parts"/><asset><mesh name="block" file="block.obj"/>
+    "scene.xml": (
+        """<mujoco><compiler meshdir="parts"/><asset><mesh name="block" file="block.obj"/>
       <hfield name="hills" file="hills.bin" size="1 1 .1 .1"/><model name="other" file="other.xml"/></asset>
       <worldbody><geom type="hfield" hfield="hills" pos="2 0 0"/><include file="arm.xml"/>
-      <frame pos="0 3 0"><attach model="other" body="pole" prefix="b"/></frame></worldbody></mujoco>""",
-    "arm.xml": """<mujocoinclude><body name="arm"><joint name="j" axis="0 1 0"/>
+      <frame pos="0 3 0"><attach model="other" body="pole" prefix="b"/></frame></worldbody></mujoco>"""
+    ),
+    "arm.xml": (
+        """<mujocoinclude><body name="arm"><joint name="j" axis="0 1 0"/>
       <geom size=".1 .1 .1" type="box"/></body>
-      <body name="toy" pos="1 0 1"><freejoint/><geom type="mesh" mesh="block"/></body></mujocoinclude>""",
-    "other.xml": """<mujoco><asset><mesh name="tip" file="tip.obj"/></asset><worldbody>
-      <body name="pole"><geom size=".1"/><geom type="mesh" mesh="tip"/></body></worldbody></mujoco>""",
+      <body name="toy" pos="1 0 1"><freejoint/><geom type="mesh" mesh="block"/></body></mujocoinclude>"""
+    ),
+    "other.xml": (
+        """<mujoco><asset><mesh name="tip" file="tip.obj"/></asset><worldbody>
+      <body name="pole"><geom size=".1"/><geom type="mesh" mesh="tip"/></body></worldbody></mujoco>"""
+    ),
     "parts/block.obj": BLOCK,
     "tip.obj": BLOCK,
-    "parts/hills.bin": np.array([2, 2], np.int32).tobytes() + np.array([0, 0.1, 0.2, 0.3], np.float32).tobytes(),
+    "parts/hills.bin": (
+        np.array([2, 2], np.int32).tobytes() + np.array([0, 0.1, 0.2, 0.3], np.float32).tobytes()
+    ),
 }
 
 
@@ -447,7 +545,11 @@ def test_every_file_that_a_load_opens_is_part_of_the_identity(tmp_path, changed)
     with Runner(robot, 1, workers=0, engine="mujoco"):
         pass
     path = tmp_path / changed
-    path.write_bytes(path.read_bytes().replace(b".1", b".2").replace(*(np.float32(x).tobytes() for x in (0.3, 0.5))))
+    path.write_bytes(
+        path.read_bytes()
+        .replace(b".1", b".2")
+        .replace(*(np.float32(x).tobytes() for x in (0.3, 0.5)))
+    )
     assert Robot.load(tmp_path / "scene.xml").describe() != robot.describe()
     robot_model.cache_clear()
     with pytest.raises(RobotError, match="has changed since the robot was loaded"):
@@ -470,7 +572,8 @@ def test_a_floating_robot_starts_where_its_file_places_its_root_body(load, name,
     place = "" if keyed else f'pos="{" ".join(values[:3])}" quat="{" ".join(values[3:])}"'
     key = f'<keyframe><key name="home" qpos="{pose} 0"/></keyframe>' if keyed else ""
     body = (
-        f'<body name="t" {place}><freejoint/><geom type="box" size=".2 .2 .05" mass="5"/><body name="l" pos="0 0 .2">'
+        f'<body name="t" {place}><freejoint/><geom type="box" size=".2 .2 .05" mass="5"/><body'
+        ' name="l" pos="0 0 .2">'
     )
     leg = '<joint name="a" axis="0 1 0" range="-1 1" damping="1"/><geom size=".05" mass=".1"/>'
     text = f"<mujoco>{OPTION}<worldbody>{ground}{body}{leg}</body></body></worldbody>{key}</mujoco>"
@@ -503,7 +606,10 @@ DEFAULTS = {
 @pytest.mark.parametrize("name", DEFAULTS)
 def test_the_ground_that_is_added_is_not_of_the_files_default_class(load, name):
     default, mask = DEFAULTS[name]
-    body = f'<body name="t" pos="0 0 .1"><freejoint/>{BOX.format(mask).replace("/>", " {}/>")}{{}}</body>'
+    body = (
+        '<body name="t" pos="0 0'
+        f' .1"><freejoint/>{BOX.format(mask).replace("/>", " {}/>")}{{}}</body>'
+    )
     own = 'margin="0" condim="3" friction="1 .005 .0001" solref=".02 1"'
     geom = '<geom size=".05" contype="0" conaffinity="0"/>'
     leg = f'<body pos="0 0 .2"><joint name="a" axis="0 1 0" range="-1 1"/>{geom}</body>'
@@ -543,9 +649,13 @@ def test_a_link_between_two_joints_of_a_body_has_no_sensor_and_no_payload(load):
 def test_ground_friction_is_drawn_around_that_of_the_file(load, draw, ground, arm):
     text = ARM.replace(LINK, LINK[:-2] + ' friction=".4"/>')
     robot = load(text.replace('type="plane"', 'type="plane" friction=".8"'))
-    spec = SceneSpec(robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf)
+    spec = SceneSpec(
+        robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf
+    )
     nominal = nominal_values("ground_friction", robot, robot.mjcf)
-    pack = ENGINE.make_pack(spec, 1, variation=Variation(ground_friction=draw.apply(nominal, draw.low)))
+    pack = ENGINE.make_pack(
+        spec, 1, variation=Variation(ground_friction=draw.apply(nominal, draw.low))
+    )
     (model,) = pack.models
     bodies = [model.body(body).name for body in model.geom_bodyid]
     friction = dict(zip(bodies, model.geom_friction[:, 0], strict=True))
@@ -557,7 +667,10 @@ def test_no_log_file_is_written(tmp_path, monkeypatch, capfd):
     """Not by a worker, either, where MuJoCo warns of a small memory."""
     boxes = "".join(f'<body pos="{x} 0 .04"><freejoint/>{BOX.format(1)}</body>' for x in range(8))
     arm = '<body pos="0 0 1"><joint name="j" axis="0 1 0"/><geom size=".1"/></body>'
-    text = f'<mujoco><size memory="30K"/><worldbody><geom type="plane" size="1 1 1"/>{boxes}{arm}</worldbody></mujoco>'
+    text = (
+        '<mujoco><size memory="30K"/><worldbody><geom type="plane" size="1 1'
+        f' 1"/>{boxes}{arm}</worldbody></mujoco>'
+    )
     (tmp_path / "scene.xml").write_text(text)
     monkeypatch.chdir(tmp_path)
     with Runner(Robot.load("scene.xml"), 1, workers=1, engine="mujoco") as runner:

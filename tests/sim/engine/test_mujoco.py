@@ -23,7 +23,9 @@ pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 def run(engine, name, **options):
     """Run to setpoints that depend on the env; return the last observation."""
     arm = load_bundled(name)
-    setpoints = np.clip(arm.start + 0.2 * np.sin(np.arange(arm.dof) + np.arange(2)[:, None]), arm.lower, arm.upper)
+    setpoints = np.clip(
+        arm.start + 0.2 * np.sin(np.arange(arm.dof) + np.arange(2)[:, None]), arm.lower, arm.upper
+    )
     with Runner(arm, 2, engine=engine, workers=0, physics="fast", **options) as runner:
         for _ in range(40):
             obs = runner.step(setpoints)
@@ -47,8 +49,16 @@ def test_a_link_named_world_and_a_floating_base(tmp_path):
         ("panda", {"control": "drive"}, 1e-5),
         ("panda", {"collisions": False}, 1e-5),
         ("panda", {"actuators": bp.make_actuators(9, command_delay=0.002, armature=0.1)}, 1e-4),
-        ("panda", {"randomization": Randomization(payload=Uniform(0.0, 2.0), link_mass=SCALE)}, 1e-4),
-        ("panda", {"randomization": Randomization(damping=Uniform(0.0, 2.0), armature=Uniform(0.0, 0.1))}, 1e-4),
+        (
+            "panda",
+            {"randomization": Randomization(payload=Uniform(0.0, 2.0), link_mass=SCALE)},
+            1e-4,
+        ),
+        (
+            "panda",
+            {"randomization": Randomization(damping=Uniform(0.0, 2.0), armature=Uniform(0.0, 0.1))},
+            1e-4,
+        ),
         ("jaco2", {}, 2e-4),
         (RUBBING, {}, 1e-4),
     ],
@@ -90,7 +100,11 @@ def test_drives_of_each_env_keep_their_gains_beside_motors(panda):
 
     def run_drives(*stiffness):
         params = panda.params(kp=np.outer(stiffness, np.ones(panda.dof)), ki=0.0, kd=10.0)
-        options = {"actuators": bp.make_actuators(panda.dof, armature=0.05), "params": params, "control": "drive"}
+        options = {
+            "actuators": bp.make_actuators(panda.dof, armature=0.05),
+            "params": params,
+            "control": "drive",
+        }
         with Runner(panda, len(stiffness), engine="mujoco", workers=0, **options) as runner:
             runner.reset()
             for _ in range(10):
@@ -105,7 +119,13 @@ def test_drives_of_each_env_keep_their_gains_beside_motors(panda):
 def test_a_state_that_is_not_finite_is_contained(panda, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     params = bp.make_params(panda.dof, kp=0.0, ki=0.0, kd=0.0)
-    options = {"workers": 0, "engine": "mujoco", "control": "effort", "compensate": "none", "params": params}
+    options = {
+        "workers": 0,
+        "engine": "mujoco",
+        "control": "effort",
+        "compensate": "none",
+        "params": params,
+    }
     with Runner(panda, 3, **options) as runner:
         runner.reset()
         efforts = np.zeros((3, panda.dof))

@@ -1,4 +1,6 @@
-"""Native code that cannot be used is refused by one sentence in ``Runner.backend``, and Python does the work."""
+"""Native code that cannot be used is refused by one sentence in ``Runner.backend``, and Python does
+the work.
+"""
 
 from __future__ import annotations
 
@@ -84,15 +86,25 @@ def test_an_extension_that_was_not_built_is_no_fault(monkeypatch, tmp_path, pand
     importlib.invalidate_caches()
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        assert rollout(panda)[1] == f"law in NumPy, Python calls into SAPIEN ({extensions.NOT_BUILT})"
+        assert (
+            rollout(panda)[1] == f"law in NumPy, Python calls into SAPIEN ({extensions.NOT_BUILT})"
+        )
 
 
 @needs_extension
 @pytest.mark.parametrize(
     ("name", "value", "reason"),
     [
-        ("TESTED", ("3.0.0",), r"native calls are not tested with SAPIEN \S+; install sapien==3.0.0"),
-        ("SYMBOLS", ("_ZN6sapien4noneEv",), r"SAPIEN \S+ has another library: .*_ZN6sapien4noneEv; install sapien=="),
+        (
+            "TESTED",
+            ("3.0.0",),
+            r"native calls are not tested with SAPIEN \S+; install sapien==3.0.0",
+        ),
+        (
+            "SYMBOLS",
+            ("_ZN6sapien4noneEv",),
+            r"SAPIEN \S+ has another library: .*_ZN6sapien4noneEv; install sapien==",
+        ),
     ],
     ids=["version", "symbols"],
 )

@@ -1,4 +1,6 @@
-"""SAPIEN has every member of the protocol of an engine, and any other engine that has them runs in the loop."""
+"""SAPIEN has every member of the protocol of an engine, and any other engine that has them runs in
+the loop.
+"""
 
 from __future__ import annotations
 
@@ -26,17 +28,23 @@ from batchpid.sim.engine.protocol import (
 )
 
 PANDA = load_bundled("panda")
-PANDA.has_ground  # noqa: B018 - by SAPIEN, before a test replaces it
+PANDA.has_ground  # noqa: B018
 DT, N = 1e-3, 3
 
 
 def parameters(function):
     """Return the names of a method's arguments; None for another attribute."""
-    return [name for name in inspect.signature(function).parameters if name != "self"] if callable(function) else None
+    return (
+        [name for name in inspect.signature(function).parameters if name != "self"]
+        if callable(function)
+        else None
+    )
 
 
 def check_members(protocol, value):
-    members = {name: member for name, member in inspect.getmembers(protocol) if not name.startswith("_")}
+    members = {
+        name: member for name, member in inspect.getmembers(protocol) if not name.startswith("_")
+    }
     assert members
     for name, member in members.items():
         assert parameters(getattr(value, name)) == parameters(member), name
@@ -136,7 +144,9 @@ class ToyEngine:
     def is_physics(self, settings):
         return False
 
-    def make_pack(self, spec, size, first_env=0, variation=None, carrier="", links=(), workspace=None):
+    def make_pack(
+        self, spec, size, first_env=0, variation=None, carrier="", links=(), workspace=None
+    ):
         return DoubleIntegrators(spec, size, first_env)
 
     def scene_tree(self, spec):
@@ -222,7 +232,10 @@ def test_its_envs_are_suspended_reset_and_restored_from_its_rows():
     ],
 )
 def test_what_it_cannot_do_is_an_error_with_a_remedy(options, argument, capability):
-    with pytest.raises(InvalidArgumentError, match=rf"{argument}: .*{capability}.*'toy' does not have.*use the engine"):
+    with pytest.raises(
+        InvalidArgumentError,
+        match=rf"{argument}: .*{capability}.*'toy' does not have.*use the engine",
+    ):
         RunnerOptions(PANDA, N, **options)
 
 

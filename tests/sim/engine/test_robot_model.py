@@ -1,4 +1,6 @@
-"""Robots have the dynamics of their URDF as MuJoCo reads it, with drawn masses too, and both engines obey them."""
+"""Robots have the dynamics of their URDF as MuJoCo reads it, with drawn masses too, and both
+engines obey them.
+"""
 
 from __future__ import annotations
 
@@ -64,13 +66,17 @@ def test_the_dynamics_are_mujocos(name, fixed_base, tmp_path):
         yields = np.linalg.solve(full[np.ix_(base, base)], full[np.ix_(base, joints)])
         matrix = full[np.ix_(joints, joints)] - full[np.ix_(joints, base)] @ yields
         at = qpos[None], qvel[None]
-        np.testing.assert_allclose(mass_matrix(arm, qpos), matrix, rtol=0, atol=1e-10 * np.abs(matrix).max())
+        np.testing.assert_allclose(
+            mass_matrix(arm, qpos), matrix, rtol=0, atol=1e-10 * np.abs(matrix).max()
+        )
         if fixed_base:
             effort = full @ data.qacc + data.qfrc_bias
             effort = effort[joints]
             ours = dynamics.inverse_dynamics(*at, qacc[None])
             np.testing.assert_allclose(ours[0], effort, rtol=0, atol=1e-9 * np.abs(effort).max())
-            np.testing.assert_allclose(dynamics.forward_dynamics(*at, ours)[0], qacc, rtol=0, atol=1e-7)
+            np.testing.assert_allclose(
+                dynamics.forward_dynamics(*at, ours)[0], qacc, rtol=0, atol=1e-7
+            )
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -86,7 +92,9 @@ def test_a_sim_step_obeys_the_mass_matrix(name, fixed_base, engine, tmp_path):
         runner.reset(pose)
         qvel = runner.step(efforts).qvel.astype(float)
     accelerations = (qvel[1:] - qvel[0]) / runner.timestep
-    np.testing.assert_allclose(accelerations @ matrix, efforts[1:], rtol=0, atol=5e-3 * efforts.max())
+    np.testing.assert_allclose(
+        accelerations @ matrix, efforts[1:], rtol=0, atol=5e-3 * efforts.max()
+    )
 
 
 def edited(arm, change):
@@ -113,15 +121,23 @@ def shift(inertial, by):
 
 
 WORLDS = {
-    "masses": ({"link_mass": Uniform(1.7, 1.7, operation="scale")}, lambda number, inertial: scale(inertial, 1.7)),
-    "centers": ({"center_of_mass": Uniform(0.03, 0.03)}, lambda number, inertial: shift(inertial, [0.03] * 3)),
+    "masses": (
+        {"link_mass": Uniform(1.7, 1.7, operation="scale")},
+        lambda number, inertial: scale(inertial, 1.7),
+    ),
+    "centers": (
+        {"center_of_mass": Uniform(0.03, 0.03)},
+        lambda number, inertial: shift(inertial, [0.03] * 3),
+    ),
 }
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("fixed_base", [True, False])
 @pytest.mark.parametrize("world", WORLDS)
-def test_a_robot_of_drawn_masses_moves_as_one_whose_urdf_has_them(world, fixed_base, engine, tmp_path):
+def test_a_robot_of_drawn_masses_moves_as_one_whose_urdf_has_them(
+    world, fixed_base, engine, tmp_path
+):
     drawn, change = WORLDS[world]
     arm = load(1, tmp_path, fixed_base=fixed_base)
     other = Robot.load(write(tmp_path, edited(arm, change), "other.urdf"), fixed_base=fixed_base)
@@ -139,7 +155,9 @@ def test_the_controller_compensates_the_model_and_not_the_drawn_masses(panda):
     for factor in (1.0, 2.0):
         drawn = Randomization(link_mass=Uniform(factor, factor, operation="scale"))
         with Runner(panda, 1, workers=0, control="effort", randomization=drawn) as runner:
-            fallen.append(np.abs(runner.rollout(np.zeros((50, panda.dof))).qpos[-1] - panda.start).max())
+            fallen.append(
+                np.abs(runner.rollout(np.zeros((50, panda.dof))).qpos[-1] - panda.start).max()
+            )
     assert fallen[0] < 1e-3
     assert fallen[1] > 0.05
 

@@ -1,4 +1,6 @@
-"""User content of a scene: built in any process, separate from env to env, and reset with its env."""
+"""User content of a scene: built in any process, separate from env to env, and reset with its
+env.
+"""
 
 import threading
 
@@ -22,7 +24,9 @@ DROP = 0.5 * 9.81 * 0.2**2
 
 
 def box_beside_the_robot(scene, env):
-    """Add a box as SAPIEN's tutorial does, visual and lights included; each env's falls from higher."""
+    """Add a box as SAPIEN's tutorial does, visual and lights included; each env's falls from
+    higher.
+    """
     builder = scene.create_actor_builder()
     builder.add_box_collision(half_size=[0.5, 0.5, 0.5])
     builder.add_box_visual(half_size=[0.5, 0.5, 0.5], material=[1.0, 0.0, 0.0])
@@ -39,7 +43,9 @@ def balls_on_the_arm(scene, env):
     for k in range(3):
         builder = scene.create_actor_builder()
         builder.add_sphere_collision(radius=0.05 + 0.01 * (env % 3))
-        builder.set_initial_pose(pose([0.02 if k == 0 else 0.4, 0.0, 1.25 if k == 0 else 0.1 + 0.12 * k]))
+        builder.set_initial_pose(
+            pose([0.02 if k == 0 else 0.4, 0.0, 1.25 if k == 0 else 0.1 + 0.12 * k])
+        )
         balls.append(builder.build())
     return balls
 
@@ -52,9 +58,13 @@ def run(build, num_envs=4, ticks=30, **options):
 
 @pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_content_falls_and_a_reset_puts_it_back(workers):
-    with Runner(ROBOT, 2, params=ROBOT.params(), workers=workers, build=box_beside_the_robot) as runner:
+    with Runner(
+        ROBOT, 2, params=ROBOT.params(), workers=workers, build=box_beside_the_robot
+    ) as runner:
         before = runner.poses()
-        np.testing.assert_allclose(before[:, 0], [[2, 0, 1.0, 1, 0, 0, 0], [2, 0, 1.1, 1, 0, 0, 0]], atol=1e-6)
+        np.testing.assert_allclose(
+            before[:, 0], [[2, 0, 1.0, 1, 0, 0, 0], [2, 0, 1.1, 1, 0, 0, 0]], atol=1e-6
+        )
         for _ in range(20):
             runner.step(ROBOT.start)
         after = runner.poses()
@@ -102,7 +112,8 @@ def test_errors_of_build_name_it_and_the_env():
 
     for workers in (0, 2):
         with pytest.raises(
-            InvalidArgumentError, match=r"build, env 2: raised KeyError: 'no such thing' \(in wrong, .*:\d+\)"
+            InvalidArgumentError,
+            match=r"build, env 2: raised KeyError: 'no such thing' \(in wrong, .*:\d+\)",
         ):
             run(wrong, workers=workers)
     with pytest.raises(InvalidArgumentError, match="other than entities"):

@@ -52,12 +52,24 @@ def gains() -> bp.PIDParams:
     return bp.make_params(2, [120.0, 40.0], kd=[8.0, 2.0])
 
 
-def run(robot: Robot, setpoints: np.ndarray, control: str = "pid", compensate: str = "none", **options):
-    """Return the rollout of a runner that begins at the first setpoint, or at FALLING for efforts."""
+def run(
+    robot: Robot, setpoints: np.ndarray, control: str = "pid", compensate: str = "none", **options
+):
+    """Return the rollout of a runner that begins at the first setpoint, or at FALLING for
+    efforts.
+    """
     actuators = bp.make_actuators(2, **(TRUTH | options.pop("actuators", {})))
-    options = {"workers": 0, "timestep": DT, "substeps": STEPS, "engine": "mujoco", "control": control} | options
+    options = {
+        "workers": 0,
+        "timestep": DT,
+        "substeps": STEPS,
+        "engine": "mujoco",
+        "control": control,
+    } | options
     params = None if control == "effort" else gains()
-    with Runner(robot, 1, params=params, compensate=compensate, actuators=actuators, **options) as runner:
+    with Runner(
+        robot, 1, params=params, compensate=compensate, actuators=actuators, **options
+    ) as runner:
         runner.reset(FALLING if control == "effort" else setpoints[0])
         return runner.rollout(setpoints)
 
@@ -70,14 +82,24 @@ def log_of(robot: Robot, rollout, noise: float = 0.0, **settings) -> Log:
 
 
 def effort_run(robot: Robot, driven: tuple[float, float] = (1.0, 1.0)):
-    """Return the rollout of efforts that follow :func:`motion` in a loop at the rate of the ticks."""
+    """Return the rollout of efforts that follow :func:`motion` in a loop at the rate of the
+    ticks.
+    """
     setpoints, rows = motion(), []
     actuators = bp.make_actuators(2, **TRUTH)
-    options = {"workers": 0, "timestep": DT, "substeps": STEPS, "engine": "mujoco", "compensate": "none"}
+    options = {
+        "workers": 0,
+        "timestep": DT,
+        "substeps": STEPS,
+        "engine": "mujoco",
+        "compensate": "none",
+    }
     with Runner(robot, 1, control="effort", actuators=actuators, **options) as runner:
         seen = runner.reset(np.zeros(2))
         for setpoint in setpoints:
-            rows.append(driven * ([60.0, 20.0] * (setpoint - seen.qpos[0]) - [5.0, 1.0] * seen.qvel[0]))
+            rows.append(
+                driven * ([60.0, 20.0] * (setpoint - seen.qpos[0]) - [5.0, 1.0] * seen.qvel[0])
+            )
             seen = runner.step(rows[-1])
         runner.reset(np.zeros(2))
         return runner.rollout(np.array(rows))

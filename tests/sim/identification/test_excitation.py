@@ -13,10 +13,14 @@ def test_the_motion_keeps_the_limits_and_moves_every_joint(name, request):
     assert (motion.position <= robot.upper + 1e-9).all()
     assert (np.abs(motion.velocity) <= robot.velocity_limit).all()
     assert motion.ticks == 400
-    assert (np.ptp(motion.position, axis=0) > [0.02 if unit == "rad" else 0.002 for unit in robot.units]).all()
+    assert (
+        np.ptp(motion.position, axis=0) > [0.02 if unit == "rad" else 0.002 for unit in robot.units]
+    ).all()
     np.testing.assert_allclose(motion.position[[0, -1]], motion.position[[0, 0]], atol=1e-4)
     assert (np.abs(motion.velocity[[0, -1]]) < 0.05).all()
-    assert np.linalg.cond(np.corrcoef(motion.velocity[:, robot.independent].T)) < 100  # all motions differ
+    assert (
+        np.linalg.cond(np.corrcoef(motion.velocity[:, robot.independent].T)) < 100
+    )  # all motions differ
 
 
 def test_the_seed_decides(panda):
@@ -28,7 +32,9 @@ def test_the_seed_decides(panda):
 def test_a_log_may_keep_the_rates_of_the_setpoints(panda, tmp_path):
     motion = excite(panda, 1.0, rate=100)
     quantities = ("setpoint", "setpoint_rate", "qpos")
-    header = ",".join(["time", *(f"{quantity}:{name}" for quantity in quantities for name in panda.joint_names)])
+    header = ",".join(
+        ["time", *(f"{quantity}:{name}" for quantity in quantities for name in panda.joint_names)]
+    )
     table = np.column_stack([motion.time, motion.position, motion.velocity, motion.position])
     np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=header, comments="")
     (log,) = read_logs(panda, [tmp_path / "log.csv"])
@@ -36,7 +42,9 @@ def test_a_log_may_keep_the_rates_of_the_setpoints(panda, tmp_path):
     np.testing.assert_allclose(log.command, motion.position[:, list(log.joints)], atol=1e-8)
 
 
-@pytest.mark.parametrize(("name", "value"), [("duration", 0), ("rate", 1), ("highest", 0.01), ("seed", -1)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("duration", 0), ("rate", 1), ("highest", 0.01), ("seed", -1)]
+)
 def test_options_out_of_range_are_refused(panda, name, value):
     with pytest.raises(bp.InvalidArgumentError, match=name):
         excite(panda, **{name: value})
@@ -48,16 +56,28 @@ BAR = """<inertial><origin xyz="0.15 0 0"/><mass value="1"/>
 
 
 def arm(folder, height=0.15, effort=60.0, bend=60.0, wall=None):
-    """Return an arm of two bars that turn about y above the ground; a wall in front of it is fixed to its base."""
+    """Return an arm of two bars that turn about y above the ground; a wall in front of it is fixed
+    to its base.
+    """
     lift = (
-        f'<origin xyz="0 0 {height}"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="{effort}" velocity="9"/>'
+        f'<origin xyz="0 0 {height}"/><axis xyz="0 1 0"/><limit lower="-2" upper="2"'
+        f' effort="{effort}" velocity="9"/>'
     )
-    place = f'<origin xyz="0.3 0 0"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="{bend}" velocity="9"/>'
+    place = (
+        f'<origin xyz="0.3 0 0"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="{bend}"'
+        ' velocity="9"/>'
+    )
     parts = [
         '<link name="base"/>',
         f'<link name="upper">{BAR}</link><link name="lower">{BAR}</link>',
-        f'<joint name="lift" type="revolute"><parent link="base"/><child link="upper"/>{lift}</joint>',
-        f'<joint name="bend" type="revolute"><parent link="upper"/><child link="lower"/>{place}</joint>',
+        (
+            '<joint name="lift" type="revolute"><parent link="base"/><child'
+            f' link="upper"/>{lift}</joint>'
+        ),
+        (
+            '<joint name="bend" type="revolute"><parent link="upper"/><child'
+            f' link="lower"/>{place}</joint>'
+        ),
     ]
     if wall is not None:
         shape = '<collision><geometry><box size="0.1 1 4"/></geometry></collision>'
@@ -80,7 +100,9 @@ def test_joints_that_would_touch_the_ground_move_less(tmp_path):
 
 def test_links_that_touch_near_every_pose_are_named(tmp_path):
     """The wall is in the middle of the upper bar, whatever the joints do but at their ends."""
-    with pytest.raises(bp.InvalidArgumentError, match=r"'upper' and 'wall' touch|'wall' and 'upper' touch"):
+    with pytest.raises(
+        bp.InvalidArgumentError, match=r"'upper' and 'wall' touch|'wall' and 'upper' touch"
+    ):
         excite(arm(tmp_path, height=1.0, wall=0.03), 2.0, rate=50)
 
 

@@ -14,7 +14,12 @@ from batchpid.sim.identification import Log, LogWarning, draw_motors, identify
 
 pytest.importorskip("scipy")
 
-KINDS = {"armature": "armature", "damping": "viscous", "friction": "coulomb", "strength": "strength"}
+KINDS = {
+    "armature": "armature",
+    "damping": "viscous",
+    "friction": "coulomb",
+    "strength": "strength",
+}
 NOISE = 2e-5
 
 
@@ -67,11 +72,16 @@ def test_motors_are_found_from_efforts(robot, effort_log):
 
 def test_the_number_of_workers_does_not_change_the_result(robot, effort_log):
     short = effort_log.part(slice(0, 200), slice(0, 200))
-    both = [identify(robot, [short], payload=False, evaluations=2, workers=workers) for workers in (0, 2)]
+    both = [
+        identify(robot, [short], payload=False, evaluations=2, workers=workers)
+        for workers in (0, 2)
+    ]
     np.testing.assert_allclose(both[0].values, both[1].values, rtol=1e-6)
 
 
-@pytest.mark.parametrize("compensate", [pytest.param("gravity", marks=pytest.mark.slow), "gravity+coriolis+friction"])
+@pytest.mark.parametrize(
+    "compensate", [pytest.param("gravity", marks=pytest.mark.slow), "gravity+coriolis+friction"]
+)
 def test_a_compensation_through_the_motors_is_part_of_the_model(robot, compensate):
     log = log_of(robot, run(robot, motion(), compensate=compensate), NOISE)
     found = identify(robot, [log], payload=False)
@@ -83,10 +93,15 @@ def test_a_compensation_through_the_motors_is_part_of_the_model(robot, compensat
 def test_a_payload_is_found_and_a_known_one_is_not_found_again(robot, tmp_path):
     tensor = " ".join(
         f'{name}="{value}"'
-        for name, value in zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), [1e-9] * 3 + [0] * 3, strict=True)
+        for name, value in zip(
+            ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), [1e-9] * 3 + [0] * 3, strict=True
+        )
     )
     tool = f'<link name="load"><inertial><mass value="0.4"/><inertia {tensor}/>'
-    fixed = '<joint name="f" type="fixed"><parent link="fore"/><child link="load"/><origin xyz="0 0 0.15"/></joint>'
+    fixed = (
+        '<joint name="f" type="fixed"><parent link="fore"/><child link="load"/><origin xyz="0 0'
+        ' 0.15"/></joint>'
+    )
     loaded = load(tmp_path, URDF.replace("</robot>", f"{tool}</inertial></link>{fixed}</robot>"))
     rollout = run(loaded, motion())
     found = identify(robot, [log_of(robot, rollout, NOISE)])
@@ -105,9 +120,13 @@ def test_delays_of_setpoints_rate_limits_and_gains_are_unknowns_of_the_control(r
     weak = gains().replace(kp=0.5 * gains().kp, kd=0.5 * gains().kd)
     found = identify(robot, [log], weak, payload=False, extras=["slew", "gain"])
     assert found.interval("setpoint_delay")[0] == pytest.approx(0.02, abs=1e-3)
-    assert [found.interval("slew", joint)[0] for joint in (0, 1)] == pytest.approx([2.0, 1.5], rel=0.03)
+    assert [found.interval("slew", joint)[0] for joint in (0, 1)] == pytest.approx(
+        [2.0, 1.5], rel=0.03
+    )
     strengths = np.array(TRUTH["strength"])
-    assert [found.interval("gain", joint)[0] for joint in (0, 1)] == pytest.approx(2 * strengths, rel=0.03)
+    assert [found.interval("gain", joint)[0] for joint in (0, 1)] == pytest.approx(
+        2 * strengths, rel=0.03
+    )
     np.testing.assert_allclose(found.gains().kp, gains().kp * strengths, rtol=0.03)
 
 
@@ -118,24 +137,34 @@ def test_further_effects_are_found_on_request(robot):
     log = replace(log, qpos=log.qpos + more["position_offset"])
     found = identify(robot, [log], payload=False, extras=["load_friction", "offset"])
     for joint in (0, 1):
-        assert found.interval("load_friction", joint)[0] == pytest.approx(more["load_friction"][joint], rel=0.1)
-        assert found.interval("offset", joint)[0] == pytest.approx(more["position_offset"][joint], rel=0.03)
+        assert found.interval("load_friction", joint)[0] == pytest.approx(
+            more["load_friction"][joint], rel=0.1
+        )
+        assert found.interval("offset", joint)[0] == pytest.approx(
+            more["position_offset"][joint], rel=0.03
+        )
 
 
 @pytest.mark.slow
 def test_a_wrong_mass_is_named_and_found_on_request(robot, tmp_path):
     text = URDF.replace('mass value="1"', 'mass value="1.4"').replace('ixx="0.01"', 'ixx="0.014"')
-    heavy = load(tmp_path, text.replace('iyy="0.01"', 'iyy="0.014"').replace('izz="0.002"', 'izz="0.0028"'))
+    heavy = load(
+        tmp_path, text.replace('iyy="0.01"', 'iyy="0.014"').replace('izz="0.002"', 'izz="0.0028"')
+    )
     log = log_of(robot, run(heavy, motion()), NOISE)
     found = identify(robot, [log], payload=False)
     assert "link fore" in found.advice
     assert "heavier" in found.advice
     better = identify(robot, [log], payload=False, extras=["mass"])
     factors = {link: better.interval("mass", link)[0] for link in ("upper", "fore")}
-    assert factors["fore"] / factors["upper"] == pytest.approx(1.4, rel=0.05)  # all masses and strengths have one scale
+    assert factors["fore"] / factors["upper"] == pytest.approx(
+        1.4, rel=0.05
+    )  # all masses and strengths have one scale
     (tmp_path / "corrected.urdf").write_text(better.corrected_urdf())
     corrected = Robot.load(tmp_path / "corrected.urdf").mass_matrix(np.zeros((1, 2)))[0, 1, 1]
-    assert corrected == pytest.approx(factors["fore"] * robot.mass_matrix(np.zeros((1, 2)))[0, 1, 1])
+    assert corrected == pytest.approx(
+        factors["fore"] * robot.mass_matrix(np.zeros((1, 2)))[0, 1, 1]
+    )
     with pytest.raises(bp.InvalidArgumentError, match="no mass was found"):
         found.corrected_urdf()
 
@@ -177,7 +206,9 @@ def test_setpoints_that_were_logged_late_are_named(robot, log):
 def test_joints_that_did_not_move_are_left_out(robot, log):
     still = log.qpos * [1.0, 0.0]
     with pytest.warns(LogWarning, match="'elbow' did not move"):
-        found = identify(robot, [replace(log, qpos=still, command=log.command * [1, 0])], payload=False)
+        found = identify(
+            robot, [replace(log, qpos=still, command=log.command * [1, 0])], payload=False
+        )
     assert found.joints == (0,)
     assert found.still == ("elbow",)
     with pytest.raises(bp.InvalidArgumentError, match="show no motion of any joint"):
@@ -188,7 +219,9 @@ def test_the_saved_file_is_what_was_found_and_holds_the_region(robot, found, tmp
     found.save(tmp_path / "motors.yaml")
     motors = bp.load_actuators(tmp_path / "motors.yaml", robot.joint_names)[0]
     for kind, field in KINDS.items():
-        assert getattr(motors, field)[0].tolist() == [found.interval(kind, joint)[0] for joint in (0, 1)]
+        assert getattr(motors, field)[0].tolist() == [
+            found.interval(kind, joint)[0] for joint in (0, 1)
+        ]
     setpoints = motion()
     with Runner(
         robot,
@@ -220,7 +253,14 @@ def test_the_saved_file_is_what_was_found_and_holds_the_region(robot, found, tmp
 
 def test_the_report_has_all_values_and_errors(found):
     report = found.report()
-    for words in ("shoulder", "elbow", "armature", "setpoint_delay", "with ideal motors", "by joint"):
+    for words in (
+        "shoulder",
+        "elbow",
+        "armature",
+        "setpoint_delay",
+        "with ideal motors",
+        "by joint",
+    ):
         assert words in report
     document = found.document()
     assert document["intervals"]["elbow"]["strength"][0] == found.interval("strength", 1)[0]
@@ -276,7 +316,8 @@ def test_intervals_hold_the_truth(robot):
     for seed in range(12):
         rng = np.random.default_rng(seed)
         truth = {
-            field: (np.array(value) * rng.uniform(0.6, 1.4, np.shape(value))).tolist() for field, value in TRUTH.items()
+            field: (np.array(value) * rng.uniform(0.6, 1.4, np.shape(value))).tolist()
+            for field, value in TRUTH.items()
         }
         log = log_of(robot, run(robot, motion(seed=seed), actuators=truth), 1e-4)
         found = identify(robot, [log], payload=False)

@@ -31,7 +31,10 @@ def table(kind: str = "setpoint", **changes) -> dict:
 
 def write(path, columns, delimiter=","):
     rows = zip(*columns.values(), strict=True)
-    lines = [delimiter.join(columns), *(delimiter.join(str(value) for value in row) for row in rows)]
+    lines = [
+        delimiter.join(columns),
+        *(delimiter.join(str(value) for value in row) for row in rows),
+    ]
     path.write_text("\n".join(lines) + "\n")
     return path
 
@@ -43,7 +46,9 @@ def read(robot, folder, columns, kind=None, **reading):
 def test_columns_are_found_by_name_in_the_order_of_the_robot(robot, tmp_path):
     (log,) = read(robot, tmp_path, table(mode=["idle"] * 200, note=[""] * 200))
     assert (log.joints, log.kind, log.held) == ((0, 1), "setpoint", False)
-    np.testing.assert_allclose(log.qpos, np.stack([table()[f"qpos:{joint}"] for joint in JOINTS], axis=1))
+    np.testing.assert_allclose(
+        log.qpos, np.stack([table()[f"qpos:{joint}"] for joint in JOINTS], axis=1)
+    )
     (other,) = read_logs(robot, [write(tmp_path / "log.txt", table(), ";")])
     np.testing.assert_array_equal(other.command, log.command)
 
@@ -79,16 +84,21 @@ FAULTS = {
     r"has no column 'time', but a": {"a": TIME},
     r"has no column qpos:JOINT": {"time": TIME, "effort:elbow": TIME},
     r"has no column setpoint:JOINT": {"time": TIME, "qpos:elbow": TIME},
-    r"column setpoint:elbow.* is missing": {"time": TIME, "qpos:elbow": TIME, "qpos:shoulder": TIME}
-    | {"setpoint:shoulder": TIME},
+    r"column setpoint:elbow.* is missing": (
+        {"time": TIME, "qpos:elbow": TIME, "qpos:shoulder": TIME} | {"setpoint:shoulder": TIME}
+    ),
     r"knee": {"time": TIME, "qpos:knee": TIME},
     r"line 12, column 'qpos:elbow' is empty or not finite": changed("qpos:elbow", 10, ""),
     r"line 12, column 'qpos:elbow' is not a number": changed("qpos:elbow", 10, "1 rad"),
     r"line 12: time decreases": changed("time", 10, 0.0),
-    r"far beyond the joint's limits.*--degrees": {name: 60 * v if name[0] == "q" else v for name, v in table().items()},
+    r"far beyond the joint's limits.*--degrees": {
+        name: 60 * v if name[0] == "q" else v for name, v in table().items()
+    },
     r"one row per 5 s": table(time=1e3 * TIME),
     r"has 40 rows": {name: values[:40] for name, values in table().items()},
-    r"has a feedforward, which efforts include": table("effort") | {f"feedforward:{joint}": TIME for joint in JOINTS},
+    r"has a feedforward, which efforts include": (
+        table("effort") | {f"feedforward:{joint}": TIME for joint in JOINTS}
+    ),
 }
 
 
@@ -118,7 +128,9 @@ def test_a_log_is_divided_at_gaps(robot, tmp_path):
 
 
 def test_wrapped_positions_become_continuous_once(robot, tmp_path):
-    """A joint whose type is not continuous is named in a warning. A log that was checked is not checked again."""
+    """A joint whose type is not continuous is named in a warning. A log that was checked is not
+    checked again.
+    """
     turning = 3.0 + np.sin(3 * TIME)
     wrapped = (turning + np.pi) % (2 * np.pi) - np.pi
     columns = table(**{"qpos:elbow": wrapped, "setpoint:elbow": wrapped})
@@ -143,7 +155,10 @@ def test_hdf5_columns_read_as_those_of_a_csv_file(robot, tmp_path):
         np.testing.assert_allclose(log.qpos, plain.qpos)
     with h5py.File(tmp_path / "aloha.h5", "w") as file:
         file["observations/qpos"], file["action"] = np.zeros((100, 2)), np.zeros((100, 2))
-    with pytest.raises(bp.InvalidArgumentError, match=r"no column 'time' and no qpos:JOINT, but action, observations"):
+    with pytest.raises(
+        bp.InvalidArgumentError,
+        match=r"no column 'time' and no qpos:JOINT, but action, observations",
+    ):
         read_logs(robot, [tmp_path / "aloha.h5"])
 
 
@@ -151,7 +166,12 @@ def test_a_recording_says_what_it_knows(robot, tmp_path):
     rollout = run(robot, motion(1.0), compensate="gravity")
     pytest.importorskip("h5py")
     (log,) = read_logs(robot, [write_recording(rollout, tmp_path / "run.h5")])
-    assert (log.kind, log.held, log.timestep, log.compensate) == ("setpoint", True, 0.001, "gravity")
+    assert (log.kind, log.held, log.timestep, log.compensate) == (
+        "setpoint",
+        True,
+        0.001,
+        "gravity",
+    )
     np.testing.assert_allclose(log.params.kp, gains().kp)
     np.testing.assert_allclose(log.command_time, rollout.time - rollout.tick)
 
@@ -182,7 +202,10 @@ def test_runs_that_a_fit_cannot_simulate_are_refused(robot, problem):
 
 def test_a_recording_of_changed_params_is_refused(robot, tmp_path):
     path = tmp_path / "run.h5"
-    with Runner(robot, 1, params=gains(), workers=0, engine="mujoco") as runner, Recorder(path, runner):
+    with (
+        Runner(robot, 1, params=gains(), workers=0, engine="mujoco") as runner,
+        Recorder(path, runner),
+    ):
         for row in motion(0.5):
             runner.step(row)
             runner.params = gains().replace(kp=0.5 * gains().kp)
@@ -201,11 +224,16 @@ def bag(path, messages):
     header, stamp, state = (types.types[name] for name in names)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         topics = dict.fromkeys(topic for topic, *_ in messages)
-        places = {topic: writer.add_connection(topic, state.__msgtype__, typestore=types) for topic in topics}
+        places = {
+            topic: writer.add_connection(topic, state.__msgtype__, typestore=types)
+            for topic in topics
+        }
         for topic, time, values in messages:
             moment = 1_700_000_000_000_000_000 + round(1e9 * time)
             numbers, none = np.array([*values.values()], float), np.zeros(0)
-            message = state(header(stamp(*divmod(moment, 10**9)), ""), [*values], numbers, none, numbers)
+            message = state(
+                header(stamp(*divmod(moment, 10**9)), ""), [*values], numbers, none, numbers
+            )
             writer.write(places[topic], moment, types.serialize_cdr(message, state.__msgtype__))
     return path
 
@@ -220,7 +248,9 @@ def test_messages_of_a_bag_are_merged_by_joint(robot, tmp_path):
             states = dict(reversed(states.items()))
         messages += [("/joint_states", time, states)]
     # Another device has more rows, and begins and ends at other times.
-    messages += [("/joint_states", time, {"finger": 0.0}) for time in np.arange(-1, TIME[-1] + 1, 0.004)]
+    messages += [
+        ("/joint_states", time, {"finger": 0.0}) for time in np.arange(-1, TIME[-1] + 1, 0.004)
+    ]
     with pytest.warns(LogWarning, match="finger: no joint of the robot"):
         (log,) = read_logs(robot, [bag(tmp_path / "bag", messages)])
     np.testing.assert_allclose(log.qpos, np.stack([np.cos(TIME), np.sin(TIME)], axis=1), atol=1e-9)
@@ -238,7 +268,10 @@ def test_messages_of_a_bag_are_merged_by_joint(robot, tmp_path):
     path = bag(tmp_path / "apart", apart)
     (log,) = read_logs(robot, [path], "setpoint", reading=Reading(command_topic="/commands"))
     np.testing.assert_allclose(log.qpos, np.sin(TIME[1:, None]) * np.ones(2), atol=1e-5)
-    with pytest.raises(bp.InvalidArgumentError, match=r"no values in the topic '/states'.*: /commands, /joint_states"):
+    with pytest.raises(
+        bp.InvalidArgumentError,
+        match=r"no values in the topic '/states'.*: /commands, /joint_states",
+    ):
         read_logs(robot, [path], reading=Reading(topic="/states"))
     (tmp_path / "damaged.mcap").write_bytes(b"nothing")
     with pytest.raises(bp.InvalidArgumentError, match="cannot be read"):

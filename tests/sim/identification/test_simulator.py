@@ -8,22 +8,41 @@ from arms import DT, FALLING, STEPS, TRUTH, gains, load, motion, run
 
 import batchpid as bp
 from batchpid.sim import Robot
-from batchpid.sim.identification.simulator import PAYLOAD, LogControl, Plant, PlantCandidates, Stretch, simulate
+from batchpid.sim.identification.simulator import (
+    PAYLOAD,
+    LogControl,
+    Plant,
+    PlantCandidates,
+    Stretch,
+    simulate,
+)
 
 MOTORS = {
     "ideal": dict.fromkeys(TRUTH),
     "late and weak": {},
-    "stiction and load": {"static": [0.8, 0.4], "stribeck": [0.2, 0.1], "load_friction": [0.1, 0.05]},
+    "stiction and load": {
+        "static": [0.8, 0.4],
+        "stribeck": [0.2, 0.1],
+        "load_friction": [0.1, 0.05],
+    },
     "offset": {"position_offset": [0.02, -0.01]},
 }
 
 
 def candidates(count=1, law=None, delay=0.0, masses=(), **actuators) -> PlantCandidates:
     """Return equal candidates."""
-    made = bp.make_actuators(2, **{name: value for name, value in actuators.items() if value is not None})
-    spread = {name: np.repeat(leaf, count, axis=0) for name, leaf in made._asdict().items() if leaf is not None}
+    made = bp.make_actuators(
+        2, **{name: value for name, value in actuators.items() if value is not None}
+    )
+    spread = {
+        name: np.repeat(leaf, count, axis=0)
+        for name, leaf in made._asdict().items()
+        if leaf is not None
+    }
     spread |= {} if made.max_delay is None else {"max_delay": made.max_delay}
-    return PlantCandidates(bp.Actuators(**spread), law or {}, np.full(count, delay), (tuple(masses),) * count)
+    return PlantCandidates(
+        bp.Actuators(**spread), law or {}, np.full(count, delay), (tuple(masses),) * count
+    )
 
 
 def stretch_of(commands, start) -> Stretch:
@@ -33,21 +52,31 @@ def stretch_of(commands, start) -> Stretch:
     return Stretch(start, np.zeros(2), table, 0, None, ends, np.zeros(len(ends)))
 
 
-def simulated(robot: Robot, commands, drive: LogControl, made: PlantCandidates, start) -> np.ndarray:
-    (table,) = simulate(Plant(robot, (0, 1)), drive, made, np.zeros((1, 2, 2)), [stretch_of(commands, start)])
+def simulated(
+    robot: Robot, commands, drive: LogControl, made: PlantCandidates, start
+) -> np.ndarray:
+    (table,) = simulate(
+        Plant(robot, (0, 1)), drive, made, np.zeros((1, 2, 2)), [stretch_of(commands, start)]
+    )
     return table[0]
 
 
 @pytest.mark.parametrize("native", ["1", "0"])
 @pytest.mark.parametrize("compensate", ["none", "gravity", "gravity+coriolis"])
 @pytest.mark.parametrize("kind", MOTORS)
-def test_a_log_of_setpoints_is_simulated_as_by_the_runner(tmp_path, monkeypatch, kind, compensate, native):
+def test_a_log_of_setpoints_is_simulated_as_by_the_runner(
+    tmp_path, monkeypatch, kind, compensate, native
+):
     monkeypatch.setenv("BATCHPID_NATIVE", native)
     robot, setpoints = load(tmp_path), motion(0.5)
     rollout = run(robot, setpoints, compensate=compensate, actuators=MOTORS[kind])
     drive = LogControl(DT, gains(), compensate)
-    offset = np.array(MOTORS[kind].get("position_offset", 0.0))  # the log has the measured positions
-    table = simulated(robot, setpoints, drive, candidates(**(TRUTH | MOTORS[kind])), setpoints[0] + offset)
+    offset = np.array(
+        MOTORS[kind].get("position_offset", 0.0)
+    )  # the log has the measured positions
+    table = simulated(
+        robot, setpoints, drive, candidates(**(TRUTH | MOTORS[kind])), setpoints[0] + offset
+    )
     np.testing.assert_allclose(table - offset, rollout.qpos[:, 0], atol=1e-4)
 
 
@@ -56,7 +85,10 @@ def test_a_log_of_efforts_is_simulated_as_by_the_runner(tmp_path, kind):
     robot = load(tmp_path)
     commands = 3.0 * motion(0.5)
     rollout = run(robot, commands, "effort", actuators=MOTORS[kind])
-    made, offset = candidates(**(TRUTH | MOTORS[kind])), np.array(MOTORS[kind].get("position_offset", 0.0))
+    made, offset = (
+        candidates(**(TRUTH | MOTORS[kind])),
+        np.array(MOTORS[kind].get("position_offset", 0.0)),
+    )
     table = simulated(robot, commands, LogControl(DT, None, "none"), made, FALLING + offset)
     np.testing.assert_allclose(table - offset, rollout.qpos[:, 0], atol=1e-4)
 
@@ -66,7 +98,9 @@ def test_delays_and_rate_limits_of_setpoints_are_those_of_late_rows_and_a_guard(
     drive = LogControl(DT, gains(), "none")
     late = np.vstack([setpoints[:1]] * 4 + [setpoints[:-4]])
     expected = simulated(robot, late, drive, candidates(**TRUTH), setpoints[0])
-    table = simulated(robot, setpoints, drive, candidates(delay=4 * STEPS * DT, **TRUTH), setpoints[0])
+    table = simulated(
+        robot, setpoints, drive, candidates(delay=4 * STEPS * DT, **TRUTH), setpoints[0]
+    )
     np.testing.assert_allclose(table, expected, atol=1e-9)
     rollout = run(robot, setpoints, guard=robot.guard(rate=np.array([1.0, 0.5])))
     slew = {"slew": np.array([[1.0, 0.5]])}
@@ -80,10 +114,16 @@ def test_masses_are_those_of_another_description(tmp_path):
     heavy = text.replace('mass value="1"', 'mass value="1.5"').replace('ixx="0.01"', 'ixx="0.015"')
     heavy = heavy.replace('iyy="0.01"', 'iyy="0.015"').replace('izz="0.002"', 'izz="0.003"')
     drive = LogControl(DT, gains(), "none")
-    table = simulated(robot, setpoints, drive, candidates(masses=[("fore", 1.5)], **TRUTH), setpoints[0])
+    table = simulated(
+        robot, setpoints, drive, candidates(masses=[("fore", 1.5)], **TRUTH), setpoints[0]
+    )
     other = load(tmp_path, heavy)
-    np.testing.assert_allclose(table, simulated(other, setpoints, drive, candidates(**TRUTH), setpoints[0]), atol=1e-9)
-    loaded = simulated(robot, setpoints, drive, candidates(masses=[(PAYLOAD, 0.5)], **TRUTH), setpoints[0])
+    np.testing.assert_allclose(
+        table, simulated(other, setpoints, drive, candidates(**TRUTH), setpoints[0]), atol=1e-9
+    )
+    loaded = simulated(
+        robot, setpoints, drive, candidates(masses=[(PAYLOAD, 0.5)], **TRUTH), setpoints[0]
+    )
     assert np.abs(loaded - table).max() < np.abs(loaded - run(robot, setpoints).qpos[:, 0]).max()
 
 
@@ -92,7 +132,9 @@ def test_candidates_and_stretches_do_not_affect_each_other(tmp_path):
     plant, drive = Plant(robot, (0, 1)), LogControl(DT, gains(), "gravity+coriolis")
     stretches = [stretch_of(setpoints, setpoints[0]), stretch_of(setpoints[20:60], setpoints[20])]
     made = candidates(3, **TRUTH)
-    made = made._replace(actuators=made.actuators._replace(strength=np.array([[1.0, 1.0], [0.9, 0.9], [0.5, 1.2]])))
+    made = made._replace(
+        actuators=made.actuators._replace(strength=np.array([[1.0, 1.0], [0.9, 0.9], [0.5, 1.2]]))
+    )
     states = np.zeros((3, 2, 2))
     states[1, 1] = 0.1
     tables = simulate(plant, drive, made, states, stretches)

@@ -1,4 +1,6 @@
-"""Random actuators in the runner: no crash, and no NaN that goes unnoticed; lost workers leave no trace."""
+"""Random actuators in the runner: no crash, and no NaN that goes unnoticed; lost workers leave no
+trace.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +57,9 @@ def check(robot, seeds):
             for seed in seeds:
                 runner.actuators = random_actuators(seed, robot.dof)
                 runner.reset()
-                rollout = runner.rollout(np.clip(rng.normal(0, 1, (4, ENVS, robot.dof)), robot.lower, robot.upper))
+                rollout = runner.rollout(
+                    np.clip(rng.normal(0, 1, (4, ENVS, robot.dof)), robot.lower, robot.upper)
+                )
                 for rows in (rollout.qpos, rollout.qvel, rollout.effort):
                     assert np.isfinite(rows[rollout.ok]).all(), seed
                 if (limit := runner.actuators.effort_limit) is not None:

@@ -33,9 +33,13 @@ def test_the_integral_of_a_drive_removes_the_error_of_gravity(panda):
 
 def test_the_integral_of_the_pid_removes_the_error_of_gravity(panda):
     gains = {"kp": 400.0, "kd": 40.0, "effort_limit": None, "derivative_filter_time": 0.002}
-    with Runner(panda, 1, workers=0, compensate="none", params=panda.params(ki=0.0, **gains)) as runner:
+    with Runner(
+        panda, 1, workers=0, compensate="none", params=panda.params(ki=0.0, **gains)
+    ) as runner:
         sag = error_after(runner, 1.5)
-    with Runner(panda, 1, workers=0, compensate="none", params=panda.params(ki=1600.0, **gains)) as runner:
+    with Runner(
+        panda, 1, workers=0, compensate="none", params=panda.params(ki=1600.0, **gains)
+    ) as runner:
         left = error_after(runner, 1.5)
     assert sag > 0.03
     assert left < 0.1 * sag
@@ -53,7 +57,9 @@ def test_efforts_are_applied_within_the_limits(panda):
 
 
 def test_the_limit_holds_for_the_effort_with_compensation_and_feedforward(panda):
-    with Runner(panda, 1, workers=0, params=panda.params(kp=5e4, ki=0.0, kd=0.0), substeps=1) as runner:
+    with Runner(
+        panda, 1, workers=0, params=panda.params(kp=5e4, ki=0.0, kd=0.0), substeps=1
+    ) as runner:
         runner.reset(POSE)
         obs = runner.step(POSE + np.r_[np.full(7, 0.3), 0, 0], feedforward=np.full(9, 5.0))
     np.testing.assert_array_equal(obs.effort[0, ARM], panda.effort_limit[ARM])
@@ -85,7 +91,9 @@ def test_setpoint_rate_removes_the_lag_behind_a_moving_setpoint(panda):
 def test_gains_change_in_flight_without_a_bump(panda):
     """An integral that carries the load carries on when ki changes."""
     gains = {"kp": 400.0, "kd": 40.0, "effort_limit": None, "derivative_filter_time": 0.002}
-    with Runner(panda, 1, workers=1, compensate="none", substeps=20, params=panda.params(ki=800.0, **gains)) as runner:
+    with Runner(
+        panda, 1, workers=1, compensate="none", substeps=20, params=panda.params(ki=800.0, **gains)
+    ) as runner:
         runner.reset(POSE)
         for _ in range(400):
             before = runner.step(POSE)

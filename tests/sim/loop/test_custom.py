@@ -1,4 +1,6 @@
-"""The caller's own controllers: called at every sim step, with a state that resets, snapshots and recovery keep."""
+"""The caller's own controllers: called at every sim step, with a state that resets, snapshots and
+recovery keep.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ N, TICKS = 5, 12
 
 
 class Law:
-    """batchpid's own law with the passive force as feedforward: what control="pid" does with gains in efforts."""
+    """batchpid's own law with the passive force as feedforward: what control="pid" does with gains
+    in efforts.
+    """
 
     def __init__(self, params):
         self.params, self.k = params, None
@@ -40,12 +44,17 @@ class Counter:
     def __call__(self, state, setpoint, qpos, qvel, passive):
         steps, filtered = state["steps"] + 1, 0.9 * state["filter"][0] + 0.1 * qvel
         wave = np.sin(0.01 * steps)[:, None]
-        return {"steps": steps, "filter": (filtered, None)}, passive + 5 * wave * setpoint - 0.5 * filtered
+        return {
+            "steps": steps,
+            "filter": (filtered, None),
+        }, passive + 5 * wave * setpoint - 0.5 * filtered
 
 
 def rollout(robot, controller, **options):
     rng = np.random.default_rng(1)
-    with Runner(robot, N, control=controller, **({"workers": 0, "substeps": 10} | options)) as runner:
+    with Runner(
+        robot, N, control=controller, **({"workers": 0, "substeps": 10} | options)
+    ) as runner:
         setpoints = robot.start + rng.uniform(-0.1, 0.1, (TICKS, N, robot.dof))
         return runner.rollout(np.clip(setpoints, robot.lower, robot.upper))
 
@@ -98,7 +107,10 @@ def test_a_fault_names_the_controller_whose_effort_is_nan(panda, how):
         options["actuators"] = bp.make_actuators(panda.dof, command_delay=delay / 2000)
     setpoint = np.zeros((N, panda.dof))
     setpoint[3, 4] = setpoint[3, 6] = 1.0
-    message = r"env 3, joint 'panda_joint5': the effort that its controller returned is not finite, at step"
+    message = (
+        r"env 3, joint 'panda_joint5': the effort that its controller returned is not finite, at"
+        r" step"
+    )
     with Runner(panda, N, **options) as runner:
         with pytest.warns(FaultWarning, match=message):
             runner.step(setpoint)
@@ -117,7 +129,9 @@ class Diverges(Counter):
 
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 def test_a_finite_effort_that_ends_the_state_is_a_fault_of_the_state(panda):
-    with Runner(panda, 1, control=Diverges(), workers=0, params=panda.params(effort_limit=None)) as runner:
+    with Runner(
+        panda, 1, control=Diverges(), workers=0, params=panda.params(effort_limit=None)
+    ) as runner:
         runner.step(np.zeros(panda.dof))
         assert [fault.cause for fault in runner.faults] == ["state"]
 
@@ -161,21 +175,31 @@ class Keeps:
 
     def __call__(self, state, *inputs):
         changes = [new - old for new, old in zip(inputs, state, strict=True)]
-        return [self.keep(rows) for rows in inputs], inputs[3] + 20 * changes[0] + 5 * changes[1] + changes[2]
+        return [self.keep(rows) for rows in inputs], inputs[3] + 20 * changes[0] + 5 * changes[
+            1
+        ] + changes[2]
 
 
 @pytest.mark.parametrize("compensate", ["gravity", "none"])
 def test_inputs_may_be_kept(panda, compensate):
     seen = []
     for keep in (lambda rows: rows, np.copy):
-        with Runner(panda, N, control=Keeps(keep), workers=0, substeps=3, compensate=compensate) as runner:
+        with Runner(
+            panda, N, control=Keeps(keep), workers=0, substeps=3, compensate=compensate
+        ) as runner:
             steps = range(4)
-            seen.append([runner.step(0.01 * np.full((N, 9), k), feedforward=np.full(9, k)) for k in steps][-1])
+            seen.append(
+                [runner.step(0.01 * np.full((N, 9), k), feedforward=np.full(9, k)) for k in steps][
+                    -1
+                ]
+            )
     assert_identical(*seen)
 
 
 class Reuses(Counter):
-    """Returns the same arrays at every call, for every group of envs: a state that counts, and an effort."""
+    """Returns the same arrays at every call, for every group of envs: a state that counts, and an
+    effort.
+    """
 
     def __init__(self, reuse):
         self.reuse, self.arrays = reuse, {}
@@ -197,7 +221,9 @@ def test_arrays_of_the_controller_may_be_used_again(panda):
     def run(reuse):
         options = {"workers": 0, "substeps": 3, "control": Reuses(reuse), "collisions": False}
         with Runner(panda, 32, **options) as runner:
-            return [runner.step(np.outer(np.linspace(0, 0.03, 32), np.ones(9))) for _ in range(3)][-1]
+            return [runner.step(np.outer(np.linspace(0, 0.03, 32), np.ones(9))) for _ in range(3)][
+                -1
+            ]
 
     assert_identical(run(True), run(False))
 
@@ -237,12 +263,19 @@ def test_a_state_of_another_kind_is_refused_by_name(panda, change, backend):
 
 
 def test_a_state_keeps_its_dtype(panda):
-    wide = Changes(lambda state: state | {"steps": state["steps"].astype(np.float32), "count": state["count"] > 0})
+    wide = Changes(
+        lambda state: (
+            state | {"steps": state["steps"].astype(np.float32), "count": state["count"] > 0}
+        )
+    )
     with Runner(panda, N, control=wide, workers=0) as runner:
         runner.step(np.zeros(panda.dof))
         snapshot = runner.snapshot()
         runner.restore(snapshot)
-    assert [snapshot.states.controller[name].dtype for name in ("steps", "count")] == [np.float64, np.int64]
+    assert [snapshot.states.controller[name].dtype for name in ("steps", "count")] == [
+        np.float64,
+        np.int64,
+    ]
 
 
 class KeepsDynamics:
@@ -268,5 +301,8 @@ def test_a_controller_that_has_run_here_can_be_sent_to_workers(panda, engine):
 def test_an_error_names_the_option_that_cannot_be_sent(panda):
     controller = KeepsDynamics()
     controller.lock = threading.Lock()
-    with pytest.raises(InvalidArgumentError, match=r"^control: cannot be sent to a worker process.* or pass workers=0"):
+    with pytest.raises(
+        InvalidArgumentError,
+        match=r"^control: cannot be sent to a worker process.* or pass workers=0",
+    ):
         rollout(panda, controller, workers=1)

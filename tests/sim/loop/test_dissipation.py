@@ -35,12 +35,22 @@ def pendulum(folder, joints, damping, friction, tip=0.2):
     for n in range(joints):
         parent, mass = f"link{n - 1}" if n else "base", tip ** (n / max(joints - 1, 1))
         parts.append(link(f"link{n}", inertial(0.01 * mass, mass, xyz="0 0 -0.2")))
-        parts.append(joint(f"joint{n}", parent, f"link{n}", inner=dynamics(damping, friction), origin="0 0 -0.4"))
+        parts.append(
+            joint(
+                f"joint{n}",
+                parent,
+                f"link{n}",
+                inner=dynamics(damping, friction),
+                origin="0 0 -0.4",
+            )
+        )
     return Robot.load(write(folder, robot(*parts)))
 
 
 def push(robot, efforts, seconds, physics="accurate", qvel=0.0, qpos=0.0, substeps=20, **options):
-    """Apply constant efforts (envs,) to the first joint; return the trajectory of all joints (ticks, envs, dof)."""
+    """Apply constant efforts (envs,) to the first joint; return the trajectory of all joints
+    (ticks, envs, dof).
+    """
     efforts = np.atleast_1d(efforts)
     setpoint = np.zeros((len(efforts), robot.dof))
     setpoint[:, 0] = efforts
@@ -58,7 +68,9 @@ def test_a_joint_sticks_below_its_friction_and_moves_above_it(physics, inertia, 
     seconds, efforts = 0.25, friction * np.array([0.95, -0.95, 0.0, 1.05, -1.2])
     if inertia < 1e-3:
         seconds = 0.01  # then it is at PhysX's largest joint speed
-    rollout = push(wheel(tmp_path, inertia, friction=friction), efforts, seconds, physics, substeps=1)
+    rollout = push(
+        wheel(tmp_path, inertia, friction=friction), efforts, seconds, physics, substeps=1
+    )
     assert np.abs(rollout.qpos[:, :3]).max() < 1e-6
     acceleration = np.sign(efforts[3:]) * (np.abs(efforts[3:]) - friction) / inertia
     np.testing.assert_allclose(rollout.qvel[-1, 3:, 0], acceleration * seconds, rtol=0.01)
@@ -68,11 +80,23 @@ def test_a_joint_sticks_below_its_friction_and_moves_above_it(physics, inertia, 
 @pytest.mark.slow
 @pytest.mark.parametrize("physics", PRESETS)
 def test_a_joint_never_creeps(physics, tmp_path):
-    """Load within the friction, constant and with an alternating part, on which LuGre's model drifts."""
+    """Load within the friction, constant and with an alternating part, on which LuGre's model
+    drifts.
+    """
     rng = np.random.default_rng(0)
-    steady, loads = push(wheel(tmp_path, 0.1, friction=1.0), 0.95, 10.0, physics), rng.uniform(-1.2, 0.95, (2000, 1, 1))
+    steady, loads = (
+        push(wheel(tmp_path, 0.1, friction=1.0), 0.95, 10.0, physics),
+        rng.uniform(-1.2, 0.95, (2000, 1, 1)),
+    )
     assert np.abs(steady.qpos).max() < 1e-6
-    with Runner(wheel(tmp_path, 0.1, friction=1.0), 1, control="effort", physics=physics, substeps=7, workers=0) as run:
+    with Runner(
+        wheel(tmp_path, 0.1, friction=1.0),
+        1,
+        control="effort",
+        physics=physics,
+        substeps=7,
+        workers=0,
+    ) as run:
         run.reset(np.zeros(1))
         moved = run.rollout(np.clip(loads, -0.95, 0.95)).qpos
     assert np.abs(moved).max() < 1e-5
@@ -83,7 +107,14 @@ def test_a_joint_never_creeps(physics, tmp_path):
 @pytest.mark.parametrize(("inertia", "friction"), [(0.1, 1.0), (0.02, 0.05), (1e-5, 0.1)])
 def test_a_moving_joint_stops_when_the_equation_says(physics, inertia, friction, tmp_path):
     expected = inertia / friction
-    rollout = push(wheel(tmp_path, inertia, friction=friction), 0.0, 1.2 * expected + 0.02, physics, 1.0, substeps=1)
+    rollout = push(
+        wheel(tmp_path, inertia, friction=friction),
+        0.0,
+        1.2 * expected + 0.02,
+        physics,
+        1.0,
+        substeps=1,
+    )
     velocity, position = rollout.qvel[:, 0, 0], rollout.qpos[:, 0, 0]
     stop = np.flatnonzero(np.abs(velocity) > 1e-2)[-1] * DT if expected > DT else 0.0
     assert stop == pytest.approx(expected, rel=0.02, abs=2 * DT)
@@ -93,7 +124,9 @@ def test_a_moving_joint_stops_when_the_equation_says(physics, inertia, friction,
 
 @pytest.mark.parametrize("physics", PRESETS)
 def test_stick_slip_on_a_spring_has_the_analytic_period(physics, tmp_path):
-    """Dragged by a spring k at speed V, a joint slips at V (1 - cos(w t)), w^2 = k / J, and stops once a period."""
+    """Dragged by a spring k at speed V, a joint slips at V (1 - cos(w t)), w^2 = k / J, and stops
+    once a period.
+    """
     inertia, stiffness, speed, friction = 0.1, 40.0, 0.5, 1.0
     robot = wheel(tmp_path, inertia, friction=friction)
     params = robot.params(kp=stiffness, ki=0.0, kd=0.0)
@@ -105,9 +138,15 @@ def test_stick_slip_on_a_spring_has_the_analytic_period(physics, tmp_path):
         velocity = runner.rollout(target).qvel[:, 0, 0]
     first_slip = np.flatnonzero(np.abs(velocity) > 1e-3 * speed)[0] * DT
     assert first_slip == pytest.approx(friction / (stiffness * speed), rel=0.1)
-    peaks = [n for n in range(1, ticks - 1) if velocity[n - 1] < velocity[n] >= velocity[n + 1] and velocity[n] > speed]
+    peaks = [
+        n
+        for n in range(1, ticks - 1)
+        if velocity[n - 1] < velocity[n] >= velocity[n + 1] and velocity[n] > speed
+    ]
     assert len(peaks) > 2
-    assert np.diff(peaks) * DT == pytest.approx(2 * math.pi * math.sqrt(inertia / stiffness), rel=0.03)
+    assert np.diff(peaks) * DT == pytest.approx(
+        2 * math.pi * math.sqrt(inertia / stiffness), rel=0.03
+    )
     assert velocity[peaks] == pytest.approx(2 * speed, rel=0.03)
 
 
@@ -141,7 +180,8 @@ def test_mujoco_finds_the_same_motion(damping, friction, tmp_path):
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "test.urdf"))
     assert model.dof_frictionloss == pytest.approx(friction)
     model.opt.timestep = DT / 10
-    # MuJoCo's Coulomb friction is soft, by default in 2 to 20 ms: as hard as it gets, or it moves 0.015 rad otherwise.
+    # MuJoCo's Coulomb friction is soft, by default in 2 to 20 ms: as hard as it gets, or it moves
+    # 0.015 rad otherwise.
     model.dof_solimp[:, :2], model.dof_solref[:] = (0.99, 0.9999), (2 * model.opt.timestep, 1.0)
     data = mujoco.MjData(model)
     data.qpos[:] = start
@@ -162,7 +202,9 @@ def test_friction_beyond_all_efforts_keeps_the_pose(fixed_base, gravity, tmp_pat
     assert rollout.ok.all()
 
 
-@pytest.mark.parametrize(("added", "speed"), [(0.0, 0.9 / 0.1 * 0.5), (0.4, 0.5 / 0.1 * 0.5), (2.0, 0.0)])
+@pytest.mark.parametrize(
+    ("added", "speed"), [(0.0, 0.9 / 0.1 * 0.5), (0.4, 0.5 / 0.1 * 0.5), (2.0, 0.0)]
+)
 def test_friction_that_is_drawn_is_in_the_urdfs_units(added, speed, tmp_path):
     drawn = Randomization(friction=Uniform(added, added))
     rollout = push(wheel(tmp_path, 0.1, friction=0.1), 1.0, 0.5, randomization=drawn)
@@ -220,5 +262,7 @@ def test_a_robot_that_moves_at_its_reset_slides_from_the_first_step(native, tmp_
     monkeypatch.setenv("BATCHPID_NATIVE", native)
     inertia, coulomb, speed, seconds = 0.1, 0.5, 4.0, 0.15
     motors = bp.make_actuators(1, coulomb=coulomb, static=5 * coulomb)
-    gone = push(wheel(tmp_path, inertia), 0.0, seconds, qvel=speed, engine="mujoco", actuators=motors).qpos[-1, 0, 0]
+    gone = push(
+        wheel(tmp_path, inertia), 0.0, seconds, qvel=speed, engine="mujoco", actuators=motors
+    ).qpos[-1, 0, 0]
     assert gone == pytest.approx(speed * seconds - 0.5 * coulomb / inertia * seconds**2, abs=1e-3)

@@ -1,4 +1,6 @@
-"""Faults: an env that fails is reported with step and joint, and suspended or reset; the others are bit-identical."""
+"""Faults: an env that fails is reported with step and joint, and suspended or reset; the others are
+bit-identical.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ from batchpid.sim.loop.step_values import Measured
 PANDA = load_bundled("panda")
 N = 6
 OVERFLOW = 1e38
-"""Effort [N m or N] that is finite, and makes the engine's state infinite or NaN in one sim step."""
+"""Effort [N m or N] that is finite, and makes the engine's state infinite or NaN in one sim
+step.
+"""
 CASES = int(os.environ.get("BATCHPID_SOAK_FAULTS", "100"))
 
 
@@ -56,7 +60,9 @@ def undisturbed(engine):
 @functools.cache
 def undisturbed_in(engine):
     with make(engine=engine) as runner:
-        return runner.rollout(setpoints(12), setpoint_rates=np.zeros((12, N, 9)), feedforwards=np.zeros((12, N, 9)))
+        return runner.rollout(
+            setpoints(12), setpoint_rates=np.zeros((12, N, 9)), feedforwards=np.zeros((12, N, 9))
+        )
 
 
 @pytest.mark.quick_rows(5)
@@ -64,7 +70,10 @@ def undisturbed_in(engine):
 def test_a_command_that_is_not_finite_suspends_its_env_alone(name, bad, workers, undisturbed):
     table, rates, forward = setpoints(12), np.zeros((12, N, 9)), np.zeros((12, N, 9))
     {"setpoint": table, "setpoint_rate": rates, "feedforward": forward}[name][5, 3, 4] = bad
-    with make(workers=workers) as runner, pytest.warns(FaultWarning, match=r"env 3, joint 'panda_joint5'"):
+    with (
+        make(workers=workers) as runner,
+        pytest.warns(FaultWarning, match=r"env 3, joint 'panda_joint5'"),
+    ):
         broken = runner.rollout(table, setpoint_rates=rates, feedforwards=forward)
     assert_others_identical(undisturbed, broken, 3)
     assert broken.ok[:5].all()
@@ -102,7 +111,9 @@ def test_a_state_that_is_not_finite_is_detected_at_its_step(control):
 def test_an_env_with_unstable_gains_is_suspended():
     gains = PANDA.params().kd.repeat(N, 0)
     gains[4, 6] = 1e9
-    with make(params=PANDA.params(kd=gains, effort_limit=None), substeps=20, speed_limit=50.0) as runner:
+    with make(
+        params=PANDA.params(kd=gains, effort_limit=None), substeps=20, speed_limit=50.0
+    ) as runner:
         with pytest.warns(FaultWarning, match="env 4"):
             rollout = runner.rollout(setpoints(10))
         assert {fault.env for fault in runner.faults} == {4}
@@ -199,7 +210,10 @@ def test_a_start_pose_that_is_not_finite_is_replaced_by_the_last_start():
             obs = runner.reset(qpos=qpos)
         assert obs.ok.tolist() == [env != 3 for env in range(N)]
         assert np.isfinite(obs.qpos).all()
-    with make(on_invalid_input="raise") as runner, pytest.raises(InvalidArgumentError, match=r"qpos.*env 3"):
+    with (
+        make(on_invalid_input="raise") as runner,
+        pytest.raises(InvalidArgumentError, match=r"qpos.*env 3"),
+    ):
         runner.reset(qpos=qpos)
 
 
@@ -207,10 +221,21 @@ def check_random_fault(case):
     """Make one env of 64 fail at a random tick and joint: the others must be bit-identical."""
     random = np.random.default_rng(case)
     num_envs, ticks = 64, 4
-    env, tick, joint = int(random.integers(num_envs)), int(random.integers(ticks)), int(random.integers(9))
-    name, cause = [("setpoint", "setpoint"), ("feedforward", "feedforward"), ("feedforward", "state")][case % 3]
+    env, tick, joint = (
+        int(random.integers(num_envs)),
+        int(random.integers(ticks)),
+        int(random.integers(9)),
+    )
+    name, cause = [
+        ("setpoint", "setpoint"),
+        ("feedforward", "feedforward"),
+        ("feedforward", "state"),
+    ][case % 3]
     bad = random.choice([OVERFLOW, -OVERFLOW] if cause == "state" else [np.nan, np.inf, -np.inf])
-    commands = {"setpoint": setpoints(ticks, num_envs, case), "feedforward": random.normal(size=(ticks, num_envs, 9))}
+    commands = {
+        "setpoint": setpoints(ticks, num_envs, case),
+        "feedforward": random.normal(size=(ticks, num_envs, 9)),
+    }
     options = {"substeps": int(random.integers(1, 4)), "params": PANDA.params(effort_limit=None)}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -238,14 +263,18 @@ def test_the_other_63_of_64_envs_are_bit_identical(case):
 @pytest.mark.quick_rows(2)
 @pytest.mark.usefixtures("engine")
 @pytest.mark.parametrize("control", ["pid", "effort"])
-def test_a_state_that_is_finite_and_far_away_is_a_fault_at_the_same_step_for_every_executor(control, monkeypatch):
+def test_a_state_that_is_finite_and_far_away_is_a_fault_at_the_same_step_for_every_executor(
+    control, monkeypatch
+):
     found = []
     for switch, backend in (("1", "numpy"), ("0", "numpy"), ("1", "jax")):
         monkeypatch.setenv("BATCHPID_NATIVE", switch)
         commands = setpoints(4, 4) if control == "pid" else np.zeros((4, 4, 9))
         forward = np.zeros((4, 4, 9))
         forward[1, 2, 5] = 1e30  # the robot is at about 1e20 rad after a sim step or two
-        with make(4, control=control, params=PANDA.params(effort_limit=None), backend=backend) as runner:
+        with make(
+            4, control=control, params=PANDA.params(effort_limit=None), backend=backend
+        ) as runner:
             with pytest.warns(FaultWarning, match="a position is beyond 1,000,000 rad or m"):
                 rollout = runner.rollout(commands, feedforwards=forward)
             assert rollout.ok[:, 2].tolist() == [True, False, False, False]
@@ -270,7 +299,9 @@ def test_a_fault_in_the_first_sim_step_is_reported():
 
 def test_quick_checks_pass_ordinary_states_and_no_failed_one():
     beyond = [np.nextafter(faults.FARTHEST, np.inf), 1e8, 1e200, np.inf, -np.inf, np.nan]
-    assert faults.far(np.array([faults.FARTHEST, *beyond])).tolist() == [False] + [True] * len(beyond)
+    assert faults.far(np.array([faults.FARTHEST, *beyond])).tolist() == [False] + [True] * len(
+        beyond
+    )
     rest, limits = Measured(np.ones((2, 3)), np.ones((2, 3)), None), (None, 2.0)
     assert faults.near(rest.qpos)
     assert faults.finite(None, rest.qpos, rest.qvel)

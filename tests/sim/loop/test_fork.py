@@ -50,7 +50,10 @@ def test_a_runner_of_another_number_of_envs_or_control_refuses_it() -> None:
         snapshot = runner.snapshot()
         with pytest.raises(InvalidArgumentError, match="num_envs 3, not 2"):
             runner.restore(snapshot.for_envs([0, 1, 1]))
-    with Runner(ARM, 3, workers=0, control="drive") as other, pytest.raises(InvalidArgumentError, match="control"):
+    with (
+        Runner(ARM, 3, workers=0, control="drive") as other,
+        pytest.raises(InvalidArgumentError, match="control"),
+    ):
         other.restore(snapshot.for_envs([0, 1, 1]))
     for envs in ([], [2], [-1], [0.0], 0):
         with pytest.raises(InvalidArgumentError, match="envs"):

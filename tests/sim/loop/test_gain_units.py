@@ -27,7 +27,9 @@ def acceleration_params(robot, units, **options):
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
 def test_one_set_of_gains_settles_every_arm_joint_of_every_robot(name):
     robot = load_bundled(name)
-    with Runner(robot, 1, params=acceleration_params(robot, "mass_matrix"), workers=0, substeps=10) as runner:
+    with Runner(
+        robot, 1, params=acceleration_params(robot, "mass_matrix"), workers=0, substeps=10
+    ) as runner:
         runner.reset(robot.settings.start)
         rollout = runner.rollout(np.broadcast_to(robot.settings.target, (400, robot.dof)))
     m = step_metrics(rollout.tick, robot.settings.target, rollout.qpos, start=robot.settings.start)
@@ -39,7 +41,9 @@ def test_one_set_of_gains_settles_every_arm_joint_of_every_robot(name):
 
 @pytest.mark.slow
 def test_gain_units_change_in_flight_without_a_bump(panda):
-    """Integrals that carry the robot's weight carry on in the unit of the new gains, back and forth."""
+    """Integrals that carry the robot's weight carry on in the unit of the new gains, back and
+    forth.
+    """
     gains = {"kp": 400.0, "ki": 800.0, "kd": 40.0, "derivative_filter_time": 2e-3}
     per_effort = panda.params(**gains, effort_limit=None)
     per_mass_matrix = panda.params(**gains, effort_limit=None, gain_units="mass_matrix")
@@ -56,13 +60,19 @@ def test_gain_units_change_in_flight_without_a_bump(panda):
 
 @pytest.mark.parametrize("substeps", [5, 20])
 def test_a_fast_arm_stays_on_its_line_where_its_axes_are_nearly_in_line(substeps, jaco2):
-    """Near upright jaco2's mass matrix changes fast: matrices that are ahead on average put it 18 mrad off."""
+    """Near upright jaco2's mass matrix changes fast: matrices that are ahead on average put it 18
+    mrad off.
+    """
     robot = jaco2
-    start = robot.settings.start + np.array([0.28, -0.29, 0.22, 0.29, 0.27, -0.21, 0.28, 0.23, 0.19, 0, 0, 0.18, 0.25])
+    start = robot.settings.start + np.array(
+        [0.28, -0.29, 0.22, 0.29, 0.27, -0.21, 0.28, 0.23, 0.19, 0, 0, 0.18, 0.25]
+    )
     move = robot.settings.target - start
     with Runner(robot, 1, params=robot.designed(), workers=0, substeps=substeps) as runner:
         runner.reset(start)
-        rollout = runner.rollout(np.broadcast_to(robot.settings.target, (1200 // substeps, robot.dof)))
+        rollout = runner.rollout(
+            np.broadcast_to(robot.settings.target, (1200 // substeps, robot.dof))
+        )
     gone = rollout.qpos[:, 0] - start
     along = gone @ move / (move @ move)
     assert along[-1] > 0.8

@@ -1,4 +1,6 @@
-"""Robots at rest, with the friction and damping of the URDF: efforts alone hold them in their pose."""
+"""Robots at rest, with the friction and damping of the URDF: efforts alone hold them in their
+pose.
+"""
 
 import numpy as np
 import pytest

@@ -14,14 +14,18 @@ from batchpid.trajectories import minimum_jerk
 from tests.sim.robot.test_design_on_robots import load
 
 PUBLISHED = [
-    f"{name}_description/urdf/{file}.urdf" for name, file in (("ur", "ur5_robot"), ("xarm", "xarm7"), ("z1", "z1"))
+    f"{name}_description/urdf/{file}.urdf"
+    for name, file in (("ur", "ur5_robot"), ("xarm", "xarm7"), ("z1", "z1"))
 ]
 DURATION, HELD = 1.0, 0.3
 
 
 @pytest.fixture(
     scope="module",
-    params=["panda", *(pytest.param(name, marks=pytest.mark.slow) for name in ("jaco2", "tree", *PUBLISHED))],
+    params=[
+        "panda",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("jaco2", "tree", *PUBLISHED)),
+    ],
 )
 def arm(request, tmp_path_factory):
     if request.param != "tree":
@@ -51,7 +55,9 @@ def largest_error(arm, dt, params, engine="sapien", substeps=1):
     start, move = move_of(arm, dt * substeps)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with Runner(arm, 1, params=params, workers=0, timestep=dt, substeps=substeps, engine=engine) as runner:
+        with Runner(
+            arm, 1, params=params, workers=0, timestep=dt, substeps=substeps, engine=engine
+        ) as runner:
             runner.reset(start)
             rollout = runner.rollout(move.position[:, None], setpoint_rates=move.velocity[:, None])
     error = np.nan_to_num(np.abs(rollout.qpos - rollout.setpoint)[:, 0], nan=1e9)
@@ -61,7 +67,9 @@ def largest_error(arm, dt, params, engine="sapien", substeps=1):
 @pytest.mark.slow
 @pytest.mark.parametrize("w", [100.0, 316.0])
 def test_it_is_stable_at_large_time_steps_and_tracks_as_at_small_ones(arm, w):
-    (fine, _), *coarse = (largest_error(arm, dt, params_of(arm, w)) for dt in (1 / 2000, 1 / 500, 1 / 100))
+    (fine, _), *coarse = (
+        largest_error(arm, dt, params_of(arm, w)) for dt in (1 / 2000, 1 / 500, 1 / 100)
+    )
     assert fine < 7 / w**2
     assert coarse[0][0] < 1.05 * fine  # at 1/500
     assert coarse[1][0] < 0.15e-3  # at 1/100
@@ -89,7 +97,9 @@ def test_setpoint_steps_in_long_ticks_settle():
     """The mass matrix is fresh in every sim step: kept for 4 steps, it would diverge."""
     panda = load_bundled("panda")
     target = panda.settings.target
-    with Runner(panda, 1, params=params_of(panda, 100.0), workers=0, timestep=1 / 100, substeps=20) as runner:
+    with Runner(
+        panda, 1, params=params_of(panda, 100.0), workers=0, timestep=1 / 100, substeps=20
+    ) as runner:
         runner.reset(panda.start)
         rollout = runner.rollout(np.broadcast_to(target, (3, panda.dof)))
     np.testing.assert_allclose(rollout.qpos[-1, 0], target, atol=1e-4)

@@ -1,4 +1,6 @@
-"""Actuators in the loop: independent of workers, company and restores; changed in flight; as the models say."""
+"""Actuators in the loop: independent of workers, company and restores; changed in flight; as the
+models say.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,9 @@ def test_actuators_that_are_off_change_no_bit(panda):
     table = commands(panda, 5)
     with Runner(panda, N, workers=0) as runner:
         ideal = runner.rollout(table)
-    with Runner(panda, N, workers=0, actuators=bp.make_actuators(panda.dof, strength=1.0)) as runner:
+    with Runner(
+        panda, N, workers=0, actuators=bp.make_actuators(panda.dof, strength=1.0)
+    ) as runner:
         assert runner.actuators is None
         assert_identical(ideal, runner.rollout(table))
         runner.actuators = actuators(panda)
@@ -66,7 +70,10 @@ def test_actuators_that_are_off_change_no_bit(panda):
 
 def test_a_masked_reset_forgets_histories_of_its_envs_alone(panda):
     chosen, table = actuators(panda), commands(panda, 4)
-    mask, quiet = np.array([True, False, True, False, False]), chosen.replace(position_noise=None, velocity_noise=None)
+    mask, quiet = (
+        np.array([True, False, True, False, False]),
+        chosen.replace(position_noise=None, velocity_noise=None),
+    )
     for each, same in ((quiet, True), (chosen, False)):  # an episode has its own noise
         with Runner(panda, N, workers=0, actuators=each) as runner:
             first = runner.rollout(table)
@@ -83,15 +90,21 @@ def test_the_effort_is_that_delivered(panda):
     asked = np.zeros((6, 1, panda.dof))
     asked[3:, :, :7] = [4.0, 3, 3, 3, 1, 1, 1]
     chosen = bp.make_actuators(panda.dof, command_delay=0.0015, strength=0.5)
-    with Runner(panda, 1, workers=0, control="effort", compensate="none", substeps=1, actuators=chosen) as runner:
+    with Runner(
+        panda, 1, workers=0, control="effort", compensate="none", substeps=1, actuators=chosen
+    ) as runner:
         effort = runner.rollout(np.concatenate((asked, asked[-1:]))).effort
-    np.testing.assert_allclose(effort[3:], np.float32(0.5 * np.concatenate((asked, asked[-1:]))[:4]))
+    np.testing.assert_allclose(
+        effort[3:], np.float32(0.5 * np.concatenate((asked, asked[-1:]))[:4])
+    )
 
 
 @pytest.mark.parametrize("control", ["pid", "effort"])
 @pytest.mark.parametrize("strength", [0.5, 1.6])
 def test_a_joint_is_saturated_exactly_where_its_motor_is(panda, strength, control):
-    """The law is held back at the command that the motor clips, so that the whole limit is delivered, and no more."""
+    """The law is held back at the command that the motor clips, so that the whole limit is
+    delivered, and no more.
+    """
     limit, moving = 12.0, slice(0, 7)
     chosen = bp.make_actuators(panda.dof, strength=strength, bias=1.0, effort_limit=limit)
     swing = np.where(np.arange(120) % 60 < 30, 1.0, -1.0)[:, None, None]
@@ -107,8 +120,13 @@ def test_a_joint_is_saturated_exactly_where_its_motor_is(panda, strength, contro
 
 
 def test_joints_alone_leave_signals_alone_and_are_in_snapshots(panda, tmp_path):
-    """Friction and reflected inertia are the engine's: without other effects no signal is processed."""
-    worn, table = bp.make_actuators(panda.dof, coulomb=0.3, viscous=0.2, armature=0.1), commands(panda, 8)
+    """Friction and reflected inertia are the engine's: without other effects no signal is
+    processed.
+    """
+    worn, table = (
+        bp.make_actuators(panda.dof, coulomb=0.3, viscous=0.2, armature=0.1),
+        commands(panda, 8),
+    )
     with Runner(panda, N, workers=0, actuators=worn) as runner:
         first = runner.rollout(table[:4])
         snapshot = runner.snapshot()
@@ -126,7 +144,13 @@ def test_joints_alone_leave_signals_alone_and_are_in_snapshots(panda, tmp_path):
 
 def test_drives_take_friction_and_armature_alone(panda):
     with pytest.raises(InvalidArgumentError, match="drives bypass all three"):
-        Runner(panda, 1, workers=0, control="drive", actuators=bp.make_actuators(panda.dof, strength=0.9))
+        Runner(
+            panda,
+            1,
+            workers=0,
+            control="drive",
+            actuators=bp.make_actuators(panda.dof, strength=0.9),
+        )
     heavy = bp.make_actuators(panda.dof, armature=1.0)
     with Runner(panda, 1, workers=0, control="drive") as runner:
         free = runner.rollout(np.tile(panda.settings.target, (5, 1)))
@@ -138,7 +162,10 @@ def test_drives_take_friction_and_armature_alone(panda):
 
 def test_a_robot_has_the_actuators_of_its_file(panda, tmp_path):
     path = tmp_path / "arm.yaml"
-    arm = {name: {"strength": 0.9, "command_delay": 0.001, "coulomb": 0.1} for name in panda.joint_names[:7]}
+    arm = {
+        name: {"strength": 0.9, "command_delay": 0.001, "coulomb": 0.1}
+        for name in panda.joint_names[:7]
+    }
     path.write_text(json.dumps({"format": "batchpid-actuators-1", "joints": arm}))
     robot, table = Robot.load("panda", actuators=path), commands(panda, 3)
     assert robot.actuators.strength.tolist() == [[0.9] * 7 + [1.0] * 2]
@@ -156,12 +183,16 @@ def test_a_robot_has_the_actuators_of_its_file(panda, tmp_path):
 
 
 def test_the_controller_knows_the_actuators_of_its_robot(panda):
-    """Their armature, damping and friction are compensated; actuators of the runner alone are not."""
+    """Their armature, damping and friction are compensated; actuators of the runner alone are
+    not.
+    """
     worn = bp.make_actuators(9, armature=0.2, viscous=3.0, coulomb=[1.0] * 7 + [0.0] * 2)
     known = dataclasses.replace(panda, actuators=worn)
     errors = []
     for robot, options in ((panda, {}), (known, {}), (panda, {"actuators": worn})):
-        with Runner(robot, 1, workers=0, params=panda.designed().replace(ki=None), **options) as runner:
+        with Runner(
+            robot, 1, workers=0, params=panda.designed().replace(ki=None), **options
+        ) as runner:
             rollout = runner.rollout(np.tile(panda.settings.target, (60, 1)))
         errors.append(np.abs(rollout.qpos[:, 0, :7] - panda.settings.target[:7]).sum())
     ideal, compensated, uncompensated = errors

@@ -1,6 +1,7 @@
 """Snapshots: their content, and files that are damaged, of another format, or malicious.
 
-test_conformance.py shows that a run goes on from a snapshot bit by bit, test_state_belongs.py which runners refuse it.
+test_conformance.py shows that a run goes on from a snapshot bit by bit, test_state_belongs.py which
+runners refuse it.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ GOAL = np.full(ARM.dof, 0.2)
 
 def make(**options: Any) -> Runner:
     params = ARM.params(kp=20.0, ki=5.0, kd=2.0, anti_windup="back_calculation", effort_limit=5.0)
-    return Runner(ARM, N, **{"params": params, "workers": 0, "on_invalid_input": "contain", **options})
+    return Runner(
+        ARM, N, **{"params": params, "workers": 0, "on_invalid_input": "contain", **options}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +48,8 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-# -- content -----------------------------------------------------------------------------------------------------
+# -- content
+# --------------------------------------------------------------------------------------------------
 
 
 def test_a_new_process_and_a_copy_go_on_from_it(jaco2: Robot, tmp_path: Path) -> None:
@@ -60,13 +64,15 @@ def test_a_new_process_and_a_copy_go_on_from_it(jaco2: Robot, tmp_path: Path) ->
     snapshot.save(tmp_path / "s.npz")
     np.save(tmp_path / "table.npy", table[3:])
     program = (
-        "import sys, numpy as np; from batchpid.sim import *; folder = sys.argv[1] + '/'; robot = Robot.load('jaco2')\n"
-        f"with Runner(robot, {N}, params=robot.params(), workers=0) as runner:\n"
-        "    runner.restore(Snapshot.load(folder + 's.npz'))\n"
-        "    np.save(folder + 'qpos.npy', runner.rollout(np.load(folder + 'table.npy')).qpos)\n"
+        "import sys, numpy as np; from batchpid.sim import *; folder = sys.argv[1] + '/'; robot ="
+        f" Robot.load('jaco2')\nwith Runner(robot, {N}, params=robot.params(), workers=0) as"
+        " runner:\n    runner.restore(Snapshot.load(folder + 's.npz'))\n    np.save(folder +"
+        " 'qpos.npy', runner.rollout(np.load(folder + 'table.npy')).qpos)\n"
     )
     environment = {"PYTHONPATH": ":".join(filter(None, sys.path)), "PATH": ""}
-    subprocess.run([sys.executable, "-W", "ignore", "-c", program, tmp_path], check=True, env=environment)
+    subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", program, tmp_path], check=True, env=environment
+    )
     np.testing.assert_array_equal(np.load(tmp_path / "qpos.npy"), went_on.qpos)
 
 
@@ -104,7 +110,8 @@ def test_it_is_immutable_and_equals_itself_alone(good: Path) -> None:
         assert len({each, dataclasses.replace(each)}) == 2
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
+# -- files
+# --------------------------------------------------------------------------------------------------
 
 
 def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -114,7 +121,9 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return json.loads(str(tables.pop("head"))), tables
 
 
-def write(path: Path, head: Any, tables: dict[str, Any], save: Callable[..., None] = np.savez) -> Path:
+def write(
+    path: Path, head: Any, tables: dict[str, Any], save: Callable[..., None] = np.savez
+) -> Path:
     save(path, head=np.array(json.dumps(head)), **tables)
     return path
 
@@ -176,7 +185,9 @@ DAMAGES = {
     "gains as text": array("params.kp", lambda rows: np.array("x")),
     "a motion of one row": array("motion", lambda rows: rows[:1]),
     "a motion of another precision": array("motion", np.float32),
-    "numbers in place of a choice": array("params.integration", lambda rows: np.zeros((1, ARM.dof))),
+    "numbers in place of a choice": array(
+        "params.integration", lambda rows: np.zeros((1, ARM.dof))
+    ),
 }
 
 
@@ -230,9 +241,16 @@ def test_a_file_holds_the_state_of_every_part(options: Any, tmp_path: Path) -> N
         assert_identical(runner.step(setpoint), expected)
         head, tables = read(tmp_path / "s.npz")
         for name, rows in tables.items():
-            if name.partition(".")[0] in ("controller", "actuators", "guard", "sensors") and rows.shape[:1] == (3,):
+            if name.partition(".")[0] in (
+                "controller",
+                "actuators",
+                "guard",
+                "sensors",
+            ) and rows.shape[:1] == (3,):
                 with pytest.raises(InvalidArgumentError):
-                    runner.restore(Snapshot.load(write(tmp_path / "bad.npz", head, tables | {name: rows[:2]})))
+                    runner.restore(
+                        Snapshot.load(write(tmp_path / "bad.npz", head, tables | {name: rows[:2]}))
+                    )
 
 
 @pytest.mark.parametrize(
@@ -259,13 +277,22 @@ def tables(snapshot: Snapshot) -> dict[str, Any]:
     """Return everything in a snapshot by name, as arrays and text."""
     found = {f"params.{name}": leaf for name, leaf in snapshot.params._asdict().items()}
     for name, rows in vars(snapshot.states).items():
-        found |= {f"{name}.{leaf}": each for leaf, each in rows.items()} if isinstance(rows, dict) else {name: rows}
+        found |= (
+            {f"{name}.{leaf}": each for leaf, each in rows.items()}
+            if isinstance(rows, dict)
+            else {name: rows}
+        )
     found |= {"about": snapshot.about, "steps": snapshot.steps}
-    return {name: value if isinstance(value, np.ndarray) else repr(value) for name, value in found.items()}
+    return {
+        name: value if isinstance(value, np.ndarray) else repr(value)
+        for name, value in found.items()
+    }
 
 
 def check(path: Path, content: bytes, original: Snapshot) -> None:
-    """Load ``content``: it is refused with our error, or equal to the original, with little memory."""
+    """Load ``content``: it is refused with our error, or equal to the original, with little
+    memory.
+    """
     path.write_bytes(content)
     tracemalloc.start()
     try:
@@ -297,7 +324,9 @@ EXTREMES = (np.nan, np.inf, -np.inf, 0.0, 1e38, -1e38, 1e-45, -1.0, 2.0**31 - 1)
 
 
 @pytest.mark.parametrize("count", [20, pytest.param(1000, marks=pytest.mark.slow)])
-def test_edits_under_right_checksums_are_refused_or_another_state(good: Path, count: int, tmp_path: Path) -> None:
+def test_edits_under_right_checksums_are_refused_or_another_state(
+    good: Path, count: int, tmp_path: Path
+) -> None:
     random, restored = np.random.default_rng(count), 0
     head, original = read(good)
     with make() as runner, warnings.catch_warnings():
@@ -307,7 +336,9 @@ def test_edits_under_right_checksums_are_refused_or_another_state(good: Path, co
             for name in random.choice(sorted(arrays), random.integers(1, 4)):
                 rows, kind = arrays[name], random.integers(6)
                 if kind < 3 and rows.size:
-                    rows.flat[random.integers(rows.size)] = np.array(random.choice(EXTREMES)).astype(rows.dtype)
+                    rows.flat[random.integers(rows.size)] = np.array(
+                        random.choice(EXTREMES)
+                    ).astype(rows.dtype)
                 elif kind == 3:
                     arrays[name] = rows.astype(random.choice(["f8", "f4", "i8", "?", "U4"]))
                 elif kind == 4:
@@ -340,7 +371,12 @@ def test_what_is_no_snapshot_is_refused_and_not_executed(good: Path, tmp_path: P
 
     encrypted = bytearray(good.read_bytes())
     encrypted[encrypted.index(b"PK\x01\x02") + 8] |= 1
-    contents = {"empty": b"", "text": b"hello", "pickle": pickle.dumps(Evil()), "encrypted": encrypted}
+    contents = {
+        "empty": b"",
+        "text": b"hello",
+        "pickle": pickle.dumps(Evil()),
+        "encrypted": encrypted,
+    }
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)
     np.savez(tmp_path / "objects.npz", head=np.array([Evil()], dtype=object))

@@ -1,4 +1,6 @@
-"""The law in XLA. That each feature is close to NumPy and bit-identical in workers is in test_conformance.py."""
+"""The law in XLA. That each feature is close to NumPy and bit-identical in workers is in
+test_conformance.py.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +23,19 @@ N = 5
 
 def commands(robot, ticks, envs=N, spread=0.3):
     rng = np.random.default_rng(3)
-    low, high = np.maximum(robot.lower, robot.start - spread), np.minimum(robot.upper, robot.start + spread)
-    return rng.uniform(low, high, (envs, ticks, robot.dof)).swapaxes(0, 1)  # those of an env do not depend on others
+    low, high = (
+        np.maximum(robot.lower, robot.start - spread),
+        np.minimum(robot.upper, robot.start + spread),
+    )
+    return rng.uniform(low, high, (envs, ticks, robot.dof)).swapaxes(
+        0, 1
+    )  # those of an env do not depend on others
 
 
 def rollout(robot, backend="jax", ticks=20, envs=N, **options):
-    with Runner(robot, envs, backend=backend, **({"workers": 0, "substeps": 10} | options)) as runner:
+    with Runner(
+        robot, envs, backend=backend, **({"workers": 0, "substeps": 10} | options)
+    ) as runner:
         return runner.rollout(commands(robot, ticks, envs))
 
 
@@ -68,7 +77,9 @@ LACKING = {
 
 @pytest.mark.parametrize("name", LACKING)
 def test_options_that_the_program_lacks_are_refused_by_name(panda, name):
-    with pytest.raises(InvalidArgumentError, match=rf"^{name}: .*backend 'jax'.*use backend='numpy'"):
+    with pytest.raises(
+        InvalidArgumentError, match=rf"^{name}: .*backend 'jax'.*use backend='numpy'"
+    ):
         Runner(**{"robot": panda, "num_envs": 2, "backend": "jax", "workers": 0} | LACKING[name])
 
 
@@ -104,11 +115,18 @@ def test_random_efforts_resets_snapshots_and_faults_are_those_of_the_loop_in_num
         "speed_limit": rng.choice([20.0, 1000.0]),
         "on_invalid_input": "contain",
     }
-    runners = [Runner(robot, envs, backend=backend, workers=0, **options) for backend in ("jax", "numpy")]
+    runners = [
+        Runner(robot, envs, backend=backend, workers=0, **options) for backend in ("jax", "numpy")
+    ]
     snapshots = [runner.snapshot() for runner in runners]
     for _ in range(25):
-        action, mask = rng.choice(["reset", "snapshot", "restore", *["step"] * 5]), rng.random(envs) < 0.4
-        qpos = np.clip(robot.start + rng.uniform(-1, 1, (envs, robot.dof)), robot.lower, robot.upper)
+        action, mask = (
+            rng.choice(["reset", "snapshot", "restore", *["step"] * 5]),
+            rng.random(envs) < 0.4,
+        )
+        qpos = np.clip(
+            robot.start + rng.uniform(-1, 1, (envs, robot.dof)), robot.lower, robot.upper
+        )
         efforts = rng.normal(size=(envs, robot.dof)) * np.minimum(robot.effort_limit, 60)
         if rng.random() < 0.1:
             efforts[rng.integers(envs), rng.integers(robot.dof)] = np.nan

@@ -94,6 +94,8 @@ def test_the_state_of_a_controller_has_the_precision_of_the_runner():
     for wide in (False, True):
         with (
             changed(jax_enable_x64=wide),
-            Runner(load_bundled(RUBBING), 2, backend="jax", control=Integrator(), workers=0) as runner,
+            Runner(
+                load_bundled(RUBBING), 2, backend="jax", control=Integrator(), workers=0
+            ) as runner,
         ):
             assert runner.snapshot().states.controller["sum"].dtype == np.float64

@@ -59,7 +59,9 @@ def test_every_joint_has_its_axes(joints):
 def is_drawn(axes, values):
     """Return whether one of the lines has these values."""
     lines = [np.asarray(line.get_ydata(), float) for line in axes.lines]
-    return any(line.shape == values.shape and np.allclose(line, values, equal_nan=True) for line in lines)
+    return any(
+        line.shape == values.shape and np.allclose(line, values, equal_nan=True) for line in lines
+    )
 
 
 def test_fan_holds_every_env_and_the_line_is_the_median():
@@ -145,7 +147,9 @@ def test_nothing_is_drawn_of_an_env_after_it_failed():
 
 def test_axes_have_the_units_of_their_joint():
     named, others = split_axes(plots.step_responses(make(2)))
-    assert [(above.get_ylabel(), below.get_ylabel()) for above, below in zip(named, others, strict=True)] == [
+    assert [
+        (above.get_ylabel(), below.get_ylabel()) for above, below in zip(named, others, strict=True)
+    ] == [
         ("rad", "N m"),
         ("m", "N"),
     ]

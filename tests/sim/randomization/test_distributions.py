@@ -13,15 +13,29 @@ from batchpid.sim import Choice, LogUniform, Normal, Randomization, Uniform
 COUNT = 20_000
 numbers = st.floats(-1e3, 1e3, allow_nan=False)
 pairs = st.tuples(numbers, numbers).map(sorted)
-options = st.fixed_dictionaries({"operation": st.sampled_from(["add", "scale", "abs"]), "shared": st.booleans()})
+options = st.fixed_dictionaries(
+    {"operation": st.sampled_from(["add", "scale", "abs"]), "shared": st.booleans()}
+)
 distributions = st.one_of(
     st.builds(lambda ends, rest: Uniform(*ends, **rest), pairs, options),
     st.builds(
-        lambda ends, rest: LogUniform(*(1e-3 + abs(end) for end in sorted(ends, key=abs)), **rest), pairs, options
+        lambda ends, rest: LogUniform(*(1e-3 + abs(end) for end in sorted(ends, key=abs)), **rest),
+        pairs,
+        options,
     ),
-    st.builds(lambda mean, std, rest: Normal(mean, std, **rest), numbers, st.floats(1e-3, 1e3), options),
-    st.builds(lambda mean, std: Normal(mean, std, low=mean - std, high=mean + 2 * std), numbers, st.floats(1e-3, 1e3)),
-    st.builds(lambda values, rest: Choice(values, **rest), st.lists(numbers, min_size=1, max_size=5), options),
+    st.builds(
+        lambda mean, std, rest: Normal(mean, std, **rest), numbers, st.floats(1e-3, 1e3), options
+    ),
+    st.builds(
+        lambda mean, std: Normal(mean, std, low=mean - std, high=mean + 2 * std),
+        numbers,
+        st.floats(1e-3, 1e3),
+    ),
+    st.builds(
+        lambda values, rest: Choice(values, **rest),
+        st.lists(numbers, min_size=1, max_size=5),
+        options,
+    ),
 )
 
 
@@ -53,11 +67,15 @@ def test_normal_has_its_moments():
 
 
 def test_normal_that_is_truncated_symmetrically_keeps_its_mean_and_is_narrower():
-    """The variance of a standard normal within +-1 is 1 - 2 phi(1) / (2 Phi(1) - 1) (N. Johnson et al., ch. 13)."""
+    """The variance of a standard normal within +-1 is 1 - 2 phi(1) / (2 Phi(1) - 1) (N. Johnson et
+    al., ch. 13).
+    """
     mean, std, error = moments(Normal(0, 1, low=-1, high=1))
     share = math.erf(1 / math.sqrt(2))
     assert mean == pytest.approx(0, abs=error)
-    assert std == pytest.approx(math.sqrt(1 - 2 * math.exp(-0.5) / math.sqrt(2 * math.pi) / share), rel=0.02)
+    assert std == pytest.approx(
+        math.sqrt(1 - 2 * math.exp(-0.5) / math.sqrt(2 * math.pi) / share), rel=0.02
+    )
 
 
 def test_choice_draws_all_values_alike_often():
@@ -82,9 +100,13 @@ def test_a_distribution_is_what_its_dict_describes(distribution):
     assert read(distribution.to_dict()) == Randomization(qpos=distribution)
 
 
-@pytest.mark.parametrize(("operation", "expected"), [("add", [5, 7]), ("scale", [6, 12]), ("abs", [3, 3])])
+@pytest.mark.parametrize(
+    ("operation", "expected"), [("add", [5, 7]), ("scale", [6, 12]), ("abs", [3, 3])]
+)
 def test_operations(operation, expected):
-    np.testing.assert_array_equal(Uniform(0, 9, operation=operation).apply(np.array([2.0, 4.0]), 3.0), expected)
+    np.testing.assert_array_equal(
+        Uniform(0, 9, operation=operation).apply(np.array([2.0, 4.0]), 3.0), expected
+    )
 
 
 @pytest.mark.parametrize(
@@ -111,7 +133,10 @@ def test_operations(operation, expected):
             lambda: read({"uniform": 1}),
             "qpos: is not a distribution: uniform needs a list",
         ),
-        (lambda: read({"uniform": [0, 1], "mode": "add"}), "qpos: unknown option .*'operation', 'shared'"),
+        (
+            lambda: read({"uniform": [0, 1], "mode": "add"}),
+            "qpos: unknown option .*'operation', 'shared'",
+        ),
         (lambda: read({"uniform": [2, 1]}), "qpos: high: is less than low"),
     ],
 )

@@ -37,7 +37,10 @@ def drawn(randomization, rows):
 @settings(max_examples=12)
 @given(rows=episodes, seed=counts, order=st.randoms())
 def test_an_env_draws_the_same_in_any_company(rows, seed, order):
-    randomization, shuffled = Randomization(seed=seed, **FIELDS), order.sample(range(len(rows)), len(rows))
+    randomization, shuffled = (
+        Randomization(seed=seed, **FIELDS),
+        order.sample(range(len(rows)), len(rows)),
+    )
     together, alone = drawn(randomization, rows), [drawn(randomization, [row]) for row in rows]
     mixed = drawn(randomization, [rows[row] for row in shuffled])
     for name, values in together.items():
@@ -62,11 +65,15 @@ def test_draws_are_those_of_philox_with_the_documented_key_and_counter():
     for stream, episode in ((0, 0), (7, 2)):
         generator = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, episode, stream]))
         expected = generator.uniform(-1, 1, PANDA.dof)
-        np.testing.assert_array_equal(drawn(randomization, [(stream, episode)])["qpos"][0], expected)
+        np.testing.assert_array_equal(
+            drawn(randomization, [(stream, episode)])["qpos"][0], expected
+        )
 
 
 def test_seeds_streams_episodes_and_fields_are_independent():
-    randomization = Randomization(payload=Uniform(0, 1), friction=Uniform(0, 1), damping=Uniform(0, 1))
+    randomization = Randomization(
+        payload=Uniform(0, 1), friction=Uniform(0, 1), damping=Uniform(0, 1)
+    )
     rows = [(stream, episode) for stream in range(40) for episode in range(40)]
     values = drawn(randomization, rows)
     table = np.column_stack([values["payload"], values["friction"], values["damping"]])
@@ -84,7 +91,10 @@ def test_shared_and_named_draws():
     assert (np.ptp(values["actuators.command_delay"], axis=1) == 0).all()
     assert (np.ptp(values["link_mass"], axis=1) > 0).all()
     named = ~np.isnan(values["friction"]).all(0)
-    assert [PANDA.joint_names[joint] for joint in np.flatnonzero(named)] == ["panda_joint1", "panda_joint4"]
+    assert [PANDA.joint_names[joint] for joint in np.flatnonzero(named)] == [
+        "panda_joint1",
+        "panda_joint4",
+    ]
     assert values["payload"].shape == (20, 1)
 
 
@@ -128,7 +138,9 @@ def test_draws_are_applied_by_their_operation():
     np.testing.assert_array_equal(later.command_delay, 0.001 + actuators.command_delay)
     start = np.tile(PANDA.upper, (3, 1))
     qpos, qvel = randomization.start(start, np.zeros_like(start), draws, PANDA)
-    np.testing.assert_array_equal(qpos, np.clip(start + draws.values["qpos"], PANDA.lower, PANDA.upper))
+    np.testing.assert_array_equal(
+        qpos, np.clip(start + draws.values["qpos"], PANDA.lower, PANDA.upper)
+    )
     assert not qvel.any()
 
 
@@ -136,11 +148,16 @@ def test_centers_of_mass_are_drawn_along_three_axes():
     """For all links, or those that are named."""
     one = Randomization(center_of_mass={"panda_link7": Uniform(-0.01, 0.01)})
     check_robot(one, PANDA)
-    columns, rows = elements("center_of_mass", PANDA), drawn(one, [(env, 0) for env in range(9)])["center_of_mass"]
+    columns, rows = (
+        elements("center_of_mass", PANDA),
+        drawn(one, [(env, 0) for env in range(9)])["center_of_mass"],
+    )
     named = [columns[at] for at in np.flatnonzero(~np.isnan(rows).all(0))]
     assert named == ["panda_link7.x", "panda_link7.y", "panda_link7.z"]
     assert len(np.unique(rows[:, ~np.isnan(rows).all(0)])) == 27
-    everywhere = drawn(Randomization(center_of_mass=Uniform(-0.01, 0.01)), [(0, 0)])["center_of_mass"]
+    everywhere = drawn(Randomization(center_of_mass=Uniform(-0.01, 0.01)), [(0, 0)])[
+        "center_of_mass"
+    ]
     assert everywhere.shape == (1, 3 * len(elements("link_mass", PANDA)))
 
 
@@ -173,7 +190,9 @@ def test_static_friction_below_coulombs_is_coulombs():
     assert rows.coulomb.tolist() == worn.coulomb.tolist()
     velocity, load = np.zeros((50, PANDA.dof)), np.full((50, PANDA.dof), 0.9)
     model = friction.Friction(rows.coulomb, None, rows.static)
-    state = friction.init(model, velocity, 0 * load, np.tile(np.eye(PANDA.dof), (50, 1, 1)), 1 / 2000)
+    state = friction.init(
+        model, velocity, 0 * load, np.tile(np.eye(PANDA.dof), (50, 1, 1)), 1 / 2000
+    )
     for _ in range(20):
         state, total = friction.advance(model, state, load, velocity)
         assert not total.any(), "below Coulomb's friction no joint moves"
@@ -187,14 +206,23 @@ def test_it_is_what_its_dict_describes():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"payload": Uniform(-1, 1)}, r"payload, entry 'payload': must be finite and >= 0 \(got -1"),
+        (
+            {"payload": Uniform(-1, 1)},
+            r"payload, entry 'payload': must be finite and >= 0 \(got -1",
+        ),
         ({"payload": Uniform(0, 1, operation="scale")}, "payload: is 0, which cannot be scaled"),
         ({"payload": Uniform(0, 1), "payload_link": "wheel"}, "payload_link: unknown option"),
-        ({"link_mass": Normal(1, 0.1, operation="scale")}, r"link_mass, entry .*: must be finite and > 0"),
+        (
+            {"link_mass": Normal(1, 0.1, operation="scale")},
+            r"link_mass, entry .*: must be finite and > 0",
+        ),
         ({"link_mass": {"wheel": Uniform(0, 1)}}, "link_mass: unknown option"),
         ({"center_of_mass": {"wheel": Uniform(0, 1)}}, "center_of_mass: unknown option"),
         ({"center_of_mass": {"panda_link7.x": Uniform(0, 1)}}, "center_of_mass: unknown option"),
-        ({"center_of_mass": Uniform(0, 1, operation="scale")}, "center_of_mass: is 0, which cannot be scaled"),
+        (
+            {"center_of_mass": Uniform(0, 1, operation="scale")},
+            "center_of_mass: is 0, which cannot be scaled",
+        ),
         ({"friction": {"panda_joint9": Uniform(0, 1)}}, "friction: unknown option"),
         ({"damping": Uniform(-0.1, 0.1)}, r"damping, entry 'panda_joint1': must be .*got -0\.097"),
         ({"qpos": {"panda_joint9": Uniform(0, 1)}}, "qpos: unknown option"),
@@ -236,7 +264,10 @@ def test_damping_that_the_engine_simulates_is_not_drawn():
         ([1], "randomization: is not a mapping"),
         ({"payload": 0.5}, "payload: is not a distribution"),
         ({"params": {"kp": {"uniform": [2, 1]}}}, "params.kp: high: is less than low"),
-        ({"friction": {"panda_joint1": {"normal": [0]}}}, "friction.panda_joint1: is not a distribution"),
+        (
+            {"friction": {"panda_joint1": {"normal": [0]}}},
+            "friction.panda_joint1: is not a distribution",
+        ),
     ],
 )
 def test_a_file_that_describes_none_is_refused(known, message):

@@ -73,7 +73,9 @@ def test_feedforwards_are_recorded_where_they_are_given(tmp_path):
         runner.step(ROBOT.start)
         rollout = runner.rollout(table(4), feedforwards=efforts)
     np.testing.assert_array_equal(rollout.feedforward, efforts)
-    np.testing.assert_array_equal(read_recording(tmp_path / "run.h5").feedforward, [0 * efforts[0], *efforts])
+    np.testing.assert_array_equal(
+        read_recording(tmp_path / "run.h5").feedforward, [0 * efforts[0], *efforts]
+    )
 
 
 def test_ticks_of_another_length_are_refused_while_it_records(tmp_path):
@@ -131,7 +133,9 @@ def test_a_runner_takes_one_recorder_at_a_time_and_none_when_closed(tmp_path):
     with make() as runner:
         with Recorder(tmp_path / "a.h5", runner):
             runner.step(ROBOT.start)
-            with pytest.raises(InvalidArgumentError, match=r"runner: is being recorded already, to .*a\.h5.*close"):
+            with pytest.raises(
+                InvalidArgumentError, match=r"runner: is being recorded already, to .*a\.h5.*close"
+            ):
                 Recorder(tmp_path / "b.h5", runner)
             runner.step(ROBOT.start)
         with Recorder(tmp_path / "b.h5", runner):
@@ -162,7 +166,9 @@ def fill_the_disk(path):
         runner.step(ROBOT.start)
         os.dup2(os.open("/dev/full", os.O_RDWR), recorder._file.id.get_vfd_handle())
         runner.step(ROBOT.start)
-        with pytest.raises(RecordingError, match=r"run\.h5: cannot be written: .*No space left on device"):
+        with pytest.raises(
+            RecordingError, match=r"run\.h5: cannot be written: .*No space left on device"
+        ):
             runner.step(ROBOT.start)
         with pytest.raises(RecordingError):
             recorder.close()
@@ -175,7 +181,12 @@ def test_a_file_that_cannot_be_written_is_an_error_before_the_next_tick(tmp_path
     folders = [str(Path(__file__).parent), str(Path.cwd()), *sys.path]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, folders))}
     path = str(tmp_path / "run.h5")
-    assert subprocess.run([sys.executable, "-c", program, path], env=environment, timeout=120).returncode == 0
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", program, path], env=environment, timeout=120
+        ).returncode
+        == 0
+    )
 
 
 def test_bad_paths_are_refused():
@@ -201,8 +212,12 @@ with (
 
 
 def kill_after(seconds, path):
-    """Kill a recorded program some seconds after its first tick; return when each of its ticks ended [s]."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))}
+    """Kill a recorded program some seconds after its first tick; return when each of its ticks
+    ended [s].
+    """
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))
+    }
     command = [sys.executable, "-c", PROGRAM, path]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         lines = [process.stdout.readline()]

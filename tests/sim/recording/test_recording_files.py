@@ -1,4 +1,6 @@
-"""Rollouts are read from files as they were written, and other files are refused with their names."""
+"""Rollouts are read from files as they were written, and other files are refused with their
+names.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,14 @@ import pytest
 from identical import assert_identical
 
 from batchpid.errors import BatchPIDError, InvalidArgumentError
-from batchpid.sim import FaultWarning, RecordingError, RunInfo, Runner, read_recording, write_recording
+from batchpid.sim import (
+    FaultWarning,
+    RecordingError,
+    RunInfo,
+    Runner,
+    read_recording,
+    write_recording,
+)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +60,11 @@ def test_rollouts_are_read_as_they_were_written(tmp_path, rollout):
     assert_same_info(read.info, replace(rollout.info, seed=7))
     (fault,) = read.info.faults
     assert (fault.env, fault.joint, fault.cause) == (1, "panda_joint4", "setpoint")
-    assert (read.info.physics, read.info.compensate, read.info.complete) == ("fast", "gravity+coriolis+friction", True)
+    assert (read.info.physics, read.info.compensate, read.info.complete) == (
+        "fast",
+        "gravity+coriolis+friction",
+        True,
+    )
     assert os.listdir(path.parent) == [path.name]
     every = read_recording(path, every=4)
     assert_identical(every, rollout.for_ticks(slice(None, None, 4)))
@@ -119,7 +132,9 @@ def test_files_that_are_no_recordings_are_refused_by_name(tmp_path, rollout):
             read_recording(path)
 
 
-@pytest.mark.parametrize("path", [".", "", "/", "..", "a" * 5000, "/dev/null", "run.h5/more", "missing.h5"])
+@pytest.mark.parametrize(
+    "path", [".", "", "/", "..", "a" * 5000, "/dev/null", "run.h5/more", "missing.h5"]
+)
 def test_paths_of_no_file_are_refused(path):
     with pytest.raises(BatchPIDError):
         read_recording(path)

@@ -1,4 +1,6 @@
-"""A damaged URDF or .srdf loads or is refused by an error of ours, within seconds and a bounded memory."""
+"""A damaged URDF or .srdf loads or is refused by an error of ours, within seconds and a bounded
+memory.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +20,29 @@ from batchpid import assets
 from batchpid.errors import RobotError
 from batchpid.sim import Robot, Runner
 
-BOX = '<collision><origin xyz="0 0 1" rpy="0 0 0.1"/><geometry><box size="1 1 1"/></geometry></collision>'
+BOX = (
+    '<collision><origin xyz="0 0 1" rpy="0 0 0.1"/><geometry><box size="1 1'
+    ' 1"/></geometry></collision>'
+)
 PAIR = '<disable_collisions link1="base" link2="arm" reason="Default"/>'
 SOURCES = {path.name: path.read_bytes() for path in Path(assets.__file__).parent.glob("*.urdf")}
 SOURCES |= {
-    "one joint": one_joint(LIMIT + '<dynamics damping="1" friction="0.1"/>', arm=INERTIAL + BOX).encode(),
-    "mimic": robot(
-        *map(link, ("base", "l", "r", "tip")),
-        joint("left", "base", "l"),
-        joint("right", "base", "r", inner=LIMIT + '<mimic joint="left" multiplier="-1" offset="0"/>'),
-        joint("end", "r", "tip", "fixed"),
-    ).encode(),
+    "one joint": (
+        one_joint(LIMIT + '<dynamics damping="1" friction="0.1"/>', arm=INERTIAL + BOX).encode()
+    ),
+    "mimic": (
+        robot(
+            *map(link, ("base", "l", "r", "tip")),
+            joint("left", "base", "l"),
+            joint(
+                "right",
+                "base",
+                "r",
+                inner=LIMIT + '<mimic joint="left" multiplier="-1" offset="0"/>',
+            ),
+            joint("end", "r", "tip", "fixed"),
+        ).encode()
+    ),
     "mesh": arm("mesh.stl").encode(),
 }
 SRDF = robot(PAIR, PAIR.replace("Default", "Never")).encode()
@@ -48,7 +62,14 @@ SNIPPETS = [
     b"<collision>",
     b"&a;",
 ]
-SNIPPETS += [b"\0", b"\xff\xfe", b"9" * 5000, b"<x>" * 300, b"mesh.stl", b"<?xml version='1.0' encoding='utf-7'?>"]
+SNIPPETS += [
+    b"\0",
+    b"\xff\xfe",
+    b"9" * 5000,
+    b"<x>" * 300,
+    b"mesh.stl",
+    b"<?xml version='1.0' encoding='utf-7'?>",
+]
 
 
 @st.composite
@@ -60,14 +81,18 @@ def damaged(draw: st.DrawFn, data: bytes) -> bytes:
         if kind == "flip" and at < len(data):
             data = data[:at] + bytes([data[at] ^ 1 << draw(st.integers(0, 7))]) + data[at + 1 :]
         elif kind == "replace":
-            data = data[:at] + draw(st.sampled_from(SNIPPETS)) + data[at + draw(st.integers(0, 40)) :]
+            data = (
+                data[:at] + draw(st.sampled_from(SNIPPETS)) + data[at + draw(st.integers(0, 40)) :]
+            )
         elif kind == "cut":
             data = data[:at] if draw(st.integers(0, 9)) == 0 else data
     return data
 
 
 def try_loading(path: Path, build: bool) -> None:
-    """Load a robot and ``build`` a scene of it: an error is one of ours, and neither takes long nor much memory."""
+    """Load a robot and ``build`` a scene of it: an error is one of ours, and neither takes long nor
+    much memory.
+    """
     before, started = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     try:
         loaded = Robot.load(path)
@@ -84,7 +109,11 @@ def fuzz(count: int, folder: Path, built: Collection[str]) -> None:
     path, srdf, mesh = (folder / name for name in ("test.urdf", "test.srdf", "mesh.stl"))
 
     @settings(
-        max_examples=count, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
+        max_examples=count,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=list(HealthCheck),
     )
     @given(data=st.data())
     def run(data: st.DataObject) -> None:
@@ -116,11 +145,15 @@ FORMATS = ["test.urdf", "test.srdf", *GOOD]
 
 
 def flip_bits(name: str, count: int, folder: Path, built: int) -> None:
-    """Load a robot whose file ``name`` has one flipped bit, for ``count`` places in it; simulate every ``built``-th."""
+    """Load a robot whose file ``name`` has one flipped bit, for ``count`` places in it; simulate
+    every ``built``-th.
+    """
     urdf = arm(name).encode() if name in GOOD else SOURCES["one joint"]
     content = {"test.urdf": urdf, "test.srdf": SRDF, **GOOD}[name]
     (folder / "test.urdf").write_bytes(urdf)
-    for case, (place, bit) in enumerate(np.random.default_rng(0).integers(0, (len(content), 8), (count, 2))):
+    for case, (place, bit) in enumerate(
+        np.random.default_rng(0).integers(0, (len(content), 8), (count, 2))
+    ):
         flipped = bytes([content[place] ^ 1 << bit])
         (folder / name).write_bytes(content[:place] + flipped + content[place + 1 :])
         try_loading(folder / "test.urdf", build=case % built == 0)

@@ -1,7 +1,8 @@
 """Designed gains, untuned, on robots of many makers: stable, and settled within two seconds.
 
-The robots are the bundled ones and, where it is installed, the robots of the package ``example-robot-data`` (extra
-"robots"). Joint friction is set to 0: these files give a torque, PhysX takes a dimensionless coefficient.
+The robots are the bundled ones and, where it is installed, the robots of the package
+``example-robot-data`` (extra "robots"). Joint friction is set to 0: these files give a torque,
+PhysX takes a dimensionless coefficient.
 """
 
 from __future__ import annotations
@@ -49,8 +50,14 @@ def load(name):
 
 
 MISSES = {
-    ("g1_description/urdf/g1_29dof_rev_1_0.urdf", "effort"): "an ankle's gains are too weak to leave its limit",
-    ("jaco2", "effort"): "a fingertip that starts at its limit gets 0.001 N m to move by 0.04 rad, and stays there",
+    (
+        "g1_description/urdf/g1_29dof_rev_1_0.urdf",
+        "effort",
+    ): "an ankle's gains are too weak to leave its limit",
+    (
+        "jaco2",
+        "effort",
+    ): "a fingertip that starts at its limit gets 0.001 N m to move by 0.04 rad, and stays there",
 }
 
 
@@ -73,7 +80,10 @@ def test_designed_gains_settle_within_two_seconds(name, units, record_property):
     )
     worst = evaluation.metrics.settling_time.max()
     record_property("settling_time", float(worst))
-    print(f"{name:52s} {ROBOTS[name]:32s} {units:12s} {robot.dof:3d} joints settle within {worst:.2f} s")
+    print(
+        f"{name:52s} {ROBOTS[name]:32s} {units:12s} {robot.dof:3d} joints settle within"
+        f" {worst:.2f} s"
+    )
     assert evaluation.rollout.ok.all()
     assert np.isfinite(evaluation.metrics.overshoot[~np.isnan(evaluation.metrics.overshoot)]).all()
     assert worst < 2.0

@@ -10,11 +10,16 @@ import batchpid as bp
 from batchpid.sim import Robot, Runner
 
 UNLIMITED = LIMIT.replace('effort="10"', "")
-OFF_CENTRE = '<inertial><origin xyz="0.5 0 0"/><mass value="2"/><inertia ixx="0.1" iyy="0.1" izz="0.1"/></inertial>'
+OFF_CENTRE = (
+    '<inertial><origin xyz="0.5 0 0"/><mass value="2"/><inertia ixx="0.1" iyy="0.1"'
+    ' izz="0.1"/></inertial>'
+)
 
 
 def test_the_suggested_limit_is_that_of_its_formula(tmp_path):
-    """A mass of 2 kg at 0.5 m, level at q = 0: gravity 9.81 N m, inertia 0.1 + 2 * 0.5^2 = 0.6 kg m^2."""
+    """A mass of 2 kg at 0.5 m, level at q = 0: gravity 9.81 N m, inertia 0.1 + 2 * 0.5^2 = 0.6 kg
+    m^2.
+    """
     text = one_joint(UNLIMITED + '<dynamics friction="0.5" damping="0.2"/>', arm=OFF_CENTRE)
     free = Robot.load(write(tmp_path, text))
     assert free.effort_limit == np.inf
@@ -23,7 +28,13 @@ def test_the_suggested_limit_is_that_of_its_formula(tmp_path):
 
 
 def test_stated_limits_are_kept_and_designed_gains_have_both(tmp_path):
-    parts = link("base"), link("a"), link("b"), joint("j", "base", "a"), joint("k", "a", "b", inner=UNLIMITED)
+    parts = (
+        link("base"),
+        link("a"),
+        link("b"),
+        joint("j", "base", "a"),
+        joint("k", "a", "b", inner=UNLIMITED),
+    )
     mixed = Robot.load(write(tmp_path, robot(*parts)))
     stated, suggested = mixed.design_effort_limit
     assert stated == 10
@@ -37,7 +48,10 @@ def test_stated_limits_are_kept_and_designed_gains_have_both(tmp_path):
 
 def test_a_robot_without_effort_limits_settles_under_designed_gains(tmp_path):
     free = Robot.load(
-        write(tmp_path, one_joint('<limit lower="-1" upper="1" effort="0" velocity="0"/>', arm=OFF_CENTRE))
+        write(
+            tmp_path,
+            one_joint('<limit lower="-1" upper="1" effort="0" velocity="0"/>', arm=OFF_CENTRE),
+        )
     )
     with Runner(free, 1, params=free.designed(), workers=0, ground=False) as runner:
         for _ in range(200):

@@ -32,12 +32,20 @@ ODD = """<robot name="odd">
 
 def odd_robot(folder):
     """A tree listed out of order, with every type of joint."""
-    return Robot.load(write(folder, re.sub(r'<link name="(\w+)"/>', lambda found: link(found[1]), ODD)))
+    return Robot.load(
+        write(folder, re.sub(r'<link name="(\w+)"/>', lambda found: link(found[1]), ODD))
+    )
 
 
-@pytest.fixture(scope="module", params=["panda", pytest.param("jaco2", marks=pytest.mark.slow), "odd"])
+@pytest.fixture(
+    scope="module", params=["panda", pytest.param("jaco2", marks=pytest.mark.slow), "odd"]
+)
 def robot(request, tmp_path_factory):
-    return odd_robot(tmp_path_factory.mktemp("odd")) if request.param == "odd" else load_bundled(request.param)
+    return (
+        odd_robot(tmp_path_factory.mktemp("odd"))
+        if request.param == "odd"
+        else load_bundled(request.param)
+    )
 
 
 def random_qpos(robot, count):
@@ -46,7 +54,9 @@ def random_qpos(robot, count):
 
 
 def test_link_poses_are_those_of_sapien(robot):
-    spec = SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["accurate"], ground=False)
+    spec = SceneSpec(
+        robot.urdf, robot.ignored_pairs, robot.joints, 1e-3, PHYSICS["accurate"], ground=False
+    )
     _scene, reference = build_scene(spec, new_system(spec))
     tree, qpos = robot.rigid_tree, random_qpos(robot, 20)
     ours = ts.link_poses(tree, qpos)
@@ -60,7 +70,11 @@ def test_link_poses_are_those_of_sapien(robot):
 
 
 def test_the_tool_is_the_hand_or_the_end_of_the_chain(panda, jaco2, tmp_path):
-    for robot, tool in ((panda, "panda_hand"), (jaco2, "j2s7s300_link_7"), (odd_robot(tmp_path), "mid")):
+    for robot, tool in (
+        (panda, "panda_hand"),
+        (jaco2, "j2s7s300_link_7"),
+        (odd_robot(tmp_path), "mid"),
+    ):
         assert robot.rigid_tree.tool == tool
 
 
@@ -71,7 +85,9 @@ vectors = st.lists(st.floats(-2, 2), min_size=3, max_size=3).map(np.array)
 @settings(deadline=None, max_examples=20)
 @given(roll=angles, pitch=angles, yaw=angles, v=vectors)
 def test_rotations_compose_keep_lengths_and_follow_the_urdf_order(roll, pitch, yaw, v):
-    x, y, z = (about(axis, angle) for axis, angle in zip(np.eye(3), (roll, pitch, yaw), strict=True))
+    x, y, z = (
+        about(axis, angle) for axis, angle in zip(np.eye(3), (roll, pitch, yaw), strict=True)
+    )
     q = from_rpy([roll, pitch, yaw])
     np.testing.assert_allclose(rotate(q, v), rotate(z, rotate(y, rotate(x, v))), atol=1e-12)
     np.testing.assert_allclose(rotate(multiply(x, y), v), rotate(x, rotate(y, v)), atol=1e-12)

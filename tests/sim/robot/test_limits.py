@@ -1,4 +1,6 @@
-"""Warnings of positions outside the joint limits: one for each call, with all joints, their worst position and envs."""
+"""Warnings of positions outside the joint limits: one for each call, with all joints, their worst
+position and envs.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from tests.sim.tiny_urdf import joint, link, robot, write
 
 @pytest.fixture
 def arm(tmp_path):
-    return Robot.load(write(tmp_path, robot(*map(link, "abc"), joint("one", "a", "b"), joint("two", "b", "c"))))
+    return Robot.load(
+        write(tmp_path, robot(*map(link, "abc"), joint("one", "a", "b"), joint("two", "b", "c")))
+    )
 
 
 def warned(call):
@@ -30,9 +34,11 @@ def test_one_warning_lists_joints_and_envs(arm):
         pose = np.zeros((8, 2))
         pose[3, 0], pose[5:, 1], pose[6, 1] = 1.5, -2.0, -3.0
         (message,) = warned(lambda: runner.reset(pose))
-        assert message == (
-            "qpos is outside the joint limits, where no joint can follow: joint 'one' at 1.5 rad, not in [-1, 1] "
-            "(env 3); joint 'two' at -3 rad, not in [-1, 1] (envs 5, 6, 7); move it inside"
+        assert (
+            message
+            == "qpos is outside the joint limits, where no joint can follow: joint 'one' at 1.5"
+            " rad, not in [-1, 1] (env 3); joint 'two' at -3 rad, not in [-1, 1] (envs 5, 6, 7);"
+            " move it inside"
         )
         (message,) = warned(lambda: runner.step(np.full(2, 2.0)))
         assert "setpoint" in message

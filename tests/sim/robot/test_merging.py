@@ -62,7 +62,9 @@ def test_without_fixed_joints_nothing_changes(tmp_path):
 
 def test_links_whose_wrench_is_measured_begin_a_body(tmp_path):
     fixed = joint("f", "b", "c", "fixed", ""), joint("g", "c", "d", "fixed", "")
-    loaded = load(tmp_path, link("a"), link("b"), link("c"), link("d"), joint("h", "a", "b"), *fixed)
+    loaded = load(
+        tmp_path, link("a"), link("b"), link("c"), link("d"), joint("h", "a", "b"), *fixed
+    )
     assert [at.link for at in loaded.bodies.values()] == ["a", "b", "b", "b"]
     assert [at.link for at in place_links(loaded.urdf, ("c",)).values()] == ["a", "b", "c", "c"]
 
@@ -76,7 +78,9 @@ def test_mass_of_shapes_counts_beside_given_mass_and_alone(given, tmp_path):
         return SpatialInertia(6.0, np.array([0.1, 0.0, 0.0]), np.eye(3))
 
     parts = link("base"), link("arm", INERTIAL if given else ""), link("tool", BOX)
-    text = load(tmp_path, *parts, joint("h", "base", "arm"), joint("f", "arm", "tool", "fixed", "")).urdf
+    text = load(
+        tmp_path, *parts, joint("h", "base", "arm"), joint("f", "arm", "tool", "fixed", "")
+    ).urdf
     arm = etree.fromstring(merge_fixed_links(text, of_shapes).urdf).find("link[@name='arm']")
     assert asked == ["tool"]
     assert len(arm.findall("collision")) == 1
@@ -100,7 +104,12 @@ def test_poses_inertia_and_order_of_random_trees_stay(seed, tmp_path):
     def world(inertias, tree, poses):
         """Total inertia in the world, of bodies that move together."""
         index = [tree.index(name) for name in inertias]
-        return total([i.moved(poses[k, :3], poses[k, 3:]) for i, k in zip(inertias.values(), index, strict=True)])
+        return total(
+            [
+                i.moved(poses[k, :3], poses[k, 3:])
+                for i, k in zip(inertias.values(), index, strict=True)
+            ]
+        )
 
     for name, at in merged.bodies.items():
         body, own = bodies[reduced.index(at.link)], poses[tree.index(name)]
@@ -130,7 +139,9 @@ def test_a_fixed_joint_is_kept_where_its_merge_would_change_the_order_of_the_joi
 
 
 def test_siblings_of_a_merged_link_stay_in_order(tmp_path):
-    """Joints below a fixed one come after the joints of their new siblings, in any order of the file."""
+    """Joints below a fixed one come after the joints of their new siblings, in any order of the
+    file.
+    """
     parts = (
         joint("late", "mount", "c"),
         joint("early", "base", "a"),
@@ -139,7 +150,10 @@ def test_siblings_of_a_merged_link_stay_in_order(tmp_path):
     original = load(tmp_path, *map(link, ("base", "a", "mount", "c")), *parts)
     merged = merge_fixed_links(original.urdf, none_asked).urdf
     assert original.joint_names == ("early", "late")
-    assert [each.get("name") for each in etree.fromstring(merged).findall("joint")] == ["early", "late"]
+    assert [each.get("name") for each in etree.fromstring(merged).findall("joint")] == [
+        "early",
+        "late",
+    ]
 
 
 def test_placements_of_a_robot_are_those_of_its_kinematics(panda):

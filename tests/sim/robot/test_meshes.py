@@ -1,4 +1,6 @@
-"""Collision meshes that SAPIEN would silently drop, or that claim more than there is, are found at load."""
+"""Collision meshes that SAPIEN would silently drop, or that claim more than there is, are found at
+load.
+"""
 
 from __future__ import annotations
 
@@ -33,12 +35,17 @@ def ascii_stl() -> bytes:
 
 
 def obj() -> bytes:
-    lines = [*("v {} {} {}".format(*corner) for corner in CORNERS), *("f {} {} {}".format(*face + 1) for face in FACES)]
+    lines = [
+        *("v {} {} {}".format(*corner) for corner in CORNERS),
+        *("f {} {} {}".format(*face + 1) for face in FACES),
+    ]
     return "\n".join(lines).encode()
 
 
 def dae() -> bytes:
-    coordinates, indices = (" ".join(map(str, table.ravel().tolist())) for table in (CORNERS, FACES))
+    coordinates, indices = (
+        " ".join(map(str, table.ravel().tolist())) for table in (CORNERS, FACES)
+    )
     return f"""<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
 <asset><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset>
 <library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a" count="12">{coordinates}</float_array>
@@ -60,23 +67,51 @@ def glb(**changed: object) -> bytes:
         "meshes": [{"primitives": [{"attributes": {"POSITION": 1}, "indices": 0}]}],
         "accessors": [
             {"componentType": 5125, "type": "SCALAR", "bufferView": 0, "count": 12},
-            {"componentType": 5126, "type": "VEC3", "bufferView": 1, "count": 4, "min": [0] * 3, "max": [1] * 3},
+            {
+                "componentType": 5126,
+                "type": "VEC3",
+                "bufferView": 1,
+                "count": 4,
+                "min": [0] * 3,
+                "max": [1] * 3,
+            },
         ],
-        "bufferViews": [{"buffer": 0, "byteLength": 48}, {"buffer": 0, "byteOffset": 48, "byteLength": 48}],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 48},
+            {"buffer": 0, "byteOffset": 48, "byteLength": 48},
+        ],
         "buffers": [{"byteLength": 96}],
     }
     text = json.dumps(content | changed).encode()
     text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    chunks = (
+        struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(binary), b"BIN\0")
+        + binary
+    )
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-GOOD = {"a.stl": stl(), "b.STL": stl(), "c.stl": ascii_stl(), "d.obj": obj(), "e.dae": dae(), "f.glb": glb()}
+GOOD = {
+    "a.stl": stl(),
+    "b.STL": stl(),
+    "c.stl": ascii_stl(),
+    "d.obj": obj(),
+    "e.dae": dae(),
+    "f.glb": glb(),
+}
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
 CLAIM = 4_000_000_000
-BAD = {f"{kind} {name}": (name, data) for name in GOOD for kind, data in {"git-lfs": LFS, "empty": b""}.items()}
+BAD = {
+    f"{kind} {name}": (name, data)
+    for name in GOOD
+    for kind, data in {"git-lfs": LFS, "empty": b""}.items()
+}
 BAD |= {
-    f"{share} of {name}": (name, data[: int(len(data) * share)]) for name, data in GOOD.items() for share in (0.1, 0.5)
+    f"{share} of {name}": (name, data[: int(len(data) * share)])
+    for name, data in GOOD.items()
+    for share in (0.1, 0.5)
 }
 BAD |= {f"all but the end of {name}": (name, GOOD[name][:-20]) for name in GOOD if name != "d.obj"}
 BAD |= {
@@ -94,11 +129,20 @@ BAD |= {
     "DAE that claims 16 GB": ("e.dae", dae().replace(b'count="12"', b'count="%d"' % CLAIM)),
     "DAE with a negative count": ("e.dae", dae().replace(b'count="12"', b'count="-12"')),
     "DAE without a count": ("e.dae", dae().replace(b'count="12"', b"")),
-    "DAE without the source of an accessor": ("e.dae", dae().replace(b'source="#a"', b'source="#b"')),
+    "DAE without the source of an accessor": (
+        "e.dae",
+        dae().replace(b'source="#a"', b'source="#b"'),
+    ),
     "DAE with an index that is no number": ("e.dae", dae().replace(b"<p>0 2", b"<p>! 2")),
     "DAE without geometry": ("e.dae", dae().replace(b"library_geometries", b"library_nothings")),
-    "GLB of 20 bytes that claims 4 GB": ("f.glb", struct.pack("<4sIIII", b"glTF", 2, CLAIM, CLAIM - 20, 0x4E4F534A)),
-    "GLB of 20 bytes with a JSON of 4 GB": ("f.glb", struct.pack("<4sIIII", b"glTF", 2, 20, CLAIM, 0x4E4F534A)),
+    "GLB of 20 bytes that claims 4 GB": (
+        "f.glb",
+        struct.pack("<4sIIII", b"glTF", 2, CLAIM, CLAIM - 20, 0x4E4F534A),
+    ),
+    "GLB of 20 bytes with a JSON of 4 GB": (
+        "f.glb",
+        struct.pack("<4sIIII", b"glTF", 2, 20, CLAIM, 0x4E4F534A),
+    ),
     "GLB without meshes": ("f.glb", glb(meshes=[])),
     "GLB with another file": ("f.glb", glb(buffers=[{"byteLength": 96, "uri": "/dev/zero"}])),
     "GLB of deep JSON": ("f.glb", glb().replace(b'"2.0"', b"[[[[[")),
@@ -108,7 +152,9 @@ BAD |= {
 
 
 def arm(name: str) -> str:
-    return one_joint(arm=INERTIAL + f'<collision><geometry><mesh filename="{name}"/></geometry></collision>')
+    return one_joint(
+        arm=INERTIAL + f'<collision><geometry><mesh filename="{name}"/></geometry></collision>'
+    )
 
 
 @pytest.mark.parametrize("name", GOOD)
@@ -116,7 +162,9 @@ def test_a_sound_mesh_is_simulated(name, tmp_path):
     (tmp_path / name).write_bytes(GOOD[name])
     loaded = Robot.load(write(tmp_path, arm(name)))
     assert loaded.repairs == ()
-    touching = loaded.dynamics().in_contact(np.array([[0.0], [np.pi]]), clearance=0.01)  # above the ground, and on it
+    touching = loaded.dynamics().in_contact(
+        np.array([[0.0], [np.pi]]), clearance=0.01
+    )  # above the ground, and on it
     assert touching.tolist() == [False, True]
 
 
@@ -200,7 +248,9 @@ def test_a_mesh_that_only_the_engine_refuses_is_an_error_of_the_runner(tmp_path)
 
 
 def test_a_mesh_that_changed_since_it_was_simulated_is_refused(tmp_path):
-    """SAPIEN caches the first shape: without an error, it would simulate the old shape for the new one."""
+    """SAPIEN caches the first shape: without an error, it would simulate the old shape for the new
+    one.
+    """
     arm = '<collision><geometry><mesh filename="m.stl"/></geometry></collision>'
     path, mesh = write(tmp_path, one_joint(arm=arm)), tmp_path / "m.stl"
     mesh.write_bytes(stl())

@@ -23,7 +23,12 @@ def mimic(leader: str, multiplier: float = 1.0, offset: float = 0.0) -> str:
 
 
 def test_limits_of_a_leader_are_narrowed_by_its_followers_through_chains(tmp_path):
-    fingers = hand(tmp_path, a=limit(-1, 1), b=limit(-1, 1) + mimic("a", 2, 0.5), c=limit(-1, 0.5) + mimic("b", -1))
+    fingers = hand(
+        tmp_path,
+        a=limit(-1, 1),
+        b=limit(-1, 1) + mimic("a", 2, 0.5),
+        c=limit(-1, 0.5) + mimic("b", -1),
+    )
     # b: 2 a + 0.5 in [-1, 1]; c: -2 a - 0.5 in [-1, 0.5]
     np.testing.assert_allclose(fingers.lower, [-0.5, -0.5, -1.0])
     np.testing.assert_allclose(fingers.upper, [0.25, 1.0, 0.5])
@@ -38,9 +43,13 @@ def test_a_follower_that_leaves_no_range_does_not_narrow_it(tmp_path):
     np.testing.assert_array_equal(fingers.upper, [1, 1])
 
 
-@pytest.mark.parametrize("leaders", [{"a": "a"}, {"a": "b", "b": "a"}, {"a": "a", "b": "a", "c": "b"}])
+@pytest.mark.parametrize(
+    "leaders", [{"a": "a"}, {"a": "b", "b": "a"}, {"a": "a", "b": "a", "c": "b"}]
+)
 def test_one_joint_of_a_loop_of_mimics_leads(leaders, tmp_path):
-    fingers = hand(tmp_path, **{name: limit(-1, 1) + mimic(leader) for name, leader in leaders.items()})
+    fingers = hand(
+        tmp_path, **{name: limit(-1, 1) + mimic(leader) for name, leader in leaders.items()}
+    )
     assert fingers.independent.sum() == 1
 
 

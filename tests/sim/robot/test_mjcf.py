@@ -1,4 +1,6 @@
-"""MJCF files: the robot that is simulated is the one that MuJoCo compiles, and whatever is not has a finding."""
+"""MJCF files: the robot that is simulated is the one that MuJoCo compiles, and whatever is not has
+a finding.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +73,10 @@ CHAIN = f"""
     <body name="table" pos="1 0 0">{BOX}</body>
   </worldbody>
 </mujoco>"""
-LEG = '<body name="leg{0}" pos="0 {0} 0"><joint name="hip{0}" axis="0 1 0" pos="0 0 .1" armature=".1"/>{1}</body>'
+LEG = (
+    '<body name="leg{0}" pos="0 {0} 0"><joint name="hip{0}" axis="0 1 0" pos="0 0 .1"'
+    ' armature=".1"/>{1}</body>'
+)
 WALKER = f"""
 <mujoco>
   <worldbody>
@@ -104,8 +109,8 @@ def load(tmp_path):
 
 def two_links(joint='<joint name="j"/>', rest="", geom=BOX):
     return (
-        f'<mujoco><worldbody><body name="a">{geom}<body name="b" pos="0 0 1">{joint}{geom}</body></body></worldbody>'
-        f"{rest}</mujoco>"
+        f'<mujoco><worldbody><body name="a">{geom}<body name="b" pos="0 0'
+        f' 1">{joint}{geom}</body></body></worldbody>{rest}</mujoco>'
     )
 
 
@@ -113,7 +118,9 @@ def spec_of(robot, **options):
     options = {
         "ground": False,
     } | options
-    return SceneSpec(robot.urdf, robot.ignored_pairs, robot.joints, 5e-4, SOLVERS["accurate"], **options)
+    return SceneSpec(
+        robot.urdf, robot.ignored_pairs, robot.joints, 5e-4, SOLVERS["accurate"], **options
+    )
 
 
 @pytest.mark.parametrize("name", TEXTS)
@@ -121,7 +128,9 @@ def test_mass_matrix_and_bias_are_those_of_the_file(load, name):
     robot = load(TEXTS[name], self_collision="none")
     model = mujoco.MjModel.from_xml_string(TEXTS[name])
     data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-    joints = [3 if each == "joint3" else model.joint(each).id for each in robot.joint_names]  # that has no name
+    joints = [
+        3 if each == "joint3" else model.joint(each).id for each in robot.joint_names
+    ]  # that has no name
     places, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
     rng = np.random.default_rng(0)
     qpos, qvel = rng.uniform(-2, 2, (2, 50, robot.dof))
@@ -151,7 +160,10 @@ def test_joints_are_those_of_the_file(load):
     np.testing.assert_array_equal(robot.actuators.armature, [[0.02, 0, 0]])
     np.testing.assert_array_equal(robot.start, [0.7, 0.1, 0.2])
     np.testing.assert_allclose(load(CHAIN).start, [0.2, 0, np.deg2rad(30), 0])
-    assert robot.describe()["settings"] != load(ARM.replace('qpos=".7', 'qpos=".6')).describe()["settings"]
+    assert (
+        robot.describe()["settings"]
+        != load(ARM.replace('qpos=".7', 'qpos=".6')).describe()["settings"]
+    )
 
 
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
@@ -200,7 +212,8 @@ def shapes_of(robot, link):
         )
 
 
-EXTENT = {  # of a geom in directions u (n, 3) in its frame, by type: capsule, ellipsoid, cylinder, box, mesh
+# of a geom in directions u (n, 3) in its frame, by type: capsule, ellipsoid, cylinder, box, mesh
+EXTENT = {
     3: lambda u, size, vertices: size[0] + size[1] * np.abs(u[:, 2]),
     4: lambda u, size, vertices: np.linalg.norm(u * size, axis=1),
     5: lambda u, size, vertices: size[0] * np.hypot(u[:, 0], u[:, 1]) + size[1] * np.abs(u[:, 2]),
@@ -210,11 +223,15 @@ EXTENT = {  # of a geom in directions u (n, 3) in its frame, by type: capsule, e
 
 
 def reach_of(model, data):
-    """Return how far the geoms that can collide reach in 60 directions (geoms, 60) [m], the shortest first."""
+    """Return how far the geoms that can collide reach in 60 directions (geoms, 60) [m], the
+    shortest first.
+    """
     directions = np.random.default_rng(0).normal(size=(60, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     rows = []
-    for geom in np.flatnonzero((model.geom_contype > 0) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)):
+    for geom in np.flatnonzero(
+        (model.geom_contype > 0) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
+    ):
         mesh = model.geom_dataid[geom]
         vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
         local = directions @ data.geom_xmat[geom].reshape(3, 3)
@@ -245,12 +262,16 @@ def test_shapes_are_where_they_are_in_the_file(load):
 def read_obj(path):
     """Return the vertices (n, 3) and the corners of the triangles (m, 3, 3) of an OBJ file."""
     lines = [line.split() for line in Path(path).read_text().splitlines()]
-    vertices, faces = (np.array([line[1:] for line in lines if line[0] == kind], float) for kind in "vf")
+    vertices, faces = (
+        np.array([line[1:] for line in lines if line[0] == kind], float) for kind in "vf"
+    )
     return vertices, vertices[faces.astype(int) - 1]
 
 
 def test_a_capsule_has_the_ends_of_the_file(load):
-    ((tag, size, place, turn),) = shapes_of(load(ARM), "upper")  # not the sphere, which is only drawn
+    ((tag, size, place, turn),) = shapes_of(
+        load(ARM), "upper"
+    )  # not the sphere, which is only drawn
     half = float(size["length"]) / 2 * rotate(turn, np.array([0.0, 0.0, 1.0]))
     anchor = np.array([0.02, 0, -0.03])  # the link's origin
     assert (tag, size["radius"]) == ("capsule", "0.03")
@@ -282,13 +303,18 @@ def test_an_ellipsoid_is_inscribed(load):
 
 def test_pairs_that_do_not_collide(load):
     def pairs(text, **options):
-        return {frozenset((pair.first, pair.second)) for pair in load(text, **options).self_contact.pairs}
+        return {
+            frozenset((pair.first, pair.second))
+            for pair in load(text, **options).self_contact.pairs
+        }
 
     assert frozenset(("base", "fore")) in pairs(ARM, self_collision="urdf")
     masked = two_links().replace('type="box"', 'type="box" contype="2" conaffinity="4"')
     assert pairs(masked, self_collision="urdf") == {frozenset("ab")}
     assert pairs(two_links(), self_collision="urdf") == set()
-    forced = masked.replace("<worldbody>", '<contact><pair geom1="ga" geom2="gb"/></contact><worldbody>')
+    forced = masked.replace(
+        "<worldbody>", '<contact><pair geom1="ga" geom2="gb"/></contact><worldbody>'
+    )
     forced = forced.replace("<geom", '<geom name="ga"', 1).replace(
         'b" pos="0 0 1"><joint name="j"/><geom', 'b" pos="0 0 1"><joint name="j"/><geom name="gb"'
     )
@@ -296,7 +322,9 @@ def test_pairs_that_do_not_collide(load):
 
 
 def test_an_srdf_has_the_last_word(load, tmp_path):
-    (tmp_path / "robot.srdf").write_text('<robot><enable_collisions link1="base" link2="fore"/></robot>')
+    (tmp_path / "robot.srdf").write_text(
+        '<robot><enable_collisions link1="base" link2="fore"/></robot>'
+    )
     assert load(ARM, self_collision="urdf").ignored_pairs == ()
 
 
@@ -317,10 +345,12 @@ def test_couplings(load):
     joints = two_links().replace('<joint name="j"/>', '<joint name="j" ref="30"/>')
     joints = joints.replace(
         "</body></body>",
-        '<body name="c" pos="0 0 1"><joint name="k" armature=".1" damping=".2"/><geom size=".1"/></body></body></body>',
+        '<body name="c" pos="0 0 1"><joint name="k" armature=".1" damping=".2"/><geom'
+        ' size=".1"/></body></body></body>',
     )
     text = joints.replace(
-        "</mujoco>", '<equality><joint joint1="k" joint2="j" polycoef=".1 -2 0 0 0"/></equality></mujoco>'
+        "</mujoco>",
+        '<equality><joint joint1="k" joint2="j" polycoef=".1 -2 0 0 0"/></equality></mujoco>',
     )
     robot = load(text)
     (mimic,) = [joint.mimic for joint in robot.joints if joint.mimic is not None]
@@ -331,7 +361,10 @@ def test_couplings(load):
 
 
 def test_a_tendon_that_pulls_coupled_fingers(load):
-    finger = '<body name="{0}"><joint name="{0}" type="slide" axis="0 {1} 0" range="0 .04"/><geom size=".01"/></body>'
+    finger = (
+        '<body name="{0}"><joint name="{0}" type="slide" axis="0 {1} 0" range="0 .04"/><geom'
+        ' size=".01"/></body>'
+    )
     text = f"""<mujoco><worldbody><body name="hand">{BOX}{finger.format("left", 1)}{finger.format("right", -1)}</body>
       </worldbody><tendon><fixed name="split" actuatorfrcrange="-60 60">
       <joint joint="left" coef=".5"/><joint joint="right" coef=".5"/></fixed>
@@ -363,7 +396,9 @@ def test_several_actuators_of_a_joint_add_up(load):
     )
     robot = load(text)
     np.testing.assert_array_equal(robot.effort_limit, [12])
-    np.testing.assert_array_equal([np.ravel(robot.mjcf_gains().kp), np.ravel(robot.mjcf_gains().kd)], [[20], [3]])
+    np.testing.assert_array_equal(
+        [np.ravel(robot.mjcf_gains().kp), np.ravel(robot.mjcf_gains().kd)], [[20], [3]]
+    )
 
 
 @pytest.mark.skipif(not hasattr(mujoco.mjtDyn, "mjDYN_PID"), reason="an older MuJoCo")
@@ -376,7 +411,9 @@ def test_a_pid_has_an_integral_and_may_have_several_inputs(load):
     gains = robot.mjcf_gains()
     figures = gains.kp, gains.ki, gains.kd, gains.integral_max
     np.testing.assert_array_equal(np.ravel(figures), [20, 12, 4, 3])
-    assert any("'number 1' has a delay, which is not simulated" in str(each) for each in robot.check())
+    assert any(
+        "'number 1' has a delay, which is not simulated" in str(each) for each in robot.check()
+    )
 
 
 def test_several_integrals_of_a_joint_keep_their_limits(load):
@@ -385,25 +422,35 @@ def test_several_integrals_of_a_joint_keep_their_limits(load):
     two = '<pid joint="j" kp="1" ki="7" imax=".25" gear="-2" slewmax="3"/>'
     robot = load(two_links(rest=f"<actuator>{one}{two}</actuator>"))
     gains = robot.mjcf_gains()
-    np.testing.assert_allclose(np.ravel([gains.ki, gains.integral_max]), [16 * 3 + 4 * 7, 4 * 1.5 + 2 * 1.75])
+    np.testing.assert_allclose(
+        np.ravel([gains.ki, gains.integral_max]), [16 * 3 + 4 * 7, 4 * 1.5 + 2 * 1.75]
+    )
     np.testing.assert_array_equal(robot.guard().rate, [[1.5]])
     free = load(two_links(rest=f"<actuator>{one}{two.replace('imax', 'user')}</actuator>"))
     assert free.mjcf_gains().integral_max is None
 
 
 def test_a_dc_motor_has_a_line_a_lag_and_gains(load):
-    motor = '<dcmotor joint="j" nominal="24 6 3" gear="-2" {}/>'  # 24 V make 6 N m at rest, 3 rad/s without load
-    controller = 'input="pos vel ff" controller="5 3 1 .5 .2 12" inductance="0 .01" saturation="4 0 0"'
+    motor = (  # 24 V make 6 N m at rest, 3 rad/s without load
+        '<dcmotor joint="j" nominal="24 6 3" gear="-2" {}/>'
+    )
+    controller = (
+        'input="pos vel ff" controller="5 3 1 .5 .2 12" inductance="0 .01" saturation="4 0 0"'
+    )
     robot = load(two_links(rest=f"<actuator>{motor.format(controller)}</actuator>"))
     gains, motors = robot.mjcf_gains(), robot.actuators
     np.testing.assert_array_equal(np.ravel([gains.kp, gains.ki, gains.kd]), [20, 12, 4])
     np.testing.assert_allclose(np.ravel([gains.integral_max, gains.effort_max]), [2 * 3 * 0.2, 8])
-    np.testing.assert_allclose(motors.saturation_effort, [[6.0]])  # half the voltage, and a gear of 2
+    np.testing.assert_allclose(
+        motors.saturation_effort, [[6.0]]
+    )  # half the voltage, and a gear of 2
     np.testing.assert_allclose(motors.no_load_speed, [[0.75]])
     np.testing.assert_array_equal(np.ravel([motors.lag, robot.guard().rate]), [0.01, 0.25])
     assert not robot.repairs
     asked = load(two_links(rest=f"<actuator>{motor}</actuator>".format('ctrlrange="-12 24"')))
-    np.testing.assert_allclose(np.ravel([asked.actuators.saturation_effort, asked.actuators.no_load_speed]), [6, 0.75])
+    np.testing.assert_allclose(
+        np.ravel([asked.actuators.saturation_effort, asked.actuators.no_load_speed]), [6, 0.75]
+    )
     braked = load(two_links(rest=f"<actuator>{motor}</actuator>".format('input="none"')))
     np.testing.assert_allclose(braked.damping, [4 * 6 / 3])
     assert braked.actuators is None
@@ -412,24 +459,45 @@ def test_a_dc_motor_has_a_line_a_lag_and_gains(load):
 @pytest.mark.parametrize(
     ("actuator", "said"),
     [
-        ('<general joint="j" gainprm="5" biastype="affine" biasprm="2 -5 -1"/>', "adds a constant force"),
-        ('<general joint="j" gainprm="5" biastype="affine" biasprm="0 5 -1"/>', "has a negative gain"),
+        (
+            '<general joint="j" gainprm="5" biastype="affine" biasprm="2 -5 -1"/>',
+            "adds a constant force",
+        ),
+        (
+            '<general joint="j" gainprm="5" biastype="affine" biasprm="0 5 -1"/>',
+            "has a negative gain",
+        ),
         ('<damper joint="j" kv="2" ctrlrange="0 1"/>', "not proportional to its input"),
         ('<pid joint="j" kp="5" input="vel ff"/>', "is a spring"),
         (
-            '<dcmotor joint="j" nominal="24 6 3" ctrlrange="-9 9" cogging="1 4 0" lugre="9 1 1 1 1"/>',
+            (
+                '<dcmotor joint="j" nominal="24 6 3" ctrlrange="-9 9" cogging="1 4 0" lugre="9 1 1'
+                ' 1 1"/>'
+            ),
             "cogging, friction (lugre)",
         ),
         ('<dcmotor joint="j" nominal="24 6 3"/>', "no torque-speed line"),
         ('<general joint="j" gainprm="0" biastype="affine" biasprm="0 -5 0"/>', "is a spring"),
         ('<velocity joint="j" kv="2"/>', "is a velocity servo"),
-        ('<general joint="j" biastype="user"/>', "adds a force that depends on its length and speed"),
+        (
+            '<general joint="j" biastype="user"/>',
+            "adds a force that depends on its length and speed",
+        ),
         (
             '<motor joint="j" group="2"/></actuator><option actuatorgroupdisable="2"/><actuator>',
             "is disabled in the file",
         ),
-        ('<general joint="j" gainprm="8" biastype="affine" biasprm="0 -4" ctrlrange="-1 2" gear="-2"/>', "(-2 to 1)"),
-        ('<dcmotor joint="j" nominal="24 6 3" ctrlrange="-9 9"/><motor joint="j"/>', "one of several actuators"),
+        (
+            (
+                '<general joint="j" gainprm="8" biastype="affine" biasprm="0 -4" ctrlrange="-1 2"'
+                ' gear="-2"/>'
+            ),
+            "(-2 to 1)",
+        ),
+        (
+            '<dcmotor joint="j" nominal="24 6 3" ctrlrange="-9 9"/><motor joint="j"/>',
+            "one of several actuators",
+        ),
     ],
 )
 def test_what_an_actuator_does_besides_is_told(load, actuator, said):
@@ -440,7 +508,11 @@ def test_what_an_actuator_does_besides_is_told(load, actuator, said):
 def test_the_range_of_a_joint_is_no_narrower_range_of_its_setpoint(load):
     joint = '<joint name="j" range="-90 90"/>'
     for share, told in ((1, 0), (0.5, 1)):
-        robot = load(two_links(joint, rest=f'<actuator><pid joint="j" kp="2" inheritrange="{share}"/></actuator>'))
+        robot = load(
+            two_links(
+                joint, rest=f'<actuator><pid joint="j" kp="2" inheritrange="{share}"/></actuator>'
+            )
+        )
         assert len(robot.repairs) == told
 
 
@@ -448,19 +520,28 @@ def test_the_gear_of_an_actuator_after_an_orientation_servo_is_its_own(load):
     """Of the servo's three outputs each has a gear."""
     servo = '<orientation site="s" refsite="r" kp="1"/>'
     sites = BOX + '<site name="s"/><site name="r"/>'
-    text = two_links(rest=f'<actuator>{servo}<motor joint="j" gear="3" ctrlrange="-2 2"/></actuator>')
+    text = two_links(
+        rest=f'<actuator>{servo}<motor joint="j" gear="3" ctrlrange="-2 2"/></actuator>'
+    )
     np.testing.assert_array_equal(load(text.replace(BOX, sites, 1)).effort_limit, [6])
 
 
 @pytest.mark.skipif(not hasattr(mujoco.MjModel, "actuator_armature"), reason="an older MuJoCo")
 def test_armature_and_damping_of_actuators(load):
-    text = two_links(rest='<actuator><motor joint="j" armature=".3" damping=".2" gear="3"/></actuator>')
+    text = two_links(
+        rest='<actuator><motor joint="j" armature=".3" damping=".2" gear="3"/></actuator>'
+    )
     robot = load(text)
     np.testing.assert_allclose(robot.actuators.armature, [[2.7]])
     np.testing.assert_allclose(robot.damping, [1.8])
-    tendon = '<tendon><fixed name="t"><joint joint="j" coef="2"/><joint joint="k" coef="1"/></fixed></tendon>'
+    tendon = (
+        '<tendon><fixed name="t"><joint joint="j" coef="2"/><joint joint="k"'
+        ' coef="1"/></fixed></tendon>'
+    )
     couple = '<equality><joint joint1="k" joint2="j" polycoef="0 3 0 0 0"/></equality>'
-    both = text.replace('joint="j" a', 'tendon="t" a').replace("</mujoco>", f"{tendon}{couple}</mujoco>")
+    both = text.replace('joint="j" a', 'tendon="t" a').replace(
+        "</mujoco>", f"{tendon}{couple}</mujoco>"
+    )
     both = both.replace('<joint name="j"/>', '<joint name="j"/><joint name="k"/>')
     robot = load(both)  # the moment arm on the leader is 3 (2 + 3 1)
     np.testing.assert_allclose(robot.actuators.armature, [[0.3 * 15**2, 0]])
@@ -470,7 +551,9 @@ def test_armature_and_damping_of_actuators(load):
 def test_floating_base(load):
     fixed, floating = load(WALKER), load(WALKER, fixed_base=False, self_collision="none")
     assert fixed.dof == floating.dof == 2
-    assert ["joint-type" in {each.code for each in robot.repairs} for robot in (fixed, floating)] == [True, False]
+    assert [
+        "joint-type" in {each.code for each in robot.repairs} for robot in (fixed, floating)
+    ] == [True, False]
     assert {each.link for each in fixed.repairs if each.code == "loose-link"} == {"ball", "goal"}
     for engine in ("sapien", "mujoco"):
         with Runner(floating, num_envs=1, workers=0, engine=engine, ground=False) as runner:
@@ -500,9 +583,15 @@ FINDINGS = {
         "limits",
         "j",
     ),
-    "filter": (two_links(rest='<actuator><position joint="j" timeconst=".1"/></actuator>'), "actuator", "j"),
+    "filter": (
+        two_links(rest='<actuator><position joint="j" timeconst=".1"/></actuator>'),
+        "actuator",
+        "j",
+    ),
     "thruster": (
-        two_links(rest='<actuator><motor site="s"/></actuator>').replace(BOX, f'{BOX}<site name="s"/>', 1),
+        two_links(rest='<actuator><motor site="s"/></actuator>').replace(
+            BOX, f'{BOX}<site name="s"/>', 1
+        ),
         "actuator",
         None,
     ),
@@ -536,11 +625,26 @@ def test_all_that_is_left_out_is_named(load):
     world = f'{named}<geom name="wall" size=".1"/><geom type="box" size=".1 .1 .1"/>'
     rest = """<tendon><fixed name="idle"><joint joint="hip1" coef="1"/></fixed></tendon><equality>
       <weld name="hold" body1="leg1"/><connect name="off" body1="leg2" anchor="0 0 0" active="false"/></equality>"""
-    told = "\n".join(map(str, load(WALKER.replace("<worldbody>", f"{rest}<worldbody>{world}")).repairs))
-    for name in ("'floor'", "'wall', 'number 2'", "'idle'", "weld 'hold'", "'off'", "'ball'", "'goal'"):
+    told = "\n".join(
+        map(str, load(WALKER.replace("<worldbody>", f"{rest}<worldbody>{world}")).repairs)
+    )
+    for name in (
+        "'floor'",
+        "'wall', 'number 2'",
+        "'idle'",
+        "weld 'hold'",
+        "'off'",
+        "'ball'",
+        "'goal'",
+    ):
         assert name in told
-    for place, said in (('pos="0 0 -1"', "at height -1 m"), ('euler="30 0 0"', "which is not level")):
-        (found,) = load(two_links().replace("<worldbody>", f"<worldbody>{floor.format(place)}")).repairs
+    for place, said in (
+        ('pos="0 0 -1"', "at height -1 m"),
+        ('euler="30 0 0"', "which is not level"),
+    ):
+        (found,) = load(
+            two_links().replace("<worldbody>", f"<worldbody>{floor.format(place)}")
+        ).repairs
         assert (found.severity, found.code) == ("warning", "collision")
         assert "plane 'number 0'" in found.text
         assert said in found.text
@@ -551,13 +655,18 @@ def test_a_plain_file_needs_no_repair(load):
 
 
 BAD = {
-    "ball joint": (two_links('<joint name="wrist" type="ball"/>'), "ball joint 'wrist'.*replace it by three hinges"),
+    "ball joint": (
+        two_links('<joint name="wrist" type="ball"/>'),
+        "ball joint 'wrist'.*replace it by three hinges",
+    ),
     "no joint": (two_links(""), "without moving joints"),
     "not compiled": (two_links('<joint name="j" pos="x"/>'), "MuJoCo cannot compile the file.*pos"),
     "no mass": (two_links(geom=""), "MuJoCo cannot compile the file.*mass"),
     "two robots": (
         two_links().replace(
-            "</worldbody>", f'<body name="c"><freejoint/>{BOX}<body name="d"><joint/>{BOX}</body></body></worldbody>'
+            "</worldbody>",
+            f'<body name="c"><freejoint/>{BOX}<body'
+            f' name="d"><joint/>{BOX}</body></body></worldbody>',
         ),
         "several robots, 'a', 'c'",
     ),
@@ -587,9 +696,18 @@ def test_missing_meshes(load, tmp_path, reason, suffix):
         (tmp_path / "parts" / f"gone.{suffix}").write_bytes(UNREADABLE[reason])
     asset = f'<compiler meshdir="parts"/><asset><mesh name="m" file="gone.{suffix}"/></asset>'
     shown = '<geom name="{}" type="mesh" mesh="m" contype="0" conaffinity="0"/>'
-    assert load(two_links(rest=asset, geom=INERTIAL + BOX + shown.format("")), missing_meshes="error").repairs == ()
+    assert (
+        load(
+            two_links(rest=asset, geom=INERTIAL + BOX + shown.format("")), missing_meshes="error"
+        ).repairs
+        == ()
+    )
     for shape in ('<geom type="mesh" mesh="m"/>', '<geom type="box" mesh="m"/>'):
-        for body in (f"{INERTIAL}{BOX}{shape}", f"{INERTIAL}{shape}", BOX + shape.replace("/>", ' mass="0"/>')):
+        for body in (
+            f"{INERTIAL}{BOX}{shape}",
+            f"{INERTIAL}{shape}",
+            BOX + shape.replace("/>", ' mass="0"/>'),
+        ):
             text = two_links(rest=asset, geom=body)
             robot = load(text)
             (finding,) = robot.repairs
@@ -613,7 +731,8 @@ def test_a_missing_mesh_without_which_the_mass_is_unknown_is_refused(load, mode,
     for geom in (shape, BOX + shape, BOX + shape.replace("/>", ' mass="2"/>')):
         text = two_links(geom=INERTIAL * inferred + geom, rest=asset)
         with pytest.raises(
-            RobotError, match=r"mesh gone\.stl \(not found\) of body 'b'; restore the file, or give the"
+            RobotError,
+            match=r"mesh gone\.stl \(not found\) of body 'b'; restore the file, or give the",
         ):
             load(text, missing_meshes=mode)
     base = two_links(rest=asset).replace(BOX, BOX + shape, 1)
@@ -624,19 +743,28 @@ def test_a_missing_mesh_without_which_the_mass_is_unknown_is_refused(load, mode,
 
 
 @pytest.mark.parametrize(
-    "asset", ['<include file="part.xml"/>', '<asset><hfield name="h" file="part.png" size="1 1 1 1"/></asset>']
+    "asset",
+    [
+        '<include file="part.xml"/>',
+        '<asset><hfield name="h" file="part.png" size="1 1 1 1"/></asset>',
+    ],
 )
 def test_a_git_lfs_pointer_in_place_of_another_file_is_named(load, tmp_path, asset):
     for suffix in ("png", "xml"):
         (tmp_path / f"part.{suffix}").write_bytes(POINTER)
-    with pytest.raises(RobotError, match=r"part\.(png|xml) is a git-lfs pointer instead of the file; run git lfs pull"):
+    with pytest.raises(
+        RobotError,
+        match=r"part\.(png|xml) is a git-lfs pointer instead of the file; run git lfs pull",
+    ):
         load(two_links(rest=asset))
 
 
 @pytest.mark.parametrize("name", ["robot.xml", "robot.urdf"])
 def test_a_git_lfs_pointer_in_place_of_the_robot_is_named(tmp_path, name):
     (tmp_path / name).write_bytes(POINTER)
-    with pytest.raises(RobotError, match=r"robot\.\w+: a git-lfs pointer instead of the file; run git lfs pull"):
+    with pytest.raises(
+        RobotError, match=r"robot\.\w+: a git-lfs pointer instead of the file; run git lfs pull"
+    ):
         Robot.load(tmp_path / name)
 
 
@@ -654,16 +782,23 @@ def test_a_mesh_beside_a_missing_one_keeps_its_shape(load, tmp_path):
         ('meshdir="parts" strippath="true"', "x/y/here.obj"),
         ('meshdir="elsewhere"', absolute),
     ):
-        asset = f'<asset><mesh name="here" file="{file}"/><mesh name="gone" file="x/gone.obj"/></asset>'
+        asset = (
+            f'<asset><mesh name="here" file="{file}"/><mesh name="gone" file="x/gone.obj"/></asset>'
+        )
         (missing,) = load(two_links(geom=geom, rest=f"<compiler {compiler}/>{asset}")).repairs
         assert "without: x/gone.obj" in missing.text
 
 
 def test_a_default_namespace_changes_nothing(load, tmp_path):
     pytest.importorskip("trimesh")
-    (tmp_path / "part.xml").write_text(f'<mujocoinclude xmlns="urn:m"><body name="c">{BOX}</body></mujocoinclude>')
+    (tmp_path / "part.xml").write_text(
+        f'<mujocoinclude xmlns="urn:m"><body name="c">{BOX}</body></mujocoinclude>'
+    )
     text = ARM.replace("</worldbody>", '<include file="part.xml"/></worldbody>')
-    plain, named = load(text), load(text.replace("<mujoco ", '<mujoco xmlns="http://mujoco.org/mjcf" '))
+    plain, named = (
+        load(text),
+        load(text.replace("<mujoco ", '<mujoco xmlns="http://mujoco.org/mjcf" ')),
+    )
     assert (named.urdf, named.repairs) == (plain.urdf, plain.repairs)
     assert [each.link for each in surfaces(named)] == [each.link for each in surfaces(plain)]
 
@@ -684,9 +819,13 @@ def test_a_geom_that_is_referred_to_stays(load):
 
 
 def test_an_include_brings_its_bodies(load, tmp_path):
-    arm = f'<mujocoinclude><body name="arm" pos="0 0 1"><joint name="j"/>{BOX}</body></mujocoinclude>'
+    arm = (
+        f'<mujocoinclude><body name="arm" pos="0 0 1"><joint name="j"/>{BOX}</body></mujocoinclude>'
+    )
     (tmp_path / "arm.xml").write_text(arm)
-    assert load('<mujoco><worldbody><include file="arm.xml"/></worldbody></mujoco>').joint_names == ("j",)
+    assert load(
+        '<mujoco><worldbody><include file="arm.xml"/></worldbody></mujoco>'
+    ).joint_names == ("j",)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -696,14 +835,18 @@ def test_a_damaged_file_is_a_robot_or_an_error(load, seed, tmp_path, monkeypatch
     for _ in range(25):
         text = rng.choice([*TEXTS.values(), *(text for text, *_ in FINDINGS.values())])
         begin = rng.randrange(len(text))
-        part = rng.choice(["", "0", "-1", "nan", "1e300", "<joint/>", "<freejoint/>", "</body>", 'mass="0"', "<"])
+        part = rng.choice(
+            ["", "0", "-1", "nan", "1e300", "<joint/>", "<freejoint/>", "</body>", 'mass="0"', "<"]
+        )
         with suppress(RobotError):
             load(text[:begin] + part + text[begin + rng.randrange(8) :])
 
 
 def test_needs_mujoco(load, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(MissingDependencyError, match=r"reading an MJCF file.*pip install 'mujoco>=3.17'"):
+    with pytest.raises(
+        MissingDependencyError, match=r"reading an MJCF file.*pip install 'mujoco>=3.17'"
+    ):
         load(ARM)
 
 
@@ -716,7 +859,13 @@ def test_an_unwritable_cache_is_an_error(load, monkeypatch, tmp_path):
 
 def test_is_drawn_by_its_shapes(load):
     pytest.importorskip("trimesh")
-    assert {surface.link for surface in surfaces(load(ARM))} == {"base", "upper", "fore", "flange", "hand"}
+    assert {surface.link for surface in surfaces(load(ARM))} == {
+        "base",
+        "upper",
+        "fore",
+        "flange",
+        "hand",
+    }
 
 
 def test_a_name_in_another_encoding_is_an_error_with_the_file(tmp_path):

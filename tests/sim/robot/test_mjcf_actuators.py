@@ -65,7 +65,9 @@ SHORTCUTS = (
 
 
 def generals():
-    """Yield <general> actuators of every kind that this version of MuJoCo has, with numbers that matter."""
+    """Yield <general> actuators of every kind that this version of MuJoCo has, with numbers that
+    matter.
+    """
     kinds = [
         [
             name.removeprefix(f"mj{kind.upper()}_").lower()
@@ -75,8 +77,13 @@ def generals():
     ]
     for gain, bias, dyn in itertools.product(*kinds):
         kind = f'gaintype="{gain}" biastype="{bias}" dyntype="{dyn}"'
-        yield f'<general {kind} gainprm="4" biasprm="0 -5 -2" dynprm=".1" lengthrange="0 1" actrange="-1 1" {{}}/>'
-    for gain, bias in itertools.product(("0", "-3"), ("0 0 0", "1 0 0", "0 -5 0", "0 0 -2", "0 5 -2", "0 -5 2")):
+        yield (
+            f'<general {kind} gainprm="4" biasprm="0 -5 -2" dynprm=".1" lengthrange="0 1"'
+            ' actrange="-1 1" {}/>'
+        )
+    for gain, bias in itertools.product(
+        ("0", "-3"), ("0 0 0", "1 0 0", "0 -5 0", "0 0 -2", "0 5 -2", "0 -5 2")
+    ):
         yield f'<general biastype="affine" gainprm="{gain}" biasprm="{bias}" {{}}/>'
 
 
@@ -89,7 +96,9 @@ def compiled(text):
 
 
 def efforts(model, control, state):
-    """Return the effort on the first joint for controls (n, nu) at states (n, 2), position and velocity."""
+    """Return the effort on the first joint for controls (n, nu) at states (n, 2), position and
+    velocity.
+    """
     data, found = mujoco.MjData(model), []
     for u, (q, v) in zip(control, state, strict=True):
         data.ctrl[:], data.qpos[0], data.qvel[0] = u, q, v
@@ -99,7 +108,9 @@ def efforts(model, control, state):
 
 
 def check_law(robot, model, text):
-    """Assert that the effort is linear in the setpoint and has the gains and limits of the robot, in MuJoCo as here."""
+    """Assert that the effort is linear in the setpoint and has the gains and limits of the robot,
+    in MuJoCo as here.
+    """
     kp = kd = 0.0
     if robot.defaults.kp is not None:
         gains = robot.mjcf_gains()
@@ -128,7 +139,9 @@ def test_every_actuator_acts_as_in_mujoco_or_is_named(tmp_path, targets):
     own = SHORTCUTS if len(targets) == 1 else rng.choice(SHORTCUTS, 8, replace=False)
     cases = [*own, *rng.choice(CASES, 90 if len(targets) == 1 else 4)]
     for case, target in itertools.product(cases, targets):
-        extras = " ".join((target, *rng.choice(["", *RANGES], 1), *rng.choice(["", 'name="motor"'], 1)))
+        extras = " ".join(
+            (target, *rng.choice(["", *RANGES], 1), *rng.choice(["", 'name="motor"'], 1))
+        )
         text = FILE.format(extension=PID, beside='<geom size=".1"/>', actuators=case.format(extras))
         if (model := compiled(text)) is None:
             continue
@@ -139,7 +152,9 @@ def test_every_actuator_acts_as_in_mujoco_or_is_named(tmp_path, targets):
             named += 1
         elif robot.actuators is not None:  # a DC motor: its torque-speed line
             assert robot.actuators.saturation_effort[0, 0] > 0
-        elif not any(each.code in ("actuator", "limits") and each.joint == "j" for each in robot.repairs):
+        elif not any(
+            each.code in ("actuator", "limits") and each.joint == "j" for each in robot.repairs
+        ):
             check_law(robot, model, text)
             read += 1
     assert min(read, named) > 1
@@ -173,11 +188,22 @@ def test_stiff_servos_diverge_as_pid_and_not_as_drives(load, kp, kv):
     data, goal = mujoco.MjData(model), np.array([0.02, 0.03])
     data.ctrl[:] = goal
     mujoco.mj_step(model, data, 400)
-    options = {"engine": "mujoco", "compensate": "none", "ground": False, "workers": 0, "substeps": 400}
+    options = {
+        "engine": "mujoco",
+        "compensate": "none",
+        "ground": False,
+        "workers": 0,
+        "substeps": 400,
+    }
     (unstable,) = [
-        each for each in robot.check(params=robot.mjcf_gains()) if each.joint is None and each.code == "unstable"
+        each
+        for each in robot.check(params=robot.mjcf_gains())
+        if each.joint is None and each.code == "unstable"
     ]
-    with pytest.warns(StabilityWarning, match="control='drive', which integrates these gains implicitly, as MuJoCo"):
+    with pytest.warns(
+        StabilityWarning,
+        match="control='drive', which integrates these gains implicitly, as MuJoCo",
+    ):
         Runner(robot, 1, params=robot.mjcf_gains(), **options).close()
     assert "control='drive'" in unstable.remedy
     with Runner(robot, 1, params=robot.mjcf_gains(), control="drive", **options) as runner:
@@ -188,16 +214,24 @@ def test_stiff_servos_diverge_as_pid_and_not_as_drives(load, kp, kv):
 def test_targets_of_velocity_have_a_range(load):
     slow = load('<velocity joint="j" kv="2" gear="2" ctrlrange="-3 1"/>')
     assert slow.velocity_limit[0] == 1.5
-    np.testing.assert_array_equal([slow.mjcf_gains().kp[0], slow.mjcf_gains().kd[0]], [[0, 0], [8, 0]])
+    np.testing.assert_array_equal(
+        [slow.mjcf_gains().kp[0], slow.mjcf_gains().kd[0]], [[0, 0], [8, 0]]
+    )
     both = load('<position joint="j" kp="5"/><velocity joint="j" kv="2" ctrlrange="-3 3"/>')
     assert both.velocity_limit[0] == np.inf  # the target of the position may be faster
     integrated = load('<intvelocity joint="j" kp="5" ctrlrange="-.5 .5" actrange="-1 1"/>')
     assert integrated.velocity_limit[0] == 0.5
-    assert any("setpoint is not limited" in str(each) and "-1 to 1" in str(each) for each in integrated.repairs)
+    assert any(
+        "setpoint is not limited" in str(each) and "-1 to 1" in str(each)
+        for each in integrated.repairs
+    )
 
 
 def test_a_motor_has_the_narrower_limit(load):
-    robot = load('<motor joint="j" gear="2" ctrlrange="-3 3" forcerange="-5 5"/><motor joint="k" forcerange="-1 1"/>')
+    robot = load(
+        '<motor joint="j" gear="2" ctrlrange="-3 3" forcerange="-5 5"/><motor joint="k"'
+        ' forcerange="-1 1"/>'
+    )
     np.testing.assert_array_equal(robot.effort_limit, [6, 1])
 
 

@@ -14,19 +14,34 @@ from batchpid.errors import RobotError
 from batchpid.sim import Robot
 
 INNER = (
-    '<limit lower="-1.25" upper="1.25" effort="10.5" velocity="2.5"/><dynamics damping="0.5" friction="0.25"/>'
-    '<safety_controller soft_lower_limit="-0.75" soft_upper_limit="0.75"/>'
+    '<limit lower="-1.25" upper="1.25" effort="10.5" velocity="2.5"/><dynamics damping="0.5"'
+    ' friction="0.25"/><safety_controller soft_lower_limit="-0.75" soft_upper_limit="0.75"/>'
 )
-SHAPES = '<box size="0.5 0.25 0.125"/>', '<sphere radius="0.5"/>', '<cylinder radius="0.5" length="0.25"/>'
+SHAPES = (
+    '<box size="0.5 0.25 0.125"/>',
+    '<sphere radius="0.5"/>',
+    '<cylinder radius="0.5" length="0.25"/>',
+)
 PLACE = '<origin xyz="0.5 0.25 0.125" rpy="0.125 0.25 0.5"/>'
 TURNED = '0.5 0.25 0.125" rpy="0.125 0.25 0.5'
 WEIGHT = INERTIAL.replace("<mass", f"{PLACE}<mass").replace('"0"', '"0.01"').replace('"1"', '"1.5"')
 WHOLE = robot(
     link("base"),
-    link("arm", WEIGHT + "".join(f"<collision>{PLACE}<geometry>{shape}</geometry></collision>" for shape in SHAPES)),
+    link(
+        "arm",
+        WEIGHT
+        + "".join(
+            f"<collision>{PLACE}<geometry>{shape}</geometry></collision>" for shape in SHAPES
+        ),
+    ),
     link("tip"),
     joint("hinge", "base", "arm", inner=INNER, origin=TURNED).replace("0 1 0", "0.5 0 1"),
-    joint("follower", "arm", "tip", inner=INNER + '<mimic joint="hinge" multiplier="0.5" offset="0.25"/>'),
+    joint(
+        "follower",
+        "arm",
+        "tip",
+        inner=INNER + '<mimic joint="hinge" multiplier="0.5" offset="0.25"/>',
+    ),
 )
 """Robot with the numbers that a URDF can have, most of them with decimals."""
 NUMBERS = [
@@ -35,7 +50,18 @@ NUMBERS = [
     for key in element.attrib
     if key not in ("name", "link", "joint", "type")
 ]
-WRONG = ("{} kg", "x", "1_0", "nan", "1,234.5", "1e999", "0x10", "--1", "1 2 3 4 5", "\N{MINUS SIGN}1")
+WRONG = (
+    "{} kg",
+    "x",
+    "1_0",
+    "nan",
+    "1,234.5",
+    "1e999",
+    "0x10",
+    "--1",
+    "1 2 3 4 5",
+    "\N{MINUS SIGN}1",
+)
 
 
 def changed(at: int, key: str, change: Callable[[str], str]) -> tuple[str, str]:
@@ -70,7 +96,10 @@ def test_a_number_that_cannot_be_read_is_quoted(at, key, tmp_path):
 @pytest.mark.parametrize(("at", "key"), NUMBERS)
 def test_a_decimal_comma_is_read_and_quoted(at, key, tmp_path):
     text, written = changed(at, key, lambda value: value.replace(".", ","))
-    loaded, whole = Robot.load(write(tmp_path, text)), Robot.load(write(tmp_path, WHOLE, "whole.urdf"))
+    loaded, whole = (
+        Robot.load(write(tmp_path, text)),
+        Robot.load(write(tmp_path, WHOLE, "whole.urdf")),
+    )
     said = f"{written!r}> is read with points in place of decimal commas"
     assert any(said in each.text for each in loaded.repairs) == ("," in written)
     assert loaded.urdf == whole.urdf
@@ -87,7 +116,9 @@ def test_an_expression_of_xacro_is_refused(at, key, expression, tmp_path):
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic", "continuous"])
 @pytest.mark.parametrize("key", ["effort", "velocity"])
-@pytest.mark.parametrize(("text", "limit"), [("-1", None), ("-1.0", None), ("0", None), ("-7.5", 7.5)])
+@pytest.mark.parametrize(
+    ("text", "limit"), [("-1", None), ("-1.0", None), ("0", None), ("-7.5", 7.5)]
+)
 def test_a_limit_that_is_not_positive(kind, key, text, limit, tmp_path):
     given = {"lower": "-1", "upper": "1", "effort": "9", "velocity": "9"} | {key: text}
     inner = "<limit {}/>".format(" ".join(f'{each}="{value}"' for each, value in given.items()))
@@ -117,4 +148,6 @@ def test_degrees_are_recognised(old, new, said, tmp_path):
 
 def test_soft_limits_without_a_range_are_reported(tmp_path):
     text = WHOLE.replace('soft_lower_limit="-0.75"', 'soft_lower_limit="0.8"')
-    assert re.search(r"0\.8, 0\.75.*soft limits without a range have no effect", report(write(tmp_path, text)))
+    assert re.search(
+        r"0\.8, 0\.75.*soft limits without a range have no effect", report(write(tmp_path, text))
+    )

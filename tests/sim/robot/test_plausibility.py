@@ -20,7 +20,8 @@ CODES = {"scale", "mass", "inertia", "load"}
 def inertial(mass: float, gyration: float = 0.05, at: str = "0 0 0.15") -> str:
     moment = mass * gyration**2
     entries = " ".join(
-        f'{key}="{moment if key[1] == key[2] else 0}"' for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        f'{key}="{moment if key[1] == key[2] else 0}"'
+        for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     )
     return f'<inertial><origin xyz="{at}"/><mass value="{mass}"/><inertia {entries}/></inertial>'
 
@@ -29,17 +30,28 @@ def box(size: float) -> str:
     """A box of 1 x 1 x 4 in units of a tenth, at the middle of a link."""
     sides = " ".join(str(size * side) for side in (0.1, 0.1, 0.4))
     middle = f"0 0 {0.2 * size}"
-    return f'<collision><origin xyz="{middle}"/><geometry><box size="{sides}"/></geometry></collision>'
+    return (
+        f'<collision><origin xyz="{middle}"/><geometry><box size="{sides}"/></geometry></collision>'
+    )
 
 
 def arm(folder, mass=3.0, gyration=0.1, size=1.0, by_shapes=False, scale=1.0, base="") -> Robot:
-    """Return an arm of three links of 0.4 m, ``scale`` times as long, whose second joint bears gravity."""
-    inner = ("" if by_shapes else inertial(mass * scale**3, gyration * scale, f"0 0 {0.2 * scale}")) + box(size * scale)
+    """Return an arm of three links of 0.4 m, ``scale`` times as long, whose second joint bears
+    gravity.
+    """
+    inner = (
+        "" if by_shapes else inertial(mass * scale**3, gyration * scale, f"0 0 {0.2 * scale}")
+    ) + box(size * scale)
     limit = LIMIT.replace('"10"', '"1e9"')
     names = ["base", "a", "b", "c"]
-    joints = [joint(f"j{k}", *ends, inner=limit, origin=f"0 0 {0.4 * scale}") for k, ends in enumerate(pairwise(names))]
+    joints = [
+        joint(f"j{k}", *ends, inner=limit, origin=f"0 0 {0.4 * scale}")
+        for k, ends in enumerate(pairwise(names))
+    ]
     return Robot.load(
-        write(folder, robot(link("base", base), *(link(name, inner) for name in names[1:]), *joints)),
+        write(
+            folder, robot(link("base", base), *(link(name, inner) for name in names[1:]), *joints)
+        ),
         self_collision="urdf",
     )
 
@@ -65,10 +77,21 @@ def found(described: Robot) -> dict[str, str]:
         (
             {"size": 10.0, "by_shapes": True},
             "load",
-            r"gravity .* N m, inertia .*1.2 m long.*correct <mass> and <inertia>; for links without, give sizes",
+            (
+                r"gravity .* N m, inertia .*1.2 m long.*correct <mass> and <inertia>; for links"
+                r" without, give sizes"
+            ),
         ),
-        ({"mass": 3000.0}, "mass", r"\(3e\+03 kg over 0.424 m\): no link of such a size is so heavy"),
-        ({"mass": 3000.0}, "load", r"'j1' \(gravity .*: no robot .* has such a load; correct <mass>"),
+        (
+            {"mass": 3000.0},
+            "mass",
+            r"\(3e\+03 kg over 0.424 m\): no link of such a size is so heavy",
+        ),
+        (
+            {"mass": 3000.0},
+            "load",
+            r"'j1' \(gravity .*: no robot .* has such a load; correct <mass>",
+        ),
         ({"gyration": 100.0}, "inertia", r"\(100 m\): no link has so much inertia.*kg m\^2"),
     ],
 )
@@ -86,7 +109,9 @@ def test_wrong_units_are_reported_with_figure_cause_and_remedy(wrong, code, mess
     by_shapes=st.booleans(),
 )
 @settings(max_examples=15)
-def test_arms_of_any_size_and_usual_density_are_sound(scale, density, gyration, size, by_shapes, tmp_path_factory):
+def test_arms_of_any_size_and_usual_density_are_sound(
+    scale, density, gyration, size, by_shapes, tmp_path_factory
+):
     folder = tmp_path_factory.mktemp("arm")
     described = arm(folder, 3.0 * density, gyration, size, by_shapes, scale)
     assert found(described) == {}
@@ -110,7 +135,10 @@ def test_masses_are_those_of_the_simulation(tmp_path):
     """Of each link, and in the robot's repr without SAPIEN."""
     shaped = arm(tmp_path, by_shapes=True)
     masses = shaped.link_masses
-    assert {name: mass.source for name, mass in masses.items()} == {"base": "none", **dict.fromkeys("abc", "shapes")}
+    assert {name: mass.source for name, mass in masses.items()} == {
+        "base": "none",
+        **dict.fromkeys("abc", "shapes"),
+    }
     assert masses["a"].mass == pytest.approx(4.0)
     assert masses["a"].size == pytest.approx(np.sqrt(0.18))
     assert masses["a"].gyration == pytest.approx(np.sqrt(0.17 / 12))

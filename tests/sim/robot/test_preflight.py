@@ -1,4 +1,6 @@
-"""Preflight findings: oddities of a robot, and of running it with given params from a given pose."""
+"""Preflight findings: oddities of a robot, and of running it with given params from a given
+pose.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +66,12 @@ def codes(findings: list[Finding]) -> dict[str, Finding]:
             "note",
             "'hinge' .3 N m.: no effort limit",
         ),
-        (one_joint(LIMIT.replace('"1"', '"inf"')), "no-limits", "note", "'hinge': no position limits"),
+        (
+            one_joint(LIMIT.replace('"1"', '"inf"')),
+            "no-limits",
+            "note",
+            "'hinge': no position limits",
+        ),
         (
             one_joint(arm=INERTIAL.replace('izz="0.1"', 'izz="0.3"')),
             "inertia",
@@ -84,7 +91,9 @@ def test_each_oddity_of_a_urdf_has_its_finding(text, code, severity, message, tm
 def test_links_without_mass_are_reported_where_they_are_bodies(tmp_path):
     parts = link("a", ""), link("tip", ""), joint("h", "b", "a"), joint("f", "a", "tip", "fixed")
     light = write(tmp_path, robot(link("b"), *parts), "light.urdf")
-    assert [finding.link for finding in Robot.load(light).check() if finding.code == "no-inertia"] == ["a"]
+    assert [
+        finding.link for finding in Robot.load(light).check() if finding.code == "no-inertia"
+    ] == ["a"]
     heavy = write(tmp_path, light.read_text().replace(link("tip", ""), link("tip")), "heavy.urdf")
     assert Robot.load(heavy).check() == []
     assert "without load" in str(Robot.load(light).check())
@@ -98,7 +107,9 @@ def test_a_sound_robot_has_no_findings(tmp_path, panda):
 def test_poses_beyond_limits_are_reported_by_joint(panda):
     findings = panda.check(qpos=np.zeros(9), setpoint=np.ones(9))
     outside = [finding for finding in findings if finding.code == "out-of-limits"]
-    assert [finding.joint for finding in outside if "start pose" in finding.text] == ["panda_joint4"]
+    assert [finding.joint for finding in outside if "start pose" in finding.text] == [
+        "panda_joint4"
+    ]
     assert {f.joint for f in findings if "setpoint" in f.text} == {
         "panda_joint4",
         "panda_finger_joint1",
@@ -108,7 +119,9 @@ def test_poses_beyond_limits_are_reported_by_joint(panda):
 
 def test_links_that_overlap_at_the_start_are_reported(tmp_path):
     box = INERTIAL + COLLISION
-    text = robot(link("b"), link("l", box), link("r", box), joint("j", "b", "l"), joint("k", "b", "r"))
+    text = robot(
+        link("b"), link("l", box), link("r", box), joint("j", "b", "l"), joint("k", "b", "r")
+    )
     assert "touching" not in codes(Robot.load(write(tmp_path, text)).check())
     assert "touching" in codes(Robot.load(write(tmp_path, text), self_collision="urdf").check())
     apart = text.replace('xyz="0 0 1"', 'xyz="0 1 1"', 1)
@@ -118,7 +131,9 @@ def test_links_that_overlap_at_the_start_are_reported(tmp_path):
 def test_params_that_disagree_with_the_urdf_on_continuous_joints_are_reported(tmp_path):
     wheel = Robot.load(write(tmp_path, one_joint("", "continuous")))
     plain = bp.make_params(1, **GAINS)
-    assert [finding.severity for finding in wheel.check(params=plain) if finding.code == "continuous"] == [
+    assert [
+        finding.severity for finding in wheel.check(params=plain) if finding.code == "continuous"
+    ] == [
         "warning",
         "note",
     ]
@@ -152,9 +167,13 @@ def test_invalid_arguments_raise(options, panda):
         panda.check(**options)
 
 
-@pytest.mark.parametrize(("kp", "moves"), [(0.0, False), pytest.param(20.0, True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("kp", "moves"), [(0.0, False), pytest.param(20.0, True, marks=pytest.mark.slow)]
+)
 def test_ki_is_reported_under_a_drive_only_where_it_has_no_effect(kp, moves, tmp_path):
-    """A drive has no integral, so the integral moves its target: without stiffness the target has no effect."""
+    """A drive has no integral, so the integral moves its target: without stiffness the target has
+    no effect.
+    """
     hinge = Robot.load(write(tmp_path, one_joint()))
     params = hinge.params(kp=kp, ki=50.0, kd=1.0)
     reported = "drive-integral" in codes(hinge.check(params=params, control="drive"))
@@ -166,27 +185,38 @@ def test_ki_is_reported_under_a_drive_only_where_it_has_no_effect(kp, moves, tmp
     assert "drive-integral" not in codes(hinge.check(params=params))
 
 
-# -- Stability -----------------------------------------------------------------------------------------------------
+# -- Stability
+# --------------------------------------------------------------------------------------------------
 
 
 def test_the_tutorials_gains_are_unstable_on_the_jaco2s_light_links(jaco2):
     (found,) = (finding for finding in jaco2.check() if finding.code == "unstable")
-    assert re.search(r"times its stability bound, mostly of joint 'j2s7s300_joint_finger_tip_\d'", found.text)
-    slower = [finding.code for finding in jaco2.check(params=jaco2.params(kp=0.01, ki=0.0, kd=1e-5))]
+    assert re.search(
+        r"times its stability bound, mostly of joint 'j2s7s300_joint_finger_tip_\d'", found.text
+    )
+    slower = [
+        finding.code for finding in jaco2.check(params=jaco2.params(kp=0.01, ki=0.0, kd=1e-5))
+    ]
     assert "unstable" not in slower
 
 
 def test_gains_that_ring_are_found_with_frequency_and_damping(panda):
     """The tutorial's gains on the panda: the simulated motion has the reported period and decay."""
-    (found,) = (finding for finding in panda.check(params=panda.params()) if finding.code == "ringing")
+    (found,) = (
+        finding for finding in panda.check(params=panda.params()) if finding.code == "ringing"
+    )
     assert (found.severity, found.joint) == ("note", "panda_joint2")
     assert "rings at 0.54 Hz with a damping ratio of 0.068" in found.text
     assert "65 % of the amplitude" in found.text
     target = panda.start + np.where(np.arange(9) == 1, 0.1, 0.0)
-    with Runner(panda, 1, workers=0, params=panda.params(), collisions=False, substeps=20) as runner:
+    with Runner(
+        panda, 1, workers=0, params=panda.params(), collisions=False, substeps=20
+    ) as runner:
         rollout = runner.rollout(np.broadcast_to(target, (500, 9)))
     error = rollout.qpos[:, 0, 1] - target[1]
-    peaks = 1 + np.flatnonzero((error[1:-1] > error[:-2]) & (error[1:-1] >= error[2:]) & (error[1:-1] > 0.01))
+    peaks = 1 + np.flatnonzero(
+        (error[1:-1] > error[:-2]) & (error[1:-1] >= error[2:]) & (error[1:-1] > 0.01)
+    )
     assert len(peaks) >= 2
     assert rollout.time[peaks[1]] - rollout.time[peaks[0]] == pytest.approx(1 / 0.54, rel=0.05)
     assert error[peaks[1]] / error[peaks[0]] == pytest.approx(0.65, abs=0.05)
@@ -196,15 +226,26 @@ def test_gains_that_ring_are_found_with_frequency_and_damping(panda):
 def test_designed_and_tuned_gains_neither_ring_nor_pass_the_bound(panda, jaco2, units):
     for each in (panda, jaco2):
         for params in (each.designed(units), each.tuned()):
-            assert not {"ringing", "unstable"} & {finding.code for finding in each.check(params=params)}
+            assert not {"ringing", "unstable"} & {
+                finding.code for finding in each.check(params=params)
+            }
 
 
-@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning", "ignore::batchpid.sim.StabilityWarning")
+@pytest.mark.filterwarnings(
+    "ignore::batchpid.sim.FaultWarning", "ignore::batchpid.sim.StabilityWarning"
+)
 @pytest.mark.parametrize("filter_time", [0.0, 1e-3])
 @pytest.mark.parametrize("units", ["effort", "mass_matrix"])
 @pytest.mark.parametrize(("factor", "stays"), [(0.9, True), (1.1, False)])
-def test_the_simulation_becomes_unstable_at_the_reported_bound(units, filter_time, factor, stays, panda):
-    options = {"ki": None, "effort_limit": None, "derivative_filter_time": filter_time, "gain_units": units}
+def test_the_simulation_becomes_unstable_at_the_reported_bound(
+    units, filter_time, factor, stays, panda
+):
+    options = {
+        "ki": None,
+        "effort_limit": None,
+        "derivative_filter_time": filter_time,
+        "gain_units": units,
+    }
 
     def gains(scale):
         return panda.params(kp=10.0 * scale, kd=scale, **options)
@@ -235,7 +276,8 @@ def test_an_effort_limit_below_gravity_is_found(tmp_path):
 
 def test_friction_counts_with_gravity(tmp_path):
     text = one_joint(
-        '<limit lower="-1.5" upper="1.5" effort="10" velocity="2"/><dynamics friction="2"/>', arm=OFF_CENTRE
+        '<limit lower="-1.5" upper="1.5" effort="10" velocity="2"/><dynamics friction="2"/>',
+        arm=OFF_CENTRE,
     )
     (finding,) = (each for each in Robot.load(write(tmp_path, text)).check() if each.code == "weak")
     assert "friction 2" in finding.detail

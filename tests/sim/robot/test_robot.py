@@ -27,13 +27,23 @@ def test_every_robot_has_a_target_within_its_limits(seed, low, width):
         loaded = Robot.load(write(Path(folder), f'<robot name="x">{text}</robot>'))
     assert not loaded.limit_violations(loaded.target)
     room = np.maximum(loaded.upper - loaded.start, loaded.start - loaded.lower)
-    np.testing.assert_allclose(np.abs(loaded.target - loaded.start), np.minimum(0.25 * room, 0.5), atol=1e-12)
+    np.testing.assert_allclose(
+        np.abs(loaded.target - loaded.start), np.minimum(0.25 * room, 0.5), atol=1e-12
+    )
     assert (load_bundled("panda").target == load_bundled("panda").settings.target).all()
 
 
 def test_a_robot_from_a_pipe():
-    program = "import sys; from batchpid.sim import Robot; print(Robot.load('/dev/stdin').joint_names)"
-    done = run([sys.executable, "-c", program], input=one_joint(), capture_output=True, text=True, check=True)
+    program = (
+        "import sys; from batchpid.sim import Robot; print(Robot.load('/dev/stdin').joint_names)"
+    )
+    done = run(
+        [sys.executable, "-c", program],
+        input=one_joint(),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert done.stdout == "('hinge',)\n"
     shown = run(
         ["bash", "-c", f"'{sys.executable}' -m batchpid inspect <(cat)"],
@@ -49,7 +59,9 @@ def test_a_robot_from_a_pipe():
 def test_designed_gains_move_any_urdf_to_its_setpoint(units, tmp_path):
     robot = Robot.load(write(tmp_path, one_joint()))
     params = robot.designed(gain_units=units)
-    np.testing.assert_array_equal(params.effort_max, np.broadcast_to(robot.effort_limit, params.effort_max.shape))
+    np.testing.assert_array_equal(
+        params.effort_max, np.broadcast_to(robot.effort_limit, params.effort_max.shape)
+    )
     with Runner(robot, 1, params=params, workers=0) as runner:
         for _ in range(200):
             obs = runner.step([0.5])

@@ -1,4 +1,6 @@
-"""Self-collision: which pairs of links do not collide, by an .srdf, the pose at rest and sampled poses."""
+"""Self-collision: which pairs of links do not collide, by an .srdf, the pose at rest and sampled
+poses.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +25,15 @@ SLIDE = '<limit lower="-0.5" upper="0.5" effort="10" velocity="2"/>'
 
 
 def sliders(*places: float) -> str:
-    """Return a robot of boxes of 0.2 m on slides along y from a base in the air, which they do not touch."""
+    """Return a robot of boxes of 0.2 m on slides along y from a base in the air, which they do not
+    touch.
+    """
     parts = [link("base", INERTIAL)]
     for index, place in enumerate(places):
         parts.append(link(f"l{index}", INERTIAL + BOX))
-        parts.append(joint(f"j{index}", "base", f"l{index}", "prismatic", SLIDE, origin=f"0 {place} 1"))
+        parts.append(
+            joint(f"j{index}", "base", f"l{index}", "prismatic", SLIDE, origin=f"0 {place} 1")
+        )
     return robot(*parts)
 
 
@@ -67,10 +73,15 @@ def test_links_apart_at_the_start_collide(tmp_path):
 
 
 def test_links_that_touch_in_nearly_every_pose_do_not_collide(tmp_path):
-    for gap, expected in ((0.01, {("l0", "l1"): "Always"}), (0.1, {})):  # a post, and a beam that slides towards it
+    for gap, expected in (
+        (0.01, {("l0", "l1"): "Always"}),
+        (0.1, {}),
+    ):  # a post, and a beam that slides towards it
         beam = sliders(0.0, -4.1 - gap).split("</link>", 2)[2]
         text = sliders(0.0, -4.1 - gap).replace(beam, beam.replace('"0.2 0.2 0.2"', '"0.2 8 0.2"'))
-        text = text.replace('lower="-0.5" upper="0.5"', 'lower="0" upper="0.001"', 1).replace('"-0.5"', '"0"')
+        text = text.replace('lower="-0.5" upper="0.5"', 'lower="0" upper="0.001"', 1).replace(
+            '"-0.5"', '"0"'
+        )
         path = write(tmp_path, text)
         assert reasons(Robot.load(path)) == expected, gap
 
@@ -85,7 +96,10 @@ def test_neighbours_are_those_with_a_chain_of_links_without_shape_between_them(t
         joint("b", "hip", "leg"),
         joint("c", "leg", "foot"),
     )
-    assert reasons(Robot.load(write(tmp_path, text))) == {("base", "leg"): "Adjacent", ("leg", "foot"): "Adjacent"}
+    assert reasons(Robot.load(write(tmp_path, text))) == {
+        ("base", "leg"): "Adjacent",
+        ("leg", "foot"): "Adjacent",
+    }
 
 
 def test_an_srdf_disables_and_enables_pairs_whatever_their_reason(tmp_path):
@@ -97,14 +111,17 @@ def test_an_srdf_disables_and_enables_pairs_whatever_their_reason(tmp_path):
             '<disable_collisions link1="l2" link2="l0" reason="Never"/>',
             '<disable_collisions link1="base" link2="l0"/>',
             '<enable_collisions link1="l1" link2="l0"/>',
-            '<disable_collisions link1="l2" link2="l7" reason="Default"/><disable_collisions link1="l1" link2="l1"/>',
+            '<disable_collisions link1="l2" link2="l7" reason="Default"/><disable_collisions'
+            ' link1="l1" link2="l1"/>',
         ),
         "test.srdf",
     )
     loaded = Robot.load(path)
     assert reasons(loaded) == {("l1", "l2"): "Default", ("l2", "l0"): "Never"}
     assert reasons(Robot.load(path, self_collision="urdf")) == {("l2", "l0"): "Never"}
-    assert [finding.code for finding in loaded.check() if finding.severity == "warning"].count("srdf-link") == 2
+    assert [finding.code for finding in loaded.check() if finding.severity == "warning"].count(
+        "srdf-link"
+    ) == 2
 
 
 def test_the_pairs_of_a_robot_travel_with_it(tmp_path):
@@ -124,7 +141,9 @@ def test_pairs_that_the_filter_cannot_hold_go_on_colliding_and_are_told(tmp_path
     contact = loaded.self_contact
     assert len(contact.pairs) + len(contact.left_over) == len(pairs)
     assert len(contact.left_over) > 0
-    assert next(f for f in loaded.check() if f.code == "pairs-left-over").text.startswith(str(len(contact.left_over)))
+    assert next(f for f in loaded.check() if f.code == "pairs-left-over").text.startswith(
+        str(len(contact.left_over))
+    )
 
 
 def test_a_base_that_is_fixed_too_low_has_no_ground(tmp_path):
@@ -157,8 +176,14 @@ def test_contacts_are_of_all_pairs_but_the_disabled_and_the_neighbours(seed):
     parts, body = [link("base", INERTIAL)], {}
     for arm in range(5):  # all at one place, each with a tool; the last on the first
         parent = "arm0" if arm == 4 else "base"
-        for name, other, kind in ((f"arm{arm}", parent, "prismatic"), (f"tool{arm}", f"arm{arm}", "fixed")):
-            parts += [link(name, INERTIAL + BOX), joint(name, other, name, kind, SLIDE, origin="0 0 0")]
+        for name, other, kind in (
+            (f"arm{arm}", parent, "prismatic"),
+            (f"tool{arm}", f"arm{arm}", "fixed"),
+        ):
+            parts += [
+                link(name, INERTIAL + BOX),
+                joint(name, other, name, kind, SLIDE, origin="0 0 0"),
+            ]
             body[name] = f"arm{arm}"
     pairs = list(combinations(body, 2))
     disabled = [pair for pair in pairs if rng.random() < rng.uniform(0, 1)]

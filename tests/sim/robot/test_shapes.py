@@ -1,4 +1,6 @@
-"""Surfaces of a robot: closed, facing out, of the right size and colour, with the collision shapes as fallback."""
+"""Surfaces of a robot: closed, facing out, of the right size and colour, with the collision shapes
+as fallback.
+"""
 
 import re
 
@@ -25,7 +27,12 @@ def visual(geometry, z=0.0, material="", kind="visual"):
 
 
 def load(folder, a="", b=""):
-    return Robot.load(write(folder, robot(RED, link("a", INERTIAL + a), link("b", INERTIAL + b), joint("j", "a", "b"))))
+    return Robot.load(
+        write(
+            folder,
+            robot(RED, link("a", INERTIAL + a), link("b", INERTIAL + b), joint("j", "a", "b")),
+        )
+    )
 
 
 def volume(vertices, faces):
@@ -41,10 +48,17 @@ def volume(vertices, faces):
         ('<cylinder radius="0.2" length="0.5"/>', (0.5, 0.4, 0.4), np.pi * 0.2**2 * 0.5, 0.02),
         ('<sphere radius="0.3"/>', (0.6, 0.6, 0.6), 4 / 3 * np.pi * 0.3**3, 0.04),
         ('<sphere radius="1e-5"/>', (2e-5, 2e-5, 2e-5), 4 / 3 * np.pi * 1e-15, 0.5),
-        ('<capsule radius="0.1" length="0.3"/>', (0.5, 0.2, 0.2), np.pi * 0.1**2 * (0.3 + 4 / 3 * 0.1), 0.06),
+        (
+            '<capsule radius="0.1" length="0.3"/>',
+            (0.5, 0.2, 0.2),
+            np.pi * 0.1**2 * (0.3 + 4 / 3 * 0.1),
+            0.06,
+        ),
     ],
 )
-def test_primitives_are_closed_face_out_and_have_their_size(geometry, size, expected, share, tmp_path):
+def test_primitives_are_closed_face_out_and_have_their_size(
+    geometry, size, expected, share, tmp_path
+):
     (surface,) = surfaces(load(tmp_path, a=visual(geometry)))
     vertices, faces = surface.vertices, surface.faces
     assert volume(vertices, faces) == pytest.approx(expected, rel=share)
@@ -54,12 +68,16 @@ def test_primitives_are_closed_face_out_and_have_their_size(geometry, size, expe
     edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     assert (edges[:, 0] != edges[:, 1]).all()
     forth, back = set(map(tuple, edges.tolist())), set(map(tuple, edges[:, ::-1].tolist()))
-    assert len(forth) == len(edges)  # every edge once in each direction: closed, and wound consistently
+    assert len(forth) == len(
+        edges
+    )  # every edge once in each direction: closed, and wound consistently
     assert forth == back
     assert len(points) > 7
 
 
-@pytest.mark.parametrize(("geometry", "angle"), [(BOX, 1), ('<cylinder radius="0.2" length="0.5"/>', 45)])
+@pytest.mark.parametrize(
+    ("geometry", "angle"), [(BOX, 1), ('<cylinder radius="0.2" length="0.5"/>', 45)]
+)
 def test_no_vertex_is_shared_across_a_sharp_edge(geometry, angle, tmp_path):
     (surface,) = surfaces(load(tmp_path, a=visual(geometry)))
     a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
@@ -103,13 +121,21 @@ def test_shapes_of_one_colour_are_joined_at_their_origins(tmp_path):
 
 def test_collision_shapes_stand_in_for_missing_visuals(tmp_path):
     collision = visual(BOX, kind="collision")
-    drawn = surfaces(load(tmp_path, a=visual('<mesh filename="lost.stl"/>') + collision, b=collision))
+    drawn = surfaces(
+        load(tmp_path, a=visual('<mesh filename="lost.stl"/>') + collision, b=collision)
+    )
     assert [surface.link for surface in drawn] == ["a", "b"]
 
 
 def test_a_robot_without_shapes_is_drawn_by_rods_between_its_joints(tmp_path):
     tip = INERTIAL.replace("<mass", '<origin xyz="0.5 0 0"/><mass')
-    parts = link("a"), link("b"), link("c", tip), joint("j", "a", "b"), joint("k", "b", "c", origin="0 -2 0")
+    parts = (
+        link("a"),
+        link("b"),
+        link("c", tip),
+        joint("j", "a", "b"),
+        joint("k", "b", "c", origin="0 -2 0"),
+    )
     drawn = surfaces(Robot.load(write(tmp_path, robot(*parts))))
     assert [surface.link for surface in drawn] == ["a", "b", "c"]
     for surface, end in zip(drawn, ([0, 0, 1], [0, -2, 0], [0.5, 0, 0]), strict=True):
@@ -122,13 +148,19 @@ def test_a_robot_without_shapes_is_drawn_by_rods_between_its_joints(tmp_path):
 @pytest.mark.parametrize("mirror", [1, -1])
 def test_a_mesh_file_is_read_and_scaled(mirror, tmp_path):
     trimesh.creation.box((1, 1, 1)).export(tmp_path / "cube.stl")
-    (cube,) = surfaces(load(tmp_path, b=visual(f'<mesh filename="cube.stl" scale="0.1 {0.2 * mirror} 0.3"/>')))
+    (cube,) = surfaces(
+        load(tmp_path, b=visual(f'<mesh filename="cube.stl" scale="0.1 {0.2 * mirror} 0.3"/>'))
+    )
     assert cube.link == "b"
     assert volume(cube.vertices, cube.faces) == pytest.approx(0.006)
 
 
-@pytest.mark.filterwarnings("ignore:Setting the shape on a NumPy array:DeprecationWarning")  # pycollada, NumPy 2.5
-@pytest.mark.parametrize(("unit", "factor"), [("", 1.0), ('<unit name="millimeter" meter="0.001"/>', 1e-3)])
+@pytest.mark.filterwarnings(
+    "ignore:Setting the shape on a NumPy array:DeprecationWarning"
+)  # pycollada, NumPy 2.5
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("", 1.0), ('<unit name="millimeter" meter="0.001"/>', 1e-3)]
+)
 def test_a_collada_file_is_read_in_its_unit(unit, factor, tmp_path):
     pytest.importorskip("collada")
     text = trimesh.creation.box((1, 2, 3)).export(file_type="dae").decode()
@@ -136,7 +168,9 @@ def test_a_collada_file_is_read_in_its_unit(unit, factor, tmp_path):
     findings = []
     (drawn,) = surfaces(load(tmp_path, b=visual('<mesh filename="box.dae"/>')), findings=findings)
     assert findings == []
-    np.testing.assert_allclose(np.ptp(drawn.vertices, axis=0), np.array([3, 2, 1]) * factor, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.ptp(drawn.vertices, axis=0), np.array([3, 2, 1]) * factor, rtol=1e-6
+    )
 
 
 def test_meshes_that_cannot_be_read_are_reported_with_link_file_and_remedy(tmp_path):
@@ -152,7 +186,9 @@ def test_meshes_that_cannot_be_read_are_reported_with_link_file_and_remedy(tmp_p
             (visual(BOX, kind="collision"), "collision shapes are drawn"),
         ):
             findings = []
-            surfaces(load(tmp_path, b=visual(f'<mesh filename="{name}"/>') + shape), findings=findings)
+            surfaces(
+                load(tmp_path, b=visual(f'<mesh filename="{name}"/>') + shape), findings=findings
+            )
             (finding,) = findings
             assert (finding.code, finding.link, finding.detail) == ("visual-mesh", "b", repr(name))
             assert re.search(f"{reason}.*: {shown}.*; .*{remedy}", str(finding)), str(finding)
@@ -164,19 +200,31 @@ def test_visuals_are_looked_up_in_package_dirs(tmp_path):
     seen = link("b", INERTIAL + visual('<mesh filename="package://pack/cube.stl"/>'))
     path = write(tmp_path, robot(link("a"), seen, joint("j", "a", "b")))
     assert [surface.link for surface in surfaces(Robot.load(path))] == ["a"]  # a rod to the joint
-    assert [surface.link for surface in surfaces(Robot.load(path, package_dirs=[tmp_path / "elsewhere"]))] == ["b"]
+    assert [
+        surface.link
+        for surface in surfaces(Robot.load(path, package_dirs=[tmp_path / "elsewhere"]))
+    ] == ["b"]
 
 
 def test_a_malformed_visual_is_an_error_that_names_it(tmp_path):
-    with pytest.raises(RobotError, match=r"link 'a': <sphere radius='big'> needs one finite number"):
+    with pytest.raises(
+        RobotError, match=r"link 'a': <sphere radius='big'> needs one finite number"
+    ):
         surfaces(load(tmp_path, a=visual('<sphere radius="big"/>')))
 
 
 def test_what_was_repaired_is_drawn(tmp_path):
-    """Loose links and copies are left out, empty attributes are defaults, an unreadable mesh is the collision shape."""
+    """Loose links and copies are left out, empty attributes are defaults, an unreadable mesh is the
+    collision shape.
+    """
     (tmp_path / "pointer.stl").write_text("version https://git-lfs.github.com/spec/v1")
     seen = visual('<mesh filename="pointer.stl"/>') + visual(BOX, kind="collision")
-    parts = link("a"), link(" b ", INERTIAL + seen), link("b", visual(BOX)), link("loose", visual(BOX))
+    parts = (
+        link("a"),
+        link(" b ", INERTIAL + seen),
+        link("b", visual(BOX)),
+        link("loose", visual(BOX)),
+    )
     text = robot(*parts, joint("j", "a", "b")).replace('xyz="0 0 0.0"', 'xyz=""')
     (surface,) = surfaces(Robot.load(write(tmp_path, text)))
     assert surface.link == "b"

@@ -40,12 +40,16 @@ def test_the_engine_becomes_unstable_at_the_bound(name, filter_time):
     fastest = {}
     for factor in (0.8, 1.5):
         scale = (factor / bound.ratio)[:, None]
-        params = bp.make_params(robot.dof, kp * scale, None, kd * scale, derivative_filter_time=filter_time)
+        params = bp.make_params(
+            robot.dof, kp * scale, None, kd * scale, derivative_filter_time=filter_time
+        )
         with Runner(robot, num_envs, params=params, workers=0, substeps=1, ground=False) as runner:
             runner.reset(poses)
             goal = poses + 1e-4 * rng.normal(size=poses.shape)
             rollout = runner.rollout(np.broadcast_to(goal, (400, *goal.shape)))
-        fastest[factor] = np.nanmax(np.abs(np.where(rollout.ok[..., None], rollout.qvel, np.inf)), axis=(0, 2))
+        fastest[factor] = np.nanmax(
+            np.abs(np.where(rollout.ok[..., None], rollout.qvel, np.inf)), axis=(0, 2)
+        )
     assert (fastest[0.8] < DIVERGED / 5).all()
     assert (fastest[1.5] > DIVERGED).all()
 
@@ -77,10 +81,19 @@ def test_the_bound_of_late_motors_predicts_the_first_unstable_gain(units, late, 
     known = replace(robot, actuators=bp.make_actuators(robot.dof, armature=0.03))
     pose = robot.start
     unit = np.diagonal(robot.mass_matrix(pose)[0]) if units == "effort" else np.ones(robot.dof)
-    gains = {"kp": 900 * unit, "kd": 60 * unit, "ki": None, "derivative_filter_time": 2e-3, "gain_units": units}
+    gains = {
+        "kp": 900 * unit,
+        "kd": 60 * unit,
+        "ki": None,
+        "derivative_filter_time": 2e-3,
+        "gain_units": units,
+    }
     params = known.params(**gains, effort_limit=None)
     ratio = stability_report(known, params, pose, DT, actuators=motors).robot_ratio
-    assert ratio > 1.2 * stability_report(known, params, pose, DT, actuators=motors.joint_side()).robot_ratio
+    assert (
+        ratio
+        > 1.2 * stability_report(known, params, pose, DT, actuators=motors.joint_side()).robot_ratio
+    )
     grows = {}
     for share in (0.95, 1.05):
         scaled = params.replace(kp=params.kp * share / ratio, kd=params.kd * share / ratio)
@@ -88,7 +101,9 @@ def test_the_bound_of_late_motors_predicts_the_first_unstable_gain(units, late, 
         with Runner(known, 1, params=scaled, actuators=motors, **options) as runner:
             runner.reset(pose)
             goal = pose + 1e-4 * np.random.default_rng(1).normal(size=pose.shape)
-            speed = np.abs(runner.rollout(np.broadcast_to(goal, (1600, 1, robot.dof))).qvel[:, 0]).max(1)
+            speed = np.abs(
+                runner.rollout(np.broadcast_to(goal, (1600, 1, robot.dof))).qvel[:, 0]
+            ).max(1)
         grows[share] = np.nanmax(speed[1200:]) / speed[400:800].max()
     assert grows[0.95] < 1
     assert grows[1.05] > 1

@@ -37,22 +37,40 @@ BAD = {
         robot(BASE, ARM, link("c"), link("d"), HINGE, joint("b", "c", "d"), joint("a", "d", "c")),
         "loop apart from the root",
     ),
-    "two robots": (robot(BASE, ARM, link("other"), link("leg"), HINGE, joint("k", "other", "leg")), "one root.*other"),
+    "two robots": (
+        robot(BASE, ARM, link("other"), link("leg"), HINGE, joint("k", "other", "leg")),
+        "one root.*other",
+    ),
     "misspelt link": (
         robot(BASE, ARM, TIP, joint("hinge", "base", "amr"), joint("k", "arm", "tip")),
         r"one root link.*joints name \['amr'\], not in the file: correct",
     ),
-    "xacro": (robot(BASE, ARM, joint("${side}_hinge", "base", "arm")), r"'\$\{side\}_hinge'> is .*xacro.*expand it"),
+    "xacro": (
+        robot(BASE, ARM, joint("${side}_hinge", "base", "arm")),
+        r"'\$\{side\}_hinge'> is .*xacro.*expand it",
+    ),
     "too much": (robot(*map(link, map(str, range(4097))), HINGE), "more than 4096 links or joints"),
-    "all in a loop": (robot(BASE, ARM, HINGE, joint("back", "arm", "base")), "exactly one root.*a loop"),
+    "all in a loop": (
+        robot(BASE, ARM, HINGE, joint("back", "arm", "base")),
+        "exactly one root.*a loop",
+    ),
     "too many links": (
-        robot(link("l0"), *(link(f"l{n + 1}") + joint(f"j{n}", f"l{n}", f"l{n + 1}") for n in range(255))),
+        robot(
+            link("l0"),
+            *(link(f"l{n + 1}") + joint(f"j{n}", f"l{n}", f"l{n + 1}") for n in range(255)),
+        ),
         "has 256 links that move; PhysX holds at most 255.*split",
     ),
     "no parent": (one_joint().replace('<parent link="base"/>', ""), "joint 'hinge'.*needs <parent"),
     "no joint": (robot(BASE), "without joints.*xacro has to be expanded"),
     "library of xacro": (
-        robot('<xacro:macro xmlns:xacro="http://wiki.ros.org/xacro" name="arm">', BASE, ARM, HINGE, "</xacro:macro>"),
+        robot(
+            '<xacro:macro xmlns:xacro="http://wiki.ros.org/xacro" name="arm">',
+            BASE,
+            ARM,
+            HINGE,
+            "</xacro:macro>",
+        ),
         "xacro has to be expanded",
     ),
     "fixed joints only": (one_joint("", "fixed"), "without moving joints"),
@@ -60,8 +78,14 @@ BAD = {
 }
 
 UNHOLDABLE = {  # by single precision or by PhysX
-    "origin": (one_joint().replace('xyz="0 0 1"', 'xyz="0 0 1e300"'), "joint 'hinge'.*origin xyz='0 0 1e300'"),
-    "angle": (one_joint().replace('xyz="0 0 1"', 'rpy="0 0 1e300"'), "joint 'hinge'.*origin rpy='0 0 1e300'"),
+    "origin": (
+        one_joint().replace('xyz="0 0 1"', 'xyz="0 0 1e300"'),
+        "joint 'hinge'.*origin xyz='0 0 1e300'",
+    ),
+    "angle": (
+        one_joint().replace('xyz="0 0 1"', 'rpy="0 0 1e300"'),
+        "joint 'hinge'.*origin rpy='0 0 1e300'",
+    ),
 }
 BAD |= {f"{name} that PhysX cannot hold": case for name, case in UNHOLDABLE.items()}
 
@@ -79,7 +103,9 @@ def test_a_bad_urdf_has_its_error(case, tmp_path):
 def test_a_missing_file_and_an_unknown_name_are_not_found(tmp_path):
     with pytest.raises(RobotNotFoundError, match=f"^{tmp_path} is a folder; pass the path"):
         Robot.load(tmp_path)
-    with pytest.raises(RobotNotFoundError, match=r"no robot 'pandaa'.*jaco2, panda.*check the spelling"):
+    with pytest.raises(
+        RobotNotFoundError, match=r"no robot 'pandaa'.*jaco2, panda.*check the spelling"
+    ):
         Robot.load("pandaa")
     for path in ("/no/such.urdf", "~nobody-at-all/arm.urdf", "x" * 1000, "x" * 5000):
         with pytest.raises(FileNotFoundError, match=path):
@@ -88,7 +114,10 @@ def test_a_missing_file_and_an_unknown_name_are_not_found(tmp_path):
 
 @pytest.mark.slow
 def test_as_many_links_as_physx_holds_are_simulated(tmp_path):
-    chain = (link(f"l{n + 1}") + joint(f"j{n}", f"l{n}", f"l{n + 1}", origin="0 0 0.01") for n in range(254))
+    chain = (
+        link(f"l{n + 1}") + joint(f"j{n}", f"l{n}", f"l{n + 1}", origin="0 0 0.01")
+        for n in range(254)
+    )
     long = Robot.load(write(tmp_path, robot(link("l0"), *chain)))
     with Runner(long, 1, workers=0, control="effort", substeps=1, ground=False) as runner:
         assert runner.step(np.zeros(254)).ok.all()
@@ -104,11 +133,17 @@ def test_parts_that_sapien_needs_are_added_and_those_that_it_does_not_need_are_r
     """SAPIEN's parser fails on each of these; none has a meaning for the simulation."""
     inertial = INERTIAL.replace('ixy="0" ixz="0" ', "").replace('iyz="0" ', "")
     parts = link("base"), link("arm", inertial + "<visual/>"), link("tip"), link("end")
-    joints = HINGE.replace("</joint>", "<calibration rising='x'/><safety_controller/></joint>"), "<material/>"
+    joints = (
+        HINGE.replace("</joint>", "<calibration rising='x'/><safety_controller/></joint>"),
+        "<material/>",
+    )
     fixed = joint("f", "arm", "tip", "fixed", '<limit lower="x"/>').replace("0 1 0", "x")
     default = joint("k", "tip", "end").replace(' xyz="0 1 0"', "")
     odd = Robot.load(
-        write(tmp_path, robot(*parts, *joints, fixed, default, "<transmission/>", "<sensor><camera/></sensor>"))
+        write(
+            tmp_path,
+            robot(*parts, *joints, fixed, default, "<transmission/>", "<sensor><camera/></sensor>"),
+        )
     )
     assert [link.inertial for link in odd.links] == [True] * 4
     with Runner(odd, 1, workers=0, params=odd.params(kp=1.0), ground=False) as runner:
@@ -129,9 +164,15 @@ HOSTILE = {
     "entities in text": robot(BASE, ARM, HINGE, "<x>&a11;</x>", head=BOMB),
     "entities in an attribute": robot(BASE, ARM, HINGE, '<x y="&a11;"/>', head=BOMB),
     "external entity": robot(
-        BASE, ARM, HINGE, "<x>&f;</x>", head="<!DOCTYPE robot [<!ENTITY f SYSTEM 'file:///etc/passwd'>]>"
+        BASE,
+        ARM,
+        HINGE,
+        "<x>&f;</x>",
+        head="<!DOCTYPE robot [<!ENTITY f SYSTEM 'file:///etc/passwd'>]>",
     ),
-    "external DTD": robot(BASE, ARM, HINGE, head="<!DOCTYPE robot SYSTEM 'http://127.0.0.1:9/x.dtd'>"),
+    "external DTD": robot(
+        BASE, ARM, HINGE, head="<!DOCTYPE robot SYSTEM 'http://127.0.0.1:9/x.dtd'>"
+    ),
     "parameter entity": robot(
         BASE, ARM, HINGE, head="<!DOCTYPE robot [<!ENTITY % p SYSTEM 'file:///etc/passwd'> %p;]>"
     ),
@@ -153,7 +194,9 @@ def test_hostile_xml_is_refused(case, tmp_path):
 
 
 def test_an_xinclude_is_not_followed(tmp_path):
-    include = '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="/etc/passwd" parse="text"/>'
+    include = (
+        '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="/etc/passwd" parse="text"/>'
+    )
     loaded = Robot.load(write(tmp_path, robot(BASE, ARM, HINGE, include)))
     assert "root:" not in loaded.urdf
 
@@ -186,7 +229,9 @@ def test_sapien_never_gets_a_mimic_and_inspect_notes_it(multiplier, offset, tmp_
 
 
 def test_links_tied_by_fixed_joints_do_not_push_each_other(tmp_path):
-    """A hand overlaps the arm beyond its flange: the engine would find contact there at every step."""
+    """A hand overlaps the arm beyond its flange: the engine would find contact there at every
+    step.
+    """
     box = INERTIAL + '<collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>'
     parts = [link("base"), link("arm", box), link("flange"), link("hand", box), link("finger", box)]
     chain = [
@@ -221,9 +266,13 @@ def test_missing_meshes_can_be_skipped(tmp_path):
     loaded = Robot.load(path)
     (finding,) = (each for each in loaded.check() if each.code == "missing-mesh")
     assert finding.text.endswith(": no.stl")
-    with pytest.raises(RobotError, match=r"needs 1 repair, which strict=True refuses:\n  robot: .*no\.stl"):
+    with pytest.raises(
+        RobotError, match=r"needs 1 repair, which strict=True refuses:\n  robot: .*no\.stl"
+    ):
         Robot.load(path, strict=True)
-    with pytest.raises(RobotError, match=r"not readable: no\.stl.*package_dirs.*missing_meshes='skip'"):
+    with pytest.raises(
+        RobotError, match=r"not readable: no\.stl.*package_dirs.*missing_meshes='skip'"
+    ):
         Robot.load(path, missing_meshes="error")
 
 
@@ -249,11 +298,17 @@ def test_invalid_options_of_load_raise(options):
         Robot.load(**options)
 
 
-@pytest.mark.parametrize("head", ['<?xml version="1.0"?>', "\n<!-- made by hand --><?xml version='1.0'?>"])
+@pytest.mark.parametrize(
+    "head", ['<?xml version="1.0"?>', "\n<!-- made by hand --><?xml version='1.0'?>"]
+)
 def test_a_default_namespace_is_ignored(head, tmp_path):
     plain = one_joint(arm=INERTIAL + '<visual><geometry><box size="1 1 1"/></geometry></visual>')
-    named = plain.replace('<?xml version="1.0"?>', head).replace("<robot", '<robot xmlns="http://www.ros.org"')
-    robots = [Robot.load(write(tmp_path, text, f"{at}.urdf")) for at, text in enumerate((plain, named))]
+    named = plain.replace('<?xml version="1.0"?>', head).replace(
+        "<robot", '<robot xmlns="http://www.ros.org"'
+    )
+    robots = [
+        Robot.load(write(tmp_path, text, f"{at}.urdf")) for at, text in enumerate((plain, named))
+    ]
     assert robots[0].urdf == robots[1].urdf
     assert to_urdf(robots[0]).text == to_urdf(robots[1]).text
 
@@ -270,20 +325,30 @@ def test_a_robot_without_a_name_is_called_after_its_file(tmp_path):
 
 def test_a_joint_gets_a_name_that_no_other_has(tmp_path):
     unnamed = HINGE.replace('name="hinge"', "")
-    loaded = Robot.load(write(tmp_path, robot(BASE, ARM, TIP, unnamed, joint("base_to_arm", "arm", "tip"))))
+    loaded = Robot.load(
+        write(tmp_path, robot(BASE, ARM, TIP, unnamed, joint("base_to_arm", "arm", "tip")))
+    )
     assert loaded.joint_names == ("base_to_arm_2", "base_to_arm")
 
 
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 def test_links_may_have_the_names_of_added_bodies(engine, tmp_path):
-    """MuJoCo's root is called world; where links of a body collide in part, each gets a body "LINK (shapes)"."""
+    """MuJoCo's root is called world; where links of a body collide in part, each gets a body "LINK
+    (shapes)".
+    """
     if engine == "mujoco":
         pytest.importorskip("mujoco")
     box = INERTIAL + '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
     names = ["world", "world_link", "world_link_2", "a", "b", "a (shapes)", "a (shapes)_2"]
-    joints = [joint(f"to {b}", a, b, "fixed" if b == "b" else "revolute") for a, b in pairwise(names)]
+    joints = [
+        joint(f"to {b}", a, b, "fixed" if b == "b" else "revolute") for a, b in pairwise(names)
+    ]
     path = write(tmp_path, robot(*(link(name, box) for name in names), *joints))
-    write(tmp_path, '<robot><disable_collisions link1="a" link2="world" reason="x"/></robot>', "test.srdf")
+    write(
+        tmp_path,
+        '<robot><disable_collisions link1="a" link2="world" reason="x"/></robot>',
+        "test.srdf",
+    )
     loaded = Robot.load(path)
     with Runner(loaded, 1, workers=0, engine=engine, params=loaded.params(kp=1.0)) as runner:
         assert runner.step(loaded.start).ok.all()

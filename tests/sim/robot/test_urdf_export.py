@@ -69,7 +69,9 @@ def test_mimics_soft_limits_and_limits_of_continuous_joints_are_kept(tmp_path):
 
 def test_visuals_are_copied_and_meshes_are_relative_to_the_folder(tmp_path):
     (tmp_path / "meshes").mkdir()
-    corners = "\n".join(f"v {x} {y} {z}" for x, y, z in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)))
+    corners = "\n".join(
+        f"v {x} {y} {z}" for x, y, z in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))
+    )
     (tmp_path / "meshes/arm.obj").write_text(f"{corners}\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     mesh = '<geometry><mesh filename="package://meshes/{}.obj"/></geometry>'
     arm = f"{INERTIAL}<visual>{mesh.format('arm')}</visual><visual>{mesh.format('gone')}</visual>"
@@ -79,7 +81,9 @@ def test_visuals_are_copied_and_meshes_are_relative_to_the_folder(tmp_path):
     exported = to_urdf(loaded, there)
     assert exported.text.count('filename="../meshes/arm.obj"') == 2
     assert '<material name="red"/>' in exported.text
-    assert exported.differences == ("visual meshes not found, written as they were: package://meshes/gone.obj",)
+    assert exported.differences == (
+        "visual meshes not found, written as they were: package://meshes/gone.obj",
+    )
     assert_same(Robot.load(write(there, exported.text), strict=True), loaded)
 
 

@@ -1,4 +1,6 @@
-"""OperationalSpace in a Runner: circles, workers, engines, snapshots, faults, and the errors of its arguments."""
+"""OperationalSpace in a Runner: circles, workers, engines, snapshots, faults, and the errors of its
+arguments.
+"""
 
 from __future__ import annotations
 
@@ -68,15 +70,22 @@ def pose_of(of, qpos, name):
     [
         ("panda", "sapien"),
         ("six_joints", "mujoco"),
-        *(pytest.param("with_friction", engine, marks=pytest.mark.slow) for engine in ("sapien", "mujoco")),
+        *(
+            pytest.param("with_friction", engine, marks=pytest.mark.slow)
+            for engine in ("sapien", "mujoco")
+        ),
     ],
 )
 def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
-    """5 cm of radius, once in 2 s; the orientation is held. Damping and friction of the joints are compensated."""
+    """5 cm of radius, once in 2 s; the orientation is held. Damping and friction of the joints are
+    compensated.
+    """
     if engine == "mujoco":
         pytest.importorskip("mujoco")
     of = request.getfixturevalue(name)
-    tool, start = (HAND, START) if name == "panda" else ("l6", np.array([0.3, 0.4, 0.9, 0.2, 0.7, 0.1]))
+    tool, start = (
+        (HAND, START) if name == "panda" else ("l6", np.array([0.3, 0.4, 0.9, 0.2, 0.7, 0.1]))
+    )
     control = OperationalSpace(of, tool, twist=True, acceleration=True, stiffness=400.0)
     at, ticks, dt = pose_of(of, start, tool), 100, 1 / 100
     phase = np.pi * dt * np.arange(1, ticks + 1)
@@ -84,15 +93,24 @@ def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
     ahead = 0.5 * np.pi * dt  # a setpoint is held for a tick: its middle is that of the motion
     setpoints[:, 0] += 0.05 * (np.cos(phase - ahead) - 1)
     setpoints[:, 1] += 0.05 * np.sin(phase - ahead)
-    setpoints[:, 7], setpoints[:, 8] = -0.05 * np.pi * np.sin(phase - ahead), 0.05 * np.pi * np.cos(phase - ahead)
-    setpoints[:, 13:15] = -0.05 * np.pi**2 * np.stack([np.cos(phase - ahead), np.sin(phase - ahead)], axis=-1)
-    with Runner(of, 1, control=control, engine=engine, workers=0, timestep=1 / 1000, substeps=10) as runner:
+    setpoints[:, 7], setpoints[:, 8] = (
+        -0.05 * np.pi * np.sin(phase - ahead),
+        0.05 * np.pi * np.cos(phase - ahead),
+    )
+    setpoints[:, 13:15] = (
+        -0.05 * np.pi**2 * np.stack([np.cos(phase - ahead), np.sin(phase - ahead)], axis=-1)
+    )
+    with Runner(
+        of, 1, control=control, engine=engine, workers=0, timestep=1 / 1000, substeps=10
+    ) as runner:
         assert runner.command.labels[7::6] == ("vx [m/s]", "ax [m/s^2]")
         runner.reset(start)
         rollout = runner.rollout(setpoints)
     assert rollout.ok.all()
     found = pose_of(of, rollout.qpos, tool)[30:]
-    circle = at[:3] + 0.05 * np.stack([np.cos(phase) - 1, np.sin(phase), 0 * phase], axis=-1)[30:, None]
+    circle = (
+        at[:3] + 0.05 * np.stack([np.cos(phase) - 1, np.sin(phase), 0 * phase], axis=-1)[30:, None]
+    )
     assert np.linalg.norm(found[..., :3] - circle, axis=-1).max() < 1e-3
     assert np.abs((found[..., 3:] * at[3:]).sum(-1)).min() > 1 - 1e-5
 
@@ -145,7 +163,9 @@ def test_quaternions_have_any_length_but_zero_and_fingers_their_setpoint(panda):
 def test_xla_computes_the_same(six_joints):
     start = np.array([0.3, 0.4, 0.9, 0.2, 0.7, 0.1])
     control = OperationalSpace(six_joints, "l6", twist=True)
-    setpoint = np.concatenate([pose_of(six_joints, start, "l6"), np.zeros(6)]) + np.eye(13)[1] * 0.02
+    setpoint = (
+        np.concatenate([pose_of(six_joints, start, "l6"), np.zeros(6)]) + np.eye(13)[1] * 0.02
+    )
     ends = []
     for backend in ("numpy", "jax"):
         with Runner(six_joints, 1, control=control, backend=backend, **OPTIONS) as runner:
@@ -197,14 +217,20 @@ def test_a_tool_has_a_point_and_the_neutral_setpoint_is_its_pose(panda):
 def test_arguments_are_checked(panda, argument, options):
     of_runner = {"control", "tool"} & options.keys()
     with pytest.raises(InvalidArgumentError) as caught:
-        Runner(panda, 1, workers=0, **options) if of_runner else OperationalSpace(panda, **{"link": HAND} | options)
+        (
+            Runner(panda, 1, workers=0, **options)
+            if of_runner
+            else OperationalSpace(panda, **{"link": HAND} | options)
+        )
     assert caught.value.argument in (argument, "link" if "tool" in options else argument)
 
 
 def test_gains_that_the_time_step_makes_unstable_are_a_warning_unless_implicit(panda):
     options = {"workers": 0, "timestep": 1 / 100}
     with (
-        pytest.warns(StabilityWarning, match=r"stiffness, 'x': 10000 .* 1.25 times .*implicit") as seen,
+        pytest.warns(
+            StabilityWarning, match=r"stiffness, 'x': 10000 .* 1.25 times .*implicit"
+        ) as seen,
         Runner(panda, 1, control=OperationalSpace(panda, HAND, stiffness=1e4), **options),
     ):
         assert seen[0].filename == __file__
@@ -225,7 +251,9 @@ def test_control_osc_moves_a_link(panda):
     with Runner(panda, 2, control="osc", tool=HAND, **OPTIONS) as runner:
         runner.reset(START)
         rollout = runner.rollout(np.broadcast_to(goal, (80, 7)))
-    np.testing.assert_allclose(pose_of(panda, rollout.qpos[-1], HAND)[:, :3], np.tile(goal[:3], (2, 1)), atol=2e-3)
+    np.testing.assert_allclose(
+        pose_of(panda, rollout.qpos[-1], HAND)[:, :3], np.tile(goal[:3], (2, 1)), atol=2e-3
+    )
     with Runner(panda, 2, control=OperationalSpace(panda, HAND), **OPTIONS) as runner:
         runner.reset(START)
         again = runner.rollout(np.broadcast_to(goal, (20, 7)))
@@ -239,7 +267,9 @@ def test_the_pose_of_the_tool_is_observed_recorded_and_drawn(panda, tmp_path):
     from batchpid.sim import Recorder, plots, read_recording
 
     control, point = OperationalSpace(panda, HAND, point=[0, 0, 0.1]), [0.0, 0.0, 0.1]
-    goals = np.broadcast_to(np.multiply(control.command.neutral, [1, 1, 1, -1, -1, -1, -1]), (6, 2, 7))
+    goals = np.broadcast_to(
+        np.multiply(control.command.neutral, [1, 1, 1, -1, -1, -1, -1]), (6, 2, 7)
+    )
     with Runner(panda, 2, control=control, **OPTIONS) as runner:
         first = runner.reset()
         with Recorder(tmp_path / "run.h5", runner):
@@ -254,7 +284,9 @@ def test_the_pose_of_the_tool_is_observed_recorded_and_drawn(panda, tmp_path):
     assert recorded.info.tool == HAND
     assert recorded.info.units_of("tool_pose") == ("m",) * 3 + ("",) * 4
     assert rollout.for_envs([1]).for_ticks(slice(2)).tool_pose.shape == (2, 1, 7)
-    named = {axes.get_title(loc="left"): axes for axes in plots.step_responses(rollout, mark=1).axes}
+    named = {
+        axes.get_title(loc="left"): axes for axes in plots.step_responses(rollout, mark=1).axes
+    }
     marked = [line.get_ydata() for line in named["setpoint qx"].get_lines()][-1]
     np.testing.assert_allclose(marked, -rollout.tool_pose[:, 1, 4])
     with Runner(panda, 1, **OPTIONS) as runner:
@@ -263,10 +295,14 @@ def test_the_pose_of_the_tool_is_observed_recorded_and_drawn(panda, tmp_path):
 
 def test_a_floating_base_is_refused():
     floating = Robot.load("panda", fixed_base=False)
-    message = "control: 'osc' needs a fixed base, .*'panda' .*; load .*fixed_base=True, or control its"
+    message = (
+        "control: 'osc' needs a fixed base, .*'panda' .*; load .*fixed_base=True, or control its"
+    )
     with pytest.raises(InvalidArgumentError, match=message):
         Runner(floating, 1, workers=0, control="osc")
-    with pytest.raises(RobotError, match=r"fixed base; load the robot with fixed_base=True, or control its joints"):
+    with pytest.raises(
+        RobotError, match=r"fixed base; load the robot with fixed_base=True, or control its joints"
+    ):
         OperationalSpace(floating, HAND)
 
 
@@ -276,19 +312,36 @@ class Called(OperationalSpace):
 
 LOOPS = {
     "default": {},
-    "with parts": {"twist": True, "acceleration": True, "wrench": True, "joints": ["panda_finger_joint1"]},
-    "integral": {"integral_gain": 20.0, "integral_limit": 5.0, "limit_margin": 0.2, "frame": "tool"},
+    "with parts": {
+        "twist": True,
+        "acceleration": True,
+        "wrench": True,
+        "joints": ["panda_finger_joint1"],
+    },
+    "integral": {
+        "integral_gain": 20.0,
+        "integral_limit": 5.0,
+        "limit_margin": 0.2,
+        "frame": "tool",
+    },
     "implicit": {"discretization": "implicit", "point": [0.0, 0.0, 0.1]},
 }
 MORE = [
     {"compensate": "gravity"},
     {"compensate": "none"},
     {"actuators": bp.make_actuators(9, command_delay=0.001, effort_limit=60.0)},
-    {"actuators": bp.make_actuators(9, sensor_delay=0.001, position_noise=1e-4, velocity_noise=1e-3)},
+    {
+        "actuators": bp.make_actuators(
+            9, sensor_delay=0.001, position_noise=1e-4, velocity_noise=1e-3
+        )
+    },
     {"arm": "damped", "link": "l6"},
     {"arm": "with_friction", "link": "l6", "compensate": "gravity+coriolis"},
     {"arm": "with_friction", "link": "l6"},
-    {"compensate": "gravity+coriolis+friction", "actuators": bp.make_actuators(9, coulomb=0.3, viscous=0.1)},
+    {
+        "compensate": "gravity+coriolis+friction",
+        "actuators": bp.make_actuators(9, coulomb=0.3, viscous=0.1),
+    },
     {"feedforward": 3.0},
     {"feedforward": 3.0, "compensate": "none"},
     {"feedforward": 3.0, "arm": "coupled", "link": "l5"},
@@ -308,7 +361,9 @@ ALL = [*((case, {}) for case in LOOPS), *(("default", more) for more in MORE)]
     ],
 )
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
-def test_sim_steps_in_native_code_give_the_bytes_of_the_called_controller(request, engine, case, more):
+def test_sim_steps_in_native_code_give_the_bytes_of_the_called_controller(
+    request, engine, case, more
+):
     """Also with resets, an env that fails, a snapshot and setpoints that change."""
     if engine == "mujoco":
         pytest.importorskip("mujoco")
@@ -316,7 +371,9 @@ def test_sim_steps_in_native_code_give_the_bytes_of_the_called_controller(reques
     arm, link = request.getfixturevalue(options.pop("arm", "panda")), options.pop("link", HAND)
     noise = 0.05 * np.random.default_rng(0).normal(size=(5, 9)) * (np.arange(9) < 7)
     starts = arm.coupled(np.clip((START + noise)[:, : arm.dof], arm.lower, arm.upper))
-    forward = options.pop("feedforward", 0.0) * np.random.default_rng(2).normal(size=(6, 5, arm.dof))
+    forward = options.pop("feedforward", 0.0) * np.random.default_rng(2).normal(
+        size=(6, 5, arm.dof)
+    )
     for kind in (OperationalSpace, Called):
         control = kind(arm, link, **LOOPS[case])
         rng, size = np.random.default_rng(1), control.command.size
@@ -328,12 +385,18 @@ def test_sim_steps_in_native_code_give_the_bytes_of_the_called_controller(reques
             parts = [runner.rollout(goals[:2], feedforwards=forward[:2] if forward.any() else None)]
             runner.reset(starts, mask=np.arange(5) == 2)
             snapshot = runner.snapshot()
-            parts.append(runner.rollout(goals[2:], feedforwards=forward[2:] if forward.any() else None))
+            parts.append(
+                runner.rollout(goals[2:], feedforwards=forward[2:] if forward.any() else None)
+            )
             runner.restore(snapshot)
             goals[0, 3, 3:7] = 0.0  # a quaternion without direction
             parts.append(runner.rollout(goals))
             seen.append(
-                [leaf for part in parts for leaf in (part.qpos, part.qvel, part.effort, part.saturated, part.ok)]
+                [
+                    leaf
+                    for part in parts
+                    for leaf in (part.qpos, part.qvel, part.effort, part.saturated, part.ok)
+                ]
             )
     for native, called in zip(*seen, strict=True):
         np.testing.assert_array_equal(native, called)
@@ -349,7 +412,9 @@ def test_joints_with_limited_efforts_are_reported(panda, kind, backend):
     control = kind(panda, HAND, effort_limit=np.where(np.arange(9) < 7, 30.0, 100.0))
     goals = np.tile(control.command.neutral, (4, 2, 1))
     goals[:, 1, 2] += 0.3
-    with Runner(panda, 2, control=control, compensate="gravity", backend=backend, **OPTIONS) as runner:
+    with Runner(
+        panda, 2, control=control, compensate="gravity", backend=backend, **OPTIONS
+    ) as runner:
         rollout = runner.rollout(goals)
     assert not rollout.saturated[:, 0].any()
     assert rollout.saturated[0, 1, :7].any()
@@ -361,7 +426,9 @@ def test_native_friction_is_that_of_numpy(with_friction, twist, monkeypatch):
     control = OperationalSpace(with_friction, "l6", twist=twist).in_runner(1 / 2000, "friction")
     rng, rows = np.random.default_rng(0), 9
     qpos, qvel, passive = rng.normal(size=(3, rows, with_friction.dof))
-    setpoint = np.tile(control.command.neutral, (rows, 1)) + 0.1 * rng.normal(size=(rows, control.command.size))
+    setpoint = np.tile(control.command.neutral, (rows, 1)) + 0.1 * rng.normal(
+        size=(rows, control.command.size)
+    )
     state, efforts = control.init(with_friction, rows), []
     for switch in ("1", "0"):
         monkeypatch.setenv("BATCHPID_NATIVE", switch)

@@ -1,5 +1,6 @@
-"""Setpoints out of reach and near-singular poses in the engines: no chatter, no error at rest, damped motion, and no
-effect on other envs."""
+"""Setpoints out of reach and near-singular poses in the engines: no chatter, no error at rest,
+damped motion, and no effect on other envs.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +14,9 @@ from tests.sim.tool_space.test_osc_controller import START, six
 
 DT = 1 / 2000
 OUT, STOPS, BACK, END = 0.6, 1.0, 2.6, 4.4
-"""The setpoint is out of reach; the arm has stretched; the setpoint returns; the arm is at rest [s]."""
+"""The setpoint is out of reach; the arm has stretched; the setpoint returns; the arm is at rest
+[s].
+"""
 
 
 @pytest.fixture(params=["aligned wrist", "straight elbow"])
@@ -28,11 +31,12 @@ def arm(request, tmp_path):
 @pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
 @pytest.mark.parametrize(("engine", "rest"), [("mujoco", 0.01e-3), ("sapien", 0.1e-3)])
 def test_a_setpoint_out_of_reach_for_2_s_and_back(arm, engine, rest):
-    """Chatter is the second difference of the efforts of successive sim steps [N m]; ``rest`` the final error [m].
+    """Chatter is the second difference of the efforts of successive sim steps [N m]; ``rest`` the
+    final error [m].
 
-    SAPIEN's float32 positions stand still below about 5e-7 / DT rad/s, where the spring moves the tool by kd / kp of
-    that. Env 0 gets setpoints in reach, env 2 a quaternion of zeros, which makes it NaN: env 0 has the same bits in a
-    run without these two.
+    SAPIEN's float32 positions stand still below about 5e-7 / DT rad/s, where the spring moves the
+    tool by kd / kp of that. Env 0 gets setpoints in reach, env 2 a quaternion of zeros, which makes
+    it NaN: env 0 has the same bits in a run without these two.
     """
     if engine == "mujoco":
         pytest.importorskip("mujoco")
@@ -41,10 +45,14 @@ def test_a_setpoint_out_of_reach_for_2_s_and_back(arm, engine, rest):
     time = DT * np.arange(1, round(END / DT) + 1)
     goals = np.tile(pose, (len(time), 3, 1))
     goals[:, 0, 2] -= 0.05
-    goals[:, 1, :3] += np.interp(time, [0, OUT, BACK, BACK + OUT], [0, 1, 1, 0])[:, None] * np.array(way)
+    goals[:, 1, :3] += np.interp(time, [0, OUT, BACK, BACK + OUT], [0, 1, 1, 0])[
+        :, None
+    ] * np.array(way)
     goals[1000:, 2, 3:] = 0.0
     control = OperationalSpace(robot, link, posture=start)
-    with Runner(robot, 3, control=control, engine=engine, workers=0, timestep=DT, substeps=1) as runner:
+    with Runner(
+        robot, 3, control=control, engine=engine, workers=0, timestep=DT, substeps=1
+    ) as runner:
         runner.reset(start)
         seen = runner.rollout(goals)
         runner.reset(start)
@@ -66,7 +74,9 @@ BENT = np.array([0.4, 0.1, 0.12, 0.4, 0.6, 0.4])
 
 def smallest_eigenvalue(tree, qpos):
     jacobian = ts.jacobian(tree, qpos[None], "l6")[0]
-    return np.linalg.eigvalsh(jacobian @ np.linalg.solve(ts.mass_matrix(tree, qpos[None])[0], jacobian.T))[0]
+    return np.linalg.eigvalsh(
+        jacobian @ np.linalg.solve(ts.mass_matrix(tree, qpos[None])[0], jacobian.T)
+    )[0]
 
 
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
@@ -82,7 +92,9 @@ def test_the_posture_does_not_pull_the_tool_off_a_near_singular_pose(engine, pul
     start[2] = 0.3
     goal = ts.link_poses(tree, BENT[None], ["l6"])[0, 0]
     control = OperationalSpace(robot, "l6", posture=posture)
-    with Runner(robot, 1, control=control, engine=engine, workers=0, timestep=1 / 500, substeps=5) as runner:
+    with Runner(
+        robot, 1, control=control, engine=engine, workers=0, timestep=1 / 500, substeps=5
+    ) as runner:
         runner.reset(start)
         tool = runner.rollout(np.tile(goal, (200, 1))).tool_pose[:, 0, :3]
     assert np.linalg.norm(tool[0] - goal[:3]) > 0.1
@@ -91,10 +103,12 @@ def test_the_posture_does_not_pull_the_tool_off_a_near_singular_pose(engine, pul
 
 @pytest.mark.parametrize("engine", ["sapien", "mujoco"])
 def test_motion_through_a_straight_elbow_is_damped(engine, tmp_path):
-    """From 0.1 s after the setpoint rests, the largest kinetic energy in 0.2 s falls from one such time to the next.
+    """From 0.1 s after the setpoint rests, the largest kinetic energy in 0.2 s falls from one such
+    time to the next.
 
-    The tool is sent 15 cm outward for 0.3 s, and back to a near-singular pose. Were the damping of the posture kept out
-    of the task down to the bound of its springs, the tool would swing about the setpoint for more than 2 s.
+    The tool is sent 15 cm outward for 0.3 s, and back to a near-singular pose. Were the damping of
+    the posture kept out of the task down to the bound of its springs, the tool would swing about
+    the setpoint for more than 2 s.
     """
     if engine == "mujoco":
         pytest.importorskip("mujoco")
@@ -105,7 +119,9 @@ def test_motion_through_a_straight_elbow_is_damped(engine, tmp_path):
     outward = goals[0, :3] - [0, 0, 0.3]
     goals[:30, :3] += 0.15 * outward / np.linalg.norm(outward)
     control = OperationalSpace(robot, "l6", posture=posture)
-    with Runner(robot, 1, control=control, engine=engine, workers=0, timestep=1 / 500, substeps=5) as runner:
+    with Runner(
+        robot, 1, control=control, engine=engine, workers=0, timestep=1 / 500, substeps=5
+    ) as runner:
         runner.reset(BENT)
         seen = runner.rollout(goals)
     qpos, qvel = seen.qpos[:, 0].astype(float), seen.qvel[:, 0].astype(float)

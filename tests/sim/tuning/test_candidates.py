@@ -66,7 +66,9 @@ def test_candidates_are_slower_the_later_the_motors(panda):
 
 def test_points_stand_for_their_gains_per_mass_matrix(panda):
     options = {"headroom": 1.0, "varied": False}
-    search = Candidates(panda, "mass_matrix", False, random_moves(panda, 1, 0), 0.2, Weights(), **options)
+    search = Candidates(
+        panda, "mass_matrix", False, random_moves(panda, 1, 0), 0.2, Weights(), **options
+    )
     gains = first_gains(0.005)
     params = search.params(search.points(gains))
     for leaf, expected in zip((params.ki, params.kp, params.kd), np.array(gains).T, strict=True):
@@ -75,7 +77,9 @@ def test_points_stand_for_their_gains_per_mass_matrix(panda):
 
 def test_delay_of_the_loop_is_that_of_the_latest_joint_and_draw(panda):
     delays = np.linspace(0.001, 0.004, panda.dof)
-    late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=delays, lag=0.01))
+    late = dataclasses.replace(
+        panda, actuators=make_actuators(panda.dof, command_delay=delays, lag=0.01)
+    )
     drawn = Randomization(actuators={"sensor_delay": Uniform(0.02, 0.02 + 1e-9)})
     assert loop_delay(panda, None, 0.002) == 0.002
     assert loop_delay(late, None, 0.002) == pytest.approx(0.016)
@@ -91,4 +95,7 @@ def test_first_generation_of_robots_that_differ_are_designs_for_their_delay(pand
     own = 1 / 2000 + float(np.max(found.start_params.derivative_filter_time))
     designs = [*first_gains(0.003 + own)[:3]]
     gains = np.array([leaf[0, 0] for leaf in (found.params.ki, found.params.kp, found.params.kd)])
-    assert min(np.abs(gains / design - 1).max() for design in designs) < 1e-9 or found.cost == found.start_cost
+    assert (
+        min(np.abs(gains / design - 1).max() for design in designs) < 1e-9
+        or found.cost == found.start_cost
+    )

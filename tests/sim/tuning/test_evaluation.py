@@ -54,7 +54,8 @@ def following_and_settling(robot, params, moves, **options):
 def test_setpoint_weights_change_how_steps_are_approached_and_not_how_motions_are_followed(panda):
     moves, tuned = random_moves(panda, 2, seed=4), panda.tuned()
     (low, slow), (high, fast) = (
-        following_and_settling(panda, tuned.replace(setpoint_weight=np.full(panda.dof, b)), moves) for b in (0.0, 0.9)
+        following_and_settling(panda, tuned.replace(setpoint_weight=np.full(panda.dof, b)), moves)
+        for b in (0.0, 0.9)
     )
     assert low.max() < 1e-3
     np.testing.assert_allclose(high, low, atol=3e-4)
@@ -64,7 +65,9 @@ def test_setpoint_weights_change_how_steps_are_approached_and_not_how_motions_ar
 def test_a_step_is_the_same_beside_a_smooth_motion(panda):
     moves = random_moves(panda, 1, seed=4).take([0, 0])
     with Runner(panda, 2, params=panda.tuned(), workers=0, substeps=5) as runner:
-        (step, _), (mixed, _) = (run_moves(runner, moves, 0.1, durations=each) for each in (None, np.array([0.0, 1.0])))
+        (step, _), (mixed, _) = (
+            run_moves(runner, moves, 0.1, durations=each) for each in (None, np.array([0.0, 1.0]))
+        )
     np.testing.assert_allclose(mixed.qpos[:, 0], step.qpos[:, 0], rtol=0, atol=1e-6)
     assert following_error(panda, mixed)[0].max() > 5 * following_error(panda, mixed)[1].max()
 
@@ -106,7 +109,11 @@ def test_a_drawback_names_the_criterion_that_decides_and_both_figures(panda):
     zeros = np.zeros((2, panda.dof))
 
     def performing(name, settling, overshoot):
-        figures = {"settling_time": zeros + settling, "steady_state_error": zeros, "overshoot": zeros.copy()}
+        figures = {
+            "settling_time": zeros + settling,
+            "steady_state_error": zeros,
+            "overshoot": zeros.copy(),
+        }
         figures["overshoot"][:, 3] = overshoot
         metrics = good.metrics._replace(**figures)
         return good._replace(name=name, metrics=metrics, chatter=zeros, settling_limit=np.ones(2))
@@ -126,7 +133,10 @@ def test_a_drawback_names_the_criterion_that_decides_and_both_figures(panda):
 @pytest.mark.slow
 def test_a_randomization_draws_the_same_at_every_evaluation_and_for_any_number_of_workers(panda):
     moves = random_moves(panda, 2, 2)
-    drawn, actuators = Randomization(payload=Uniform(0, 1)), bp.make_actuators(panda.dof, command_delay=5e-4)
+    drawn, actuators = (
+        Randomization(payload=Uniform(0, 1)),
+        bp.make_actuators(panda.dof, command_delay=5e-4),
+    )
     plain, *varied = (
         evaluate_gains(panda, panda.designed(), moves, seconds=0.15, workers=workers, **options)
         for workers, options in (
@@ -145,14 +155,18 @@ def test_payload_outside_the_model_pulls_the_hand_down_and_the_integral_lifts_it
     pose[[1, 3]] = 0.8, -1.0
     loaded = Randomization(payload=Uniform(2.0, 2.0), payload_link="panda_hand")
     gains = bp.design_gains(panda, gain_units="mass_matrix", measurement_rate="measured")
-    evaluation = evaluate_gains(panda, gains, hold(pose), seconds=3.0, randomization=loaded, workers=0)
+    evaluation = evaluate_gains(
+        panda, gains, hold(pose), seconds=3.0, randomization=loaded, workers=0
+    )
     assert evaluation.metrics.peak_deviation[0, 1] > 3e-3
     assert evaluation.metrics.steady_state_error[0, :7].max() < 1e-3
 
 
 def test_randomization_is_a_file(panda, tmp_path):
     path = tmp_path / "drawn.yaml"
-    path.write_text("payload: {uniform: [0, 0.3]}\nparams: {kp: {log_uniform: [0.5, 2], operation: scale}}\n")
+    path.write_text(
+        "payload: {uniform: [0, 0.3]}\nparams: {kp: {log_uniform: [0.5, 2], operation: scale}}\n"
+    )
     loaded = load_randomization(path, panda, seed=4)
     kp = LogUniform(0.5, 2, operation="scale")
     assert loaded == Randomization(seed=4, payload=Uniform(0, 0.3), params={"kp": kp})

@@ -21,7 +21,11 @@ def same(one, other):
 
 
 def test_names_stand_for_the_robots_own_gains(panda):
-    for name, params in (("tuned", panda.tuned()), ("designed", panda.designed()), ("tutorial", panda.params())):
+    for name, params in (
+        ("tuned", panda.tuned()),
+        ("designed", panda.designed()),
+        ("tutorial", panda.params()),
+    ):
         gains = gain_set(panda, name)
         assert (gains.name, gains.control) == (name, "pid")
         assert same(gains.params, params)
@@ -62,11 +66,28 @@ def test_tuned_gains_of_a_robot_without_are_refused(panda):
 def test_gains_of_an_mjcf_file_are_those_of_its_servos(panda, tmp_path):
     pytest.importorskip("mujoco", "3.17")
     params = bp.make_params(
-        9, np.linspace(5, 80, 9), 3.0, 2.0, effort_limit=20.0, integral_limit=7.0, measurement_rate="measured"
+        9,
+        np.linspace(5, 80, 9),
+        3.0,
+        2.0,
+        effort_limit=20.0,
+        integral_limit=7.0,
+        measurement_rate="measured",
     )
     path, gains = tmp_path / "arm.xml", tmp_path / "gains.yaml"
     bp.save_params(gains, params, panda.joint_names)
-    words = ("export", "panda", "--to", "mjcf", "--timestep", 1 / 2000, "--gains", gains, "--out", path)
+    words = (
+        "export",
+        "panda",
+        "--to",
+        "mjcf",
+        "--timestep",
+        1 / 2000,
+        "--gains",
+        gains,
+        "--out",
+        path,
+    )
     assert not main([*map(str, words)])
     assert same(gain_set(panda, str(path)).params, params)
     path.write_text(path.read_text().replace("panda_joint1", "joint_1"))

@@ -6,12 +6,21 @@ import numpy as np
 import pytest
 
 from batchpid.sim.tuning import Moves, random_moves, search_moves, tutorial_move
-from batchpid.sim.tuning.moves import shortest_durations, smooth_durations, smooth_effort, smooth_variation
+from batchpid.sim.tuning.moves import (
+    shortest_durations,
+    smooth_durations,
+    smooth_effort,
+    smooth_variation,
+)
 from batchpid.trajectories import minimum_jerk
 
 
 def test_random_moves_are_seeded_within_limits_and_free_of_contact(panda):
-    moves, again, other = random_moves(panda, 8, 3), random_moves(panda, 8, 3), random_moves(panda, 8, 4)
+    moves, again, other = (
+        random_moves(panda, 8, 3),
+        random_moves(panda, 8, 3),
+        random_moves(panda, 8, 4),
+    )
     np.testing.assert_array_equal(moves.start, again.start)
     np.testing.assert_array_equal(moves.target, again.target)
     assert (moves.start != other.start).any()
@@ -34,7 +43,9 @@ def test_search_moves_are_the_tutorials_one_of_each_kind_and_the_hardest_of_more
 
 
 def test_shortest_duration_is_the_double_integrators_bang_bang_for_a_lone_joint(panda):
-    """T = 2 sqrt(A I / limit) where gravity and coupling play no part: the last joint of the arm, alone."""
+    """T = 2 sqrt(A I / limit) where gravity and coupling play no part: the last joint of the arm,
+    alone.
+    """
     start = panda.start
     target = start.copy()
     target[6] += 1.0
@@ -43,19 +54,27 @@ def test_shortest_duration_is_the_double_integrators_bang_bang_for_a_lone_joint(
     limit = 12.0 - abs(gravity[6])
     expected = 2 * np.sqrt(inertia / limit)
     # the others must hold against it, with room to spare
-    assert shortest_durations(panda, Moves(start[None], target[None], ("",)))[0] == pytest.approx(expected, rel=0.05)
+    assert shortest_durations(panda, Moves(start[None], target[None], ("",)))[0] == pytest.approx(
+        expected, rel=0.05
+    )
 
 
 @pytest.mark.parametrize("name", ["panda", "jaco2"])
-def test_smooth_motions_take_half_of_the_velocity_limits_and_leave_a_reserve_of_effort(name, request):
+def test_smooth_motions_take_half_of_the_velocity_limits_and_leave_a_reserve_of_effort(
+    name, request
+):
     robot = request.getfixturevalue(name)
     moves = random_moves(robot, 4, 3)
     durations = smooth_durations(robot, moves)
     assert (durations > shortest_durations(robot, moves)).all()
     for start, target, duration in zip(moves.start, moves.target, durations, strict=True):
-        peak = np.abs(minimum_jerk(start, target, duration / 500, duration=duration).velocity).max(0)
+        peak = np.abs(minimum_jerk(start, target, duration / 500, duration=duration).velocity).max(
+            0
+        )
         velocity = (peak / robot.velocity_limit).max()
-        effort, still = (smooth_effort(robot, start, target, each) for each in (duration, 1e3 * duration))
+        effort, still = (
+            smooth_effort(robot, start, target, each) for each in (duration, 1e3 * duration)
+        )
         shares = (np.abs(effort) - np.abs(still)) / (robot.design_effort_limit - np.abs(still))
         assert velocity <= 0.5 + 1e-6
         assert shares.max() <= 0.71

@@ -29,14 +29,19 @@ SMALL = {"generations": 2, "population": 4, "seconds": 0.1, "engine": "mujoco"}
 @pytest.fixture
 def few_moves(monkeypatch):
     """Search on two moves, with a final on one other."""
-    monkeypatch.setattr("batchpid.sim.tuning.search.search_moves", lambda robot, seed: random_moves(robot, 2, seed))
+    monkeypatch.setattr(
+        "batchpid.sim.tuning.search.search_moves", lambda robot, seed: random_moves(robot, 2, seed)
+    )
     monkeypatch.setattr("batchpid.sim.tuning.search.FINAL_MOVES", 1)
 
 
 def test_gains_and_implicit_laws_are_refused(panda):
     motors = make_actuators(panda.dof, strength=0.9)
     for options, message in (
-        ({"params": panda.designed()}, r"params: .*explicit gains; .*bp\.design_gains makes implicit gains"),
+        (
+            {"params": panda.designed()},
+            r"params: .*explicit gains; .*bp\.design_gains makes implicit gains",
+        ),
         ({"discretization": "implicit"}, r"discretization: .*explicit gains; .*bp\.design_gains"),
         ({"motors": motors, "actuators": motors}, "actuators: is given with motors"),
     ):
@@ -52,11 +57,16 @@ def test_same_seed_gives_bit_identical_gains_for_any_number_of_workers(few_moves
     assert len({cost for row in found.history for cost in row}) > 3
     assert tune(ARM, workers=0, seed=6, **SMALL).history != found.history
     assert found.cost <= found.start_cost
-    assert found.cost in [*sorted(cost for row in found.history for cost in row)[:3], found.start_cost]
+    assert found.cost in [
+        *sorted(cost for row in found.history for cost in row)[:3],
+        found.start_cost,
+    ]
 
 
 @pytest.mark.slow
-def test_robots_touch_things_in_the_final_and_where_the_moves_are_given(panda, few_moves, monkeypatch):
+def test_robots_touch_things_in_the_final_and_where_the_moves_are_given(
+    panda, few_moves, monkeypatch
+):
     options = []
 
     def runner(*args, **kwargs):
@@ -87,7 +97,12 @@ def test_cost_is_linear_in_the_weight_of_the_following_error():
 @pytest.mark.parametrize("name", ["arm", "panda", "jaco2"])
 def test_a_short_search_is_near_the_best_of_many_candidates(name, engine):
     robot = ARM if name == "arm" else load_bundled(name)
-    options = SMALL | {"seconds": 0.3, "engine": engine, "moves": random_moves(robot, 2, 0), "workers": 0}
+    options = SMALL | {
+        "seconds": 0.3,
+        "engine": engine,
+        "moves": random_moves(robot, 2, 0),
+        "workers": 0,
+    }
     short = tune(robot, **options)
     wide = tune(robot, **options | {"generations": 1, "population": 48, "seed": 1})
     assert short.cost <= short.start_cost
@@ -97,19 +112,30 @@ def test_a_short_search_is_near_the_best_of_many_candidates(name, engine):
 def test_search_starts_from_the_designed_gains():
     found = tune(ARM, moves=random_moves(ARM, 1, 0), workers=0, **SMALL)
     for name in ("kp", "ki", "kd"):
-        np.testing.assert_array_equal(getattr(found.start_params, name), getattr(ARM.designed(), name))
+        np.testing.assert_array_equal(
+            getattr(found.start_params, name), getattr(ARM.designed(), name)
+        )
 
 
 def test_gains_in_efforts_and_of_single_joints_can_be_searched_too():
-    found = tune(ARM, moves=random_moves(ARM, 1, 0), gain_units="effort", per_joint=True, workers=0, **SMALL)
+    found = tune(
+        ARM, moves=random_moves(ARM, 1, 0), gain_units="effort", per_joint=True, workers=0, **SMALL
+    )
     ratio = found.params.kp / found.start_params.kp
     assert found.cost == found.start_cost or np.ptp(ratio) > 0
 
 
 def test_moves_are_made_with_different_motors_of_which_the_worst_counts():
     motors = make_actuators(ARM.dof, command_delay=np.array([[1e-3], [4e-2]]).repeat(ARM.dof, 1))
-    options = SMALL | {"moves": random_moves(ARM, 2, 0), "workers": 0, "generations": 1, "seconds": 0.3}
-    late, mixed, early = (tune(ARM, motors=motors.for_envs(rows), **options) for rows in ([1, 1], [0, 1], [0, 0]))
+    options = SMALL | {
+        "moves": random_moves(ARM, 2, 0),
+        "workers": 0,
+        "generations": 1,
+        "seconds": 0.3,
+    }
+    late, mixed, early = (
+        tune(ARM, motors=motors.for_envs(rows), **options) for rows in ([1, 1], [0, 1], [0, 0])
+    )
     assert early.start_cost < mixed.start_cost < late.start_cost
 
 
@@ -135,7 +161,9 @@ def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(
     payload = Randomization(payload=Uniform(0, 0.5))
     found = tune(robot, generations=1, randomization=payload)
     moves = tutorial_move(robot) + random_moves(robot, 20, 1)
-    judged = evaluate_gains(robot, found.params, moves, randomization=dataclasses.replace(payload, seed=1))
+    judged = evaluate_gains(
+        robot, found.params, moves, randomization=dataclasses.replace(payload, seed=1)
+    )
     late = judged.demands(arm_joints(robot))["settling time"].max(1) > 1
     assert len(late) - late.sum() >= least
 
@@ -144,7 +172,10 @@ def test_first_candidates_are_in_time_with_late_motors_an_encoder_and_a_payload(
 def test_gains_of_the_search_follow_unseen_motions_more_closely_than_designed_ones(panda):
     found = tune(panda)
     moves = tutorial_move(panda) + random_moves(panda, 20, 1)
-    designed, tuned = (evaluate_gains(panda, each, moves, follow=True) for each in (found.start_params, found.params))
+    designed, tuned = (
+        evaluate_gains(panda, each, moves, follow=True)
+        for each in (found.start_params, found.params)
+    )
     arm = arm_joints(panda)
     assert tuned.following_error[:, arm].max() < 0.8 * designed.following_error[:, arm].max()
     assert tuned.metrics.settling_time[:, arm].max() <= designed.metrics.settling_time[:, arm].max()

@@ -13,11 +13,15 @@ def picture(page):
     """Return a screenshot (height, width, 3)."""
     from PIL import Image
 
-    return np.asarray(Image.open(io.BytesIO(page.get_screenshot_as_png())).convert("RGB")).astype(int)
+    return np.asarray(Image.open(io.BytesIO(page.get_screenshot_as_png())).convert("RGB")).astype(
+        int
+    )
 
 
 def dark(image):
-    """Count the pixels between the panels that are as dark as the robots' links; the floor is brighter."""
+    """Count the pixels between the panels that are as dark as the robots' links; the floor is
+    brighter.
+    """
     middle = image[:, 400 : image.shape[1] - 360]
     return int((middle.max(-1) < 110).sum())
 
@@ -26,7 +30,9 @@ def number_box(page, label):
     """Return the number box of the slider with this label."""
     from selenium.webdriver.common.by import By
 
-    return page.find_element(By.XPATH, f"//label[text()='{label}']/following::input[@type='text'][1]")
+    return page.find_element(
+        By.XPATH, f"//label[text()='{label}']/following::input[@type='text'][1]"
+    )
 
 
 def press(page, text):
@@ -48,7 +54,9 @@ def slide(page, label, steps):
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
 
-    thumb = page.find_element(By.XPATH, f"//label[text()='{label}']/following::*[@role='slider'][1]")
+    thumb = page.find_element(
+        By.XPATH, f"//label[text()='{label}']/following::*[@role='slider'][1]"
+    )
     for _ in range(steps):
         thumb.send_keys(Keys.ARROW_RIGHT)
 
@@ -128,4 +136,6 @@ def test_a_recorded_run_plays(jaco2, serve, open_page, until):
     until(lambda: playback.frame().time[0] > 0.5, what="playing")
     view.panel.frames_left = 0
     enter(page, "Time [s]", 0.1)
-    until(lambda: playback.frame().time[0] == pytest.approx(0.1, abs=playback.period), what="seeking")
+    until(
+        lambda: playback.frame().time[0] == pytest.approx(0.1, abs=playback.period), what="seeking"
+    )

@@ -22,7 +22,9 @@ def test_a_robot_is_drawn_where_it_is(panda, ground):
     painter = film.Painter(panda, 2, ground, (160, 90))
     start, target = panda.start, panda.target
     first = painter.picture(np.array([start, target]))
-    second = painter.picture(np.array([target, np.full(panda.dof, np.nan)]))  # the second keeps its pose
+    second = painter.picture(
+        np.array([target, np.full(panda.dof, np.nan)])
+    )  # the second keeps its pose
     third = painter.picture(np.array([start, start]))
     assert first.std() > 5  # not empty
     assert (first == painter.picture(np.array([start, target]))).all()
@@ -34,7 +36,18 @@ def test_a_robot_is_drawn_where_it_is(panda, ground):
 def read_film(path, width, height):
     """Return the pictures of a film, (frames, height, width, 3)."""
     ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
-    command = [ffmpeg, "-v", "error", "-i", f"file:{path}", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    command = [
+        ffmpeg,
+        "-v",
+        "error",
+        "-i",
+        f"file:{path}",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-",
+    ]
     data = subprocess.run(command, capture_output=True, check=True).stdout
     return np.frombuffer(data, np.uint8).reshape(-1, height, width, 3)
 
@@ -44,7 +57,9 @@ def test_a_film_has_its_pictures_in_order(name, rollout, tmp_path, monkeypatch):
     pytest.importorskip("imageio_ffmpeg")
     monkeypatch.chdir(tmp_path)
     film.write_film(rollout, name, width=161, height=91, fps=100)
-    frames = read_film(name, 162 if name.endswith("mp4") else 161, 92 if name.endswith("mp4") else 91)
+    frames = read_film(
+        name, 162 if name.endswith("mp4") else 161, 92 if name.endswith("mp4") else 91
+    )
     assert len(frames) == 20
     differences = np.abs(frames.astype(int) - frames[0]).mean((1, 2, 3))
     assert differences[-1] > differences[10] > differences[3] > 0
@@ -79,6 +94,10 @@ def test_the_message_of_ffmpeg_is_in_the_error(tmp_path):
 
 
 def test_bad_arguments_are_named(rollout, tmp_path):
-    for options, named in (({"out": "film.avi"}, "out"), ({"fps": 0.0}, "fps"), ({"width": 3}, "width")):
+    for options, named in (
+        ({"out": "film.avi"}, "out"),
+        ({"fps": 0.0}, "fps"),
+        ({"width": 3}, "width"),
+    ):
         with pytest.raises(InvalidArgumentError, match=named):
             film.write_film(rollout, **({"out": tmp_path / "film.mp4"} | options))

@@ -1,4 +1,6 @@
-"""Who may open the page: only a browser with the token in its address, at this server, from no other site."""
+"""Who may open the page: only a browser with the token in its address, at this server, from no
+other site.
+"""
 
 import socket
 import urllib.error
@@ -23,7 +25,9 @@ def view(panda, serve):
 
 def status(url, **headers):
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=20) as response:
+        with urllib.request.urlopen(
+            urllib.request.Request(url, headers=headers), timeout=20
+        ) as response:
             return response.status
     except urllib.error.HTTPError as error:
         return error.code
@@ -36,7 +40,14 @@ def test_a_page_opens_with_the_address_that_was_printed_and_otherwise_gets_403(v
         assert status(view.url, Host=host, Origin=f"http://{host}") == 200
     for origin in ("http://evil.example", "null", f"http://127.0.0.1:{port + 1}", ""):
         assert status(view.url, Origin=origin) == 403
-    for host in ("evil.example", f"evil.example:{port}", "127.0.0.1.evil.example", "10.0.0.1", "[", ""):
+    for host in (
+        "evil.example",
+        f"evil.example:{port}",
+        "127.0.0.1.evil.example",
+        "10.0.0.1",
+        "[",
+        "",
+    ):
         assert status(view.url, Host=host) == 403
     for path in ("", "/", "/index.html", "/" + "x" * 22 + "/", view.url[len(base) : -2], "/%"):
         assert status(base + path) == 403

@@ -87,7 +87,10 @@ def test_a_robot_without_settings_gets_gains_that_hold_it(tmp_path, panda):
 
 
 def test_bad_arguments_are_named(panda, live):
-    for options, named in (({"num_envs": 65}, "num_envs"), ({"num_envs": 2, "period": 0.0}, "period")):
+    for options, named in (
+        ({"num_envs": 65}, "num_envs"),
+        ({"num_envs": 2, "period": 0.0}, "period"),
+    ):
         with pytest.raises(InvalidArgumentError, match=named):
             LiveSimulation(panda, workers=0, **options)
     before = live.params
@@ -98,5 +101,9 @@ def test_bad_arguments_are_named(panda, live):
 
 
 def test_joint_names_lose_the_words_that_all_share(panda, jaco2):
-    assert short_names(panda) == (*(f"joint{k}" for k in range(1, 8)), "finger_joint1", "finger_joint2")
+    assert short_names(panda) == (
+        *(f"joint{k}" for k in range(1, 8)),
+        "finger_joint1",
+        "finger_joint2",
+    )
     assert short_names(jaco2)[6:8] == ("joint_7", "finger_1")

@@ -1,4 +1,6 @@
-"""Runners on a Ray cluster of several nodes on this machine: bit-identical to a local one, after any loss."""
+"""Runners on a Ray cluster of several nodes on this machine: bit-identical to a local one, after
+any loss.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,11 @@ from ray.cluster_utils import Cluster  # noqa: E402
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.filterwarnings("ignore:os.fork:RuntimeWarning"),  # of JAX, which other tests may have loaded
-    # Ray's own: files and sockets that it leaves to the collector, and calls that its dependencies deprecate.
+    pytest.mark.filterwarnings(
+        "ignore:os.fork:RuntimeWarning"
+    ),  # of JAX, which other tests may have loaded
+    # Ray's own: files and sockets that it leaves to the collector, and calls that its dependencies
+    # deprecate.
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.filterwarnings("ignore::DeprecationWarning:ray"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
@@ -65,7 +70,9 @@ def program(runner, disturb=lambda: None):
     setpoints = np.clip(ROBOT.settings.target + noise, ROBOT.lower, ROBOT.upper)
     runner.rollout(setpoints[:20])
     runner.reset(0.9 * ROBOT.start + 0.1 * ROBOT.settings.target, mask=np.arange(N) % 3 == 1)
-    runner.params = ROBOT.params(kp=np.linspace(20.0, 30.0, N)[:, None], derivative_filter_time=1e-3)
+    runner.params = ROBOT.params(
+        kp=np.linspace(20.0, 30.0, N)[:, None], derivative_filter_time=1e-3
+    )
     snapshot = runner.snapshot()
     runner.step(setpoints[0], feedforward=np.ones(ROBOT.dof), substeps=7)
     disturb()
@@ -77,10 +84,14 @@ def program(runner, disturb=lambda: None):
 def test_results_are_bit_identical_after_the_loss_of(disturb, cluster):
     with Runner(ROBOT, N, params=ROBOT.params(), workers=0) as runner:
         expected = program(runner)
-    with Runner(ROBOT, N, params=ROBOT.params(), cluster=Ray(cluster.address), timeout=5.0) as runner:
+    with Runner(
+        ROBOT, N, params=ROBOT.params(), cluster=Ray(cluster.address), timeout=5.0
+    ) as runner:
         pids = [pid for info in runner.nodes for pid in (info.pid, *info.pids)]
         assert [info.envs for info in runner.nodes] == [slice(0, 6), slice(6, 12)]
-        with pytest.warns(RecoveryWarning, match=r"node [01] \(envs \d+ to \d+\) on [\d.]+ (died|lost|is stuck)"):
+        with pytest.warns(
+            RecoveryWarning, match=r"node [01] \(envs \d+ to \d+\) on [\d.]+ (died|lost|is stuck)"
+        ):
             results = program(runner, lambda: disturb(runner, cluster))
         for one, two in zip(expected, results, strict=True):
             assert_identical(one, two)

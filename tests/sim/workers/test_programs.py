@@ -1,4 +1,6 @@
-"""Programs with workers: they start without a main guard, from any folder, and no worker remains at their end."""
+"""Programs with workers: they start without a main guard, from any folder, and no worker remains at
+their end.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,9 @@ def test_workers_end_with_a_program_that_gets_a_signal(number, body):
     process, pids = start(body)
     with process:
         os.kill(pids[0], signal.SIGSTOP if number == signal.SIGKILL else signal.SIGCONT)
-        for _ in range(2 if (number, body) == (signal.SIGINT, LONG) else 1):  # a long tick ends with the second one
+        for _ in range(
+            2 if (number, body) == (signal.SIGINT, LONG) else 1
+        ):  # a long tick ends with the second one
             time.sleep(0.3)
             process.send_signal(number)
         error = process.communicate(timeout=PATIENCE)[1]
@@ -75,7 +79,11 @@ def test_workers_end_with_a_program_that_gets_a_signal(number, body):
         ("raise RuntimeError('the caller')", 1),
         ("runner.step(robot.settings.target); del runner; sys.exit(3)", 3),
         pytest.param("os._exit(9)", 9, marks=pytest.mark.slow),
-        pytest.param("if os.fork() == 0: runner.close(); os._exit(0)\nos.wait(); " + STEP, 0, marks=pytest.mark.slow),
+        pytest.param(
+            "if os.fork() == 0: runner.close(); os._exit(0)\nos.wait(); " + STEP,
+            0,
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_workers_end_with_their_runner_or_with_the_program(body, status):
@@ -116,7 +124,9 @@ def test_programs_run_in_any_way_and_from_any_folder(arguments, text, output, tm
 
 def test_workers_outlive_the_thread_that_made_them(panda):
     made = []
-    thread = threading.Thread(target=lambda: made.append(Runner(panda, 1, params=panda.params(), workers=1)))
+    thread = threading.Thread(
+        target=lambda: made.append(Runner(panda, 1, params=panda.params(), workers=1))
+    )
     thread.start()
     thread.join()
     with made[0] as runner:
