@@ -43,11 +43,8 @@ class Measured(NamedTuple):
 
     qpos: Array
     qvel: Array
-    """None where nothing needs it."""
     passive: Array
-    """Efforts that cancel gravity, and Coriolis and centrifugal forces; None without
-    compensation.
-    """
+    """Efforts that cancel gravity, and Coriolis and centrifugal forces; 0 without compensation."""
 
 
 class Step(NamedTuple):
@@ -102,7 +99,7 @@ class Values(NamedTuple):
     outputs: Outputs = Outputs()
 
 
-class KnownFriction(NamedTuple):
+class ModelledFriction(NamedTuple):
     """Friction that the compensation cancels, arrays (dof,)."""
 
     friction: Array
@@ -132,7 +129,8 @@ class Constants(NamedTuple):
     friction: Friction = Friction()
     drive: tuple[Array, Array] = (0.0, 0.0)
     """Damping and stiffness of the engine's drives [N m s/rad, N m/rad]."""
-    known: KnownFriction | None = None
+    modelled: ModelledFriction | None = None
+    """Friction of the description and of the robot's actuators."""
     guard: Any = None
     """:class:`batchpid.Guard`"""
     motors: Any = None
@@ -169,8 +167,6 @@ class Model(NamedTuple):
     """
     when: Callable[[Any, Callable[[], Any], Any], Any] = when
     """:func:`when`, or a conditional of JAX."""
-    law: Callable[..., Any] = PIDLaw.advance
-    """:meth:`batchpid.sim.loop.pid_law.PIDLaw.advance`, or a law with its arguments."""
     controller: Any = None
     """Caller's own controller: (state, setpoint, qpos, qvel, feedforward) -> (state, effort), and,
     if it limits efforts itself, the mask of joints with limited efforts.
@@ -191,6 +187,11 @@ class Layout(NamedTuple):
     """Law of control "pid"."""
     measures: bool = False
     """Whether the law takes the joints' state from sensors."""
+    moves: bool = False
+    """Whether joint setpoints move within a tick, at a given rate."""
+    gravity: bool = False
+    coriolis: bool = False
+    """Parts of the passive force that are compensated."""
     model: Model = Model()
 
     def left(self, index: Any, end: Array, timestep: Array) -> Array:
