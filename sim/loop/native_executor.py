@@ -44,7 +44,6 @@ class NativeExecutor:
         self._buffers = Buffers(_copied(state), command, measured, np.zeros(shape))
         self._programs: dict[bool, TickProgram] = {}
         self._program: TickProgram | None = None
-        self._begin = (0, 0)
         self.failed = False
         self.measure()
 
@@ -136,22 +135,18 @@ class NativeExecutor:
         assert self._program is not None
         tick = self._program.tick
         tick.group = self._engine.compiled().prepare()
-        self._begin = tick.tick, tick.step
         noise = leaves(self._noise())
         tick.drawn = min(map(len, noise), default=-1)
         for place, block in enumerate(noise):
             tick.noise[place] = block.ctypes.data
         return self._program.bound
 
-    def is_waiting(self, steps: int) -> bool:
-        """Count the sim steps that ran, in ticks of ``steps``; return whether the rest waits for
-        noise.
-        """
+    def is_waiting(self) -> bool:
+        """Count the sim steps that ran; return whether the rest waits for noise."""
         assert self._program is not None
-        tick, (first, step) = self._program.tick, self._begin
-        motors = self._buffers.state.motors
-        if motors is not None:
-            motors.step[...] += (tick.tick - first) * steps + tick.step - step
+        tick, motors = self._program.tick, self._buffers.state.motors
+        if motors is not None and motors.step is not None:
+            motors.step[...] += tick.ran
         return bool(tick.status & _NO_NOISE)
 
     def _noise(self) -> Any:
@@ -175,7 +170,7 @@ def run_ticks(
     call = native.extension("_gateway").ticks
     while executors:
         call(tuple([executor.prepare() for executor in executors]), until, steps, whole)
-        executors = [executor for executor in executors if executor.is_waiting(steps)]
+        executors = [executor for executor in executors if executor.is_waiting()]
 
 
 def runs_natively(setup: Setup) -> bool:

@@ -7,7 +7,7 @@ have a native function.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -30,6 +30,7 @@ from batchpid.sim.loop.step_values import (
     Layout,
     Measured,
     Model,
+    Outputs,
     Step,
     StepState,
     Values,
@@ -191,19 +192,18 @@ class TickProgram:
         """Add the stages that apply; return the values after them."""
         _, _, layout, constants, _ = self._setup
         stages = [stage for stage in STAGES if stage.applies(layout, constants)]
-        last = max(at for at, stage in enumerate(stages) if stage.name not in _NATIVE)
         waiting = list[SimStage]()
-        for at, stage in enumerate(stages):
+        for stage in stages:
             if stage.name not in _NATIVE:
                 waiting.append(stage)
                 continue
             if waiting:
-                values = self._add_program(waiting, values, last < at)
+                values = self._add_program(tuple(waiting), values)
                 waiting = []
             values = _NATIVE[stage.name](self, values)
         return values
 
-    def _add_program(self, stages: Sequence[SimStage], values: Values, is_last: bool) -> Values:
+    def _add_program(self, stages: tuple[SimStage, ...], values: Values) -> Values:
         """Add a program of stages; return ``values`` with the arrays that it writes.
 
         State is changed in place. Other results have arrays of their own.
@@ -211,29 +211,23 @@ class TickProgram:
         shape = self._buffers.before.shape
         constants = mapped(_split, self._setup.constants)
         inputs, state = leaves(values), leaves(values.state)
-        traced = _trace(
-            tuple(stages),
-            is_last,
-            self._setup.layout._replace(model=Model()),
-            tuple(array.ndim == 3 for array in state),
-            structure(constants),
-            structure(values),
-        )
+        layout = self._setup.layout._replace(model=Model())
+        histories = tuple(array.ndim == 3 for array in state)
+        traced = _trace(stages, layout, histories, structure(constants), structure(values))
         outputs = [np.zeros(shape, bool if is_mask else float) for is_mask in traced.program.masks]
         for array, place in zip(state, traced.places, strict=False):  # the state comes first
             if place.is_result:
                 outputs[place.number] = array
         arrays = ((outputs if place.is_result else inputs)[place.number] for place in traced.places)
-        after: Values = filled(traced.values, arrays)
-        if not outputs:
-            return after
-        program = ArrayProgram(traced.program, leaves(constants), len(inputs), shape)
-        pairs = tuple([(array, _row_size(array)) for array in inputs])
-        drawn = [id(block) for block in leaves(values.noise)]
-        noise = [at for at, array in enumerate(inputs) if id(array) in drawn]
-        self._add_stage("program", program=len(self._programs), noise=(*noise, -1, -1)[:2])
-        self._programs.append(self._native.bind(program.arguments, pairs, tuple(outputs)))
-        self._references += inputs, outputs
+        after = values._replace(**filled(traced.values, arrays)._asdict(), noise=None)
+        if outputs:
+            program = ArrayProgram(traced.program, leaves(constants), len(inputs), shape)
+            pairs = tuple([(array, _row_size(array)) for array in inputs])
+            drawn = [id(block) for block in leaves(values.noise)]
+            noise = [at for at, array in enumerate(inputs) if id(array) in drawn]
+            self._add_stage("program", program=len(self._programs), noise=(*noise, -1, -1)[:2])
+            self._programs.append(self._native.bind(program.arguments, pairs, tuple(outputs)))
+            self._references += inputs, outputs
         return after
 
     def _add_stage(self, kind: str, every: int = 1, **fields: Any) -> None:
@@ -303,6 +297,14 @@ _TYPES = {"tree": np.int32, "leader": np.int32, "age": np.int64}
 """Dtypes of arrays that are not float64."""
 
 
+class _Changed(NamedTuple):
+    """Values that programs change."""
+
+    state: StepState
+    seen: Measured
+    outputs: Outputs
+
+
 class _Place(NamedTuple):
     """Place of an array of the values after a program."""
 
@@ -316,7 +318,7 @@ class _Traced(NamedTuple):
 
     program: Trace
     values: Pytree
-    """Structure of the values after it."""
+    """Structure of the :class:`_Changed` values after it."""
     places: tuple[_Place, ...]
     """Places of the arrays in these."""
 
@@ -324,7 +326,6 @@ class _Traced(NamedTuple):
 @lru_cache(maxsize=64)
 def _trace(
     stages: tuple[SimStage, ...],
-    is_last: bool,
     layout: Layout,
     histories: tuple[bool, ...],
     constants: Any,
@@ -334,7 +335,6 @@ def _trace(
 
     ``constants`` and ``inputs`` are structures of the constants and of the values before it.
     ``histories`` says which arrays of the state are histories, which a program changes in place.
-    The last program has no results but state and outputs.
     """
     first, count = len(leaves(constants)), len(leaves(inputs))
     result_parts: list[Any] = []
@@ -346,16 +346,11 @@ def _trace(
         for stage in stages:
             assert stage.function is not None
             values = stage.function(layout, k, values)
-        if is_last:
-            nothing: Any = Measured(None, None, None)
-            none: Any = Command(None, None, None, None)
-            values = Values(
-                values.state, none, nothing, values.step, nothing, outputs=values.outputs
-            )
+        changed = _Changed(values.state, values.seen, values.outputs)
         numbers = {symbol: number for number, symbol in enumerate(symbols[first:])}
-        outputs = set(map(id, leaves(values.outputs)))
+        outputs = set(map(id, leaves(changed.outputs)))
         results, places = list[Any](), list[_Place]()
-        for at, leaf in enumerate(leaves(values)):
+        for at, leaf in enumerate(leaves(changed)):
             is_state, number = at < len(histories), numbers.get(leaf)
             if is_state and (number == at or histories[at]):
                 places.append(_Place(False, at))
@@ -365,7 +360,7 @@ def _trace(
             else:
                 places.append(_Place(True, len(results)))
                 results.append(leaf)
-        result_parts[:] = structure(values), tuple(places)
+        result_parts[:] = structure(changed), tuple(places)
         return results
 
     program = trace(function, first, count)

@@ -177,7 +177,7 @@ class Tick(ctypes.Structure):
         ("group", ctypes.c_void_p),
         ("timestep", ctypes.c_double),
         *((name, ctypes.c_int64) for name in ("dof", "stage_count", "transfer_count")),
-        *((name, ctypes.c_int64) for name in ("tick", "step", "drawn")),
+        *((name, ctypes.c_int64) for name in ("tick", "step", "drawn", "ran")),
         *((name, ctypes.c_int32) for name in ("matrix_steps",)),
         *((name, ctypes.c_int32) for name in ("gravity", "coriolis", "late", "status", "unused")),
     ]

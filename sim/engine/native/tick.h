@@ -74,6 +74,7 @@ struct Tick {
   std::int64_t dof, stage_count, transfer_count;
   Place place;                    // where the ticks are
   std::int64_t drawn;             // sim steps that the noise is for; -1 without noise
+  std::int64_t ran;               // sim steps that ran
   std::int32_t matrix_steps;
   std::int32_t gravity, coriolis;  // parts of the passive force
   std::int32_t late;              // the law takes its setpoint at the end of a sim step
@@ -195,7 +196,8 @@ inline std::int32_t run_ticks(BoundTicks const &bound, std::int64_t until, std::
   Tick &tick = *bound.tick;
   Group &group = *tick.group;
   Place &place = tick.place;
-  for (std::int64_t done = 0; place.tick < until; ++place.tick, place.step = 0) {
+  std::int64_t &done = tick.ran = 0;
+  for (; place.tick < until; ++place.tick, place.step = 0) {
     if (whole && place.step == 0 && !read_commands(tick, place.tick)) return 0;
     for (std::int64_t const first = place.step; place.step < steps; ++done) {
       if (done == tick.drawn) return NO_NOISE;
