@@ -21,11 +21,13 @@ from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.loop.acting_draws import make_pack
 from batchpid.sim.loop.arrays import Arrays, Ticks
+from batchpid.sim.loop.backend import native_obstacle
 from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_group import EnvGroup
 from batchpid.sim.loop.failure import Failure, RunError, order
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot
+from batchpid.sim.loop.xla_executor import ROWS
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 
@@ -65,7 +67,7 @@ class Loop:
         self._given: tuple[bool, ...] = ()
         self._workspace: dict[Any, Any] = {}
         controller = None if isinstance(options.control, str) else OwnController(options)
-        count, size = envs.stop - envs.start, options.load_engine().group_size
+        count, size = envs.stop - envs.start, group_size(options)
         self.groups = list[EnvGroup]()
         for first in range(0, count, size):
             rows = slice(first, min(first + size, count))
@@ -74,7 +76,8 @@ class Loop:
             group = EnvGroup(self._build(rows), rows, own_params, options, controller, ticks)
             self.groups.append(group)
         self.set_actuators(None if options.actuators is None else options.actuators.for_envs(envs))
-        self._batches = [[group] for group in self.groups]
+        # Packs that share working memory cannot run in one native call.
+        self._batches = [[group] for group in self.groups] if self._workspace else [self.groups]
 
     def _build(self, envs: slice, draws: Draws | None = None) -> EnginePack:
         first = self.options.first_env + self._first_env + envs.start
@@ -207,3 +210,11 @@ class Loop:
         for group in self.groups:
             group.pack.close()
         self.groups = []
+
+
+def group_size(options: RunnerOptions) -> int:
+    """Return the number of envs of a group, which changes no result."""
+    size = options.load_engine().group_size
+    is_native = options.backend == "numpy" and not native_obstacle(options)
+    # Calls of NumPy and XLA have an overhead, which more envs share.
+    return size if is_native else max(size, ROWS)
