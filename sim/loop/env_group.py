@@ -472,7 +472,7 @@ class EnvGroup:
             sensors = constants.motors, motors, qpos, qvel, noise, model.stages
             _, qpos, _ = advance_measurement(*sensors)
         if self._controller is None:
-            law = bp.reset(acting.acting_params, state.law, qpos, mask)
+            state = state._replace(law=bp.reset(acting.acting_params, state.law, qpos, mask))
         else:
-            law = self._controller.reset(state.law, mask)
-        executor.write_state(reset_friction(setup, state._replace(law=law), mask))
+            state = state._replace(law=self._controller.reset(state.law, mask))
+        executor.write_state(reset_friction(setup, state, mask))

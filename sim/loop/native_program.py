@@ -259,7 +259,8 @@ class TickProgram:
         return values
 
     def _add_controller(self, values: Values) -> Values:
-        self.control = self._setup.options.control.bound(*values.seen)
+        controller: Any = self._setup.options.control
+        self.control = controller.bound(*values.seen)
         self.control.set_state(self._buffers.state.law)
         self.tick.control = self.control.address
         self._add_stage("controller")

@@ -11,10 +11,9 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array
 from batchpid.law.coefficients import Coefficients
-from batchpid.motors import STAGES, ActuatorState, Stages
+from batchpid.motors import STAGES, Stages
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction, FrictionState
-from batchpid.motors.guard import GuardState
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.pid_law import PIDLaw
 
@@ -31,9 +30,10 @@ class StepState(NamedTuple):
     """Sim steps since the last update of the friction model's inertia (M,); None without Coulomb
     friction.
     """
-    motors: ActuatorState | None = None
-    """Motors and sensors; None for ideal ones."""
-    guard: GuardState | None = None
+    motors: Any = None
+    """:class:`batchpid.motors.ActuatorState` of motors and sensors; None for ideal ones."""
+    guard: Any = None
+    """:class:`batchpid.motors.guard.GuardState`; None without guard."""
     matrix: Array = None
     """Mass matrix of the law (M, dof, dof). Each tick begins with a new one."""
 
@@ -120,8 +120,8 @@ class Constants(NamedTuple):
     limits: tuple[Array, Array]
     """Least and largest effort of the params [N m or N]."""
     coupling: Coupling
-    k: Coefficients | None = None
-    """Coefficients of the PID law."""
+    k: Any = None
+    """:class:`batchpid.law.coefficients.Coefficients` of the PID law."""
     armature: Array = None
     """Armature of the motors that the law knows (dof,) [kg m^2 or kg]."""
     damping: Array = None
@@ -187,12 +187,12 @@ class Layout(NamedTuple):
     """Law of control "pid"."""
     measures: bool = False
     """Whether the law takes the joints' state from sensors."""
+    model: Model = Model()
     moves: bool = False
     """Whether joint setpoints move within a tick, at a given rate."""
     gravity: bool = False
     coriolis: bool = False
     """Parts of the passive force that are compensated."""
-    model: Model = Model()
 
     def left(self, index: Any, end: Array, timestep: Array) -> Array:
         """Return the time from the law's setpoint in sim step ``index`` to the end of a tick of
