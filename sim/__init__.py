@@ -11,6 +11,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from batchpid.sim.command import CommandSpec
+from batchpid.sim.diagnosis.loop_stability import StabilityWarning
+from batchpid.sim.diagnosis.run_checks import MovingSetpointWarning, SetpointWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.observation import Observation, Rollout, RunInfo
@@ -21,9 +23,7 @@ from batchpid.sim.ray_options import Ray
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
 from batchpid.sim.robot.findings import Finding, RepairWarning
-from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.run_checks import MovingSetpointWarning, SetpointWarning
 from batchpid.sim.runner_keywords import Controller, RunnerKeywords
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContact, MissedContactWarning

@@ -472,7 +472,8 @@ class Runner(SingleOwner):
         state = self._state
         options = self.options
         draws = None if options.randomization is None else state.draws
-        return options.robot.run_info(
+        return RunInfo.of(
+            options.robot,
             **options.values_for("recording"),
             own_command=options.own_command,
             params=state.params,

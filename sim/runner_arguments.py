@@ -15,11 +15,11 @@ from batchpid.arrays.array_types import Bool, Float64
 from batchpid.checks.validate import array, entries, read_array, within
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.command import POSE_UNITS, TWIST_UNITS
+from batchpid.sim.diagnosis.run_checks import SetpointCheck
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FARTHEST, ORIGIN
 from batchpid.sim.options import RunnerOptions
 from batchpid.sim.robot.robot_model import base_start
-from batchpid.sim.robot.run_checks import SetpointCheck
 from batchpid.sim.runner_state import Motion, RunnerState
 
 _SHORTEST = 1e-9
