@@ -18,7 +18,6 @@ from batchpid.arrays.digest import digest
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
-from batchpid.sim.observation import RunInfo
 from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import (
@@ -35,6 +34,7 @@ from batchpid.sim.robot.robot_model import RobotModel
 from batchpid.sim.robot.self_collision import SelfContact, Srdf, self_contact
 from batchpid.sim.robot.setpoint_limits import setpoint_guard
 from batchpid.sim.robot.simulated_links import body_inertias, link_masses, rigid_tree, simulated
+from batchpid.sim.signals.observation import RunInfo
 from batchpid.task_space.rigid_tree import RigidTree
 
 GRAVITY_MARGIN = 2.0  # of the effort that holds the joint still

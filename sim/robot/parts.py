@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.observation import OBSERVED
 from batchpid.sim.robot.findings import Finding
+from batchpid.sim.signals.observation import OBSERVED
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")

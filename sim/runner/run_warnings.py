@@ -6,7 +6,7 @@ import batchpid as bp
 from batchpid.checks.warn import warn
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.loop_stability import StabilityCheck
 from batchpid.sim.robot.run_checks import MovingSetpointCheck, SetpointCheck
 from batchpid.sim.tool_space.osc_controller import OperationalSpace

@@ -19,7 +19,7 @@ from batchpid.arrays.array_types import Bool, DType, Float32, Float64, Rows
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
-from batchpid.sim.command import (
+from batchpid.sim.signals.command import (
     FORCE_UNITS,
     POSE_UNITS,
     TWIST_UNITS,
