@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.diagnosis.run_checks import MovingSetpointWarning, SetpointWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
