@@ -101,6 +101,7 @@ GONE = (
     r"register_findings",
     r"register_plot",
     r"_repr_html_",
+    r"robot\.run_info",
     r"robot_survey",
     r"robot[./]unsettled",
     r"rollout .*--resume",

@@ -145,7 +145,7 @@ def count_open() -> tuple[int, int]:
     "seed", [0, *[pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, PROGRAMS)]]
 )
 def test_commands_in_any_order_under_disturbances(seed, monkeypatch):
-    monkeypatch.setattr("batchpid.sim.runner.CHECKPOINT_STEPS", 40)
+    monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 40)
     before = count_open()
     run_program(seed, length=10, engine=("sapien", "mujoco")[seed % 2])
     descriptors, children = count_open()
@@ -234,7 +234,7 @@ class WritesDots:
 
 
 def test_only_the_requests_since_the_last_checkpoint_are_replayed(tmp_path, monkeypatch):
-    monkeypatch.setattr("batchpid.sim.runner.CHECKPOINT_STEPS", 20)
+    monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", 20)
     path = tmp_path / "steps"
     with Runner(ROBOT, 1, workers=1, control=WritesDots(path), substeps=5) as runner:
         for _ in range(9):

@@ -8,7 +8,7 @@ from identical import assert_identical
 
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Fault, Robot, Rollout, RunInfo, Runner
-from batchpid.sim.observation import RULES, Redraw
+from batchpid.sim.signals.observation import RULES, Redraw
 
 
 @pytest.fixture(scope="module")

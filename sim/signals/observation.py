@@ -19,7 +19,7 @@ from batchpid.arrays.array_types import Bool, DType, Float32, Float64, Rows
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.params import PIDParams
 from batchpid.motors import Actuators
-from batchpid.sim.command import (
+from batchpid.sim.signals.command import (
     FORCE_UNITS,
     POSE_UNITS,
     TWIST_UNITS,
@@ -206,12 +206,18 @@ class Redraw(NamedTuple):
     episode: int
 
 
+_OF_ROBOT = (
+    *("joint_names", "units", "lower", "upper", "effort_limit"),
+    *("urdf", "dissipation", "fixed_base"),
+)  # fields of RunInfo that are attributes of a robot
+
+
 @dataclass(frozen=True, eq=False)
 class RunInfo:
     """Robot, options and origin of a run; None where unknown.
 
     :meth:`batchpid.sim.Runner.rollout` and :func:`batchpid.sim.read_recording` fill it;
-    ``robot.run_info()`` makes one by hand.
+    :meth:`of` makes one by hand.
     """
 
     robot: str
@@ -295,6 +301,14 @@ class RunInfo:
     """
     options: Mapping[str, Any] | None = None
     """Further options of the runner that recordings keep, by name."""
+
+    @classmethod
+    def of(cls, robot: Any, **options: Any) -> RunInfo:
+        """Return the info of a run of a :class:`batchpid.sim.Robot`; ``options`` are further
+        fields.
+        """
+        values = {name: getattr(robot, name) for name in _OF_ROBOT}
+        return cls(robot=robot.name, description=robot, **values, **options)
 
     @property
     def command(self) -> CommandSpec:
