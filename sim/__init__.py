@@ -10,6 +10,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from batchpid.sim.diagnosis.loop_stability import StabilityWarning
+from batchpid.sim.diagnosis.run_checks import MovingSetpointWarning, SetpointWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
 from batchpid.sim.options.keywords import Controller, RunnerKeywords
@@ -20,11 +22,10 @@ from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.recording.recorder import Recorder
 from batchpid.sim.recording.recording_files import RecordingError, read_recording, write_recording
 from batchpid.sim.robot.findings import Finding, RepairWarning
-from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.run_checks import MovingSetpointWarning, SetpointWarning
 from batchpid.sim.signals.command import CommandSpec
-from batchpid.sim.signals.observation import Observation, Rollout, RunInfo
+from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContact, MissedContactWarning
 

@@ -34,7 +34,6 @@ from batchpid.sim.robot.robot_model import RobotModel
 from batchpid.sim.robot.self_collision import SelfContact, Srdf, self_contact
 from batchpid.sim.robot.setpoint_limits import setpoint_guard
 from batchpid.sim.robot.simulated_links import body_inertias, link_masses, rigid_tree, simulated
-from batchpid.sim.signals.observation import RunInfo
 from batchpid.task_space.rigid_tree import RigidTree
 
 GRAVITY_MARGIN = 2.0  # of the effort that holds the joint still
@@ -258,17 +257,6 @@ class RobotDescription(Urdf):
             remedy = "pass kp=, ki=, kd= (scalar or per joint), or use robot.designed()"
             raise InvalidArgumentError("kp", f"robot {self.name!r} has no gains", remedy=remedy)
         return bp.make_params(joints=self.dof, **(known | options))
-
-    def run_info(self, **options: Any) -> RunInfo:
-        """Return the info of a run of this robot; ``options`` are further fields of
-        :class:`batchpid.sim.RunInfo`.
-        """
-        shared = (
-            *("joint_names", "units", "lower", "upper", "effort_limit"),
-            *("urdf", "dissipation", "fixed_base"),
-        )
-        values = {name: getattr(self, name) for name in shared}
-        return RunInfo(robot=self.name, description=self, **values, **options)
 
     def sample(self, count: int, seed: int = 0) -> Float64:
         """Return seeded poses (count, dof), uniform within the limits and half a turn of the start;

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 from batchpid.arrays.array_types import Float64
 from batchpid.sim.robot.findings import Finding
-from batchpid.sim.signals.observation import OBSERVED
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
@@ -70,7 +69,7 @@ class Joint:
     @property
     def effort_unit(self) -> str:
         """Unit of effort: ``"N"`` for a prismatic joint, else ``"N m"``."""
-        return OBSERVED["effort"].unit_for(self.unit)
+        return {"rad": "N m", "m": "N"}[self.unit]
 
 
 @dataclass(frozen=True)

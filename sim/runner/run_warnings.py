@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import batchpid as bp
 from batchpid.checks.warn import warn
+from batchpid.sim.diagnosis.loop_stability import StabilityCheck
+from batchpid.sim.diagnosis.run_checks import MovingSetpointCheck, SetpointCheck
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.faults import FaultLog, FaultWarning
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.robot.loop_stability import StabilityCheck
-from batchpid.sim.robot.run_checks import MovingSetpointCheck, SetpointCheck
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContactLog, MissedContactWarning
 from batchpid.sim.workers.pool import RecoveryWarning

@@ -19,8 +19,8 @@ from batchpid.checks.validate import array, choice, flag, instance, names
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.friction import LOOKAHEAD, compensation
+from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
-from batchpid.sim.robot.loop_stability import StabilityWarning
 from batchpid.sim.robot.parts import DISSIPATION
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.signals.command import POSE_UNITS, CommandSpec

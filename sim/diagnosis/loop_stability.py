@@ -158,7 +158,7 @@ def implicit_remedy(params: bp.PIDParams) -> str:
 
 class StabilityWarning(UserWarning):
     """The gains pass the stability bound of the sampled PID loop, see
-    :mod:`batchpid.sim.robot.loop_stability`.
+    :mod:`batchpid.sim.diagnosis.loop_stability`.
 
     The bound holds at the start pose, and counts delays, lag, strength, armature and viscous
     friction of the actuators. It does not count noise and effort limits: beyond the bound, a joint

@@ -16,11 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 import batchpid as bp
 from batchpid.checks.validate import array, choice, instance, number, within
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.diagnosis.loop_stability import (
+    implicit_remedy,
+    slow_oscillation,
+    stability_report,
+)
 from batchpid.sim.robot.description import POSES, RobotDescription
 from batchpid.sim.robot.findings import SEVERITIES, Finding, Findings
 from batchpid.sim.robot.joint_repair import GIVE_RANGE
 from batchpid.sim.robot.link_repair import DENSITY
-from batchpid.sim.robot.loop_stability import implicit_remedy, slow_oscillation, stability_report
 from batchpid.sim.robot.plausibility import implausible_figures
 
 # of the triangle inequality of principal moments, above which it is reported; less is rounding
