@@ -52,7 +52,8 @@ from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 from batchpid.sim.signals.command import CommandSpec, joint_command, own_command
-from batchpid.sim.signals.observation import Quantity, RunInfo, observed_by_loop
+from batchpid.sim.signals.observation import Quantity, observed
+from batchpid.sim.signals.rollout import RunInfo
 from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
 
 IDEAL = bp.Actuators()
@@ -272,9 +273,7 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def observed(self) -> dict[str, Quantity]:
         """Quantities that the loop observes."""
-        return observed_by_loop(
-            self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches
-        )
+        return observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
 
     @property
     def misses_contacts(self) -> bool:
