@@ -22,7 +22,7 @@ from batchpid.sim.cli.outputs import bar
 from batchpid.sim.cli.report import run_report
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.options.keywords import DEFAULT_ENGINE
+from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.tuning.evaluation import Evaluation, evaluate_gains
 from batchpid.sim.tuning.gain_sets import GainSet
