@@ -67,7 +67,8 @@ class Terms(NamedTuple):
             finite = xp.isfinite(self.unsaturated)
         else:
             terms = [xp.where(finite, term, zero) for term in self[:5]]
-        return Terms(*terms, self.effort, self.effort != self.unsaturated, finite)
+        saturated = self.effort != self.unsaturated
+        return Terms._make((*terms, self.effort, saturated, finite))
 
     def __repr__(self) -> str:
         return array_summary(self, "envs", "joints")
