@@ -23,7 +23,7 @@ mujoco_batch = pytest.importorskip("mujoco.batch")
 from batchpid.sim import MujocoSolver, Robot, Runner  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.scene_spec import SceneSpec  # noqa: E402
-from batchpid.sim.options import default_params  # noqa: E402
+from batchpid.sim.options.options import default_params  # noqa: E402
 
 TICKS, ROUNDS, SUBSTEPS = 20, 5, 20
 GAINS = ("tutorial", "tuned")

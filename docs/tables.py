@@ -21,8 +21,8 @@ from batchpid.arrays.choices import CHOICES
 from batchpid.arrays.field_tables import Field, declared
 from batchpid.law.params import FIELDS as PARAMS
 from batchpid.motors.actuators import FIELDS as ACTUATORS
+from batchpid.sim.options.keywords import DEFAULT_ENGINE, OPTIONS, RunnerKeywords
 from batchpid.sim.randomization.randomization import EVENTS, PHYSICAL, START, Randomization
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE, OPTIONS, RunnerKeywords
 
 DOCS = Path(__file__).parent
 

@@ -13,7 +13,7 @@ import tyro
 from batchpid.arrays.array_types import Document, Kind
 from batchpid.arrays.field_tables import Field, declared, plain
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.runner_keywords import (
+from batchpid.sim.options.keywords import (
     KINDS,
     OPTIONS,
     Compensation,

@@ -25,7 +25,7 @@ from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_group import EnvGroup
 from batchpid.sim.loop.failure import Failure, RunError, order
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 
 

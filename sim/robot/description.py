@@ -18,7 +18,6 @@ from batchpid.arrays.digest import digest
 from batchpid.arrays.read_only import read_only
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors.coupling import Coupling
-from batchpid.sim.observation import RunInfo
 from batchpid.sim.robot.meshes import content_of
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import (
@@ -258,17 +257,6 @@ class RobotDescription(Urdf):
             remedy = "pass kp=, ki=, kd= (scalar or per joint), or use robot.designed()"
             raise InvalidArgumentError("kp", f"robot {self.name!r} has no gains", remedy=remedy)
         return bp.make_params(joints=self.dof, **(known | options))
-
-    def run_info(self, **options: Any) -> RunInfo:
-        """Return the info of a run of this robot; ``options`` are further fields of
-        :class:`batchpid.sim.RunInfo`.
-        """
-        shared = (
-            *("joint_names", "units", "lower", "upper", "effort_limit"),
-            *("urdf", "dissipation", "fixed_base"),
-        )
-        values = {name: getattr(self, name) for name in shared}
-        return RunInfo(robot=self.name, description=self, **values, **options)
 
     def sample(self, count: int, seed: int = 0) -> Float64:
         """Return seeded poses (count, dof), uniform within the limits and half a turn of the start;

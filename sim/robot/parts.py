@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from batchpid.arrays.array_types import Float64
-from batchpid.sim.observation import OBSERVED
 from batchpid.sim.robot.findings import Finding
 from batchpid.task_space.spatial_inertia import SpatialInertia
 
@@ -70,7 +69,7 @@ class Joint:
     @property
     def effort_unit(self) -> str:
         """Unit of effort: ``"N"`` for a prismatic joint, else ``"N m"``."""
-        return OBSERVED["effort"].unit_for(self.unit)
+        return {"rad": "N m", "m": "N"}[self.unit]
 
 
 @dataclass(frozen=True)

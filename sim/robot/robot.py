@@ -25,7 +25,6 @@ from batchpid.sim.robot.joint_repair import free_base, free_joint_of
 from batchpid.sim.robot.merging import place_links
 from batchpid.sim.robot.mimics import couple
 from batchpid.sim.robot.parts import DISSIPATION, FileDefaults, Joint, Settings
-from batchpid.sim.robot.preflight import check
 from batchpid.sim.robot.self_collision import SELF_COLLISION, Srdf, read_srdf
 from batchpid.sim.robot.urdf import read_source, read_urdf
 from batchpid.task_space.rigid_tree import RigidTree
@@ -201,6 +200,8 @@ class Robot(RobotDescription):
         InvalidArgumentError
             An argument has a wrong shape, type or range.
         """
+        from batchpid.sim.diagnosis.preflight import check
+
         if params is None and self.settings is not None and control == "pid":
             params = self.params()
         return check(self, params, qpos, setpoint, timestep, control)

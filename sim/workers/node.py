@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from batchpid.errors import InvalidArgumentError, MissingDependencyError, WorkerError
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.failure import Failure, failure_of
-from batchpid.sim.ray_options import Ray
+from batchpid.sim.options.ray_options import Ray
 from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.placement import split_in_shares
 from batchpid.sim.workers.requests import Build, Request, Start

@@ -10,7 +10,7 @@ from tiny_urdf import INERTIAL, joint, link, robot
 from tiny_urdf import write as write_urdf
 
 import batchpid as bp
-from batchpid.sim import Observation, Robot, Rollout, write_recording
+from batchpid.sim import Observation, Robot, Rollout, RunInfo, write_recording
 
 pytest.importorskip("viser")
 SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)
@@ -21,7 +21,7 @@ def write(path, robot="panda", envs=1, **changed):
     panda = load_bundled("panda")
     zeros = np.zeros((2, envs, panda.dof), np.float32)
     seen = Observation(zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool), zeros > 0)
-    info = replace(panda.run_info(), robot=robot, **changed)
+    info = replace(RunInfo.of(panda), robot=robot, **changed)
     return write_recording(
         Rollout(np.array([0.1, 0.2]), zeros.astype(float), seen, tick=0.1, info=info), path
     )

@@ -79,7 +79,7 @@ def test_a_new_process_and_a_copy_go_on_from_it(jaco2: Robot, tmp_path: Path) ->
 def test_in_free_motion_the_barrier_changes_the_last_bits_only(monkeypatch) -> None:
     results = []
     for checkpoint_steps in (8000, 40):
-        monkeypatch.setattr("batchpid.sim.runner.CHECKPOINT_STEPS", checkpoint_steps)
+        monkeypatch.setattr("batchpid.sim.runner.runner.CHECKPOINT_STEPS", checkpoint_steps)
         with make(ground=False) as runner:
             results.append(runner.rollout(np.tile(GOAL, (20, 1))))
     np.testing.assert_allclose(results[0].qpos, results[1].qpos, rtol=0, atol=1e-7)

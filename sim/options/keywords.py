@@ -4,7 +4,7 @@ An option has its type, default, bounds and documentation here, the places that 
 help of its flag. From this record come the signature of :class:`batchpid.sim.Runner`, the checks of
 plain numbers, bools and choices, the values that snapshots, recordings and scenes keep, and the
 flags of the command line. Checks of options that depend on the robot or on each other are in
-:mod:`batchpid.sim.options`. CONTRIBUTING.md lists the steps for a new option.
+:mod:`batchpid.sim.options.options`. CONTRIBUTING.md lists the steps for a new option.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ import batchpid as bp
 from batchpid.arrays.array_types import Kind, Rows
 from batchpid.arrays.field_tables import Field, declared, plain
 from batchpid.sim.engine.physics import MujocoSolver, Physics
+from batchpid.sim.options.ray_options import Ray
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.robot import Robot
 
 P = ParamSpec("P")
@@ -137,7 +137,7 @@ class RunnerKeywords:
     """Number of robots, one in each scene."""
     params: Annotated[bp.PIDParams | None, option(role="restored")] = None
     """PID parameters of one row, or one row per env. Default: see
-    :func:`batchpid.sim.options.default_params`.
+    :func:`batchpid.sim.options.options.default_params`.
     """
 
     first_env: Annotated[int, Field(high=1e9), option("snapshot")] = 0

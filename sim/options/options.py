@@ -31,21 +31,11 @@ from batchpid.law.computed_torque import check_gain_units
 from batchpid.law.input_checks import check_drive
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction
-from batchpid.sim.command import CommandSpec, joint_command, own_command
 from batchpid.sim.engine.native import xla
 from batchpid.sim.engine.physics import MujocoSolver, Physics
 from batchpid.sim.engine.protocol import Capability, Engine, load_engine, require
 from batchpid.sim.engine.scene_spec import added_friction
-from batchpid.sim.observation import Quantity, RunInfo, observed_by_loop
-from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
-from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.ray_options import Ray
-from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
-from batchpid.sim.robot.merging import place_links
-from batchpid.sim.robot.parts import MjcfFile
-from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.setpoint_limits import fit_guard
-from batchpid.sim.runner_keywords import (
+from batchpid.sim.options.keywords import (
     OPTIONS,
     Controller,
     ControlMode,
@@ -53,6 +43,17 @@ from batchpid.sim.runner_keywords import (
     RunnerKeywords,
     checked_option,
 )
+from batchpid.sim.options.ray_options import Ray
+from batchpid.sim.randomization.checks import check_params, check_robot, prepared_actuators
+from batchpid.sim.randomization.randomization import Randomization
+from batchpid.sim.robot.actuator_checks import fit_actuators, known_joints
+from batchpid.sim.robot.merging import place_links
+from batchpid.sim.robot.parts import MjcfFile
+from batchpid.sim.robot.robot import Robot
+from batchpid.sim.robot.setpoint_limits import fit_guard
+from batchpid.sim.signals.command import CommandSpec, joint_command, own_command
+from batchpid.sim.signals.observation import Quantity, observed
+from batchpid.sim.signals.rollout import RunInfo
 from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
 
 IDEAL = bp.Actuators()
@@ -272,9 +273,7 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def observed(self) -> dict[str, Quantity]:
         """Quantities that the loop observes."""
-        return observed_by_loop(
-            self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches
-        )
+        return observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
 
     @property
     def misses_contacts(self) -> bool:
