@@ -23,8 +23,8 @@ from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.choices import PerMassMatrix
 from batchpid.arrays.digest import digest
 from batchpid.arrays.jax_settings import require_jax
-from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
+from batchpid.arrays.records import frozen
 from batchpid.checks.validate import AxisKind, choice, instance, joint_speeds, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
