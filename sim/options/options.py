@@ -21,7 +21,7 @@ from batchpid.arrays.choices import PerMassMatrix
 from batchpid.arrays.digest import digest
 from batchpid.arrays.field_tables import Field, declared, plain
 from batchpid.arrays.jax_settings import require_jax
-from batchpid.arrays.leaves import frozen
+from batchpid.arrays.records import frozen
 from batchpid.checks.validate import AxisKind, instance
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
