@@ -24,7 +24,7 @@ from batchpid.sim.diagnosis.loop_stability import (
 from batchpid.sim.robot.description import POSES, RobotDescription
 from batchpid.sim.robot.findings import SEVERITIES, Finding, Findings
 from batchpid.sim.robot.joint_repair import GIVE_RANGE
-from batchpid.sim.robot.link_repair import DENSITY
+from batchpid.sim.robot.link_repair import DENSITY, triangle_excess
 from batchpid.sim.robot.plausibility import implausible_figures
 
 # of the triangle inequality of principal moments, above which it is reported; less is rounding
@@ -78,24 +78,26 @@ def _links(robot: RobotDescription) -> Iterator[Finding]:
     """Yield the links with an odd inertia tensor, or without mass or inertia of their own."""
     bodies = {name: at.link for name, at in robot.bodies.items()}
     root = bodies[robot.all_joints[0].parent_link]
-    solid = {bodies[link.name] for link in robot.links if link.inertial or link.num_shapes}
+    shaped = {shape.owner for shape in robot.tables.shapes}
+    solid = {bodies[link.name] for link in robot.links if link.mass or link.name in shaped}
     loaded = set(solid)  # bodies with mass in them or in the links that they carry
     for joint in reversed(robot.all_joints):
         if bodies[joint.child_link] in loaded:
             loaded.add(bodies[joint.parent_link])
     for link in robot.links:
         name, body = link.name, bodies[link.name]
-        if link.triangle_excess > EXCESS:
+        excess = triangle_excess(link.inertia) if link.mass else 0.0
+        if excess > EXCESS:
             text = (
                 "no body has such an inertia tensor, a moment above the sum of the others:"
                 " simulated as given"
             )
-            detail = f"by {100 * link.triangle_excess:.0f} %"
+            detail = f"by {100 * excess:.0f} %"
             yield Finding("note", "inertia", text, "correct <inertia>", link=name, detail=detail)
-        if link.inertial or (robot.fixed_base and body == root):
+        if link.mass or (robot.fixed_base and body == root):
             continue
         severity, detail = "warning" if name == body else "note", ""
-        if link.num_shapes:
+        if name in shaped:
             effect = f"mass and inertia are those of the collision shapes, at {DENSITY:g} kg/m^3"
             detail = f"{robot.link_masses[name].mass:.3g} kg"
         elif name != body or body in solid:

@@ -208,7 +208,7 @@ class Redraw(NamedTuple):
 
 _OF_ROBOT = (
     *("joint_names", "units", "lower", "upper", "effort_limit"),
-    *("urdf", "dissipation", "fixed_base"),
+    *("digest", "dissipation", "fixed_base"),
 )  # fields of RunInfo that are attributes of a robot
 
 
@@ -231,8 +231,8 @@ class RunInfo:
     """Upper position limits (joints,) [rad or m]."""
     effort_limit: Float64
     """Effort limits (joints,) [N m or N]."""
-    urdf: str | None = None
-    """Text of the robot description."""
+    digest: str | None = None
+    """Digest of the robot's bodies, joints and shapes."""
     dissipation: str | None = None
     """Source of joint friction and damping: "urdf" or "sapien"."""
     fixed_base: bool | None = None
@@ -425,7 +425,16 @@ def _joined_rates(values: Sequence[bool | None]) -> bool | None:
 _FIRST = itemgetter(0)
 RULES: dict[str, FieldRule] = dict.fromkeys(
     (
-        *("robot", "joint_names", "units", "lower", "upper", "effort_limit", "urdf", "dissipation"),
+        *(
+            "robot",
+            "joint_names",
+            "units",
+            "lower",
+            "upper",
+            "effort_limit",
+            "digest",
+            "dissipation",
+        ),
         *(
             "fixed_base",
             "timestep",
