@@ -24,7 +24,8 @@ from batchpid.sim.recording.recording_files import RecordingError, read_recordin
 from batchpid.sim.robot.findings import Finding, RepairWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.signals.command import CommandSpec
-from batchpid.sim.signals.observation import Observation, Rollout, RunInfo
+from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 from batchpid.sim.workers.contact_log import MissedContact, MissedContactWarning
 

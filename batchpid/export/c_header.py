@@ -30,7 +30,7 @@ from batchpid.law.computed_torque import advance_with_mass_matrix, check_gain_un
 from batchpid.law.params import PIDParams
 from batchpid.law.state import PIDState
 from batchpid.motors import guard as guard_model
-from batchpid.motors.guard import Guard, GuardState, check_guard
+from batchpid.motors.guard import Guard, GuardState
 from batchpid.native.symbols import Symbol
 from batchpid.native.tracing import trace
 from batchpid.task_space.rigid_tree import RigidTree
@@ -112,7 +112,7 @@ class Header:
         params.check(1, labels)
         check_gain_units(params)
         if guard is not None:
-            check_guard(guard, 1, labels)
+            guard.check(1, labels)
         measures = isinstance(params.measurement_rate, MeasuredRate)
         if inputs is None:
             inputs = ("measurement_rate", "feedforward") if measures else ("feedforward",)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import batchpid as bp
-from batchpid.arrays.array_types import Rows
+from batchpid.arrays.array_types import Bool, Float64, Rows
 from batchpid.checks.warn import warn
 from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 
@@ -50,41 +50,34 @@ class SetpointCheck:
         outside &= np.isfinite(positions)
         if envs is not None:
             outside &= envs[:, None]
-        new = [
-            joint
-            for joint in np.flatnonzero(outside.reshape(-1, self._robot.dof).any(0)).tolist()
-            if (argument, joint) not in self._warned
-        ]
-        if not new:
-            return
-        self._warned.update((argument, joint) for joint in new)
-        found = "; ".join(
-            self._describe(joint, positions[..., joint], outside[..., joint]) for joint in new
-        )
-        warn(
-            f"{argument} is outside the joint limits, where no joint can follow: {found}; move it"
-            " inside",
-            SetpointWarning,
-        )
+        sentences = []
+        for joint in np.flatnonzero(outside.reshape(-1, self._robot.dof).any(0)).tolist():
+            if (argument, joint) not in self._warned:
+                self._warned.add((argument, joint))
+                sentences.append(self._describe(joint, positions[..., joint], outside[..., joint]))
+        if sentences:
+            warn(
+                f"{argument} is outside the joint limits, where no joint can follow:"
+                f" {'; '.join(sentences)}; move it inside",
+                SetpointWarning,
+            )
 
     def _describe(self, index: int, positions: Rows, outside: NDArray[np.bool_]) -> str:
-        """Return joint, limits, worst position and envs of ``positions`` (..., envs), of which some
-        are outside.
-        """
+        """Return joint, limits, worst position and envs of ``positions`` (..., envs)."""
         joint = self._robot.joints[index]
-        beyond = np.where(
-            outside, np.maximum(joint.lower - positions, positions - joint.upper), 0.0
-        )
-        worst = positions.flat[np.argmax(beyond)]
-        envs = np.flatnonzero(outside.reshape(-1, outside.shape[-1]).any(0)).tolist()
-        listed = ", ".join(map(str, envs[:LISTED])) + (
-            f" and {len(envs) - LISTED} more" if len(envs) > LISTED else ""
-        )
-        of_envs = "" if outside.shape[-1] == 1 else f" (env{'s' * (len(envs) > 1)} {listed})"
-        return (
-            f"joint {joint.name!r} at {worst:g} {joint.unit}, not in [{joint.lower:g},"
-            f" {joint.upper:g}]{of_envs}"
-        )
+        excess = np.where(outside, np.abs(positions - (joint.lower + joint.upper) / 2), 0.0)
+        worst = positions.flat[np.argmax(excess)]
+        place = f"joint {joint.name!r} at {worst:g} {joint.unit}"
+        limits = f"[{joint.lower:g}, {joint.upper:g}]"
+        size = outside.shape[-1]
+        if size == 1:
+            return f"{place}, not in {limits}"
+        envs = np.flatnonzero(outside.reshape(-1, size).any(0)).tolist()
+        numbers = ", ".join(map(str, envs[:LISTED]))
+        if len(envs) > LISTED:
+            numbers += f" and {len(envs) - LISTED} more"
+        plural = "s" * (len(envs) > 1)
+        return f"{place}, not in {limits} (env{plural} {numbers})"
 
 
 class MovingSetpointCheck:
@@ -96,69 +89,58 @@ class MovingSetpointCheck:
     """
 
     def __init__(self, robot: RobotDescription) -> None:
-        self._robot, self._fastest = robot, robot.velocity_limit
-        self._lag: NDArray[np.float64] | None = None
-        self._last: NDArray[np.float64] | None = None
+        self._robot = robot
+        self._fastest = robot.velocity_limit
+        self._lag: Float64 = np.zeros(robot.dof)
+        self._last: Float64 | None = None
         self._moved: Any = 0.0  # seconds, of each env
         self._has_warned = False
-        self.found: int | None = None
-        """Joint with such a setpoint, once there is one; no other is looked for."""
-
-    @property
-    def is_watching(self) -> bool:
-        """False where no joint lags, and after the warning: :meth:`see` then has nothing to
-        find.
-        """
-        return self._lag is not None and not self._has_warned
+        self.is_watching = False
+        """False where no joint lags, and after the warning: :meth:`see` then finds nothing."""
 
     def set_params(self, params: bp.PIDParams) -> None:
         """Find the lags of these gains."""
-        self._lag = None
         b = params.setpoint_weight
         ki = params.ki
-        if b is None or ki is None or self.found is not None:
-            return
-        lag = np.max(params.kp * (1 - b) / np.where(ki > 0, ki, np.inf), axis=0)
-        self._lags = lag > LAG
-        if self._lags.any():
-            self._lag = np.broadcast_to(lag, (self._robot.dof,))
+        self._lag = np.zeros(self._robot.dof)
+        if b is not None and ki is not None:
+            self._lag += np.max(params.kp * (1 - b) / np.where(ki > 0, ki, np.inf), axis=0)
+        self.is_watching = not self._has_warned and bool((self._lag > LAG).any())
 
-    def see(self, setpoints: NDArray[np.float64], rated: bool, seconds: float) -> None:
+    def see(self, setpoints: Float64, rated: bool, seconds: float) -> None:
         """Look at the setpoints of ticks (ticks, envs, dof) of ``seconds`` each, which are
-        ``rated`` or not.
+        ``rated`` or not, and warn of those that move.
         """
-        if self._lag is None or self.found is not None:
+        if not self.is_watching:
             return
         if rated:
             self._last, self._moved = None, 0.0
             return
+        reduce = np.logical_or.reduce  # methods of arrays take calls of Python
         for rows in setpoints:
             last, self._last = self._last, rows
             if last is None:
                 continue
-            reduce = np.logical_or.reduce  # methods of arrays take calls of Python
             if not reduce(rows != last, None):
                 self._moved = 0.0
                 continue
             change = np.abs(rows - last)
-            moves = reduce((change > 0) & self._lags, axis=1)
+            moves = reduce((change > 0) & (self._lag > LAG), axis=1)
             moves &= ~reduce(change > self._fastest * seconds, axis=1)
             self._moved = (self._moved + seconds) * moves
-            long = self._moved >= MOVING
-            if reduce(long):
-                self.found = int(np.where(change[long][0] > 0, self._lag, 0.0).argmax())
+            if reduce(self._moved >= MOVING):
+                self._warn(change[self._moved >= MOVING][0] > 0)
                 return
 
-    def warn(self) -> None:
-        """Warn of the setpoints that were found, if there are some, and only once."""
-        if self.found is None or self._has_warned:
-            return
-        assert self._lag is not None
+    def _warn(self, moves: Bool) -> None:
+        """Warn of the joint with the largest lag of those that move (dof,)."""
         self._has_warned = True
-        joint, lag = self._robot.joint_names[self.found], self._lag[self.found]
+        self.is_watching = False
+        joint = int(np.where(moves, self._lag, 0.0).argmax())
         warn(
-            f"setpoint moves in every tick without its rate: under these gains joint {joint!r}"
-            f" follows {1e3 * lag:.0f} ms behind (kp (1 - b) / ki); pass setpoint_rate, such as the"
-            " change over a tick by the tick, or use gains with setpoint_weight=1",
+            "setpoint moves in every tick without its rate: under these gains joint"
+            f" {self._robot.joint_names[joint]!r} follows {1e3 * self._lag[joint]:.0f} ms behind"
+            " (kp (1 - b) / ki); pass setpoint_rate, such as the change over a tick by the tick, or"
+            " use gains with setpoint_weight=1",
             MovingSetpointWarning,
         )

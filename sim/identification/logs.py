@@ -28,7 +28,7 @@ from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checke
 from batchpid.sim.recording.recording_files import RecordingError, read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.observation import Rollout
+from batchpid.sim.signals.rollout import Rollout
 
 QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")

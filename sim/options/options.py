@@ -23,8 +23,8 @@ from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.choices import PerMassMatrix
 from batchpid.arrays.digest import digest
 from batchpid.arrays.jax_settings import require_jax
-from batchpid.arrays.leaves import frozen
 from batchpid.arrays.read_only import read_only
+from batchpid.arrays.records import frozen
 from batchpid.checks.validate import AxisKind, choice, instance, joint_speeds, names
 from batchpid.errors import InvalidArgumentError
 from batchpid.law.computed_torque import check_gain_units
@@ -52,7 +52,8 @@ from batchpid.sim.robot.parts import MjcfFile
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.robot.setpoint_limits import fit_guard
 from batchpid.sim.signals.command import CommandSpec, joint_command, own_command
-from batchpid.sim.signals.observation import Quantity, RunInfo, observed_by_loop
+from batchpid.sim.signals.observation import Quantity, observed
+from batchpid.sim.signals.rollout import RunInfo
 from batchpid.sim.tool_space.osc_controller import OperationalSpace, default_tool
 
 IDEAL = bp.Actuators()
@@ -272,9 +273,7 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def observed(self) -> dict[str, Quantity]:
         """Quantities that the loop observes."""
-        return observed_by_loop(
-            self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches
-        )
+        return observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
 
     @property
     def misses_contacts(self) -> bool:

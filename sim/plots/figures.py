@@ -30,7 +30,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
 from batchpid.sim.plots import drawing
 from batchpid.sim.signals.command import CommandSpec
-from batchpid.sim.signals.observation import Rollout
+from batchpid.sim.signals.rollout import Rollout
 
 FORMATS = (".png", ".svg")
 """Suffixes of the files that :func:`save` writes."""

@@ -27,7 +27,7 @@ from batchpid.sim.diagnosis.loop_stability import StabilityReport, stability_rep
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner
-from batchpid.sim.signals.observation import Rollout
+from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.tuning.moves import (
     MAX_OVERSHOOT,
     Moves,

@@ -15,7 +15,7 @@ import numpy as np
 
 from batchpid.errors import BatchPIDError
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.signals.observation import Rollout
+from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.playback import Playback
 from batchpid.sim.view.simulation import GAINS, LiveSimulation
 

@@ -15,7 +15,8 @@ from batchpid.checks.validate import choice, integer, number
 from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner
-from batchpid.sim.signals.observation import Observation, Rollout, RunInfo
+from batchpid.sim.signals.observation import Observation
+from batchpid.sim.signals.rollout import Rollout, RunInfo
 from batchpid.sim.view.playback import HISTORY_SECONDS
 from batchpid.sim.view.scene import MAX_ROBOTS
 
@@ -119,7 +120,13 @@ class LiveSimulation:
 
     def history(self) -> Rollout:
         """Return the frames of the last :data:`HISTORY_SECONDS`, the present one included."""
-        return Rollout.join(list(self._frames))
+        frames = list(self._frames)
+        return replace(
+            frames[-1],
+            time=np.concatenate([frame.time for frame in frames]),
+            setpoint=np.concatenate([frame.setpoint for frame in frames]),
+            observation=Observation.join([frame.observation for frame in frames]),
+        )
 
     def advance(self) -> None:
         """Run one frame."""

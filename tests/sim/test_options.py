@@ -83,7 +83,7 @@ def test_commands_and_recordings_take_switches_from_their_declaration():
     """A new switch changes its declaration and the code where it acts, and no other module."""
     switches = [each.name for each in fields(RunnerKeywords) if isinstance(each.default, bool)]
     assert "collisions" in switches
-    root = Path(inspect.getfile(RunnerKeywords)).parent
+    root = Path(inspect.getfile(RunnerKeywords)).parents[1]
     texts = {
         path.name: path.read_text()
         for folder in ("cli", "recording")

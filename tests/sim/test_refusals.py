@@ -115,9 +115,12 @@ def test_a_value_of_any_kind_is_accepted_or_refused_by_name(
         if parameter.kind is parameter.VAR_KEYWORD or name in NOT_CHECKED:
             continue
         for value in ODD:
+            PID.reset(ROWS)
+            before = PID.state
             try:
                 function(**{**good, name: value})
             except (BatchPIDError, FileNotFoundError, IsADirectoryError) as error:
+                assert all(map(np.array_equal, PID.state, before))
                 text = str(error)
                 is_named = name.removesuffix("s") in text or "joint" in text or "path" in good
                 assert is_named or isinstance(value, str), (name, value, text)

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from identical import assert_identical
 from option_values import ARM, DECLARED, VALUES, is_slow, option_values
 
-import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Randomization, Robot, Runner, RunnerOptions, Uniform
 from batchpid.sim.gym import ReachVectorEnv
@@ -232,31 +231,3 @@ def test_a_drawn_start_is_the_first_setpoint(mode):
             else:
                 assert np.abs(env.observed.qpos - start).max() < 0.02
             ended = truncated.any()
-
-
-GIVEN = {"gain_units": ["mass_matrix"], "measurement_rate": ["measured"]}
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [(name, value) for name, values in GIVEN.items() for value in values]
-)
-def test_the_pure_law_refuses_what_it_is_not_given(name, value):
-    params = bp.make_params(2, 4.0, 1.0, 1.0, **{name: value})
-    y = np.zeros((1, 2))
-    state = bp.init(params, y)
-
-    def call():
-        return bp.BatchPID(params, 1, 0.01)(y, y)
-
-    calls = [
-        lambda f=f: f(params, state, y, y, 0.01) for f in (bp.step, bp.step_terms, bp.drive_target)
-    ]
-    for each in (*calls, lambda: bp.track(params, state, y, y, y, dt=0.01), call):
-        with pytest.raises(InvalidArgumentError, match=name):
-            each()
-
-
-@pytest.mark.parametrize("rate", [2000, 50])
-def test_a_rate_is_no_time_step(rate):
-    with pytest.raises(InvalidArgumentError, match=f"1/{rate}"):
-        bp.BatchPID(bp.make_params(1, 1.0), 1, rate)

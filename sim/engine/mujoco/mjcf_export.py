@@ -20,7 +20,7 @@ from batchpid.export.pd_drive import Drive
 from batchpid.law.params import PIDParams, make_params
 from batchpid.motors.actuators import Actuators
 from batchpid.motors.friction import Friction
-from batchpid.motors.guard import Guard, check_guard
+from batchpid.motors.guard import Guard
 from batchpid.sim.engine.mujoco.mjcf_actuators import FAR, MjcfActuators
 from batchpid.sim.engine.mujoco.model_builder import principal_inertia, robot_spec
 from batchpid.sim.engine.physics import SOLVERS
@@ -74,7 +74,7 @@ def to_mjcf(
     """
     law = make_params(robot.dof, 0.0, measurement_rate="measured") if params is None else params
     if guard is not None:
-        check_guard(guard, 1, robot.joint_names)
+        guard.check(1, robot.joint_names)
         if params is None:
             raise InvalidArgumentError(
                 "guard", "limits setpoints of a law", remedy="pass params, or leave it out"
