@@ -272,7 +272,7 @@ class Scene(Group):
             problem = "need a robot without SAPIEN's link damping, which acts like a contact"
             remedy = "load the robot with dissipation='urdf'"
             raise InvalidArgumentError(argument, problem, remedy=remedy)
-        bodies = place_links(robot.urdf, links if argument == "wrenches" else ())
+        bodies = place_links(robot.tables, links if argument == "wrenches" else ())
         root = next(place.link for place in bodies.values())
         for link in links:
             choice(argument, link, [link.name for link in robot.links])
