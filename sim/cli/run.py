@@ -110,11 +110,11 @@ def read_run(
     of the same name.
     """
     rollout = read_recording(path)
-    name, description = rollout.info.robot, rollout.info.urdf
+    name, digest = rollout.info.robot, rollout.info.digest
     if robot is not None:
         return rollout, Robot.load(robot, **vars(meshes))
     bundled = Robot.load(name, **vars(meshes)) if name in Robot.bundled() else None
-    if bundled is None or description not in (None, bundled.urdf):
+    if bundled is None or digest not in (None, bundled.digest):
         problem = (
             "is not bundled"
             if bundled is None

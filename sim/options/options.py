@@ -257,7 +257,7 @@ class RunnerOptions(RunnerKeywords):
             raise InvalidArgumentError(
                 option, problem, remedy="load the robot with dissipation='urdf'"
             )
-        bodies = place_links(robot.urdf, links if option == "wrenches" else ())
+        bodies = place_links(robot.tables, links if option == "wrenches" else ())
         root = next(at.link for at in bodies.values())
         for link in links:
             if link not in known:

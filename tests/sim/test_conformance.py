@@ -31,6 +31,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import (
     LogUniform,
     Normal,
+    OperationalSpace,
     Randomization,
     Robot,
     Runner,
@@ -158,6 +159,10 @@ def motors(*effects: dict[str, Any], joints: int = 2) -> dict[str, Any]:
     }
 
 
+def osc(**options: Any) -> dict[str, Any]:
+    return {"control": OperationalSpace(ARM, "hand", **options)}
+
+
 FEATURES: dict[str, Feature] = {
     "default gains": Feature(),
     "accelerations": Feature(accelerations=True),
@@ -176,6 +181,8 @@ FEATURES: dict[str, Feature] = {
     "drive with an integral": Feature({"control": "drive"}, EFFORTS, exact=True),
     "efforts": Feature({"control": "effort"}, exact=True),
     "osc": Feature({"control": "osc", "tool": "hand"}),
+    "osc with an integral": Feature(osc(integral_gain=20.0, integral_limit=5.0, frame="tool")),
+    "implicit osc": Feature(osc(discretization="implicit", point=[0, 0, 0.1], limit_margin=0.2)),
     "own controller": Feature({"control": Damped()}, exact=True),
     "guard": Feature({"guard": GUARD}),
     "guarded drive": Feature({"control": "drive", "guard": GUARD}, exact=True),
