@@ -22,6 +22,7 @@ GONE = (
     r"batchpid[./]startup",
     r"batchpid survey",
     r"batchpid tune --resume",
+    r"\bcheck_guard\b|\bmotors\.check_actuators\b",
     r"\bcheck_renderer\b",
     r"\bdc_motor\(",
     r"\bdelayed_pd\b",

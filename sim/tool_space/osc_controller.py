@@ -14,7 +14,7 @@ from batchpid.arrays.array_types import Array
 from batchpid.arrays.digest import digest
 from batchpid.arrays.display import summary
 from batchpid.arrays.elementwise import namespace
-from batchpid.arrays.leaves import frozen
+from batchpid.arrays.records import frozen
 from batchpid.checks.validate import array, choice, flag, instance, names
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
