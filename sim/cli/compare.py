@@ -10,7 +10,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, write_figures
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE
+from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import gain_set
 
 RUNNER = flags.runner_flags(*flags.SCENE_FLAGS, "workers")
@@ -42,7 +42,7 @@ class CompareCommand:
     json: flags.Json = None
     force: flags.Force = False
 
-    imports = ("batchpid.sim.plots", "batchpid.sim.runner")
+    imports = ("batchpid.sim.plots", "batchpid.sim.runner.runner")
 
     def run(self) -> None:
         """Run the command."""

@@ -84,7 +84,7 @@ class RolloutCommand:
     json: flags.Json = None
     force: flags.Force = False
 
-    imports = ("batchpid.sim.plots", "batchpid.sim.runner")
+    imports = ("batchpid.sim.plots", "batchpid.sim.runner.runner")
 
     def run(self) -> int:
         """Run the command; return the exit status, 3 if a setpoint was held and no env settles."""

@@ -28,7 +28,7 @@ from batchpid.sim.loop.failure import Failure, RunError, order
 from batchpid.sim.loop.native_executor import NativeExecutor, run_ticks
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot
 from batchpid.sim.loop.xla_executor import ROWS
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 
 
@@ -55,7 +55,7 @@ class Loop:
         self.options, self.arrays = options, arrays
         self._first_env = envs.start
         self._scene = SceneSpec(
-            urdf=robot.urdf,
+            tables=robot.tables,
             ignored=robot.ignored_pairs,
             joints=robot.joints,
             dissipation=robot.dissipation,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from batchpid.arrays.array_types import Bool, Rows
 from batchpid.sim.engine.protocol import EnginePack
-from batchpid.sim.observation import untouched
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.signals.observation import untouched
 
 
 class LinkSensors:

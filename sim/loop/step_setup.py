@@ -26,7 +26,7 @@ from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.model_functions import model_functions
 from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.loop.step_values import Constants, Layout, ModelledFriction, StepState
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION

@@ -30,12 +30,11 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.versions import package_versions
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.groups import DEFAULT_ENGINE, Ray
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.ray_options import Ray
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner import Runner
-from batchpid.sim.runner_keywords import DEFAULT_ENGINE
+from batchpid.sim.runner.runner import Runner
 from batchpid.sim.tuning.candidates import Candidates, first_gains, loop_delay
 from batchpid.sim.tuning.cost import Weights
 from batchpid.sim.tuning.evaluation import SUBSTEPS

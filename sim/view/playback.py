@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.scene import MAX_ROBOTS
 
 HISTORY_SECONDS = 8.0

@@ -10,7 +10,7 @@ from tiny_urdf import INERTIAL, joint, link, robot
 from tiny_urdf import write as write_urdf
 
 import batchpid as bp
-from batchpid.sim import Observation, Robot, Rollout, write_recording
+from batchpid.sim import Observation, Robot, Rollout, RunInfo, write_recording
 
 pytest.importorskip("viser")
 SHORT = ("--num-envs", 1, "--workers", 0, "--port", 18300)
@@ -21,7 +21,7 @@ def write(path, robot="panda", envs=1, **changed):
     panda = load_bundled("panda")
     zeros = np.zeros((2, envs, panda.dof), np.float32)
     seen = Observation(zeros, zeros, zeros, zeros > 0, np.ones((2, envs), bool), zeros > 0)
-    info = replace(panda.run_info(), robot=robot, **changed)
+    info = replace(RunInfo.of(panda), robot=robot, **changed)
     return write_recording(
         Rollout(np.array([0.1, 0.2]), zeros.astype(float), seen, tick=0.1, info=info), path
     )
@@ -89,7 +89,7 @@ def test_a_port_in_use_is_named_with_the_next(batchpid):
 def test_a_run_of_another_robot_with_the_name_of_a_bundled_one_is_not_shown_as_that(
     batchpid, tmp_path
 ):
-    run = write(tmp_path / "my run.h5", urdf=load_bundled("panda").urdf.replace("0.333", "0.433"))
+    run = write(tmp_path / "my run.h5", digest="of another robot")
     said = (
         "robot: 'panda' of the recording is another one than the bundled robot of that name; name"
         " its URDF: batchpid"
