@@ -130,7 +130,7 @@ class EnvGroup:
 
     def _write_drives(self) -> None:
         """Set the engine's drives, under control "drive"."""
-        if isinstance(self.pack, DrivenPack) and self._options.control == "drive":
+        if self._options.control == "drive" and isinstance(self.pack, DrivenPack):
             damping, stiffness = self._constants.drive
             limit = self._acting_params.effort_max
             self.pack.write_drive(
