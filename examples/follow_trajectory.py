@@ -1,5 +1,4 @@
-"""Follow a trajectory: to the tutorial's pose and back along a step, a trapezoid, minimum jerk, or
-limited acceleration.
+"""Follow a trajectory: to the tutorial's pose and back along a step, a trapezoid, and minimum jerk.
 
     python examples/follow_trajectory.py
 
