@@ -223,7 +223,6 @@ class RunnerKeywords:
             snapshot="solver_settings",
             recording="physics_name",
             scene="solver",
-            flag="Solver settings: those of SAPIEN and MuJoCo, or fewer iterations.",
         ),
     ] = "accurate"
     """Solver settings: ``"accurate"`` (the default: those of SAPIEN), ``"fast"`` (fewer
@@ -236,7 +235,6 @@ class RunnerKeywords:
             "snapshot",
             "recording",
             "scene",
-            flag="Robots have no collision shapes: faster, for free motion only.",
         ),
     ] = True
     """Robots have collision shapes; default True. False removes the shapes and the ground, for free
@@ -316,10 +314,6 @@ class RunnerKeywords:
         Literal["ray"] | Ray | None,
         option(
             role="processes",
-            flag=(
-                "Run on a Ray cluster: that of RAY_ADDRESS, else of this machine (extra `ray`;"
-                " docs/reliability.md)."
-            ),
         ),
     ] = None
     """``"ray"`` or :class:`batchpid.sim.Ray`: the workers run on the machines of a Ray cluster,

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import tempfile
+import weakref
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from lxml import etree
 from numpy.typing import NDArray
 
 from batchpid.checks.validate import integer
@@ -20,21 +24,20 @@ HISTORY_SECONDS = 8.0
 class Playback:
     """Recorded run as the data of a page, from the first row to the last and then again.
 
-    ``robot`` is by default the bundled one of the run's name. Frames are ``period`` [s] apart, or a
-    tick of the run.
+    ``robot`` is by default :func:`recorded_robot`. Frames are ``period`` [s] apart, or a tick of
+    the run.
 
     Raises
     ------
     InvalidArgumentError
-        The run has more robots than fit on a page, or another number of joints than the robot.
-    RobotNotFoundError
-        The robot of the run is not bundled.
+        The run has more robots than fit on a page, or another number of joints than the robot; or
+        it holds no description of its robot, which is not bundled.
     """
 
     def __init__(
         self, rollout: Rollout, robot: Robot | None = None, *, period: float = 1 / 30
     ) -> None:
-        robot = Robot.load(rollout.info.robot) if robot is None else robot
+        robot = recorded_robot(rollout) if robot is None else robot
         joints = rollout.qpos.shape[2]
         if joints != robot.dof:
             raise InvalidArgumentError(
@@ -81,6 +84,33 @@ class Playback:
         """Return the rows from a time [s] to the present one."""
         first, last = rows_at(self._rollout, np.array([start, self._now])).tolist()
         return self._rollout.for_ticks(slice(first, last + 1))
+
+
+def recorded_robot(rollout: Rollout) -> Robot:
+    """Return the robot of a run: the bundled one, or the one that the run's description holds,
+    without its meshes.
+
+    A recording is untrusted input, so no path in it is opened.
+    """
+    name, description = rollout.info.robot, rollout.info.urdf
+    if name in Robot.bundled():
+        bundled = Robot.load(name)
+        if description in (None, bundled.urdf):
+            return bundled
+    if description is None:
+        remedy = "name its URDF or MJCF file"
+        raise InvalidArgumentError("robot", f"{name!r} is not in the recording", remedy=remedy)
+    root = etree.fromstring(description.encode(), etree.XMLParser(resolve_entities=False))
+    for mesh in root.findall(".//mesh"):
+        shape = mesh.getparent().getparent()  # <visual> or <collision>
+        shape.getparent().remove(shape)
+    folder = tempfile.TemporaryDirectory()
+    path = Path(folder.name, "recorded.urdf")
+    path.write_bytes(etree.tostring(root))
+    robot = Robot.load(path, fixed_base=rollout.info.fixed_base)
+    # The file is read once more when the robot is drawn.
+    weakref.finalize(robot, folder.cleanup)
+    return robot
 
 
 def rows_at(rollout: Rollout, seconds: NDArray[np.float64]) -> NDArray[np.int64]:
