@@ -38,7 +38,7 @@ from batchpid.sim.engine import native
 from batchpid.sim.engine.protocol import EnginePack, load_engine
 from batchpid.sim.loop.arrays import Arrays, Command
 from batchpid.sim.loop.loop import Loop
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 
 OURS, BY_TICKS, PYTHON = "closed loop", "closed loop, tick by tick", "closed loop, Python calls"

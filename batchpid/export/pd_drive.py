@@ -42,7 +42,7 @@ class Drive(Differences):
         self.actuators = instance(
             "actuators", motors, Actuators, "build them with make_actuators()"
         )
-        if motors.num_envs > 1 or motors.num_joints not in (None, len(self.joints)):
+        if motors.num_envs > 1 or motors.num_joints not in (0, len(self.joints)):
             problem = f"are of {motors.num_envs} envs and {motors.num_joints} joints"
             remedy = f"give those of one env and {len(self.joints)} joints"
             raise InvalidArgumentError("actuators", problem, remedy=remedy)

@@ -33,7 +33,7 @@ from batchpid.motors.actuator_files import (
     save_actuators,
 )
 from batchpid.motors.actuator_state import ActuatorState
-from batchpid.motors.actuators import DRIVEN, JOINT_SIDE, Actuators, check_actuators, make_actuators
+from batchpid.motors.actuators import DRIVEN, JOINT_SIDE, Actuators, make_actuators
 from batchpid.motors.coupling import Coupling, Follower
 
 __all__ = [
@@ -48,7 +48,6 @@ __all__ = [
     "Stages",
     "advance_effort",
     "advance_measurement",
-    "check_actuators",
     "command_limits",
     "deliver",
     "discretise",

@@ -21,7 +21,7 @@ from batchpid.sim.cli.plot import plot
 from batchpid.sim.cli.rollout import demo, rollout
 from batchpid.sim.cli.view import view
 from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.tuning.comparison import compare, default_sets
 from batchpid.sim.tuning.evaluation import tuning_engine
 from batchpid.sim.tuning.gain_sets import default_gains

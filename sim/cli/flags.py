@@ -20,9 +20,9 @@ import tyro
 
 from batchpid.arrays.array_types import Document, Kind
 from batchpid.arrays.field_tables import Field, declared, plain
+from batchpid.sim.options.options import KINDS, OPTIONS, RunnerKeywords
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner_keywords import KINDS, OPTIONS, RunnerKeywords
 
 PLAIN = (NoneType, bool, int, float, str, Path)
 OPTIONS_WITH_FLAG = {

@@ -13,7 +13,7 @@ from batchpid.arrays.array_types import Document
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
-from batchpid.sim.runner_keywords import Compensation
+from batchpid.sim.options.groups import Compensation
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -20,8 +20,8 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import OperationalSpace, Robot
 from batchpid.sim.cli.flags import BOUNDS
 from batchpid.sim.cli.report import Run
+from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.randomization.randomization import Randomization
-from batchpid.sim.robot.run_checks import SetpointWarning
 from batchpid.sim.tool_space.osc_controller import default_tool
 from batchpid.sim.tuning.gain_sets import gain_set
 
@@ -120,7 +120,7 @@ def rollout(
         Draw the robot of each env: a YAML file (docs/randomization.md), e.g. `payload: {uniform:
         [0, 0.5]}`.
     """
-    from batchpid.sim.runner import Runner
+    from batchpid.sim.runner.runner import Runner
 
     options |= {"timestep": timestep, "randomization": randomization, "control": control}
     center: Rows = robot.start

@@ -19,9 +19,9 @@ import batchpid.task_space as ts
 from batchpid.arrays.array_types import Bool, Float64
 from batchpid.arrays.elementwise import TURN
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.description import LIMIT_TOLERANCE, RobotDescription
 from batchpid.sim.robot.findings import Finding, Findings
+from batchpid.sim.signals.rollout import Rollout
 
 BAND = 0.02  # half width of the settling band, as a share of the move
 EXAMINED = 100  # envs at most

@@ -33,9 +33,9 @@ from batchpid.sim.identification.regression import (
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.identification.simulator import LogControl, Plant
 from batchpid.sim.identification.unknowns import BASIC, EXTRAS, LAW, Unknowns
+from batchpid.sim.options.groups import Compensation
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner_keywords import Compensation
 
 STILL = {"rad": 1e-3, "m": 1e-4}
 """Standard deviation of the positions up to which a joint did not move."""

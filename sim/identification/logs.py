@@ -25,10 +25,10 @@ from batchpid.checks.validate import file_path
 from batchpid.checks.warn import warn
 from batchpid.errors import MissingDependencyError
 from batchpid.sim.identification.log import CommandKind, Log, LogWarning, checked, interpolated
-from batchpid.sim.observation import Rollout
 from batchpid.sim.recording.recording_files import RecordingError, read_recording
 from batchpid.sim.recording.setpoint_files import columns_by_joint, error, read_csv
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.rollout import Rollout
 
 QUANTITIES = ("setpoint", "effort", "feedforward", "measured_effort", "qpos")
 BAGS = (".bag", ".mcap", ".db3")

@@ -9,7 +9,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.engine.scene_spec import SceneSpec, Variation
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
 from batchpid.sim.randomization.fields import elements, nominal_values
 from batchpid.sim.randomization.randomization import PHYSICAL

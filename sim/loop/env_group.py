@@ -40,9 +40,9 @@ from batchpid.sim.loop.step_setup import (
 )
 from batchpid.sim.loop.step_values import StepState
 from batchpid.sim.loop.xla_executor import XLAExecutor
-from batchpid.sim.observation import untouched
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import Draws
+from batchpid.sim.signals.observation import untouched
 
 
 class EnvGroup:

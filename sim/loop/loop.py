@@ -25,7 +25,7 @@ from batchpid.sim.loop.custom import OwnController
 from batchpid.sim.loop.env_group import EnvGroup
 from batchpid.sim.loop.failure import Failure, RunError, order
 from batchpid.sim.loop.snapshot import EnvStates, Snapshot
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.distributions import NOTHING, Draws
 
 
@@ -54,7 +54,7 @@ class Loop:
         """Input and output of each tick."""
         self._first_env = envs.start
         self._scene = SceneSpec(
-            urdf=robot.urdf,
+            tables=robot.tables,
             ignored=robot.ignored_pairs,
             joints=robot.joints,
             dissipation=robot.dissipation,

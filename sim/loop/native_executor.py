@@ -17,7 +17,7 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.native_ticks import NativeTicks, Table
 from batchpid.sim.loop.numpy_executor import NumPyExecutor, Ran, Span
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, StepState, Values
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 

@@ -28,7 +28,7 @@ from batchpid.sim.loop.step_values import (
     StepState,
     Values,
 )
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 
 
 class Span(NamedTuple):

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from batchpid.arrays.array_types import Bool, Float64
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 
 Int64 = NDArray[np.int64]
 COUNTS = ("steps", "due", "number")

@@ -23,7 +23,7 @@ from batchpid.sim.engine.protocol import EnginePack
 from batchpid.sim.loop.control_step import REFRESH_STEPS, mass_matrix, refreshed
 from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.loop.step_values import Constants, KnownFriction, Layout, StepState
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.robot.actuator_checks import BAND, known_joints
 from batchpid.sim.robot.mimics import coupling_of
 from batchpid.sim.robot.parts import DISSIPATION

@@ -35,7 +35,7 @@ from batchpid.sim.loop.step_values import (
     StepState,
     Values,
 )
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 
 ROWS = 16
 """Number of which the rows in a program are a multiple."""

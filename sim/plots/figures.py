@@ -28,9 +28,9 @@ from batchpid.arrays.array_types import Array, Float64
 from batchpid.checks.validate import file_path
 from batchpid.errors import InvalidArgumentError
 from batchpid.io.files import write_atomically
-from batchpid.sim.command import CommandSpec
-from batchpid.sim.observation import Rollout
 from batchpid.sim.plots import drawing
+from batchpid.sim.signals.command import CommandSpec
+from batchpid.sim.signals.rollout import Rollout
 
 FORMATS = (".png", ".svg")
 """Suffixes of the files that :func:`save` writes."""

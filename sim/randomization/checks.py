@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 import batchpid as bp
-from batchpid.arrays.array_types import Rows
+from batchpid.arrays.array_types import Document, Rows
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
 from batchpid.motors import DRIVEN
@@ -92,7 +92,8 @@ def check_params(randomization: Randomization, params: bp.PIDParams, robot: Robo
             )
             raise InvalidArgumentError(f"params.{name}", problem, remedy=remedy)
         for rows in _extremes(f"params.{name}", distribution, robot.joint_names, leaves[name]):
-            params._replace(**{name: rows}).check(params.num_envs, robot.joint_names)
+            drawn: Document = {name: rows}
+            params._replace(**drawn).check(params.num_envs, robot.joint_names)
 
 
 def prepared_actuators(

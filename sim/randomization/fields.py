@@ -12,10 +12,10 @@ import numpy as np
 from batchpid.arrays.array_types import Float64
 from batchpid.checks.validate import choice
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.command import TWIST_UNITS
 from batchpid.sim.randomization.distributions import Distribution, read_distribution
 from batchpid.sim.robot.parts import CONTACT_FRICTION, MjcfFile
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.command import TWIST_UNITS
 
 Field = Distribution | Mapping[str, Distribution]
 """Distribution for all joints or links, or one for each of those that are named."""

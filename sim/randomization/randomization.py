@@ -265,11 +265,11 @@ class Randomization:
         """
         if draws is None or not self.params:
             return params
-        values = {
-            name: self.apply(f"params.{name}", getattr(params, name), draws, robot)
-            for name in self.params
-        }
-        return params._replace(**{name: rows.astype(params.dtype) for name, rows in values.items()})
+        drawn: Document = {}
+        for name in self.params:
+            rows = self.apply(f"params.{name}", getattr(params, name), draws, robot)
+            drawn[name] = rows.astype(params.dtype)
+        return params._replace(**drawn)
 
     def randomized_actuators(
         self, actuators: bp.Actuators | None, draws: Draws | None, robot: Robot

@@ -27,9 +27,10 @@ from batchpid.arrays.array_types import Document, Rows
 from batchpid.checks.validate import file_path, instance, integer
 from batchpid.errors import BatchPIDError, InvalidArgumentError
 from batchpid.io.files import write_atomically
-from batchpid.sim.command import CommandSpec
 from batchpid.sim.loop.faults import Fault
-from batchpid.sim.observation import Observation, Quantity, Redraw, Rollout, RunInfo
+from batchpid.sim.signals.command import CommandSpec
+from batchpid.sim.signals.observation import Observation, Quantity
+from batchpid.sim.signals.rollout import Redraw, Rollout, RunInfo
 
 if TYPE_CHECKING:
     import h5py  # functions load it, since commands that record nothing start sooner without it

@@ -15,10 +15,10 @@ from batchpid.arrays.array_types import Document, Rows
 from batchpid.arrays.field_tables import Field
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim.engine.protocol import load_engine
+from batchpid.sim.options.groups import EngineName
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner_keywords import EngineName
 from batchpid.sim.tuning.evaluation import Evaluation, arm_joints, evaluate_gains, tuning_engine
 from batchpid.sim.tuning.gain_sets import GainSet, gain_set
 from batchpid.sim.tuning.moves import random_moves, tutorial_move

@@ -23,12 +23,12 @@ from batchpid.checks.validate import number
 from batchpid.errors import InvalidArgumentError
 from batchpid.metrics import StepMetrics, step_metrics
 from batchpid.sim.diagnosis.findings import absolute_band
-from batchpid.sim.observation import Rollout
-from batchpid.sim.robot.loop_stability import StabilityReport, stability_report
+from batchpid.sim.diagnosis.loop_stability import StabilityReport, stability_report
+from batchpid.sim.diagnosis.run_checks import SetpointWarning
+from batchpid.sim.options.groups import EngineName
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.robot.run_checks import SetpointWarning
-from batchpid.sim.runner import Runner
-from batchpid.sim.runner_keywords import EngineName
+from batchpid.sim.runner.runner import Runner
+from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.tuning.moves import (
     Moves,
     shortest_durations,

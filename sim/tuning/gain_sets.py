@@ -11,8 +11,8 @@ import numpy as np
 import batchpid as bp
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
+from batchpid.sim.options.groups import ControlMode
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner_keywords import ControlMode
 
 NAMES = ("tuned", "designed", "sapien-tutorial", "mjcf", "drive")
 """Names of gain sets; "drive" is "drive:20,5"."""

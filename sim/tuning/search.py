@@ -31,11 +31,11 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.versions import package_versions
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.groups import EngineName
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
-from batchpid.sim.runner import Runner
-from batchpid.sim.runner_keywords import EngineName
+from batchpid.sim.runner.runner import Runner
 from batchpid.sim.tuning.candidates import Candidates, first_gains, loop_delay
 from batchpid.sim.tuning.comparison import Comparison, compare
 from batchpid.sim.tuning.cost import Weights

@@ -22,8 +22,8 @@ from batchpid.arrays.array_types import Float64, Rows
 from batchpid.checks.validate import file_path, integer, number
 from batchpid.errors import BatchPIDError, MissingDependencyError
 from batchpid.io.files import replacing
-from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.playback import Playback, rows_at
 from batchpid.sim.view.scene import FIELD_OF_VIEW, MAX_ROBOTS, TILE, RobotScene
 from batchpid.task_space.rotations import rotate

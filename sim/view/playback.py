@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import tempfile
-import weakref
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from lxml import etree
 from numpy.typing import NDArray
 
 from batchpid.checks.validate import integer
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.observation import Rollout
 from batchpid.sim.robot.robot import Robot
+from batchpid.sim.signals.rollout import Rollout
 from batchpid.sim.view.scene import MAX_ROBOTS
 
 HISTORY_SECONDS = 8.0
@@ -87,30 +83,20 @@ class Playback:
 
 
 def recorded_robot(rollout: Rollout) -> Robot:
-    """Return the robot of a run: the bundled one, or the one that the run's description holds,
-    without its meshes.
+    """Return the robot of a run in this process, or the bundled one that was recorded.
 
-    A recording is untrusted input, so no path in it is opened.
+    Raises InvalidArgumentError if it is neither.
     """
-    name, description = rollout.info.robot, rollout.info.urdf
-    if name in Robot.bundled():
-        bundled = Robot.load(name)
-        if description in (None, bundled.urdf):
+    info = rollout.info
+    if isinstance(info.description, Robot):
+        return info.description
+    problem = f"{info.robot!r} of the recording is not bundled"
+    if info.robot in Robot.bundled():
+        bundled = Robot.load(info.robot, fixed_base=info.fixed_base)
+        if info.digest in (None, bundled.digest):
             return bundled
-    if description is None:
-        remedy = "name its URDF or MJCF file"
-        raise InvalidArgumentError("robot", f"{name!r} is not in the recording", remedy=remedy)
-    root = etree.fromstring(description.encode(), etree.XMLParser(resolve_entities=False))
-    for mesh in root.findall(".//mesh"):
-        shape = mesh.getparent().getparent()  # <visual> or <collision>
-        shape.getparent().remove(shape)
-    folder = tempfile.TemporaryDirectory()
-    path = Path(folder.name, "recorded.urdf")
-    path.write_bytes(etree.tostring(root))
-    robot = Robot.load(path, fixed_base=rollout.info.fixed_base)
-    # The file is read once more when the robot is drawn.
-    weakref.finalize(robot, folder.cleanup)
-    return robot
+        problem = f"{info.robot!r} of the recording is another one than the bundled robot"
+    raise InvalidArgumentError("robot", problem, remedy="name its URDF or MJCF file")
 
 
 def rows_at(rollout: Rollout, seconds: NDArray[np.float64]) -> NDArray[np.int64]:

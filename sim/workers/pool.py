@@ -19,7 +19,7 @@ from batchpid.checks.single_owner import SingleOwner
 from batchpid.errors import ClosedError
 from batchpid.sim.loop.arrays import Arrays, Ticks
 from batchpid.sim.loop.failure import Failure, order
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 from batchpid.sim.workers.exchange import SharedArrays
 from batchpid.sim.workers.node import NODE_STEPS, Cluster, NodeInfo, NodeWorker
 from batchpid.sim.workers.placement import pinned_cores, split_in_shares

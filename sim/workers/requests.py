@@ -1,4 +1,4 @@
-"""Requests to workers (:mod:`batchpid.sim.operations`), and the start of a loop."""
+"""Requests to workers (:mod:`batchpid.sim.runner.operations`), and the start of a loop."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Self
 import batchpid as bp
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.loop import Loop
-from batchpid.sim.options import RunnerOptions
+from batchpid.sim.options.options import RunnerOptions
 
 
 class Request(ABC):

@@ -259,32 +259,6 @@ def test_reset_restarts_the_masked_envs_alone(case, run, mask, keep):
             assert np.array_equal(new[~mask], old[~mask])
 
 
-@given(cases, runs)
-@settings(max_examples=25)
-def test_arguments_are_neither_written_to_nor_kept(case, run):
-    """Read-only arrays are accepted, and a caller may reuse its buffers."""
-    params = bp.make_params(JOINTS, **OPTIONS[case])
-    r, y, ff = (x.copy() for x in run)
-    expected = roll(params, r, y, ff)[1][-1]
-    state, buffers = bp.init(params, y[0]), [np.empty((ENVS, JOINTS)) for _ in range(3)]
-    for t in range(len(r)):
-        for buffer, source in zip(buffers, (r, y, ff), strict=True):
-            buffer.setflags(write=True)
-            buffer[...] = source[t]
-            buffer.setflags(write=False)
-        for leaf in state:
-            if leaf is not None:
-                leaf.setflags(write=False)
-        state, terms = bp.step_terms(
-            params, state, buffers[0], buffers[1], DT, feedforward=buffers[2]
-        )
-        effort = terms.effort
-        kept = effort.copy()
-        effort += 1e6  # the caller's own, from here on
-    assert np.array_equal(kept, expected.effort)
-    assert np.array_equal(terms.unsaturated, expected.unsaturated)
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_decayed_filters_never_hold_denormal_numbers(dtype):
     params = bp.make_params(

@@ -15,6 +15,7 @@ from batchpid.sim import (
     CommandSpec,
     FaultWarning,
     Robot,
+    RunInfo,
     Runner,
     RunnerOptions,
     SetpointWarning,
@@ -207,7 +208,7 @@ def test_commands_of_joints_have_their_names_and_units(panda):
         options = RunnerOptions(panda, 1, control=control)
         assert options.command == CommandSpec(panda.joint_names, units)
         assert options.own_command is None
-        info = panda.run_info(control=options.control_name)
+        info = RunInfo.of(panda, control=options.control_name)
         assert (info.command, info.sets_positions) == (options.command, control != "effort")
         assert info.units_of("qvel") == ("rad/s",) * 7 + ("m/s", "m/s")
 

@@ -31,14 +31,15 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import (
     LogUniform,
     Normal,
+    OperationalSpace,
     Randomization,
     Robot,
     Runner,
-    RunnerKeywords,
     Snapshot,
     Uniform,
 )
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
+from batchpid.sim.options.options import OPTIONS
 
 N, TICKS, SPLIT, FAILING = 5, 5, 3, 2
 """Envs and ticks of the program, ticks before its snapshot, and the env that fails."""
@@ -158,6 +159,10 @@ def motors(*effects: dict[str, Any], joints: int = 2) -> dict[str, Any]:
     }
 
 
+def osc(**options: Any) -> dict[str, Any]:
+    return {"control": OperationalSpace(ARM, "hand", **options)}
+
+
 FEATURES: dict[str, Feature] = {
     "default gains": Feature(),
     "accelerations": Feature(accelerations=True),
@@ -176,6 +181,8 @@ FEATURES: dict[str, Feature] = {
     "drive with an integral": Feature({"control": "drive"}, EFFORTS, exact=True),
     "efforts": Feature({"control": "effort"}, exact=True),
     "osc": Feature({"control": "osc", "tool": "hand"}),
+    "osc with an integral": Feature(osc(integral_gain=20.0, integral_limit=5.0, frame="tool")),
+    "implicit osc": Feature(osc(discretization="implicit", point=[0, 0, 0.1], limit_margin=0.2)),
     "own controller": Feature({"control": Damped()}, exact=True),
     "guard": Feature({"guard": GUARD}),
     "guarded drive": Feature({"control": "drive", "guard": GUARD}, exact=True),
@@ -576,4 +583,4 @@ def test_every_option_has_a_row() -> None:
     }
     of_programs = {"timestep", "substeps", "on_invalid_input"}
     options = {name for feature in FEATURES.values() for name in feature.options}
-    assert options >= RunnerKeywords.__annotations__.keys() - of_paths - of_programs
+    assert options >= OPTIONS.keys() - of_paths - of_programs

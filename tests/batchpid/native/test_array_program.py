@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_compiled_law import bits, numbers
+from native_cases import bits, numbers
 
 from batchpid.arrays.elementwise import (
     matrix_vector,

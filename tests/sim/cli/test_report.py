@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from batchpid.sim import Observation, Rollout
+from batchpid.sim import Observation, Rollout, RunInfo
 from batchpid.sim.cli import report
 
 TICKS, ENVS = 200, 5
@@ -31,7 +31,7 @@ def first_order_lag(panda, setpoint, time_constant=0.05):
             guarded=np.zeros(shape, bool),
         ),
         tick=0.01,
-        info=panda.run_info(),
+        info=RunInfo.of(panda),
     )
     return rollout
 

@@ -42,7 +42,7 @@ def test_rows_of_no_env(engine, floats):
     robot = Robot.load("quadruped", fixed_base=not floats)
     engine = load_engine(engine)
     spec = SceneSpec(
-        robot.urdf,
+        robot.tables,
         (),
         robot.joints,
         1e-3,

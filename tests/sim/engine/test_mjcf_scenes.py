@@ -493,7 +493,7 @@ def test_a_snapshot_holds_the_integration_state(load):
     )
     whole, kept = int(mujoco.mjtState.mjSTATE_INTEGRATION), []
     spec = SceneSpec(
-        robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf
+        robot.tables, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf
     )
     packs = [ENGINE.make_pack(spec, 2) for _ in range(2)]
     rng = np.random.default_rng(0)
@@ -650,7 +650,7 @@ def test_ground_friction_is_drawn_around_that_of_the_file(load, draw, ground, ar
     text = ARM.replace(LINK, LINK[:-2] + ' friction=".4"/>')
     robot = load(text.replace('type="plane"', 'type="plane" friction=".8"'))
     spec = SceneSpec(
-        robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf
+        robot.tables, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf
     )
     nominal = nominal_values("ground_friction", robot, robot.mjcf)
     pack = ENGINE.make_pack(

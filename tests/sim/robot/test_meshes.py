@@ -195,7 +195,8 @@ def test_a_mesh_is_found_by_the_ways_that_urdfs_name_it(name, tmp_path):
         (folder / each).mkdir(parents=True)
     (folder / "meshes" / "arm.stl").write_bytes(stl())
     loaded = Robot.load(write(folder / "urdf", arm(name.format(folder=folder))), strict=True)
-    assert str(folder / "meshes" / "arm.stl") in loaded.urdf.replace("urdf/../", "")
+    (shape,) = loaded.tables.shapes
+    assert shape.file.replace("urdf/../", "") == str(folder / "meshes" / "arm.stl")
 
 
 @pytest.mark.parametrize(
@@ -216,7 +217,7 @@ def test_packages_of_a_ros_environment_are_found(variable, path, package, tmp_pa
     with pytest.raises(RobotError, match=r"package_dirs=\[...\] with .*ROS_PACKAGE_PATH"):
         Robot.load(urdf, missing_meshes="error")
     monkeypatch.setenv(variable, path.format(tmp_path))
-    assert str(file) in Robot.load(urdf, strict=True).urdf
+    assert [shape.file for shape in Robot.load(urdf, strict=True).tables.shapes] == [str(file)]
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -275,6 +276,6 @@ def test_robots_of_other_content_differ_in_what_they_say_about_themselves(tmp_pa
     moved = Robot.load(write(tmp_path / "other", one_joint(arm=arm)))
     assert moved.describe() == first.describe(), "equal but for the folder"
     (tmp_path / "m.stl").write_bytes(ascii_stl())
-    assert Robot.load(path).describe()["urdf"] != first.describe()["urdf"]
+    assert Robot.load(path).describe()["content"] != first.describe()["content"]
     for name, value in (("fixed_base", False), ("self_collision", "none")):
         assert Robot.load(path, **{name: value}).describe()[name] == value != first.describe()[name]

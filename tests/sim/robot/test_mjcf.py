@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lxml import etree
 
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.batch")
@@ -22,9 +21,8 @@ from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
 from batchpid.sim.engine.protocol import SceneSpec  # noqa: E402
 from batchpid.sim.robot.shapes import surfaces  # noqa: E402
-from batchpid.sim.robot.xml import numbers  # noqa: E402
 from batchpid.sim.tuning import gain_set  # noqa: E402
-from batchpid.task_space.rotations import from_rpy, rotate  # noqa: E402
+from batchpid.task_space.rotations import rotate  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 
@@ -119,7 +117,7 @@ def spec_of(robot, **options):
         "ground": False,
     } | options
     return SceneSpec(
-        robot.urdf, robot.ignored_pairs, robot.joints, 5e-4, SOLVERS["accurate"], **options
+        robot.tables, robot.ignored_pairs, robot.joints, 5e-4, SOLVERS["accurate"], **options
     )
 
 
@@ -199,19 +197,6 @@ def test_both_engines_agree_and_settle(load):
     np.testing.assert_allclose(ends[0], np.tile(target, (2, 1)), atol=2e-2)
 
 
-def shapes_of(robot, link):
-    """Return (tag, attributes, position, rotation) of the collision shapes of a link."""
-    root = etree.fromstring(robot.urdf.encode())
-    for collision in root.findall(f"link[@name='{link}']/collision"):
-        origin, (shape,) = collision.find("origin"), collision.find("geometry")
-        yield (
-            shape.tag,
-            shape.attrib,
-            np.array(numbers(origin, "xyz", "0 0 0", "")),
-            from_rpy(numbers(origin, "rpy", "0 0 0", "")),
-        )
-
-
 # of a geom in directions u (n, 3) in its frame, by type: capsule, ellipsoid, cylinder, box, mesh
 EXTENT = {
     3: lambda u, size, vertices: size[0] + size[1] * np.abs(u[:, 2]),
@@ -269,31 +254,30 @@ def read_obj(path):
 
 
 def test_a_capsule_has_the_ends_of_the_file(load):
-    ((tag, size, place, turn),) = shapes_of(
-        load(ARM), "upper"
-    )  # not the sphere, which is only drawn
-    half = float(size["length"]) / 2 * rotate(turn, np.array([0.0, 0.0, 1.0]))
+    (shape,) = load(ARM).tables.shapes_of("upper")  # not the sphere, which is only drawn
+    radius, half_length = shape.size
+    half = half_length * rotate(shape.wxyz, np.array([0.0, 0.0, 1.0]))
     anchor = np.array([0.02, 0, -0.03])  # the link's origin
-    assert (tag, size["radius"]) == ("capsule", "0.03")
-    ends = sorted((anchor + place + sign * half).tolist() for sign in (1, -1))
+    assert (shape.kind, radius) == ("capsule", 0.03)
+    ends = sorted((anchor + shape.position + sign * half).tolist() for sign in (1, -1))
     np.testing.assert_allclose(ends, [[0, 0, 0], [0.3, 0, 0.1]], atol=1e-12)
 
 
 def test_a_mesh_is_its_convex_hull(load, hulls):
-    ((tag, attributes, place, turn),) = shapes_of(load(ARM), "fore")
-    vertices, corners = read_obj(attributes["filename"])
-    placed = rotate(turn, vertices) + place - [0.1, 0, 0]
+    (shape,) = load(ARM).tables.shapes_of("fore")
+    vertices, corners = read_obj(shape.file)
+    placed = rotate(shape.wxyz, vertices) + shape.position - [0.1, 0, 0]
     expected = [[0, 0, 0], [0, 0, 0.2], [0, 0.1, 0], [0.1, 0, 0]]  # without the vertex inside
     np.testing.assert_allclose(sorted(placed.round(6).tolist()), expected, atol=1e-6)
-    assert tag == "mesh"
-    assert Path(attributes["filename"]) in hulls.iterdir()
+    assert shape.kind == "mesh"
+    assert Path(shape.file) in hulls.iterdir()
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.einsum("ij,ij->i", outward, corners[:, 0] - vertices.mean(0)) > 0).all()
 
 
 def test_an_ellipsoid_is_inscribed(load):
-    (shape,) = shapes_of(load(ARM), "hand")
-    vertices, corners = (each / [0.02, 0.03, 0.05] for each in read_obj(shape[1]["filename"]))
+    (shape,) = load(ARM).tables.shapes_of("hand")
+    vertices, corners = (part / [0.02, 0.03, 0.05] for part in read_obj(shape.file))
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1, atol=1e-6)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     distances = np.einsum("ij,ij->i", normals, corners[:, 0]) / np.linalg.norm(normals, axis=1)
@@ -799,7 +783,7 @@ def test_a_default_namespace_changes_nothing(load, tmp_path):
         load(text),
         load(text.replace("<mujoco ", '<mujoco xmlns="http://mujoco.org/mjcf" ')),
     )
-    assert (named.urdf, named.repairs) == (plain.urdf, plain.repairs)
+    assert (named.tables, named.repairs) == (plain.tables, plain.repairs)
     assert [each.link for each in surfaces(named)] == [each.link for each in surfaces(plain)]
 
 

@@ -166,7 +166,7 @@ def test_an_effortless_robot_that_overlaps_at_rest_stays_there(tmp_path):
 
 
 def spec_of(loaded):
-    return SceneSpec(loaded.urdf, loaded.ignored_pairs, loaded.joints, 1e-3, None, ground=False)
+    return SceneSpec(loaded.tables, loaded.ignored_pairs, loaded.joints, 1e-3, None, ground=False)
 
 
 @given(st.integers(0, 2**32))

@@ -13,7 +13,7 @@ from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, robot, write
 import batchpid as bp
 from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Finding, Robot, Runner
-from batchpid.sim.robot.loop_stability import stability_report
+from batchpid.sim.diagnosis.loop_stability import stability_report
 
 COLLISION = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
 GAINS = {"kp": 1.0, "ki": 0.0, "kd": 0.1}
