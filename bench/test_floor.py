@@ -114,7 +114,7 @@ def bare_engine(
     options = {"fixed_base": False, "engine": "mujoco"}
     built = robot_model(
         SceneSpec(
-            robot.urdf, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
+            robot.tables, robot.ignored_pairs, robot.joints, 1 / 2000, MujocoSolver(), **options
         )
     )
     batch = mujoco_batch.Batch(built.model, num_envs, nthread=1, persistent=True)

@@ -10,7 +10,7 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.sim import Robot
 from batchpid.sim.cli import flags
 from batchpid.sim.cli.outputs import OutputFiles, write_figures
-from batchpid.sim.options.keywords import DEFAULT_ENGINE
+from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.tuning.gain_sets import gain_set
 
 RUNNER = flags.runner_flags(*flags.SCENE_FLAGS, "workers")

@@ -13,14 +13,8 @@ import tyro
 from batchpid.arrays.array_types import Document, Kind
 from batchpid.arrays.field_tables import Field, declared, plain
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.options.keywords import (
-    KINDS,
-    OPTIONS,
-    Compensation,
-    EngineName,
-    PhysicsPreset,
-    RunnerKeywords,
-)
+from batchpid.sim.options.groups import Compensation, EngineName, PhysicsPreset
+from batchpid.sim.options.options import KINDS, OPTIONS, RunnerKeywords
 
 
 def _flag(help: str | None = None, **options: Any) -> Any:

@@ -22,7 +22,7 @@ from batchpid.sim.cli.outputs import bar
 from batchpid.sim.cli.report import run_report
 from batchpid.sim.diagnosis.run_checks import SetpointWarning
 from batchpid.sim.engine.protocol import load_engine
-from batchpid.sim.options.keywords import DEFAULT_ENGINE
+from batchpid.sim.options.groups import DEFAULT_ENGINE
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.tuning.evaluation import Evaluation, evaluate_gains
 from batchpid.sim.tuning.gain_sets import GainSet
@@ -110,11 +110,11 @@ def read_run(
     of the same name.
     """
     rollout = read_recording(path)
-    name, description = rollout.info.robot, rollout.info.urdf
+    name, digest = rollout.info.robot, rollout.info.digest
     if robot is not None:
         return rollout, Robot.load(robot, **vars(meshes))
     bundled = Robot.load(name, **vars(meshes)) if name in Robot.bundled() else None
-    if bundled is None or description not in (None, bundled.urdf):
+    if bundled is None or digest not in (None, bundled.digest):
         problem = (
             "is not bundled"
             if bundled is None

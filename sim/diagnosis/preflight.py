@@ -21,8 +21,8 @@ from batchpid.sim.diagnosis.loop_stability import slow_oscillation, stability_re
 from batchpid.sim.robot.description import POSES, RobotDescription
 from batchpid.sim.robot.findings import SEVERITIES, Finding, Findings
 from batchpid.sim.robot.joint_repair import GIVE_RANGE
-from batchpid.sim.robot.link_repair import DENSITY
-from batchpid.sim.robot.parts import Joint, Link
+from batchpid.sim.robot.link_repair import DENSITY, triangle_excess
+from batchpid.sim.robot.parts import Joint
 from batchpid.sim.robot.plausibility import implausible_figures
 
 # of the triangle inequality of principal moments, above which it is reported; less is rounding
@@ -108,41 +108,43 @@ class _Preflight:
         robot = self.robot
         bodies = {name: place.link for name, place in robot.bodies.items()}
         root = bodies[robot.all_joints[0].parent_link]
-        solid = {bodies[link.name] for link in robot.links if link.inertial or link.num_shapes}
+        shaped = {shape.owner for shape in robot.tables.shapes}
+        solid = {bodies[link.name] for link in robot.links if link.mass or link.name in shaped}
         loaded = set(solid)  # bodies with mass in them or in the links that they carry
         for joint in reversed(robot.all_joints):
             if bodies[joint.child_link] in loaded:
                 loaded.add(bodies[joint.parent_link])
         for link in robot.links:
             body = bodies[link.name]
-            if link.triangle_excess > EXCESS:
+            excess = triangle_excess(link.inertia) if link.mass else 0.0
+            if excess > EXCESS:
                 self._note(
                     "inertia",
                     "no body has such an inertia tensor, a moment above the sum of the others:"
                     " simulated as given",
                     "correct <inertia>",
                     link=link.name,
-                    detail=f"by {100 * link.triangle_excess:.0f} %",
+                    detail=f"by {100 * excess:.0f} %",
                 )
             is_held = robot.fixed_base and body == root
-            adds_nothing = not link.num_shapes and (link.name != body or body in solid)
-            if not (link.inertial or is_held or adds_nothing):
-                self._report_mass(link, link.name == body, body in loaded)
+            adds_nothing = link.name not in shaped and (link.name != body or body in solid)
+            if not (link.mass or is_held or adds_nothing):
+                self._report_mass(link.name, link.name == body, body in loaded)
 
-    def _report_mass(self, link: Link, is_body: bool, is_loaded: bool) -> None:
+    def _report_mass(self, link: str, is_body: bool, is_loaded: bool) -> None:
         """Report a link without ``<inertial>``."""
         report = self._warn if is_body else self._note
         detail = ""
-        if link.num_shapes:
+        if self.robot.link_masses[link].source == "shapes":
             effect = f"mass and inertia are those of the collision shapes, at {DENSITY:g} kg/m^3"
-            detail = f"{self.robot.link_masses[link.name].mass:.3g} kg"
+            detail = f"{self.robot.link_masses[link].mass:.3g} kg"
         elif is_loaded:
             report = self._note
             effect = "it becomes a link of 1e-6 kg; only the links that it carries have mass"
         else:
             effect = "it becomes a link of 1e-6 kg, without load: no gains per effort control it"
         remedy = "add <inertial> with mass and inertia"
-        report("no-inertia", f"no <inertial>: {effect}", remedy, link=link.name, detail=detail)
+        report("no-inertia", f"no <inertial>: {effect}", remedy, link=link, detail=detail)
 
     def _check_contacts(self, start: Float64) -> None:
         """Report pairs that PhysX's filter does not hold, and contacts at the start pose."""

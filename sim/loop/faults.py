@@ -19,7 +19,7 @@ from batchpid.arrays.array_types import Array, Bool, Rows
 from batchpid.sim.engine.native.interface import FARTHEST
 from batchpid.sim.loop.arrays import Arrays
 from batchpid.sim.loop.step_values import Measured
-from batchpid.sim.options.keywords import FaultAction
+from batchpid.sim.options.groups import FaultAction
 
 CAUSES = (
     *("state", "speed", "setpoint", "setpoint_rate", "feedforward", "qpos", "qvel", "effort"),

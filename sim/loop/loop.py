@@ -54,7 +54,7 @@ class Loop:
         """Input and output of each tick."""
         self._first_env = envs.start
         self._scene = SceneSpec(
-            urdf=robot.urdf,
+            tables=robot.tables,
             ignored=robot.ignored_pairs,
             joints=robot.joints,
             dissipation=robot.dissipation,

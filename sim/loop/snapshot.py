@@ -208,7 +208,9 @@ class Snapshot:
                 isinstance(value, str) and len(value) == _DIGITS for value in (ours, theirs)
             )
             problem = (
-                f"another {key}" if is_digest else f"{key} {reprlib.repr(theirs)}, not {ours!r}"
+                f"another {key}"
+                if is_digest
+                else f"{key} {reprlib.repr(theirs)}, not {reprlib.repr(ours)}"
             )
             problem += "".join(f", and another {other}" for other in others)
             remedy = "restore it in a runner made with the same options"

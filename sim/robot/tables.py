@@ -97,7 +97,9 @@ class Tables:
     bodies: tuple[Body, ...]
     """Breadth first from the base, siblings in the order of the file."""
     shapes: tuple[Shape, ...]
-    """In the order of the bodies and of the file; after a merge the mirrored ones are the last."""
+    """In the order of the bodies and of the file; after a merge the mirrored shapes of a body are its
+    last.
+    """
     links: Mapping[str, Placement]
     """Body and place in it of each link of the file, in the order of the file's rows."""
 
@@ -111,6 +113,10 @@ class Tables:
     def digest(self) -> str:
         """Digest of the content, with the paths of mesh files."""
         return digest(self.bodies, self.shapes, self.links)
+
+    def shapes_of(self, link: str) -> list[Shape]:
+        """Return the shapes of a link of the file."""
+        return [shape for shape in self.shapes if shape.owner == link]
 
     @property
     def joints(self) -> tuple[Joint, ...]:

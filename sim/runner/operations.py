@@ -278,7 +278,7 @@ def snapshot_of(options: RunnerOptions, state: RunnerState, states: EnvStates) -
         motion = np.stack([last, np.zeros_like(last) if rate is None else rate], axis=1)
     episodes = None if options.randomization is None else state.draws.episodes.copy()
     return Snapshot(
-        options.describe(), state.steps, state.params, states, state.actuators, episodes, motion
+        options.described, state.steps, state.params, states, state.actuators, episodes, motion
     )
 
 

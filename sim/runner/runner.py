@@ -31,14 +31,8 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.backend import describe
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
-from batchpid.sim.options.keywords import (
-    DEFAULT_ENGINE,
-    KINDS,
-    OPTIONS,
-    arguments_of,
-    checked_option,
-)
-from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.options.groups import DEFAULT_ENGINE
+from batchpid.sim.options.options import KINDS, OPTIONS, RunnerOptions, arguments_of, checked_option
 from batchpid.sim.runner.arguments import count_ticks, read_command
 from batchpid.sim.runner.operations import (
     Operation,
@@ -155,7 +149,7 @@ class Runner(SingleOwner):
         workers = len(self.pids)
         nodes = len(self.nodes)
         where = "closed" if self.closed else f"{workers} workers" if workers else "in this process"
-        further = "".join(f", {name} {value}" for name, value in options.switched.items())
+        further = "" if options.collisions else ", no collisions"
         where = f"{nodes} nodes" if nodes else where
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control"

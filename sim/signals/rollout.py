@@ -42,7 +42,7 @@ class Redraw(NamedTuple):
 
 _OF_ROBOT = (
     *("joint_names", "units", "lower", "upper", "effort_limit"),
-    *("urdf", "dissipation", "fixed_base"),
+    *("digest", "dissipation", "fixed_base"),
 )  # fields of RunInfo that are attributes of a robot
 _OF_ENVS = ("params", "actuators", "start", "episodes")  # fields with a row for each env
 
@@ -66,8 +66,8 @@ class RunInfo:
     """Upper position limits (joints,) [rad or m]."""
     effort_limit: Float64
     """Effort limits (joints,) [N m or N]."""
-    urdf: str | None = None
-    """Text of the robot description."""
+    digest: str | None = None
+    """Digest of the robot's bodies, joints and shapes."""
     dissipation: str | None = None
     """Source of joint friction and damping: "urdf" or "sapien"."""
     fixed_base: bool | None = None

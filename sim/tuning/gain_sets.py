@@ -11,7 +11,7 @@ import numpy as np
 import batchpid as bp
 from batchpid.checks.warn import warn
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim.options.keywords import ControlMode
+from batchpid.sim.options.groups import ControlMode
 from batchpid.sim.robot.robot import Robot
 
 NAMES = ("tuned", "designed", "tutorial", "mjcf", "drive")

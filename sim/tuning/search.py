@@ -30,9 +30,8 @@ from batchpid.arrays.array_types import Document, Float64
 from batchpid.checks.validate import integer, number
 from batchpid.errors import InvalidArgumentError, MissingDependencyError
 from batchpid.io.versions import package_versions
-from batchpid.sim.options.keywords import DEFAULT_ENGINE
+from batchpid.sim.options.groups import DEFAULT_ENGINE, Ray
 from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.options.ray_options import Ray
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner

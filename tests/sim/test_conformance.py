@@ -35,11 +35,11 @@ from batchpid.sim import (
     Randomization,
     Robot,
     Runner,
-    RunnerKeywords,
     Snapshot,
     Uniform,
 )
 from batchpid.sim.loop.numpy_executor import NumPyExecutor
+from batchpid.sim.options.options import OPTIONS
 
 N, TICKS, SPLIT, FAILING = 5, 5, 3, 2
 """Envs and ticks of the program, ticks before its snapshot, and the env that fails."""
@@ -583,4 +583,4 @@ def test_every_option_has_a_row() -> None:
     }
     of_programs = {"timestep", "substeps", "on_invalid_input"}
     options = {name for feature in FEATURES.values() for name in feature.options}
-    assert options >= RunnerKeywords.__annotations__.keys() - of_paths - of_programs
+    assert options >= OPTIONS.keys() - of_paths - of_programs

@@ -12,7 +12,7 @@ from trees import NAMES, planar, robot_of, states, tool_of, tree_of
 
 import batchpid.task_space as ts
 from batchpid.errors import InvalidArgumentError, RobotError
-from batchpid.sim import Robot
+from batchpid.sim import Robot, to_urdf
 from batchpid.task_space import frames
 
 POINT = np.array([0.1, -0.2, 0.3])
@@ -33,7 +33,7 @@ def test_mujoco_computes_the_same(case, native, monkeypatch):
     monkeypatch.setenv("BATCHPID_NATIVE", native)
     mujoco = pytest.importorskip("mujoco")
     tree, tool, robot = case
-    spec = mujoco.MjSpec.from_string(robot.urdf)
+    spec = mujoco.MjSpec.from_string(to_urdf(robot).text)
     spec.compiler.fusestatic, spec.compiler.discardvisual = False, True
     model = spec.compile()
     data, columns = (

@@ -616,7 +616,7 @@ def test_ground_friction_is_drawn_around_that_of_the_file(load, draw, ground, ar
     text = ARM.replace(LINK, LINK[:-2] + ' friction=".4"/>')
     robot = load(text.replace('type="plane"', 'type="plane" friction=".8"'))
     spec = SceneSpec(
-        robot.urdf, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf
+        robot.tables, (), robot.joints, 1e-3, SOLVERS["accurate"], engine="mujoco", mjcf=robot.mjcf
     )
     nominal = nominal_values("ground_friction", robot, robot.mjcf)
     pack = ENGINE.make_pack(
