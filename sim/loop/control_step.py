@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, nearest_turn, replace_envs, wrap
 from batchpid.law.pid import advance_drive
-from batchpid.motors import advance_effort, advance_measurement
+from batchpid.motors import advance_effort, advance_measurement, command_limits
 from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
 from batchpid.motors.friction import FrictionState
@@ -134,9 +134,7 @@ def carried(command: Command, left: Array) -> Command:
 def _sensors(layout: Layout, constants: Constants, values: Values) -> Values:
     motors, (qpos, qvel, passive), model = values.state.motors, values.measured, layout.model
     noise = values.noise if model.noise is None else model.noise(constants.motors, motors, qpos)
-    motors, qpos, qvel = advance_measurement(
-        constants.motors, motors, qpos, qvel, noise, model.stages
-    )
+    motors, qpos, qvel = advance_measurement(constants.motors, motors, qpos, qvel, noise)
     seen = Measured(qpos, qvel, passive)
     return values._replace(state=values.state._replace(motors=motors), seen=seen, noise=None)
 
@@ -232,7 +230,7 @@ def _law(layout: Layout, constants: Constants, values: Values) -> Values:
     qpos, qvel, _ = values.seen
     limits = None, None
     if constants.motors is not None:
-        limits = layout.model.stages.limits(constants.motors, qpos, qvel)
+        limits = command_limits(constants.motors, qpos, qvel)
     values = _LAWS[layout.control](layout, constants, values, limits)
     return values._replace(outputs=values.outputs._replace(motor=values.outputs.qf))
 
@@ -310,9 +308,7 @@ _LAWS: dict[str, Callable[..., Values]] = {
 
 def _motors(layout: Layout, constants: Constants, values: Values) -> Values:
     (qpos, qvel, _), state, outputs = values.measured, values.state, values.outputs
-    motors, effort = advance_effort(
-        constants.motors, state.motors, outputs.qf, qpos, qvel, layout.model.stages
-    )
+    motors, effort = advance_effort(constants.motors, state.motors, outputs.qf, qpos, qvel)
     return values._replace(
         state=state._replace(motors=motors), outputs=outputs._replace(qf=effort, motor=effort)
     )

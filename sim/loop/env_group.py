@@ -112,7 +112,7 @@ class EnvGroup:
             self._executor = NativeExecutor(setup, state, self._last)
         else:
             self._executor = NumPyExecutor(setup, state)
-        if isinstance(self.pack, DrivenPack) and self._options.control == "drive":
+        if self._options.control == "drive" and isinstance(self.pack, DrivenPack):
             damping, stiffness = setup.constants.drive
             limit = self.acting.acting_params.effort_max
             if limit is None:
@@ -469,8 +469,7 @@ class EnvGroup:
             state = state._replace(motors=motors)
             # The law starts at the joints' state as the sensors show it.
             noise = model.noise(constants.motors, motors, qpos)
-            sensors = constants.motors, motors, qpos, qvel, noise, model.stages
-            _, qpos, _ = advance_measurement(*sensors)
+            _, qpos, _ = advance_measurement(constants.motors, motors, qpos, qvel, noise)
         if self._controller is None:
             state = state._replace(law=bp.reset(acting.acting_params, state.law, qpos, mask))
         else:

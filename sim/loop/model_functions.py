@@ -14,7 +14,6 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array, Float64
 from batchpid.motors import ActuatorState, MotorCoefficients, measurement_noise
-from batchpid.native.compiled import compiled_stages
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import CompiledPack, EnginePack
 from batchpid.sim.loop.control_step import REFRESH_STEPS
@@ -41,9 +40,6 @@ def model_functions(
         )
     if not steps_natively(pack):
         return model
-    if constants.motors is not None:
-        stages = compiled_stages(constants.motors, (pack.size, pack.dof))
-        model = model._replace(stages=stages)
     if constants.friction.coulomb is not None:
         inputs = constants.friction, constants.drive, constants.coupling, constants.timestep
         refresh = NativeRefresh(

@@ -11,7 +11,6 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array
 from batchpid.law.coefficients import Coefficients
-from batchpid.motors import STAGES, Stages
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction, FrictionState
 from batchpid.sim.loop.arrays import Command
@@ -175,7 +174,6 @@ class Model(NamedTuple):
     """coefficients and state of the sensors, qpos -> their noise, drawn in advance; None to draw it
     at each step.
     """
-    stages: Stages = STAGES
 
 
 class Layout(NamedTuple):
