@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,8 +29,9 @@ def make_pack(
     make = options.load_engine().make_pack
     if randomization is None or not randomization.changes_robot:
         return make(scene, size, first_env, workspace=workspace)
-    varied, links = variation(options, size, draws), elements("link_mass", robot)
-    return make(scene, size, first_env, varied, randomization.carrier(robot), links, workspace)
+    links = tuple(elements("link_mass", robot))
+    scene = replace(scene, carrier=randomization.carrier(robot), varied_links=links)
+    return make(scene, size, first_env, variation(options, size, draws), workspace)
 
 
 def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variation:
