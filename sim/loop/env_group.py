@@ -516,9 +516,7 @@ class EnvGroup:
             state = state._replace(motors=motors)
             model = layout.model
             noise = model.noise(self._constants.motors, motors, qpos)
-            _, qpos, _ = advance_measurement(
-                self._constants.motors, motors, qpos, qvel, noise, model.stages
-            )
+            _, qpos, _ = advance_measurement(self._constants.motors, motors, qpos, qvel, noise)
         if self._controller is None:
             state = state._replace(law=bp.reset(self._acting_params, state.law, qpos, mask))
         else:

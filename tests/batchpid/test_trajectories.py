@@ -9,7 +9,6 @@ from batchpid.errors import InvalidArgumentError
 from batchpid.task_space.rotations import rotate
 from batchpid.trajectories import (
     Trajectory,
-    jerk_limited,
     minimum_jerk,
     sine,
     straight_line,
@@ -161,38 +160,3 @@ def test_a_tool_moves_on_a_straight_line_and_turns_about_one_axis(sign):
     angle = 2 * np.arccos(path.position[:, 3])  # about y, from 0 to 1.2 rad
     np.testing.assert_allclose(np.diff(angle) / DT, path.velocity[1:, 4], atol=0.05)
     np.testing.assert_allclose(path.velocity[-1], 0, atol=1e-12)
-
-
-JERK_LIMITS = {"max_velocity": [1.0, 2.0], "max_acceleration": [3.0, 8.0], "max_jerk": 40.0}
-
-
-class TestJerkLimited:
-    @pytest.fixture(autouse=True)
-    def _needs_ruckig(self):
-        pytest.importorskip("ruckig")
-
-    def test_limits_and_ends(self):
-        rng = np.random.default_rng(1)
-        start, target = rng.uniform(-2, 2, (2, 6, 2))
-        t = jerk_limited(start, target, DT, **JERK_LIMITS)
-        np.testing.assert_allclose(t.position[-1], target)
-        assert not t.velocity[-1].any()
-        assert (np.abs(t.velocity) <= np.array([1.0, 2.0]) + 1e-9).all()
-        assert (np.abs(t.acceleration) <= np.array([3.0, 8.0]) + 1e-9).all()
-        jerk = np.diff(t.acceleration, axis=0, prepend=0) / DT
-        assert (np.abs(jerk) <= 40 + 1e-6).all()
-
-    def test_it_is_no_faster_than_the_trapezoid_without_a_jerk_limit(self):
-        loose = {name: limit for name, limit in JERK_LIMITS.items() if name != "max_jerk"}
-        target = np.array([1.0, -2.0])
-        smooth = jerk_limited(np.zeros(2), target, DT, **JERK_LIMITS)
-        assert smooth.position.shape == (smooth.ticks, 2)
-        assert smooth.time[-1] >= trapezoidal(np.zeros(2), target, DT, **loose).time[-1]
-
-    def test_it_can_begin_in_motion(self):
-        t = jerk_limited([0.0, 0.0], [1.0, 1.0], DT, start_velocity=[0.5, 0.0], **JERK_LIMITS)
-        np.testing.assert_allclose(t.position[0], [0.5 * DT, 0.0], atol=1e-5)
-
-    def test_an_impossible_start_is_an_error(self):
-        with pytest.raises(InvalidArgumentError, match="start, env 0"):
-            jerk_limited([0.0, 0.0], [1.0, 1.0], DT, start_velocity=[1e300, 0.0], **JERK_LIMITS)
