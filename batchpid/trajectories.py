@@ -5,12 +5,9 @@ A move from x0 to x1 is x(t) = x0 + (x1 - x0) s(t), with s from 0 to 1::
 
     minimum jerk    s = 10 (t/T)^3 - 15 (t/T)^4 + 6 (t/T)^5                 rests at both ends, in acceleration too
     trapezoidal     s'' = +a, 0, -a                                         the fastest within v and a
-    jerk limited    s''' = +j, 0, -j                                        the fastest within v, a and j
 
 The first is T. Flash and N. Hogan, The coordination of arm movements, J. Neurosci. 5(7), 1985; the
-second B. Siciliano et al., Robotics: Modelling, Planning and Control (2009), section 4.2; the third
-is computed by the ``ruckig`` library (L. Berscheid and T. Kroeger, Jerk-limited real-time
-trajectory generation, RSS 2021).
+second B. Siciliano et al., Robotics: Modelling, Planning and Control (2009), section 4.2.
 """
 
 from __future__ import annotations
@@ -24,7 +21,7 @@ from numpy.typing import ArrayLike
 from batchpid.arrays.array_types import Float64
 from batchpid.arrays.display import array_summary
 from batchpid.checks.validate import at_least, broadcast, entries, positive, read_array, time_step
-from batchpid.errors import InvalidArgumentError, MissingDependencyError
+from batchpid.errors import InvalidArgumentError
 
 _PEAK_VELOCITY = 15 / 8  # of the minimum-jerk s, times T
 _PEAK_ACCELERATION = 10 / math.sqrt(3)  # times T^2
@@ -209,76 +206,6 @@ def trapezoidal(
     rate = np.minimum(np.minimum(as_ * t, as_ * left), peak)
     acceleration = np.where(t < ramp, as_, np.where(left < ramp, -as_, 0.0))
     return _trajectory(time, x0, way, s, rate, acceleration, done=left <= _ROUNDING * total)
-
-
-def jerk_limited(
-    start: ArrayLike,
-    target: ArrayLike,
-    dt: float,
-    *,
-    max_velocity: ArrayLike,
-    max_acceleration: ArrayLike,
-    max_jerk: ArrayLike,
-    start_velocity: ArrayLike = 0.0,
-    start_acceleration: ArrayLike = 0.0,
-) -> Trajectory:
-    """Return the fastest move to rest at ``target`` within limits of velocity, acceleration and
-    jerk, by ``ruckig``.
-
-    The joints of an env arrive together; the move may begin in motion. Shapes as in
-    :func:`trapezoidal`; every limit is finite.
-
-    Raises
-    ------
-    MissingDependencyError
-        Without the ``ruckig`` package.
-    InvalidArgumentError
-        Naming the argument and joint; also where ruckig finds no such move, e.g. from beyond a
-        limit.
-    """
-    try:
-        import ruckig
-    except ImportError:
-        raise MissingDependencyError("ruckig", "jerk_limited()") from None
-    x0, way = _move(start, target)
-    asked = {
-        "current_position": x0,
-        "target_position": x0 + way,
-        "current_velocity": _limits("start_velocity", start_velocity, way, low=-math.inf),
-        "current_acceleration": _limits(
-            "start_acceleration", start_acceleration, way, low=-math.inf
-        ),
-        "max_velocity": _limits("max_velocity", max_velocity, way),
-        "max_acceleration": _limits("max_acceleration", max_acceleration, way),
-        "max_jerk": _limits("max_jerk", max_jerk, way),
-    }
-    joints = way.shape[-1]
-    rows = {name: value.reshape(-1, joints) for name, value in asked.items()}
-    # ruckig plans one env at a time, and knows the joints of it that have to arrive together.
-    planner, plans = ruckig.Ruckig(joints, time_step("dt", dt)), []
-    for env in range(way.size // joints):
-        inputs, plan = ruckig.InputParameter(joints), ruckig.Trajectory(joints)
-        for name, table in rows.items():
-            setattr(inputs, name, table[env].tolist())
-        try:
-            planner.calculate(inputs, plan)
-        except ruckig.RuckigError:
-            remedy = "begin within the limits, or widen them"
-            raise InvalidArgumentError(
-                "start", "allows no jerk-limited move", env=env, remedy=remedy
-            ) from None
-        plans.append(plan)
-    durations = np.array([plan.duration for plan in plans])
-    time = _ticks(dt, durations)
-    table = np.array(
-        [[plan.at_time(min(t, plan.duration)) for plan in plans] for t in time.tolist()]
-    )
-    arrived = time[:, None, None] >= (1 - _ROUNDING) * durations[:, None]
-    position, velocity, acceleration = (
-        np.where(arrived, rest, table[:, :, k]).reshape(len(time), *way.shape)
-        for k, rest in enumerate((rows["target_position"], np.zeros(()), np.zeros(())))
-    )
-    return Trajectory(time, position, velocity, acceleration)
 
 
 def _trajectory(

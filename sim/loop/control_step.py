@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 from batchpid.arrays.array_types import Array
 from batchpid.arrays.elementwise import clip, namespace, nearest_turn, replace_envs, wrap
 from batchpid.law.pid import advance_drive
-from batchpid.motors import advance_effort, advance_measurement
+from batchpid.motors import advance_effort, advance_measurement, command_limits
 from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
 from batchpid.motors.friction import FrictionState
@@ -157,9 +157,7 @@ def _sensors(layout: Layout, constants: Constants, values: Values) -> Values:
     if motors is None:
         return values
     noise = values.noise if model.noise is None else model.noise(constants.motors, motors, qpos)
-    motors, qpos, qvel = advance_measurement(
-        constants.motors, motors, qpos, qvel, noise, model.stages
-    )
+    motors, qpos, qvel = advance_measurement(constants.motors, motors, qpos, qvel, noise)
     seen = Measured(qpos, qvel, passive)
     return values._replace(state=values.state._replace(motors=motors), seen=seen, noise=None)
 
@@ -268,7 +266,7 @@ def _law(layout: Layout, constants: Constants, values: Values) -> Values:
     """Effort within the limits of params and motors."""
     motors, (qpos, qvel, _), limits = constants.motors, values.seen, (None, None)
     if values.state.motors is not None:
-        limits = layout.model.stages.limits(motors, qpos, qvel)
+        limits = command_limits(motors, qpos, qvel)
     values = _LAWS[layout.control](layout, constants, values, limits)
     return values._replace(outputs=values.outputs._replace(motor=values.outputs.qf))
 
@@ -362,9 +360,7 @@ def _motors(layout: Layout, constants: Constants, values: Values) -> Values:
     (qpos, qvel, _), state, outputs = values.measured, values.state, values.outputs
     if state.motors is None:
         return values
-    motors, effort = advance_effort(
-        constants.motors, state.motors, outputs.qf, qpos, qvel, layout.model.stages
-    )
+    motors, effort = advance_effort(constants.motors, state.motors, outputs.qf, qpos, qvel)
     return values._replace(
         state=state._replace(motors=motors), outputs=outputs._replace(qf=effort, motor=effort)
     )

@@ -130,7 +130,7 @@ class EnvGroup:
 
     def _write_drives(self) -> None:
         """Set the engine's drives, under control "drive"."""
-        if isinstance(self.pack, DrivenPack) and self._options.control == "drive":
+        if self._options.control == "drive" and isinstance(self.pack, DrivenPack):
             damping, stiffness = self._constants.drive
             limit = self._acting_params.effort_max
             self.pack.write_drive(
@@ -516,9 +516,7 @@ class EnvGroup:
             state = state._replace(motors=motors)
             model = layout.model
             noise = model.noise(self._constants.motors, motors, qpos)
-            _, qpos, _ = advance_measurement(
-                self._constants.motors, motors, qpos, qvel, noise, model.stages
-            )
+            _, qpos, _ = advance_measurement(self._constants.motors, motors, qpos, qvel, noise)
         if self._controller is None:
             state = state._replace(law=bp.reset(self._acting_params, state.law, qpos, mask))
         else:

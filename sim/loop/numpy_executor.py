@@ -10,7 +10,6 @@ import numpy as np
 from batchpid.arrays.array_types import Array, Float64, Rows
 from batchpid.law.coefficients import spread
 from batchpid.motors import ActuatorState, MotorCoefficients, measurement_noise
-from batchpid.native.compiled import compiled_stages
 from batchpid.sim.engine.native_model import NativeRefresh, mass_matrix_of, passive_force_of
 from batchpid.sim.engine.protocol import CompiledPack, DrivenPack, EnginePack
 from batchpid.sim.loop.arrays import Command
@@ -172,15 +171,13 @@ def with_model(
     controller: OwnController | None,
 ) -> Layout:
     """Return ``layout`` with model functions for NumPy arrays, natively compiled where possible."""
-    motors, (gravity, coriolis) = constants.motors, passive_forces(options)
+    gravity, coriolis = passive_forces(options)
     model = Model(
         mass_matrix_of(pack.spec, _is_native(pack)),
         partial(_joint_mass_matrix, pack),
         controller=controller,
         noise=NoiseBlocks(),
     )
-    if motors is not None and _is_native(pack):
-        model = model._replace(stages=compiled_stages(motors, (pack.size, pack.dof)))
     if constants.friction.coulomb is not None and _is_native(pack):
         given = constants.friction, constants.drive, constants.coupling, constants.timestep
         model = model._replace(

@@ -11,7 +11,7 @@ import numpy as np
 
 from batchpid.arrays.array_types import Array
 from batchpid.law.coefficients import Coefficients
-from batchpid.motors import STAGES, ActuatorState, Stages
+from batchpid.motors import ActuatorState
 from batchpid.motors.coupling import Coupling
 from batchpid.motors.friction import Friction, FrictionState
 from batchpid.motors.guard import GuardState
@@ -179,7 +179,6 @@ class Model(NamedTuple):
     """coefficients and state of the sensors, qpos -> their noise, drawn in advance; None to draw it
     at each step.
     """
-    stages: Stages = STAGES
 
 
 class Layout(NamedTuple):

@@ -124,7 +124,6 @@ class Scene(Group):
             "recording",
             snapshot="solver",
             scene="solver",
-            flag="Solver settings: those of SAPIEN and MuJoCo, or fewer iterations.",
         ),
     ] = "accurate"
     """Solver settings: ``"accurate"`` (the default: those of SAPIEN), ``"fast"`` (fewer
@@ -137,7 +136,6 @@ class Scene(Group):
             "snapshot",
             "recording",
             "scene",
-            flag="Robots have no collision shapes: faster, for free motion only.",
         ),
     ] = True
     """Robots have collision shapes; default True. False removes the shapes and the ground, for free
@@ -517,10 +515,6 @@ class Workers(Group):
         Literal["ray"] | Ray | None,
         option(
             "processes",
-            flag=(
-                "Run on a Ray cluster: that of RAY_ADDRESS, else of this machine (extra `ray`;"
-                " docs/reliability.md)."
-            ),
         ),
     ] = None
     """``"ray"`` or :class:`batchpid.sim.Ray`: the workers run on the machines of a Ray cluster,

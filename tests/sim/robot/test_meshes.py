@@ -122,7 +122,7 @@ def test_packages_of_a_ros_environment_are_found(variable, path, package, tmp_pa
     elsewhere.mkdir()
     file.write_bytes(stl())
     urdf = write(elsewhere, arm("package://arm_description/meshes/my%20arm.stl"))
-    with pytest.raises(RobotError, match=r"package_dirs=\[...\] \(--package-dirs"):
+    with pytest.raises(RobotError, match=r"package_dirs=\[...\] with .*ROS_PACKAGE_PATH"):
         Robot.load(urdf, missing_meshes="error")
     monkeypatch.setenv(variable, path.format(tmp_path))
     assert [shape.file for shape in Robot.load(urdf, strict=True).tables.shapes] == [str(file)]
