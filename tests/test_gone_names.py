@@ -111,7 +111,6 @@ GONE = (
     r"robot_survey",
     r"robot[./]unsettled",
     r"rollout .*--resume",
-    r"Rollout\.join",
     r"ros2_control_reader",
     r"runner_arguments",
     r"runner_commands",
