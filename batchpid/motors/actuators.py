@@ -78,6 +78,7 @@ effort.
 SENSOR_SIDE = in_group(FIELDS, "sensor")
 """Effects between the joint's state and its measurement."""
 DELAYS = ("command_delay", "sensor_delay")
+NOISES = ("position_noise", "velocity_noise")
 
 
 class Actuators(Record, _ActuatorsFields):
@@ -239,7 +240,7 @@ def make_actuators(
     points, efforts = _table(build, position_limit)
     longest = _longest_delay(leaves, max_delay)
     words = integer("seed", seed, 0, 2**64 - 1)
-    has_noise = leaves["position_noise"] is not None or leaves["velocity_noise"] is not None
+    has_noise = any(leaves[name] is not None for name in NOISES)
     return Actuators(
         **leaves,
         limit_positions=points,
