@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from inspect import Signature, signature
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from time import strftime
@@ -446,7 +447,7 @@ class Runner(SingleOwner):
         """
         self._ready("restore")
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
-        restore = restored(self.options, self._state, snapshot, self._read(ReadStateSizes()))
+        restore = restored(self.options, self._state, snapshot, self._state_sizes)
         self._execute(restore)
         self._pool.start_replay_from(restore)
         self._warnings.set_params(self._state.params)
@@ -484,6 +485,11 @@ class Runner(SingleOwner):
             ),
             episodes=None if draws is None else draws.episodes.copy(),
         )
+
+    @cached_property
+    def _state_sizes(self) -> list[int]:
+        """Number of values in the engine's state of each env."""
+        return [*chain.from_iterable(self._execute(ReadStateSizes()).results)]
 
     @cached_property
     def _versions(self) -> dict[str, str]:
@@ -738,7 +744,7 @@ class Runner(SingleOwner):
         """
         state = self._state
         snapshot = snapshot_of(self.options, state, self._read(TakeSnapshot()))
-        self._pool.start_replay_from(Restore(snapshot, state.draws))
+        self._pool.start_replay_from(Restore(snapshot.copy(), state.draws))
         return snapshot
 
     def _max_ticks(self) -> int:
