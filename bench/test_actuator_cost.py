@@ -15,7 +15,7 @@ from workload import Workload
 import batchpid as bp
 from batchpid.motors import advance_effort, advance_measurement, command_limits, discretise
 from batchpid.sim import Robot
-from batchpid.sim.loop.numpy_executor import NoiseBlocks
+from batchpid.sim.loop.model_functions import NoiseBlocks
 
 ENVS, JOINTS, STEPS, TICKS = 16, 9, 512, 10
 EFFECTS = {
