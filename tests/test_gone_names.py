@@ -37,6 +37,7 @@ GONE = (
     r"\bis_ros2_control\b",
     r"\bjerk_limited\b|import ruckig",
     r"\bmesa-vulkan-drivers\b",
+    r"\bpid_controller\b",
     r"\bPushEnv\b",
     r"\bPush-v0\b",
     r"\brecover=",
