@@ -3,7 +3,6 @@ state of an env.
 """
 
 import dataclasses
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -163,28 +162,6 @@ def test_the_law_drives_the_joints_and_the_arm_pushes_the_cube(load, control):
         0.05 if control == "pid" else 0.1
     )  # a drive has no integral
     assert np.linalg.norm((after - before)[0, 0, :2]) > 0.01
-
-
-@pytest.mark.filterwarnings("ignore::batchpid.sim.FaultWarning")
-def test_workers_and_other_envs_change_no_bit(load):
-    robot = load(ARM)
-    targets = np.stack([np.linspace(0.2, 0.8, 5), np.full(5, 0.25), np.linspace(0, 0.3, 5)], axis=1)
-    kept = []
-    for workers in (0, 1, 2):
-        with Runner(robot, 5, workers=workers, engine="mujoco") as runner:
-            for _ in range(60):
-                obs = runner.step(targets)
-            kept.append((runner.bodies(OBJECTS), obs.qpos))
-    with Runner(robot, 1, workers=0, engine="mujoco") as runner:
-        for _ in range(60):
-            obs = runner.step(targets[3])
-        kept.append((runner.bodies(OBJECTS), obs.qpos))
-    assert np.ptp(kept[0][0][:, 0], axis=0).max() > 0.01  # the cubes differ
-    for one, other in pairwise(kept[:3]):
-        for ours, theirs in zip(one, other, strict=True):
-            np.testing.assert_array_equal(ours, theirs)
-    for ours, theirs in zip(kept[0], kept[3], strict=True):
-        np.testing.assert_array_equal(ours[3], theirs[0])
 
 
 def test_objects_belong_to_snapshots_resets_and_faults(load, tmp_path):

@@ -89,25 +89,6 @@ def test_shipped_gains_meet_the_demands_on_moves_that_the_search_did_not_see(nam
 
 
 @pytest.mark.slow
-def test_a_randomization_draws_the_same_at_every_evaluation_and_for_any_number_of_workers(panda):
-    moves = random_moves(panda, 2, 2)
-    drawn, actuators = (
-        Randomization(payload=Uniform(0, 1)),
-        bp.make_actuators(panda.dof, command_delay=5e-4),
-    )
-    plain, *varied = (
-        evaluate_gains(panda, panda.designed(), moves, seconds=0.15, workers=workers, **options)
-        for workers, options in (
-            (0, {}),
-            (0, {"randomization": drawn, "actuators": actuators}),
-            (2, {"randomization": drawn, "actuators": actuators}),
-        )
-    )
-    assert varied[0].rollout.qpos.tobytes() == varied[1].rollout.qpos.tobytes()
-    assert np.abs(varied[0].rollout.qpos - plain.rollout.qpos).max() > 1e-3
-
-
-@pytest.mark.slow
 def test_payload_outside_the_model_pulls_the_hand_down_and_the_integral_lifts_it(panda):
     pose = panda.start.copy()
     pose[[1, 3]] = 0.8, -1.0

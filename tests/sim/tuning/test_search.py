@@ -11,7 +11,7 @@ from robots import load_bundled
 
 from batchpid import make_actuators
 from batchpid.errors import InvalidArgumentError
-from batchpid.sim import Randomization, Runner, Uniform
+from batchpid.sim import Randomization, Uniform
 from batchpid.sim.tuning import (
     Weights,
     arm_joints,
@@ -61,24 +61,6 @@ def test_same_seed_gives_bit_identical_gains_for_any_number_of_workers(few_moves
         *sorted(cost for row in found.history for cost in row)[:3],
         found.start_cost,
     ]
-
-
-@pytest.mark.slow
-def test_robots_touch_things_in_the_final_and_where_the_moves_are_given(
-    panda, few_moves, monkeypatch
-):
-    options = []
-
-    def runner(*args, **kwargs):
-        options.append((kwargs.get("collisions", True), kwargs.get("physics")))
-        return Runner(*args, **kwargs)
-
-    monkeypatch.setattr("batchpid.sim.tuning.candidates.Runner", runner)
-    tune(panda, workers=0, physics="fast", **SMALL)
-    assert options == [(False, "fast"), (True, "fast")]
-    options.clear()
-    tune(panda, moves=random_moves(panda, 1, 0), workers=0, physics="fast", **SMALL)
-    assert options == [(True, "fast")]
 
 
 def test_cost_is_linear_in_the_weight_of_the_following_error():
@@ -137,18 +119,6 @@ def test_moves_are_made_with_different_motors_of_which_the_worst_counts():
         tune(ARM, motors=motors.for_envs(rows), **options) for rows in ([1, 1], [0, 1], [0, 0])
     )
     assert early.start_cost < mixed.start_cost < late.start_cost
-
-
-@pytest.mark.slow
-def test_randomization_and_actuators_make_another_search(panda):
-    moves, drawn = random_moves(panda, 1, 0), Randomization(payload=Uniform(0, 1))
-    late = dataclasses.replace(panda, actuators=make_actuators(panda.dof, command_delay=0.003))
-    plain, varied, late = (
-        tune(robot, moves=moves, workers=0, randomization=randomization, **SMALL)
-        for robot, randomization in ((panda, None), (panda, drawn), (late, None))
-    )
-    assert len({plain.history, varied.history, late.history}) == 3
-    assert varied.settings["randomization"] == drawn.to_dict()
 
 
 @pytest.mark.slow
