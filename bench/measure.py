@@ -161,7 +161,7 @@ def measure_phases(workload: Workload) -> dict[str, float]:
     loop.reset(
         np.ones(share, bool), np.tile(workload.start, (share, 1)), np.zeros((share, robot.dof))
     )
-    loop.ticks[0].command.setpoint[...] = workload.target
+    loop.arrays.command.setpoint[...] = workload.target
     spent = dict.fromkeys(("read", "control", "passive", "write", "step", "waiting"), 0.0)
     for group in loop.groups:
         group.execute_in_numpy()

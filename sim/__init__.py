@@ -14,9 +14,8 @@ from batchpid.sim.diagnosis.loop_stability import StabilityWarning
 from batchpid.sim.diagnosis.run_checks import MovingSetpointWarning, SetpointWarning
 from batchpid.sim.loop.faults import Fault, FaultWarning
 from batchpid.sim.loop.snapshot import Snapshot
-from batchpid.sim.options.keywords import Controller, RunnerKeywords
-from batchpid.sim.options.options import RunnerOptions
-from batchpid.sim.options.ray_options import Ray
+from batchpid.sim.options.groups import Controller, Ray
+from batchpid.sim.options.options import RunnerKeywords, RunnerOptions
 from batchpid.sim.randomization.distributions import Choice, LogUniform, Normal, Uniform
 from batchpid.sim.randomization.randomization import Randomization
 from batchpid.sim.recording.recorder import Recorder

@@ -36,7 +36,7 @@ PLAIN = (
 """Options that become a leaf without regard to others."""
 
 
-class _Fields(NamedTuple):
+class _ParamsFields(NamedTuple):
     kp: Annotated[Array, Field("N m/rad or N/m")]
     ki: Annotated[Array, Field("N m/(rad s) or N/(m s)")] = None
     kd: Annotated[Array, Field("N m s/rad or N s/m")] = None
@@ -69,11 +69,11 @@ class _Fields(NamedTuple):
     """ImplicitLaw(): the law acts on the predicted end of the step; off: on its beginning."""
 
 
-FIELDS = declared(_Fields, Field) | {"anti_windup": Field(neutral="none")}
+FIELDS = declared(_ParamsFields, Field) | {"anti_windup": Field(neutral="none")}
 """Options of a joint."""
 
 
-class PIDParams(Record, _Fields):
+class PIDParams(Record, _ParamsFields):
     """Parameters of the law. Every leaf is a float array, (1, joints) or (envs, joints); None is
     off.
 

@@ -10,7 +10,7 @@ from batchpid.arrays.elementwise import namespace
 from batchpid.arrays.records import Record
 
 
-class _Fields(NamedTuple):
+class _PIDStateFields(NamedTuple):
     integral: Array = None
     """I, in effort units."""
     measurement: Array = None
@@ -27,7 +27,7 @@ class _Fields(NamedTuple):
     """o: where setpoint weighting measures positions from [rad or m]."""
 
 
-class PIDState(Record, _Fields):
+class PIDState(Record, _PIDStateFields):
     """State of the law, arrays (envs, joints); None where no option needs it."""
 
     __slots__ = ()

@@ -14,9 +14,7 @@ See docs/actuators.md.
 
 from batchpid.arrays.elementwise import replace_envs as reset
 from batchpid.motors.actuator_dynamics import (
-    STAGES,
     MotorCoefficients,
-    Stages,
     advance_effort,
     advance_measurement,
     command_limits,
@@ -39,13 +37,11 @@ from batchpid.motors.coupling import Coupling, Follower
 __all__ = [
     "DRIVEN",
     "JOINT_SIDE",
-    "STAGES",
     "ActuatorState",
     "Actuators",
     "Coupling",
     "Follower",
     "MotorCoefficients",
-    "Stages",
     "advance_effort",
     "advance_measurement",
     "command_limits",

@@ -9,7 +9,7 @@ from batchpid.arrays.display import array_summary
 from batchpid.arrays.records import Record
 
 
-class _Fields(NamedTuple):
+class _ActuatorStateFields(NamedTuple):
     command: Array = None
     """Efforts asked for, latest first (envs, samples, joints) [N m or N]."""
     effort: Array = None
@@ -26,7 +26,7 @@ class _Fields(NamedTuple):
     """Measurements since the reset (envs,) uint32."""
 
 
-class ActuatorState(Record, _Fields):
+class ActuatorState(Record, _ActuatorStateFields):
     """State of actuators and sensors; None where no effect needs it. Every array has the envs as
     its first axis.
     """

@@ -26,7 +26,7 @@ TABLE = {"limit_efforts": Field("N m or N", math.inf)}
 """Declared field of the efforts at the points of a position-dependent limit."""
 
 
-class _Fields(NamedTuple):
+class _ActuatorsFields(NamedTuple):
     command_delay: Annotated[Array, Field("s", high=MAX_DELAY, group="motor")] = None
     sensor_delay: Annotated[Array, Field("s", high=MAX_DELAY, group="sensor")] = None
     lag: Annotated[Array, Field("s", group="motor")] = None
@@ -63,7 +63,7 @@ class _Fields(NamedTuple):
     """Of the noise: two words (1, 2) uint32, the lower one first; None without noise."""
 
 
-FIELDS = declared(_Fields, Field)
+FIELDS = declared(_ActuatorsFields, Field)
 """Declared fields of all effects that are one number for each joint."""
 MOTOR_SIDE = in_group(FIELDS, "motor")
 """Effects between the effort asked for and the effort delivered."""
@@ -78,9 +78,10 @@ effort.
 SENSOR_SIDE = in_group(FIELDS, "sensor")
 """Effects between the joint's state and its measurement."""
 DELAYS = ("command_delay", "sensor_delay")
+NOISES = ("position_noise", "velocity_noise")
 
 
-class Actuators(Record, _Fields):
+class Actuators(Record, _ActuatorsFields):
     """Parameters of actuators and sensors. Every leaf is a float array, (1, joints) or (envs,
     joints); None is off.
 
@@ -239,7 +240,7 @@ def make_actuators(
     points, efforts = _table(build, position_limit)
     longest = _longest_delay(leaves, max_delay)
     words = integer("seed", seed, 0, 2**64 - 1)
-    has_noise = leaves["position_noise"] is not None or leaves["velocity_noise"] is not None
+    has_noise = any(leaves[name] is not None for name in NOISES)
     return Actuators(
         **leaves,
         limit_positions=points,

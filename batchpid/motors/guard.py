@@ -31,7 +31,7 @@ from batchpid.arrays.records import LeafBuilder, Record, with_fields
 from batchpid.checks.validate import check_time_step
 
 
-class _Fields(NamedTuple):
+class _GuardFields(NamedTuple):
     lower: Annotated[Array, Field("rad or m", -math.inf, low=-math.inf)] = None
     upper: Annotated[Array, Field("rad or m", math.inf, low=-math.inf)] = None
     rate: Annotated[Array, Field("rad/s or m/s", math.inf, above=True)] = None
@@ -42,11 +42,11 @@ class _Fields(NamedTuple):
     """1 / (2 pi) on continuous joints, 0 elsewhere."""
 
 
-FIELDS = declared(_Fields, Field)
+FIELDS = declared(_GuardFields, Field)
 """Options of a joint."""
 
 
-class Guard(Record, _Fields):
+class Guard(Record, _GuardFields):
     """Limits of setpoints, (1, joints) or (envs, joints); None is off. Build one with
     :func:`make_guard`.
     """

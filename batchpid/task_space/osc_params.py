@@ -37,7 +37,7 @@ TASK_CHOICES: dict[str, Document] = {
 """Options chosen by name, and the entries of the params; the first is the default."""
 
 
-class _Fields(NamedTuple):
+class _OSCParamsFields(NamedTuple):
     stiffness: Annotated[Array, Field("1/s^2", group="axis", default=150.0)]
     """kp (1 | envs, 6) [1/s^2]."""
     damping: Annotated[Array, Field("1/s", group="axis")]
@@ -88,7 +88,7 @@ class _Fields(NamedTuple):
     """ImplicitLaw(): the gains act on the predicted end of the step; None: on its beginning."""
 
 
-FIELDS = declared(_Fields, Field) | {
+FIELDS = declared(_OSCParamsFields, Field) | {
     "damping_ratio": Field("1", 1.0, group="axis", default=1.0),
     "posture_damping_ratio": Field("1", 1.0, group="joint", default=1.0),
     "effort_limit": Field("N m or N", math.inf, group="joint"),
@@ -102,7 +102,7 @@ WITHOUT_EFFECT = {
 """Options without effect where another one is given (True), or is not (False), and the reason."""
 
 
-class OSCParams(Record, _Fields):
+class OSCParams(Record, _OSCParamsFields):
     """Parameters of operational-space control, for one tool of one kind of robot. Build it with
     :func:`make_osc_params`.
 

@@ -22,8 +22,7 @@ from batchpid.arrays.array_types import Bool, Document, DType, Float32, Float64,
 from batchpid.checks.single_owner import SingleOwner
 from batchpid.checks.validate import array, check_keywords, choice, env_mask, flag, integer, number
 from batchpid.errors import CallOrderError, InvalidArgumentError
-from batchpid.sim.options.keywords import OPTIONS, checked_option
-from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.options.options import OPTIONS, RunnerOptions, checked_option
 from batchpid.sim.randomization.randomization import LARGEST
 from batchpid.sim.robot.robot import Robot
 from batchpid.sim.runner.runner import Runner

@@ -33,7 +33,7 @@ from batchpid.sim.identification.regression import (
 from batchpid.sim.identification.result import Identification
 from batchpid.sim.identification.simulator import LogControl, Plant
 from batchpid.sim.identification.unknowns import BASIC, EXTRAS, LAW, Unknowns
-from batchpid.sim.options.keywords import Compensation
+from batchpid.sim.options.groups import Compensation
 from batchpid.sim.robot.parts import FileDefaults
 from batchpid.sim.robot.robot import Robot
 

@@ -26,7 +26,7 @@ import batchpid as bp
 import batchpid.task_space as ts
 from batchpid import motors as actuator_model
 from batchpid.arrays.array_types import Document, Float64
-from batchpid.arrays.elementwise import TURN
+from batchpid.arrays.elementwise import TURN, namespace
 from batchpid.arrays.trees import leaves, mapped, structure
 from batchpid.motors import friction as friction_model
 from batchpid.motors import guard as guard_model
@@ -38,7 +38,6 @@ from batchpid.native.array_program import ArrayProgram
 from batchpid.native.availability import obstacle
 from batchpid.native.tracing import Trace, trace_trees
 from batchpid.sim.engine.scene_spec import added_friction
-from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import REFRESH_STEPS, control_step
 from batchpid.sim.loop.pid_law import PIDLaw
 from batchpid.sim.loop.step_values import Constants, Layout, Measured, Model, Step, StepState
@@ -497,9 +496,10 @@ def _step(
     """Return state and efforts of a control step."""
     command, qpos, qvel, passive = inputs
     step = Step(0, 1)
-    new, outputs = control_step(
-        layout, constants, state, Command(command), Measured(qpos, qvel, passive), step
-    )
+    if passive is None:
+        passive = namespace(qpos).zeros_like(qpos)
+    measured = Measured(qpos, qvel, passive)
+    new, outputs = control_step(layout, constants, state, command, measured, step)
     return new, outputs.qf
 
 

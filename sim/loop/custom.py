@@ -23,7 +23,7 @@ from batchpid.sim.tool_space.osc_controller import OperationalSpace
 
 
 class OwnController:
-    """Caller's own controller (:class:`batchpid.sim.options.options.Controller`), checked; its state is a
+    """Caller's own controller (:class:`batchpid.sim.Controller`), checked; its state is a
     dictionary of arrays by name.
 
     All groups of envs share it, and thus its JAX program.

@@ -117,10 +117,13 @@ class EnvStates:
 
     def for_envs(self, envs: slice | NDArray[np.intp]) -> EnvStates:
         """Return the state of some envs, as copies."""
-        tables = flatten(vars(self), ".")
-        return EnvStates(
-            **unflatten(vars(self), {name: rows[envs].copy() for name, rows in tables.items()}, ".")
-        )
+        parts: Document = {}
+        for name, part in vars(self).items():
+            if isinstance(part, dict):
+                parts[name] = {leaf: rows[envs].copy() for leaf, rows in part.items()}
+            else:
+                parts[name] = part[envs].copy()
+        return EnvStates(**parts)
 
     @staticmethod
     def join(parts: Sequence[EnvStates]) -> EnvStates:
@@ -130,9 +133,19 @@ class EnvStates:
         for part in parts:
             missing = width - part.engine.shape[1]
             engine = np.pad(part.engine, ((0, 0), (0, missing)), constant_values=np.nan)
-            tables.append(flatten(vars(part) | {"engine": engine}, "."))
+            tables.append(replace(part, engine=engine).tables())
         joined = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
         return EnvStates(**unflatten(vars(parts[0]), joined, "."))
+
+    def tables(self) -> dict[str, Rows]:
+        """Return all arrays by name, such as "friction.age"."""
+        tables: dict[str, Rows] = {}
+        for name, part in vars(self).items():
+            if isinstance(part, dict):
+                tables |= {f"{name}.{leaf}": rows for leaf, rows in part.items()}
+            else:
+                tables[name] = part
+        return tables
 
     def check(self, fresh: EnvStates, command_size: int, engine_sizes: Sequence[int]) -> None:
         """Compare the arrays with :meth:`fresh` states of the runner that restores them.
@@ -145,7 +158,7 @@ class EnvStates:
         InvalidArgumentError
             An array is missing, unknown, or of another shape, dtype or range.
         """
-        _compare(flatten(vars(self), "."), flatten(vars(fresh) | {"engine": self.engine}, "."))
+        _compare(self.tables(), replace(fresh, engine=self.engine).tables())
         joint, cause = self.containment["joint"], self.containment["cause"]
         of_command = np.isin(cause, [CAUSES.index(name) for name in COMMAND_CAUSES])
         joints = np.where(of_command, command_size, self.effort.shape[1])
@@ -208,7 +221,9 @@ class Snapshot:
                 isinstance(value, str) and len(value) == _DIGITS for value in (ours, theirs)
             )
             problem = (
-                f"another {key}" if is_digest else f"{key} {reprlib.repr(theirs)}, not {ours!r}"
+                f"another {key}"
+                if is_digest
+                else f"{key} {reprlib.repr(theirs)}, not {reprlib.repr(ours)}"
             )
             problem += "".join(f", and another {other}" for other in others)
             remedy = "restore it in a runner made with the same options"
@@ -266,6 +281,10 @@ class Snapshot:
             episodes=None if self.episodes is None else self.episodes[envs],
             motion=None if self.motion is None else self.motion[envs],
         )
+
+    def copy(self) -> Snapshot:
+        """Return a snapshot with arrays of its own."""
+        return self.for_envs(np.arange(len(self.states.effort)))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an .npz file, as a whole or not at all: an older file stays until this one is
@@ -361,13 +380,19 @@ def _compare(theirs: dict[str, Rows], ours: dict[str, Rows]) -> None:
     """Raise InvalidArgumentError if the arrays of a snapshot differ in name, shape or dtype from
     those of a runner.
     """
+    shapes, expected = (
+        {name: (rows.dtype, rows.shape) for name, rows in tables.items()}
+        for tables in (theirs, ours)
+    )
+    if shapes == expected:
+        return
     for name in sorted(ours.keys() | theirs.keys()):
-        kinds = [
-            f"{rows[name].dtype} {rows[name].shape}" if name in rows else "no array"
-            for rows in (theirs, ours)
-        ]
-        if kinds[0] != kinds[1]:
-            problem = f"has {kinds[0]} for {name}, not {kinds[1]}"
+        kind, other = (
+            "no array" if name not in table else "{} {}".format(*table[name])
+            for table in (shapes, expected)
+        )
+        if kind != other:
+            problem = f"has {kind} for {name}, not {other}"
             raise InvalidArgumentError("snapshot", problem, remedy="take a new one")
 
 

@@ -123,6 +123,23 @@ def efforts(
     return figure
 
 
+def following_errors(rollout: Rollout, *, joints: Joints = None, title: str = "") -> Figure:
+    """Draw, for each joint, position minus setpoint at the ends of the ticks, where a setpoint
+    holds.
+
+    Parameters as in :func:`step_responses`.
+    """
+    run = _blank_failed(rollout)
+    figure, blocks = _figure(run, joints, rows=1, title=title)
+    for joint, (axes,) in blocks:
+        error = run.qpos[..., joint] - run.setpoint[..., joint]
+        drawing.draw_fan(axes, run.time, error, None)
+        axes.autoscale(axis="y")
+        axes.set_ylabel(run.info.units[joint], fontsize=drawing.SMALL)
+    _legend(figure, _fan_entries(run, None))
+    return figure
+
+
 def comparison(
     first: Rollout,
     second: Rollout,

@@ -29,7 +29,7 @@ from batchpid.task_space.rotations import rotate
 Rgba = tuple[float, ...]
 _REMEDY = (
     "repair the file, put it next to the URDF, or pass package_dirs=[...] to Robot.load"
-    " (--package-dirs)"
+    ", or ROS_PACKAGE_PATH"
 )
 
 DEVIATION = 2e-3  # default distance allowed between a chord and its arc [m]

@@ -133,17 +133,16 @@ def _repair(
     if missing and missing_meshes == "error":
         raise RobotError(
             f"{path}: collision mesh not found or not readable: {', '.join(missing)}; repair the"
-            " file, pass package_dirs=[...] (--package-dirs on the command line) with the folder"
-            " that holds the package, or missing_meshes='skip' (--missing-meshes skip) to simulate"
-            " without"
+            " file, pass package_dirs=[...] with the folder that holds the package (or name it in"
+            " ROS_PACKAGE_PATH), or missing_meshes='skip' to simulate without"
         )
     if missing:
         text = (
             f"collision meshes not found or not readable, simulated without: {', '.join(missing)}"
         )
         remedy = (
-            "repair the files, or pass package_dirs=[...] to Robot.load (--package-dirs on the"
-            " command line)"
+            "repair the files, or pass package_dirs=[...] to Robot.load, or name their folder in"
+            " ROS_PACKAGE_PATH"
         )
         repairs.append(Finding("warning", "missing-mesh", text, remedy))
 

@@ -245,9 +245,6 @@ class ReadStateSizes(Operation):
     def apply(self, loop: Loop) -> list[int]:
         return loop.state_sizes()
 
-    def join(self, results: list[list[int]]) -> list[int]:
-        return [*chain.from_iterable(results)]
-
 
 @dataclass(frozen=True)
 class ReadPoses(Operation):
@@ -278,7 +275,7 @@ def snapshot_of(options: RunnerOptions, state: RunnerState, states: EnvStates) -
         motion = np.stack([last, np.zeros_like(last) if rate is None else rate], axis=1)
     episodes = None if options.randomization is None else state.draws.episodes.copy()
     return Snapshot(
-        options.describe(), state.steps, state.params, states, state.actuators, episodes, motion
+        options.described, state.steps, state.params, states, state.actuators, episodes, motion
     )
 
 
@@ -313,4 +310,4 @@ def restored(
         sensors=untouched(options.num_envs, options.observed),
     )
     snapshot.states.check(fresh, options.command.size, sizes)
-    return Restore(replace(snapshot, params=params, actuators=actuators), draws).copy()
+    return Restore(replace(snapshot.copy(), params=params, actuators=actuators), draws)

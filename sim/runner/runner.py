@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from inspect import Signature, signature
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from time import strftime
@@ -31,14 +32,8 @@ from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.backend import describe
 from batchpid.sim.loop.faults import Fault
 from batchpid.sim.loop.snapshot import Snapshot
-from batchpid.sim.options.keywords import (
-    DEFAULT_ENGINE,
-    KINDS,
-    OPTIONS,
-    arguments_of,
-    checked_option,
-)
-from batchpid.sim.options.options import RunnerOptions
+from batchpid.sim.options.groups import DEFAULT_ENGINE
+from batchpid.sim.options.options import KINDS, OPTIONS, RunnerOptions, arguments_of, checked_option
 from batchpid.sim.runner.arguments import count_ticks, read_command
 from batchpid.sim.runner.operations import (
     Operation,
@@ -155,7 +150,7 @@ class Runner(SingleOwner):
         workers = len(self.pids)
         nodes = len(self.nodes)
         where = "closed" if self.closed else f"{workers} workers" if workers else "in this process"
-        further = "".join(f", {name} {value}" for name, value in options.switched.items())
+        further = "" if options.collisions else ", no collisions"
         where = f"{nodes} nodes" if nodes else where
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control"
@@ -452,7 +447,7 @@ class Runner(SingleOwner):
         """
         self._ready("restore")
         instance("snapshot", snapshot, Snapshot, "take one with runner.snapshot()")
-        restore = restored(self.options, self._state, snapshot, self._read(ReadStateSizes()))
+        restore = restored(self.options, self._state, snapshot, self._state_sizes)
         self._execute(restore)
         self._pool.start_replay_from(restore)
         self._warnings.set_params(self._state.params)
@@ -490,6 +485,11 @@ class Runner(SingleOwner):
             ),
             episodes=None if draws is None else draws.episodes.copy(),
         )
+
+    @cached_property
+    def _state_sizes(self) -> list[int]:
+        """Number of values in the engine's state of each env."""
+        return [*chain.from_iterable(self._execute(ReadStateSizes()).results)]
 
     @cached_property
     def _versions(self) -> dict[str, str]:
@@ -744,7 +744,7 @@ class Runner(SingleOwner):
         """
         state = self._state
         snapshot = snapshot_of(self.options, state, self._read(TakeSnapshot()))
-        self._pool.start_replay_from(Restore(snapshot, state.draws))
+        self._pool.start_replay_from(Restore(snapshot.copy(), state.draws))
         return snapshot
 
     def _max_ticks(self) -> int:

@@ -311,6 +311,24 @@ class Rollout:
         setpoint, seen = function(self.setpoint), self.observation.map(function)
         return replace(self, setpoint=setpoint, observation=seen, feedforward=feedforward, **others)
 
+    @staticmethod
+    def join(parts: Sequence[Rollout]) -> Rollout:
+        """Return successive rollouts of one run as one, with the info of the first, and the faults
+        of the last, which include the earlier ones.
+        """
+        first, last = parts[0], parts[-1]
+        feedforward = None
+        if first.feedforward is not None:
+            feedforward = np.concatenate([part.feedforward for part in parts])
+        return replace(
+            first,
+            time=np.concatenate([part.time for part in parts]),
+            setpoint=np.concatenate([part.setpoint for part in parts]),
+            observation=Observation.join([part.observation for part in parts]),
+            info=replace(first.info, faults=last.info.faults, redraws=last.info.redraws),
+            feedforward=feedforward,
+        )
+
     def __repr__(self) -> str:
         ticks, envs, dof = self.qpos.shape
         end = f"up to {self.time[-1]:g} s" if ticks else "empty"

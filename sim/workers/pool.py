@@ -204,8 +204,10 @@ class WorkerPool(SingleOwner):
         return Outcome(results, failure, count, self.ticks)
 
     def start_replay_from(self, request: Request | None) -> None:
-        """Drop the kept requests, because ``request`` brings a new worker to the present state."""
-        self._replay = [Build()] if request is None else [Build(), request.copy()]
+        """Drop the kept requests, because ``request``, whose arrays no one changes, brings a new
+        worker to the present state.
+        """
+        self._replay = [Build()] if request is None else [Build(), request]
 
     def close(self) -> None:
         """End all workers at once. May be called again, as after an interrupt."""

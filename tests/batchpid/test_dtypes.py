@@ -52,6 +52,8 @@ def run_of(xp, dtype, options, own):
     yield convert_integral(
         started, accelerations, accelerations.replace(gain_units="effort"), matrix
     )
+    drive = bp.make_params(JOINTS, 4.0, 2.0, 1.0, dtype=own)
+    yield from bp.drive_target(drive, bp.init(drive, y), r, y, DT)
     limits = bp.make_guard(JOINTS, rate=1.0, acceleration=5.0, dtype=own)
     yield (guarded := guards.init(limits, y))
     yield guards.advance(limits, guarded, r, DT)[0]

@@ -402,8 +402,6 @@ def rows():
 
 @pytest.mark.parametrize(("module", "function", "argument"), sorted(rows(), key=lambda row: row.id))
 def test_arguments_of_every_public_function(module, function, argument):
-    if function is trajectories.jerk_limited:
-        pytest.importorskip("ruckig")
     good = needed(function, module=module)
     function(**good)
     for value in WRONG[argument]:

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from batchpid.sim import Fault, Runner
+from batchpid.sim import Fault, Rollout, Runner
 from batchpid.sim.signals.rollout import Redraw
 
 
@@ -80,3 +80,4 @@ def test_some_ticks_begin_where_those_before_have_ended(rollout):
     assert second.info.episodes.tolist() == [[0, 0], [1, 0], [2, 1]]
     assert [redraw.env for redraw in second.info.redraws] == [1]
     assert rollout.for_ticks(slice(0, 1)).info.faults == rollout.info.faults[:1]
+    np.testing.assert_array_equal(Rollout.join([first, second]).qpos, rollout.qpos)

@@ -28,11 +28,11 @@ from batchpid.sim import (
     Recorder,
     Robot,
     Runner,
-    RunnerKeywords,
     Snapshot,
     Uniform,
     read_recording,
 )
+from batchpid.sim.options.options import OPTIONS
 
 pytest.importorskip("mujoco.batch")
 DOF, N = ARM.dof, 2
@@ -126,7 +126,7 @@ def test_a_value_of_any_kind_is_accepted_or_refused_by_name(
                 assert is_named or isinstance(value, str), (name, value, text)
 
 
-@pytest.mark.parametrize("name", ["robot", "num_envs", "params", *RunnerKeywords.__annotations__])
+@pytest.mark.parametrize("name", [*OPTIONS])
 def test_values_of_no_use_are_refused_for_every_option(name: str) -> None:
     options = {"robot": ARM, "num_envs": N, "workers": 0}
     if name in ("tool", "cluster"):

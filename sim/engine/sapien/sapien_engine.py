@@ -19,7 +19,7 @@ class SapienEngine:
     name, title = "sapien", "SAPIEN"
     capabilities: frozenset[Capability] = frozenset(get_args(Capability)) - {"base_state"}
     physics: Mapping[str, Any] = PHYSICS
-    group_size = 16
+    group_size = 4
 
     def is_physics(self, settings: object) -> bool:
         """Return whether these are :class:`batchpid.sim.Physics`."""

@@ -122,25 +122,6 @@ def decay(steps):
     return errors
 
 
-def test_near_a_singularity_damping_of_the_posture_enters_the_task_and_springs_do_not():
-    """With an eigenvalue s = s0/2, along its eigenvector: 1 - s^2/s0^2 of the damping, nothing of
-    the springs.
-    """
-    tree, rng = tree_of("panda"), np.random.default_rng(0)
-    qpos, c = poses(tree, HAND, 8), tree.chain(HAND)
-    d = ts.task_dynamics(tree, qpos, 0 * qpos, HAND)
-    j, mass = d.jacobian[..., c], d.mass_matrix[:, c][..., c]
-    values, vectors = np.linalg.eigh(j @ np.linalg.solve(mass, j.swapaxes(1, 2)))
-    k = ts.discretise(ts.make_osc_params(tree, smallest_eigenvalue=2 * values[:, 0]), DT)
-    a_n = c * rng.normal(size=qpos.shape)
-    wanted = (vectors[..., 0] * (d.jacobian @ a_n[..., None])[..., 0]).sum(-1)
-    assert np.abs(wanted).max() > 0.1
-    for springs, share in ((a_n, 0.0), (0 * a_n, 0.75)):
-        found = ts.projections.projections(k, d, np.zeros((8, 6)), a_n, springs=springs)
-        moved = (j @ np.linalg.solve(mass, found.posture[:, c, None]))[..., 0]
-        np.testing.assert_allclose((vectors[..., 0] * moved).sum(-1), share * wanted, atol=1e-10)
-
-
 def test_the_force_on_a_wall_is_the_one_asked_for():
     """A wall of 1e5 N/m in z, and 5 to 40 N: to 0.2 %. The other axes hold their place."""
     tree, asked = tree_of("panda"), np.array([5.0, 10.0, 20.0, 40.0])

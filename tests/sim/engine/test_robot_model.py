@@ -162,14 +162,6 @@ def test_the_controller_compensates_the_model_and_not_the_drawn_masses(panda):
     assert fallen[1] > 0.05
 
 
-def test_jax_computes_the_same(panda):
-    jax = pytest.importorskip("jax")
-    qpos, model = panda.sample(6), panda.dynamics()
-    with jax.enable_x64(True):
-        found = np.asarray(jax.jit(model.mass_matrix)(jax.numpy.asarray(qpos)))
-    np.testing.assert_allclose(found, model.mass_matrix(qpos), rtol=1e-10, atol=1e-12)
-
-
 def test_dynamics_give_every_thread_its_own_results(panda):
     dynamics, poses = panda.dynamics(), panda.sample(80)
 

@@ -69,15 +69,6 @@ def test_all_of_them_at_once(case):
         assert_identical(motion(case), wanted)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", ["pid", "controller"])
-def test_workers_under_settings_of_their_environment(monkeypatch, case):
-    wanted = expected(case)
-    for name, value in SETTINGS.items():
-        monkeypatch.setenv(name.upper(), "1" if value is True else value)
-    assert_identical(motion(case, workers=1), wanted)
-
-
 def test_the_state_of_a_controller_has_the_precision_of_the_runner():
     for wide in (False, True):
         with (

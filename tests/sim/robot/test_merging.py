@@ -1,7 +1,5 @@
 """Links joined by fixed joints, merged: the tree, placements, inertia and order of the joints."""
 
-import pickle
-
 import numpy as np
 import pytest
 from tiny_urdf import INERTIAL, joint, link, random_tree, robot, write
@@ -10,8 +8,8 @@ import batchpid.task_space as ts
 from batchpid.sim import Robot
 from batchpid.sim.robot.merging import link_inertias, merge_fixed, place_links
 from batchpid.sim.robot.simulated_links import rigid_tree
-from batchpid.task_space.rotations import from_rpy, multiply, rotate
-from batchpid.task_space.spatial_inertia import SpatialInertia, total
+from batchpid.task_space.rotations import multiply, rotate
+from batchpid.task_space.spatial_inertia import total
 
 BOX = '<collision><origin xyz="0.1 0 0"/><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
 
@@ -49,12 +47,6 @@ def test_a_rigid_body_becomes_its_first_link(tmp_path):
     np.testing.assert_array_equal(arm.position, [0, 0, 2])
     assert (arm.joint.name, arm.joint.parent_link, arm.mass) == ("hinge", "base", 2)
     np.testing.assert_allclose(merged.links["camera"].position, [0, 0, 2])
-
-
-def test_without_fixed_joints_nothing_changes(tmp_path):
-    tables = load(tmp_path, link("a"), link("b"), joint("h", "a", "b")).tables
-    assert merge_fixed(tables) == tables
-    assert hash(pickle.loads(pickle.dumps(tables))) == hash(tables)
 
 
 def test_links_whose_wrench_is_measured_begin_a_body(tmp_path):
@@ -136,22 +128,3 @@ def test_siblings_of_a_merged_link_stay_in_order(tmp_path):
     original = load(tmp_path, *map(link, ("base", "a", "mount", "c")), *parts)
     assert original.joint_names == ("early", "late")
     assert [each.name for each in merge_fixed(original.tables).joints] == ["early", "late"]
-
-
-def test_placements_of_a_robot_are_those_of_its_kinematics(panda):
-    tree = panda.rigid_tree
-    poses = ts.link_poses(tree, np.zeros(panda.dof))
-    for name, at in panda.bodies.items():
-        body, pose = (poses[tree.index(link)] for link in (at.link, name))
-        np.testing.assert_allclose(body[:3] + rotate(body[3:], at.position), pose[:3], atol=1e-12)
-
-
-def test_total_of_two_masses_is_that_of_a_dumbbell():
-    still = np.zeros((3, 3))
-    ends = [SpatialInertia(1.0, np.array([x, 0.0, 0.0]), still) for x in (-1.0, 1.0)]
-    body = total(ends)
-    np.testing.assert_allclose(body.center, 0)
-    np.testing.assert_allclose(body.tensor, np.diag([0.0, 2.0, 2.0]))
-    turned = body.moved(np.array([0.0, 0.0, 1.0]), from_rpy([0, 0, np.pi / 2]))
-    np.testing.assert_allclose(turned.tensor, np.diag([2.0, 0.0, 2.0]), atol=1e-15)
-    np.testing.assert_allclose(turned.center, [0, 0, 1])

@@ -7,7 +7,6 @@ from __future__ import annotations
 import random
 import sys
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,10 +19,8 @@ from batchpid.sim import Robot, Runner, to_urdf  # noqa: E402
 from batchpid.sim.engine.mujoco.model_builder import robot_model  # noqa: E402
 from batchpid.sim.engine.physics import SOLVERS  # noqa: E402
 from batchpid.sim.engine.protocol import SceneSpec  # noqa: E402
-from batchpid.sim.robot.collision_shapes import mesh_file  # noqa: E402
 from batchpid.sim.robot.shapes import surfaces  # noqa: E402
 from batchpid.sim.tuning import gain_set  # noqa: E402
-from batchpid.task_space.rotations import rotate  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::batchpid.sim.StabilityWarning")
 
@@ -183,21 +180,6 @@ def test_swings_as_in_mujoco(load, engine):
     np.testing.assert_allclose(moved, data.qpos, atol=1e-4)
 
 
-@pytest.mark.slow
-def test_both_engines_agree_and_settle(load):
-    robot = load(ARM)
-    target, ends = np.array([0.2, 0.05, 0.6]), []
-    for engine in ("sapien", "mujoco"):
-        with Runner(robot, num_envs=2, workers=0, engine=engine, substeps=20) as runner:
-            runner.reset()
-            for _ in range(100):
-                observation = runner.step(target)
-        assert observation.ok.all()
-        ends.append(observation.qpos)
-    np.testing.assert_allclose(ends[0], ends[1], atol=1e-4)
-    np.testing.assert_allclose(ends[0], np.tile(target, (2, 1)), atol=2e-2)
-
-
 # of a geom in directions u (n, 3) in its frame, by type: capsule, ellipsoid, cylinder, box, mesh
 EXTENT = {
     3: lambda u, size, vertices: size[0] + size[1] * np.abs(u[:, 2]),
@@ -243,47 +225,6 @@ def test_shapes_are_where_they_are_in_the_file(load):
     errors = np.abs(reach[0] - reach[1]).max(1)
     assert np.count_nonzero(errors < 1e-6) == 4
     assert errors.max() < 0.03 * 0.05  # the ellipsoid's
-
-
-def read_obj(path):
-    """Return the vertices (n, 3) and the corners of the triangles (m, 3, 3) of an OBJ file."""
-    lines = [line.split() for line in Path(path).read_text().splitlines()]
-    vertices, faces = (
-        np.array([line[1:] for line in lines if line[0] == kind], float) for kind in "vf"
-    )
-    return vertices, vertices[faces.astype(int) - 1]
-
-
-def test_a_capsule_has_the_ends_of_the_file(load):
-    (shape,) = load(ARM).tables.shapes_of("upper")  # not the sphere, which is only drawn
-    radius, half_length = shape.size
-    half = half_length * rotate(shape.wxyz, np.array([0.0, 0.0, 1.0]))
-    anchor = np.array([0.02, 0, -0.03])  # the link's origin
-    assert (shape.kind, radius) == ("capsule", 0.03)
-    ends = sorted((anchor + shape.position + sign * half).tolist() for sign in (1, -1))
-    np.testing.assert_allclose(ends, [[0, 0, 0], [0.3, 0, 0.1]], atol=1e-12)
-
-
-def test_a_mesh_is_its_convex_hull(load, hulls):
-    (shape,) = load(ARM).tables.shapes_of("fore")
-    vertices, corners = read_obj(mesh_file(shape))
-    placed = rotate(shape.wxyz, vertices) + shape.position - [0.1, 0, 0]
-    expected = [[0, 0, 0], [0, 0, 0.2], [0, 0.1, 0], [0.1, 0, 0]]  # without the vertex inside
-    np.testing.assert_allclose(sorted(placed.round(6).tolist()), expected, atol=1e-6)
-    assert shape.kind == "mesh"
-    assert Path(mesh_file(shape)) in hulls.iterdir()
-    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert (np.einsum("ij,ij->i", outward, corners[:, 0] - vertices.mean(0)) > 0).all()
-
-
-def test_an_ellipsoid_is_inscribed(load):
-    (shape,) = load(ARM).tables.shapes_of("hand")
-    vertices, corners = (part / [0.02, 0.03, 0.05] for part in read_obj(mesh_file(shape)))
-    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1, atol=1e-6)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    distances = np.einsum("ij,ij->i", normals, corners[:, 0]) / np.linalg.norm(normals, axis=1)
-    assert distances.min() > 0.97
-    assert distances.max() < 1
 
 
 def test_pairs_that_do_not_collide(load):

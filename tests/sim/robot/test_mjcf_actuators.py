@@ -209,14 +209,6 @@ def test_stiff_servos_diverge_as_pid_and_not_as_drives(load, kp, kv):
         np.testing.assert_allclose(runner.step(goal).qpos[0], data.qpos, atol=1e-3)
 
 
-def test_a_motor_has_the_narrower_limit(load):
-    robot = load(
-        '<motor joint="j" gear="2" ctrlrange="-3 3" forcerange="-5 5"/><motor joint="k"'
-        ' forcerange="-1 1"/>'
-    )
-    np.testing.assert_array_equal(robot.effort_limit, [6, 1])
-
-
 def test_an_actuator_of_another_object_is_named(load):
     held = '<body name="lid"><joint name="hinge"/><geom size=".1"/></body>'
     robot = load('<motor joint="hinge"/><motor joint="j"/>', beside=held)

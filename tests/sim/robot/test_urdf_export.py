@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_repair import REPAIRED
+from faulty_urdfs import REPAIRED
 from tiny_urdf import INERTIAL, LIMIT, joint, link, one_joint, random_tree, robot, write
 
 from batchpid.errors import RobotError

@@ -29,11 +29,6 @@ def six_joints(tmp_path_factory):
     return six(tmp_path_factory.mktemp("arm"))
 
 
-@pytest.fixture(scope="module")
-def with_friction(tmp_path_factory):
-    return six(tmp_path_factory.mktemp("arm"), '<dynamics damping="8" friction="2"/>')
-
-
 def pose_of(of, qpos, name):
     return ts.link_poses(of.kinematic_tree(), qpos, [name])[..., 0, :]
 
@@ -43,10 +38,6 @@ def pose_of(of, qpos, name):
     [
         ("panda", "sapien"),
         ("six_joints", "mujoco"),
-        *(
-            pytest.param("with_friction", engine, marks=pytest.mark.slow)
-            for engine in ("sapien", "mujoco")
-        ),
     ],
 )
 def test_a_circle_is_followed_within_a_millimetre(name, engine, request):
@@ -103,19 +94,6 @@ def test_quaternions_have_any_length_but_zero_and_fingers_their_setpoint(panda):
     np.testing.assert_array_equal(rollout.qpos[:, 0], rollout.qpos[:, 3])
     np.testing.assert_allclose(rollout.qpos[:, 1], rollout.qpos[:, 0], atol=1e-6)
     np.testing.assert_allclose(rollout.qpos[-1, 0, 7:], [panda.start[7], 0.035], atol=1e-3)
-
-
-def test_later_writes_to_params_have_no_effect(panda):
-    params = ts.make_osc_params(panda.kinematic_tree(), effort_limit=panda.effort_limit)
-    own = params._replace(stiffness=np.array(params.stiffness))
-    control = OperationalSpace(panda, "panda_hand", params=own)
-    target = np.add(control.command.neutral, 0.02)
-    with Runner(panda, 1, control=control, workers=0) as runner:
-        effort = runner.step(target).effort
-        own.stiffness[:] = 1.0
-        runner.reset()
-        again = runner.step(target).effort
-    np.testing.assert_array_equal(effort, again)
 
 
 def test_a_tool_has_a_point_and_the_neutral_setpoint_is_its_pose(panda):
@@ -248,20 +226,3 @@ def test_joints_with_limited_efforts_are_reported(panda, kind, backend):
     assert not rollout.saturated[:, 0].any()
     assert rollout.saturated[0, 1, :7].any()
     assert not rollout.saturated[0, 1, 7:].any()
-
-
-@pytest.mark.parametrize("twist", [False, True])
-def test_native_friction_is_that_of_numpy(with_friction, twist, monkeypatch):
-    control = OperationalSpace(with_friction, "l6", twist=twist).in_runner(1 / 2000, "friction")
-    rng, rows = np.random.default_rng(0), 9
-    qpos, qvel, passive = rng.normal(size=(3, rows, with_friction.dof))
-    setpoint = np.tile(control.command.neutral, (rows, 1)) + 0.1 * rng.normal(
-        size=(rows, control.command.size)
-    )
-    state, efforts = control.init(with_friction, rows), []
-    for switch in ("1", "0"):
-        monkeypatch.setenv("BATCHPID_NATIVE", switch)
-        efforts.append(control(state, setpoint, qpos, qvel, passive)[1])
-    np.testing.assert_allclose(*efforts, rtol=1e-9, atol=1e-9)
-    idle = OperationalSpace(with_friction, "l6", twist=twist).in_runner(1 / 2000, "none")
-    assert np.abs(efforts[0] - idle(state, setpoint, qpos, qvel, passive)[1]).max() > 1.0
