@@ -21,8 +21,9 @@ from batchpid.sim.robot.description import RobotDescription
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.link_repair import SHAPES
 from batchpid.sim.robot.meshes import find_mesh, read_mesh
+from batchpid.sim.robot.reader import is_mjcf
 from batchpid.sim.robot.tables import Shape
-from batchpid.sim.robot.urdf import is_mjcf, read_origin, read_shape
+from batchpid.sim.robot.urdf import read_origin, read_shape
 from batchpid.sim.robot.xml import numbers, parse_xml
 from batchpid.task_space.rotations import rotate
 

@@ -1,7 +1,4 @@
-"""URDF reader: parses safely, repairs the text, resolves meshes, and reads the tables of the robot.
-
-MJCF files are read by :mod:`batchpid.sim.robot.mjcf`.
-"""
+"""URDF reader: repairs the elements, resolves meshes, and reads the tables of the robot."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from lxml import etree
 
 from batchpid.arrays.array_types import Document, Float64
 from batchpid.arrays.read_only import read_only
-from batchpid.errors import MissingDependencyError, RobotError
+from batchpid.errors import RobotError
 from batchpid.motors import Actuators
 from batchpid.sim.robot.findings import Finding, finding_of
 from batchpid.sim.robot.joint_repair import ends_of, free_base, free_joint_of
@@ -26,7 +23,7 @@ from batchpid.sim.robot.parts import FileDefaults, Joint, Mimic, MjcfFile
 from batchpid.sim.robot.repair import repair
 from batchpid.sim.robot.self_collision import DisabledPair
 from batchpid.sim.robot.tables import Body, Shape, Tables, breadth_first
-from batchpid.sim.robot.xml import number, numbers, parse_xml
+from batchpid.sim.robot.xml import number, numbers
 from batchpid.task_space.rotations import from_rpy
 
 MOST_READ = 4096  # links and joints of a file
@@ -55,31 +52,19 @@ class Source(NamedTuple):
     actuators: Actuators | None = None
 
 
-def is_mjcf(root: etree._Element) -> bool:
-    """Return whether a root element is an MJCF file's; MuJoCo ignores a default namespace."""
-    return root.prefix is None and etree.QName(root).localname == "mujoco"
-
-
-def read_robot(
-    path: Path, fixed_base: bool | None, package_dirs: tuple[Path, ...], missing_meshes: str
+def read_urdf(
+    root: etree._Element,
+    path: Path,
+    findings: list[Finding],
+    fixed_base: bool | None,
+    package_dirs: tuple[Path, ...],
+    missing_meshes: str,
 ) -> Source:
-    """Return the robot in the URDF or MJCF file at ``path``.
+    """Return the robot of the root element of a URDF, with ``findings`` of reading the file.
 
-    For the arguments see :meth:`batchpid.sim.Robot.load`.
-
-    Raises
-    ------
-    RobotError
-        A file that cannot be read, a structure or number that SAPIEN cannot build, a bad mesh, or
-        an MJCF file that MuJoCo does not compile.
-    MissingDependencyError
-        The file is MJCF, and the package ``mujoco`` is missing.
+    The element is repaired in place. Raises RobotError for a structure or number that SAPIEN cannot
+    build, or a bad mesh.
     """
-    findings: list[Finding] = []
-    root = parse_xml(path, findings)
-    if is_mjcf(root):
-        source = _read_mjcf(path, root, fixed_base is not False, missing_meshes)
-        return source._replace(repairs=(*findings, *source.repairs))
     free_joint, base = free_joint_of(root), None
     fixed_base = free_joint is None if fixed_base is None else fixed_base
     if free_joint is not None and not fixed_base:
@@ -89,25 +74,6 @@ def read_robot(
     tables = _read_tables(root, path, added)
     name, oddities = root.get("name", path.stem), tuple(_degrees(root))
     return Source(name, tables, tuple(findings), fixed_base, base, oddities)
-
-
-def _read_mjcf(path: Path, root: etree._Element, fixed_base: bool, missing_meshes: str) -> Source:
-    if not path.is_file():
-        raise RobotError(
-            f"{path}: an MJCF file is read several times, also by workers; save it as a file first"
-        )
-    try:
-        import mujoco  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError("mujoco>=3.17", "reading an MJCF file") from error
-    from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
-
-    try:
-        return read_mjcf(path, root.get("model") or path.stem, fixed_base, missing_meshes)
-    except UnicodeDecodeError as error:
-        raise RobotError(
-            f"{path}: a name is not UTF-8, which MuJoCo requires: {error}; save it as UTF-8"
-        ) from error
 
 
 def _repair(

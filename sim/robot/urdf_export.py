@@ -20,9 +20,9 @@ from batchpid.sim.robot.findings import summary
 from batchpid.sim.robot.link_repair import MOMENTS
 from batchpid.sim.robot.merging import link_inertias
 from batchpid.sim.robot.meshes import find_mesh
+from batchpid.sim.robot.reader import is_mjcf, read_robot
 from batchpid.sim.robot.repair import UNUSED
 from batchpid.sim.robot.tables import NO_TURN, Body, Shape
-from batchpid.sim.robot.urdf import is_mjcf, read_robot
 from batchpid.sim.robot.xml import parse_xml
 from batchpid.task_space.rotations import to_rpy
 
