@@ -118,13 +118,6 @@ def test_a_tool_is_moved_to_a_pose(saved):
     assert line.split()[-1] == f"{errors.max():.2g}"
 
 
-@pytest.mark.slow
-def test_picture(batchpid, tmp_path):
-    path = tmp_path / "run.svg"
-    assert batchpid("rollout", *SHORT, "--picture", path)[0] == 0
-    assert "panda_joint7" in path.read_text()
-
-
 def test_the_figures_are_those_of_the_table(batchpid, tmp_path):
     files = ("--json", tmp_path / "a.json", "--picture", tmp_path / "a.svg")
     status, said, error = batchpid(
@@ -140,6 +133,7 @@ def test_the_figures_are_those_of_the_table(batchpid, tmp_path):
     )
     row = figures["joints"]["panda_joint4"]
     line = next(line for line in said.splitlines() if line.startswith("panda_joint4"))
+    assert "panda_joint7" in (tmp_path / "a.svg").read_text()
     assert f" {max(row['steady_state_error']):.2g} " in line
     assert f" {max(row['settling_time']):.2f} s" in line
 
