@@ -12,7 +12,7 @@ import pytest
 import batchpid as bp
 from batchpid.sim import Robot, Runner, read_recording
 from batchpid.trajectories import Trajectory, minimum_jerk
-from tests.sim.tiny_urdf import LIMIT, joint, link, one_joint, robot, write
+from tests.sim.tiny_urdf import gripper, joint, link, one_joint, write
 
 SHORT = ("--num-envs", 3, "--workers", 0, "--seconds", 0.05)
 FILE = "run.h5"
@@ -265,23 +265,10 @@ def test_changes_beyond_the_velocity_limits_are_steps(batchpid, tmp_path, panda)
 
 
 def test_rates_take_the_short_way_round_and_followers_need_no_column(saved, tmp_path):
-    follower = joint(
-        "right",
-        "base",
-        "r",
-        inner=LIMIT + '<mimic joint="left" multiplier="-0.5"/>',
-        origin="0 -1 1",
-    )
     turning = joint(
         "turn", "base", "t", "continuous", '<limit effort="50" velocity="9"/>', origin="0 3 1"
     )
-    parts = (
-        *map(link, ("base", "l", "r", "t")),
-        follower,
-        joint("left", "base", "l", origin="0 1 1"),
-        turning,
-    )
-    arm, path = write(tmp_path, robot(*parts)), tmp_path / "motion.csv"
+    arm, path = write(tmp_path, gripper(link("t"), turning)), tmp_path / "motion.csv"
     path.write_text(
         "time,setpoint:left,setpoint:turn\n0,0.1,3.13\n0.01,0.12,-3.13\n0.02,0.14,-3.11\n"
     )
