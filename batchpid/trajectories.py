@@ -22,6 +22,7 @@ from batchpid.arrays.array_types import Float64
 from batchpid.arrays.display import array_summary
 from batchpid.checks.validate import at_least, broadcast, entries, positive, read_array, time_step
 from batchpid.errors import InvalidArgumentError
+from batchpid.task_space.rotations import multiply
 
 _PEAK_VELOCITY = 15 / 8  # of the minimum-jerk s, times T
 _PEAK_ACCELERATION = 10 / math.sqrt(3)  # times T^2
@@ -152,6 +153,76 @@ def minimum_jerk(
     rate = 30 * tau**2 * (1 - tau) ** 2 / safe
     acceleration = 60 * tau * (1 - tau) * (1 - 2 * tau) / safe**2
     return _trajectory(time, x0, way, s, rate, acceleration, done=tau >= 1 - _ROUNDING)
+
+
+def straight_line(start: ArrayLike, target: ArrayLike, dt: float, *, duration: float) -> Trajectory:
+    """Return the minimum-jerk move of a tool between two poses: on a straight line, while it turns
+    about one axis (slerp; K. Shoemake, Animating rotation with quaternion curves, 1985).
+
+    ``np.hstack(path[1:])`` are the setpoints of ``OperationalSpace(..., twist=True,
+    acceleration=True)``.
+
+    Parameters
+    ----------
+    start, target
+        Poses (7,): x, y, z [m], qw, qx, qy, qz. Of the two ways round, the shorter one is taken.
+    dt, duration
+        Time of a tick and of the move [s].
+
+    Returns
+    -------
+    Trajectory
+        Poses (ticks, 7); twists (ticks, 6) [m/s, rad/s] and their derivatives, in the world's axes.
+    """
+    first, last = (broadcast(name, x, (7,)) for name, x in (("start", start), ("target", target)))
+    q0, q1 = (pose[3:] / np.linalg.norm(pose[3:]) for pose in (first, last))
+    turn = multiply(q1, q0 * np.array([1, -1, -1, -1]))
+    turn = turn if turn[0] >= 0 else -turn
+    sine = np.linalg.norm(turn[1:])
+    angle = 2 * np.arctan2(sine, turn[0])
+    axis = turn[1:] / max(sine, 1e-300)  # a turn by 0 needs none
+    way = np.concatenate([last[:3] - first[:3], angle * axis])
+    s = minimum_jerk([0.0], [1.0], dt, duration=duration)
+    half = s.position * angle / 2
+    q = multiply(np.concatenate([np.cos(half), np.sin(half) * axis], 1), q0)
+    position = np.concatenate([first[:3] + s.position * way[:3], q], 1)
+    return Trajectory(s.time, position, s.velocity * way, s.acceleration * way)
+
+
+def sine(
+    center: ArrayLike,
+    amplitude: ArrayLike,
+    dt: float,
+    *,
+    frequency: float,
+    duration: float,
+    fade: float = 1.0,
+) -> Trajectory:
+    """Return oscillations about ``center`` that grow from rest within ``fade`` [s].
+
+    ``x(t) = center + a(t) sin(2 pi f t)``, where a(t) rises to the amplitude as a minimum-jerk
+    move: the first setpoint has no jump of position, rate or acceleration.
+
+    Parameters
+    ----------
+    center, amplitude
+        (joints,) or (envs, joints) [rad or m].
+    dt, duration
+        Time of a tick and of the trajectory [s].
+    frequency
+        f [Hz].
+    """
+    low, way = _move(center, np.add(center, amplitude))
+    time = _ticks(dt, np.array(positive("duration", duration, "s")))
+    growth = minimum_jerk([0.0], [1.0], dt, duration=positive("fade", fade, "s"))
+    growth = growth.hold(duration)
+    a, rate, change = (part[: len(time), 0] for part in growth[1:])
+    w = 2 * np.pi * positive("frequency", frequency, "Hz")
+    sin, cos = np.sin(w * time), np.cos(w * time)
+    # Products of the growth and the wave, and their derivatives.
+    rows = (a * sin, rate * sin + w * a * cos, (change - w**2 * a) * sin + 2 * w * rate * cos)
+    shares = [row[(...,) + (None,) * way.ndim] for row in rows]
+    return Trajectory(time, low + shares[0] * way, shares[1] * way, shares[2] * way)
 
 
 def trapezoidal(

@@ -116,7 +116,7 @@ class Scene(Group):
         ),
     ] = DEFAULT_ENGINE
     """Physics engine: ``"sapien"``, the reference and the default where it is installed, or
-    ``"mujoco"``, several times as fast (docs/two-engines.md).
+    ``"mujoco"``, several times as fast (docs/performance.md).
     """
     physics: Annotated[
         PhysicsPreset | Physics | MujocoSolver,

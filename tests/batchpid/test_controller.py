@@ -101,7 +101,7 @@ def test_params_of_another_size_or_type_are_refused_and_change_nothing(kind):
 
 def test_a_missing_jax_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax", None)
-    with pytest.raises(bp.MissingDependencyError, match=r"batchpid\[jax\]"):
+    with pytest.raises(bp.MissingDependencyError, match=r"\.\[jax\]"):
         bp.BatchPID(PARAMS, ENVS, DT, "jax")
 
 

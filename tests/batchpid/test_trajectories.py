@@ -6,7 +6,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from batchpid.errors import InvalidArgumentError
-from batchpid.trajectories import Trajectory, minimum_jerk, trapezoidal
+from batchpid.task_space.rotations import rotate
+from batchpid.trajectories import (
+    Trajectory,
+    minimum_jerk,
+    sine,
+    straight_line,
+    trapezoidal,
+)
 
 DT = 0.004
 LIMITS = {"max_velocity": [1.0, 2.0, np.inf], "max_acceleration": [3.0, 8.0, 5.0]}
@@ -129,3 +136,27 @@ def test_trajectories_can_be_joined_and_held():
         there.then(minimum_jerk([0.0, 0.0], [1.0, 2.0], 0.01, duration=0.1))
     with pytest.raises(InvalidArgumentError, match="same shape"):
         there.then(minimum_jerk([0.0], [1.0], DT, duration=0.1))
+
+
+def test_a_sine_grows_from_rest_to_its_amplitude():
+    wave = sine([0.5, -1.0], [0.2, 0.1], DT, frequency=0.5, duration=5.0, fade=1.5)
+    steps = np.diff(wave.position, axis=0) / DT
+    np.testing.assert_allclose(steps, wave.velocity[1:], atol=2 * DT)
+    np.testing.assert_allclose(np.diff(wave.velocity, axis=0) / DT, wave.acceleration[1:], atol=0.1)
+    np.testing.assert_allclose(wave.position[0], [0.5, -1.0], atol=1e-6)
+    late = wave.position[wave.time > 2.0] - [0.5, -1.0]
+    np.testing.assert_allclose(np.abs(late).max(0), [0.2, 0.1], rtol=1e-3)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_tool_moves_on_a_straight_line_and_turns_about_one_axis(sign):
+    start = np.array([0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])
+    target = np.array([0.4, 0.0, 0.3, *(sign * np.array([np.cos(0.6), 0.0, np.sin(0.6), 0.0]))])
+    path = straight_line(start, target, DT, duration=0.8)
+    assert np.hstack(path[1:]).shape == (200, 19)
+    np.testing.assert_allclose(path.position[-1, :3], target[:3], atol=1e-12)
+    ends = rotate(np.stack([path.position[-1, 3:], target[3:]]), np.array([1.0, 2.0, 3.0]))
+    np.testing.assert_allclose(*ends, atol=1e-12)
+    angle = 2 * np.arccos(path.position[:, 3])  # about y, from 0 to 1.2 rad
+    np.testing.assert_allclose(np.diff(angle) / DT, path.velocity[1:, 4], atol=0.05)
+    np.testing.assert_allclose(path.velocity[-1], 0, atol=1e-12)

@@ -49,7 +49,7 @@ def test_every_keyword_is_an_option_and_is_shown_with_its_default():
 def test_a_missing_jax_is_named_with_its_extra_before_a_worker_starts(monkeypatch):
     monkeypatch.setitem(sys.modules, "jax", None)
     with pytest.raises(
-        MissingDependencyError, match=r"backend='jax' needs the package 'jax'.*batchpid\[jax\]"
+        MissingDependencyError, match=r"backend='jax' needs the package 'jax'.*\.\[jax\]"
     ):
         Runner(PANDA, 1, backend="jax")
 
