@@ -299,7 +299,7 @@ def error(
     return InvalidArgumentError(f"{source}: {key}", problem, joint=joint, remedy=remedy)
 
 
-def plain(column: Rows) -> object:
+def plain(column: Rows) -> Any:
     """Return a joint's option as one plain value, or a list of one per env."""
     values = column.tolist()
     if column.dtype == np.float32:

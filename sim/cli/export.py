@@ -175,7 +175,7 @@ def _controllers(
         params.for_joints(leaders),
         [robot.joint_names[joint] for joint in np.flatnonzero(leaders)],
         dt,
-        name=name,
+        name=name or "joint_trajectory_controller",
         inertia=_inertia(robot)[:, leaders],
     )
     if limits:

@@ -10,6 +10,7 @@ import dataclasses
 import json
 import os
 import pickle
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -135,6 +136,17 @@ def array(name: str, change: Callable[[np.ndarray], Any] | None) -> Callable[...
     return damage
 
 
+def params(pattern: str, text: str) -> Callable[..., None]:
+    """Return a damage that changes the text of the params."""
+
+    def damage(head: Any, tables: dict[str, Any]) -> None:
+        head["params"], count = re.subn(pattern, text, head["params"])
+        assert count
+
+    return damage
+
+
+KP = r'(?<="kp": )([-\d.]+|\[[^]]*\])'
 DAMAGES = {
     "an older format": head(format=2),
     "no description": head(about=None),
@@ -142,8 +154,8 @@ DAMAGES = {
     "negative steps": head(steps=-1),
     "half a step": head(steps=1.5),
     "more steps than an integer holds": head(steps=10**30),
-    "an unknown choice": head(choices={"anti_windup": "Evil"}),
-    "the choice of another field": head(choices={"kp": "Everywhere"}),
+    "an unknown choice": params('"explicit"', '"evil"'),
+    "no params": head(params=None),
     "more envs than memory": about(num_envs=10**12),
     "more envs than rows": about(num_envs=10**9),
     "envs as text": about(num_envs="2"),
@@ -166,15 +178,11 @@ DAMAGES = {
     "a joint beyond": array("containment.joint", lambda rows: rows + ARM.dof),
     "a negative joint": array("containment.joint", lambda rows: rows - 1),
     "a cause beyond": array("containment.cause", lambda rows: rows + 99),
-    "gains that are not numbers": array("params.kp", lambda rows: rows * np.nan),
-    "negative gains": array("params.kp", lambda rows: -rows),
-    "whole gains": array("params.kp", lambda rows: rows.astype(int)),
-    "gains as text": array("params.kp", lambda rows: np.array("x")),
+    "gains that are not numbers": params(KP, "NaN"),
+    "negative gains": params(KP, "-1.0"),
+    "gains as text": params(KP, '"x"'),
     "a motion of one row": array("motion", lambda rows: rows[:1]),
     "a motion of another precision": array("motion", np.float32),
-    "numbers in place of a choice": array(
-        "params.integration", lambda rows: np.zeros((1, ARM.dof))
-    ),
 }
 
 
