@@ -85,7 +85,7 @@ GONE = (
     r"--measured\b",
     r"measured_motors",
     r"measured_rate\b",
-    r"merge_fixed\b",
+    r"merge_fixed=",
     r"motors\.presets",
     r"mujoco[.]pid",
     r"NoDecoupling|PartialDecoupling",

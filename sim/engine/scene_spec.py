@@ -6,7 +6,7 @@ A variation changes a robot's inertias, and the friction and damping of its join
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -40,7 +40,8 @@ class SceneSpec:
     ``physics`` are the solver settings of ``engine``, in the engine's type. Without ``collisions``
     scenes have no collision shapes and no ground, but the same masses and inertias. ``mjcf`` is the
     file that MuJoCo compiles in place of ``tables``. ``contacts`` and ``wrenches`` are links with
-    sensors. Specs that differ in ``build`` alone are equal.
+    sensors. ``carrier`` is the link that carries payloads, and ``varied_links`` are those whose mass
+    or center of mass varies. Specs that differ in ``build`` alone are equal.
     """
 
     tables: Tables
@@ -58,6 +59,8 @@ class SceneSpec:
     contacts: tuple[str, ...] | None = None
     wrenches: tuple[str, ...] | None = None
     mjcf: MjcfFile | None = None
+    carrier: str = ""
+    varied_links: tuple[str, ...] = ()
 
     @property
     def simulated(self) -> Tables:
@@ -104,9 +107,6 @@ class VariedMasses:
     """Inertias of the simulated links of ``size`` robots that differ by ``variation``, one row for
     each.
 
-    ``carrier`` is the link of the URDF that carries the payload; ``links`` are those whose mass or
-    center varies.
-
     Attributes
     ----------
     added
@@ -114,15 +114,13 @@ class VariedMasses:
         no mass varies.
     """
 
-    def __init__(
-        self, spec: SceneSpec, size: int, variation: Variation, carrier: str, links: Sequence[str]
-    ) -> None:
-        self._variation, self._bodies = variation, dict[str, BodyParts]()
+    def __init__(self, spec: SceneSpec, size: int, variation: Variation) -> None:
+        self._variation = variation
+        self._bodies: dict[str, BodyParts] = {}
         varies_links = variation.link_mass is not None or variation.center_of_mass is not None
         if varies_links or variation.payload is not None:
-            self._bodies = varied_bodies(
-                spec.tables, spec.separate, carrier, links if varies_links else []
-            )
+            links = spec.varied_links if varies_links else ()
+            self._bodies = varied_bodies(spec.tables, spec.separate, spec.carrier, links)
         self._nominal = {
             name: total([part.inertia for part in body.parts])
             for name, body in self._bodies.items()

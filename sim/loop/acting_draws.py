@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -69,11 +70,9 @@ def make_pack(
     make = options.load_engine().make_pack
     if randomization is None or not randomization.changes_robot:
         return make(scene, size, first_env, workspace=workspace)
-    varied = variation(options, size, draws)
-    links = elements("link_mass", options.robot)
-    return make(
-        scene, size, first_env, varied, randomization.carrier(options.robot), links, workspace
-    )
+    links = tuple(elements("link_mass", options.robot))
+    scene = replace(scene, carrier=randomization.carrier(options.robot), varied_links=links)
+    return make(scene, size, first_env, variation(options, size, draws), workspace)
 
 
 def variation(options: RunnerOptions, size: int, draws: Draws | None) -> Variation:

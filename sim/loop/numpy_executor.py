@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from batchpid.arrays.array_types import Float64, Rows
-from batchpid.sim.engine.protocol import CompiledPack, CompiledStep, DrivenPack, EnginePack
+from batchpid.sim.engine.protocol import CompiledPack, CompiledStep, EnginePack
 from batchpid.sim.loop.arrays import Command
 from batchpid.sim.loop.control_step import COUPLING_STEPS, sim_step
 from batchpid.sim.loop.custom import controller_errors
@@ -105,9 +105,8 @@ class NumPyExecutor:
 
     def _write_targets(self, layout: Layout, constants: Constants, values: Values) -> Values:
         """Write the targets of the drives where they move, since it costs a call for each joint."""
-        pack = self.setup.pack
+        pack: Any = self.setup.pack
         if values.step.index == self._first or moves_drives(layout, constants):
-            assert isinstance(pack, DrivenPack)
             pack.write_drive_target(values.outputs.target, values.outputs.target_rate)
         return values
 
@@ -166,8 +165,7 @@ class EngineSteps:
 
     def compiled(self) -> CompiledStep:
         """Return the native sim step of the present robots."""
-        pack = self._setup.pack
-        assert isinstance(pack, CompiledPack)
+        pack: Any = self._setup.pack  # a CompiledPack, which takes long to check
         if self._step is None or self._bound is not pack.calls:
             parts = self._parts if self.native_force else (False, False)
             drives = self._setup.layout.control == "drive"

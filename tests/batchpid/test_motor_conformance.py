@@ -244,11 +244,13 @@ def test_signals_are_those_of_plain_numbers(case, name, seed, request):
         request.getfixturevalue("x64")
     made = CASES[case](np.random.default_rng(seed), dtype)
     run, _ = EXECUTORS[name]
-    found = [
-        [np.broadcast_to(np.asarray(each, float), SHAPE) for each in row]
-        for row in run(made, dtype)
-    ]
-    found = np.moveaxis(np.array(found), 0, 1)  # signals, steps, envs, joints
+
+    def signals(rows):
+        """Return the signals (signals, steps, envs, joints)."""
+        found = [[np.broadcast_to(np.asarray(each, float), SHAPE) for each in row] for row in rows]
+        return np.moveaxis(np.array(found), 0, 1)
+
+    found = signals(run(made, dtype))
     wanted = np.array(
         [[list(made.oracle(env, joint)) for joint in range(JOINTS)] for env in range(ENVS)], float
     )
@@ -258,8 +260,4 @@ def test_signals_are_those_of_plain_numbers(case, name, seed, request):
     )  # a resolution, or the last step to a setpoint, may round away
     np.testing.assert_allclose(found, wanted, rtol=tolerance, atol=tolerance)
     if name == "programs":
-        plain = [
-            [np.broadcast_to(np.asarray(each, float), SHAPE) for each in row]
-            for row in by_numpy(made, dtype)
-        ]
-        np.testing.assert_array_equal(found, np.moveaxis(np.array(plain), 0, 1))
+        np.testing.assert_array_equal(found, signals(by_numpy(made, dtype)))

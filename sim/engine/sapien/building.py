@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from sapien import Pose, physx
 from sapien.wrapper.articulation_builder import ArticulationBuilder
 
-from batchpid.arrays.array_types import Document, Float64
+from batchpid.arrays.array_types import Float64
 from batchpid.errors import RobotError
 from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene, MirroringBuilder
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_groups import Words, link_groups
+from batchpid.sim.robot.collision_shapes import mesh_file
 from batchpid.sim.robot.meshes import note_meshes
 from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
 from batchpid.sim.robot.tables import Shape
@@ -101,7 +102,7 @@ def _add_shape(link: Any, shape: Shape) -> None:
     elif shape.kind == "cylinder":
         link.add_cylinder_collision(place * _ALONG_Z, *size, material)
     else:
-        link.add_convex_collision_from_file(shape.file, place, shape.scale, material)
+        link.add_convex_collision_from_file(mesh_file(shape), place, shape.scale, material)
 
 
 def _pose(position: Float64, axes: Float64) -> Pose:
@@ -139,13 +140,9 @@ def _principal(inertia: Float64, name: str) -> tuple[Float64, Float64]:
 def set_inertia(link: Any, inertia: SpatialInertia) -> None:
     """Give one of SAPIEN's links this inertia, in the frame of the link."""
     principal, axes = np.linalg.eigh(inertia.tensor)
-    at = np.eye(4)
-    at[:3, :3], at[:3, 3] = (
-        axes * np.linalg.det(axes),
-        inertia.center,
-    )  # a rotation, not a reflection
     link.set_mass(inertia.mass)
-    link.set_cmass_local_pose(Pose(at))
+    # A rotation, not a reflection.
+    link.set_cmass_local_pose(_pose(inertia.center, axes * np.linalg.det(axes)))
     link.set_inertia(principal)
 
 
@@ -198,8 +195,7 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
     """Return a new scene in ``system`` and the robot in it, with the ground and the dissipation of
     ``spec``.
 
-    Raises RobotError if SAPIEN cannot build a collision shape, which it would silently leave out,
-    or numbers the joints in another order than ours.
+    Raises RobotError if SAPIEN cannot build a collision shape, which it would silently leave out.
     """
     scene = HeadlessScene(system)
     with engine_settings(spec):
@@ -208,26 +204,7 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
         builder.set_scene(None)  # the scene can be freed
         if spec.ground and spec.collisions:
             scene.add_ground(0.0, render=False)
-    asked = {link.name: link.collision_records for link in builder.link_builders}
-    for link in robot.links:
-        if len(link.collision_shapes) != len(records := asked[link.name]):
-            files = ", ".join(record.filename for record in records if record.filename)
-            remedy = "repair the file, or remove that <collision>"
-            raise RobotError(
-                f"link {link.name!r}: SAPIEN cannot build a collision shape from {files}; {remedy}"
-            )
-    words = _shape_words(spec)
-    for link in robot.links:
-        for shape, groups in zip(link.collision_shapes, words[link.name], strict=True):
-            shape.set_collision_groups(groups)
-    names, ours = (
-        [joint.name for joint in robot.active_joints],
-        [joint.name for joint in spec.joints],
-    )
-    if names != ours:
-        raise RobotError(
-            f"SAPIEN numbers the joints {names}, not {ours}; please report it, with the URDF"
-        )
+    _set_words(spec, robot)
     robot.set_sleep_threshold(0.0)
     dissipation = DISSIPATION[spec.dissipation]
     for link in robot.links:
@@ -245,6 +222,22 @@ def build_scene(spec: SceneSpec, system: Any) -> tuple[HeadlessScene, Any]:
             built.set_drive_properties(0.0, 0.0)
             built.set_armature(np.array([spec.timestep * joint.damping], np.float32))
     return scene, robot
+
+
+def _set_words(spec: SceneSpec, robot: Any) -> None:
+    """Set the filter words of the shapes of a robot."""
+    words = _shape_words(spec)
+    for link in robot.links:
+        shapes = link.collision_shapes
+        if len(shapes) != len(words[link.name]):
+            meshes = [shape.file for shape in spec.simulated.shapes if shape.body == link.name]
+            files = ", ".join(filter(None, meshes))
+            remedy = "repair the file, or remove that <collision>"
+            raise RobotError(
+                f"link {link.name!r}: SAPIEN cannot build a collision shape from {files}; {remedy}"
+            )
+        for shape, groups in zip(shapes, words[link.name], strict=True):
+            shape.set_collision_groups(groups)
 
 
 @lru_cache(maxsize=8)
@@ -269,67 +262,55 @@ def link_frames(spec: SceneSpec, robot: Any) -> Frames:
 
 @lru_cache(maxsize=8)
 def scene_tree(spec: SceneSpec) -> RigidTree:
-    """Return the tree of the robot of ``spec``, all joints independent, the same object for equal
-    specs.
+    """Return the tree of the robot of ``spec`` as PhysX rounds it, all joints independent, the same
+    object for equal specs.
 
     Before each link but the base comes a link without mass, "LINK (joint)", in the frame of the
     joint above.
     """
     _scene, robot = build_scene(spec, new_system(spec))
-    rows: list[Document] = []
-    at: dict[Any, int] = {}
+    names: list[str] = []
+    parents: list[int] = []
+    kinds: list[str] = []
+    poses: list[Pose] = []
+    inertias: list[SpatialInertia] = []
+
+    def add(name: str, parent: int, kind: str, pose: Pose, inertia: SpatialInertia) -> None:
+        names.append(name)
+        parents.append(parent)
+        kinds.append(kind)
+        poses.append(pose)
+        inertias.append(inertia)
+
+    massless = SpatialInertia(0.0, np.zeros(3), np.zeros((3, 3)))
     for link in robot.links:
-        kind, turn = "fixed", np.diag([float(str(one)) for one in link.inertia])
-        axes, center = _place(link.cmass_local_pose)
-        inertia = {"mass": link.mass, "center": center, "inertia": axes @ turn @ axes.T}
+        axes = matrix_of(_wxyz(link.cmass_local_pose))
+        moments = np.diag([float(str(moment)) for moment in link.inertia])
+        inertia = SpatialInertia(link.mass, link.cmass_local_pose.p, axes @ moments @ axes.T)
         if link.parent is None:
-            rows.append(_row(link.name, -1, "fixed", None) | inertia)
-        else:
-            kind = {"fixed": "fixed", "prismatic": "prismatic"}.get(link.joint.type, "revolute")
-            rows.append(
-                _row(f"{link.name} (joint)", at[link.parent], kind, link.joint.pose_in_parent)
-            )
-            rows.append(
-                _row(link.name, len(rows) - 1, "fixed", link.joint.pose_in_child.inv()) | inertia
-            )
-        at[link] = len(rows) - 1
-    columns: Document = {
-        name: np.array([row[name] for row in rows])
-        for name in rows[0]
-        if name not in ("links", "joint_types")
-    }
-    names = tuple(joint.name for joint in spec.joints)
-    links, kinds = (tuple(row[name] for row in rows) for name in ("links", "joint_types"))
+            add(link.name, -1, "fixed", Pose(), inertia)
+            continue
+        kind = link.joint.type if link.joint.type in ("fixed", "prismatic") else "revolute"
+        above = names.index(link.parent.name)
+        add(f"{link.name} (joint)", above, kind, link.joint.pose_in_parent, massless)
+        add(link.name, len(names) - 1, "fixed", link.joint.pose_in_child.inv(), inertia)
     return RigidTree(
-        links,
-        joint_types=kinds,
-        joint_names=names,
-        **columns,
+        tuple(names),
+        np.array(parents),
+        tuple(kinds),
+        tuple(joint.name for joint in spec.joints),
+        position=np.array([pose.p for pose in poses], float),
+        wxyz=np.array([_wxyz(pose) for pose in poses]),
+        axis=np.tile([1.0, 0.0, 0.0], (len(names), 1)),
+        mass=np.array([inertia.mass for inertia in inertias]),
+        center=np.array([inertia.center for inertia in inertias], float),
+        inertia=np.array([inertia.tensor for inertia in inertias]),
         gravity=spec.gravity,
         fixed_base=spec.fixed_base,
     )
 
 
-def _row(name: str, parent: int, kind: str, pose: Any) -> Document:
-    """Return a link without mass at one of SAPIEN's poses in its parent."""
-    position, wxyz = (
-        (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])) if pose is None else (pose.p, _wxyz(pose))
-    )
-    empty = {"mass": 0.0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}
-    place = {
-        "position": np.asarray(position, float),
-        "wxyz": wxyz,
-        "axis": np.array([1.0, 0.0, 0.0]),
-    }
-    return {"links": name, "parent": parent, "joint_types": kind, **place, **empty}
-
-
-def _place(pose: Any) -> tuple[Float64, Float64]:
-    """Return axes (3, 3) and position (3,) of one of SAPIEN's poses."""
-    return matrix_of(_wxyz(pose)), np.asarray(pose.p, float)
-
-
-def _wxyz(pose: Any) -> Float64:
+def _wxyz(pose: Pose) -> Float64:
     """Return the rotation of one of SAPIEN's poses, by roll, pitch and yaw, as SAPIEN's own
     dynamics take it.
     """
