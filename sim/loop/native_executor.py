@@ -167,8 +167,8 @@ def run_ticks(
     of the tables; else the ticks stop at the end of the first one.
     """
     while executors:
-        call = native.extension("_gateway").ticks  # loaded only where a group is native
-        call(tuple([executor.prepare() for executor in executors]), until, steps, whole)
+        ticks = tuple([executor.prepare() for executor in executors])
+        native.extension("_gateway").ticks(ticks, until, steps, whole)
         executors = [executor for executor in executors if executor.is_waiting()]
 
 

@@ -21,6 +21,7 @@ from batchpid.errors import RobotError
 from batchpid.sim.engine.sapien.user_content import Frames, HeadlessScene, MirroringBuilder
 from batchpid.sim.engine.scene_spec import SceneSpec
 from batchpid.sim.robot.collision_groups import Words, link_groups
+from batchpid.sim.robot.collision_shapes import mesh_file
 from batchpid.sim.robot.meshes import note_meshes
 from batchpid.sim.robot.parts import CONTACT_FRICTION, DISSIPATION
 from batchpid.sim.robot.tables import Shape
@@ -101,7 +102,7 @@ def _add_shape(link: Any, shape: Shape) -> None:
     elif shape.kind == "cylinder":
         link.add_cylinder_collision(place * _ALONG_Z, *size, material)
     else:
-        link.add_convex_collision_from_file(shape.file, place, shape.scale, material)
+        link.add_convex_collision_from_file(mesh_file(shape), place, shape.scale, material)
 
 
 def _pose(position: Float64, axes: Float64) -> Pose:
