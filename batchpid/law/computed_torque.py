@@ -137,7 +137,7 @@ def _unlimited(k: Coefficients) -> Coefficients:
 
 def _to_effort(
     k: Coefficients, old: PIDState, new: PIDState, a: Array, mass_matrix: Array, feedforward: Array
-) -> tuple[PIDState, Any, Any]:
+) -> tuple[PIDState, Array, Array]:
     """Return the state, the effort of the acceleration ``a`` within the limits of ``k``, and
     without them.
     """

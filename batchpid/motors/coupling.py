@@ -47,7 +47,7 @@ def _of_followers(method: Callable[[Coupling, Any], Any]) -> Callable[[Coupling,
     """Return a method that returns its argument if no joint follows."""
 
     @wraps(method)
-    def call(self: Coupling, given: Any) -> Array:
+    def call(self: Coupling, given: Array) -> Array:
         return method(self, given) if self.shares else given
 
     return call
@@ -159,17 +159,17 @@ class Coupling(NamedTuple):
         return acting
 
     @_of_followers
-    def of_independent(self, figures: Any) -> Array:
+    def of_independent(self, figures: Array) -> Array:
         """Return ``figures`` with 0 for followers."""
         return namespace(figures).where(self.independent, figures, 0.0)
 
     @_of_followers
-    def of_leaders(self, figures: Any) -> Array:
+    def of_leaders(self, figures: Array) -> Array:
         """Return ``figures`` in which followers take the figures of their leaders."""
         return take_columns(figures, self.leader)
 
     @_of_followers
-    def of_all(self, figures: Any) -> Array:
+    def of_all(self, figures: Array) -> Array:
         """Return ``figures`` (..., independent) for all joints (..., joints); followers have their
         leaders' values.
         """

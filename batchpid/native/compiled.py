@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from batchpid.arrays.array_types import DType, Rows
+from batchpid.arrays.array_types import Array, DType, Rows
 from batchpid.arrays.trees import leaves, structure
 from batchpid.law.coefficients import Coefficients
 from batchpid.law.pid import advance
@@ -29,7 +29,7 @@ def _trace(structures: tuple[Any, ...], terms: bool, dtype: DType) -> tuple[Trac
     """
     kept: list[int] = []
 
-    def function(k: Coefficients, state: PIDState, inputs: tuple[Any, ...]) -> list[Any]:
+    def function(k: Coefficients, state: PIDState, inputs: tuple[Any, ...]) -> list[Array]:
         new, found = advance(k, state, *inputs)
         kept[:] = [at for at, leaf in enumerate(new) if leaf is not None]
         return [*(new[at] for at in kept), *(found.filled() if terms else ()), found.effort]
@@ -67,7 +67,7 @@ class CompiledLaw:
 
     def step(
         self, state: PIDState, inputs: tuple[Rows | None, ...], out: Rows | None
-    ) -> tuple[PIDState, Any, Terms | None, Callable[..., Any] | None]:
+    ) -> tuple[PIDState, Array, Terms | None, Callable[..., Any] | None]:
         """Advance the law; return the new state, the effort, the terms, and a fast function for the
         next steps.
 

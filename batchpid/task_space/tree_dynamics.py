@@ -117,7 +117,7 @@ def _of_base(tree: RigidTree, bodies: Bodies, all_: _Composite, xp: ArrayModule)
     return xp.concatenate([upper, xp.concatenate([crossed, tensor + zero], axis=-1)], axis=-2)
 
 
-def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayModule) -> Any:
+def mass_matrix_of(tree: RigidTree, bodies: Bodies, motions: Motions, xp: ArrayModule) -> Array:
     """Return the mass matrices (..., dof, dof) at given motions of the joints."""
     all_ = _composite(tree, bodies, motions, xp)
     s = xp.concatenate([motions.linear, motions.angular], axis=-1)
@@ -140,7 +140,7 @@ def effort_of(
     motions: Motions,
     rates: Velocities,
     xp: ArrayModule,
-    turning: Any = None,
+    turning: Array = None,
 ) -> Array:
     """Return the efforts (..., dof) of given velocities and accelerations of the bodies, without
     armature.
