@@ -115,8 +115,8 @@ class JAXBackend:
         def step(
             params: PIDParams, state: PIDState, *inputs: Array
         ) -> tuple[PIDState, Array, Terms | None]:
-            new, found = pid.advance(discretise(params, dt), state, *inputs)
-            return new, found.effort, found.filled() if terms else None
+            new, results = pid.advance(discretise(params, dt), state, *inputs)
+            return new, results.effort, results.filled() if terms else None
 
         def step_in_blocks(
             params: PIDParams, spare: PIDState, state: PIDState, *inputs: Array

@@ -58,12 +58,12 @@ def advance_in_blocks(
         def cut(x: Array) -> Array:
             return jax.lax.dynamic_slice_in_dim(x, start, block) if jnp.shape(x) == (total,) else x
 
-        new, terms = advance(*jax.tree.map(cut, given))
+        new, terms = advance(*jax.tree.map(cut, arguments))
         done = new, terms.effort
         return jax.tree.map(
             lambda x, part: jax.lax.dynamic_update_slice_in_dim(x, part, start, 0), out, done
         )
 
-    given = jax.tree.map(flat, (k, state, *inputs))
+    arguments = jax.tree.map(flat, (k, state, *inputs))
     out = jax.lax.fori_loop(0, -(-envs // rows), step, jax.tree.map(flat, out))
     return jax.tree.map(lambda x: x.reshape(envs, joints), out)

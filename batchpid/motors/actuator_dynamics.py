@@ -120,12 +120,12 @@ def init(
     xp = namespace(*actuators, qpos)
     zeros = xp.zeros_like(qpos)
     position, velocity = zeros + qpos, zeros if qvel is None else zeros + qvel
-    asked = zeros if effort is None else zeros + effort
+    requested = zeros if effort is None else zeros + effort
     command = sensor = encoder = key = step = None
     if actuators.max_delay is not None:
         samples = delay.samples_of(actuators.max_delay, dt) if samples is None else samples
         if actuators.command_delay is not None:
-            command = delay.start(asked, samples)
+            command = delay.start(requested, samples)
         if actuators.sensor_delay is not None:
             sensor = delay.start(xp.concatenate((position, velocity), axis=1), samples)
     if actuators.backlash is not None:
@@ -139,7 +139,9 @@ def init(
     if actuators.lag is None:
         return state
     k = discretise(actuators, state, dt)
-    return state._replace(effort=clip(_motor(k, asked), *limits(k.envelope, velocity), xp) + zeros)
+    return state._replace(
+        effort=clip(_motor(k, requested), *limits(k.envelope, velocity), xp) + zeros
+    )
 
 
 def discretise(
@@ -189,7 +191,7 @@ def discretise(
         return xp.broadcast_to(leaf, (*leaf.shape[:-2], num_envs, leaf.shape[-1])).copy()
 
     flat = {name: spread(leaf) for name, leaf in k._asdict().items() if not isinstance(leaf, tuple)}
-    ends, commands = (Envelope(*map(spread, each)) for each in (k.envelope, k.commands))
+    ends, commands = (Envelope(*map(spread, item)) for item in (k.envelope, k.commands))
     return k._replace(**flat, envelope=ends, commands=commands)
 
 

@@ -99,12 +99,12 @@ class Coupling(NamedTuple):
             leaders[joint], multipliers[joint], offsets[joint] = leader, multiplier, offset
         independent = np.array([joint not in direct for joint in range(joints)], bool)
         of_leader = [
-            [each for each in sorted(direct) if leaders[each] == joint] for joint in range(joints)
+            [item for item in sorted(direct) if leaders[item] == joint] for joint in range(joints)
         ]
         shares = list[Share]()
         for number in range(max(map(len, of_leader), default=0)):
-            exists = np.array([len(each) > number for each in of_leader])
-            chosen = np.array([each[number] if len(each) > number else 0 for each in of_leader])
+            exists = np.array([len(item) > number for item in of_leader])
+            chosen = np.array([item[number] if len(item) > number else 0 for item in of_leader])
             shares.append(
                 Share(*map(read_only, (exists, chosen, np.where(exists, multipliers[chosen], 0.0))))
             )

@@ -106,8 +106,8 @@ def frames_of_bodies(tree: RigidTree, bodies: Bodies, qpos: Array, xp: ArrayModu
         )
         frames: list[Any] = []
         for joint, above in enumerate(tree.body_parents):
-            own = local[..., joint, :, :]
-            frames.append(own if above < 0 else turned(frames[above], own))
+            part = local[..., joint, :, :]
+            frames.append(part if above < 0 else turned(frames[above], part))
         return xp.stack(frames, axis=-3)
 
 
@@ -156,10 +156,10 @@ def from_tips(tree: RigidTree, parts: Array, xp: ArrayModule) -> Array:
 
 def frame_of_link(tree: RigidTree, bodies: Bodies, frames: Array, index: int) -> Array:
     """Return the frame (..., 3, 4) of a link, from the frames of the bodies."""
-    body, own = tree.link_bodies[index], bodies.link_frames[index]
+    body, part = tree.link_bodies[index], bodies.link_frames[index]
     if body >= 0:
-        return turned(frames[..., body, :, :], own)
-    return own + namespace(frames).zeros_like(frames[..., 0, :, :])
+        return turned(frames[..., body, :, :], part)
+    return part + namespace(frames).zeros_like(frames[..., 0, :, :])
 
 
 def tool_frame(tree: RigidTree, bodies: Bodies, frames: Array, index: int, point: Array) -> Array:
