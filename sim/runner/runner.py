@@ -110,7 +110,7 @@ class Runner(SingleOwner):
         self.recorder: TickRecorder | None = None
         """Recorder of every tick; :class:`batchpid.sim.Recorder` sets it."""
         self._call, self._warnings = OneCall(), RunWarnings(checked)
-        self._tool_pose = checked.tool_pose
+        self._derived = checked.derived
         self._state = RunnerState.first(checked)
         self._sent: Run | None = None  # and not completed yet
         self._unreceived: Observation | None = None
@@ -202,7 +202,7 @@ class Runner(SingleOwner):
         self._ready("reset")
         limits, base = self._warnings.limits, (base_pose, base_twist)
         self._execute(Reset.read(self.options, self._state, limits, (qpos, qvel), mask, seed, base))
-        return self._pool.present.observation.copied(self._tool_pose)
+        return self._pool.present.observation.copied(self._derived)
 
     def step(
         self,
@@ -245,7 +245,7 @@ class Runner(SingleOwner):
             self._ready("step")
         command = setpoint, setpoint_rate, setpoint_acceleration, feedforward
         self._execute(self._tick(command, substeps))
-        return self._pool.present.observation.copied(self._tool_pose)
+        return self._pool.present.observation.copied(self._derived)
 
     def send(
         self,
@@ -338,8 +338,8 @@ class Runner(SingleOwner):
                         : done - number
                     ]
         next(shown, None)  # the end
-        if options.tool_pose is not None:
-            seen = seen._replace(tool_pose=options.tool_pose(seen.qpos))
+        further = {name: derive(seen) for name, derive in options.derived.items()}
+        seen = seen._replace(**further)
         if (faults := self._state.faults.faults) is not info.faults:
             info = replace(info, faults=faults)
         return Rollout(times, command.setpoint, seen, tick, info, command.feedforward)
@@ -347,7 +347,7 @@ class Runner(SingleOwner):
     def observe(self) -> Observation:
         """Return the state of every env, as fresh arrays."""
         self._ready()
-        return self._pool.present.observation.copied(self._tool_pose)
+        return self._pool.present.observation.copied(self._derived)
 
     def poses(self) -> NDArray[np.float32]:
         """Return the poses of the entities that ``build`` returned (envs, entities, 7): x, y, z
@@ -453,7 +453,7 @@ class Runner(SingleOwner):
         self._execute(restore)
         self._pool.start_replay_from(restore)
         self._warnings.set_params(self._state.params)
-        return self._pool.present.observation.copied(self._tool_pose)
+        return self._pool.present.observation.copied(self._derived)
 
     def settle(self) -> None:
         """Complete a tick that :meth:`send` began, as every other method does first."""
@@ -690,7 +690,7 @@ class Runner(SingleOwner):
                     (
                         None
                         if outcome.failure
-                        else self._pool.present.observation.copied(self._tool_pose)
+                        else self._pool.present.observation.copied(self._derived)
                     ),
                 )
             if outcome.failure is not None and operation.changes_loop:
@@ -731,7 +731,7 @@ class Runner(SingleOwner):
             recorder.append(
                 time,
                 run.command.map(itemgetter(number)),
-                arrays.observation.copied(self._tool_pose),
+                arrays.observation.copied(self._derived),
             )
 
     def _fail(self, error: BaseException) -> None:
