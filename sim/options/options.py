@@ -181,9 +181,8 @@ class RunnerOptions(RunnerKeywords):
     @cached_property
     def observed(self) -> dict[str, Quantity]:
         """Quantities that the loop observes."""
-        links = {"contacts": self.contacts, "wrenches": self.wrenches}
-        quantities = observed(self.robot.fixed_base, **links).items()
-        return {name: quantity for name, quantity in quantities if quantity.derive is None}
+        quantities = observed(self.robot.fixed_base, contacts=self.contacts, wrenches=self.wrenches)
+        return {name: quantity for name, quantity in quantities.items() if quantity.derive is None}
 
     @property
     def misses_contacts(self) -> bool:
@@ -275,6 +274,7 @@ class RunnerOptions(RunnerKeywords):
         InvalidArgumentError
             They do not fit.
         """
+        # The engine's drive replaces the motors' electronics, and not what is behind the gear.
         if actuators is None:
             actuators = self.robot.actuators or IDEAL
             if self.control == "drive":
@@ -304,6 +304,7 @@ class RunnerOptions(RunnerKeywords):
         for name, entry in OPTIONS.items():
             if place in entry.kept:
                 values[name] = getattr(self, entry.kept[place] or name)
+        # A recording is read without the classes of the engine and of the randomization.
         if place == "recording":
             values["physics"] = str(self.physics)
             if self.randomization is not None:

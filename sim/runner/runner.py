@@ -147,16 +147,12 @@ class Runner(SingleOwner):
 
     def __repr__(self) -> str:
         options = self.options
-        workers = len(self.pids)
-        nodes = len(self.nodes)
-        where = "closed" if self.closed else f"{workers} workers" if workers else "in this process"
-        further = "" if options.collisions else ", no collisions"
-        where = f"{nodes} nodes" if nodes else where
+        where = f"{len(self.nodes) or len(self.pids)} {'nodes' if self.nodes else 'workers'}"
+        state = "closed" if self.closed else f"at {self.time:g} s"
         return (
             f"Runner({self.robot.name}, {self.num_envs} envs, {where}, control"
-            f" {options.control_name!r}, compensate {options.compensate!r},\n       physics"
-            f" {options.physics!r}{further}, timestep {self.timestep:g} s, {self.substeps}"
-            f" substeps, at {self.time:g} s)"
+            f" {options.control_name!r}, {options.engine}, timestep {self.timestep:g} s,"
+            f" {self.substeps} substeps, {state})"
         )
 
     # -- commands
@@ -307,7 +303,7 @@ class Runner(SingleOwner):
             Wraps the range of ticks, e.g. ``tqdm.tqdm``.
         """
         self._ready("rollout")
-        given = {
+        arrays = {
             "setpoints": setpoints,
             "setpoint_rates": setpoint_rates,
             "setpoint_accelerations": setpoint_accelerations,
@@ -316,7 +312,7 @@ class Runner(SingleOwner):
         options, ticks = self.options, count_ticks(self.options, setpoints)
         tick = options.substeps * options.timestep
         command = read_command(
-            options, self._state, self._warnings.setpoint_limits, given, tick, ticks
+            options, self._state, self._warnings.setpoint_limits, arrays, tick, ticks
         )
         robot = options.robot
         done = 0
@@ -360,11 +356,8 @@ class Runner(SingleOwner):
         """
         self._ready()
         rows = self._read(ReadPoses())
-        counts = [len(row) for row in rows]
-        if not rows or len(set(counts)) > 1:
-            problem = (
-                f"returned {sorted(set(counts))} entities, by env" if rows else "was not given"
-            )
+        if len({len(poses) for poses in rows}) != 1:
+            problem = "was not given, or returned more entities for one env than for another"
             remedy = "let build(scene, env) return as many entities for every env"
             raise InvalidArgumentError("build", problem, remedy=remedy)
         return np.stack(rows)
@@ -467,12 +460,14 @@ class Runner(SingleOwner):
     def info(self) -> RunInfo:
         """Robot, options and origin of a run that starts now."""
         start = self.observe().qpos
-        state = self._state
-        options = self.options
-        draws = None if options.randomization is None else state.draws
+        state, options = self._state, self.options
+        drawn = {}
+        if options.randomization is not None:
+            drawn = {"draws": self.draws, "episodes": self.episodes}
         return RunInfo.of(
             options.robot,
             **options.values_for("recording"),
+            **drawn,
             own_command=options.own_command,
             params=state.params,
             actuators=state.actuators,
@@ -480,12 +475,6 @@ class Runner(SingleOwner):
             versions=dict(self._versions),
             begun=strftime("%Y-%m-%dT%H:%M:%S%z"),
             faults=state.faults.faults,
-            draws=(
-                None
-                if draws is None
-                else {name: rows.copy() for name, rows in draws.values.items()}
-            ),
-            episodes=None if draws is None else draws.episodes.copy(),
         )
 
     @cached_property
@@ -673,6 +662,7 @@ class Runner(SingleOwner):
         is_due = self.recorder is not None or self._state.steps_since_checkpoint >= CHECKPOINT_STEPS
         if is_due and run is not None and not is_sent:
             self._prepare_ticks()
+        # From here on Ctrl-C waits, so that workers and state change together or not at all.
         call.begin()
         try:
             call.waits, before = True, self._state
@@ -680,6 +670,7 @@ class Runner(SingleOwner):
                 pool.begin(operation)
             outcome = pool.finish()
             call.waits = False
+            # Ticks before a failure count: the workers have run them.
             if outcome.failure is None or run is not None:
                 self._state = operation.committed(before, outcome)
             if run is not None and self.recorder is not None:
@@ -704,6 +695,7 @@ class Runner(SingleOwner):
             call.end()
         if outcome.failure is not None:
             raise outcome.failure.error
+        # Warnings come last: as errors they must leave a runner that can go on.
         moving = self._warnings.moving
         if run is not None and moving is not None:
             rows, rates = run.command.setpoint[: outcome.num_ticks], run.command.setpoint_rate
@@ -758,5 +750,5 @@ class Runner(SingleOwner):
 
 _PARAMETERS = signature(RunnerOptions).parameters.items()
 Runner.__signature__ = Signature(
-    [each.replace(annotation=get_args(KINDS[name])[0]) for name, each in _PARAMETERS]
+    [one.replace(annotation=get_args(KINDS[name])[0]) for name, one in _PARAMETERS]
 )

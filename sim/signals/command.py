@@ -110,18 +110,10 @@ def own_command(control: object) -> CommandSpec | None:
     InvalidArgumentError
         The attribute is neither a CommandSpec nor a sequence of names.
     """
-    given = None if isinstance(control, str) else getattr(control, "command", None)
-    if given is None or isinstance(given, CommandSpec):
-        return given
-    try:
-        return CommandSpec(given)
-    except InvalidArgumentError as error:
-        raise InvalidArgumentError(
-            "control",
-            f"has an attribute 'command' whose {error.argument} {error.problem}",
-            value=given,
-            remedy="use a batchpid.sim.CommandSpec, or names such as ('x', 'y')",
-        ) from None
+    command = None if isinstance(control, str) else getattr(control, "command", None)
+    if command is None or isinstance(command, CommandSpec):
+        return command
+    return CommandSpec(command)
 
 
 def _texts(argument: str, value: object) -> tuple[str, ...]:
