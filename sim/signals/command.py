@@ -113,7 +113,12 @@ def own_command(control: object) -> CommandSpec | None:
     command = None if isinstance(control, str) else getattr(control, "command", None)
     if command is None or isinstance(command, CommandSpec):
         return command
-    return CommandSpec(command)
+    try:
+        return CommandSpec(command)
+    except InvalidArgumentError as error:
+        problem = f"has an attribute 'command' whose {error.argument} {error.problem}"
+        remedy = "use a batchpid.sim.CommandSpec, or names such as ('x', 'y')"
+        raise InvalidArgumentError("control", problem, remedy=remedy) from None
 
 
 def _texts(argument: str, value: object) -> tuple[str, ...]:
