@@ -167,9 +167,9 @@ def run_ticks(
     command or velocities that are not finite. With ``whole``, commands and observations are those
     of the tables; else the ticks stop at the end of the first one.
     """
-    call = native.extension("_gateway").ticks
     while executors:
-        call(tuple([executor.prepare() for executor in executors]), until, steps, whole)
+        ticks = tuple([executor.prepare() for executor in executors])
+        native.extension("_gateway").ticks(ticks, until, steps, whole)
         executors = [executor for executor in executors if executor.is_waiting()]
 
 
