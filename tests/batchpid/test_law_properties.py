@@ -14,15 +14,6 @@ import batchpid as bp
 numbers = st.floats(-1e3, 1e3, allow_subnormal=False)
 runs = st.tuples(*[npst.arrays(float, (6, ENVS, JOINTS), elements=numbers)] * 3)
 cases = st.sampled_from(sorted(OPTIONS))
-TRACKED = (
-    "pid",
-    "mixed per env",
-    "rate and limits",
-    "filter",
-    "setpoint weight",
-    "continuous",
-    "everything",
-)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -143,11 +134,8 @@ def test_without_the_option_a_nan_propagates_in_its_joint():
     assert terms.finite.tolist() == [[True, False]]
 
 
-@pytest.mark.quick_rows(3)
-@pytest.mark.parametrize(
-    "case",
-    [case if case in TRACKED else pytest.param(case, marks=pytest.mark.slow) for case in OPTIONS],
-)
+@pytest.mark.quick_rows(4)
+@pytest.mark.parametrize("case", OPTIONS)
 @given(runs, npst.arrays(float, (ENVS, JOINTS), elements=st.floats(-0.9, 0.9)), st.booleans())
 @settings(max_examples=20)
 def test_track_makes_the_next_step_reproduce_the_effort(case, run, share, rates):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 from collections.abc import Callable
+from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -118,7 +119,7 @@ def test_a_value_of_any_kind_is_accepted_or_refused_by_name(
             PID.reset(ROWS)
             before = PID.state
             try:
-                function(**{**good, name: value})
+                function(**{**good, name: deepcopy(value)})  # it may be written to
             except (BatchPIDError, FileNotFoundError, IsADirectoryError) as error:
                 assert all(map(np.array_equal, PID.state, before))
                 text = str(error)

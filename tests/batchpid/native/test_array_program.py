@@ -209,14 +209,16 @@ def test_histories_that_do_not_fit_are_refused():
     assert not history[:, 1:].any()
     fixed = history.copy()
     fixed.setflags(write=False)
-    for wrong in (fixed, history[:, :, :2].copy(), history[:3].copy(), value):
+    for at, inputs in (
+        *(
+            (places, (wrong, value))
+            for wrong in (fixed, history[:, :, :2].copy(), history[:3], value)
+        ),
+        *((wrong, (history, value)) for wrong in (places - 1, places + 50)),
+        (places, (history, history.ravel()[:12].reshape(4, 3))),
+    ):
         with pytest.raises(ValueError, match="do not fit"):
-            ArrayProgram(traced, [places], 2, value.shape)(wrong, value)
-    for wrong in (places - 1, places + 50):
-        with pytest.raises(ValueError, match="do not fit"):
-            ArrayProgram(traced, [wrong], 2, value.shape)(history, value)
-    with pytest.raises(ValueError, match="do not fit"):
-        ArrayProgram(traced, [places], 2, value.shape)(history, history.ravel()[:12].reshape(4, 3))
+            ArrayProgram(traced, [at], 2, value.shape)(*inputs)
 
 
 # -- Traces
