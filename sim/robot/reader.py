@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lxml import etree
 
-from batchpid.errors import MissingDependencyError, RobotError
+from batchpid.errors import RobotError
 from batchpid.sim.robot.findings import Finding
 from batchpid.sim.robot.urdf import Source, read_urdf
 from batchpid.sim.robot.xml import parse_xml
@@ -24,8 +24,6 @@ def read_robot(
     RobotError
         A file that cannot be read, a structure or number that SAPIEN cannot build, a bad mesh, or
         an MJCF file that MuJoCo does not compile.
-    MissingDependencyError
-        The file is MJCF, and the package ``mujoco`` is missing.
     """
     findings: list[Finding] = []
     root = parse_xml(path, findings)
@@ -35,10 +33,8 @@ def read_robot(
         raise RobotError(
             f"{path}: an MJCF file is read several times, also by workers; save it as a file first"
         )
-    try:
-        from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
-    except ImportError as error:
-        raise MissingDependencyError("mujoco>=3.17", "reading an MJCF file") from error
+    from batchpid.sim.robot.mjcf.mjcf_reader import read_mjcf
+
     name = root.get("model") or path.stem
     try:
         source = read_mjcf(path, name, fixed_base, missing_meshes)
