@@ -88,10 +88,10 @@ class Window(NamedTuple):
 
 
 class FitResiduals(NamedTuple):
-    """Residuals of each window (rows, joints), and derivatives (rows, joints, unknowns)."""
+    """Residuals of each window (rows, joints), and their changes (rows, joints, n)."""
 
     residuals: list[Float64]
-    derivatives: list[Float64]
+    changes: list[Float64]
 
 
 class Solution(NamedTuple):
@@ -140,15 +140,15 @@ class Problem:
     """Map over groups of windows: ``map``, or that of worker processes."""
 
     def evaluate(
-        self, point: Float64, steps: Float64 | None = None, free_states: bool = True
+        self, point: Float64, changes: Float64 | None = None, free_states: bool = True
     ) -> FitResiduals:
-        """Return residuals at a point (unknowns,), and derivatives by ``steps`` (unknowns,); None:
-        no derivatives.
+        """Return residuals at a point (unknowns,), and their changes by ``changes`` (n, unknowns)
+        of the point; None: none.
 
         Initial states of windows of efforts are projected out if they are free.
         """
         joints = self.windows[0].measured.shape[1]
-        changes = np.zeros((0, len(point))) if steps is None else np.diag(steps)
+        changes = np.zeros((0, len(point))) if changes is None else changes
         free = free_states and self.data[0].drive.params is None
         shifts = np.diag(np.repeat(STATE_STEPS, joints if free else 0))
         # Rows: the point, a change of each unknown, a change of each initial state.
@@ -169,7 +169,7 @@ class Problem:
                 change = np.moveaxis(errors[1:] - errors[0], 0, 2)
                 residual, slope = _projected(errors[0], change, count - 1)
                 residuals[number] = residual
-                slopes[number] = slope if steps is None else slope / steps
+                slopes[number] = slope
         return FitResiduals(residuals, slopes)
 
     def _task(self, group: list[int], candidates: PlantCandidates, states: Float64) -> Any:
@@ -234,7 +234,7 @@ class Problem:
         """
         from scipy.optimize import least_squares
 
-        steps = np.full(len(start), STEP)
+        steps = STEP * np.eye(len(start))
         cache = dict[bytes, FitResiduals]()
 
         def at(point: Float64) -> FitResiduals:
@@ -278,8 +278,8 @@ class Problem:
     def system(
         self, evaluation: FitResiduals, point: Float64, size: Float64
     ) -> tuple[Float64, Float64]:
-        """Return residuals and derivatives (n, unknowns) of the fitted rows over their ``size``,
-        then of the prior.
+        """Return residuals and derivatives (n, unknowns), by changes of STEP, of the fitted rows
+        over their ``size``, then of the prior.
         """
         rows = sum(int(window.fitted.sum()) for window in self.windows)
         every = 1 + rows * len(size) * len(point) // MOST_NUMBERS
@@ -287,7 +287,9 @@ class Problem:
         slopes = list[Float64]()
         for window, residual, slope in zip(self.windows, *evaluation, strict=True):
             residuals.append((residual[window.fitted][::every] / size).ravel())
-            slopes.append((slope[window.fitted][::every] / size[:, None]).reshape(-1, len(point)))
+            slopes.append(
+                (slope[window.fitted][::every] / (STEP * size[:, None])).reshape(-1, len(point))
+            )
         mean, spread = self.unknowns.prior
         residuals.append((point - mean) / spread)
         slopes.append(np.diag(1 / spread))
@@ -321,17 +323,13 @@ class Problem:
         entries = unknowns.entries
         values = unknowns.values(solution.point[None])[0]
         sizes = np.array([entry.size for entry in entries])
-        further = values + 0.01 * np.maximum(np.abs(values), sizes)
-        ends = []
-        for table in (values, further):
-            pairs = zip(entries, table, strict=True)
-            ends.append(np.array([entry.coordinate(value) for entry, value in pairs]))
-        point = ends[0]
-        steps = ends[1] - point
+        change = 0.01 * np.maximum(np.abs(values), sizes)
+        point = unknowns.points(values[None])[0]
+        further = unknowns.points(values + np.diag(change))
         prior = np.array([KINDS[entry.kind].spread for entry in entries])
-        prior *= np.maximum(np.abs(point), 1.0)
-        evaluation = self.evaluate(point, steps)
-        blocks = self._blocks(evaluation, solution, steps * sizes / (further - values))
+        prior *= np.maximum(np.abs(values) / sizes, 1.0)
+        evaluation = self.evaluate(point, further - point)
+        blocks = self._blocks(evaluation, solution, STEP * sizes / change)
         total = sum(matrix.T @ matrix for matrix, _ in blocks)
         moment = sum(matrix.T @ residual for matrix, residual in blocks)
         count = sum(len(residual) for _, residual in blocks)

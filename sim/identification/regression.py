@@ -35,8 +35,11 @@ from batchpid.sim.identification.simulator import (
 CUTOFF = 15.0
 """Corner of the filter [Hz]."""
 DELAYS = np.arange(0.0, 0.03, 1e-3)
+LOOP_DELAYS = DELAYS[:9]
 SETPOINT_DELAYS = np.arange(-0.05, 0.06, 5e-3)
-"""Delays that are tried [s]. A delay of setpoints is negative where they were logged late."""
+"""Delays of efforts, of efforts within a loop of setpoints, and of setpoints, that are tried [s]. A
+delay of setpoints is negative where they were logged late. Loops have short delays of efforts.
+"""
 EDGE = 0.15
 """Time left out at both ends of a log, where the filter begins [s]."""
 MOST_ROWS = 4000
@@ -141,6 +144,7 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
     dt = data[0].drive.timestep
     every = 1 + sum(len(part.motion.qpos) for part in data) // MOST_ROWS
     cutoff = min(_cutoff(part.log) for part in data)
+    delays = LOOP_DELAYS
     tables = list[Any]()
     for part in data:
         motion, drive = part.motion, part.drive
@@ -158,8 +162,9 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
                 links -= held[rows]
         if drive.params is None:
             efforts = lowpass(efforts[0], cutoff, dt)[None]
+            delays = DELAYS
         time = dt * np.arange(len(motion.qpos))
-        late = [[interpolated(time[rows] - delay, time, u) for delay in DELAYS] for u in efforts]
+        late = [[interpolated(time[rows] - delay, time, u) for delay in delays] for u in efforts]
         still = 0.01 * np.abs(motion.qvel).max(0) + 1e-9
         sign = lowpass(np.clip(motion.qvel / still, -1, 1), cutoff, dt)[rows]
         tables.append((links, motion.qacc[rows], motion.qvel[rows], sign, np.array(late)))
@@ -171,7 +176,7 @@ def regress(data: Sequence[LogData], has_slew: bool = False) -> list[Guess]:
     names = ("armature", "damping", "friction", "strength", "bias", "cost")
     for late, by_delay in zip(SETPOINT_DELAYS, efforts, strict=False):
         options = list[Guess]()
-        for delay, effort in zip(DELAYS, by_delay, strict=True):
+        for delay, effort in zip(delays, by_delay, strict=True):
             joints = []
             for joint, fast in enumerate(moves.T):
                 joints.append(_solve([column[fast, joint] for column in (*columns, effort)]))

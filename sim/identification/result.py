@@ -335,10 +335,7 @@ def advice(problem: Problem, solution: Solution) -> str:
     count = len(solution.point)
     start = [entry.coordinate(entry.start) for entry in further]
     point = np.concatenate([solution.point, start])
-    steps = np.full(len(point), STEP)
-    for at, entry in enumerate(wide.entries):
-        if entry.kind == "load_friction":
-            steps[at] = 4.0
+    steps = STEP * np.eye(len(point))
     wider = replace(problem, unknowns=wide)
     residual, matrix = wider.system(wider.evaluate(point, steps), point, solution.size)
     # Without the prior of the further unknowns: any size of an effect is as likely.
